@@ -1,0 +1,40 @@
+# `make repro` and `make test` are all that a fresh clone needs. Both can be run again at any time.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+export PATH := $(CURDIR)/$(BIN):$(PATH)
+
+.PHONY: help setup repro test lint smoke clean
+
+help:
+	@echo "make repro   set up and run the whole pipeline; the page is data/report/index.html"
+	@echo "make test    set up and run the tests"
+	@echo "make lint    ruff, mypy, import-linter, tables up to date"
+	@echo "make smoke   the pipeline at CI size, in outputs/run/smoke"
+	@echo "make clean   remove the virtual environment and caches (data/ stays)"
+
+setup: $(READY)
+
+$(READY): pyproject.toml constraints.txt .ci/setup
+	@.ci/setup "$(PYTHON)" "$(VENV)"
+	@touch $(READY)
+
+repro: setup
+	dvc repro
+
+test: setup
+	python -m pytest -n 2 --dist loadfile
+
+lint: setup
+	ruff check .
+	ruff format --check .
+	mypy
+	lint-imports
+	polarnet docs --check
+
+smoke: setup
+	polarnet run experiment=smoke
+
+clean:
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis build *.egg-info

@@ -1,0 +1,1 @@
+"""What people use today: events to intensity, one polarizer at a time, and constants."""

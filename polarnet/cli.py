@@ -1,0 +1,137 @@
+"""The `polarnet` command. Each subcommand is thin: the library does the work."""
+
+import argparse
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from polarnet import __version__
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; the exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(options)
+    except (ValueError, FileNotFoundError, RuntimeError) as error:
+        print(f"polarnet {options.command}: {error}", file=sys.stderr)
+        return 1
+
+
+def project_root(start: Path | None = None) -> Path:
+    """The nearest folder at or above `start` (default: here) that holds params.yaml and dvc.yaml."""
+    start = (start or Path.cwd()).resolve()
+    for folder in [start, *start.parents]:
+        if (folder / "params.yaml").exists() and (folder / "dvc.yaml").exists():
+            return folder
+    raise FileNotFoundError(f"no params.yaml beside a dvc.yaml in {start} or above; run this inside a polarnet clone")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="polarnet", description="DoLP from event cameras: simulate, train, benchmark. `dvc repro` runs it all."
+    )
+    parser.add_argument("--version", action="version", version=f"polarnet {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    doctor = commands.add_parser("doctor", help="what this machine offers: versions, device, bf16, weights, free disk")
+    doctor.set_defaults(run=_doctor)
+
+    preset = commands.add_parser("preset", help="write a named experiment's values into params.yaml, comments kept")
+    preset.add_argument("name", help="a file of conf/experiment: demo, smoke, paper, ...")
+    preset.set_defaults(run=_preset)
+
+    run = commands.add_parser("run", help="run all stages through Hydra alone, into outputs/run/NAME")
+    run.add_argument("overrides", nargs="*", help="as Hydra takes them: experiment=smoke seed=2 paths.data=FOLDER")
+    run.set_defaults(run=_run)
+
+    stages = commands.add_parser("stages", help="the names of the stages, in order")
+    stages.set_defaults(run=_stages)
+
+    verify = commands.add_parser("verify", help="check every byte of an event store")
+    verify.add_argument("store", help="folder, zip or fsspec URL")
+    verify.set_defaults(run=_verify)
+
+    docs = commands.add_parser("docs", help="write docs/results/*.json into the tables of README.md and docs/")
+    docs.add_argument("--check", action="store_true", help="change nothing; fail where a table is out of date")
+    docs.set_defaults(run=_docs)
+
+    measure = commands.add_parser("measure", help="time the README's two commands in a fresh clone of HEAD")
+    measure.set_defaults(run=_measure)
+    return parser
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from polarnet.doctor import findings
+
+    for finding in findings():
+        print(finding)
+    return 0
+
+
+def _preset(options: argparse.Namespace) -> int:
+    from polarnet.experiments import write_preset
+
+    changed = write_preset(project_root(), options.name)
+    print(f"params.yaml now holds experiment {options.name}: {len(changed)} values changed")
+    for line in changed:
+        print(f"  {line}")
+    return 0
+
+
+def _run(options: argparse.Namespace) -> int:
+    from polarnet.experiments import stage_names
+
+    root = project_root()
+    chosen = dict(item.split("=", 1) for item in options.overrides if "=" in item)
+    folder = chosen.get("paths.data", f"outputs/run/{chosen.get('experiment', 'demo')}")
+    overrides = [*options.overrides, *([] if "paths.data" in chosen else [f"paths.data={folder}"])]
+    for stage in stage_names(root):
+        print(f"== {stage}", flush=True)
+        status = subprocess.run([sys.executable, "-m", f"stages.{stage}", *overrides], cwd=root).returncode
+        if status:
+            print(f"polarnet run: stage {stage} failed; what earlier stages made lies in {folder}", file=sys.stderr)
+            return status
+    print(f"done: {os.path.join(folder, 'report', 'index.html')}")
+    return 0
+
+
+def _stages(options: argparse.Namespace) -> int:
+    from polarnet.experiments import stage_names
+
+    print("\n".join(stage_names(project_root())))
+    return 0
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from polarnet.events.store import verify
+
+    problems = verify(options.store)
+    for problem in problems:
+        print(problem)
+    if not problems:
+        print(f"{options.store}: every sequence is whole")
+    return 1 if problems else 0
+
+
+def _docs(options: argparse.Namespace) -> int:
+    from polarnet.reports.readme import update_results_blocks
+
+    changed = update_results_blocks(project_root(), check=options.check)
+    for path in changed:
+        print(f"{path}: {'out of date; run polarnet docs' if options.check else 'updated'}")
+    return 1 if changed and options.check else 0
+
+
+def _measure(options: argparse.Namespace) -> int:
+    from polarnet.measure import measure_pipeline
+
+    path = measure_pipeline(project_root())
+    print(f"wrote {path}; `polarnet docs` brings it into the README")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

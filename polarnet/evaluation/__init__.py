@@ -1,0 +1,1 @@
+"""Every method behind one signature, and how it is scored."""

@@ -1,0 +1,1 @@
+"""Layers and networks that recover polarization from events."""

@@ -1,0 +1,67 @@
+"""Device, determinism and named random generators."""
+
+import hashlib
+import os
+from dataclasses import dataclass, field
+
+import numba
+import numpy as np
+import torch
+
+from polarnet.ranges import allowed, check_ranges
+
+
+@dataclass(frozen=True)
+class RuntimeConfig:
+    """Section `runtime` of conf/config.yaml: settings that change no result."""
+
+    device: str
+    """auto (CUDA where there is one), cpu, cuda or cuda:N."""
+    threads: int = field(metadata=allowed(low=0))
+    """Of torch and numba in each process; 0: as many as there are cores."""
+    workers: int = field(metadata=allowed(low=1))
+    """Processes that share out sequences."""
+
+    def __post_init__(self):
+        check_ranges(self)
+
+
+def seed_for(seed: int, name: str, purpose: str) -> int:
+    """A 64-bit seed for one purpose of one named thing, whatever the order, worker or machine that asks."""
+    digest = hashlib.blake2b(f"{seed}\0{name}\0{purpose}".encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little")
+
+
+def generator_for(seed: int, name: str, purpose: str) -> np.random.Generator:
+    """A counter-based generator seeded by `seed_for`."""
+    return np.random.Generator(np.random.Philox(seed_for(seed, name, purpose)))
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def limit_threads(threads: int) -> None:
+    """Let torch and numba use this many threads in this process."""
+    torch.set_num_threads(threads)
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+
+
+def device_of(config: RuntimeConfig) -> torch.device:
+    """The torch device that `config.device` names; ValueError where it asks for a GPU that is not there."""
+    if config.device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = torch.device(config.device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"runtime.device={config.device}: torch {torch.__version__} sees no GPU; use device=cpu")
+    return device
+
+
+def configure(config: RuntimeConfig, seed: int) -> torch.device:
+    """Set threads, seed torch, ask torch for deterministic kernels; the device to run on."""
+    limit_threads(config.threads or usable_cores())
+    torch.manual_seed(seed)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    return device_of(config)

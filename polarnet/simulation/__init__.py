@@ -1,0 +1,1 @@
+"""From pictures to polarization events: scenes, motion, and the pixels of an event camera."""

@@ -1,0 +1,57 @@
+"""Polarization optics: Stokes vectors, DoLP, AoLP and what a polarizer lets through (paper Eq. 1-4)."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+POLARIZER_ANGLES_DEG = (0, 45, 90, 135)
+
+
+def stokes_from_intensities(intensities: Float[Tensor, "*b 4 h w"]) -> Float[Tensor, "*b 3 h w"]:
+    """(S0, S1, S2) from intensities behind linear polarizers at 0, 45, 90 and 135 degrees (paper Eq. 1)."""
+    i0, i45, i90, i135 = intensities.unbind(-3)
+    return torch.stack([i0 + i90, i0 - i90, i45 - i135], dim=-3)
+
+
+def stokes_from_polarization(
+    s0: Float[Tensor, "*b h w"], dolp: Float[Tensor, "*b h w"], aolp: Float[Tensor, "*b h w"]
+) -> Float[Tensor, "*b 3 h w"]:
+    """(S0, S1, S2) from intensity, degree and angle (radians) of linear polarization: Eq. 2 and 3 inverted."""
+    polarized = s0 * dolp
+    return torch.stack([s0, polarized * torch.cos(2 * aolp), polarized * torch.sin(2 * aolp)], dim=-3)
+
+
+def intensity_behind_polarizer(stokes: Float[Tensor, "*b 3 h w"], angle: float) -> Float[Tensor, "*b h w"]:
+    """Intensity behind an ideal linear polarizer at `angle` radians (paper Eq. 4, written in Stokes parameters).
+
+    S0 (1 - DoLP) / 2 + S0 DoLP cos^2(angle - AoLP) = (S0 + S1 cos(2 angle) + S2 sin(2 angle)) / 2.
+    """
+    s0, s1, s2 = stokes.unbind(-3)
+    return (s0 + s1 * math.cos(2 * angle) + s2 * math.sin(2 * angle)) / 2
+
+
+def intensities_from_stokes(stokes: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 4 h w"]:
+    """Intensities behind polarizers at 0, 45, 90 and 135 degrees (paper Eq. 4)."""
+    return torch.stack(
+        [intensity_behind_polarizer(stokes, math.radians(angle)) for angle in POLARIZER_ANGLES_DEG], dim=-3
+    )
+
+
+def dolp(stokes: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
+    """Degree of linear polarization (paper Eq. 2); 0 where there is no light.
+
+    Not clamped: intensities reconstructed from events can be unphysical and exceed 1.
+    """
+    s0, s1, s2 = stokes.unbind(-3)
+    lit = s0 > 0
+    return torch.where(lit, torch.hypot(s1, s2) / torch.where(lit, s0, 1.0), 0.0)
+
+
+def aolp(stokes: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
+    """Angle of linear polarization in radians, [0, pi) (paper Eq. 3, over the whole circle); 0 where unpolarized."""
+    _, s1, s2 = stokes.unbind(-3)
+    angle = torch.atan2(s2, s1) / 2
+    folded = torch.where(angle < 0, angle + math.pi, angle)
+    return torch.where(folded >= math.pi, 0.0, folded)  # -1e-9 + pi rounds to pi

@@ -1,0 +1,1 @@
+"""One thin Hydra entry point per DVC stage."""

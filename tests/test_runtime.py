@@ -1,0 +1,28 @@
+import pytest
+
+from polarnet.runtime import RuntimeConfig, device_of, generator_for, seed_for
+
+
+def test_a_seed_depends_on_each_of_its_three_parts_and_on_nothing_else():
+    assert seed_for(1, "coffee", "motion") == seed_for(1, "coffee", "motion")
+    assert len({seed_for(1, "coffee", "motion"), seed_for(2, "coffee", "motion"), seed_for(1, "cat", "motion"),
+                seed_for(1, "coffee", "events")}) == 4  # fmt: skip
+
+
+def test_parts_do_not_run_into_each_other():
+    assert seed_for(1, "1a", "b") != seed_for(11, "a", "b")
+
+
+def test_the_generator_of_a_name_is_pinned_for_ever():
+    assert generator_for(1, "coffee", "motion").integers(0, 1000, 4).tolist() == [260, 379, 998, 973]
+    assert seed_for(0, "", "") == 14014920894283999531
+
+
+def test_a_missing_gpu_is_refused_with_the_way_out():
+    with pytest.raises(ValueError, match="use device=cpu"):
+        device_of(RuntimeConfig(device="cuda:99", threads=1, workers=1))
+
+
+def test_zero_workers_are_refused():
+    with pytest.raises(ValueError, match="workers: expected >= 1, got 0"):
+        RuntimeConfig(device="cpu", threads=1, workers=0)

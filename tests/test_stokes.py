@@ -1,0 +1,74 @@
+import math
+
+import pytest
+import torch
+
+from polarnet.stokes import (
+    POLARIZER_ANGLES_DEG,
+    aolp,
+    dolp,
+    intensities_from_stokes,
+    intensity_behind_polarizer,
+    stokes_from_intensities,
+    stokes_from_polarization,
+)
+
+
+def pixel(*planes: float) -> torch.Tensor:
+    return torch.tensor(planes, dtype=torch.float64).view(-1, 1, 1)
+
+
+def test_horizontal_light_passes_the_0_degree_polarizer_whole_and_the_90_degree_one_not_at_all():
+    stokes = stokes_from_polarization(torch.ones(1, 1), torch.ones(1, 1), torch.zeros(1, 1))
+    assert intensities_from_stokes(stokes).flatten().tolist() == pytest.approx([1, 0.5, 0, 0.5], abs=1e-7)
+
+
+def test_eq_1_on_four_intensities_worked_by_hand():
+    assert stokes_from_intensities(pixel(0.5, 0.4, 0.1, 0.2)).flatten().tolist() == pytest.approx([0.6, 0.4, 0.2])
+
+
+def test_eq_2_and_3_on_a_3_4_5_triangle():
+    stokes = pixel(10, 3, 4)
+    assert dolp(stokes).item() == pytest.approx(0.5)
+    assert aolp(stokes).item() == pytest.approx(0.5 * math.atan2(4, 3))
+
+
+@pytest.mark.parametrize(
+    ("s1", "s2", "degrees"), [(1, 0, 0), (0, 1, 45), (-1, 0, 90), (0, -1, 135), (1, 1, 22.5), (1, -1, 157.5)]
+)
+def test_aolp_covers_the_whole_half_circle(s1, s2, degrees):
+    assert math.degrees(aolp(pixel(2, s1, s2)).item()) == pytest.approx(degrees)
+
+
+def test_aolp_stays_below_pi_where_rounding_would_reach_it():
+    assert aolp(torch.tensor([1.0, 1.0, -1e-9]).view(3, 1, 1)).item() < math.pi
+
+
+def test_no_light_has_no_polarization():
+    assert dolp(torch.zeros(3, 1, 1)).item() == 0
+    assert dolp(pixel(-1, 1, 0)).item() == 0
+
+
+def test_unphysical_intensities_are_not_hidden():
+    assert dolp(pixel(1, 3, 0)).item() == 3
+
+
+def test_eq_4_as_printed_equals_the_stokes_form():
+    s0, degree, angle = 0.8, 0.3, math.radians(20)
+    stokes = stokes_from_polarization(*(torch.full((1, 1), v, dtype=torch.float64) for v in (s0, degree, angle)))
+    for degrees in POLARIZER_ANGLES_DEG:
+        theta = math.radians(degrees)
+        printed = 0.5 * s0 * (1 - degree) + s0 * degree * math.cos(theta - angle) ** 2
+        assert intensity_behind_polarizer(stokes, theta).item() == pytest.approx(printed)
+
+
+def test_round_trip_and_redundancy_on_random_polarization():
+    generator = torch.Generator().manual_seed(0)
+    s0, degree, angle = torch.rand(3, 2, 5, 7, dtype=torch.float64, generator=generator) + 0.01
+    degree, angle = degree.clamp(max=1), angle * 3
+    intensities = intensities_from_stokes(stokes_from_polarization(s0, degree, angle))
+    stokes = stokes_from_intensities(intensities)
+    torch.testing.assert_close(stokes[:, 0], s0)
+    torch.testing.assert_close(dolp(stokes), degree)
+    torch.testing.assert_close(aolp(stokes), angle)
+    torch.testing.assert_close(intensities[:, 0] + intensities[:, 2], intensities[:, 1] + intensities[:, 3])
