@@ -16,13 +16,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from polarnet.baselines.complementary_filter import ComplementaryFilterConfig, HighPassConfig
 from polarnet.evaluation.score import BenchmarkConfig
+from polarnet.lpips import LpipsConfig, lpips_problem
 from polarnet.networks.dolp_unet import DolpUNetConfig
 from polarnet.ranges import check_ranges
 from polarnet.runtime import RuntimeConfig, configure
-from polarnet.similarity import LpipsConfig, lpips_problem
 from polarnet.simulation.emulator import EmulatorConfig
-from polarnet.simulation.ingest import IngestConfig
 from polarnet.simulation.motion import MotionConfig
+from polarnet.simulation.pictures.ingest import IngestConfig
 from polarnet.training.e2v import E2vConfig
 from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig
@@ -124,6 +124,20 @@ def register_schema() -> None:
     ConfigStore.instance().store(name="schema", node=_schema_of(Config))
 
 
+def check_keys(root: Path, overrides: list[str]) -> None:
+    """Raise a ValueError for the first key of params.yaml or of `overrides` that is not a setting, listing those there.
+
+    Hydra refuses such a key as well, but does not say which ones there are.
+    """
+    params = OmegaConf.to_container(OmegaConf.load(root / "params.yaml"))
+    for key in _leaves(params):
+        _check_key(key, "params.yaml")
+    for override in overrides:
+        key = override.split("=", 1)[0].lstrip("+~").split("@")[0]
+        if key != "experiment" and not key.startswith(("hydra.", "hydra/", "paths.data")):
+            _check_key(key, "command line")
+
+
 def hydra_stage(main: Stage) -> Callable[[], None]:
     """Make `main(config)` a Hydra command line: composes, checks, sets up the runtime, then runs it.
 
@@ -134,6 +148,11 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
     os.environ[ROOT_VARIABLE] = str(root)
     register_schema()
 
+    def command_line() -> None:
+        overrides = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
+        _or_exit(lambda: check_keys(root, overrides))
+        run()
+
     @functools.wraps(main)
     def checked(node: DictConfig) -> Any:
         config = _or_exit(lambda: typed(node))
@@ -141,12 +160,31 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
         configure(config.runtime, config.seed)
         return main(config)
 
-    return hydra.main(version_base="1.3", config_path=str(root / "conf"), config_name="config")(checked)
+    run = hydra.main(version_base="1.3", config_path=str(root / "conf"), config_name="config")(checked)
+    return command_line
 
 
 def _check_lpips(config: Config) -> None:
-    if config.lpips.required and (problem := lpips_problem(config.lpips)):
+    if config.lpips.required and (problem := lpips_problem(config.lpips, config.paths.weights)):
         raise ValueError(f"lpips.required is true: {problem}")
+
+
+def _check_key(key: str, where: str) -> None:
+    section: Any = Config
+    path = key.split(".")
+    for depth, name in enumerate(path):
+        names = sorted(field.name for field in dataclasses.fields(section)) if dataclasses.is_dataclass(section) else []
+        if name not in names:
+            inside = ".".join(path[:depth]) or "the configuration"
+            allowed = f"{inside} has {', '.join(names)}" if names else f"{inside} is a value, not a section"
+            raise ValueError(f"{where}: {key} is not a setting; {allowed}")
+        section = typing.get_type_hints(section)[name]
+
+
+def _leaves(values: Any, prefix: str = "") -> list[str]:
+    if not isinstance(values, dict):
+        return [prefix]
+    return [leaf for key, value in values.items() for leaf in _leaves(value, f"{prefix}.{key}" if prefix else str(key))]
 
 
 def _or_exit(check: Callable[[], T]) -> T:

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import psutil
 import torch
 
+from polarnet.lpips import BACKBONES, LpipsConfig, lpips_problem
 from polarnet.runtime import usable_cores
-from polarnet.similarity import BACKBONES, LpipsConfig, lpips_problem
 
 PACKAGES = ("torch", "numpy", "numba", "zarr", "OpenImageIO", "opencv-contrib-python-headless", "scikit-image",
             "dvc", "hydra-core")  # fmt: skip

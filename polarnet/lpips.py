@@ -107,16 +107,18 @@ class Backbone(NamedTuple):
     """Numbers of layers after which the features are compared."""
     channels: tuple[int, ...]
     """At each tap."""
+    least_side: int
+    """Pixels that an image must have for the last tap to see anything."""
     file: str
     """torchvision's name of the weights; its last part begins the file's sha256."""
 
 
 BACKBONES = {
     "squeeze": Backbone(
-        squeezenet1_1, (2, 5, 8, 10, 11, 12, 13), (64, 128, 256, 384, 384, 512, 512), "squeezenet1_1-b8a52dc0.pth"
+        squeezenet1_1, (2, 5, 8, 10, 11, 12, 13), (64, 128, 256, 384, 384, 512, 512), 17, "squeezenet1_1-b8a52dc0.pth"
     ),
-    "alex": Backbone(alexnet, (2, 5, 8, 10, 12), (64, 192, 384, 256, 256), "alexnet-owt-7be5be79.pth"),
-    "vgg": Backbone(vgg16, (4, 9, 16, 23, 30), (64, 128, 256, 512, 512), "vgg16-397923af.pth"),
+    "alex": Backbone(alexnet, (2, 5, 8, 10, 12), (64, 192, 384, 256, 256), 31, "alexnet-owt-7be5be79.pth"),
+    "vgg": Backbone(vgg16, (4, 9, 16, 23, 30), (64, 128, 256, 512, 512), 16, "vgg16-397923af.pth"),
 }
 
 
@@ -137,7 +139,12 @@ class Lpips(nn.Module):
     @classmethod
     def of(cls, backbone: str, tensors: Mapping[str, Tensor]) -> "Lpips":
         """From tensors under torchvision's and LPIPS's names; ValueError where they are not this backbone's."""
-        state = {name.replace("features.", "layers."): value for name, value in tensors.items()}
+        state = {
+            name.replace("features.", "layers."): (
+                value.contiguous(memory_format=torch.channels_last) if value.ndim == 4 else value  # the faster layout
+            )
+            for name, value in tensors.items()
+        }
         for i in range(len(BACKBONES[backbone].taps)):
             if (head := state.pop(f"lin{i}.model.1.weight", None)) is not None:
                 state[f"heads.{i}"] = head.flatten()
@@ -167,7 +174,15 @@ class Lpips(nn.Module):
         return self.distance(self.features(a), self.features(b))
 
     def features(self, images: Float[Tensor, "b h w"] | Float[Tensor, "b 3 h w"]) -> list[Float[Tensor, "b _c _h _w"]]:
-        """Unit-length features of images in [0, 1] at each tap: what to keep of a truth that is compared often."""
+        """Unit-length features of images in [0, 1] at each tap: what to keep of a truth that is compared often.
+
+        ValueError for images too small for the backbone.
+        """
+        least = BACKBONES[self.backbone].least_side
+        if min(images.shape[-2:]) < least:
+            raise ValueError(
+                f"LPIPS ({self.backbone}) needs images of {least} pixels a side, got {tuple(images.shape)}"
+            )
         if images.ndim == 3:
             images = images[:, None].expand(-1, 3, -1, -1)
         x = (2 * images - 1 - images.new_tensor(SHIFT).view(3, 1, 1)) / images.new_tensor(SCALE).view(3, 1, 1)

@@ -47,6 +47,7 @@ def measure_pipeline(root: Path) -> Path:
             raise RuntimeError(f"a second make repro ran {', '.join(again)}; everything should have been cached")
         record["test_minutes"], _ = _timed("test", clone)
         record["metrics"] = json.loads((clone / "data" / "benchmark" / "metrics.json").read_text())
+        record["lpips_reason"] = json.loads((clone / "data" / "weights" / "lpips.json").read_text())["reason"]
     path = root / "docs" / "results" / "pipeline.json"
     path.write_text(json.dumps(record, indent=2) + "\n")
     return path

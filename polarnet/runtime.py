@@ -45,7 +45,12 @@ def usable_cores() -> int:
 def limit_threads(threads: int) -> None:
     """Let torch and numba use this many threads in this process."""
     torch.set_num_threads(threads)
-    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+
+
+def threads_of(config: RuntimeConfig) -> int:
+    """Threads that one worker may use, so that all of them together use those of the machine."""
+    return config.threads or max(1, usable_cores() // config.workers)
 
 
 def device_of(config: RuntimeConfig) -> torch.device:

@@ -75,12 +75,13 @@ def test_correlation_is_that_of_numpy(pair):
 
 
 def test_ssim_is_that_of_torchmetrics(pair):
-    a, b = pair
+    a, b = (x.double() for x in pair)
     for i in range(2):
         expected = structural_similarity_index_measure(
             b[i][None, None], a[i][None, None], gaussian_kernel=True, sigma=1.5, kernel_size=11, data_range=1.0
         )
-        torch.testing.assert_close(ssim(a, b)[i], expected, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(ssim(a, b)[i], expected, rtol=1e-7, atol=0)
+        assert ssim(*(x.float() for x in (a, b)))[i].item() == pytest.approx(expected.item(), rel=1e-4)
 
 
 def test_ssim_is_that_of_scikit_image_where_its_window_meets_no_border():
@@ -88,7 +89,7 @@ def test_ssim_is_that_of_scikit_image_where_its_window_meets_no_border():
     phase = torch.arange(27, dtype=torch.float64) * torch.pi / 13
     a = 0.5 + 0.4 * torch.cos(phase)[:, None] * torch.cos(phase)
     b = 0.5 + 0.3 * torch.cos(2 * phase)[:, None] * torch.cos(phase)
-    tiles = [torch.cat([x, x[1:], x[1:]])[:, :].repeat(1, 1) for x in (a, b)]
+    tiles = [torch.cat([x, x[1:], x[1:]]) for x in (a, b)]
     tiles = [torch.cat([x, x[:, 1:], x[:, 1:]], dim=1) for x in tiles]
     _, expected = structural_similarity(
         *(x.numpy() for x in tiles), data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
@@ -138,6 +139,14 @@ def test_a_backbone_has_the_parameters_of_torchvisions_features(backbone, parame
 def test_taps_have_the_channels_that_the_heads_expect(backbone):
     features = Lpips(backbone).features(torch.rand(1, 64, 64))
     assert tuple(x.shape[1] for x in features) == BACKBONES[backbone].channels
+
+
+@pytest.mark.parametrize(("backbone", "side"), [("squeeze", 17), ("alex", 31), ("vgg", 16)])
+def test_the_smallest_image_that_a_backbone_takes(backbone, side):
+    distance = Lpips(backbone)
+    assert distance(torch.zeros(1, side, side), torch.ones(1, side, side)).isfinite().all()
+    with pytest.raises(ValueError, match=rf"LPIPS \({backbone}\) needs images of {side} pixels a side"):
+        distance.features(torch.zeros(1, 50, side - 1))
 
 
 def test_lpips_is_0_for_equal_images_symmetric_and_reaches_only_the_images():
@@ -328,7 +337,7 @@ def test_weights_that_are_not_those_of_the_record_are_refused(hub, tmp_path):
     write_weights(tmp_path, "squeeze", find_weights(config()))
     file = tmp_path / "lpips.safetensors"
     file.write_bytes(file.read_bytes()[:-4] + b"\0\0\0\0")
-    with pytest.raises(ValueError, match="not the file that lpips.json describes"):
+    with pytest.raises(ValueError, match=r"not the file that lpips.json describes"):
         Lpips.load(tmp_path)
 
 

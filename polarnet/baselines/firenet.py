@@ -1,0 +1,133 @@
+"""FireNet: events to intensity with 37,777 parameters (Scheerlinck et al., WACV 2020).
+
+Published checkpoints, of FireNet and of FireNet+ (Stoffregen et al., ECCV 2020), load with `FireNet.load`.
+"""
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+CHANNELS = 16
+MIDDLE_INTENSITY = 0.25  # the output's bias at the start: half of S0 = 0.5 passes a polarizer
+PUBLISHED_NAMES = {
+    "head.conv.conv2d": "head.conv2d",
+    "head.recurrent_block": "G1",
+    "resblocks.0.conv": "R1",
+    "resblocks.0.recurrent_block": "G2",
+    "resblocks.1": "R2",
+}
+
+
+class FireNet(nn.Module):
+    """conv - ConvGRU - residual - ConvGRU - residual - 1x1 conv, all at full size; no output activation.
+
+    The input is a voxel grid of one polarizer, normalised by `normalise_nonzero` (FireNet+: as it is).
+    """
+
+    def __init__(self, bins: int):
+        super().__init__()
+        self.bins = bins
+        self.head = Convolution(bins, CHANNELS, kernel_size=3)
+        self.G1 = ConvGRU()
+        self.R1 = ResidualBlock()
+        self.G2 = ConvGRU()
+        self.R2 = ResidualBlock()
+        self.pred = Convolution(CHANNELS, 1, kernel_size=1)
+        assert self.pred.conv2d.bias is not None
+        nn.init.constant_(self.pred.conv2d.bias, MIDDLE_INTENSITY)
+
+    def forward(
+        self, voxels: Float[Tensor, "b bins h w"], state: list[Tensor] | None = None
+    ) -> tuple[Float[Tensor, "b h w"], list[Tensor]]:
+        """Intensity at the end of one window (not clamped), and the state for the next; None at the start."""
+        if voxels.shape[1] != self.bins:
+            raise ValueError(f"this FireNet takes {self.bins} bins, got {voxels.shape[1]}")
+        before1, before2 = state or (None, None)
+        x = F.relu(self.head(voxels.contiguous(memory_format=torch.channels_last)))
+        after1 = self.G1(x, before1)
+        after2 = self.G2(self.R1(after1), before2)
+        intensity = self.pred(self.R2(after2))
+        return intensity[:, 0].float(), [after1, after2]
+
+    def unroll(
+        self, voxels: Float[Tensor, "t b bins h w"], state: list[Tensor] | None = None
+    ) -> tuple[Float[Tensor, "t b h w"], list[Tensor]]:
+        """t windows of b streams, one after the other."""
+        state, frames = state or [], []
+        for window in voxels:
+            frame, state = self(window, state)
+            frames.append(frame)
+        return torch.stack(frames), state
+
+    @classmethod
+    def load(cls, path: Path) -> "FireNet":
+        """A published checkpoint, of FireNet or FireNet+, read without running code from it.
+
+        ValueError for a file that holds something else.
+        """
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        tensors = {_own_name(name): tensor for name, tensor in content.get("state_dict", content).items()}
+        head = tensors.get("head.conv2d.weight")
+        if head is None:
+            raise ValueError(f"{path} holds no FireNet: expected tensors head.conv2d.weight, G1..., R1..., pred...")
+        network = cls(bins=head.shape[1])
+        try:
+            network.load_state_dict(tensors)
+        except RuntimeError as error:
+            raise ValueError(f"{path} holds no FireNet: {error}") from None
+        return network.eval()
+
+
+class Convolution(nn.Module):
+    """A convolution that keeps height and width."""
+
+    def __init__(self, inputs: int, outputs: int, kernel_size: int):
+        super().__init__()
+        self.conv2d = nn.Conv2d(inputs, outputs, kernel_size, padding=kernel_size // 2)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h w"]:
+        """d channels."""
+        return self.conv2d(x)
+
+
+class ConvGRU(nn.Module):
+    """reset, update = sigmoid(conv[x, h]); candidate = tanh(conv[x, reset * h]); h <- h + update * (candidate - h)."""
+
+    def __init__(self):
+        super().__init__()
+        self.reset_gate = nn.Conv2d(2 * CHANNELS, CHANNELS, 3, padding=1)
+        self.update_gate = nn.Conv2d(2 * CHANNELS, CHANNELS, 3, padding=1)
+        self.out_gate = nn.Conv2d(2 * CHANNELS, CHANNELS, 3, padding=1)
+
+    def forward(self, x: Float[Tensor, "b c h w"], state: Float[Tensor, "b c h w"] | None) -> Float[Tensor, "b c h w"]:
+        """The new state; the old one is None at the start, and counts as zeros."""
+        state = torch.zeros_like(x) if state is None else state.to(x.dtype)
+        both = torch.cat([x, state], dim=1)
+        reset, update = torch.sigmoid(self.reset_gate(both)), torch.sigmoid(self.update_gate(both))
+        candidate = torch.tanh(self.out_gate(torch.cat([x, reset * state], dim=1)))
+        return torch.lerp(state, candidate, update)
+
+
+class ResidualBlock(nn.Module):
+    """relu(x + conv(relu(conv(x))))."""
+
+    def __init__(self):
+        super().__init__()
+        self.conv1 = nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1)
+        self.conv2 = nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """The same shape."""
+        return F.relu(x + self.conv2(F.relu(self.conv1(x))))
+
+
+def _own_name(name: str) -> str:
+    """Of a published tensor: FireNet+ has our names, FireNet's say in which block of E2VID's code each layer sat."""
+    name = name.removeprefix("net.")
+    for theirs, ours in PUBLISHED_NAMES.items():
+        if name.startswith(theirs):
+            return ours + name.removeprefix(theirs)
+    return name

@@ -1,0 +1,239 @@
+"""Ground truth of event sequences: exact frames of intensity, DoLP and AoLP, quantised to 16 bits, in Zarr v3."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64, UInt16
+from torch import Tensor
+
+from polarnet.events.table import Column, Columns, Table, check_names, create_table, open_table, refuse_missing
+
+FORMAT = "polarnet.frames"
+VERSION = 1
+
+SPLITS = ("train", "val", "test")
+FRACTION_STEPS = 2**16 - 1
+ANGLE_STEPS = 2**16
+TOLERANCE = 1e-4  # float32 arithmetic may leave [0, 1] by some of its steps; more is a mistake of the caller's
+FRAMES_A_CHUNK = 32
+
+CONVENTIONS = {
+    "t_us": "microseconds from the start of the sequence; -1 after its last frame",
+    "intensity": "behind polarizers at 0, 45, 90 and 135 degrees (third axis), with I0 + I90 = S0: value / 65535",
+    "dolp": "degree of linear polarization: value / 65535",
+    "aolp": "angle of linear polarization in radians, [0, pi): value * pi / 65536",
+}
+
+
+class Frames(NamedTuple):
+    """The frames of one sequence."""
+
+    t_us: Int64[Tensor, " n"]
+    intensity: Float[Tensor, "n 4 h w"]
+    dolp: Float[Tensor, "n h w"]
+    aolp: Float[Tensor, "n h w"]
+
+
+def quantise_fraction(fraction: Float[Tensor, "*shape"]) -> UInt16[np.ndarray, "*shape"]:
+    """A quantity of [0, 1] in 65535 steps; ValueError outside, beyond float32's own error."""
+    _check_range(fraction, 1.0)
+    return (fraction * FRACTION_STEPS).round().clamp(0, FRACTION_STEPS).numpy().astype(np.uint16)
+
+
+def dequantise_fraction(steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
+    """The quantity of [0, 1] that `quantise_fraction` stored."""
+    return torch.from_numpy(steps.astype(np.float32)).div_(FRACTION_STEPS)
+
+
+def quantise_angle(angle: Float[Tensor, "*shape"]) -> UInt16[np.ndarray, "*shape"]:
+    """Radians of [0, pi) in 65536 steps round the circle (what rounds up to pi is 0); ValueError outside."""
+    _check_range(angle, math.pi)
+    return ((angle * (ANGLE_STEPS / math.pi)).round().numpy().astype(np.int64) % ANGLE_STEPS).astype(np.uint16)
+
+
+def dequantise_angle(steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
+    """The radians that `quantise_angle` stored."""
+    return torch.from_numpy(steps.astype(np.float32)).mul_(math.pi / ANGLE_STEPS)
+
+
+class FrameStore:
+    """Frames of sequences, and which sequences are for training, validation and test; see `create` and `open`."""
+
+    def __init__(self, table: Table):
+        self._table = table
+        self.path = table.path
+        self.sequences: list[str] = list(table.attributes["sequences"])
+        self.splits: dict[str, str] = dict(zip(self.sequences, table.attributes["splits"], strict=True))
+        self.height: int = table.attributes["height"]
+        self.width: int = table.attributes["width"]
+        self.attributes: dict[str, Any] = table.attributes["attributes"]
+        """What whoever created the store said about it."""
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        sequences: Sequence[str],
+        splits: Mapping[str, str],
+        n_frames: int,
+        height: int,
+        width: int,
+        attributes: Mapping[str, Any],
+    ) -> "FrameStore":
+        """A store to write, at PATH.tmp until it is finished, for at most `n_frames` a sequence.
+
+        `splits` maps each sequence to train, val or test. Resumes as `EventStore.create` does.
+        """
+        check_names(sequences)
+        check_splits(sequences, splits)
+        metadata = {
+            "sequences": list(sequences),
+            "splits": [splits[sequence] for sequence in sequences],
+            "n_frames": n_frames,
+            "height": height,
+            "width": width,
+            "conventions": CONVENTIONS,
+            "attributes": dict(attributes),
+        }
+        return cls(create_table(path, FORMAT, VERSION, metadata, _columns(metadata)))
+
+    @classmethod
+    def open(cls, path: str | Path) -> "FrameStore":
+        """A finished store: a local folder, a zip, or an fsspec URL. See `polarnet.events.table.open_table`."""
+        return cls(open_table(path, FORMAT, VERSION, _columns))
+
+    def write(
+        self,
+        sequence: str,
+        t_us: Int64[Tensor, " n"],
+        intensity: Float[Tensor, "n 4 h w"],
+        dolp: Float[Tensor, "n h w"],
+        aolp: Float[Tensor, "n h w"],
+    ) -> None:
+        """Put the frames of a sequence in its row; ValueError for values out of range or times that do not increase."""
+        self._check(t_us, intensity, dolp, aolp)
+        values = {
+            "intensity": quantise_fraction(intensity),
+            "dolp": quantise_fraction(dolp),
+            "aolp": quantise_angle(aolp),
+        }
+        self._table.erase("t_us", sequence)
+        for name, steps in values.items():
+            self._table.write(name, sequence, steps)
+        self._table.write("t_us", sequence, t_us.numpy())
+
+    def missing(self) -> list[str]:
+        """Sequences that are not written yet."""
+        return [sequence for sequence in self.sequences if not self._table.is_written("t_us", sequence)]
+
+    def finish(self) -> None:
+        """Mark the store complete and move it from PATH.tmp to PATH; ValueError where sequences are missing."""
+        refuse_missing(self.path, self.missing())
+        self._table.finish({})
+
+    def of_split(self, split: str) -> list[str]:
+        """The sequences of `train`, `val` or `test`, in the store's order."""
+        if split not in SPLITS:
+            raise ValueError(f"expected a split of {', '.join(SPLITS)}, got {split!r}")
+        return [sequence for sequence in self.sequences if self.splits[sequence] == split]
+
+    def t_us(self, sequence: str) -> Int64[Tensor, " n"]:
+        """Times of a sequence's frames, from its start."""
+        t_us = self._table.read("t_us", sequence)
+        return torch.from_numpy(t_us[t_us >= 0])
+
+    def intensity(self, sequence: str) -> Float[Tensor, "n 4 h w"]:
+        """Intensities behind the four polarizers."""
+        return dequantise_fraction(self._read("intensity", sequence))
+
+    def dolp(self, sequence: str) -> Float[Tensor, "n h w"]:
+        """Degree of linear polarization, [0, 1]."""
+        return dequantise_fraction(self._read("dolp", sequence))
+
+    def aolp(self, sequence: str) -> Float[Tensor, "n h w"]:
+        """Angle of linear polarization in radians, [0, pi)."""
+        return dequantise_angle(self._read("aolp", sequence))
+
+    def frames(self, sequence: str) -> Frames:
+        """All of a sequence."""
+        return Frames(self.t_us(sequence), self.intensity(sequence), self.dolp(sequence), self.aolp(sequence))
+
+    def problems(self, sequence: str) -> list[str]:
+        """Damaged or missing data of a sequence."""
+        problems = []
+        for read in (self.t_us, self.intensity, self.dolp, self.aolp):
+            try:
+                read(sequence)
+            except ValueError as error:
+                problems.append(str(error))
+        return problems
+
+    def _read(self, name: str, sequence: str) -> np.ndarray:
+        return self._table.read(name, sequence, slice(len(self.t_us(sequence))))
+
+    def _check(self, t_us: Tensor, intensity: Tensor, dolp: Tensor, aolp: Tensor) -> None:
+        n, most = len(t_us), self._table.columns["t_us"].shape[0]
+        if not 0 < n <= most or (t_us < 0).any() or (t_us.diff() <= 0).any():
+            raise ValueError(f"expected 1 to {most} frame times, increasing from 0 or later, got {t_us.tolist()[:40]}")
+        for name, frames, shape in (
+            ("intensity", intensity, (n, 4, self.height, self.width)),
+            ("dolp", dolp, (n, self.height, self.width)),
+            ("aolp", aolp, (n, self.height, self.width)),
+        ):
+            if tuple(frames.shape) != shape:
+                raise ValueError(f"expected {name} of shape {shape}, got {tuple(frames.shape)}")
+
+
+def check_splits(names: Sequence[str], splits: Mapping[str, str]) -> None:
+    """ValueError for the first name without a split, or with one that is not train, val or test."""
+    for name in names:
+        if splits.get(name) not in SPLITS:
+            raise ValueError(f"expected {name} in one of the splits {', '.join(SPLITS)}, got {splits.get(name)!r}")
+
+
+def verify_frames(path: str | Path) -> list[str]:
+    """Everything that is wrong with a frame store, each with its sequence and column; empty when it is whole."""
+    try:
+        store = FrameStore.open(path)
+    except (FileNotFoundError, ValueError) as error:
+        return [str(error)]
+    return store._table.metadata_problems() + [problem for name in store.sequences for problem in store.problems(name)]
+
+
+def _columns(metadata: Mapping[str, Any]) -> Columns:
+    n, size = metadata["n_frames"], (metadata["height"], metadata["width"])
+    together = min(n, FRAMES_A_CHUNK)
+    whole = -(-n // together) * together
+
+    def pictures(*channels: int) -> Column:
+        return Column(
+            metadata["sequences"],
+            (n, *channels, *size),
+            (together, *channels, *size),
+            (whole, *channels, *size),
+            "uint16",
+            fill=0,
+            fill_is_data=True,
+            shuffle="bitshuffle",
+        )
+
+    return {
+        "intensity": pictures(4),
+        "dolp": pictures(),
+        "aolp": pictures(),
+        "t_us": Column(
+            metadata["sequences"], (n,), (n,), (n,), "int64", fill=-1, fill_is_data=False, shuffle="shuffle"
+        ),
+    }
+
+
+def _check_range(values: Tensor, most: float) -> None:
+    if not values.numel():
+        return
+    low, high = float(values.min()), float(values.max())
+    if not (low >= -TOLERANCE and high <= most + TOLERANCE):  # false for NaN too
+        raise ValueError(f"expected values of 0 to {most:.6g}, got {low:.6g} to {high:.6g}")

@@ -1,0 +1,95 @@
+"""Events to dense network input. Every function says where in its time axis the first and the last event lie."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from polarnet.events.stream import Events
+
+VOXEL_BINS = 5  # of E2VID (Rebecq et al. 2019) and FireNet
+
+Encode = Callable[[Events, int], Tensor]
+
+
+def event_tensor(events: Events, window_us: int) -> Float[Tensor, "h w"]:
+    """Polarities summed per pixel, each weighted by its time since the first event (paper Eq. 5).
+
+    Time counts from the first event of this channel in the window, in window lengths: that event weighs 0, one at the
+    very end of the window less than 1 (1, when the first came as the window opened).
+    """
+    elapsed = (events.t - events.t[:1]) / window_us
+    image = elapsed.new_zeros(events.height * events.width).index_add_(0, _pixel(events), events.p * elapsed)
+    return image.view(events.height, events.width)
+
+
+def voxel_grid(events: Events, bins: int) -> Float[Tensor, "bins h w"]:
+    """Polarities shared out between the two nearest of `bins` instants (E2VID, Rebecq et al. 2019).
+
+    t* = (bins - 1) (t - first) / (last - first): the first event is in bin 0, the last in bin n-1, however long the
+    window is. Bilinear in time only. Events that all have one time are in bin 0.
+    """
+    size = events.height * events.width
+    grid = torch.zeros(bins * size)
+    if len(events):
+        elapsed = events.t - events.t[0]
+        position = (bins - 1) * elapsed / elapsed[-1].clamp(min=1)
+        bin_before = position.long().clamp(max=max(bins - 2, 0))  # the last event belongs wholly to the bin after
+        share_after = position - bin_before
+        place = bin_before * size + _pixel(events)
+        grid.index_add_(0, place, events.p * (1 - share_after))
+        if bins > 1:
+            grid.index_add_(0, place + size, events.p * share_after)
+    return grid.view(bins, events.height, events.width)
+
+
+def normalise_nonzero(grids: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b c h w"]:
+    """Entries other than 0 shifted and scaled to mean 0 and standard deviation 1, grid by grid, as E2VID does.
+
+    Zeros stay zero. Entries that are all equal become 0, not infinite.
+    """
+    filled = grids != 0
+    over = (-3, -2, -1)
+    count = filled.sum(over, keepdim=True).clamp(min=1)
+    centred = torch.where(filled, grids - grids.sum(over, keepdim=True) / count, 0.0)
+    deviation = (centred.square().sum(over, keepdim=True) / count).sqrt()
+    return centred / torch.where(deviation > 0, deviation, 1.0)
+
+
+def time_surface(events: Events, window_us: int) -> Float[Tensor, "h w"]:
+    """Polarity of each pixel's last event, faded by its age: p exp(-(t_last - t) / window) (Lagorce et al. 2017).
+
+    Ages count back from the last event of the channel, which therefore weighs 1. Pixels without an event are 0.
+    """
+    size = events.height * events.width
+    number = torch.arange(1, len(events) + 1)
+    latest = torch.zeros(size, dtype=torch.int64).scatter_reduce_(0, _pixel(events), number, "amax")  # 0: no event
+    seen = latest > 0
+    last = latest[seen] - 1
+    surface = torch.zeros(size)
+    surface[seen] = events.p[last] * torch.exp((events.t[last] - events.t[-1:]) / window_us)
+    return surface.view(events.height, events.width)
+
+
+def voxel_grid_of_window(events: Events, window_us: int) -> Float[Tensor, "bins h w"]:
+    """`voxel_grid` in E2VID's 5 bins, which stretch over the events whatever the window's length."""
+    return voxel_grid(events, VOXEL_BINS)
+
+
+REPRESENTATIONS: dict[str, Encode] = {
+    "event_tensor": event_tensor,
+    "voxel_grid": voxel_grid_of_window,
+    "time_surface": time_surface,
+}
+"""Events of one polarizer in a window of so many microseconds -> an image, or a stack of them."""
+
+
+def channels_of(encode: Encode) -> int:
+    """How many images a representation makes of one polarizer's events."""
+    shape = encode(Events.empty(1, 1), 1).shape
+    return shape[0] if len(shape) == 3 else 1
+
+
+def _pixel(events: Events) -> Int64[Tensor, " n"]:
+    return events.y.long() * events.width + events.x

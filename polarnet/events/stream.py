@@ -1,0 +1,171 @@
+"""Events of one polarizer channel as columns, and what can be done to them without knowing where they came from."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Int8, Int16, Int64
+from torch import Tensor
+
+LARGEST_SIDE = 2**15 - 1  # pixels; coordinates are int16
+
+_COLUMNS = {"t": torch.int64, "x": torch.int16, "y": torch.int16, "p": torch.int8}
+
+
+@dataclass(frozen=True)
+class Events:
+    """What the pixels behind one polarizer reported, in time order.
+
+    Making one checks shapes and types alone, so that a slice costs nothing; `validate` checks every event.
+    """
+
+    t: Int64[Tensor, " n"]  # microseconds
+    x: Int16[Tensor, " n"]  # column
+    y: Int16[Tensor, " n"]  # row
+    p: Int8[Tensor, " n"]  # +1 brighter, -1 darker; never 0, so a sum needs no conversion
+    height: int
+    width: int
+
+    def __post_init__(self):
+        for name, dtype in _COLUMNS.items():
+            column = getattr(self, name)
+            if column.dtype != dtype or column.shape != self.t.shape or column.ndim != 1:
+                raise ValueError(
+                    f"events: expected {name} as {dtype} of shape ({len(self.t)},), "
+                    f"got {column.dtype} of shape {tuple(column.shape)}"
+                )
+        if not (0 < self.height <= LARGEST_SIDE and 0 < self.width <= LARGEST_SIDE):
+            raise ValueError(f"events: expected sides of 1 to {LARGEST_SIDE} px, got {self.height}x{self.width}")
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @classmethod
+    def empty(cls, height: int, width: int) -> "Events":
+        """No events on a sensor of this size."""
+        t, x, y, p = (torch.empty(0, dtype=dtype) for dtype in _COLUMNS.values())
+        return cls(t, x, y, p, height, width)
+
+
+def validate(events: Events) -> Events:
+    """`events`, unchanged, once every event is known to be in time order, on the sensor and of polarity +1 or -1.
+
+    ValueError names the first event that is not.
+    """
+    in_time_order = torch.ones(len(events), dtype=torch.bool)
+    in_time_order[1:] = events.t[1:] >= events.t[:-1]
+    for holds, expected in (
+        (in_time_order, "a time no earlier than that of the event before"),
+        ((events.x >= 0) & (events.x < events.width), f"x from 0 to {events.width - 1}"),
+        ((events.y >= 0) & (events.y < events.height), f"y from 0 to {events.height - 1}"),
+        (events.p.abs() == 1, "polarity +1 or -1"),
+    ):
+        if not holds.all():
+            i = int(holds.logical_not().nonzero()[0])
+            values = ", ".join(f"{name}={int(getattr(events, name)[i])}" for name in _COLUMNS)
+            raise ValueError(f"event {i} of {len(events)}: expected {expected}, got {values}")
+    return events
+
+
+def slice_time(events: Events, start_us: int, stop_us: int) -> Events:
+    """Events with start <= t < stop."""
+    start, stop = torch.searchsorted(events.t, torch.tensor([start_us, stop_us])).tolist()
+    return slice_count(events, start, stop)
+
+
+def slice_count(events: Events, start: int, stop: int) -> Events:
+    """Events number `start` up to, not including, `stop`; views, not copies."""
+    return Events(
+        events.t[start:stop],
+        events.x[start:stop],
+        events.y[start:stop],
+        events.p[start:stop],
+        events.height,
+        events.width,
+    )
+
+
+def crop(events: Events, top: int, left: int, height: int, width: int) -> Events:
+    """Events of a part of the sensor, counted from the part's own corner; ValueError where it is not on the sensor."""
+    if not (0 <= top <= top + height <= events.height and 0 <= left <= left + width <= events.width):
+        raise ValueError(
+            f"crop: rows {top} to {top + height} and columns {left} to {left + width} are not on a sensor of "
+            f"{events.height}x{events.width} px"
+        )
+    inside = (events.y >= top) & (events.y < top + height) & (events.x >= left) & (events.x < left + width)
+    return Events(
+        events.t[inside],
+        events.x[inside] - left,
+        events.y[inside] - top,
+        events.p[inside],
+        height,
+        width,
+    )
+
+
+def downscale(events: Events, height: int, width: int, *, keep_rate: bool) -> Events:
+    """The events as a sensor of fewer pixels sees them: pixel (y, x) falls into (y * height // H, x * width // W).
+
+    The event-rate rule is `keep_rate`. False: every event is kept, so a coarse pixel fires as often as all the fine
+    pixels under it together, as if its contrast threshold were smaller by their number. True: a coarse pixel reports
+    what one pixel with the same threshold would, an event each time its fine pixels, weighing +1 and -1, have moved by
+    as many as they are on average (H W / (height width)), since that is one threshold of their mean log intensity.
+    ValueError where the new size is larger than the old.
+    """
+    if not (0 < height <= events.height and 0 < width <= events.width):
+        raise ValueError(f"downscale: expected a size within {events.height}x{events.width} px, got {height}x{width}")
+    y = (events.y.long() * height // events.height).short()
+    x = (events.x.long() * width // events.width).short()
+    coarse = Events(events.t, x, y, events.p, height, width)
+    if not keep_rate:
+        return coarse
+    fine_pixels = events.height * events.width / (height * width)
+    fired = torch.from_numpy(_fires(y.numpy(), x.numpy(), events.p.numpy(), height, width, fine_pixels))
+    return Events(events.t[fired], x[fired], y[fired], events.p[fired], height, width)
+
+
+def concatenate(parts: Sequence[Events]) -> Events:
+    """Consecutive pieces of one stream as one; ValueError where a piece starts before the one ahead of it ended."""
+    height, width = _common_size(parts)
+    filled = [part for part in parts if len(part)]
+    for i, (before, after) in enumerate(itertools.pairwise(filled), start=1):
+        if after.t[0] < before.t[-1]:
+            raise ValueError(
+                f"concatenate: piece {i} starts at {int(after.t[0])} us, before the end of the piece ahead of it at "
+                f"{int(before.t[-1])} us; merge() sorts streams that overlap"
+            )
+    t, x, y, p = (torch.cat([getattr(part, name) for part in parts]) for name in _COLUMNS)
+    return Events(t, x, y, p, height, width)
+
+
+def merge(streams: Sequence[Events]) -> Events:
+    """Streams of one sensor, which may overlap in time, as one; of equal times, the earlier stream's events first."""
+    height, width = _common_size(streams)
+    t, x, y, p = (torch.cat([getattr(stream, name) for stream in streams]) for name in _COLUMNS)
+    t, order = torch.sort(t, stable=True)
+    return Events(t, x[order], y[order], p[order], height, width)
+
+
+def _common_size(streams: Sequence[Events]) -> tuple[int, int]:
+    sizes = {(stream.height, stream.width) for stream in streams}
+    if len(sizes) != 1:
+        raise ValueError(f"expected streams of one sensor, got sizes {sorted(sizes)} (height, width)")
+    return sizes.pop()
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _fires(y, x, p, height, width, threshold):
+    """Which events carry the sum of their pixel's polarities across a multiple of `threshold`."""
+    sums = np.zeros((height, width))
+    fired = np.zeros(len(p), dtype=np.bool_)
+    for i in range(len(p)):
+        sums[y[i], x[i]] += p[i]
+        if sums[y[i], x[i]] * p[i] >= threshold:
+            sums[y[i], x[i]] -= p[i] * threshold
+            fired[i] = True
+    return fired

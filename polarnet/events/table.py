@@ -1,0 +1,300 @@
+"""How every store on disk is made, resumed, finished and opened: a Zarr v3 group whose arrays have a row per name.
+
+A store is written as PATH.tmp. Each row has files of its own, so processes may write different rows at the same time,
+and whoever uses a table writes one column of a row last: a row without it is missing. Zarr's local store writes a file
+beside its place and renames it, so a process that is killed leaves a row missing, never damaged. `finish` sets the
+attribute `complete` last and renames PATH.tmp to PATH. The same rows give the same bytes, in whatever order they came.
+"""
+
+import asyncio
+import hashlib
+import itertools
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from zarr.abc.store import RangeByteRequest
+from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
+from zarr.core.sync import sync
+from zarr.storage import FsspecStore, LocalStore, ZipStore
+
+COMPRESSION_LEVEL = 1  # of zstd; higher levels cost 10-100 times the time for 6 % fewer bytes
+REPAIR = "write this store again, or copy it again from where it is whole"
+
+
+@dataclass(frozen=True)
+class Column:
+    """One array of a table: a row of `shape` for each name in `rows`."""
+
+    rows: Sequence[str]
+    shape: tuple[int, ...]
+    """The most a row can hold; what it leaves out takes no space."""
+    chunk: tuple[int, ...]
+    """What is compressed together, and read at the least."""
+    shard: tuple[int, ...]
+    """What is one file: a multiple of `chunk`."""
+    dtype: str
+    fill: int | float
+    """Stands where nothing was written."""
+    fill_is_data: bool
+    """Whether `fill` can also be written; a chunk of nothing else is then not left out."""
+    shuffle: str
+    """Of Blosc: shuffle (bytes) or bitshuffle."""
+
+
+Columns = Mapping[str, Column]
+Attributes = dict[str, Any]
+
+
+class Table:
+    """A group with its columns; `create_table` and `open_table` make one. It can be sent to other processes."""
+
+    def __init__(self, path: str, group: zarr.Group, columns: Columns):
+        self.path = path
+        self.columns = columns
+        self.attributes: Attributes = dict(group.attrs)
+        self._arrays = {name: _array(path, group, name, column) for name, column in columns.items()}
+        self._numbers = {name: {row: i for i, row in enumerate(c.rows)} for name, c in columns.items()}
+
+    def write(self, name: str, row: str, values: np.ndarray) -> None:
+        """Put `values` at the start of a row, and nothing after them.
+
+        Whole files are replaced, so what a killed process left does not matter, nor does another process that writes
+        the same values at the same time.
+        """
+        array, number = self._arrays[name], self._number(name, row)
+        sides = (array.shards or array.chunks)[1:]
+        whole = [min(-(-n // side) * side, size) for n, side, size in zip(values.shape, sides, array.shape[1:])]
+        padded = np.full(whole, self.columns[name].fill, array.dtype)
+        padded[tuple(slice(n) for n in values.shape)] = values
+        place: tuple[int | slice, ...] = (number, *(slice(n) for n in whole))
+        array[place] = padded
+        folder, written = Path(self.path, name), set(self._files(name, row, place[1:]))
+        for file in (folder / "c" / str(number)).rglob("*"):
+            if file.is_file() and file.suffix != ".partial" and file.relative_to(folder).as_posix() not in written:
+                file.unlink(missing_ok=True)
+
+    def is_written(self, name: str, row: str) -> bool:
+        """Whether a row of a column is on disk, for a row that is a single file."""
+        return all((Path(self.path, name) / key).exists() for key in self._files(name, row, ()))
+
+    def read(self, name: str, row: str, *window: slice) -> np.ndarray:
+        """A row, or the `window` of it; ValueError that names row and column where it is damaged or not there."""
+        return self.read_together([(name, row, window)])[0]
+
+    def read_together(self, requests: Sequence[tuple[str, str, tuple[slice, ...]]]) -> list[np.ndarray]:
+        """`read` for several (column, row, window) at the same time."""
+
+        async def gather() -> list[np.ndarray]:
+            return await asyncio.gather(*(self._fetch(*request) for request in requests))
+
+        return sync(gather())
+
+    async def _fetch(self, name: str, row: str, window: tuple[slice, ...]) -> np.ndarray:
+        array, number = self._arrays[name], self._number(name, row)
+        try:
+            if any((s.stop or 0) > size for s, size in zip(window, array.shape[1:], strict=False)):
+                raise ValueError(f"its zarr.json says that rows end at {array.shape[1:]}")
+            for key in self._files(name, row, window):
+                first_byte = await (array.store_path / key).get(byte_range=RangeByteRequest(0, 1))
+                if not first_byte:  # Zarr would read fill values
+                    raise FileNotFoundError(f"there is no {key}, or nothing in it")
+            return np.asarray(await array.async_array.getitem((number, *window)))
+        except Exception as error:  # each codec has exceptions of its own
+            raise ValueError(f"{self.path}: {row}, column {name} is unreadable: {error}; {REPAIR}") from error
+
+    def finish(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        """Cut columns to the row `shapes` in use, mark the table complete and put it in its place."""
+        for name, shape in shapes.items():
+            _resize(self._arrays[name], shape)
+        folder = Path(self.path)
+        for leftover in folder.rglob("*.partial"):  # of a process killed while it wrote a file
+            leftover.unlink()
+        header = {**self.attributes, "metadata_sha256": self._metadata_digests(), "complete": True}
+        zarr.open_group(folder, mode="r+").attrs.put({**header, "checksum": _checksum(header)})
+        final = folder.with_name(folder.name.removesuffix(".tmp"))
+        replaced = final.with_name(final.name + ".old")
+        shutil.rmtree(replaced, ignore_errors=True)
+        if final.exists():
+            os.replace(final, replaced)  # a folder cannot be renamed onto one that is not empty
+        os.replace(folder, final)
+        shutil.rmtree(replaced, ignore_errors=True)
+
+    def metadata_problems(self) -> list[str]:
+        """Which zarr.json of the columns are not those that `finish` saw."""
+        digests = self._metadata_digests()
+        return [
+            f"{self.path}: {name}/zarr.json is not as it was written; {REPAIR}"
+            for name, digest in self.attributes["metadata_sha256"].items()
+            if digests.get(name) != digest
+        ]
+
+    def _metadata_digests(self) -> dict[str, str]:
+        """SHA-256 of the zarr.json of each column and of each group on the way to one."""
+        group = open_group(self.path)
+        names = {*self.columns, *(name.rpartition("/")[0] for name in self.columns)} - {""}
+        texts = {name: sync((group.store_path / name / "zarr.json").get()) for name in sorted(names)}
+        return {name: hashlib.sha256(text.to_bytes() if text else b"").hexdigest() for name, text in texts.items()}
+
+    def _number(self, name: str, row: str) -> int:
+        if row not in self._numbers[name]:
+            raise ValueError(f"{self.path}: there is no {row!r} among its {len(self._numbers[name])} rows of {name}")
+        return self._numbers[name][row]
+
+    def _files(self, name: str, row: str, window: Sequence[slice]) -> list[str]:
+        """Keys, below the column, of the files that hold a window of a row."""
+        array = self._arrays[name]
+        spans = [s.indices(size)[:2] for s, size in zip(window, array.shape[1:], strict=False)]
+        spans += [(0, size) for size in array.shape[1 + len(spans) :]]
+        sides = (array.shards or array.chunks)[1:]
+        grid = [range(start // side, -(-stop // side)) for (start, stop), side in zip(spans, sides, strict=True)]
+        number = self._number(name, row)
+        return [array.metadata.encode_chunk_key((number, *place)) for place in itertools.product(*grid)]
+
+
+def check_names(names: Sequence[str]) -> None:
+    """ValueError unless there is at least one name and none comes twice."""
+    repeated = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
+    if not names or repeated:
+        raise ValueError(f"expected at least one name, each once, got {'none' if not names else f'{repeated} again'}")
+
+
+def refuse_missing(path: str, missing: Sequence[str]) -> None:
+    """ValueError that says how much of a store is missing, and names the first few."""
+    if missing:
+        raise ValueError(f"{path}: {len(missing)} not written yet: {', '.join(missing[:8])}; write them, then finish")
+
+
+def create_table(path: str | Path, form: str, version: int, attributes: Mapping[str, Any], columns: Columns) -> Table:
+    """A table to write at PATH.tmp: the unfinished one that lies there, if its attributes are equal, else a new one.
+
+    One process creates, and hands the table to the others that write.
+    """
+    folder = Path(path).with_name(Path(path).name + ".tmp")
+    header = _header(form, version, attributes)
+    if _header_on_disk(folder) != header:
+        shutil.rmtree(folder, ignore_errors=True)
+        _lay_out(folder, header, columns)
+    group = zarr.open_group(folder, mode="r+")
+    group.attrs.put(header)  # not complete, whatever a process killed in `finish` left
+    table = Table(str(folder), group, columns)
+    for name, column in columns.items():
+        _resize(table._arrays[name], column.shape)
+    return table
+
+
+def open_table(path: str | Path, form: str, version: int, columns_of: Callable[[Attributes], Columns]) -> Table:
+    """A finished table to read; `columns_of(attributes)` says which columns it has.
+
+    `path` is a local folder, a zip of one (its zarr.json at the top, as `cd STORE; zip -r0 ../STORE.zip .` makes it),
+    or an fsspec URL. FileNotFoundError where there is nothing; ValueError where there is something else, another
+    version, or a table that was never finished.
+    """
+    group = open_group(path)
+    header = dict(group.attrs)
+    if header.get("format") != form:
+        raise ValueError(f"{path}: expected a store of format {form!r}, got {header.get('format')!r}")
+    if header.get("version") != version:
+        raise ValueError(
+            f"{path}: this polarnet reads version {version} of {form}, the store is of version "
+            f"{header.get('version')}; use the polarnet that wrote it (a newer version: upgrade), or write it again"
+        )
+    if header.get("complete") is not True:
+        raise ValueError(f"{path}: the store was never finished; run the stage that writes it again")
+    if header.get("checksum") != _checksum(header):
+        raise ValueError(f"{path}: the attributes in zarr.json are not what was written; {REPAIR}")
+    return Table(os.fspath(path), group, columns_of(header))
+
+
+def open_group(path: str | Path) -> zarr.Group:
+    """The Zarr group in a local folder, a zip or at an fsspec URL, to read; FileNotFoundError where there is none."""
+    name = os.fspath(path)
+    store: FsspecStore | ZipStore | LocalStore
+    try:
+        if "://" in name:
+            store = FsspecStore.from_url(name, read_only=True)
+        elif Path(name).is_file():
+            store = ZipStore(name, mode="r", read_only=True)
+        else:
+            store = LocalStore(name, read_only=True)
+        return zarr.open_group(store, mode="r", zarr_format=3)
+    except FileNotFoundError:
+        unfinished = f" ({name}.tmp is unfinished)" if Path(f"{name}.tmp").exists() else ""
+        raise FileNotFoundError(
+            f"{name}: there is no Zarr v3 group{unfinished}; run the stage that writes it"
+        ) from None
+    except (ValueError, TypeError, KeyError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{name} is unreadable: {error}; {REPAIR}") from error
+
+
+def _header(form: str, version: int, attributes: Mapping[str, Any]) -> Attributes:
+    """The attributes of an unfinished group, as they come back from disk."""
+    try:
+        header = json.loads(json.dumps({"format": form, "version": version, **attributes}, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the attributes of a store must be finite, plain JSON: {error}") from None
+    header["complete"] = False
+    return {**header, "checksum": _checksum(header)}
+
+
+def _checksum(header: Attributes) -> str:
+    signed = {key: value for key, value in header.items() if key != "checksum"}
+    return hashlib.sha256(json.dumps(signed, sort_keys=True).encode()).hexdigest()
+
+
+def _header_on_disk(folder: Path) -> Attributes | None:
+    """The header of a table as it was before `finish`; None where there is none."""
+    try:
+        header = json.loads((folder / "zarr.json").read_text())["attributes"]
+    except (OSError, ValueError, KeyError):
+        return None
+    header.pop("metadata_sha256", None)
+    header["complete"] = False
+    return {**header, "checksum": _checksum(header)}
+
+
+def _lay_out(folder: Path, header: Attributes, columns: Columns) -> None:
+    """Make the empty arrays, then the group's header: a folder without it is no table."""
+    group = zarr.open_group(folder, mode="w", zarr_format=3)
+    for name, column in columns.items():
+        _create_array(group, name, column)
+    group.attrs.put(header)
+
+
+def _create_array(group: zarr.Group, name: str, column: Column) -> zarr.Array:
+    dtype = np.dtype(column.dtype)
+    blosc = BloscCodec(
+        typesize=dtype.itemsize, cname="zstd", clevel=COMPRESSION_LEVEL, shuffle=BloscShuffle(column.shuffle)
+    )
+    return group.create_array(
+        name,
+        shape=(len(column.rows), *column.shape),
+        chunks=(1, *column.chunk),
+        shards=None if column.shard == column.chunk else (1, *column.shard),
+        dtype=dtype,
+        fill_value=column.fill,
+        compressors=[blosc, Crc32cCodec()],
+    )
+
+
+def _array(path: str, group: zarr.Group, name: str, column: Column) -> zarr.Array:
+    try:
+        array = group[name]
+        if not isinstance(array, zarr.Array) or array.shape[0] != len(column.rows):
+            raise ValueError("it is not an array with as many rows as there are names")
+    except Exception as error:
+        raise ValueError(f"{path}: {name}/zarr.json is unreadable: {error}; {REPAIR}") from error
+    return array.with_config({"write_empty_chunks": column.fill_is_data})
+
+
+def _resize(array: zarr.Array, row_shape: tuple[int, ...]) -> None:
+    shape = (array.shape[0], *row_shape)
+    if array.shape != shape:
+        sync(array.async_array.resize(shape, delete_outside_chunks=False))  # looking for them takes minutes

@@ -1,0 +1,81 @@
+"""A sequence cut into timed windows, and the torch `Dataset` of such sequences."""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from polarnet.events.frames import FrameStore
+from polarnet.events.representations import Encode
+from polarnet.events.store import EventStore
+from polarnet.events.stream import Events, slice_count
+
+
+class WindowSequence(NamedTuple):
+    """All windows of a sequence, with the truth at the end of each."""
+
+    name: str
+    inputs: Float[Tensor, "t c h w"]
+    """Polarizer by polarizer (0, 45, 90, 135 degrees); c is 4 times the channels of the representation."""
+    dolp: Float[Tensor, "t h w"]
+    aolp: Float[Tensor, "t h w"]
+    intensity: Float[Tensor, "t 4 h w"]
+
+
+def windows_of(t_us: Int64[Tensor, " n"]) -> list[tuple[int, int]]:
+    """(start, stop) of the windows between consecutive frame times: one fewer than there are frames."""
+    return list(itertools.pairwise(t_us.tolist()))
+
+
+def cut_windows(events: Events, t_us: Int64[Tensor, " n"]) -> list[Events]:
+    """The events of each window of `windows_of`: start <= t < stop; the last window includes its stop."""
+    edges = torch.searchsorted(events.t, t_us)
+    edges[-1] = torch.searchsorted(events.t, t_us[-1], right=True)
+    return [slice_count(events, start, stop) for start, stop in windows_of(edges)]
+
+
+def encode_windows(channels: Sequence[Events], t_us: Int64[Tensor, " n"], encode: Encode) -> Float[Tensor, "t c h w"]:
+    """Every window of every channel through `encode`, polarizer by polarizer along the second axis.
+
+    ValueError where there is no window, that is, fewer than two frame times.
+    """
+    if len(t_us) < 2:
+        raise ValueError(f"expected at least two frame times to have a window, got {t_us.tolist()}")
+    lengths = [stop - start for start, stop in windows_of(t_us)]
+    per_channel = [
+        torch.stack([encode(window, length) for window, length in zip(cut_windows(events, t_us), lengths, strict=True)])
+        for events in channels
+    ]
+    height, width = per_channel[0].shape[-2:]
+    return torch.cat([images.view(len(lengths), -1, height, width) for images in per_channel], dim=1)
+
+
+class WindowDataset(Dataset[WindowSequence]):
+    """Item i: all windows of sequence i, encoded as it is asked for. Frames give the windows' ends and the truth."""
+
+    def __init__(self, events: EventStore, frames: FrameStore, sequences: list[str], encode: Encode):
+        absent = [name for name in sequences if name not in set(events.sequences) & set(frames.sequences)]
+        if absent:
+            raise ValueError(f"{', '.join(absent[:8])}: not both in {events.path} and in {frames.path}")
+        if (events.height, events.width) != (frames.height, frames.width):
+            raise ValueError(
+                f"events are {events.height}x{events.width} px ({events.path}), "
+                f"frames {frames.height}x{frames.width} ({frames.path}); write both from the same scenes"
+            )
+        self.events = events
+        self.frames = frames
+        self.sequences = sequences
+        self.encode = encode
+
+    def __len__(self) -> int:
+        return len(self.sequences)
+
+    def __getitem__(self, i: int) -> WindowSequence:
+        name = self.sequences[i]
+        t_us, intensity, dolp, aolp = self.frames.frames(name)
+        inputs = encode_windows(self.events.read(name), t_us, self.encode)
+        return WindowSequence(name, inputs, dolp[1:], aolp[1:], intensity[1:])

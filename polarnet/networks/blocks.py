@@ -1,0 +1,86 @@
+"""Layers of the networks that are not Swin transformer blocks. Images are kept channels_last, the layout CPUs prefer.
+
+Recurrent layers take a whole run of windows at once: "n" counts images, time-major (n = windows * batch), so that
+everything but the recurrence itself is one large operation.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+class Prediction(NamedTuple):
+    """What a network says about each pixel. `dolp` is not clamped; fields that a network does not predict are None."""
+
+    dolp: Float[Tensor, "*b h w"]
+    aolp: Float[Tensor, "*b h w"] | None = None
+    log_variance: Float[Tensor, "*b h w"] | None = None
+
+
+def conv3x3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
+    """A 3x3 convolution, stride 1, that keeps height and width."""
+    return nn.Conv2d(inputs, outputs, kernel_size=3, padding=1, bias=bias)
+
+
+class ConvGRU(nn.Module):
+    """Convolutional gated recurrent unit (Ballas et al., ICLR 2016), all its convolutions 3x3.
+
+    reset, update = sigmoid(W x + U h);  candidate = tanh(W x + U (reset * h));  h <- h + update * (candidate - h).
+    The three W are one convolution over all windows at once; only the U run window by window.
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.channels = channels
+        self.from_input = conv3x3(channels, 3 * channels)
+        self.from_state = conv3x3(channels, 2 * channels, bias=False)
+        self.from_reset_state = conv3x3(channels, channels, bias=False)
+
+    def forward(
+        self, x: Float[Tensor, "n c h w"], state: Float[Tensor, "b c h w"]
+    ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "b c h w"]]:
+        """The state after each of the n / b windows, and the last of them again, to carry on from."""
+        channels = state.shape[1]
+        states = []
+        for inputs in self.from_input(x).split(len(state)):
+            gates_in, candidate_in = inputs.split([2 * channels, channels], dim=1)
+            reset, update = torch.sigmoid(gates_in + self.from_state(state)).chunk(2, dim=1)
+            candidate = torch.tanh(candidate_in + self.from_reset_state(reset * state))
+            state = torch.lerp(state.to(candidate.dtype), candidate, update)
+            states.append(state)
+        return torch.cat(states), state
+
+
+class ResidualBlock(nn.Module):
+    """relu(x + conv(relu(conv(x)))), 3x3, stride 1 (He et al., CVPR 2016), without normalisation."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.first = conv3x3(channels, channels)
+        self.second = conv3x3(channels, channels)
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+        """The same shape."""
+        return F.relu(x + self.second(F.relu(self.first(x))))
+
+
+class UpBlock(nn.Module):
+    """Twice the size: a 1x1 convolution to the skip's channels, enlarged bilinearly, plus the skip, a 3x3 convolution.
+
+    The skip is added, not set beside: half the convolution's work, and it is the largest image of the network.
+    """
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        self.narrow = nn.Conv2d(inputs, outputs, kernel_size=1)
+        self.smooth = conv3x3(outputs, outputs)
+
+    def forward(
+        self, x: Float[Tensor, "n c h w"], skip: Float[Tensor, "n d 2*h 2*w"]
+    ) -> Float[Tensor, "n d 2*h 2*w"]:
+        """`skip` has the channels and the size of the result."""
+        enlarged = F.interpolate(self.narrow(x), scale_factor=2, mode="bilinear")
+        return F.relu(self.smooth(enlarged + skip))

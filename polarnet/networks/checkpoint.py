@@ -1,0 +1,89 @@
+"""Checkpoints: tensors in NAME.safetensors, everything else that is needed to use them in NAME.json beside it.
+
+Loading runs no code from either file. Neither holds a date, so equal trainings give equal bytes.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor, nn
+
+from polarnet.networks.dolp_unet import NETWORKS
+
+FORMAT = "polarnet-checkpoint-1"
+
+
+def save_checkpoint(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
+    """Write `path` (.safetensors) and the .json beside it. `metadata` says at least "network", "config", "in_channels".
+
+    The JSON is written last and names the hash of the tensors, so a pair from two saves is never taken for one.
+    """
+    _check_suffix(path)
+    content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
+    record = {"format": FORMAT, "sha256": hashlib.sha256(content).hexdigest(), **metadata}
+    _write(path, content)
+    _write(path.with_suffix(".json"), (json.dumps(record, indent=2) + "\n").encode())
+
+
+def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors (on the CPU) and metadata; ValueError or FileNotFoundError for anything but an intact pair of files."""
+    _check_suffix(path)
+    for file in (path, path.with_suffix(".json")):
+        if not file.exists():
+            raise FileNotFoundError(f"{file} is missing; a checkpoint is NAME.safetensors and NAME.json together")
+    try:
+        metadata = json.loads(path.with_suffix(".json").read_text())
+    except ValueError as error:
+        raise ValueError(f"{path.with_suffix('.json')} is not JSON: {error}") from None
+    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
+        raise ValueError(f"{path.with_suffix('.json')}: expected a {FORMAT}, which it does not say it is")
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != metadata["sha256"]:
+        raise ValueError(f"{path} is not the file that {path.stem}.json describes; copy or train the pair again")
+    try:
+        return load(content), metadata
+    except SafetensorError as error:
+        raise ValueError(f"{path} is not a safetensors file: {error}") from None
+
+
+def load_network(path: Path) -> tuple[nn.Module, dict[str, Any]]:
+    """The DoLP network of a checkpoint, ready to evaluate, and its metadata (representation, training, versions)."""
+    tensors, metadata = load_checkpoint(path)
+    if metadata["network"] not in NETWORKS:
+        raise ValueError(
+            f"{path} holds a {metadata['network']!r}; expected a DoLP network, one of {', '.join(NETWORKS)}"
+        )
+    build, config_class = NETWORKS[metadata["network"]]
+    network = build(config_class(**metadata["config"]), metadata["in_channels"])
+    load_tensors(network, tensors, path)
+    return network.eval(), metadata
+
+
+def load_tensors(network: nn.Module, tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Give `network` the tensors of a file; ValueError that names what is missing, left over or of another shape."""
+    expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
+    found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    wrong = sorted(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))
+    if wrong:
+        raise ValueError(
+            f"{path} does not fit the network it is for: {wrong[0]} should be {expected.get(wrong[0], 'absent')}, "
+            f"is {found.get(wrong[0], 'absent')} ({len(wrong)} tensors differ)"
+        )
+    network.load_state_dict(tensors)
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix != ".safetensors":
+        raise ValueError(f"a checkpoint is named by its tensors, NAME.safetensors, got {path}")
+
+
+def _write(path: Path, content: bytes) -> None:
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_bytes(content)
+    os.replace(temporary, path)

@@ -1,0 +1,110 @@
+"""The paper's end-to-end DoLP recovery network (section 3.3, Fig. 6)."""
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from polarnet.networks.blocks import ConvGRU, Prediction, ResidualBlock, UpBlock, conv3x3
+from polarnet.networks.swin import SwinStage
+from polarnet.ranges import allowed, check_ranges
+
+STRIDE = 4  # two stages that halve the size
+MIDDLE_DOLP = 0.5  # the output's bias at the start: DoLP lies in [0, 1]
+
+
+@dataclass(frozen=True)
+class DolpUNetConfig:
+    """Section `networks.paper` of params.yaml."""
+
+    channels: list[int] = field(metadata=allowed(low=1))
+    """Of C1, of S1 and G1, of S2, G2, R1 and R2; the paper has 32, 64, 128."""
+    swin_depth: int = field(metadata=allowed(low=1))
+    """Blocks a stage; every second one has shifted windows."""
+    swin_window: int = field(metadata=allowed(low=2))
+    """Pixels."""
+    swin_heads: list[int] = field(metadata=allowed(low=1))
+    """Attention heads of S1 and S2."""
+    residual_blocks: int = field(metadata=allowed(low=0))
+    """The paper has two, R1 and R2."""
+
+    def __post_init__(self):
+        check_ranges(self)
+        if len(self.channels) != 3 or len(self.swin_heads) != 2:
+            raise ValueError(f"channels, swin_heads: expected 3 and 2 numbers, got {self.channels}, {self.swin_heads}")
+        for channels, heads in zip(self.channels[1:], self.swin_heads, strict=True):
+            if channels % heads:
+                raise ValueError(f"swin_heads: expected a divisor of {channels} channels, got {heads}")
+
+
+class DolpUNet(nn.Module):
+    """Event tensors of the four polarizers to DoLP, window by window, with a recurrent state.
+
+    Inputs are compressed to sign(x) log(1 + |x|): where many events fall into one pixel the tensor reaches tens, where
+    it matters most it is below one. The output is linear, so that no pixel's gradient vanishes near 0 or 1: it can
+    leave [0, 1], and whoever scores or shows it clamps it.
+    """
+
+    def __init__(self, config: DolpUNetConfig, in_channels: int = 4):
+        super().__init__()
+        full, half, quarter = config.channels
+        depth, window, (heads_half, heads_quarter) = config.swin_depth, config.swin_window, config.swin_heads
+        self.c1 = conv3x3(in_channels, full)
+        self.s1 = SwinStage(full, half, depth, heads_half, window)
+        self.g1 = ConvGRU(half)
+        self.s2 = SwinStage(half, quarter, depth, heads_quarter, window)
+        self.g2 = ConvGRU(quarter)
+        self.r = nn.Sequential(*(ResidualBlock(quarter) for _ in range(config.residual_blocks)))
+        self.d2 = UpBlock(quarter, half)
+        self.d1 = UpBlock(half, full)
+        self.p1 = nn.Conv2d(full, 1, kernel_size=1)
+        assert self.p1.bias is not None
+        nn.init.constant_(self.p1.bias, MIDDLE_DOLP)
+
+    def forward(
+        self, inputs: Float[Tensor, "b c h w"], state: list[Tensor] | None = None
+    ) -> tuple[Prediction, list[Tensor]]:
+        """One window of b streams. `state` is what the window before handed back, None at the start."""
+        prediction, state = self.unroll(inputs[None], state)
+        return Prediction(prediction.dolp[0]), state
+
+    def unroll(
+        self, inputs: Float[Tensor, "t b c h w"], state: list[Tensor] | None = None
+    ) -> tuple[Prediction, list[Tensor]]:
+        """t windows of b streams at once: the same numbers as `forward` window by window, in fewer operations."""
+        t, b, _, height, width = inputs.shape
+        x = compress(inputs).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+        x = F.pad(x, (0, -width % STRIDE, 0, -height % STRIDE))  # no events there
+        state1, state2 = state or self.initial_state(x[:b])
+
+        c1 = F.relu(self.c1(x))
+        s1 = self.s1(c1)
+        g1, state1 = self.g1(s1, state1)
+        s2 = self.s2(g1)
+        g2, state2 = self.g2(s2, state2)
+        r = self.r(g2)
+        d2 = self.d2(r, skip=g1)
+        d1 = self.d1(d2, skip=c1)
+        dolp = self.p1(d1)
+
+        dolp = dolp[:, 0, :height, :width].float().unflatten(0, (t, b))
+        return Prediction(dolp), [state1, state2]
+
+    def initial_state(self, x: Float[Tensor, "b c h w"]) -> list[Tensor]:
+        """Nothing seen yet: zeros at half and at a quarter of the size of x, which divides by 4."""
+        b, _, height, width = x.shape
+        return [
+            x.new_zeros(b, height // scale, width // scale, channels).permute(0, 3, 1, 2)
+            for scale, channels in ((2, self.g1.channels), (4, self.g2.channels))
+        ]
+
+
+NETWORKS: dict[str, tuple[type[DolpUNet], type[DolpUNetConfig]]] = {"paper": (DolpUNet, DolpUNetConfig)}
+"""Each network by its name in params.yaml, and the class of its section there."""
+
+
+def compress(events: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
+    """sign(x) log(1 + |x|)."""
+    return torch.sign(events) * torch.log1p(events.abs())

@@ -1,0 +1,160 @@
+"""Swin transformer blocks (Liu et al., ICCV 2021) for images of any size."""
+
+import functools
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+MLP_RATIO = 4  # hidden width of the blocks' perceptron, as in Swin-T
+BIAS_STD = 0.02  # of the relative position bias at the start, as in Swin-T
+
+
+class PatchMerging(nn.Module):
+    """Half the size: 2x2 pixels become one, normalised afterwards as in Swin v2 (Liu et al., CVPR 2022)."""
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        self.reduce = nn.Conv2d(inputs, outputs, kernel_size=2, stride=2)
+        self.norm = nn.LayerNorm(outputs)
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n h2 w2 d"]:
+        """h and w must be even."""
+        return self.norm(self.reduce(x).permute(0, 2, 3, 1))
+
+
+class WindowAttention(nn.Module):
+    """Multi-head self-attention inside square windows whose grid starts at (-shift, -shift), with position bias.
+
+    Where the grid reaches beyond the image, the missing pixels are masked. For shift > 0 this attends over exactly the
+    neighbourhoods of Swin's cyclic shift with its mask, without wrapping the image around.
+    """
+
+    def __init__(self, channels: int, heads: int, window: int, shift: int):
+        super().__init__()
+        if channels % heads:
+            raise ValueError(f"expected heads that divide {channels} channels, got {heads}")
+        self.heads, self.window, self.shift = heads, window, shift
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.merge_heads = nn.Linear(channels, channels)
+        self.position_bias = nn.Parameter(torch.randn(heads, (2 * window - 1) ** 2) * BIAS_STD)
+
+    def forward(self, x: Float[Tensor, "n h w c"]) -> Float[Tensor, "n h w c"]:
+        """The same shape."""
+        height, width = x.shape[1:3]
+        query, key, value = split_windows(self.qkv(x), self.heads, self.window, self.shift)
+        bias = self.position_bias[:, relative_position(self.window, x.device)]
+        visible = visible_pixels(height, width, self.window, self.shift, x.device)
+        attended = attend(query, key, value, bias, visible)
+        return self.merge_heads(join_windows(attended, height, width, self.window, self.shift).to(x.dtype))
+
+
+class SwinBlock(nn.Module):
+    """x + attention(norm(x)), then x + perceptron(norm(x))."""
+
+    def __init__(self, channels: int, heads: int, window: int, shift: int):
+        super().__init__()
+        self.attention_norm = nn.LayerNorm(channels)
+        self.attention = WindowAttention(channels, heads, window, shift)
+        self.mlp_norm = nn.LayerNorm(channels)
+        self.mlp = nn.Sequential(
+            nn.Linear(channels, MLP_RATIO * channels), nn.GELU(), nn.Linear(MLP_RATIO * channels, channels)
+        )
+
+    def forward(self, x: Float[Tensor, "n h w c"]) -> Float[Tensor, "n h w c"]:
+        """The same shape."""
+        x = x + self.attention(self.attention_norm(x))
+        return x + self.mlp(self.mlp_norm(x))
+
+
+class SwinStage(nn.Module):
+    """Patch merging by 2, then `depth` blocks, every second one with windows shifted by half a window."""
+
+    def __init__(self, inputs: int, outputs: int, depth: int, heads: int, window: int):
+        super().__init__()
+        self.merge = PatchMerging(inputs, outputs)
+        self.blocks = nn.Sequential(
+            *(SwinBlock(outputs, heads, window, shift=window // 2 if i % 2 else 0) for i in range(depth))
+        )
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n d h2 w2"]:
+        """h and w must be even; the result is channels_last."""
+        return self.blocks(self.merge(x)).permute(0, 3, 1, 2)
+
+
+def attend(
+    query: Float[Tensor, "n g heads p d"],
+    key: Float[Tensor, "n g heads p d"],
+    value: Float[Tensor, "n g heads p d"],
+    bias: Float[Tensor, "heads p p"],
+    visible: Bool[Tensor, "g 1 1 p"] | None,
+) -> Float[Tensor, "n g heads p d"]:
+    """softmax(query key^T / sqrt(d) + bias) value over the p pixels of each of g windows; only visible keys count.
+
+    Computed in float32: windows are far smaller than the tiles of a CPU's bfloat16 product, which is 3 times slower.
+    """
+    with torch.autocast(query.device.type, enabled=False):
+        similarity = query.float() * query.shape[-1] ** -0.5 @ key.float().transpose(-1, -2) + bias
+        if visible is not None:
+            similarity = similarity.masked_fill(~visible, -torch.inf)
+        return similarity.softmax(-1) @ value.float()
+
+
+def split_windows(
+    qkv: Float[Tensor, "n h w c3"], heads: int, window: int, shift: int
+) -> tuple[Float[Tensor, "n g heads p d"], Float[Tensor, "n g heads p d"], Float[Tensor, "n g heads p d"]]:
+    """Queries, keys and values (float32) of every window: g windows of p = window^2 pixels, row by row.
+
+    The grid starts at (-shift, -shift) and ends where it covers the image; what lies outside is 0.
+    """
+    n, height, width, _ = qkv.shape
+    rows, columns = _grid(height, width, window, shift)
+    bottom, right = rows * window - height - shift, columns * window - width - shift
+    if shift or bottom or right:
+        qkv = F.pad(qkv, (0, 0, shift, right, shift, bottom))
+    windows = qkv.view(n, rows, window, columns, window, 3, heads, -1).permute(5, 0, 1, 3, 6, 2, 4, 7)
+    windows = windows.to(torch.float32, memory_format=torch.contiguous_format).contiguous()
+    query, key, value = windows.view(3, n, rows * columns, heads, window * window, -1).unbind()
+    return query, key, value
+
+
+def join_windows(
+    windows: Float[Tensor, "n g heads p d"], height: int, width: int, window: int, shift: int
+) -> Float[Tensor, "n h w c"]:
+    """The image that `split_windows` cut up, c = heads * d; what lay outside is dropped."""
+    n, _, heads, _, _ = windows.shape
+    rows, columns = _grid(height, width, window, shift)
+    image = windows.view(n, rows, columns, heads, window, window, -1).permute(0, 1, 4, 2, 5, 3, 6)
+    image = image.reshape(n, rows * window, columns * window, -1)
+    return image[:, shift : shift + height, shift : shift + width]
+
+
+def _grid(height: int, width: int, window: int, shift: int) -> tuple[int, int]:
+    return -(-(height + shift) // window), -(-(width + shift) // window)
+
+
+@functools.lru_cache(maxsize=32)
+def visible_pixels(
+    height: int, width: int, window: int, shift: int, device: torch.device
+) -> Bool[Tensor, "g 1 1 p"] | None:
+    """For every window of `split_windows`, which of its pixels lie in the image; None where all do."""
+    rows, columns = _grid(height, width, window, shift)
+    if not shift and (rows * window, columns * window) == (height, width):
+        return None
+    with torch.inference_mode(False):
+        row = torch.arange(rows * window) - shift
+        column = torch.arange(columns * window) - shift
+        inside = ((row >= 0) & (row < height))[:, None] & ((column >= 0) & (column < width))
+        inside = inside.view(rows, window, columns, window).permute(0, 2, 1, 3)
+        return inside.reshape(rows * columns, 1, 1, window * window).to(device)
+
+
+@functools.lru_cache(maxsize=32)
+def relative_position(window: int, device: torch.device) -> Int64[Tensor, "p p"]:
+    """Which entry of the position bias belongs to query pixel i and key pixel j of a window, by their offset."""
+    with torch.inference_mode(False):
+        row, column = torch.meshgrid(torch.arange(window), torch.arange(window), indexing="ij")
+        position = torch.stack([row.flatten(), column.flatten()])
+        offset = position[:, :, None] - position[:, None, :] + window - 1
+        return (offset[0] * (2 * window - 1) + offset[1]).to(device)

@@ -1,0 +1,259 @@
+"""Figures drawn with matplotlib: comparison panels, training curves, how scores spread over scenes.
+
+A figure is returned, not shown, and `png` writes it without a date or software name: same input, same bytes.
+"""
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+from cycler import cycler
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image
+from polarnet.reports.tables import COLUMNS, METHODS, in_order
+from polarnet.similarity import mse, psnr
+
+DOTS_PER_INCH = 160
+
+
+@dataclass(frozen=True)
+class Theme:
+    """Colours of text and lines on a light or a dark page; the figure itself has no background."""
+
+    text: str
+    quiet: str
+    grid: str
+    face: str
+    """Of the page, for what must hide lines behind it; "none" leaves it open."""
+
+
+LIGHT = Theme(text="#1c2330", quiet="#667085", grid="#e4e7ec", face="#ffffff")
+DARK = Theme(text="#e6e9ef", quiet="#98a2b3", grid="#313947", face="#161b24")
+
+METHOD_COLOURS = {
+    "zeros": "#98a2b3",
+    "train_mean": "#98a2b3",
+    "oracle_mean": "#98a2b3",
+    "cf": "#e08a1e",
+    "highpass": "#b0851f",
+    "e2v": "#3d8fd9",
+    "ours": "#d6336c",
+}
+OTHER_COLOUR = "#4aa37c"
+
+
+class PanelScene(NamedTuple):
+    """One row of a comparison: a window of one test scene and what each method made of it."""
+
+    name: str
+    events: Float[Tensor, "4 h w"]
+    truth: Float[Tensor, "h w"]
+    recovered: Mapping[str, Float[Tensor, "h w"]]
+
+
+class Curve(NamedTuple):
+    """One line of a training figure; `values` holds NaN where an epoch has none."""
+
+    label: str
+    epochs: Sequence[int]
+    values: Sequence[float]
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as PNG bytes that depend on nothing but what is drawn."""
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure)
+    compression = {"compress_level": 9}
+    figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None}, pil_kwargs=compression)
+    return buffer.getvalue()
+
+
+def comparison_panel(rows: Sequence[PanelScene], path: Path, theme: Theme = LIGHT) -> None:
+    """Write a picture like the paper's Fig. 10: a row a scene; events, truth and each method; MSE and PSNR below."""
+    if not rows:
+        raise ValueError("a comparison panel needs at least one scene, got none")
+    methods = in_order(rows[0].recovered)
+    height, width = rows[0].truth.shape
+    grid = _TileGrid(len(rows), 2 + len(methods), tile_width=1.35, aspect=height / width)
+    figure = _figure(grid.size, theme)
+    figure.patch.set_facecolor(theme.face)
+    for i, row in enumerate(rows):
+        full_scale = event_full_scale(row.events)
+        tiles = [(event_image(row.events[0], full_scale), ""), (dolp_image(row.truth), "")]
+        tiles += [(dolp_image(row.recovered[m]), score_line(row.recovered[m], row.truth)) for m in methods]
+        headings = ["events, 0°", "true DoLP", *(METHODS.get(m, m) for m in methods)]
+        for j, ((picture, below), heading) in enumerate(zip(tiles, headings, strict=True)):
+            axes = figure.add_axes(grid.rectangle(i, j))
+            show_picture(axes, picture, theme)
+            axes.set_xlabel(below, color=theme.quiet, fontsize=6, labelpad=2.5)
+            if i == 0:
+                axes.set_title(heading, color=theme.text, fontsize=8, pad=4)
+            if j == 0:
+                axes.set_ylabel(_short(row.name), color=theme.quiet, fontsize=6)
+    bar_axes = figure.add_axes(grid.beside())
+    _colour_bar(figure, bar_axes, theme, "vertical", label_size=6)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(png(figure))
+
+
+def training_curves(loss: Sequence[Curve], validation: Sequence[Curve], validation_label: str, theme: Theme) -> Figure:
+    """Loss terms of training on the left (logarithmic), a validation score on the right, over epochs from 1."""
+    with matplotlib.rc_context(chart_style(theme)):
+        figure = Figure(figsize=(5.7, 2.5), layout="constrained", facecolor="none")
+        left, right = figure.subplots(1, 2)
+        for axes, curves, label in ((left, loss, "training loss"), (right, validation, validation_label)):
+            for curve in curves:
+                axes.plot([e + 1 for e in curve.epochs], curve.values, marker="o", markersize=3, label=curve.label)
+            axes.set_xlabel("epoch")
+            axes.set_title(label, loc="left", fontsize=9)
+            axes.xaxis.get_major_locator().set_params(integer=True)
+            if len(curves) > 1:
+                axes.legend(frameon=False, fontsize=7, labelcolor=theme.text)
+        if all(value > 0 for curve in loss for value in curve.values):
+            left.set_yscale("log")
+    return figure
+
+
+def score_distribution(per_scene: Mapping[str, Mapping[str, Sequence[float]]], theme: Theme) -> Figure:
+    """Every test scene as a dot over each method's box, one plot a metric.
+
+    `per_scene` is metric, then method, then the scenes' means. Boxes span the quartiles, whiskers all scenes.
+    """
+    metrics = [key for key in COLUMNS if key in per_scene]
+    methods = in_order(dict.fromkeys(method for key in metrics for method in per_scene[key]))
+    with matplotlib.rc_context(chart_style(theme)):
+        figure = Figure(figsize=(9.4, 0.62 + 0.27 * len(methods)), layout="constrained", facecolor="none")
+        for axes, metric in zip(np.atleast_1d(figure.subplots(1, len(metrics), sharey=True)), metrics, strict=True):
+            for position, method in enumerate(methods):
+                _strip(axes, position, per_scene[metric].get(method, ()), method, theme)
+            axes.set_title(COLUMNS[metric].heading, loc="left", fontsize=9)
+            if metric == "mse":
+                axes.set_xscale("log")  # errors of good and bad methods differ by an order of magnitude
+            axes.set_yticks(range(len(methods)), [METHODS.get(m, m) for m in methods])
+            axes.set_ylim(len(methods) - 0.4, -0.6)
+            axes.grid(axis="y", visible=False)
+            axes.tick_params(axis="y", length=0)
+    return figure
+
+
+def score_line(recovered: Float[Tensor, "h w"], truth: Float[Tensor, "h w"]) -> str:
+    """MSE and PSNR of one frame, for below its picture."""
+    error, ratio = (float(score(recovered[None], truth[None])) for score in (mse, psnr))
+    return f"{error:.4f} · {ratio:.2f} dB"
+
+
+def dolp_bar(theme: Theme) -> Figure:
+    """The legend of `maps.dolp_image`."""
+    figure = _figure((2.1, 0.32), theme)
+    axes = figure.add_axes((0.06, 0.6, 0.88, 0.38))
+    _colour_bar(figure, axes, theme, "horizontal", label_size=8)
+    return figure
+
+
+@dataclass(frozen=True)
+class _TileGrid:
+    """Where the pictures of a panel lie, in inches, so that every tile keeps its aspect."""
+
+    rows: int
+    columns: int
+    tile_width: float
+    aspect: float
+    gap: float = 0.06
+    left: float = 0.22
+    right: float = 0.5
+    top: float = 0.26
+    below: float = 0.2
+
+    @property
+    def tile_height(self) -> float:
+        return self.tile_width * self.aspect
+
+    @property
+    def size(self) -> tuple[float, float]:
+        width = self.left + self.columns * (self.tile_width + self.gap) + self.right
+        return width, self.top + self.rows * (self.tile_height + self.below)
+
+    def rectangle(self, row: int, column: int) -> tuple[float, float, float, float]:
+        width, height = self.size
+        x = self.left + column * (self.tile_width + self.gap)
+        y = height - self.top - row * (self.tile_height + self.below) - self.tile_height
+        return x / width, y / height, self.tile_width / width, self.tile_height / height
+
+    def beside(self) -> tuple[float, float, float, float]:
+        x, y, _, height = self.rectangle(0, self.columns)
+        return x + 0.04 / self.size[0], y, 0.09 / self.size[0], height
+
+
+def _figure(size: tuple[float, float], theme: Theme) -> Figure:
+    with matplotlib.rc_context(chart_style(theme)):
+        return Figure(figsize=size, facecolor="none")
+
+
+def chart_style(theme: Theme) -> dict[Any, Any]:
+    """matplotlib settings of every figure."""
+    return {
+        "font.family": "DejaVu Sans",  # comes with matplotlib, so that text looks the same everywhere
+        "font.size": 8,
+        "text.color": theme.text,
+        "axes.labelcolor": theme.quiet,
+        "axes.titlecolor": theme.text,
+        "axes.edgecolor": theme.grid,
+        "axes.facecolor": "none",
+        "axes.grid": True,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.axisbelow": True,
+        "grid.color": theme.grid,
+        "grid.linewidth": 0.7,
+        "xtick.color": theme.quiet,
+        "ytick.color": theme.quiet,
+        "xtick.labelsize": 7,
+        "ytick.labelsize": 7,
+        "lines.linewidth": 1.5,
+        "axes.prop_cycle": cycler(color=["#d6336c", "#3d8fd9", "#e08a1e", "#4aa37c", "#8b6fd6"]),
+    }
+
+
+def show_picture(axes: Axes, picture: np.ndarray, theme: Theme) -> None:
+    """A picture without ticks, in a thin frame."""
+    axes.imshow(picture)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.grid(visible=False)
+    for spine in axes.spines.values():
+        spine.set(visible=True, color=theme.grid, linewidth=0.6)
+
+
+def _colour_bar(figure: Figure, axes: Axes, theme: Theme, orientation: str, label_size: float) -> None:
+    bar = figure.colorbar(ScalarMappable(cmap=DOLP_COLOURS), cax=axes, orientation=orientation, ticks=[0, 0.5, 1])
+    bar.ax.tick_params(labelsize=label_size, length=2, pad=2, colors=theme.quiet)
+    bar.outline.set_visible(False)
+
+
+def _strip(axes: Axes, position: int, values: Sequence[float], method: str, theme: Theme) -> None:
+    known = np.array([value for value in values if np.isfinite(value)])
+    if len(known) == 0:
+        return
+    colour = METHOD_COLOURS.get(method, OTHER_COLOUR)
+    axes.boxplot(
+        known, positions=[position], orientation="horizontal", widths=0.62, whis=(0, 100), patch_artist=True,
+        manage_ticks=False,
+        boxprops={"facecolor": colour, "alpha": 0.28, "linewidth": 0}, medianprops={"color": theme.text},
+        whiskerprops={"color": colour, "linewidth": 0.8}, capprops={"linewidth": 0},
+    )  # fmt: skip
+    offset = (np.arange(len(known)) % 5 - 2) * 0.08  # spreads dots that would cover each other; no randomness
+    axes.scatter(known, position + offset, s=6, color=colour, alpha=0.8, linewidths=0, zorder=3)
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= 18 else name[:17] + "…"

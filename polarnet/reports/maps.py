@@ -1,0 +1,92 @@
+"""Tensors to colour pictures: events, DoLP, and polarization as hue, saturation and value."""
+
+import math
+
+import cv2
+import matplotlib
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.colors import LinearSegmentedColormap, hsv_to_rgb
+from torch import Tensor
+
+DOLP_COLOURS = "viridis"  # perceptually uniform, and still monotonic in grey
+EVENT_COLOURS = LinearSegmentedColormap.from_list(
+    "events",
+    ["#0b3c8c", "#3f83d6", "#ffffff", "#e8604c", "#9c0f1b"],
+    N=257,  # odd, so that the middle is white
+)
+FULL_SCALE_QUANTILE = 0.99  # of the pixels that saw events: a few hot pixels must not bleach a picture
+
+
+def event_full_scale(events: Float[Tensor, "*b h w"]) -> float:
+    """The magnitude that most pixels with events stay below; 1 where no pixel saw any.
+
+    Pass the four polarizers together so that their pictures share one scale.
+    """
+    magnitude = events.abs().flatten()
+    seen = magnitude[magnitude > 0]
+    if len(seen) == 0:
+        return 1.0
+    return float(np.quantile(seen.numpy(force=True), FULL_SCALE_QUANTILE))
+
+
+def event_image(events: Float[Tensor, "h w"], full_scale: float) -> UInt8[np.ndarray, "h w 3"]:
+    """Signed event counts or an event tensor (paper Eq. 5): ON red, OFF blue, nothing white; +-full_scale saturate."""
+    unit = (events.numpy(force=True) / full_scale).clip(-1, 1)
+    return _bytes(EVENT_COLOURS((unit + 1) / 2)[..., :3])
+
+
+def dolp_image(dolp: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """DoLP from 0 (dark violet) to 1 (yellow); values outside are clamped."""
+    return _bytes(matplotlib.colormaps[DOLP_COLOURS](dolp.numpy(force=True).clip(0, 1))[..., :3])
+
+
+def intensity_image(intensity: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Light from 0 (black) to 1 (white); values outside are clamped."""
+    return np.repeat(_bytes(intensity.numpy(force=True).clip(0, 1))[..., None], 3, axis=-1)
+
+
+def polarization_hsv(
+    s0: Float[Tensor, "h w"], dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Hue is AoLP (radians, period pi: 0 red, 60 degrees green, 120 blue), saturation DoLP, value S0 (paper Fig. 3).
+
+    The inverse of how the simulation reads a photograph, so that a simulated scene comes out as its photograph.
+    """
+    hue = (aolp / math.pi).remainder(1.0)
+    hsv = np.stack([hue.numpy(force=True), *(x.clamp(0, 1).numpy(force=True) for x in (dolp, s0))], axis=-1)
+    return _bytes(hsv_to_rgb(hsv.astype(np.float64)))
+
+
+def hue_wheel(size: int) -> UInt8[np.ndarray, "size size 4"]:
+    """The legend of `polarization_hsv`: direction is AoLP, radius is DoLP, value 1. RGBA, transparent outside.
+
+    The two directions of a line are one angle of polarization, so opposite points agree. Angles count anticlockwise
+    from the right, as on paper; the first row is the top.
+    """
+    axis = (np.arange(size) + 0.5) / size * 2 - 1
+    x, y = np.meshgrid(axis, -axis)
+    radius = np.hypot(x, y)
+    hue = np.arctan2(y, x) / math.pi % 1.0
+    rgb = hsv_to_rgb(np.stack([hue, radius.clip(0, 1), np.ones_like(hue)], axis=-1))
+    edge = ((1 - radius) * size / 2).clip(0, 1)  # one pixel of soft rim
+    return np.concatenate([_bytes(rgb), _bytes(edge)[..., None]], axis=-1)
+
+
+def encode_png(picture: UInt8[np.ndarray, "h w channels"]) -> bytes:
+    """RGB or RGBA bytes as a PNG without any metadata: the same picture gives the same bytes."""
+    order = [2, 1, 0, 3][: picture.shape[-1]]
+    done, data = cv2.imencode(".png", picture[..., order], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    assert done, f"OpenCV could not encode a picture of {picture.shape}"
+    return data.tobytes()
+
+
+def encode_jpeg(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """RGB bytes as a small JPEG, for thumbnails of photographs."""
+    done, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
+    assert done, f"OpenCV could not encode a picture of {picture.shape}"
+    return data.tobytes()
+
+
+def _bytes(unit: np.ndarray) -> np.ndarray:
+    return np.rint(unit * 255).astype(np.uint8)

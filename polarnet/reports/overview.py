@@ -1,0 +1,169 @@
+"""One picture of the whole method: photograph, polarization, four polarizers, four event streams, recovered DoLP."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch
+from torch import Tensor
+
+from polarnet.events.stream import Events
+from polarnet.reports.figures import LIGHT, chart_style, png, show_picture
+from polarnet.reports.maps import dolp_image, hue_wheel, intensity_image, polarization_hsv
+from polarnet.stokes import POLARIZER_ANGLES_DEG
+
+ON, OFF = "#d0312d", "#1f5fb8"
+MOST_EVENTS = 25_000  # drawn per stream; beyond, every k-th event
+
+# The sheet, in inches. README pages show it about 900 pixels wide: hence few columns and large letters.
+HEIGHT = 4.45
+TOP, BOTTOM = 4.0, 0.2
+GAP = 0.12
+LARGE, MEDIUM, SMALL = ((TOP - BOTTOM - (rows - 1) * GAP) / rows for rows in (2, 3, 4))  # heights of the pictures
+MARGIN = 0.15
+ARROW = 0.6
+PHOTOGRAPH_WIDTH = 2.0
+STREAM_WIDTH = 2.1
+
+
+class Overview(NamedTuple):
+    """One test sequence, from the photograph it moved over to what the network made of one of its windows."""
+
+    name: str
+    photograph: UInt8[np.ndarray, "height width 3"]
+    path: Float[np.ndarray, "2 times"]
+    """Of the window's centre while the events fell: x and y in fractions of the photograph's width and height."""
+    outline: Float[np.ndarray, "2 corners"]
+    """Of the window at the end, in the same fractions."""
+    intensity: Float[Tensor, "4 h w"]
+    dolp: Float[Tensor, "h w"]
+    aolp: Float[Tensor, "h w"]
+    streams: Sequence[Events]
+    """Of the four polarizers, from `start_us` on."""
+    start_us: int
+    duration_us: int
+    recovered: Float[Tensor, "h w"]
+
+
+def write_overview(overview: Overview, path: Path) -> None:
+    """Write the picture as a PNG."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(png(overview_figure(overview)))
+
+
+def overview_figure(overview: Overview) -> Figure:
+    """The method from left to right, drawn from the data of one sequence."""
+    height, width = overview.dolp.shape
+    with matplotlib.rc_context(chart_style(LIGHT)):
+        pictures = (LARGE + MEDIUM + SMALL) * width / height + PHOTOGRAPH_WIDTH + STREAM_WIDTH
+        figure = Figure(figsize=(pictures + 4 * ARROW + 2 * MARGIN, HEIGHT), facecolor=LIGHT.face)
+        x = MARGIN
+        _photograph(figure, x, overview)
+        x = _arrow(figure, x + PHOTOGRAPH_WIDTH, "HSV")
+        _heading(figure, x, "polarization")
+        full = torch.ones_like(overview.dolp)
+        _picture(figure, x, _row(0, MEDIUM), MEDIUM, dolp_image(overview.dolp), "DoLP")
+        _picture(figure, x, _row(1, MEDIUM), MEDIUM, polarization_hsv(full, full, overview.aolp), "AoLP")
+        _picture(figure, x, _row(2, MEDIUM), MEDIUM, intensity_image(overview.intensity[::2].sum(0)), "S0")
+        x = _arrow(figure, x + MEDIUM * width / height, "Eq. 4")
+        _heading(figure, x, "polarizers")
+        for i, angle in enumerate(POLARIZER_ANGLES_DEG):
+            _picture(figure, x, _row(i, SMALL), SMALL, intensity_image(overview.intensity[i]), f"{angle}°")
+        x = _arrow(figure, x + SMALL * width / height, "motion,\nDVS")
+        _heading(figure, x, f"events, {overview.duration_us / 1000:.0f} ms")
+        for i, stream in enumerate(overview.streams):
+            _cloud(_place(figure, x, _row(i, SMALL), STREAM_WIDTH, SMALL), stream, overview)
+        x = _arrow(figure, x + STREAM_WIDTH, "network")
+        _heading(figure, x, "DoLP")
+        _picture(figure, x, _row(0, LARGE), LARGE, dolp_image(overview.recovered), "recovered")
+        _picture(figure, x, _row(1, LARGE), LARGE, dolp_image(overview.dolp), "truth")
+    return figure
+
+
+def _row(index: int, height: float) -> float:
+    """Lower edge of a row of pictures."""
+    return TOP - height - index * (height + GAP)
+
+
+def _place(figure: Figure, x: float, y: float, width: float, height: float) -> Axes:
+    sheet = figure.get_figwidth()
+    return figure.add_axes((x / sheet, y / HEIGHT, width / sheet, height / HEIGHT))
+
+
+def _text(figure: Figure, x: float, y: float, text: str, **style: Any) -> None:
+    figure.text(x / figure.get_figwidth(), y / HEIGHT, text, **style)
+
+
+def _heading(figure: Figure, x: float, text: str) -> None:
+    _text(figure, x, TOP + 0.13, text, color=LIGHT.text, fontsize=12.5, weight="bold")
+
+
+def _picture(figure: Figure, x: float, y: float, height: float, picture: np.ndarray, label: str = "") -> Axes:
+    rows, columns = picture.shape[:2]
+    axes = _place(figure, x, y, height * columns / rows, height)
+    show_picture(axes, picture, LIGHT)
+    if label:
+        box = {"facecolor": "black", "alpha": 0.55, "edgecolor": "none", "pad": 1.6}
+        axes.annotate(label, (0, 1), (4, -4), xycoords="axes fraction", textcoords="offset points", va="top",
+                      color="white", fontsize=9.5, bbox=box)  # fmt: skip
+    return axes
+
+
+def _photograph(figure: Figure, x: float, overview: Overview) -> None:
+    """The photograph with the window's way over it, and below how its colours are read."""
+    rows, columns = overview.photograph.shape[:2]
+    height = PHOTOGRAPH_WIDTH * rows / columns
+    _heading(figure, x, "photograph")
+    axes = _picture(figure, x, TOP - height, height, overview.photograph)
+    for line in (overview.outline, overview.path):
+        across, down = line * np.array([[columns], [rows]])
+        axes.plot(across, down, color="black", linewidth=2.4, alpha=0.6)
+        axes.plot(across, down, color="white", linewidth=1.2)
+    axes.set(xlim=(0, columns), ylim=(rows, 0))
+    wheel = _place(figure, x + 0.4, 1.0, 1.2, 1.2)
+    wheel.imshow(hue_wheel(480))
+    wheel.axis("off")
+    for angle, (across, up, sideways, upright) in {
+        "0°": (1.05, 0.5, "left", "center"), "45°": (0.87, 0.88, "left", "bottom"),
+        "90°": (0.5, 1.03, "center", "bottom"), "135°": (0.13, 0.88, "right", "bottom"),
+    }.items():  # fmt: skip
+        wheel.text(across, up, angle, transform=wheel.transAxes, ha=sideways, va=upright, color=LIGHT.quiet, fontsize=9)
+    text = "hue → AoLP\nsaturation → DoLP\nvalue → S0"
+    style: dict[str, Any] = {"color": LIGHT.quiet, "fontsize": 9.5, "ha": "center", "va": "center", "linespacing": 1.5}
+    _text(figure, x + PHOTOGRAPH_WIDTH / 2, 0.52, text, **style)
+
+
+def _arrow(figure: Figure, x: float, text: str) -> float:
+    """An arrow to the next column and what happens on the way; where that column starts."""
+    middle = (TOP + BOTTOM) / 2
+    ends = [((x + inset) / figure.get_figwidth(), middle / HEIGHT) for inset in (0.1, ARROW - 0.1)]
+    figure.add_artist(FancyArrowPatch(*ends, transform=figure.transFigure, arrowstyle="-|>", mutation_scale=14,
+                                      color=LIGHT.quiet, linewidth=1.6, shrinkA=0, shrinkB=0))  # fmt: skip
+    _text(figure, x + ARROW / 2, middle + 0.1, text, ha="center", va="bottom", color=LIGHT.quiet, fontsize=9.5)
+    return x + ARROW
+
+
+def _cloud(axes: Axes, events: Events, overview: Overview) -> None:
+    """Events in space and time: the sensor seen from the side, time running to the right."""
+    step = -(-len(events) // MOST_EVENTS) or 1
+    t, x, y, p = (column.numpy(force=True)[::step] for column in (events.t, events.x, events.y, events.p))
+    across, up = _oblique((t - overview.start_us) / overview.duration_us, x / events.width, y / events.height)
+    axes.scatter(across, up, s=0.35, c=np.where(p > 0, ON, OFF), alpha=0.5, linewidths=0)
+    for time in (0.0, 1.0):
+        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]], dtype=float)
+        axes.plot(*_oblique(np.full(5, time), corners[:, 0], corners[:, 1]), color=LIGHT.quiet, linewidth=0.6)
+    for corner in ((0.0, 1.0), (1.0, 1.0), (0.0, 0.0), (1.0, 0.0)):
+        axes.plot(*_oblique(np.array([0.0, 1.0]), *(np.full(2, c) for c in corner)), color=LIGHT.grid, linewidth=0.6)
+    axes.set(xlim=(-0.02, 1.02), ylim=(-0.03, 1.03))
+    axes.axis("off")
+
+
+def _oblique(time: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where a point of the space-time box (all coordinates 0 to 1, y down) lies on the page."""
+    return 0.72 * time + 0.28 * x, 0.72 * (1 - y) + 0.28 * x

@@ -1,0 +1,59 @@
+"""Where a report comes from: the code, the machine and the versions that made it."""
+
+import importlib.metadata
+import platform
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from polarnet.runtime import usable_cores
+
+PACKAGES = ("polarnet", "torch", "numpy", "numba", "zarr", "opencv-contrib-python-headless", "dvc", "hydra-core")
+
+
+@dataclass(frozen=True)
+class Run:
+    """What the page says about how its results came to be."""
+
+    command: str
+    """What a person types to get them again."""
+    parameters: Mapping[str, Any]
+    """params.yaml as it was in use: sections and single values."""
+    facts: Mapping[str, str]
+    """Seed, commit, machine, versions."""
+
+
+def facts(root: Path) -> dict[str, str]:
+    """Commit of the project at `root` where it has one, and machine and versions of this process."""
+    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
+    return {
+        "commit": _commit(root),
+        "machine": f"{_processor()}, {usable_cores()} cores, {platform.system()} {platform.machine()}",
+        "versions": f"Python {platform.python_version()}, {versions}",
+    }
+
+
+def _commit(root: Path) -> str:
+    commit = _git(root, "rev-parse", "HEAD")
+    if not commit:
+        return "none: not a git repository with a commit"
+    # what the pipeline itself writes is no change of the code
+    changed = _git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!dvc.lock", ":!data")
+    return f"{commit}, with uncommitted changes" if changed else commit
+
+
+def _git(root: Path, *arguments: str) -> str:
+    try:
+        done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True)
+    except FileNotFoundError:  # a machine without git
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

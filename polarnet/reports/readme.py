@@ -1,0 +1,80 @@
+"""Blocks of README.md and docs/*.md that are written from docs/results/NAME.json, so that no measured number is typed.
+
+A block lies between `<!-- results:NAME -->` and `<!-- /results:NAME -->`.
+"""
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from polarnet.reports.tables import as_markdown, score_table, standing
+
+MARKER = re.compile(r"<!-- (?P<end>/?)results:(?P<name>[\w-]+) -->")
+
+
+def update_results_blocks(root: Path, check: bool) -> list[Path]:
+    """Rewrite every block from its committed results; the files that changed.
+
+    With `check` nothing is written and the list names the files that are out of date. Raises ValueError for a block
+    that is not closed or that nothing renders, FileNotFoundError where its results have not been measured.
+    """
+    changed = []
+    for path in [root / "README.md", *sorted((root / "docs").glob("*.md"))]:
+        if not path.exists():
+            continue
+        old = path.read_text(encoding="utf-8")
+        new = _with_blocks(old, path, root / "docs" / "results")
+        if new != old:
+            changed.append(path)
+            if not check:
+                path.write_text(new, encoding="utf-8")
+    return changed
+
+
+def pipeline_block(results: Mapping[str, Any]) -> str:
+    """The benchmark table of one measured run of the whole pipeline, and what the run took.
+
+    `results` is docs/results/pipeline.json as `polarnet.measure` writes it; `metrics` is data/benchmark/metrics.json.
+    """
+    metrics = results["metrics"]
+    lines = [as_markdown(score_table(metrics, results.get("lpips_reason"))), ""]
+    if any(key.endswith("_ci") for scores in metrics.values() for key in scores):
+        lines += ["Means over the test scenes; below them the 95 % bootstrap interval over scenes.", ""]
+    lines += [f"- {line}" for line in standing(metrics)]
+    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
+    lines += [
+        "",
+        f"`make repro` took {results['repro_minutes']:.1f} minutes and `make test` {results['test_minutes']:.1f} on "
+        f"{results['cores']} cores ({results['machine']}, load {results['load']:.1f} before the start; {versions}; "
+        f"commit `{results['commit'][:10]}`).",
+    ]
+    if stages := results.get("stage_minutes"):
+        lines += ["", "Minutes by stage: " + ", ".join(f"{name} {value:.1f}" for name, value in stages.items()) + "."]
+    return "\n".join(lines)
+
+
+RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {"pipeline": pipeline_block}
+"""What writes the block of each name."""
+
+
+def _with_blocks(text: str, path: Path, results: Path) -> str:
+    parts, position = [], 0
+    markers = list(MARKER.finditer(text))
+    for start, stop in zip(markers[::2], [*markers[1::2], None], strict=False):
+        name = start["name"]
+        if start["end"] or stop is None or not stop["end"] or stop["name"] != name:
+            raise ValueError(f"{path}: expected <!-- results:{name} --> ... <!-- /results:{name} -->; close each block")
+        parts += [text[position : start.end()], "\n", _rendered(name, path, results), "\n"]
+        position = stop.start()
+    return "".join([*parts, text[position:]])
+
+
+def _rendered(name: str, path: Path, results: Path) -> str:
+    if name not in RENDERERS:
+        raise ValueError(f"{path}: no renderer for results:{name}; there are {', '.join(RENDERERS)}")
+    file = results / f"{name}.json"
+    if not file.exists():
+        raise FileNotFoundError(f"{path} shows results:{name}, but {file} is missing; run `polarnet measure {name}`")
+    return RENDERERS[name](json.loads(file.read_text(encoding="utf-8"))).strip()

@@ -1,0 +1,214 @@
+"""Benchmark scores as tables: chosen, rounded and ranked once, then written as Markdown, plain text or HTML."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
+
+Scores = Mapping[str, Mapping[str, Any]]
+"""Method, then metric: data/benchmark/metrics.json. None where there is no value; `<metric>_ci` holds an interval."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A metric as tables show it."""
+
+    label: str
+    decimals: int
+    better: Literal["low", "high"]
+    ranked: bool
+    """Whether the best value is set in bold; a speed is no score."""
+    unit: str
+
+    @property
+    def heading(self) -> str:
+        """Label with the direction in which the metric improves."""
+        return f"{self.label} {'↓' if self.better == 'low' else '↑'}"
+
+    def printed(self, value: float) -> str:
+        """A value with the decimals of its column."""
+        return f"{value:.{self.decimals}f}"
+
+
+COLUMNS = {
+    "mse": Column("MSE", 4, "low", True, ""),
+    "psnr": Column("PSNR", 2, "high", True, " dB"),
+    "ssim": Column("SSIM", 4, "high", True, ""),
+    "lpips": Column("LPIPS", 4, "low", True, ""),
+    "corr": Column("corr.", 3, "high", True, ""),
+    "ms_per_window": Column("ms / window", 1, "low", False, " ms"),
+}
+ERROR_PARTS = {
+    "mse": COLUMNS["mse"],
+    "level_mse": Column("level", 4, "low", True, ""),
+    "pattern_mse": Column("pattern", 4, "low", True, ""),
+}
+"""MSE split in two: level, the squared error of the frame's mean, and pattern, what is left without it."""
+
+METHODS = {
+    "zeros": "zeros",
+    "train_mean": "training mean",
+    "oracle_mean": "oracle mean",
+    "cf": "CF",
+    "highpass": "high-pass",
+    "e2v": "E2V",
+    "ours": "ours",
+}
+"""Readable names, in the order of every table: first what needs no events, then the peers, then the network."""
+
+TRIVIAL = ("zeros", "train_mean", "oracle_mean")
+"""Methods whose answer is one value everywhere."""
+
+PAPER_SOURCE = "Yan et al., Photonics 2024, 11(5), 481, Table 2"
+PAPER_TABLE_2: Mapping[str, Scores] = {
+    "simulated": {
+        "cf": {"mse": 0.1371, "psnr": 10.60, "ssim": 0.1667, "lpips": 0.5890},
+        "e2v": {"mse": 0.0778, "psnr": 12.74, "ssim": 0.3068, "lpips": 0.4140},
+        "ours": {"mse": 0.0355, "psnr": 15.56, "ssim": 0.3947, "lpips": 0.3295},
+    },
+    "real": {
+        "cf": {"mse": 0.0087, "psnr": 23.17, "ssim": 0.4116, "lpips": 0.3342},
+        "e2v": {"mse": 0.0134, "psnr": 20.02, "ssim": 0.3819, "lpips": 0.3350},
+        "ours": {"mse": 0.0026, "psnr": 27.48, "ssim": 0.5189, "lpips": 0.1369},
+    },
+}
+PAPER_COMPARABILITY = (
+    "Both tables ask the same question of different pictures: compare how the methods rank and how far apart they "
+    "lie, not the numbers themselves. The paper's simulated test set is 50 sequences from photographs of the same "
+    "collection as its training set (MIT-Adobe FiveK); its network saw 1000 sequences for 250 epochs; its CF and E2V "
+    "ran with their default parameters. It does not say which windows were scored, how reconstructed intensities were "
+    "scaled before the Stokes formula, or with which settings SSIM and LPIPS were computed. Its real experiment "
+    "is another task again: 32 targets turning in front of a camera, where a background that is hardly polarized lifts "
+    "the PSNR of every method. What is the same here: contrast thresholds of 0.2, 120 by 180 pixels, 30 windows a "
+    "second, photographs read as hue, saturation and value."
+)
+
+
+class Cell(NamedTuple):
+    """One value of a table."""
+
+    text: str
+    interval: str
+    """95 % interval, or nothing."""
+    best: bool
+    """Whether no row of its column shows a better value; ties are all best."""
+
+
+class Row(NamedTuple):
+    """One method of a table."""
+
+    method: str
+    label: str
+    cells: tuple[Cell, ...]
+
+
+class Table(NamedTuple):
+    """What there is to show, before any markup."""
+
+    headings: tuple[str, ...]
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...]
+
+
+def in_order(methods: Iterable[str]) -> list[str]:
+    """Methods in the order of every table and figure; those that METHODS does not name come last."""
+    given = list(methods)
+    return [m for m in METHODS if m in given] + [m for m in given if m not in METHODS]
+
+
+def score_table(
+    scores: Scores, lpips_reason: str | None = None, columns: Mapping[str, Column] = MappingProxyType(COLUMNS)
+) -> Table:
+    """Scores of the methods in the fixed order; a metric that no method has gets no column, except LPIPS when
+    `lpips_reason` says why it is missing. Methods this module has no name for follow under their own key.
+    """
+    if not scores:
+        raise ValueError("a table needs the scores of at least one method, got none")
+    keys = [
+        key
+        for key in columns
+        if any(scores[method].get(key) is not None for method in scores) or (key == "lpips" and lpips_reason)
+    ]
+    methods = in_order(scores)
+    best = {key: _best(columns[key], [scores[m].get(key) for m in methods]) for key in keys}
+    rows = tuple(
+        Row(
+            method,
+            METHODS.get(method, method),
+            tuple(
+                _cell(columns[key], scores[method].get(key), scores[method].get(f"{key}_ci"), best[key]) for key in keys
+            ),
+        )
+        for method in methods
+    )
+    notes = (f'LPIPS "-": {lpips_reason}',) if lpips_reason else ()
+    return Table(tuple(columns[key].heading for key in keys), rows, notes)
+
+
+def paper_table(experiment: Literal["simulated", "real"]) -> Table:
+    """The paper's Table 2, one of its two experiments."""
+    return score_table(PAPER_TABLE_2[experiment])
+
+
+def as_markdown(table: Table) -> str:
+    """A GitHub table: best values in bold, intervals small below their values, notes after it."""
+    lines = ["| | " + " | ".join(table.headings) + " |", "|---|" + "---:|" * len(table.headings)]
+    for row in table.rows:
+        cells = (
+            (f"**{cell.text}**" if cell.best else cell.text)
+            + (f"<br><sub>{cell.interval}</sub>" if cell.interval else "")
+            for cell in row.cells
+        )
+        lines.append(f"| {row.label} | " + " | ".join(cells) + " |")
+    return "\n".join(lines + [f"\n{note}" for note in table.notes])
+
+
+def as_plain(table: Table) -> str:
+    """Aligned columns for a terminal, best values marked with an asterisk, notes below."""
+    grid = [["", *(heading + " " for heading in table.headings)]]
+    grid += [[row.label, *(cell.text + ("*" if cell.best else " ") for cell in row.cells)] for row in table.rows]
+    widths = [max(map(len, column)) for column in zip(*grid, strict=True)]
+    lines = [
+        "  ".join([line[0].ljust(widths[0]), *(x.rjust(width) for x, width in zip(line[1:], widths[1:], strict=True))])
+        for line in grid
+    ]
+    lines.insert(1, "-" * len(lines[0]))
+    return "\n".join([*(line.rstrip() for line in lines), *table.notes])
+
+
+def standing(scores: Scores) -> list[str]:
+    """How `ours` compares with every other method: one sentence each, with the differences; none without `ours`."""
+    if "ours" not in scores:
+        return []
+    return [
+        f"ours against {label}: " + ", ".join(differences) + "."
+        for rival, label in METHODS.items()
+        if rival in scores and rival != "ours" and (differences := _differences(scores["ours"], scores[rival]))
+    ]
+
+
+def _differences(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> list[str]:
+    words = []
+    for key, column in COLUMNS.items():
+        a, b = ours.get(key), rival.get(key)
+        if column.ranked and a is not None and b is not None:
+            better = (a < b) == (column.better == "low") if a != b else None
+            verdict = {True: "better", False: "worse", None: "equal"}[better]
+            words.append(f"{column.label} {a - b:+.{column.decimals}f}{column.unit} ({verdict})")
+    return words
+
+
+def _best(column: Column, values: Sequence[float | None]) -> str | None:
+    """The best value as it is printed, so that rows which read the same are bold together."""
+    known = [value for value in values if value is not None]
+    if not column.ranked or not known:
+        return None
+    return column.printed(min(known) if column.better == "low" else max(known))
+
+
+def _cell(column: Column, value: float | None, interval: Sequence[float] | None, best: str | None) -> Cell:
+    if value is None:
+        return Cell("-", "", False)
+    ends = "" if interval is None else " to ".join(column.printed(end) for end in interval)
+    text = column.printed(value)
+    return Cell(text, ends, text == best)

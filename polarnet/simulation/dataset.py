@@ -1,0 +1,59 @@
+"""The event store of a scene store: every sequence emulated, each on its own, so that runs can stop and go on."""
+
+import functools
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from polarnet.events.store import EventStore
+from polarnet.events.stream import Events
+from polarnet.runtime import seed_for
+from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.motion import Trajectory
+from polarnet.simulation.scene import scene_from_polarization
+from polarnet.simulation.scenes import SceneStore
+from polarnet.simulation.synthesize import synthesize_sequence
+
+
+def emulate_scenes(
+    scenes: Path, events: Path, config: EmulatorConfig, seed: int, mapper: Callable[..., Iterable[Any]], threads: int
+) -> int:
+    """Fill the event store with the sequences of a scene store; how many there are.
+
+    `mapper` is `polarnet.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks emulates one
+    sequence on `threads` threads. An interrupted run of the same scenes, configuration and seed goes on where it
+    stopped.
+    """
+    source = SceneStore.open(scenes)
+    attributes = {"emulate": asdict(config), "seed": seed, "scenes": source.attributes}
+    store = EventStore.create(events, source.sequences, source.window_height, source.window_width, attributes)
+    task = functools.partial(_emulate_into, scenes=source, events=store, config=config, seed=seed, threads=threads)
+    for _ in mapper(task, store.missing()):
+        pass
+    store.finish()
+    return len(store.sequences)
+
+
+def emulate_sequence(
+    scenes: SceneStore, sequence: str, config: EmulatorConfig, seed: int, threads: int
+) -> list[Events]:
+    """Events of the four polarizers of one stored sequence; its noise depends on the seed and its name alone."""
+    record = scenes.read(sequence)
+    return synthesize_sequence(
+        scene_from_polarization(record.s0, record.dolp, record.aolp),
+        Trajectory.from_vector(record.trajectory.numpy()),
+        record.duration_us,
+        scenes.window_height,
+        scenes.window_width,
+        config,
+        seed_for(seed, sequence, "emulate"),
+        threads,
+    )
+
+
+def _emulate_into(
+    sequence: str, scenes: SceneStore, events: EventStore, config: EmulatorConfig, seed: int, threads: int
+) -> None:
+    duration_us = scenes.duration_us(sequence)
+    events.write(sequence, emulate_sequence(scenes, sequence, config, seed, threads), duration_us)

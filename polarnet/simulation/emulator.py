@@ -1,0 +1,213 @@
+"""Event-camera emulation: light on the planes of one sensor in, events and the sensor's state out."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64, Shaped
+from torch import Tensor
+
+from polarnet.events.stream import Events
+from polarnet.ranges import allowed, check_ranges
+from polarnet.simulation.pixels import exact, v2e
+from polarnet.simulation.pixels.columns import Columns, empty_columns, trimmed
+from polarnet.simulation.pixels.light import Light, light_of_frames
+
+EVENTS_PER_PIXEL_AND_STEP = 0.12  # room to begin with; columns grow where a scene is busier
+LARGEST_FIRST_ROOM = 1 << 20  # events
+
+
+@dataclass(frozen=True)
+class EmulatorConfig:
+    """Section `emulate` of params.yaml. Contrast thresholds are steps of natural-log intensity."""
+
+    model: str = field(metadata=allowed(choices=["v2e", "exact"]))
+    render_rate_hz: float | None = field(metadata=allowed(above=0))
+    """Frames a second of the light that the pixels see; null: a step for each pixel of motion."""
+    contrast_threshold_on: float = field(metadata=allowed(low=0.01, high=10))
+    contrast_threshold_off: float = field(metadata=allowed(low=0.01, high=10))
+    contrast_threshold_sigma: float = field(metadata=allowed(low=0))
+    """Standard deviation between pixels, drawn for each polarizer."""
+    cutoff_hz: float = field(metadata=allowed(low=0))
+    """Bandwidth of the photoreceptor at full brightness, less in the dark; 0: infinite."""
+    leak_rate_hz: float = field(metadata=allowed(low=0))
+    """ON events per second of a pixel that sees no change."""
+    leak_jitter: float = field(metadata=allowed(low=0, high=1))
+    """Relative standard deviation of the leak."""
+    noise_rate_cov_decades: float = field(metadata=allowed(low=0))
+    """Spread of the leak rate between pixels, as a power of ten."""
+    shot_noise_rate_hz: float = field(metadata=allowed(low=0))
+    """Noise events per second of a pixel in the dark, ON and OFF together; a quarter of it at full brightness."""
+    refractory_period_us: float = field(metadata=allowed(low=0))
+
+    def __post_init__(self):
+        check_ranges(self)
+
+
+class PixelModel(NamedTuple):
+    """One way in which pixels turn light into events; see the modules of `polarnet.simulation.pixels`."""
+
+    physics: Callable[[EmulatorConfig], Any]
+    initial: Callable[[int, int, Any, np.uint64, int], Any]
+    start: Callable[..., None]
+    advance: Callable[..., tuple[Columns, int]]
+    eight_bit: bool
+    """Whether rendered light is rounded to whole digital numbers first."""
+
+
+def _v2e_physics(config: EmulatorConfig) -> v2e.Physics:
+    return v2e.Physics(
+        config.contrast_threshold_on,
+        config.contrast_threshold_off,
+        config.contrast_threshold_sigma,
+        config.cutoff_hz,
+        config.leak_rate_hz,
+        config.leak_jitter,
+        config.noise_rate_cov_decades,
+        config.shot_noise_rate_hz,
+        config.refractory_period_us * 1e-6,
+    )
+
+
+MODELS = {
+    "v2e": PixelModel(_v2e_physics, v2e.initial, v2e.start, v2e.advance, eight_bit=True),
+    "exact": PixelModel(_v2e_physics, exact.initial, exact.start, exact.advance, eight_bit=False),
+}
+
+
+@dataclass(frozen=True)
+class SensorState:
+    """Where the pixels of a sensor stand after its last frame; hand it back to go on from there."""
+
+    model: str
+    height: int
+    width: int
+    planes: tuple[int, ...]
+    pixels: tuple[Any, ...]
+    """State arrays of each plane, as the model's module defines them."""
+    t_us: float
+    """Time of the last frame."""
+    steps: int
+    """Frames seen after the first; noise is drawn by their number."""
+
+
+def emulate(
+    frames: Shaped[Tensor, "n planes h w"],
+    t_us: Int64[Tensor, " m"] | Float64[Tensor, " m"],
+    config: EmulatorConfig,
+    key: int,
+    state: SensorState | None = None,
+    planes: Sequence[int] | None = None,
+    threads: int = 1,
+) -> tuple[list[Events], SensorState]:
+    """Events of each plane of a sensor that sees `frames` (uint8, or float in digital numbers 0..255) at times `t_us`.
+
+    The first frame after `state=None` fires nothing: it is what the pixels have adapted to. A clip cut into pieces,
+    each given the state that the one before returned, gives the events of the whole. `key` (64 bits) seeds all noise;
+    `planes` are the numbers by which the planes draw their own mismatch and noise, 0, 1, ... by default. Events are in
+    the order (t, y, x, p), and the same to the last bit for any number of threads and any order of planes.
+    ValueError for times that do not increase, values that are not finite or negative, and sizes that do not fit.
+    """
+    columns, state = emulate_columns(frames, t_us, config, key, state, planes, threads)
+    return [events_of(c, state.height, state.width) for c in columns], state
+
+
+def emulate_columns(
+    frames: Shaped[Tensor, "n planes h w"],
+    t_us: Int64[Tensor, " m"] | Float64[Tensor, " m"],
+    config: EmulatorConfig,
+    key: int,
+    state: SensorState | None = None,
+    planes: Sequence[int] | None = None,
+    threads: int = 1,
+    labels: bool = False,
+    exact: bool = False,
+) -> tuple[list[Columns], SensorState]:
+    """As `emulate`, as numpy columns, with the process behind each event (`labels`) and times before rounding (`exact`)."""
+    planes = tuple(range(frames.shape[1])) if planes is None else tuple(planes)
+    times = np.asarray(t_us, dtype=np.float64)
+    _check_frames(frames, times, planes, state)
+    clip = frames.numpy() if frames.dtype == torch.uint8 else frames.to(torch.float32).numpy()
+    lights = [light_of_frames(np.ascontiguousarray(clip[:, i])) for i in range(len(planes))]
+    height, width = frames.shape[2:]
+    return run(lights, times, height, width, config, key, state, planes, threads, labels, exact)
+
+
+def run(
+    lights: Sequence[Light],
+    t_us: Float64[np.ndarray, " n"],
+    height: int,
+    width: int,
+    config: EmulatorConfig,
+    key: int,
+    state: SensorState | None,
+    planes: tuple[int, ...],
+    threads: int = 1,
+    labels: bool = False,
+    exact: bool = False,
+) -> tuple[list[Columns], SensorState]:
+    """Events of planes under `lights` at times `t_us`, and the state after them; planes are shared among threads."""
+    model = MODELS[config.model]
+    physics, seed = model.physics(config), np.uint64(key)
+    fresh = state is None
+    times = t_us if fresh else np.concatenate([[state.t_us], t_us])
+    steps = 0 if fresh else state.steps
+    room = int(min(LARGEST_FIRST_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
+
+    def one_plane(i: int) -> tuple[Columns, Any]:
+        if fresh:
+            pixels = model.initial(height, width, physics, seed, planes[i])
+            model.start(lights[i], pixels, physics, height, width, times[0], seed, planes[i])
+        else:
+            pixels = type(state.pixels[i])(*(array.copy() for array in state.pixels[i]))
+        columns, used = model.advance(
+            lights[i], int(fresh), pixels, physics, height, width, times, steps, seed, planes[i],
+            empty_columns(room, labels, exact),
+        )  # fmt: skip
+        return trimmed(columns, used), pixels
+
+    if threads > 1 and len(planes) > 1:
+        with ThreadPoolExecutor(min(threads, len(planes))) as pool:
+            results = list(pool.map(one_plane, range(len(planes))))
+    else:
+        results = [one_plane(i) for i in range(len(planes))]
+    columns, pixels = zip(*results, strict=True)
+    after = SensorState(config.model, height, width, planes, pixels, float(times[-1]), steps + len(times) - 1)
+    return list(columns), after
+
+
+def events_of(columns: Columns, height: int, width: int) -> Events:
+    """The columns as events; shares their memory."""
+    t, x, y, p = (torch.from_numpy(column) for column in columns[:4])
+    return Events(t, x, y, p, height, width)
+
+
+def _check_frames(
+    frames: Tensor, times: Float64[np.ndarray, " m"], planes: tuple[int, ...], state: SensorState | None
+) -> None:
+    if frames.ndim != 4 or len(frames) != len(times) or len(times) == 0:
+        raise ValueError(
+            f"emulate: expected frames (n, planes, h, w) with one time each and at least one frame, "
+            f"got frames {tuple(frames.shape)} and {len(times)} times"
+        )
+    if frames.dtype != torch.uint8 and not frames.is_floating_point():
+        raise ValueError(f"emulate: expected frames as uint8 or float digital numbers (0..255), got {frames.dtype}")
+    if frames.dtype != torch.uint8 and not (torch.isfinite(frames).all() and (frames >= 0).all()):
+        raise ValueError("emulate: expected finite frames >= 0, got NaN, infinite or negative values")
+    if len(set(planes)) != frames.shape[1]:
+        raise ValueError(f"emulate: expected {frames.shape[1]} different plane numbers, one a plane, got {planes}")
+    before = times if state is None else np.concatenate([[state.t_us], times])
+    if not (np.isfinite(before).all() and (np.diff(before) > 0).all()):
+        raise ValueError(
+            "emulate: expected strictly increasing times in microseconds"
+            + ("" if state is None else f", the first after the state's {state.t_us}")
+            + f", got {times[:5].tolist()}..."
+        )
+    if state is not None and (*state.planes, state.height, state.width) != (*planes, *frames.shape[2:]):
+        raise ValueError(
+            f"emulate: the state is of planes {state.planes} of {state.height}x{state.width} pixels, "
+            f"the frames are of planes {planes} of {frames.shape[2]}x{frames.shape[3]}"
+        )

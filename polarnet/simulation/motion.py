@@ -1,0 +1,323 @@
+"""The window that moves over a scene: closed-form trajectories of bounded speed and acceleration, and what it sees."""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple, no_type_check
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64
+from torch import Tensor
+
+from polarnet.ranges import allowed, check_ranges
+from polarnet.simulation.scene import PolarizationScene
+
+HARMONICS = 3  # of the motion along each axis
+HARMONIC_SPEEDS = np.array([1.0, 0.5, 0.25])  # typical share of each in the speed: mostly drift, some turning
+PHASES = np.linspace(0, 2 * math.pi, 4096, endpoint=False)
+GRID_SLACK = 1e-4  # relative; a maximum over PHASES is at most (HARMONICS * pi / 4096)^2 = 5e-6 short of the true one
+BORDER_SLACK_PX = 0.02  # the same for positions, up to scenes of 4000 pixels
+TURN_SHARE = 0.2  # of the allowed speed and acceleration that roll may use, and zoom
+TURN_RATE_MAX = 2 * math.pi  # radians per second, of the sines of roll and zoom
+FASTEST_OVER_SLOWEST = 3.0  # how much quicker than the room demands the window may turn back
+ATTEMPTS = 64
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Section `synthesize` of params.yaml. Speeds are in pixels of the scene and hold for every pixel of the window."""
+
+    sequences_per_picture: int = field(metadata=allowed(low=1))
+    duration_s: float = field(metadata=allowed(above=0))
+    frame_rate_hz: float = field(metadata=allowed(above=0))
+    """Ground-truth frames; the windows of events between them are the network's inputs."""
+    window_height: int = field(metadata=allowed(low=2))
+    window_width: int = field(metadata=allowed(low=2))
+    speed_min_px_s: float = field(metadata=allowed(above=0))
+    """The peak speed of a sequence is drawn between this and speed_max_px_s."""
+    speed_max_px_s: float = field(metadata=allowed(above=0))
+    acceleration_max_px_s2: float = field(metadata=allowed(above=0))
+    rotation_max_deg: float = field(metadata=allowed(low=0, high=90))
+    zoom_max: float = field(metadata=allowed(low=1, high=16))
+
+    def __post_init__(self):
+        check_ranges(self)
+        if self.speed_max_px_s < self.speed_min_px_s:
+            raise ValueError(f"speed_max_px_s: expected >= speed_min_px_s {self.speed_min_px_s}, got {self}")
+        if round(self.duration_s * self.frame_rate_hz) < 1:
+            raise ValueError(f"duration_s: expected at least one frame at {self.frame_rate_hz} Hz, got {self}")
+
+
+class Pose(NamedTuple):
+    """Where the window is, at one or many times."""
+
+    x: Float64[np.ndarray, "*n"]  # column of the scene under the window's centre
+    y: Float64[np.ndarray, "*n"]  # row
+    angle: Float64[np.ndarray, "*n"]  # radians by which the camera is rolled, from the x axis towards the y axis (down)
+    zoom: Float64[np.ndarray, "*n"]  # window pixels per scene pixel, >= 1
+
+
+@dataclass(frozen=True)
+class Sine:
+    """amplitude * sin(rate * t + phase), rate in radians per second."""
+
+    amplitude: float
+    rate: float
+    phase: float
+
+    def at(self, t_s: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
+        """Its value at times in seconds."""
+        return self.amplitude * np.sin(self.rate * t_s + self.phase)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A motion for all times, of which no part leaves the scene it was made for."""
+
+    x: float  # about which the window's centre swings
+    y: float
+    x_sines: tuple[Sine, ...]  # HARMONICS of them
+    y_sines: tuple[Sine, ...]
+    roll: Sine  # radians
+    zoom: Sine  # about 1 + amplitude
+    speed_px_s: float  # that no pixel of the window exceeds at any time; reached once where roll and zoom are 0
+
+    def pose(self, t_s: Float64[np.ndarray, "*n"]) -> Pose:
+        """The window at times in seconds from the start of the sequence."""
+        return Pose(
+            x=self.x + sum((sine.at(t_s) for sine in self.x_sines), np.zeros_like(t_s)),
+            y=self.y + sum((sine.at(t_s) for sine in self.y_sines), np.zeros_like(t_s)),
+            angle=self.roll.at(t_s),
+            zoom=1 + self.zoom.amplitude + self.zoom.at(t_s),
+        )
+
+    @staticmethod
+    def vector_names() -> list[str]:
+        """What the numbers of `to_vector` are."""
+        sines = [f"{axis}_sine{k + 1}" for axis in "xy" for k in range(HARMONICS)] + ["roll", "zoom"]
+        of_sines = [f"{sine}.{number.name}" for sine in sines for number in dataclasses.fields(Sine)]
+        return ["x", "y", *of_sines, "speed_px_s"]
+
+    def to_vector(self) -> Float64[np.ndarray, " n"]:
+        """All coefficients, always as many, in the order of the fields."""
+        sines = (*self.x_sines, *self.y_sines, self.roll, self.zoom)
+        coefficients = [number for sine in sines for number in dataclasses.astuple(sine)]
+        return np.array([self.x, self.y, *coefficients, self.speed_px_s])
+
+    @classmethod
+    def from_vector(cls, vector: Float64[np.ndarray, " n"]) -> "Trajectory":
+        """The trajectory whose `to_vector` this is, to the last bit."""
+        names = cls.vector_names()
+        if vector.shape != (len(names),):
+            raise ValueError(f"a trajectory has {len(names)} coefficients, got an array of shape {vector.shape}")
+        x, y, *coefficients, speed_px_s = vector.tolist()
+        sines = [Sine(*coefficients[i : i + 3]) for i in range(0, len(coefficients), 3)]
+        x_sines, y_sines = tuple(sines[:HARMONICS]), tuple(sines[HARMONICS : 2 * HARMONICS])
+        return cls(x, y, x_sines, y_sines, sines[-2], sines[-1], speed_px_s)
+
+
+def random_trajectory(
+    config: MotionConfig, scene_height: int, scene_width: int, generator: np.random.Generator
+) -> Trajectory:
+    """A smooth motion of a window inside a scene.
+
+    The velocity along each axis is a sum of harmonics whose slowest lets the window swing over the scene and turn back
+    before the border. Its peak speed, drawn between the configured bounds, is reached at a random time of the sequence.
+    ValueError where the scene is too small for the window, or for its slowest motion.
+    """
+    reach_x, reach_y = _reach(config)
+    room = np.array([scene_width - 1 - 2 * reach_x, scene_height - 1 - 2 * reach_y]) - 2 * BORDER_SLACK_PX
+    if room.min() <= 0:
+        raise ValueError(
+            f"a scene of {scene_height}x{scene_width} (height x width) is too small: a window of "
+            f"{config.window_height}x{config.window_width} rolled by up to {config.rotation_max_deg:g} degrees needs "
+            f"more than {2 * reach_y + 1:.0f}x{2 * reach_x + 1:.0f}; use larger pictures or a smaller window"
+        )
+    speed = generator.uniform(config.speed_min_px_s, config.speed_max_px_s)
+    turns = (config.rotation_max_deg > 0) + (config.zoom_max > 1)
+    drift = 1 - TURN_SHARE * turns  # share of speed and acceleration left for the window's centre
+    for _ in range(ATTEMPTS):
+        shape = _random_shape(generator)
+        crowding = max(shape.extent / room)  # per pixel
+        # rate >= drift * speed * crowding to turn back in time, <= acceleration / (speed * peak) to turn softly
+        highest = math.sqrt(config.acceleration_max_px_s2 / (drift * shape.acceleration * crowding))
+        if highest >= config.speed_min_px_s:
+            break
+    else:
+        raise ValueError(
+            f"a scene of {scene_height}x{scene_width} leaves a window of {config.window_height}x{config.window_width} "
+            f"too little room to reach speed_min_px_s={config.speed_min_px_s:g} within "
+            f"acceleration_max_px_s2={config.acceleration_max_px_s2:g} (about {highest:.0f} px/s can be reached); "
+            f"use larger pictures, a smaller window or a lower speed"
+        )
+    speed = min(speed, highest)
+    slowest = drift * speed * crowding
+    quickest = min(config.acceleration_max_px_s2 / (speed * shape.acceleration), FASTEST_OVER_SLOWEST * slowest)
+    rate = slowest * max(quickest / slowest, 1.0) ** generator.random()
+    return _placed(config, shape, rate, speed, drift, (reach_x, reach_y), room, generator)
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """A closed path walked once in phase 0 to 2 pi, scaled to peak speed 1 per radian."""
+
+    speeds: Float64[np.ndarray, "2 harmonics"]  # amplitudes of the velocity along x and y
+    phases: Float64[np.ndarray, "2 harmonics"]
+    lowest: Float64[np.ndarray, " 2"]  # position relative to where it swings about
+    extent: Float64[np.ndarray, " 2"]
+    acceleration: float  # largest, per radian^2
+    peak_phase: float  # where the speed is 1
+
+
+def _random_shape(generator: np.random.Generator) -> _Shape:
+    order = np.arange(1, HARMONICS + 1)
+    speeds = generator.standard_normal((2, HARMONICS)) * HARMONIC_SPEEDS
+    phases = generator.uniform(0, 2 * math.pi, (2, HARMONICS))
+    angles = order[:, None] * PHASES + phases[:, :, None]
+    velocity = (speeds[:, :, None] * np.cos(angles)).sum(axis=1)
+    speed = np.hypot(*velocity)
+    peak = speed.max() * (1 + GRID_SLACK)
+    position = (speeds[:, :, None] / order[:, None] * np.sin(angles)).sum(axis=1) / peak
+    acceleration = np.hypot(*(speeds[:, :, None] * order[:, None] * np.sin(angles)).sum(axis=1)) / peak
+    return _Shape(
+        speeds=speeds / peak,
+        phases=phases,
+        lowest=position.min(axis=1),
+        extent=position.max(axis=1) - position.min(axis=1),
+        acceleration=acceleration.max() * (1 + GRID_SLACK),
+        peak_phase=float(PHASES[speed.argmax()]),
+    )
+
+
+def _placed(
+    config: MotionConfig,
+    shape: _Shape,
+    rate: float,
+    speed: float,
+    drift: float,
+    reach: tuple[float, float],
+    room: Float64[np.ndarray, " 2"],
+    generator: np.random.Generator,
+) -> Trajectory:
+    """The shape walked at `rate` radians per second, somewhere in the room it has, with roll and zoom."""
+    order = np.arange(1, HARMONICS + 1)
+    size = drift * speed / rate  # pixels per unit of the shape
+    peak_time = generator.uniform(0, config.duration_s)
+    phases = shape.phases + order * (shape.peak_phase - rate * peak_time)
+    spare = np.maximum(room - size * shape.extent, 0)
+    x, y = np.array(reach) + BORDER_SLACK_PX - size * shape.lowest + spare * generator.random(2)
+    amplitudes, rates = size * shape.speeds / order, np.broadcast_to(rate * order, (2, HARMONICS))
+    sines = np.stack([amplitudes, rates, phases % (2 * math.pi)], axis=-1).tolist()
+    x_sines, y_sines = (tuple(Sine(*sine) for sine in axis) for axis in sines)
+    roll = generator.uniform(0, math.radians(config.rotation_max_deg))
+    zoom = generator.uniform(0, (config.zoom_max - 1) / 2)
+    return Trajectory(
+        float(x),
+        float(y),
+        x_sines,
+        y_sines,
+        roll=_turn(roll, 2.0, config, speed, generator),
+        zoom=_turn(zoom, 3.0, config, speed, generator),
+        speed_px_s=speed,
+    )
+
+
+def _turn(
+    amplitude: float, coupling: float, config: MotionConfig, speed: float, generator: np.random.Generator
+) -> Sine:
+    """Roll or zoom slow enough that it moves the window's corners within its share of speed and acceleration.
+
+    A pixel q away from the centre sees q exp(i roll) / zoom, whose second derivative is at most
+    q (roll'' + 2 roll'^2 + zoom'' + 3 zoom'^2) since zoom >= 1 and 2 roll' zoom' <= roll'^2 + zoom'^2.
+    """
+    corner = math.hypot(config.window_width - 1, config.window_height - 1) / 2
+    start, hurry = generator.uniform(0, 2 * math.pi), generator.uniform(0.3, 1)
+    if amplitude == 0:
+        return Sine(0.0, 0.0, 0.0)
+    by_speed = TURN_SHARE * speed / (corner * amplitude)
+    bending = corner * (amplitude + coupling * amplitude**2)
+    by_acceleration = math.sqrt(TURN_SHARE * config.acceleration_max_px_s2 / bending)
+    return Sine(amplitude, hurry * min(by_speed, by_acceleration, TURN_RATE_MAX), start)
+
+
+def _reach(config: MotionConfig) -> tuple[float, float]:
+    """How far the window's corners get from its centre along x and y, at the worst roll and no zoom."""
+    half_width, half_height = (config.window_width - 1) / 2, (config.window_height - 1) / 2
+    largest = math.radians(config.rotation_max_deg)
+
+    def reach(along: float, across: float) -> float:
+        angle = min(largest, math.atan2(across, along))  # where along cos + across sin is largest
+        return along * math.cos(angle) + across * math.sin(angle)
+
+    return reach(half_width, half_height), reach(half_height, half_width)
+
+
+def frame_times_us(config: MotionConfig) -> list[int]:
+    """Microseconds of the N + 1 ground-truth frames that bound the N windows of a sequence."""
+    windows = round(config.duration_s * config.frame_rate_hz)
+    return [round(1e6 * k / config.frame_rate_hz) for k in range(windows + 1)]
+
+
+def render(
+    scene: PolarizationScene, trajectory: Trajectory, t_s: Float64[np.ndarray, " n"], height: int, width: int
+) -> Float32[Tensor, "n 3 h w"]:
+    """Stokes pictures that the moving window sees, by bilinear interpolation of the scene's.
+
+    Pixel (row, column) of the window looks at the point of the scene that `window_to_scene` says; pixel centres are at
+    integers in both. A camera rolled by a measures angles from its own axes, so that its AoLP is the scene's minus a.
+    """
+    out = np.empty((len(t_s), 3, height, width), dtype=np.float32)
+    planes = np.ascontiguousarray(scene.stokes.numpy(), dtype=np.float32)
+    pose = trajectory.pose(np.asarray(t_s, dtype=np.float64))
+    _render(planes, pose.x, pose.y, pose.angle, pose.zoom, out)
+    return torch.from_numpy(out)
+
+
+@no_type_check
+@numba.njit(cache=True, nogil=True)
+def window_to_scene(
+    x: float, y: float, angle: float, zoom: float, height: int, width: int
+) -> tuple[float, float, float, float]:
+    """(left, top, along, across): window pixel (row, column) looks at this point of the scene.
+
+    x = left + column * along - row * across
+    y = top + column * across + row * along
+    The centre of the window, ((height - 1) / 2, (width - 1) / 2), looks at (x, y).
+    """
+    along, across = math.cos(angle) / zoom, math.sin(angle) / zoom
+    middle_row, middle_column = (height - 1) / 2, (width - 1) / 2
+    left = x - middle_column * along + middle_row * across
+    top = y - middle_column * across - middle_row * along
+    return left, top, along, across
+
+
+@no_type_check
+@numba.njit(cache=True, nogil=True, inline="always")
+def bilinear(plane: Float32[np.ndarray, "h w"], x: float, y: float) -> float:
+    """Value of a plane between the four pixels around (x, y); exact where both are integers, clamped at the border."""
+    column = min(max(int(x), 0), plane.shape[1] - 2)
+    row = min(max(int(y), 0), plane.shape[0] - 2)
+    right, down = np.float32(x - column), np.float32(y - row)
+    left, up = np.float32(1) - right, np.float32(1) - down
+    upper = left * plane[row, column] + right * plane[row, column + 1]
+    lower = left * plane[row + 1, column] + right * plane[row + 1, column + 1]
+    return up * upper + down * lower
+
+
+@no_type_check
+@numba.njit(cache=True, nogil=True)
+def _render(planes, x, y, angle, zoom, out) -> None:
+    height, width = out.shape[2:]
+    for k in range(len(x)):
+        left, top, along, across = window_to_scene(x[k], y[k], angle[k], zoom[k], height, width)
+        cos, sin = np.float32(math.cos(2 * angle[k])), np.float32(math.sin(2 * angle[k]))
+        for row in range(height):
+            for column in range(width):
+                at_x = left + column * along - row * across
+                at_y = top + column * across + row * along
+                s1, s2 = bilinear(planes[1], at_x, at_y), bilinear(planes[2], at_x, at_y)
+                out[k, 0, row, column] = bilinear(planes[0], at_x, at_y)
+                out[k, 1, row, column] = s1 * cos + s2 * sin
+                out[k, 2, row, column] = s2 * cos - s1 * sin

@@ -1,0 +1,1 @@
+"""Pictures from files, wheels and seeds, made alike and split by source."""

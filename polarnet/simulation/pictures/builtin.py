@@ -1,0 +1,80 @@
+"""Colour photographs that lie in scikit-image's wheel, so that a fresh clone has real pictures without a network."""
+
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class BuiltinPhoto:
+    """One file of scikit-image's data folder, with what scikit-image says about where it comes from."""
+
+    file: str
+    origin: str
+    licence: str
+    author: str
+
+    @property
+    def path(self) -> Path:
+        """Where the installed scikit-image keeps the file; FileNotFoundError where it does not."""
+        path = Path(str(resources.files("skimage"))) / "data" / self.file
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"{self.file} is not in the data folder of the installed scikit-image; reinstall it as constraints.txt "
+                f"pins it, or use your own pictures with ingest.source=folder"
+            )
+        return path
+
+
+# Origins, licences and authors from the docstrings of skimage.data, scikit-image 0.26. Of the stereo pair of
+# the motorcycle only the left half is here: both show one scene, which must not be in two splits.
+BUILTIN_PHOTOS = (
+    BuiltinPhoto(
+        file="astronaut.png",
+        origin="https://flic.kr/p/r9qvLn",
+        licence="public domain (no known copyright restrictions)",
+        author="NASA",
+    ),
+    BuiltinPhoto(
+        file="chelsea.png",
+        origin="skimage.data.chelsea",
+        licence="CC0-1.0",
+        author="Stefan van der Walt",
+    ),
+    BuiltinPhoto(
+        file="coffee.png",
+        origin="skimage.data.coffee, courtesy of Pikolo Espresso Bar",
+        licence="CC0-1.0",
+        author="Rachel Michetti",
+    ),
+    BuiltinPhoto(
+        file="hubble_deep_field.jpg",
+        origin="http://hubblesite.org/newscenter/archive/releases/2012/37/image/a/",
+        licence="public domain (NASA media guidelines)",
+        author="NASA",
+    ),
+    BuiltinPhoto(
+        file="ihc.png",
+        origin="skimage.data.immunohistochemistry",
+        licence="no known copyright restrictions",
+        author="Center for Microscopy And Molecular Imaging (CMMI)",
+    ),
+    BuiltinPhoto(
+        file="motorcycle_left.png",
+        origin="http://vision.middlebury.edu/stereo/data/scenes2014/",
+        licence="unstated by scikit-image and the dataset; asks to cite Scharstein et al., GCPR 2014",
+        author="Nera Nesic, Porter Westling, Xi Wang, York Kitajima, Greg Krathwohl, Daniel Scharstein",
+    ),
+    BuiltinPhoto(
+        file="retina.jpg",
+        origin="https://commons.wikimedia.org/wiki/File:Fundus_photograph_of_normal_left_eye.jpg",
+        licence="CC0-1.0",
+        author="Mikael Häggström",
+    ),
+    BuiltinPhoto(
+        file="rocket.jpg",
+        origin="https://www.flickr.com/photos/spacexphotos/16511594820/in/photostream/",
+        licence="public domain",
+        author="SpaceX",
+    ),
+)

@@ -1,0 +1,119 @@
+"""What lies in data/images: the pictures, where each comes from, its split, and what was left out and why."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+MANIFEST = "manifest.json"
+SPLITS = ("train", "val", "test")
+
+
+@dataclass(frozen=True)
+class ManifestEntry:
+    """One picture of data/images."""
+
+    name: str
+    """Of the source and the first 8 digits of `sha256`; sequences are called after it."""
+    file: str
+    """In the folder of the manifest."""
+    split: str
+    """train, val or test; every sequence made of this picture belongs to it."""
+    source: str
+    """photograph, dead_leaves, folder or polarization."""
+    origin: str
+    """Where the picture comes from: an address, a file relative to ingest.root, or the seed it was made from."""
+    licence: str | None
+    author: str | None
+    sha256: str
+    """Of the source's upright pixels, before they were cut, scaled and converted."""
+    bits: int
+    height: int
+    width: int
+    source_height: int
+    source_width: int
+    colour_profile: str | None
+    """What was converted to sRGB."""
+    residual: float | None = None
+    """Of measured polarization: the median of |I0 + I90 - I45 - I135| / S0."""
+    saturated_fraction: float | None = None
+    """Of measured polarization: pixels of the source with a saturated angle."""
+    masked_fraction: float | None = None
+    """Of measured polarization: pixels whose light cannot be known; `valid` in the file says which."""
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A file that gave no picture."""
+
+    file: str
+    """Relative to ingest.root."""
+    reason: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Everything that ingest wants to tell later stages and people; the same for the same pictures and settings."""
+
+    pictures: tuple[ManifestEntry, ...]
+    skipped: tuple[Skipped, ...]
+    ignored_files: int
+    """Files without the extension of a picture."""
+    unread_files: int
+    """Pictures beyond ingest.limit."""
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Pictures, also per split, and what was left out."""
+        of_split = {split: sum(entry.split == split for entry in self.pictures) for split in SPLITS}
+        return {
+            "pictures": len(self.pictures),
+            **of_split,
+            "skipped": len(self.skipped),
+            "ignored_files": self.ignored_files,
+            "unread_files": self.unread_files,
+        }
+
+
+def split_by_content(hashes: Sequence[str], val_fraction: float, test_fraction: float) -> list[str]:
+    """The split of each picture of one group, by the rank of its content hash.
+
+    The first ceil(test_fraction n) are test, the next ceil(val_fraction n) val, the rest train. Names and order do not
+    matter, and another picture moves at most a few at the two borders.
+    """
+    n = len(hashes)
+    # the tolerance: 0.1 * 30 is 3.0000000000000004, and nobody who writes 0.1 means 4 of 30
+    n_test = min(n, math.ceil(test_fraction * n - 1e-9))
+    n_val = min(n - n_test, math.ceil(val_fraction * n - 1e-9))
+    splits = [""] * n
+    for rank, i in enumerate(sorted(range(n), key=lambda i: hashes[i])):
+        splits[i] = "test" if rank < n_test else "val" if rank < n_test + n_val else "train"
+    return splits
+
+
+def write_manifest(manifest: Manifest, folder: Path) -> None:
+    """Write `folder`/manifest.json, the same bytes for the same manifest."""
+    content = {
+        "pictures": [asdict(entry) for entry in manifest.pictures],
+        "skipped": [asdict(skipped) for skipped in manifest.skipped],
+        "counts": manifest.counts,
+    }
+    (folder / MANIFEST).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of a folder that `ingest` wrote; FileNotFoundError or ValueError where there is none."""
+    path = folder / MANIFEST
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no manifest; run the stage ingest first (dvc repro ingest)")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return Manifest(
+            pictures=tuple(ManifestEntry(**entry) for entry in content["pictures"]),
+            skipped=tuple(Skipped(**skipped) for skipped in content["skipped"]),
+            ignored_files=content["counts"]["ignored_files"],
+            unread_files=content["counts"]["unread_files"],
+        )
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path}: not a manifest of this version ({error}); run the stage ingest again") from error

@@ -1,0 +1,152 @@
+"""From a scene and a motion to the events behind four polarizers of one sensor, without a clip in between."""
+
+import math
+
+import numba
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from polarnet.events.stream import Events
+from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, events_of, run
+from polarnet.simulation.motion import Pose, Trajectory, bilinear, window_to_scene
+from polarnet.simulation.pixels.columns import Columns
+from polarnet.simulation.pixels.light import FULL_SCALE, light_of_frames, light_of_scene
+from polarnet.simulation.scene import PolarizationScene
+from polarnet.stokes import intensities_from_stokes
+
+POLARIZERS = (0, 1, 2, 3)
+STEP_PX = 1.0  # of an adaptive rate: no pixel of the window moves further in a step
+SLOWEST_RATE_HZ = 30.0  # of an adaptive rate, for a window that stands still
+SPEED_SAMPLES_PER_PX = 8
+TURNING_CHUNK = 16  # steps that are rendered before their events are made, where the window turns or zooms
+
+
+def synthesize_sequence(
+    scene: PolarizationScene,
+    trajectory: Trajectory,
+    duration_us: int,
+    height: int,
+    width: int,
+    config: EmulatorConfig,
+    key: int,
+    threads: int = 1,
+) -> list[Events]:
+    """Events of the four polarizers of a sensor of height x width pixels that moves over a scene for `duration_us`.
+
+    Times count from the start of the motion. `key` (64 bits) seeds the pixels' mismatch and all noise.
+    """
+    t_us = render_times_us(trajectory, duration_us, height, width, config)
+    events, _ = synthesize_steps(scene, trajectory, t_us, height, width, config, key, None, threads)
+    return events
+
+
+def synthesize_steps(
+    scene: PolarizationScene,
+    trajectory: Trajectory,
+    t_us: Int64[np.ndarray, " n"],
+    height: int,
+    width: int,
+    config: EmulatorConfig,
+    key: int,
+    state: SensorState | None,
+    threads: int = 1,
+) -> tuple[list[Events], SensorState]:
+    """As `synthesize_sequence`, for light rendered at times `t_us`; hand the state back to go on from there.
+
+    A window that only drifts is rendered row by row as its pixels need it; one that turns or zooms, a few frames at
+    a time. Either way light is interpolated between the scene's Stokes parameters, as `motion.render` does.
+    ValueError where the window leaves the scene.
+    """
+    pose = trajectory.pose(t_us * 1e-6)
+    _check_inside(scene, pose, t_us, height, width)
+    sensor = {"height": height, "width": width, "config": config, "key": key, "planes": POLARIZERS, "threads": threads}
+    if (pose.angle == 0).all() and (pose.zoom == 1).all():
+        left, top = pose.x - (width - 1) / 2, pose.y - (height - 1) / 2
+        lights = [light_of_scene(plane, top, left) for plane in _scene_behind_polarizers(scene)]
+        columns, state = run(lights, t_us.astype(np.float64), state=state, **sensor)
+        return [events_of(c, height, width) for c in columns], state
+    pieces = []
+    for first in range(0, len(t_us), TURNING_CHUNK):
+        chunk = slice(first, first + TURNING_CHUNK)
+        frames = render_intensities(scene, Pose(*(values[chunk] for values in pose)), height, width, config)
+        lights = [light_of_frames(frames[plane]) for plane in POLARIZERS]
+        columns, state = run(lights, t_us[chunk].astype(np.float64), state=state, **sensor)
+        pieces.append(columns)
+    joined = [Columns(*map(np.concatenate, zip(*plane, strict=True))) for plane in zip(*pieces, strict=True)]
+    return [events_of(c, height, width) for c in joined], state
+
+
+def render_times_us(
+    trajectory: Trajectory, duration_us: int, height: int, width: int, config: EmulatorConfig
+) -> Int64[np.ndarray, " n"]:
+    """When the light is rendered: at `render_rate_hz`, or, if that is null, whenever a pixel has moved by one pixel.
+
+    The first time is 0, the last `duration_us`. The adaptive rate is never below 30 Hz.
+    """
+    if config.render_rate_hz is not None:
+        steps = math.ceil(duration_us * 1e-6 * config.render_rate_hz)
+        times = np.rint(1e6 / config.render_rate_hz * np.arange(steps + 1))
+    else:
+        samples = 2 + math.ceil(SPEED_SAMPLES_PER_PX * duration_us * 1e-6 * max(trajectory.speed_px_s, SLOWEST_RATE_HZ))
+        t_s = np.linspace(0, duration_us * 1e-6, samples)
+        pose = trajectory.pose(t_s)
+        corners = np.stack(_corners(pose, height, width))  # [x or y, corner, time]
+        moved = np.hypot(*np.diff(corners, axis=-1)).max(axis=0) * np.maximum(pose.zoom[1:], pose.zoom[:-1])
+        progress = np.concatenate([[0], np.cumsum(np.maximum(moved / STEP_PX, SLOWEST_RATE_HZ * np.diff(t_s)))])
+        times = np.rint(1e6 * np.interp(np.linspace(0, progress[-1], math.ceil(progress[-1]) + 1), progress, t_s))
+    times[-1] = duration_us
+    return np.unique(np.minimum(times, duration_us).astype(np.int64))
+
+
+def render_intensities(
+    scene: PolarizationScene, pose: Pose, height: int, width: int, config: EmulatorConfig
+) -> UInt8[np.ndarray, "4 n h w"] | Float32[np.ndarray, "4 n h w"]:
+    """Digital numbers behind the four polarizers as the window sees them; uint8 where the pixel model wants 8 bits."""
+    frames = np.empty((4, len(pose.x), height, width), np.uint8 if MODELS[config.model].eight_bit else np.float32)
+    _render_turning(np.ascontiguousarray(scene.stokes.numpy()), pose.x, pose.y, pose.angle, pose.zoom, frames)
+    return frames
+
+
+@numba.njit(cache=True, nogil=True)
+def _render_turning(stokes, x, y, angle, zoom, frames) -> None:  # pragma: no cover (compiled)
+    height, width = frames.shape[2:]
+    half, rounding = np.float32(FULL_SCALE / 2), np.float32(0.5 if frames.itemsize == 1 else 0.0)
+    for k in range(len(x)):
+        left, top, along, across = window_to_scene(x[k], y[k], angle[k], zoom[k], height, width)
+        cos, sin = np.float32(math.cos(2 * angle[k])), np.float32(math.sin(2 * angle[k]))
+        for row in range(height):
+            for column in range(width):
+                at_x = left + column * along - row * across
+                at_y = top + column * across + row * along
+                s0 = bilinear(stokes[0], at_x, at_y)
+                s1, s2 = bilinear(stokes[1], at_x, at_y), bilinear(stokes[2], at_x, at_y)
+                # the polarizers roll with the camera
+                for plane, part in enumerate((s1 * cos + s2 * sin, s2 * cos - s1 * sin)):
+                    frames[plane, k, row, column] = max(half * (s0 + part), np.float32(0)) + rounding
+                    frames[plane + 2, k, row, column] = max(half * (s0 - part), np.float32(0)) + rounding
+
+
+def _scene_behind_polarizers(scene: PolarizationScene) -> Float32[np.ndarray, "4 h1 w1"]:
+    """Digital numbers of the whole scene, a row and a column wider, so that interpolation may look past the last."""
+    intensities = intensities_from_stokes(scene.stokes).clamp(min=0) * FULL_SCALE
+    return np.pad(intensities.numpy(), ((0, 0), (0, 1), (0, 1)), mode="edge")
+
+
+def _corners(pose: Pose, height: int, width: int) -> tuple[Float64[np.ndarray, "4 n"], Float64[np.ndarray, "4 n"]]:
+    """Columns and rows of the scene under the window's corner pixels."""
+    across = np.array([[-1], [1], [-1], [1]]) * (width - 1) / 2 / pose.zoom
+    down = np.array([[-1], [-1], [1], [1]]) * (height - 1) / 2 / pose.zoom
+    cos, sin = np.cos(pose.angle), np.sin(pose.angle)
+    return pose.x + across * cos - down * sin, pose.y + across * sin + down * cos
+
+
+def _check_inside(scene: PolarizationScene, pose: Pose, t_us: Int64[np.ndarray, " n"], height: int, width: int) -> None:
+    x, y = _corners(pose, height, width)
+    outside = ((x < 0) | (x > scene.width - 1) | (y < 0) | (y > scene.height - 1)).any(axis=0)
+    if outside.any():
+        k = int(outside.argmax())
+        raise ValueError(
+            f"at {t_us[k]} us a window of {height}x{width} pixels reaches rows {y[:, k].min():.1f} to "
+            f"{y[:, k].max():.1f}, columns {x[:, k].min():.1f} to {x[:, k].max():.1f} of a scene of "
+            f"{scene.height}x{scene.width}; use a trajectory made for this scene and window"
+        )

@@ -1,0 +1,127 @@
+"""Pictures -> scenes, trajectories and the exact frames that an ideal camera in their place would take."""
+
+import functools
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from polarnet import stokes
+from polarnet.events.frames import FrameStore
+from polarnet.runtime import generator_for
+from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory, render
+from polarnet.simulation.pictures.images import read_rgb
+from polarnet.simulation.pictures.manifest import Manifest, read_manifest
+from polarnet.simulation.pictures.polarimetry import read_intensities
+from polarnet.simulation.scene import (
+    PolarizationScene,
+    polarization_from_rgb,
+    scene_from_intensities,
+    scene_from_polarization,
+)
+from polarnet.simulation.scenes import SceneStore
+
+
+def frames_of(
+    scene: PolarizationScene, trajectory: Trajectory, t_us: Sequence[int], height: int, width: int
+) -> tuple[Float[Tensor, "n 4 h w"], Float[Tensor, "n h w"], Float[Tensor, "n h w"]]:
+    """(intensity behind the four polarizers, DoLP, AoLP) that a window of a scene sees at times in microseconds.
+
+    Light mixes between pixels, angles do not: all three follow from the interpolated Stokes vector.
+    """
+    seen = render(scene, trajectory, np.asarray(t_us) * 1e-6, height, width)
+    return stokes.intensities_from_stokes(seen).clamp(0, 1), stokes.dolp(seen).clamp(0, 1), stokes.aolp(seen)
+
+
+def synthesize(
+    images: Path, scenes: Path, frames: Path, config: MotionConfig, seed: int, mapper: Callable[..., Iterable[Any]]
+) -> int:
+    """Fill both stores with `sequences_per_picture` sequences of every picture of `images`; how many there are.
+
+    `mapper` is `polarnet.cluster.pmap` with its workers bound, or the built-in `map`. Every trajectory depends on
+    the seed and the sequence's name alone. An interrupted run goes on where it stopped.
+    """
+    manifest = read_manifest(images)
+    scene_store, frame_store = _create(manifest, images, scenes, frames, config, seed)
+    missing = {*scene_store.missing(), *frame_store.missing()}
+    pictures = {scene_store.picture_of[sequence] for sequence in missing} | set(scene_store.missing_pictures())
+    task = functools.partial(
+        _synthesize_picture, images=images, scenes=scene_store, frames=frame_store, config=config, seed=seed
+    )
+    for _ in mapper(task, sorted(pictures)):
+        pass
+    scene_store.finish()
+    frame_store.finish()
+    return len(scene_store.sequences)
+
+
+def _create(
+    manifest: Manifest, images: Path, scenes: Path, frames: Path, config: MotionConfig, seed: int
+) -> tuple[SceneStore, FrameStore]:
+    """Two unfinished stores; their attributes say what they are made from, so that only the same is resumed."""
+    picture_of, splits = {}, {}
+    for entry in manifest.pictures:
+        for number in range(config.sequences_per_picture):
+            sequence = f"{entry.name}-{number:02d}"
+            picture_of[sequence], splits[sequence] = entry.name, entry.split
+    attributes = {"synthesize": asdict(config), "seed": seed, "images_sha256": _digest(manifest, images)}
+    window = config.window_height, config.window_width
+    largest = max(entry.height for entry in manifest.pictures), max(entry.width for entry in manifest.pictures)
+    names = Trajectory.vector_names()
+    scene_store = SceneStore.create(
+        scenes,
+        picture_of,
+        splits,
+        largest_picture=largest,
+        window=window,
+        trajectory_names=names,
+        attributes=attributes,
+    )
+    n_frames = len(frame_times_us(config))
+    frame_attributes = {**attributes, "scenes": picture_of}
+    frame_store = FrameStore.create(frames, list(picture_of), splits, n_frames, *window, frame_attributes)
+    return scene_store, frame_store
+
+
+def _synthesize_picture(
+    picture: str, images: Path, scenes: SceneStore, frames: FrameStore, config: MotionConfig, seed: int
+) -> None:
+    """Write one picture and all its sequences."""
+    s0, dolp, aolp = _read_polarization(images, picture)
+    scenes.write_picture(picture, s0, dolp, aolp)
+    height, width = s0.shape
+    t_us = frame_times_us(config)
+    for sequence in [name for name, of in scenes.picture_of.items() if of == picture]:
+        try:
+            trajectory = random_trajectory(config, height, width, generator_for(seed, sequence, "motion"))
+        except ValueError as error:
+            raise ValueError(f"{picture}: {error}") from error
+        scenes.write(sequence, torch.from_numpy(trajectory.to_vector()), t_us[-1])
+        record = scenes.read(sequence)  # quantised: the scene that is emulated, and so the truth
+        scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
+        seen = frames_of(scene, trajectory, t_us, config.window_height, config.window_width)
+        frames.write(sequence, torch.tensor(t_us), *seen)
+
+
+def _read_polarization(images: Path, picture: str) -> Float[Tensor, "3 h w"]:
+    """(S0, DoLP, AoLP) of a photograph, by its colours, or of a measurement."""
+    measured = images / f"{picture}.npz"
+    if not measured.exists():
+        return polarization_from_rgb(read_rgb(images / f"{picture}.png"))
+    intensities, _ = read_intensities(measured)
+    seen = scene_from_intensities(intensities).stokes
+    return torch.stack([seen[0].clamp(max=1), stokes.dolp(seen).clamp(max=1), stokes.aolp(seen)])
+
+
+def _digest(manifest: Manifest, images: Path) -> str:
+    """Of all picture files."""
+    digest = hashlib.sha256()
+    for entry in manifest.pictures:
+        digest.update(entry.file.encode() + b"\0" + hashlib.sha256((images / entry.file).read_bytes()).digest())
+    return digest.hexdigest()

@@ -1,0 +1,56 @@
+"""How the E2V baseline is trained: one polarizer's events in, the intensity behind that polarizer out."""
+
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from polarnet.baselines.firenet import FireNet
+from polarnet.events.representations import normalise_nonzero, voxel_grid
+from polarnet.events.stream import Events
+from polarnet.ranges import allowed
+from polarnet.similarity import Lpips
+from polarnet.training.loop import LoopConfig
+from polarnet.training.losses import FrameLoss
+from polarnet.training.sequences import Batch
+from polarnet.training.task import Task, initialised
+
+
+@dataclass(frozen=True)
+class E2vConfig(LoopConfig):
+    """Section `baselines.e2v` of params.yaml."""
+
+    arch: str = field(metadata=allowed(choices=("firenet",)))
+    bins: int = field(metadata=allowed(low=2))
+    """Of the voxel grid."""
+    ssim: float = field(metadata=allowed(low=0))
+    """Weight of 1 - SSIM; the mean absolute error weighs 1."""
+    lpips: float = field(metadata=allowed(low=0))
+
+
+def e2v_task(config: E2vConfig, lpips: Lpips | None, seed: int) -> Task:
+    """Train a new FireNet; the four polarizers of a sequence are four streams of its batch.
+
+    The truth is the intensity itself, in [0, 1] with I0 + I90 = S0: one scale for the four, as Stokes parameters need.
+    """
+    network = initialised(lambda: FireNet(config.bins), seed)
+
+    def encode(events: Events, window_us: int) -> Tensor:
+        return normalise_nonzero(voxel_grid(events, config.bins))
+
+    def streams(batch: Batch) -> tuple[Tensor, Tensor]:
+        voxels = batch.inputs.unflatten(2, (4, config.bins))
+        return voxels.flatten(1, 2), batch.intensity.flatten(1, 2)
+
+    return Task(
+        network=network,
+        encode=encode,
+        streams=streams,
+        unroll=network.unroll,
+        loss=FrameLoss({"mae": 1.0, "ssim": config.ssim, "lpips": config.lpips}, lpips),
+        description={
+            "network": config.arch,
+            "config": {"bins": config.bins},
+            "in_channels": config.bins,
+            "representation": "voxel_grid, nonzero entries normalised",
+        },
+    )

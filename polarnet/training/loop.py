@@ -1,0 +1,136 @@
+"""The training loop, the same for every network: see `train`."""
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+
+import torch
+from torch import nn
+
+from polarnet.events.representations import REPRESENTATIONS
+from polarnet.events.windows import WindowDataset
+from polarnet.ranges import allowed, check_ranges
+from polarnet.similarity import correlation, mse, psnr
+from polarnet.training.recorder import Recorder
+from polarnet.training.sequences import Batch, Views, batches_of, shuffled
+from polarnet.training.task import Split, Task
+
+SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """How a network is trained; `train` and `baselines.e2v` of params.yaml have these fields and their own."""
+
+    epochs: int = field(metadata=allowed(low=1))
+    batch_size: int = field(metadata=allowed(low=1))
+    """Sequences."""
+    bptt_windows: int = field(metadata=allowed(low=1))
+    """Windows of one step: gradients are not carried further back, the recurrent state is."""
+    learning_rate: float = field(metadata=allowed(above=0))
+    """Of Adam, at its highest."""
+    schedule: str = field(metadata=allowed(choices=("constant", "cosine")))
+    """cosine: from the highest rate to 0 over the training."""
+    warmup: float = field(metadata=allowed(low=0, high=1))
+    """The fraction of the training over which the rate rises from 0."""
+    gradient_norm: float | None = field(metadata=allowed(above=0))
+    """Gradients that are longer together are shortened to this; null: never."""
+    precision: str = field(metadata=allowed(choices=("fp32", "bf16")))
+    """Of autocast; weights and Adam are float32 either way."""
+    crop: list[int] | None = field(metadata=allowed(low=16))
+    """Height and width in pixels of the part seen of each sequence, another one in every epoch; null: all of it."""
+    symmetries: bool
+    """Mirror the image and renumber the polarizers at random, which leaves DoLP as it is."""
+
+    def __post_init__(self):
+        check_ranges(self)
+        if self.crop is not None and len(self.crop) != 2:
+            raise ValueError(f"crop: expected height and width, or null, got {self.crop}")
+
+
+@dataclass(frozen=True)
+class TrainConfig(LoopConfig):
+    """Section `train` of params.yaml."""
+
+    representation: str = field(metadata=allowed(choices=tuple(REPRESENTATIONS)))
+
+
+def train(
+    task: Task, split: Split, config: LoopConfig, recorder: Recorder, seed: int, device: torch.device, workers: int
+) -> None:
+    """Train the task's network; where the recorder holds a killed run of the same training, go on with that.
+
+    All that is random derives from the seed, the epoch and a sequence's name, so a run that was killed and resumed ends
+    with the weights of one that was not. Workers (processes that read ahead) do not change them either.
+    """
+    network = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
+    progress = recorder.resume(network, optimizer)
+    for epoch in range(progress.epoch, config.epochs):
+        views = Views(split.train, seed, epoch, config.crop, config.symmetries)
+        order = shuffled(len(split.train), seed, epoch)
+        batches = batches_of(views, order[progress.sequences :], config.batch_size, workers)
+        for batch in recorder.show(batches, progress, len(order), config.epochs):
+            set_learning_rate(optimizer, config, (epoch + progress.sequences / len(order)) / config.epochs)
+            losses = train_batch(task, optimizer, batch, config, device)
+            progress.add(losses, len(batch.names))
+            recorder.keep(progress, network, optimizer)
+        recorder.end_epoch(progress, network, validate(task, split.val, config, device, workers))
+        recorder.keep(progress, network, optimizer, at_once=True)
+    recorder.finish()
+
+
+def train_batch(
+    task: Task, optimizer: torch.optim.Optimizer, batch: Batch, config: LoopConfig, device: torch.device
+) -> list[dict[str, float]]:
+    """One step for each run of `bptt_windows` windows; the loss and its terms at each."""
+    inputs, truth = (tensor.to(device) for tensor in task.streams(batch))
+    state, losses = None, []
+    for windows, frames in zip(inputs.split(config.bptt_windows), truth.split(config.bptt_windows), strict=True):
+        with autocast(config.precision, device):
+            predicted, state = task.unroll(windows, state)
+            terms = task.loss(predicted, frames)
+            total = task.loss.total(terms)
+        optimizer.zero_grad()
+        total.backward()
+        if config.gradient_norm is not None:
+            nn.utils.clip_grad_norm_(task.network.parameters(), config.gradient_norm)
+        optimizer.step()
+        state = [tensor.detach() for tensor in state or []]
+        losses.append({name: term.item() for name, term in {"total": total, **terms}.items()})
+    return losses
+
+
+@torch.no_grad()
+def validate(
+    task: Task, dataset: WindowDataset, config: LoopConfig, device: torch.device, workers: int
+) -> dict[str, float]:
+    """Mean over all frames of the loss, its terms, and mse, psnr and correlation of the frames as they are."""
+    task.network.eval()
+    sums, count = Counter[str](), 0
+    for batch in batches_of(dataset, range(len(dataset)), 1, workers):
+        inputs, truth = (tensor.to(device) for tensor in task.streams(batch))
+        state = None
+        for windows, frames in zip(inputs.split(config.bptt_windows), truth.split(config.bptt_windows), strict=True):
+            with autocast(config.precision, device):
+                predicted, state = task.unroll(windows, state)
+                terms = task.loss(predicted, frames)
+            scores = {"total": task.loss.total(terms), **terms}
+            scores |= {name: score(predicted, frames).mean() for name, score in SCORES.items()}
+            sums.update({name: value.item() * frames.shape[0] * frames.shape[1] for name, value in scores.items()})
+            count += frames.shape[0] * frames.shape[1]
+    task.network.train()
+    return {name: value / count for name, value in sums.items()}
+
+
+def set_learning_rate(optimizer: torch.optim.Optimizer, config: LoopConfig, done: float) -> None:
+    """The rate once this fraction of the training is done: the warm-up's rise, times the schedule's fall."""
+    rise = min(1.0, done / config.warmup) if config.warmup else 1.0
+    fall = (1 + math.cos(math.pi * done)) / 2 if config.schedule == "cosine" else 1.0
+    for group in optimizer.param_groups:
+        group["lr"] = config.learning_rate * rise * fall
+
+
+def autocast(precision: str, device: torch.device) -> torch.autocast:
+    """Convolutions and matrix products in bfloat16 where `precision` is bf16."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16")

@@ -1,0 +1,168 @@
+"""What a training leaves behind: checkpoints, curves, and the running checkpoint from which a killed one goes on.
+
+The outputs hold no date and no duration, so equal trainings leave equal bytes.
+"""
+
+import hashlib
+import json
+import logging
+import math
+import os
+import shutil
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from dvclive import Live
+from scmrepo.exceptions import SCMError
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from polarnet.networks.checkpoint import save_checkpoint
+from polarnet.training.sequences import Batch
+
+logger = logging.getLogger(__name__)
+
+KEEP_EVERY_S = 60.0  # writing a running checkpoint of the paper's network takes 0.1 s
+
+
+@dataclass
+class Progress:
+    """How far a training has come."""
+
+    epoch: int = 0
+    """Epochs that are complete."""
+    sequences: int = 0
+    """Sequences of the current epoch that have been trained on."""
+    steps: int = 0
+    """Steps of the optimizer in the current epoch, over which `sums` adds up the loss and its terms."""
+    sums: dict[str, float] = field(default_factory=dict)
+    history: list[dict[str, Any]] = field(default_factory=list)
+    """One row an epoch: its number, the mean loss terms of training, and the scores on the validation split."""
+    best: dict[str, Tensor] = field(default_factory=dict)
+    """The weights of the epoch with the smallest validation MSE."""
+
+    def add(self, losses: Sequence[Mapping[str, float]], sequences: int) -> None:
+        """Count one batch; FloatingPointError where the loss has become infinite or NaN."""
+        sums = Counter(self.sums)
+        for terms in losses:
+            if not math.isfinite(terms["total"]):
+                raise FloatingPointError(
+                    f"the loss is {terms['total']} in epoch {self.epoch} after {self.steps} steps; lower "
+                    "learning_rate, set gradient_norm, or use precision=fp32"
+                )
+            sums.update(terms)
+        self.sums, self.steps, self.sequences = dict(sums), self.steps + len(losses), self.sequences + sequences
+
+    def end_epoch(self, weights: Mapping[str, Tensor], scores: Mapping[str, float]) -> None:
+        """Add a row to the history, keep the weights if they are the best so far, and begin the next epoch."""
+        means = {name: value / self.steps for name, value in self.sums.items()}
+        self.history.append({"epoch": self.epoch, "train": means, "val": dict(scores)})
+        if best_row(self.history) is self.history[-1]:
+            self.best = {name: tensor.detach().cpu().clone() for name, tensor in weights.items()}
+        self.epoch, self.sequences, self.steps, self.sums = self.epoch + 1, 0, 0, {}
+
+
+class Recorder:
+    """Writes a training into the folder `out`, and its running checkpoint below `resume`, until `finish` deletes it.
+
+    `metadata` says all that decides the weights: it goes into the JSON of both checkpoints, and the running checkpoint
+    is found again by its hash. Anything left in `out` from before is removed.
+    """
+
+    def __init__(self, out: Path, resume: Path, metadata: Mapping[str, Any], keep_every_s: float = KEEP_EVERY_S):
+        self.out, self.metadata, self.keep_every_s = out, dict(metadata), keep_every_s
+        key = hashlib.sha256(json.dumps(self.metadata, sort_keys=True).encode()).hexdigest()
+        self.running = resume / key[:16]
+        self.kept_at = time.monotonic()
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir(parents=True)
+
+    def resume(self, network: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
+        """Put network and optimizer where the running checkpoint left them, if there is one; how far that is."""
+        file = self.running / "running.pt"
+        if not file.exists():
+            return Progress()
+        content = torch.load(file, map_location="cpu", weights_only=True)
+        network.load_state_dict(content["network"])
+        optimizer.load_state_dict(content["optimizer"])
+        progress = Progress(**content["progress"])
+        tqdm.write(f"resuming in epoch {progress.epoch + 1}, from {file}")
+        if progress.history:
+            self._write(progress, network)
+        return progress
+
+    def keep(
+        self, progress: Progress, network: nn.Module, optimizer: torch.optim.Optimizer, at_once: bool = False
+    ) -> None:
+        """Write the running checkpoint if the last one is old enough."""
+        if not at_once and time.monotonic() - self.kept_at < self.keep_every_s:
+            return
+        self.running.mkdir(parents=True, exist_ok=True)
+        content = {
+            "network": network.state_dict(),
+            "optimizer": optimizer.state_dict(),
+            "progress": asdict(progress),
+        }
+        torch.save(content, self.running / "running.pt.tmp")
+        os.replace(self.running / "running.pt.tmp", self.running / "running.pt")
+        self.kept_at = time.monotonic()
+
+    def show(self, batches: Iterable[Batch], progress: Progress, sequences: int, epochs: int) -> Iterator[Batch]:
+        """The batches, behind a progress bar that counts sequences."""
+        with tqdm(
+            total=sequences, initial=progress.sequences, desc=f"epoch {progress.epoch + 1}/{epochs}", unit="sequence"
+        ) as bar:
+            for batch in batches:
+                yield batch
+                bar.update(len(batch.names))
+                bar.set_postfix(loss=f"{progress.sums['total'] / progress.steps:.4f}")
+
+    def end_epoch(self, progress: Progress, network: nn.Module, scores: Mapping[str, float]) -> None:
+        """Close the epoch in `progress` and write checkpoints, history and curves."""
+        progress.end_epoch(network.state_dict(), scores)
+        tqdm.write("  validation: " + "  ".join(f"{name} {value:.4f}" for name, value in scores.items()))
+        self._write(progress, network)
+
+    def finish(self) -> None:
+        """The training is complete: nothing is left to resume."""
+        shutil.rmtree(self.running, ignore_errors=True)
+
+    def _write(self, progress: Progress, network: nn.Module) -> None:
+        last = progress.history[-1]
+        best = best_row(progress.history)
+        save_checkpoint(self.out / "last.safetensors", network.state_dict(), {**self.metadata, **_result(last)})
+        save_checkpoint(self.out / "best.safetensors", progress.best, {**self.metadata, **_result(best)})
+        (self.out / "history.json").write_text(json.dumps(progress.history, indent=2) + "\n")
+        write_curves(self.out / "live", progress.history)
+
+
+def best_row(history: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The epoch with the smallest validation MSE, the first of equals."""
+    return min(history, key=lambda row: row["val"]["mse"])
+
+
+def _result(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {"epoch": row["epoch"], "val": row["val"]}
+
+
+def write_curves(folder: Path, history: Sequence[Mapping[str, Any]]) -> None:
+    """DVCLive's metrics and curves (`dvc plots show`) of every row of `history`, anew.
+
+    From the history and not from DVCLive's own resumption: DVC empties a stage's outputs before it runs it again.
+    """
+    try:
+        live = Live(str(folder), dvcyaml=None, save_dvc_exp=False, monitor_system=False, cache_images=False)
+    except SCMError as error:  # in a git repository without a commit
+        logger.warning("no DVCLive curves in %s (%s); history.json has their values", folder, error)
+        return
+    for row in history:
+        for split in ("train", "val"):
+            for name, value in row[split].items():
+                live.log_metric(f"{split}/{name}", value)
+        live.next_step()
+    live.end()

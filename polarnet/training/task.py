@@ -1,0 +1,118 @@
+"""What is trained on what: the parts of a training that differ from one network to another, and its data."""
+
+import hashlib
+import json
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from polarnet import __version__
+from polarnet.events.frames import FrameStore
+from polarnet.events.representations import Encode
+from polarnet.events.store import EventStore
+from polarnet.events.windows import WindowDataset
+from polarnet.runtime import seed_for
+from polarnet.similarity import Lpips
+from polarnet.training.losses import FrameLoss
+from polarnet.training.sequences import Batch
+
+logger = logging.getLogger(__name__)
+
+BLOCK = 2**20  # bytes
+
+State = list[Tensor] | None
+Network = TypeVar("Network", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What differs between one network's training and another's."""
+
+    network: nn.Module
+    encode: Encode
+    """One polarizer's events in a window, as the network wants them."""
+    streams: Callable[[Batch], tuple[Float[Tensor, "t b c h w"], Float[Tensor, "t b h w"]]]
+    """What the network gets of a batch, and what it should say."""
+    unroll: Callable[[Tensor, State], tuple[Float[Tensor, "t b h w"], State]]
+    """What it says for windows in a row, and its state after them."""
+    loss: FrameLoss
+    description: Mapping[str, Any]
+    """What a checkpoint says of the network and its input: at least "network", "config" and "in_channels"."""
+
+
+class Split(NamedTuple):
+    """Sequences to learn from, and others to see how well it goes."""
+
+    train: WindowDataset
+    val: WindowDataset
+
+
+def open_split(events: str, frames: str, encode: Encode) -> Split:
+    """The training and the validation sequences of the stores; ValueError where either split is empty."""
+    event_store, frame_store = EventStore.open(events), FrameStore.open(frames)
+    names = {split: frame_store.of_split(split) for split in Split._fields}
+    for split, sequences in names.items():
+        if not sequences:
+            raise ValueError(
+                f"{frames} has no sequence in split {split!r}; ingest more pictures or change the fractions"
+            )
+    return Split(**{s: WindowDataset(event_store, frame_store, sequences, encode) for s, sequences in names.items()})
+
+
+def initialised(build: Callable[[], Network], seed: int) -> Network:
+    """A new network whose weights depend on the seed alone, not on what else has drawn random numbers."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed_for(seed, "network", "initial weights"))
+        return build()
+
+
+def lpips_of(folder: Path, weight: float) -> Lpips | None:
+    """The LPIPS network that stage `weights` left in `folder`, if the loss wants it; a warning where there is none."""
+    if weight == 0:
+        return None
+    lpips = Lpips.load(folder)
+    if lpips is None:
+        reason = json.loads((folder / "lpips.json").read_text())["reason"]
+        rule = "!" * 100
+        logger.warning("\n%s\nLPIPS IS LEFT OUT OF THE LOSS: %s\n%s", rule, reason, rule)
+    return lpips
+
+
+def describe(task: Task, split: Split, config: Any, weights: Path, seed: int) -> dict[str, Any]:
+    """All that decides the weights: what the JSON of a checkpoint says, and what the running checkpoint is keyed by."""
+    events, frames = split.train.events, split.train.frames
+    lpips = json.loads((weights / "lpips.json").read_text()) if "lpips" in task.loss.weights else {}
+    return {
+        **task.description,
+        "training": {"seed": seed, **asdict(config)},
+        "loss": dict(task.loss.weights),
+        "lpips": {key: lpips.get(key) for key in ("backbone", "sha256")},
+        "data": {
+            "train_sequences": len(split.train),
+            "val_sequences": len(split.val),
+            "height": events.height,
+            "width": events.width,
+            "events_sha256": content_hash(events.path),
+            "frames_sha256": content_hash(frames.path),
+        },
+        "versions": {"polarnet": __version__, "torch": torch.__version__},
+    }
+
+
+def content_hash(path: str) -> str:
+    """sha256 over the names and bytes of everything at `path`; of the address alone where it is not on this machine."""
+    digest = hashlib.sha256()
+    if not Path(path).exists():
+        digest.update(path.encode())
+    for file in sorted(file for file in [Path(path), *Path(path).rglob("*")] if file.is_file()):
+        digest.update(f"{file.relative_to(path)}\0{file.stat().st_size}\0".encode())
+        with file.open("rb") as content:
+            while block := content.read(BLOCK):
+                digest.update(block)
+    return digest.hexdigest()

@@ -1,0 +1,23 @@
+"""data/scenes.zarr -> data/events.zarr: what an event camera behind each of the four polarizers reports."""
+
+import functools
+from pathlib import Path
+
+from polarnet.cluster import pmap
+from polarnet.config import Config, hydra_stage
+from polarnet.runtime import threads_of
+from polarnet.simulation.dataset import emulate_scenes
+
+
+@hydra_stage
+def main(config: Config) -> None:
+    """Emulate every sequence that the event store does not hold yet."""
+    mapper = functools.partial(pmap, workers=config.runtime.workers, label="emulate", address=config.cluster.address)
+    scenes, events = Path(config.paths.scenes), Path(config.paths.events)
+    threads = threads_of(config.runtime)
+    count = emulate_scenes(scenes, events, config.emulate, config.seed, mapper, threads)
+    print(f"{count} sequences")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,20 @@
+"""Photographs and generated pictures -> data/images: RGB pictures of one size, each with its split."""
+
+import functools
+from pathlib import Path
+
+from polarnet.cluster import pmap
+from polarnet.config import Config, hydra_stage
+from polarnet.simulation.pictures.ingest import ingest
+
+
+@hydra_stage
+def main(config: Config) -> None:
+    """Fill data/images and say what lies there."""
+    mapper = functools.partial(pmap, workers=config.runtime.workers, label="ingest", address=config.cluster.address)
+    manifest = ingest(config.ingest, config.seed, Path(config.paths.images), mapper)
+    print(", ".join(f"{count} {name.replace('_', ' ')}" for name, count in manifest.counts.items()))
+
+
+if __name__ == "__main__":
+    main()

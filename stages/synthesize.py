@@ -1,0 +1,21 @@
+"""data/images -> data/scenes.zarr, data/frames.zarr: scenes of polarized light, motions over them, exact frames."""
+
+import functools
+from pathlib import Path
+
+from polarnet.cluster import pmap
+from polarnet.config import Config, hydra_stage
+from polarnet.simulation.truth import synthesize
+
+
+@hydra_stage
+def main(config: Config) -> None:
+    """Make a scene of every picture and let windows move over it."""
+    mapper = functools.partial(pmap, workers=config.runtime.workers, label="synthesize", address=config.cluster.address)
+    images, scenes, frames = (Path(path) for path in (config.paths.images, config.paths.scenes, config.paths.frames))
+    count = synthesize(images, scenes, frames, config.synthesize, config.seed, mapper)
+    print(f"{count} sequences")
+
+
+if __name__ == "__main__":
+    main()

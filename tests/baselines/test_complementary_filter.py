@@ -1,0 +1,117 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet.baselines.complementary_filter import (
+    ComplementaryFilterConfig,
+    Decay,
+    HighPassConfig,
+    at_rest,
+    integrate,
+    log_intensity_at,
+    reconstruct_cf,
+    reconstruct_highpass,
+)
+from polarnet.events.stream import Events, slice_count
+
+LN2 = math.log(2)
+HALVING_PER_MS_HZ = LN2 / (2 * math.pi * 1e-3)  # the cut-off at which log intensity halves every millisecond
+
+
+def cf_config(cutoff_hz=HALVING_PER_MS_HZ, contrast_on=0.1, contrast_off=-0.1, intensity_range=(-0.1, 1.2)):
+    return ComplementaryFilterConfig(cutoff_hz, contrast_on, contrast_off, list(intensity_range))
+
+
+def highpass_config(cutoff_hz=HALVING_PER_MS_HZ, decay_per_event=LN2, intensity_range=(-0.5, 1.5)):
+    return HighPassConfig(cutoff_hz, decay_per_event, 0.1, -0.1, list(intensity_range))
+
+
+def events_of(*rows, height=2, width=3):
+    """From (t_us, x, y, p)."""
+    columns = zip(*rows, strict=True)
+    types = (torch.int64, torch.int16, torch.int16, torch.int8)
+    return Events(*(torch.tensor(c, dtype=d) for c, d in zip(columns, types, strict=True)), height, width)
+
+
+@pytest.fixture
+def hand_list():
+    """Pixel (1, 2): ON at 1 and 2 ms, OFF at 4 ms. Pixel (0, 0): OFF at 3 ms."""
+    return events_of((1000, 2, 1, 1), (2000, 2, 1, 1), (3000, 0, 0, -1), (4000, 2, 1, -1))
+
+
+def times(*t_us):
+    return torch.tensor(t_us)
+
+
+def test_cf_of_a_hand_worked_event_list(hand_list):
+    found = reconstruct_cf(hand_list, times(500, 2000, 3000, 5000), cf_config())
+    # log intensity of (1, 2): 0 | 0.1 / 2 + 0.1 | 0.15 / 2 | (0.15 / 4 - 0.1) / 2; of (0, 0): 0 | 0 | -0.1 | -0.1 / 4
+    expected = np.zeros((4, 2, 3))
+    expected[:, 1, 2] = [0, 0.15, 0.075, -0.03125]
+    expected[:, 0, 0] = [0, 0, -0.1, -0.025]
+    np.testing.assert_allclose(found, (np.exp(expected) - 1 + 0.1) / 1.3, rtol=0, atol=1e-12)
+
+
+def test_highpass_of_a_hand_worked_event_list(hand_list):
+    found = reconstruct_highpass(hand_list, times(500, 2000, 3000, 5000), highpass_config())
+    # each event halves once more: (1, 2): 0 | 0.1 / 4 + 0.1 | 0.125 / 2 | (0.125 / 8 - 0.1) / 2
+    expected = np.zeros((4, 2, 3))
+    expected[:, 1, 2] = [0, 0.125, 0.0625, -0.0421875]
+    expected[:, 0, 0] = [0, 0, -0.1, -0.025]
+    np.testing.assert_allclose(found, (1.5 * np.exp(expected) - 1 + 0.5) / 2, rtol=0, atol=1e-12)
+
+
+def test_without_a_cutoff_log_intensity_is_the_sum_of_the_steps(hand_list):
+    found = reconstruct_cf(hand_list, times(9_000_000), cf_config(cutoff_hz=0.0, contrast_on=0.3, contrast_off=-0.2))
+    assert found[0, 1, 2].item() == pytest.approx((math.exp(0.4) - 0.9) / 1.3, abs=1e-12)
+
+
+def test_before_any_event_a_filter_shows_log_intensity_zero():
+    none = Events.empty(2, 3)
+    torch.testing.assert_close(
+        reconstruct_cf(none, times(0, 10), cf_config()), torch.full((2, 2, 3), 0.1 / 1.3, dtype=torch.float64)
+    )
+    torch.testing.assert_close(
+        reconstruct_highpass(none, times(0, 10), highpass_config()), torch.full((2, 2, 3), 0.5, dtype=torch.float64)
+    )
+
+
+def test_intensities_outside_the_range_are_clipped():
+    bright = events_of(*((t, 0, 0, 1) for t in range(9)))
+    dark = events_of(*((t, 0, 0, -1) for t in range(9)))
+    assert reconstruct_cf(bright, times(9), cf_config(cutoff_hz=0.0))[0, 0, 0] == 1  # exp(0.9) - 1 = 1.46 > 1.2
+    assert reconstruct_cf(dark, times(9), cf_config(cutoff_hz=0.0))[0, 0, 0] == 0
+
+
+def test_asking_for_more_output_times_changes_no_frame(hand_list):
+    sparse = reconstruct_cf(hand_list, times(5000), cf_config())
+    dense = reconstruct_cf(hand_list, torch.arange(0, 5001, 100), cf_config())
+    assert torch.equal(dense[-1], sparse[0])
+
+
+def test_events_in_two_pieces_leave_the_state_of_one_and_the_old_state_alone(hand_list):
+    decay = Decay(1e-4, 0.06, 0.1, -0.2)
+    whole = integrate(at_rest(2, 3), hand_list, decay)
+    half = integrate(at_rest(2, 3), slice_count(hand_list, 0, 2), decay)
+    kept = half.log_intensity.copy()
+    again = integrate(half, slice_count(hand_list, 2, 4), decay)
+    assert np.array_equal(log_intensity_at(again, 6000, decay), log_intensity_at(whole, 6000, decay))
+    assert np.array_equal(half.log_intensity, kept)
+
+
+def test_an_event_from_the_past_is_refused():
+    with pytest.raises(ValueError, match="older than one its pixel has seen"):
+        integrate(at_rest(2, 3), events_of((5, 0, 0, 1), (4, 0, 0, 1)), Decay(0.0, 0.0, 0.1, -0.1))
+
+
+@pytest.mark.parametrize("bad", [[0.5, 0.5], [1.0, 0.0], [0.0], [0.0, 0.5, 1.0]])
+def test_an_intensity_range_must_rise(bad):
+    with pytest.raises(ValueError, match=r"intensity_range: expected \[low, high\] with low < high"):
+        cf_config(intensity_range=bad)
+
+
+def test_contrasts_of_the_wrong_sign_are_refused():
+    with pytest.raises(ValueError, match=r"contrast_off: expected <= 0, got 0.1"):
+        cf_config(contrast_off=0.1)

@@ -1,0 +1,152 @@
+import csv
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from polarnet.evaluation.score import METRICS, BenchmarkConfig, FrameScore, score_sequence, summary, write_frames
+from polarnet.similarity import Lpips, psnr, ssim
+
+CPU = torch.device("cpu")
+
+
+def row(scene, value, method="m", sequence=None, window=0, lpips=None):
+    scores = dict.fromkeys(METRICS, value) | {"lpips": lpips}
+    return FrameScore(method, scene, sequence or scene, window, 0, **scores)
+
+
+def config(**changes):
+    values = {
+        "methods": ["zeros"],
+        "warmup_windows": 1,
+        "precision": "fp32",
+        "bootstrap_samples": 10,
+        "panel_scenes": 1,
+    }
+    return BenchmarkConfig(**{**values, **changes})
+
+
+def test_a_constant_offset_scores_its_square_as_level(recording):
+    recording = dataclasses.replace(recording, dolp=0.5 * recording.dolp)
+    rows = score_sequence(recording, {"m": recording.dolp + 0.1}, 0, None, CPU)
+    assert [r.window for r in rows] == [0, 1, 2, 3]
+    assert [r.t_us for r in rows] == [1000, 2000, 3000, 4000]
+    for r in rows:
+        assert r.mse == pytest.approx(0.01)
+        assert r.psnr == pytest.approx(20)
+        assert r.level_mse == pytest.approx(0.01)
+        assert r.pattern_mse == pytest.approx(0, abs=1e-9)
+        assert r.corr == pytest.approx(1)
+        assert r.lpips is None
+
+
+def test_rows_hold_the_metrics_of_their_own_frame(make_recording):
+    recording, other = make_recording(seed=1), make_recording(seed=2)
+    rows = score_sequence(recording, {"m": other.dolp}, 1, None, CPU)
+    for r in rows:
+        pair = other.dolp[r.window], recording.dolp[r.window]
+        assert r.ssim == pytest.approx(ssim(*pair).item(), rel=1e-5)
+        assert r.psnr == pytest.approx(psnr(*pair).item(), rel=1e-6)
+
+
+def test_warm_up_windows_count_for_no_method(recording):
+    spoilt = recording.dolp.clone()
+    spoilt[:2] = float("nan")
+    rows = score_sequence(recording, {"a": spoilt, "b": recording.dolp}, 2, None, CPU)
+    assert [(r.method, r.window) for r in rows] == [("a", 2), ("a", 3), ("b", 2), ("b", 3)]
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_frame_that_is_not_a_number_is_named_not_dropped(recording, bad):
+    spoilt = recording.dolp.clone()
+    spoilt[3, 5, 5] = bad
+    with pytest.raises(ValueError, match=r"m on a, window 3: mse is (nan|inf)"):
+        score_sequence(recording, {"m": spoilt}, 0, None, CPU)
+
+
+def test_a_sequence_with_nothing_left_after_the_warm_up_is_refused(recording):
+    with pytest.raises(
+        ValueError, match=r"a has 4 windows and the first 4 are warm-up.*lower benchmark.warmup_windows"
+    ):
+        score_sequence(recording, {"m": recording.dolp}, 4, None, CPU)
+
+
+def test_frames_of_another_size_are_refused(recording):
+    with pytest.raises(ValueError, match=r"m on a: expected frames of \(4, 18, 20\), got \(3, 18, 20\)"):
+        score_sequence(recording, {"m": recording.dolp[:3]}, 0, None, CPU)
+
+
+def test_lpips_in_chunks_is_lpips_frame_by_frame(make_recording):
+    torch.manual_seed(0)
+    lpips = Lpips("squeeze")
+    recording, other = make_recording(windows=10), make_recording(windows=10, seed=1)
+    rows = score_sequence(recording, {"m": other.dolp}, 0, lpips, CPU)
+    for r in rows:
+        k = slice(r.window, r.window + 1)
+        assert r.lpips == pytest.approx(lpips(other.dolp[k], recording.dolp[k]).item(), rel=1e-4)
+
+
+def test_scenes_weigh_alike_however_many_sequences_show_them():
+    rows = [row("x", 1.0, sequence="x1"), row("x", 3.0, sequence="x2"), row("x", 5.0, sequence="x2", window=1)]
+    rows += [row("y", 9.0)]
+    assert summary(rows, 100, 0)["m"]["mse"] == 6.0  # (3 + 9) / 2, not (1 + 3 + 5 + 9) / 4
+
+
+def test_the_interval_is_the_same_every_time_and_shrinks_to_a_single_scene():
+    rows = [row(f"s{i}", float(i)) for i in range(10)]
+    first, again, other = summary(rows, 500, 1), summary(rows, 500, 1), summary(rows, 500, 2)
+    assert first == again
+    assert first["m"]["mse_ci"] != other["m"]["mse_ci"]
+    low, high = first["m"]["mse_ci"]
+    assert 2 < low < 4.5 < high < 7  # +- 1.96 * 2.87 / sqrt(10) = 1.78
+    assert summary(rows[3:4], 500, 1)["m"]["mse_ci"] == [3.0, 3.0]
+
+
+def test_all_methods_see_the_same_resampled_scenes():
+    values = (0.0, 4.0, 2.0)
+    rows = [row(f"s{i}", value, "a") for i, value in enumerate(values)]
+    rows += [row(f"s{i}", value + 1, "b") for i, value in enumerate(values)]
+    table = summary(rows, 200, 0)
+    assert table["b"]["mse_ci"] == pytest.approx([end + 1 for end in table["a"]["mse_ci"]])
+
+
+def test_the_order_of_rows_changes_nothing():
+    rows = [row(f"s{i}", math.sqrt(i), window=k) for i in range(5) for k in range(3)]
+    assert summary(rows, 50, 0) == summary(rows[::-1], 50, 0)
+
+
+def test_lpips_that_was_not_computed_is_null_without_an_interval():
+    table = summary([row("x", 1.0), row("y", 2.0)], 10, 0)["m"]
+    assert table["lpips"] is None
+    assert "lpips_ci" not in table
+    assert summary([row("x", 1.0, lpips=0.5)], 10, 0)["m"]["lpips"] == 0.5
+
+
+def test_a_method_that_lacks_a_scene_is_named():
+    with pytest.raises(ValueError, match=r"b has no score for \['y'\]"):
+        summary([row("x", 1.0, "a"), row("y", 1.0, "a"), row("x", 1.0, "b")], 10, 0)
+
+
+def test_frames_are_written_one_a_line_with_empty_cells_for_what_is_not_known(tmp_path):
+    write_frames(tmp_path / "frames.csv", [row("x", 0.1), row("y", 1 / 3, lpips=0.25)])
+    with (tmp_path / "frames.csv").open() as file:
+        first, second = csv.DictReader(file)
+    assert first["lpips"] == ""
+    assert float(second["mse"]) == 1 / 3
+    assert second["scene"] == "y"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"methods": ["zeros", "magic"]}, "methods: expected one of zeros, train_mean, .*, got"),
+        ({"methods": ["zeros", "zeros"]}, "methods: expected at least one and none twice"),
+        ({"methods": []}, "methods: expected at least one and none twice"),
+        ({"warmup_windows": -1}, "warmup_windows: expected >= 0, got -1"),
+        ({"precision": "fp16"}, "precision: expected one of fp32, bf16, got 'fp16'"),
+    ],
+)
+def test_settings_out_of_range_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        config(**change)

@@ -1,0 +1,128 @@
+"""What can be done to a stream of events."""
+
+import pytest
+
+from polarnet.events.stream import (
+    Events,
+    concatenate,
+    crop,
+    downscale,
+    merge,
+    slice_count,
+    slice_time,
+    validate,
+)
+
+
+def rows(events: Events) -> list[tuple[int, ...]]:
+    return list(zip(*(c.tolist() for c in (events.t, events.x, events.y, events.p)), strict=True))
+
+
+def test_a_time_slice_holds_its_start_but_not_its_stop(make_events):
+    events = make_events([(0, 0, 0, 1), (10, 1, 0, 1), (20, 2, 0, -1), (20, 3, 0, 1), (30, 4, 0, 1)], 1, 5)
+    assert slice_time(events, 10, 20).x.tolist() == [1]
+    assert slice_time(events, 20, 31).x.tolist() == [2, 3, 4]
+    assert len(slice_time(events, 31, 40)) == 0
+
+
+def test_a_count_slice_shares_the_memory_of_the_stream(make_events):
+    events = make_events([(0, 0, 0, 1), (10, 1, 0, 1), (20, 2, 0, -1)], 1, 3)
+    part = slice_count(events, 1, 3)
+    assert part.t.tolist() == [10, 20]
+    assert part.t.data_ptr() == events.t[1:].data_ptr()
+
+
+def test_a_crop_counts_from_its_own_corner(make_events):
+    events = make_events([(0, 4, 3, 1), (1, 5, 3, -1), (2, 7, 5, 1), (3, 8, 3, 1)], 8, 10)
+    assert rows(crop(events, top=3, left=5, height=3, width=3)) == [(1, 0, 0, -1), (2, 2, 2, 1)]
+
+
+def test_a_crop_beyond_the_sensor_is_refused(make_events):
+    with pytest.raises(ValueError, match="rows 3 to 9"):
+        crop(make_events([], 8, 10), top=3, left=0, height=6, width=3)
+
+
+def test_downscaling_by_scaled_coordinates_keeps_every_event(make_events):
+    events = make_events([(0, 0, 0, 1), (1, 1, 0, 1), (2, 2, 3, -1), (3, 3, 2, 1)], 4, 4)
+    assert rows(downscale(events, 2, 2, keep_rate=False)) == [(0, 0, 0, 1), (1, 0, 0, 1), (2, 1, 1, -1), (3, 1, 1, 1)]
+
+
+def test_downscaling_at_one_pixels_rate_needs_four_fine_events_for_a_coarse_one(make_events):
+    """Four pixels that each brighten by one threshold brighten their mean by one threshold."""
+    brighter = [(t, t % 2, t // 2 % 2, 1) for t in range(8)]
+    darker = [(8 + t, t % 2, t // 2 % 2, -1) for t in range(4)]
+    assert rows(downscale(make_events(brighter + darker, 2, 2), 1, 1, keep_rate=True)) == [
+        (3, 0, 0, 1),
+        (7, 0, 0, 1),
+        (11, 0, 0, -1),
+    ]
+
+
+def test_opposite_changes_under_a_coarse_pixel_cancel(make_events):
+    flicker = make_events([(t, t % 2, 0, 1 - 2 * (t % 2)) for t in range(20)], 1, 2)
+    assert len(downscale(flicker, 1, 1, keep_rate=True)) == 0
+
+
+def test_downscaling_works_by_ratios_that_are_no_whole_numbers(make_random_events):
+    """The paper's 240x400 pixels to 120x180."""
+    events = make_random_events(0, 5000, 10_000, 240, 400)
+    coarse = validate(downscale(events, 120, 180, keep_rate=False))
+    assert int(coarse.x.max()) == 179
+    assert int(coarse.y.max()) == 119
+    fewer = downscale(events, 120, 180, keep_rate=True)
+    assert int(fewer.p.sum()) <= int(events.p.sum()) / (240 * 400 / (120 * 180)) + 120 * 180
+
+
+def test_a_sensor_cannot_be_downscaled_to_a_larger_one(make_events):
+    with pytest.raises(ValueError, match="8x10"):
+        downscale(make_events([], 8, 10), 16, 5, keep_rate=False)
+
+
+def test_pieces_of_a_stream_join_to_the_stream(make_random_events):
+    events = make_random_events(1, 100, 1000, 5, 5)
+    parts = [slice_count(events, 0, 30), slice_count(events, 30, 30), slice_count(events, 30, 100)]
+    assert rows(concatenate(parts)) == rows(events)
+
+
+def test_pieces_that_overlap_in_time_are_not_joined_but_merged(make_events):
+    first = make_events([(0, 0, 0, 1), (10, 0, 0, 1)], 1, 2)
+    second = make_events([(5, 1, 0, -1), (10, 1, 0, -1)], 1, 2)
+    with pytest.raises(ValueError, match=r"piece 1 starts at 5 us, before .* 10 us; merge\(\)"):
+        concatenate([first, second])
+    assert rows(merge([first, second])) == [(0, 0, 0, 1), (5, 1, 0, -1), (10, 0, 0, 1), (10, 1, 0, -1)]
+
+
+def test_streams_of_different_sensors_are_not_joined():
+    with pytest.raises(ValueError, match="one sensor"):
+        merge([Events.empty(2, 2), Events.empty(2, 3)])
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ((5, 0, 0, 1), "event 1 of 2: expected a time no earlier than that of the event before, got t=5"),
+        ((10, 3, 0, 1), "event 1 of 2: expected x from 0 to 2, got t=10, x=3"),
+        ((10, -1, 0, 1), "expected x from 0 to 2"),
+        ((10, 0, 2, 1), "expected y from 0 to 1"),
+        ((10, 0, 0, 0), r"expected polarity \+1 or -1, got t=10, x=0, y=0, p=0"),
+    ],
+)
+def test_validate_names_the_first_event_that_cannot_be(make_events, bad, message):
+    with pytest.raises(ValueError, match=message):
+        validate(make_events([(10, 0, 0, 1), bad], 2, 3))
+
+
+def test_validate_hands_back_good_events(make_random_events):
+    events = make_random_events(2, 100, 1000, 5, 5)
+    assert validate(events) is events
+    assert len(validate(Events.empty(1, 1))) == 0
+
+
+def test_columns_of_a_wrong_type_or_length_are_refused(make_events):
+    events = make_events([(0, 0, 0, 1)], 1, 1)
+    with pytest.raises(Exception, match="p"):
+        Events(events.t, events.x, events.y, events.p.float(), 1, 1)
+    with pytest.raises(Exception, match="x"):
+        Events(events.t, events.x.repeat(2), events.y, events.p, 1, 1)
+    with pytest.raises(ValueError, match="sides of 1 to 32767 px, got 0x1"):
+        Events.empty(0, 1)

@@ -1,0 +1,60 @@
+import math
+
+import torch
+
+from polarnet.networks.blocks import ConvGRU, ResidualBlock, UpBlock
+
+
+def only_centres(gru: ConvGRU, from_input: list[float], from_state: list[float], from_reset_state: float) -> None:
+    """Make a one-channel GRU act on each pixel alone: every 3x3 kernel is zero but for its centre."""
+    with torch.no_grad():
+        for convolution, centres in (
+            (gru.from_input, from_input),
+            (gru.from_state, from_state),
+            (gru.from_reset_state, [from_reset_state]),
+        ):
+            convolution.weight.zero_()
+            convolution.weight[:, 0, 1, 1] = torch.tensor(centres)
+        gru.from_input.bias.zero_()
+
+
+def sigmoid(x: float) -> float:
+    return 1 / (1 + math.exp(-x))
+
+
+def test_a_conv_gru_of_one_pixel_is_the_textbook_gru():
+    gru = ConvGRU(1)
+    only_centres(gru, from_input=[0.5, -1.0, 2.0], from_state=[1.0, 0.25], from_reset_state=-0.5)
+    x, state = 0.8, 0.4
+    reset = sigmoid(0.5 * x + 1.0 * state)
+    update = sigmoid(-1.0 * x + 0.25 * state)
+    candidate = math.tanh(2.0 * x - 0.5 * reset * state)
+    expected = (1 - update) * state + update * candidate
+    states, last = gru(torch.full((1, 1, 1, 1), x), torch.full((1, 1, 1, 1), state))
+    assert math.isclose(states.item(), expected, rel_tol=1e-6)
+    assert torch.equal(states, last)
+
+
+def test_a_conv_gru_over_windows_at_once_is_the_same_as_window_by_window():
+    torch.manual_seed(0)
+    gru, x, state = ConvGRU(3), torch.randn(8, 3, 4, 5), torch.randn(2, 3, 4, 5)
+    states, last = gru(x, state)
+    for window, together in zip(x.split(2), states.split(2), strict=True):
+        alone, state = gru(window, state)
+        torch.testing.assert_close(together, alone)
+    torch.testing.assert_close(last, state)
+
+
+def test_a_residual_block_with_zero_weights_is_a_relu():
+    block = ResidualBlock(2)
+    for parameter in block.parameters():
+        torch.nn.init.zeros_(parameter)
+    assert block(torch.tensor([-1.0, 2.0]).view(1, 2, 1, 1)).flatten().tolist() == [0.0, 2.0]
+
+
+def test_a_residual_block_has_two_3x3_convolutions_with_biases():
+    assert sum(p.numel() for p in ResidualBlock(128).parameters()) == 2 * (128 * 128 * 9 + 128)
+
+
+def test_an_up_block_doubles_the_size_and_takes_the_channels_of_its_skip():
+    assert UpBlock(8, 4)(torch.randn(3, 8, 5, 6), skip=torch.randn(3, 4, 10, 12)).shape == (3, 4, 10, 12)

@@ -1,0 +1,75 @@
+import pytest
+import torch
+
+from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig, compress
+
+PAPER = DolpUNetConfig(channels=[32, 64, 128], swin_depth=2, swin_window=5, swin_heads=[2, 4], residual_blocks=2)
+SMALL = DolpUNetConfig(channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1)
+
+
+def small() -> DolpUNet:
+    torch.manual_seed(0)
+    return DolpUNet(SMALL).eval()
+
+
+@torch.no_grad()
+def test_any_height_and_width_come_back_as_they_went_in():
+    for height, width in ((16, 24), (17, 22), (6, 7), (120, 180)):
+        prediction, state = small()(torch.randn(2, 4, height, width))
+        assert prediction.dolp.shape == (2, height, width)
+        assert prediction.aolp is None
+        assert len(state) == 2
+
+
+@torch.no_grad()
+def test_windows_at_once_are_windows_one_by_one_with_the_state_carried():
+    network, windows = small(), torch.randn(5, 2, 4, 12, 20)
+    together, last = network.unroll(windows)
+    state = None
+    for window, expected in zip(windows, together.dolp, strict=True):
+        prediction, state = network(window, state)
+        torch.testing.assert_close(prediction.dolp, expected)
+    torch.testing.assert_close(state, last)
+
+
+@torch.no_grad()
+def test_the_state_remembers_windows_that_are_gone():
+    network, before, now = small(), torch.randn(3, 1, 4, 12, 20), torch.randn(1, 4, 12, 20)
+    _, state = network.unroll(before)
+    assert not torch.allclose(network(now, state)[0].dolp, network(now)[0].dolp)
+
+
+@torch.no_grad()
+def test_streams_of_a_batch_do_not_mix():
+    network, windows = small(), torch.randn(2, 3, 4, 12, 20)
+    together, _ = network.unroll(windows)
+    alone, _ = network.unroll(windows[:, 1:2])
+    torch.testing.assert_close(together.dolp[:, 1:2], alone.dolp, atol=1e-5, rtol=1e-5)
+
+
+def test_the_papers_network_has_this_many_parameters():
+    def count(module: torch.nn.Module) -> int:
+        return sum(p.numel() for p in module.parameters())
+
+    network = DolpUNet(PAPER)
+    assert count(network.c1) == 4 * 32 * 9 + 32
+    assert count(network.g2) == 128 * 9 * 128 * 6 + 3 * 128  # three kernels for the input, three for the state
+    assert count(network.p1) == 32 + 1
+    assert count(network) == 2_339_661
+
+
+def test_every_parameter_has_a_gradient_from_two_windows():
+    network = small()
+    network.unroll(torch.randn(2, 1, 4, 16, 16))[0].dolp.sum().backward()
+    assert [name for name, p in network.named_parameters() if p.grad is None or not p.grad.any()] == []
+
+
+def test_inputs_are_compressed_logarithmically_with_their_sign():
+    torch.testing.assert_close(
+        compress(torch.tensor([[-(torch.e - 1), 0.0, torch.e - 1]])), torch.tensor([[-1.0, 0.0, 1.0]])
+    )
+
+
+def test_heads_that_do_not_divide_the_channels_are_refused():
+    with pytest.raises(ValueError, match="swin_heads: expected a divisor of 64 channels, got 3"):
+        DolpUNetConfig(channels=[32, 64, 128], swin_depth=2, swin_window=5, swin_heads=[3, 4], residual_blocks=2)

@@ -1,0 +1,89 @@
+"""The stages themselves, at toy size, as DVC calls them."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from polarnet.experiments import stage_names
+
+TINY = [
+    "ingest.dead_leaves=4",
+    "ingest.limit=7",
+    "ingest.val_fraction=0.2",
+    "synthesize.duration_s=0.2",
+    "synthesize.window_height=40",
+    "synthesize.window_width=60",
+    "train.epochs=1",
+    "train.bptt_windows=3",
+    "baselines.e2v.epochs=1",
+    "baselines.e2v.bptt_windows=3",
+    "benchmark.warmup_windows=1",
+    "benchmark.bootstrap_samples=20",
+    "benchmark.panel_scenes=1",
+]
+GENERATED = ("images", "scenes.zarr", "frames.zarr", "events.zarr")
+
+
+def run_stage(root: Path, stage: str, data: Path, *overrides: str) -> str:
+    command = [sys.executable, "-m", f"stages.{stage}", *TINY, f"paths.data={data}", f"paths.resume={data / 'resume'}",
+               f"hydra.run.dir={data / 'logs' / stage}", *overrides]  # fmt: skip
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def bytes_of(folder: Path) -> dict[str, str]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+@pytest.fixture(scope="module")
+def data(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the whole pipeline leaves behind, one worker."""
+    folder = tmp_path_factory.mktemp("pipeline") / "data"
+    for stage in stage_names(project_root):
+        run_stage(project_root, stage, folder)
+    return folder
+
+
+def test_the_benchmark_has_a_row_for_every_method_and_says_that_lpips_is_missing(data):
+    metrics = json.loads((data / "benchmark" / "metrics.json").read_text())
+    assert set(metrics) == {"zeros", "train_mean", "oracle_mean", "cf", "highpass", "e2v", "ours"}
+    weights = json.loads((data / "weights" / "lpips.json").read_text())
+    for method, row in metrics.items():
+        assert {"mse", "psnr", "ssim", "lpips", "corr", "ms_per_window"} <= set(row), method
+        assert 0 <= row["mse"] <= 1
+        assert (row["lpips"] is None) == (weights["sha256"] is None)
+    assert metrics["oracle_mean"]["mse"] <= min(metrics["zeros"]["mse"], metrics["train_mean"]["mse"])
+
+
+def test_pictures_are_split_by_source(data):
+    manifest = json.loads((data / "images" / "manifest.json").read_text())
+    splits = [picture["split"] for picture in manifest["pictures"]]
+    assert len(splits) == 7
+    assert set(splits) == {"train", "val", "test"}
+    assert len({picture["sha256"] for picture in manifest["pictures"]}) == len(splits)
+
+
+def test_the_page_needs_no_other_file(data):
+    page = (data / "report" / "index.html").read_text()
+    assert "data:image/png;base64," in page
+    assert 'src="http' not in page
+
+
+def test_the_same_values_give_the_same_bytes_whatever_the_number_of_workers(project_root, data, tmp_path):
+    for stage in ("ingest", "synthesize", "emulate"):
+        run_stage(project_root, stage, tmp_path, "runtime.workers=2", "runtime.threads=1")
+    for name in GENERATED:
+        assert bytes_of(tmp_path / name) == bytes_of(data / name), name
+
+
+def test_a_later_stage_without_its_input_says_which_stage_makes_it(project_root, tmp_path):
+    command = [sys.executable, "-m", "stages.emulate", f"paths.data={tmp_path}", f"hydra.run.dir={tmp_path / 'log'}"]
+    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "run the stage that writes it" in done.stderr

@@ -1,0 +1,95 @@
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from polarnet.reports.maps import (
+    dolp_image,
+    encode_png,
+    event_full_scale,
+    event_image,
+    hue_wheel,
+    intensity_image,
+    polarization_hsv,
+)
+
+RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
+
+
+def pixel(value):
+    return torch.full((1, 1), float(value))
+
+
+@pytest.mark.parametrize(("aolp_deg", "colour"), [(0, RED), (60, GREEN), (120, BLUE), (180, RED)])
+def test_fully_polarized_light_shows_its_angle_as_hue(aolp_deg, colour):
+    assert tuple(polarization_hsv(pixel(1), pixel(1), pixel(math.radians(aolp_deg)))[0, 0]) == colour
+
+
+def test_unpolarized_light_is_grey_whatever_its_angle():
+    assert tuple(polarization_hsv(pixel(1), pixel(0), pixel(1.0))[0, 0]) == WHITE
+    assert tuple(polarization_hsv(pixel(0.2), pixel(0), pixel(1.0))[0, 0]) == (51, 51, 51)
+
+
+def test_no_light_is_black():
+    assert tuple(polarization_hsv(pixel(0), pixel(1), pixel(1.0))[0, 0]) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(("direction_deg", "colour"), [(0, RED), (60, GREEN), (120, BLUE), (180, RED), (240, GREEN)])
+def test_the_wheel_shows_at_each_direction_the_colour_of_that_angle(direction_deg, colour):
+    size = 401
+    wheel = hue_wheel(size)
+    middle, radius = size // 2, 196
+    row = middle - round(radius * math.sin(math.radians(direction_deg)))
+    column = middle + round(radius * math.cos(math.radians(direction_deg)))
+    assert wheel[row, column, :3].astype(int) == pytest.approx(colour, abs=10)
+
+
+def test_the_wheel_is_white_at_its_centre_and_transparent_outside():
+    wheel = hue_wheel(101)
+    assert tuple(wheel[50, 50]) == (255, 255, 255, 255)
+    assert wheel[0, 0, 3] == 0
+
+
+def test_on_is_red_off_is_blue_and_no_event_is_white():
+    on, off, none = event_image(torch.tensor([[3.0, -3.0, 0.0]]), full_scale=3.0)[0].tolist()
+    assert on[0] > max(on[1:])
+    assert off[2] > max(off[:2])
+    assert none == [255, 255, 255]
+
+
+def test_events_beyond_full_scale_saturate():
+    picture = event_image(torch.tensor([[5.0, 50.0]]), full_scale=5.0)
+    assert (picture[0, 0] == picture[0, 1]).all()
+
+
+def test_full_scale_ignores_pixels_without_events_and_a_hot_pixel():
+    events = torch.zeros(1, 1, 10_000)
+    events[0, 0, :1000] = -2.0
+    events[0, 0, 5000] = 900.0
+    assert event_full_scale(events) == 2.0
+
+
+def test_full_scale_of_no_events_is_one():
+    assert event_full_scale(torch.zeros(4, 3, 3)) == 1.0
+
+
+def test_dolp_grows_lighter_in_equal_steps():
+    """Rec. 709 luminance of the colours rises everywhere: the map also reads in grey."""
+    picture = dolp_image(torch.linspace(0, 1, 64)[None]).astype(float)
+    assert (np.diff(picture[0] @ [0.2126, 0.7152, 0.0722]) > 0).all()
+
+
+def test_dolp_and_intensity_outside_their_range_are_clamped():
+    values, clamped = torch.tensor([[-0.5, 1.5]]), torch.tensor([[0.0, 1.0]])
+    assert (dolp_image(values) == dolp_image(clamped)).all()
+    assert intensity_image(values)[0].tolist() == [[0, 0, 0], [255, 255, 255]]
+
+
+def test_a_picture_encodes_to_the_same_bytes_and_back():
+    picture = np.arange(4 * 5 * 3, dtype=np.uint8).reshape(4, 5, 3)
+    data = encode_png(picture)
+    assert data == encode_png(picture.copy())
+    assert not any(chunk in data for chunk in (b"tEXt", b"iTXt", b"tIME"))
+    assert (cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1] == picture).all()

@@ -1,0 +1,75 @@
+import json
+
+import pytest
+
+from polarnet.reports.readme import update_results_blocks
+
+RESULTS = {
+    "repro_minutes": 12.34,
+    "test_minutes": 4.5,
+    "cores": 2,
+    "load": 0.1,
+    "versions": {"python": "3.11", "torch": "2.13.0"},
+    "commit": "abc1234",
+    "machine": "a processor",
+    "metrics": {"zeros": {"mse": 0.1, "psnr": 10.0}, "ours": {"mse": 0.02, "psnr": 17.0}},
+}
+BEFORE = "# title\n\n<!-- results:pipeline -->\n<!-- /results:pipeline -->\n\nafter\n"
+
+
+@pytest.fixture
+def project(tmp_path):
+    (tmp_path / "docs" / "results").mkdir(parents=True)
+    (tmp_path / "docs" / "results" / "pipeline.json").write_text(json.dumps(RESULTS))
+    (tmp_path / "README.md").write_text(BEFORE)
+    return tmp_path
+
+
+def test_the_block_shows_the_committed_results_and_nothing_else_changes(project):
+    assert update_results_blocks(project, check=False) == [project / "README.md"]
+    text = (project / "README.md").read_text()
+    assert text.startswith("# title\n\n<!-- results:pipeline -->\n")
+    assert text.endswith("\n<!-- /results:pipeline -->\n\nafter\n")
+    assert "| ours | **0.0200** | **17.00** |" in text
+    assert "`make repro` took 12.3 minutes and `make test` 4.5 on 2 cores (a processor" in text
+
+
+def test_a_second_update_changes_nothing(project):
+    update_results_blocks(project, check=False)
+    assert update_results_blocks(project, check=False) == []
+
+
+def test_check_reports_drift_and_writes_nothing(project):
+    assert update_results_blocks(project, check=True) == [project / "README.md"]
+    assert (project / "README.md").read_text() == BEFORE
+
+
+def test_check_passes_after_an_update_and_fails_after_an_edit_by_hand(project):
+    update_results_blocks(project, check=False)
+    assert update_results_blocks(project, check=True) == []
+    readme = project / "README.md"
+    readme.write_text(readme.read_text().replace("17.00", "27.00"))
+    assert update_results_blocks(project, check=True) == [readme]
+
+
+def test_documents_below_docs_are_updated_too(project):
+    (project / "docs" / "pipeline.md").write_text(BEFORE)
+    assert project / "docs" / "pipeline.md" in update_results_blocks(project, check=False)
+
+
+def test_a_block_that_is_not_closed_is_an_error(project):
+    (project / "README.md").write_text("<!-- results:pipeline -->\n")
+    with pytest.raises(ValueError, match="close each block"):
+        update_results_blocks(project, check=True)
+
+
+def test_a_block_without_a_renderer_is_an_error(project):
+    (project / "README.md").write_text("<!-- results:dreams -->\n<!-- /results:dreams -->\n")
+    with pytest.raises(ValueError, match="no renderer for results:dreams; there are pipeline"):
+        update_results_blocks(project, check=True)
+
+
+def test_a_block_without_results_says_which_command_measures_them(project):
+    (project / "docs" / "results" / "pipeline.json").unlink()
+    with pytest.raises(FileNotFoundError, match="polarnet measure pipeline"):
+        update_results_blocks(project, check=True)

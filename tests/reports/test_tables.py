@@ -1,0 +1,116 @@
+import math
+
+import pytest
+
+from polarnet.reports.tables import (
+    ERROR_PARTS,
+    PAPER_TABLE_2,
+    as_markdown,
+    as_plain,
+    paper_table,
+    score_table,
+    standing,
+)
+
+SCORES = {
+    "ours": {"mse": 0.02, "psnr": 17.0, "ssim": 0.4, "lpips": None, "corr": 0.6, "ms_per_window": 19.04},
+    "zeros": {"mse": 0.09, "psnr": 11.0, "ssim": 0.1, "lpips": None, "corr": 0.0, "ms_per_window": 0.0},
+    "cf": {"mse": 0.3, "psnr": 7.0, "ssim": 0.05, "lpips": None, "corr": 0.1, "ms_per_window": 9.0},
+}
+
+
+def row(table, method):
+    return next(row for row in table.rows if row.method == method)
+
+
+def test_methods_keep_one_order_whatever_the_file_says():
+    assert [r.method for r in score_table(SCORES).rows] == ["zeros", "cf", "ours"]
+
+
+def test_a_method_without_a_name_follows_under_its_own_key():
+    table = score_table({"e2vid_official": {"mse": 0.1}, "zeros": {"mse": 0.2}})
+    assert [r.label for r in table.rows] == ["zeros", "e2vid_official"]
+
+
+def test_the_lowest_mse_and_the_highest_psnr_are_bold():
+    table = score_table({"cf": {"mse": 0.1, "psnr": 10.0}, "ours": {"mse": 0.2, "psnr": 12.0}})
+    assert [cell.best for cell in row(table, "cf").cells] == [True, False]
+    assert [cell.best for cell in row(table, "ours").cells] == [False, True]
+    assert "| ours | 0.2000 | **12.00** |" in as_markdown(table)
+
+
+def test_values_that_read_the_same_are_bold_together():
+    table = score_table({"cf": {"psnr": 12.001}, "ours": {"psnr": 12.004}})
+    assert [r.cells[0].best for r in table.rows] == [True, True]
+
+
+def test_the_fastest_method_is_not_bold_because_speed_is_no_score():
+    table = score_table(SCORES)
+    assert table.headings[-1] == "ms / window ↓"
+    assert not any(r.cells[-1].best for r in table.rows)
+
+
+def test_arrows_say_which_way_a_metric_improves():
+    assert score_table(SCORES).headings[:3] == ("MSE ↓", "PSNR ↑", "SSIM ↑")
+
+
+def test_a_missing_lpips_is_a_dash_with_the_reason_below():
+    table = score_table(SCORES, lpips_reason="no squeeze weights were found")
+    column = table.headings.index("LPIPS ↓")
+    assert {r.cells[column].text for r in table.rows} == {"-"}
+    assert 'LPIPS "-": no squeeze weights were found' in table.notes
+
+
+def test_a_metric_that_nobody_measured_has_no_column():
+    assert "LPIPS ↓" not in score_table(SCORES).headings
+
+
+def test_a_value_that_is_missing_is_never_the_best():
+    table = score_table({"zeros": {"ssim": None}, "ours": {"ssim": -0.5}})
+    assert row(table, "zeros").cells[0].text == "-"
+    assert row(table, "ours").cells[0].best
+
+
+def test_intervals_stand_below_their_values_with_the_same_decimals():
+    table = score_table({"cf": {"psnr": 7.0}, "ours": {"psnr": 17.0, "psnr_ci": [16.125, 18.0]}})
+    assert "**17.00**<br><sub>16.12 to 18.00</sub>" in as_markdown(table)
+    assert row(table, "cf").cells[0].interval == ""
+
+
+def test_other_columns_can_be_asked_for():
+    scores = {"ours": {"mse": 0.03, "psnr": 15.0, "level_mse": 0.01, "pattern_mse": 0.02}}
+    assert score_table(scores, columns=ERROR_PARTS).headings == ("MSE ↓", "level ↓", "pattern ↓")
+
+
+def test_no_scores_at_all_is_an_error():
+    with pytest.raises(ValueError, match="at least one method"):
+        score_table({})
+
+
+def test_plain_columns_line_up():
+    lines = as_plain(score_table(SCORES)).splitlines()
+    decimal_points = {line.index(".") for line in lines[2:5]}
+    assert decimal_points == {lines[2].index(".")}
+    assert "17.00*" in lines[4]
+
+
+def test_the_papers_table_is_ours_best_everywhere_in_both_experiments():
+    for experiment in ("simulated", "real"):
+        assert all(cell.best for cell in row(paper_table(experiment), "ours").cells)
+        assert set(PAPER_TABLE_2[experiment]) == {"cf", "e2v", "ours"}
+
+
+def test_paper_psnr_is_near_the_psnr_of_the_papers_mse():
+    """-10 log10(MSE) bounds the mean PSNR from below (Jensen); the typed numbers must obey it."""
+    for methods in PAPER_TABLE_2.values():
+        for scores in methods.values():
+            assert scores["psnr"] >= -10 * math.log10(scores["mse"]) - 0.01
+
+
+def test_standing_says_better_or_worse_with_the_difference():
+    lines = standing({"train_mean": {"mse": 0.05, "psnr": 13.0, "ssim": 0.5}, "ours": SCORES["ours"]})
+    assert lines == ["ours against training mean: MSE -0.0300 (better), PSNR +4.00 dB (better), SSIM -0.1000 (worse)."]
+
+
+def test_standing_without_ours_says_nothing():
+    assert standing({"cf": {"mse": 0.1}}) == []

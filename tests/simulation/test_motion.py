@@ -1,0 +1,261 @@
+"""Trajectories keep their promises for all times, and the window sees what the scene holds."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from polarnet.simulation.motion import (
+    MotionConfig,
+    Sine,
+    Trajectory,
+    bilinear,
+    frame_times_us,
+    random_trajectory,
+    render,
+    window_to_scene,
+)
+from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
+from polarnet.stokes import aolp, dolp, intensities_from_stokes
+
+CONFIG = MotionConfig(
+    sequences_per_picture=1,
+    duration_s=1.0,
+    frame_rate_hz=30.0,
+    window_height=120,
+    window_width=180,
+    speed_min_px_s=60.0,
+    speed_max_px_s=200.0,
+    acceleration_max_px_s2=800.0,
+    rotation_max_deg=0.0,
+    zoom_max=1.0,
+)
+STILL = Sine(0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def scene() -> PolarizationScene:
+    return scene_from_rgb(torch.rand(3, 60, 80, generator=torch.Generator().manual_seed(0)))
+
+
+def still(x: float, y: float, roll: float = 0.0, zoom: float = 1.0) -> Trajectory:
+    """A window that stays where it is."""
+    return Trajectory(
+        x,
+        y,
+        (STILL,) * 3,
+        (STILL,) * 3,
+        roll=Sine(roll, 0.0, math.pi / 2),
+        zoom=Sine((zoom - 1) / 2, 0.0, math.pi / 2),
+        speed_px_s=0.0,
+    )
+
+
+def corners(trajectory: Trajectory, config: MotionConfig, t_s: np.ndarray) -> np.ndarray:
+    """Points of the scene, x + iy, under the four corner pixels of the window; the definition, written anew."""
+    pose = trajectory.pose(t_s)
+    half_width, half_height = (config.window_width - 1) / 2, (config.window_height - 1) / 2
+    offsets = np.array([sx * half_width + 1j * sy * half_height for sx in (-1, 1) for sy in (-1, 1)])
+    return pose.x + 1j * pose.y + offsets[:, None] * np.exp(1j * pose.angle) / pose.zoom
+
+
+configs = st.builds(
+    lambda low, ratio, acceleration, roll, zoom, width: dataclasses.replace(
+        CONFIG,
+        speed_min_px_s=low,
+        speed_max_px_s=low * ratio,
+        acceleration_max_px_s2=acceleration,
+        rotation_max_deg=roll,
+        zoom_max=zoom,
+        window_width=width,
+    ),
+    st.floats(10, 100),
+    st.floats(1, 4),
+    st.floats(500, 5000),
+    st.sampled_from([0.0, 5.0, 45.0, 90.0]),
+    st.sampled_from([1.0, 1.2, 4.0]),
+    st.integers(60, 180),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(config=configs, seed=st.integers(0, 2**32))
+def test_no_pixel_of_the_window_ever_leaves_the_scene_or_exceeds_speed_or_acceleration(config, seed):
+    height, width = 400, 600
+    trajectory = random_trajectory(config, height, width, np.random.default_rng(seed))
+    step = 1e-4
+    for start in (-3.0, 0.0, 40.0):  # the promise is for all times, not only for the sequence
+        points = corners(trajectory, config, np.arange(start, start + 1, step))
+        assert points.real.min() >= 0
+        assert points.real.max() <= width - 1
+        assert points.imag.min() >= 0
+        assert points.imag.max() <= height - 1
+        assert np.abs(np.diff(points)).max() / step <= trajectory.speed_px_s * (1 + 1e-6)
+        acceleration = np.abs(np.diff(points, 2)).max() / step**2
+        assert acceleration <= config.acceleration_max_px_s2 * 1.0001 + 0.1  # 0.1: rounding of second differences
+    assert trajectory.speed_px_s <= config.speed_max_px_s
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32))
+def test_the_drawn_peak_speed_is_really_reached_within_the_sequence(seed):
+    trajectory = random_trajectory(CONFIG, 400, 600, np.random.default_rng(seed))
+    t_s = np.linspace(0, 1, 10001)
+    pose = trajectory.pose(t_s)
+    peak = np.hypot(np.diff(pose.x), np.diff(pose.y)).max() * 10000
+    assert peak == pytest.approx(trajectory.speed_px_s, rel=1e-3)
+    assert CONFIG.speed_min_px_s <= trajectory.speed_px_s <= CONFIG.speed_max_px_s
+
+
+def test_motion_is_mostly_drift_and_seldom_stops():
+    t_s = np.linspace(0, 1, 201)
+    relative = []
+    for seed in range(100):
+        trajectory = random_trajectory(CONFIG, 400, 600, np.random.default_rng(seed))
+        pose = trajectory.pose(t_s)
+        relative.append(np.hypot(np.diff(pose.x), np.diff(pose.y)) * 200 / trajectory.speed_px_s)
+    assert np.median(relative) > 0.7
+    assert np.percentile(relative, 1) > 0.1
+
+
+def test_trajectories_of_one_seed_are_the_same_and_of_two_differ():
+    draw = lambda seed: random_trajectory(CONFIG, 400, 600, np.random.default_rng(seed))  # noqa: E731
+    assert draw(1) == draw(1)
+    assert draw(1) != draw(2)
+
+
+def test_a_trajectory_survives_the_way_through_its_vector_to_the_last_bit():
+    config = dataclasses.replace(CONFIG, rotation_max_deg=10.0, zoom_max=1.5)
+    trajectory = random_trajectory(config, 400, 600, np.random.default_rng(0))
+    assert Trajectory.from_vector(trajectory.to_vector()) == trajectory
+    with pytest.raises(ValueError, match="27 coefficients"):
+        Trajectory.from_vector(np.zeros(5))
+
+
+def test_pose_follows_its_closed_form():
+    swing = Sine(10.0, 2.0, 0.0)
+    trajectory = Trajectory(
+        100.0, 50.0, (swing, STILL, STILL), (STILL,) * 3, Sine(0.1, 1.0, 0.0), Sine(0.25, 1.0, 0.0), 20.0
+    )
+    pose = trajectory.pose(np.array([0.0, math.pi / 4, math.pi / 2]))
+    np.testing.assert_allclose(pose.x, [100, 110, 100], atol=1e-12)
+    np.testing.assert_allclose(pose.y, 50)
+    np.testing.assert_allclose(pose.angle, [0, 0.1 / math.sqrt(2), 0.1])
+    np.testing.assert_allclose(pose.zoom, [1.25, 1.25 + 0.25 / math.sqrt(2), 1.5])
+
+
+def test_a_scene_too_small_for_the_window_is_refused():
+    with pytest.raises(ValueError, match=r"scene of 120x300 .* too small: a window of 120x180 .* more than 120x180"):
+        random_trajectory(CONFIG, 120, 300, np.random.default_rng(0))
+    rolled = dataclasses.replace(CONFIG, rotation_max_deg=90.0)
+    with pytest.raises(ValueError, match="more than 216x216"):  # the window's diagonal
+        random_trajectory(rolled, 215, 600, np.random.default_rng(0))
+
+
+def test_a_scene_with_too_little_room_for_the_slowest_motion_is_refused():
+    with pytest.raises(ValueError, match="too little room to reach speed_min_px_s=60"):
+        random_trajectory(CONFIG, 122, 182, np.random.default_rng(0))
+
+
+def test_speed_is_lowered_to_what_a_small_scene_allows():
+    """With 20 pixels of room and 800 px/s^2, sqrt(800 * 20 / 2) = 126 px/s is about the most."""
+    speeds = [random_trajectory(CONFIG, 140, 200, np.random.default_rng(seed)).speed_px_s for seed in range(50)]
+    assert min(speeds) >= 60
+    assert max(speeds) < 150
+
+
+def test_a_frame_lies_at_both_ends_of_every_window():
+    times = frame_times_us(CONFIG)
+    assert len(times) == 31
+    assert times[:3] == [0, 33333, 66667]
+    assert times[-1] == 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"speed_max_px_s": 50.0}, "speed_max_px_s: expected >= speed_min_px_s 60"),
+        ({"duration_s": 0.01}, "duration_s: expected at least one frame"),
+        ({"zoom_max": 0.5}, "zoom_max: expected >= 1"),
+        ({"rotation_max_deg": 120.0}, "rotation_max_deg: expected >= 0 and <= 90"),
+    ],
+)
+def test_a_bad_setting_is_refused_by_name(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(CONFIG, **changes)
+
+
+# -- what the window sees ----------------------------------------------------------------------------------------------
+
+
+def test_a_window_at_whole_pixels_sees_exactly_those_pixels(scene):
+    for top, left in ((0, 0), (7, 11), (40, 50)):
+        seen = render(scene, still(left + 29 / 2, top + 19 / 2), np.zeros(1), 20, 30)[0]
+        assert torch.equal(seen, scene.stokes[:, top : top + 20, left : left + 30])
+
+
+def test_a_motion_by_whole_pixels_is_an_exact_shift(scene):
+    swing = Sine(8.0, math.pi / 2, 0.0)  # 0, 8, 0, -8 pixels after 0, 1, 2, 3 seconds
+    trajectory = Trajectory(40 + 0.5, 30 + 0.5, (swing, STILL, STILL), (STILL,) * 3, STILL, STILL, 13.0)
+    first, second, *_ = render(scene, trajectory, np.arange(2.0), 20, 30)
+    assert torch.equal(first[..., 8:], second[..., :-8])
+
+
+def test_half_way_between_two_pixels_the_window_sees_their_mean(scene):
+    seen = render(scene, still(20.5 + 29 / 2, 10 + 19 / 2), np.zeros(1), 20, 30)[0]
+    left, right = scene.stokes[:, 10:30, 20:50], scene.stokes[:, 10:30, 21:51]
+    torch.testing.assert_close(seen, (left + right) / 2)
+
+
+def test_intensities_of_the_interpolated_light_are_the_interpolated_intensities(scene):
+    """Equation 4 is linear in the Stokes vector: it does not matter which is interpolated."""
+    trajectory = still(20.3 + 29 / 2, 10.8 + 19 / 2)
+    behind = intensities_from_stokes(scene.stokes)
+    expected = torch.stack(
+        [render(PolarizationScene(i.expand(3, -1, -1)), trajectory, np.zeros(1), 20, 30)[0, 0] for i in behind]
+    )
+    torch.testing.assert_close(
+        intensities_from_stokes(render(scene, trajectory, np.zeros(1), 20, 30)[0]), expected, atol=1e-6, rtol=0
+    )
+
+
+def test_a_quarter_turn_of_the_camera_turns_picture_and_polarization(scene):
+    """Rolled by +90 degrees (x axis towards y, down), window column c looks down along the scene's rows."""
+    side = 21
+    seen = render(scene, still(40.0, 30.0, roll=math.pi / 2), np.zeros(1), side, side)[0]
+    patch = scene.stokes[:, 20:41, 30:51]
+    turned = torch.rot90(patch, 1, dims=(1, 2))
+    torch.testing.assert_close(seen[0], turned[0], atol=1e-5, rtol=0)
+    # measured from the camera's axes, every angle is 90 degrees less: S1 and S2 change sign
+    torch.testing.assert_close(seen[1:], -turned[1:], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("roll_deg", [-30.0, 10.0, 45.0])
+def test_a_roll_by_a_lowers_the_angle_of_polarization_by_a(roll_deg):
+    uniform = scene_from_rgb(torch.tensor([0.2, 0.8, 0.2]).view(3, 1, 1).expand(3, 60, 80).contiguous())  # 60 degrees
+    seen = render(uniform, still(40.0, 30.0, roll=math.radians(roll_deg)), np.zeros(1), 20, 30)[0]
+    assert math.degrees(aolp(seen)[0, 0]) == pytest.approx((60 - roll_deg) % 180, abs=1e-3)
+    torch.testing.assert_close(dolp(seen), torch.full((20, 30), 0.75))
+
+
+def test_zoom_2_puts_neighbouring_scene_pixels_two_window_pixels_apart(scene):
+    seen = render(scene, still(40.0, 30.0, zoom=2.0), np.zeros(1), 21, 31)[0]
+    torch.testing.assert_close(seen[:, ::2, 1::2], scene.stokes[:, 25:36, 33:48])
+
+
+def test_the_centre_of_the_window_looks_at_the_pose():
+    left, top, along, across = window_to_scene(100.0, 50.0, 0.3, 1.5, 121, 181)
+    assert left + 90 * along - 60 * across == pytest.approx(100)
+    assert top + 90 * across + 60 * along == pytest.approx(50)
+    assert math.hypot(along, across) == pytest.approx(1 / 1.5)
+
+
+def test_bilinear_is_exact_on_a_plane_that_is_one():
+    rows, columns = np.mgrid[:5, :7].astype(np.float32)
+    plane = 2 * columns + 3 * rows
+    for x, y in ((0.0, 0.0), (1.25, 2.5), (6.0, 4.0), (5.75, 3.5)):
+        assert bilinear(plane, x, y) == 2 * x + 3 * y

@@ -1,0 +1,71 @@
+"""Hue is the angle, saturation the degree, value the intensity."""
+
+import math
+
+import pytest
+import torch
+
+from polarnet.simulation.scene import polarization_from_rgb, scene_from_intensities, scene_from_rgb
+from polarnet.stokes import aolp, dolp, intensities_from_stokes, intensity_behind_polarizer
+
+
+def pixel(*rgb: float) -> torch.Tensor:
+    return torch.tensor(rgb).view(3, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("rgb", "s0", "degree", "angle_deg"),
+    [
+        ((1.0, 0.0, 0.0), 1.0, 1.0, 0),  # red
+        ((1.0, 1.0, 0.0), 1.0, 1.0, 30),
+        ((0.0, 1.0, 0.0), 1.0, 1.0, 60),  # green
+        ((0.0, 1.0, 1.0), 1.0, 1.0, 90),
+        ((0.0, 0.0, 1.0), 1.0, 1.0, 120),  # blue
+        ((1.0, 0.0, 1.0), 1.0, 1.0, 150),
+        ((0.5, 0.25, 0.25), 0.5, 0.5, 0),  # dull red
+        ((0.4, 0.8, 0.4), 0.8, 0.5, 60),
+        ((0.7, 0.7, 0.7), 0.7, 0.0, 0),  # grey
+        ((0.0, 0.0, 0.0), 0.0, 0.0, 0),
+    ],
+)
+def test_a_colour_has_the_angle_of_its_hue_and_the_degree_of_its_saturation(rgb, s0, degree, angle_deg):
+    stokes = scene_from_rgb(pixel(*rgb)).stokes
+    assert stokes[0].item() == pytest.approx(s0, abs=1e-6)
+    assert dolp(stokes).item() == pytest.approx(degree, abs=1e-6)
+    assert aolp(stokes).item() == pytest.approx(math.radians(angle_deg), abs=1e-6)
+
+
+def test_hue_just_below_red_is_an_angle_just_below_180_degrees():
+    angle = math.degrees(polarization_from_rgb(pixel(1.0, 0.0, 0.01))[2].item())
+    assert angle == pytest.approx(180 - 0.3, abs=1e-3)  # 0.01 / 6 of the circle of hues below red
+
+
+def test_no_hue_rounds_up_to_180_degrees():
+    almost_red = torch.tensor([1.0, 0.0, 0.0]).view(3, 1, 1) + torch.tensor([0, 0, 1e-12]).view(3, 1, 1)
+    assert 0 <= polarization_from_rgb(almost_red)[2].item() < math.pi
+
+
+def test_a_red_pixel_is_bright_behind_0_and_dark_behind_90_degrees():
+    intensities = intensities_from_stokes(scene_from_rgb(pixel(1.0, 0.0, 0.0)).stokes).flatten()
+    torch.testing.assert_close(intensities, torch.tensor([1.0, 0.5, 0.0, 0.5]))
+
+
+@pytest.mark.parametrize("angle_deg", [0, 17, 45, 90, 135])
+def test_a_scene_behind_a_polarizer_follows_equation_4(angle_deg):
+    rgb = torch.rand(3, 8, 9, generator=torch.Generator().manual_seed(0))
+    s0, degree, angle = polarization_from_rgb(rgb)
+    theta = math.radians(angle_deg)
+    expected = s0 * (1 - degree) / 2 + s0 * degree * torch.cos(theta - angle) ** 2
+    torch.testing.assert_close(intensity_behind_polarizer(scene_from_rgb(rgb).stokes, theta), expected)
+
+
+def test_measured_intensities_come_back_from_the_scene_they_make():
+    measured = torch.tensor([0.4, 0.3, 0.1, 0.2]).view(4, 1, 1)  # I0 + I90 = I45 + I135
+    torch.testing.assert_close(intensities_from_stokes(scene_from_intensities(measured).stokes), measured)
+
+
+def test_an_unphysical_measurement_is_fully_polarized_at_its_angle():
+    stokes = scene_from_intensities(torch.tensor([0.4, 0.4, 0.0, 0.0]).view(4, 1, 1)).stokes
+    assert dolp(stokes).item() == pytest.approx(1)  # measured: sqrt(2)
+    assert aolp(stokes).item() == pytest.approx(math.pi / 8)
+    assert stokes[0].item() == pytest.approx(0.4)

@@ -1,0 +1,136 @@
+"""The stage in between: pictures in, scenes, trajectories and exact frames out."""
+
+import dataclasses
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from polarnet.events.frames import FrameStore
+from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us
+from polarnet.simulation.pictures.ingest import IngestConfig, ingest
+from polarnet.simulation.scene import scene_from_polarization
+from polarnet.simulation.scenes import SceneStore
+from polarnet.simulation.truth import frames_of, synthesize
+from polarnet.stokes import aolp, dolp, stokes_from_intensities
+
+CONFIG = MotionConfig(
+    sequences_per_picture=2,
+    duration_s=0.2,
+    frame_rate_hz=30.0,
+    window_height=24,
+    window_width=36,
+    speed_min_px_s=60.0,
+    speed_max_px_s=200.0,
+    acceleration_max_px_s2=2000.0,
+    rotation_max_deg=10.0,
+    zoom_max=1.2,
+)
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("ingested")
+    (root / "pictures").mkdir()
+    for i in range(5):
+        coarse = Image.fromarray(np.random.default_rng(i).integers(0, 256, (6, 8, 3), dtype=np.uint8))
+        coarse.resize((120, 80), Image.Resampling.BICUBIC).save(root / "pictures" / f"{i}.png")
+    config = IngestConfig(
+        source="folder",
+        root=str(root / "pictures"),
+        limit=None,
+        dead_leaves=0,
+        height=80,
+        width=120,
+        max_upscale=2.0,
+        val_fraction=0.2,
+        test_fraction=0.2,
+        mosaic="90 45 / 135 0",
+        residual_max=0.1,
+    )
+    logging.disable(logging.WARNING)
+    ingest(config, 1, root / "images", map)
+    logging.disable(logging.NOTSET)
+    return root / "images"
+
+
+def run(images: Path, folder: Path, config: MotionConfig = CONFIG, mapper=map) -> tuple[SceneStore, FrameStore]:
+    synthesize(images, folder / "scenes.zarr", folder / "frames.zarr", config, 1, mapper)
+    return SceneStore.open(folder / "scenes.zarr"), FrameStore.open(folder / "frames.zarr")
+
+
+@pytest.fixture(scope="module")
+def stores(images, tmp_path_factory) -> tuple[SceneStore, FrameStore]:
+    return run(images, tmp_path_factory.mktemp("stores"))
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_every_picture_gets_its_sequences_and_all_of_them_its_split(stores):
+    scenes, frames = stores
+    assert len(scenes.sequences) == len(frames.sequences) == 10
+    assert [len(frames.of_split(split)) for split in ("train", "val", "test")] == [6, 2, 2]
+    for split in ("train", "val", "test"):
+        assert frames.of_split(split) == scenes.of_split(split)
+
+
+def test_the_stored_truth_is_what_the_stored_scene_and_trajectory_show(stores):
+    scenes, frames = stores
+    t_us = frame_times_us(CONFIG)
+    for sequence in scenes.sequences[:3]:
+        record = scenes.read(sequence)
+        scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
+        trajectory = Trajectory.from_vector(record.trajectory.numpy())
+        intensity, degree, angle = frames_of(scene, trajectory, t_us, 24, 36)
+        stored = frames.frames(sequence)
+        assert stored.t_us.tolist() == t_us
+        torch.testing.assert_close(stored.intensity, intensity, atol=1 / 65535, rtol=0)
+        torch.testing.assert_close(stored.dolp, degree, atol=1 / 65535, rtol=0)
+        turn = (stored.aolp - angle + torch.pi / 2) % torch.pi - torch.pi / 2
+        assert turn.abs().max() <= torch.pi / 65536
+
+
+def test_the_truth_follows_from_the_four_intensities_by_equations_1_to_3(stores):
+    _, frames = stores
+    seen = frames.frames(frames.sequences[0])
+    stokes = stokes_from_intensities(seen.intensity)
+    bright = stokes[:, 0] > 0.2
+    torch.testing.assert_close(dolp(stokes)[bright], seen.dolp[bright], atol=3e-4, rtol=0)
+    polarized = bright & (seen.dolp > 0.3)
+    turn = (aolp(stokes) - seen.aolp + torch.pi / 2) % torch.pi - torch.pi / 2
+    assert turn[polarized].abs().max() < 1e-3
+
+
+def test_a_run_killed_half_way_ends_with_the_same_bytes(images, stores, tmp_path):
+    def dies_after_two(function, items):
+        for item in items[:2]:
+            function(item)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(images, tmp_path, mapper=dies_after_two)
+    assert not (tmp_path / "frames.zarr").exists()
+    redone = []
+    run(images, tmp_path, mapper=lambda function, items: redone.extend(items) or [function(item) for item in items])
+    assert len(redone) == 3
+    undisturbed = Path(stores[0].path).parent
+    for name in ("scenes.zarr", "frames.zarr"):
+        assert files(tmp_path / name) == files(undisturbed / name)
+
+
+def test_another_setting_is_not_mixed_with_what_an_interrupted_run_left(images, tmp_path):
+    def dies(function, items):
+        function(items[0])
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(images, tmp_path, mapper=dies)
+    redone = []
+    faster = dataclasses.replace(CONFIG, speed_min_px_s=150.0)
+    run(images, tmp_path, faster, lambda function, items: redone.extend(items) or [function(item) for item in items])
+    assert len(redone) == 5
