@@ -98,6 +98,10 @@ class Config:
         known = [field.name for field in dataclasses.fields(NetworksConfig)]
         if self.network not in known:
             raise ValueError(f"network: expected one of {', '.join(known)}, got {self.network!r}")
+        window = [self.synthesize.window_height, self.synthesize.window_width]
+        for key, crop in (("train.crop", self.train.crop), ("baselines.e2v.crop", self.baselines.e2v.crop)):
+            if crop is not None and (crop[0] > window[0] or crop[1] > window[1]):
+                raise ValueError(f"{key}: expected at most the window of section synthesize, {window}, got {crop}")
 
     @property
     def network_config(self) -> DolpUNetConfig:

@@ -5,12 +5,14 @@ import json
 import os
 import platform
 import re
+import shutil
 import subprocess
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
+from polarnet.reports.provenance import git, processor
 from polarnet.runtime import usable_cores
 
 VERSIONS_OF = ("torch", "numpy", "numba", "zarr", "dvc", "hydra-core")
@@ -20,26 +22,28 @@ STAGE_STARTS = re.compile(r"Running stage '([\w@]+)'")  # what dvc repro prints
 def machine_record(root: Path) -> dict[str, Any]:
     """Where and with what a figure was measured: the keys that every file of docs/results carries."""
     return {
-        "machine": _processor(),
+        "machine": processor(),
         "cores": usable_cores(),
         "load": round(os.getloadavg()[0], 2),
         "versions": {"python": platform.python_version()} | {n: importlib.metadata.version(n) for n in VERSIONS_OF},
-        "commit": _git(root, "rev-parse", "HEAD"),
+        "commit": git(root, "rev-parse", "HEAD"),
     }
 
 
 def measure_pipeline(root: Path) -> Path:
     """Clone HEAD of the project at `root`, time `make repro` and `make test` there; write docs/results/pipeline.json.
 
+    The picture of the README comes from the same run.
+
     Raises RuntimeError when a command fails, when the tree has uncommitted changes (the figures would not belong to
     the commit they name), or when a second `make repro` runs a stage.
     """
-    if _git(root, "status", "--porcelain", "--untracked-files=no"):
+    if git(root, "status", "--porcelain", "--untracked-files=no"):
         raise RuntimeError("the tree has uncommitted changes; commit them first, the figures name a commit")
     record = machine_record(root)
     with tempfile.TemporaryDirectory() as folder:
         clone = Path(folder) / "polarnet"
-        _git(root, "clone", "--quiet", str(root), str(clone))
+        subprocess.run(["git", "clone", "--quiet", str(root), str(clone)], check=True)
         record["setup_minutes"], _ = _timed("setup", clone)
         record["repro_minutes"], record["stage_minutes"] = _timed("repro", clone)
         _, again = _timed("repro", clone)
@@ -48,6 +52,7 @@ def measure_pipeline(root: Path) -> Path:
         record["test_minutes"], _ = _timed("test", clone)
         record["metrics"] = json.loads((clone / "data" / "benchmark" / "metrics.json").read_text())
         record["lpips_reason"] = json.loads((clone / "data" / "weights" / "lpips.json").read_text())["reason"]
+        shutil.copy(clone / "data" / "report" / "overview.png", root / "docs" / "pictures" / "overview.png")
     path = root / "docs" / "results" / "pipeline.json"
     path.write_text(json.dumps(record, indent=2) + "\n")
     return path
@@ -71,19 +76,3 @@ def _timed(target: str, folder: Path) -> tuple[float, dict[str, float]]:
     ends = [start for _, start in marks[1:]] + [ended]
     stages = {name: round((end - start) / 60, 2) for (name, start), end in zip(marks, ends, strict=True)}
     return round((ended - started) / 60, 2), stages
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
-
-
-def _git(root: Path, *arguments: str) -> str:
-    done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError(f"git {arguments[0]}: {done.stderr.strip()}")
-    return done.stdout.strip()

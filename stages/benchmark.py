@@ -4,11 +4,10 @@ import json
 from pathlib import Path
 
 from polarnet.config import Config, hydra_stage
-from polarnet.evaluation.benchmark import Panel, run_benchmark, train_mean_dolp, write_benchmark
+from polarnet.evaluation.benchmark import run_benchmark, train_mean_dolp, write_benchmark
 from polarnet.evaluation.methods import Context
 from polarnet.events.frames import FrameStore
 from polarnet.events.store import EventStore
-from polarnet.reports.figures import PanelScene, comparison_panel
 from polarnet.reports.tables import as_plain, score_table
 from polarnet.runtime import device_of
 from polarnet.similarity import Lpips
@@ -16,7 +15,7 @@ from polarnet.similarity import Lpips
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Recover, score, draw, print."""
+    """Recover, score, print."""
     frames = FrameStore.open(config.paths.frames)
     train_mean = train_mean_dolp(frames, config.benchmark.warmup_windows)
     context = Context(
@@ -35,13 +34,7 @@ def main(config: Config) -> None:
     metrics = write_benchmark(
         folder, benchmark, config.benchmark, config.seed, {"lpips": weights, "train_mean": train_mean}
     )
-    if benchmark.panels:
-        comparison_panel([_row(panel) for panel in benchmark.panels], folder / "panels" / "comparison.png")
     print(as_plain(score_table(metrics, lpips_reason=weights["reason"])))
-
-
-def _row(panel: Panel) -> PanelScene:
-    return PanelScene(panel.scene, panel.events, panel.truth_dolp, panel.dolp)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,8 @@ def main(config: Config) -> None:
     """Write the page; says where it is."""
     paths = ReportPaths(**{f.name: Path(getattr(config.paths, f.name)) for f in dataclasses.fields(ReportPaths)})
     parameters = {name: value for name, value in dataclasses.asdict(config).items() if name not in PLUMBING}
-    command = "dvc repro" if "DVC_STAGE" in os.environ else " ".join(["polarnet run", *sys.argv[1:]])
+    overrides = [override for override in sys.argv[1:] if not override.startswith("hydra.")]
+    command = "dvc repro" if "DVC_STAGE" in os.environ else " ".join(["polarnet run", *overrides])
     run = Run(command, parameters, {"seed": str(config.seed)} | facts(Path(__file__).resolve().parent.parent))
     print(f"the report: {write_report(paths, run, Path(config.paths.report))}")
 

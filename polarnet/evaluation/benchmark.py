@@ -135,10 +135,10 @@ def write_benchmark(
 
 
 def _spread(names: Sequence[str], count: int, scenes: Mapping[str, str]) -> set[str]:
-    """The first sequences of `count` scenes, evenly spread over the split."""
+    """The first sequences of `count` scenes, evenly spread over the split, from its first to its last."""
     first = list({scenes.get(name, name): name for name in reversed(names)}.values())[::-1]
     count = min(count, len(first))
-    return {first[i * len(first) // count] for i in range(count)}
+    return {first[round(i * (len(first) - 1) / max(count - 1, 1))] for i in range(count)}
 
 
 def _panel(recording: Recording, recovered: Mapping[str, Recovered], warmup_windows: int) -> Panel:

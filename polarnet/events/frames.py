@@ -114,14 +114,18 @@ class FrameStore:
         dolp: Float[Tensor, "n h w"],
         aolp: Float[Tensor, "n h w"],
     ) -> None:
-        """Put the frames of a sequence in its row; ValueError for values out of range or times that do not increase."""
+        """Put the frames of a sequence in its row; a sequence that is there already stays as it is.
+
+        ValueError for values out of range or times that do not increase.
+        """
         self._check(t_us, intensity, dolp, aolp)
+        if self._table.is_written("t_us", sequence):
+            return
         values = {
             "intensity": quantise_fraction(intensity),
             "dolp": quantise_fraction(dolp),
             "aolp": quantise_angle(aolp),
         }
-        self._table.erase("t_us", sequence)
         for name, steps in values.items():
             self._table.write(name, sequence, steps)
         self._table.write("t_us", sequence, t_us.numpy())
@@ -137,9 +141,7 @@ class FrameStore:
 
     def of_split(self, split: str) -> list[str]:
         """The sequences of `train`, `val` or `test`, in the store's order."""
-        if split not in SPLITS:
-            raise ValueError(f"expected a split of {', '.join(SPLITS)}, got {split!r}")
-        return [sequence for sequence in self.sequences if self.splits[sequence] == split]
+        return names_of_split(self.splits, split)
 
     def t_us(self, sequence: str) -> Int64[Tensor, " n"]:
         """Times of a sequence's frames, from its start."""
@@ -160,7 +162,12 @@ class FrameStore:
 
     def frames(self, sequence: str) -> Frames:
         """All of a sequence."""
-        return Frames(self.t_us(sequence), self.intensity(sequence), self.dolp(sequence), self.aolp(sequence))
+        t_us = self.t_us(sequence)
+        window = (slice(len(t_us)),)
+        intensity, dolp, aolp = self._table.read_together(
+            [(name, sequence, window) for name in ("intensity", "dolp", "aolp")]
+        )
+        return Frames(t_us, dequantise_fraction(intensity), dequantise_fraction(dolp), dequantise_angle(aolp))
 
     def problems(self, sequence: str) -> list[str]:
         """Damaged or missing data of a sequence."""
@@ -193,6 +200,13 @@ def check_splits(names: Sequence[str], splits: Mapping[str, str]) -> None:
     for name in names:
         if splits.get(name) not in SPLITS:
             raise ValueError(f"expected {name} in one of the splits {', '.join(SPLITS)}, got {splits.get(name)!r}")
+
+
+def names_of_split(splits: Mapping[str, str], split: str) -> list[str]:
+    """The names that are in `split`, in their order; ValueError unless it is train, val or test."""
+    if split not in SPLITS:
+        raise ValueError(f"expected a split of {', '.join(SPLITS)}, got {split!r}")
+    return [name for name, its_split in splits.items() if its_split == split]
 
 
 def verify_frames(path: str | Path) -> list[str]:

@@ -31,7 +31,7 @@ def voxel_grid(events: Events, bins: int) -> Float[Tensor, "bins h w"]:
     window is. Bilinear in time only. Events that all have one time are in bin 0.
     """
     size = events.height * events.width
-    grid = torch.zeros(bins * size)
+    grid = torch.zeros(bins * size, device=events.t.device)
     if len(events):
         elapsed = events.t - events.t[0]
         position = (bins - 1) * elapsed / elapsed[-1].clamp(min=1)
@@ -63,11 +63,11 @@ def time_surface(events: Events, window_us: int) -> Float[Tensor, "h w"]:
     Ages count back from the last event of the channel, which therefore weighs 1. Pixels without an event are 0.
     """
     size = events.height * events.width
-    number = torch.arange(1, len(events) + 1)
-    latest = torch.zeros(size, dtype=torch.int64).scatter_reduce_(0, _pixel(events), number, "amax")  # 0: no event
+    number = torch.arange(1, len(events) + 1, device=events.t.device)
+    latest = number.new_zeros(size).scatter_reduce_(0, _pixel(events), number, "amax")  # 0: no event
     seen = latest > 0
     last = latest[seen] - 1
-    surface = torch.zeros(size)
+    surface = torch.zeros(size, device=events.t.device)
     surface[seen] = events.p[last] * torch.exp((events.t[last] - events.t[-1:]) / window_us)
     return surface.view(events.height, events.width)
 

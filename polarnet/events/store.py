@@ -34,9 +34,9 @@ VERSION = 1
 CHANNELS = len(POLARIZER_ANGLES_DEG)
 LONGEST_US = 2**32 - 2  # 71 minutes: t is uint32, its largest value stands for "nothing here"
 MOST_EVENTS = 2**32  # of the four channels of a sequence
-CHUNK = 2**17  # events; half as many would take a third longer to read as a whole
+CHUNK = 2**18  # events; smaller ones cost Zarr more time than they save, for a window as well as for a whole sequence
 SHARD = 2**22
-MILLISECOND_CHUNK = 2**10
+MILLISECOND_CHUNK = 2**12
 MILLISECOND_SHARD = 2**16
 
 CONVENTIONS = {
@@ -91,19 +91,21 @@ class EventStore:
         return cls(open_table(path, FORMAT, VERSION, _columns))
 
     def write(self, sequence: str, channels: Sequence[Events], duration_us: int) -> None:
-        """Put the four channels (0, 45, 90, 135 degrees) of a sequence in its row, in place of what was there.
+        """Put the four channels (0, 45, 90, 135 degrees) of a sequence in its row.
 
-        ValueError, before anything is written, for events out of order, off the sensor or outside [0, duration_us].
+        A sequence that is there already stays as it is: the store's attributes determine its events. ValueError, before
+        anything is written, for events out of order, off the sensor or outside [0, duration_us].
         """
         self._check(channels, duration_us)
-        counts = [len(channel) for channel in channels]
-        offsets = np.concatenate([[0], np.cumsum(counts)])
-        index = [offset + first_at_millisecond(c.t, duration_us) for offset, c in zip(offsets, channels, strict=False)]
-        self._table.erase("offsets", sequence)
+        if self._table.is_written("offsets", sequence):
+            return
+        offsets = np.cumsum([0, *map(len, channels)])
+        index = [
+            start + first_at_millisecond(c.t, duration_us) for start, c in zip(offsets[:-1], channels, strict=True)
+        ]
         for name in "xytp":
-            column = f"events/{name}"
             values = torch.cat([getattr(channel, name) for channel in channels]).numpy()
-            self._table.write(column, sequence, values.astype(self._table.columns[column].dtype))
+            self._table.write(f"events/{name}", sequence, values)
         self._table.write("ms_to_idx", sequence, np.stack(index))
         self._table.write("duration_us", sequence, np.array(duration_us))
         self._table.write("offsets", sequence, offsets)
@@ -115,10 +117,11 @@ class EventStore:
     def finish(self) -> None:
         """Mark the store complete and move it from PATH.tmp to PATH; ValueError where sequences are missing."""
         refuse_missing(self.path, self.missing())
-        most = max(sum(self.count(sequence)) for sequence in self.sequences)
-        longest = max(_milliseconds(self.duration_us(sequence)) for sequence in self.sequences)
+        offsets = self._table.read_together([("offsets", sequence, ()) for sequence in self.sequences])
+        durations = self._table.read_together([("duration_us", sequence, ()) for sequence in self.sequences])
+        most, longest_us = max(int(row[-1]) for row in offsets), max(map(int, durations))
         columns = {f"events/{name}": (most,) for name in "xytp"}
-        self._table.finish({**columns, "ms_to_idx": (CHANNELS, longest)})
+        self._table.finish({**columns, "ms_to_idx": (CHANNELS, _milliseconds(longest_us))})
 
     def duration_us(self, sequence: str) -> int:
         """Length of a sequence in microseconds."""
@@ -153,12 +156,13 @@ class EventStore:
             index = self._table.read("ms_to_idx", sequence, slice(CHANNELS), slice(_milliseconds(duration_us)))
         except ValueError as error:
             return [str(error)]
-        if len(unreadable := self._unreadable_columns(sequence, int(offsets[-1]))):
+        if unreadable := self._unreadable_columns(sequence, int(offsets[-1])):
             return unreadable
         problems = []
-        for angle, start, stop, row in zip(POLARIZER_ANGLES_DEG, offsets, offsets[1:], index, strict=False):
+        spans = list(itertools.pairwise(offsets.tolist()))
+        channels = self._events(sequence, spans)
+        for angle, (start, _), channel, row in zip(POLARIZER_ANGLES_DEG, spans, channels, index, strict=True):
             where = f"{self.path}: {sequence}, polarizer {angle}: "
-            (channel,) = self._events(sequence, [(int(start), int(stop))])
             try:
                 _check_channel(channel, duration_us)
             except ValueError as error:

@@ -73,7 +73,7 @@ def validate(events: Events) -> Events:
 
 def slice_time(events: Events, start_us: int, stop_us: int) -> Events:
     """Events with start <= t < stop."""
-    start, stop = torch.searchsorted(events.t, torch.tensor([start_us, stop_us])).tolist()
+    start, stop = torch.searchsorted(events.t, events.t.new_tensor([start_us, stop_us])).tolist()
     return slice_count(events, start, stop)
 
 

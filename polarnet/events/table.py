@@ -13,6 +13,7 @@ import json
 import os
 import shutil
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,22 +72,25 @@ class Table:
         """
         array, number = self._arrays[name], self._number(name, row)
         sides = (array.shards or array.chunks)[1:]
-        whole = [min(-(-n // side) * side, size) for n, side, size in zip(values.shape, sides, array.shape[1:])]
+        whole = [
+            min(-(-n // side) * side, size) for n, side, size in zip(values.shape, sides, array.shape[1:], strict=True)
+        ]
         padded = np.full(whole, self.columns[name].fill, array.dtype)
         padded[tuple(slice(n) for n in values.shape)] = values
-        place: tuple[int | slice, ...] = (number, *(slice(n) for n in whole))
+        window = tuple(slice(n) for n in whole)
+        place: tuple[int | slice, ...] = (number, *window)
         array[place] = padded
-        folder, written = Path(self.path, name), set(self._files(name, row, place[1:]))
+        folder, written = Path(self.path, name), self._files(name, row, window)
         for file in (folder / "c" / str(number)).rglob("*"):
             if file.is_file() and file.suffix != ".partial" and file.relative_to(folder).as_posix() not in written:
                 file.unlink(missing_ok=True)
 
     def is_written(self, name: str, row: str) -> bool:
-        """Whether a row of a column is on disk, for a row that is a single file."""
+        """Whether a row of a local column of single files is there."""
         return all((Path(self.path, name) / key).exists() for key in self._files(name, row, ()))
 
     def read(self, name: str, row: str, *window: slice) -> np.ndarray:
-        """A row, or the `window` of it; ValueError that names row and column where it is damaged or not there."""
+        """A row, or the `window` of it; ValueError that names row and column where it cannot be read."""
         return self.read_together([(name, row, window)])[0]
 
     def read_together(self, requests: Sequence[tuple[str, str, tuple[slice, ...]]]) -> list[np.ndarray]:
@@ -161,9 +165,11 @@ class Table:
 
 def check_names(names: Sequence[str]) -> None:
     """ValueError unless there is at least one name and none comes twice."""
-    repeated = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
-    if not names or repeated:
-        raise ValueError(f"expected at least one name, each once, got {'none' if not names else f'{repeated} again'}")
+    if not names:
+        raise ValueError("expected at least one name, got none")
+    repeated = [name for name, times in Counter(names).items() if times > 1]
+    if repeated:
+        raise ValueError(f"expected each name once, got {', '.join(repeated[:8])} again")
 
 
 def refuse_missing(path: str, missing: Sequence[str]) -> None:

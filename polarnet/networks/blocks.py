@@ -78,9 +78,7 @@ class UpBlock(nn.Module):
         self.narrow = nn.Conv2d(inputs, outputs, kernel_size=1)
         self.smooth = conv3x3(outputs, outputs)
 
-    def forward(
-        self, x: Float[Tensor, "n c h w"], skip: Float[Tensor, "n d 2*h 2*w"]
-    ) -> Float[Tensor, "n d 2*h 2*w"]:
+    def forward(self, x: Float[Tensor, "n c h w"], skip: Float[Tensor, "n d 2*h 2*w"]) -> Float[Tensor, "n d 2*h 2*w"]:
         """`skip` has the channels and the size of the result."""
         enlarged = F.interpolate(self.narrow(x), scale_factor=2, mode="bilinear")
         return F.relu(self.smooth(enlarged + skip))

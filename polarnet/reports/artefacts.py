@@ -15,12 +15,14 @@ from torch import Tensor
 from polarnet.events.frames import FrameStore
 from polarnet.events.store import EventStore
 from polarnet.reports.figures import Curve
+from polarnet.reports.maps import polarization_hsv
 from polarnet.reports.overview import Overview
 from polarnet.simulation.motion import Pose, Trajectory, window_to_scene
-from polarnet.simulation.pictures.manifest import Manifest, read_manifest
+from polarnet.simulation.pictures.manifest import SPLITS, Manifest, read_manifest
 from polarnet.simulation.scenes import SceneStore
 
-OVERVIEW_US = 150_000  # of events in the overview: enough to see edges move
+THUMBNAIL_WIDTH = 208  # pixels, twice the size shown
+MOST_THUMBNAILS = 24  # of a split
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ class Panel(NamedTuple):
     """One window of one test sequence, as the benchmark kept it; `dolp` and `aolp` by method."""
 
     sequence: str
+    generated: bool
+    """Whether its picture is one of the dead leaves."""
     window: int
     t_us: int
     events: Float[Tensor, "4 h w"]
@@ -63,6 +67,13 @@ class Panel(NamedTuple):
     truth_s0: Float[Tensor, "h w"]
     dolp: Mapping[str, Float[Tensor, "h w"]]
     aolp: Mapping[str, Float[Tensor, "h w"]]
+
+
+class Thumbnail(NamedTuple):
+    """A picture of data/images, small; one of measured polarization as hue, saturation and value."""
+
+    name: str
+    picture: UInt8[np.ndarray, "h w 3"]
 
 
 class EventRate(NamedTuple):
@@ -97,8 +108,9 @@ class Artefacts:
     e2v: History
     rates: Sequence[EventRate]
     overview: Overview | None
-    """None where the benchmark kept no panel."""
-    images: Path
+    """None where the benchmark kept no panel of the network."""
+    thumbnails: Mapping[str, Sequence[Thumbnail]]
+    """By split; photographs first, the first `MOST_THUMBNAILS` of them."""
 
     @property
     def lpips_reason(self) -> str | None:
@@ -109,10 +121,17 @@ class Artefacts:
 def read_artefacts(paths: ReportPaths) -> Artefacts:
     """Everything under `paths`; FileNotFoundError that says which stage to run."""
     paths.check()
-    frames, events = FrameStore.open(paths.frames), EventStore.open(paths.events)
+    scenes, frames, events = (
+        SceneStore.open(paths.scenes),
+        FrameStore.open(paths.frames),
+        EventStore.open(paths.events),
+    )
     manifest = read_manifest(paths.images)
-    panels = [_panel(file) for file in sorted((paths.benchmark / "panels").glob("*.npz"))]
-    shown = next((panel for panel in panels if "ours" in panel.dolp), None)
+    pictures = sorted(manifest.pictures, key=lambda entry: entry.source == "dead_leaves")  # photographs first
+    generated = {entry.name for entry in pictures if entry.source == "dead_leaves"}
+    files = sorted((paths.benchmark / "panels").glob("*.npz"))
+    panels = [_panel(file, scenes.picture_of[file.stem] in generated) for file in files]
+    panels.sort(key=lambda panel: panel.generated)
     return Artefacts(
         manifest=manifest,
         metrics=_json(paths.benchmark / "metrics.json"),
@@ -121,8 +140,10 @@ def read_artefacts(paths: ReportPaths) -> Artefacts:
         ours=read_history(paths.train / "history.json"),
         e2v=read_history(paths.train_e2v / "history.json"),
         rates=event_rates(events, frames),
-        overview=None if shown is None else overview_of(shown, paths, frames, events),
-        images=paths.images,
+        overview=next((overview_of(panel, scenes, frames, events) for panel in _telling(panels)), None),
+        thumbnails={
+            split: thumbnails([entry.name for entry in pictures if entry.split == split], scenes) for split in SPLITS
+        },
     )
 
 
@@ -143,7 +164,7 @@ def read_history(path: Path) -> History:
 def event_rates(events: EventStore, frames: FrameStore) -> list[EventRate]:
     """How many events each split has; a split without sequences is left out."""
     rates = []
-    for split in ("train", "val", "test"):
+    for split in SPLITS:
         names = [name for name in frames.of_split(split) if name in set(events.sequences)]
         if names:
             seconds = sum(events.duration_us(name) for name in names) / 1e6
@@ -153,19 +174,19 @@ def event_rates(events: EventStore, frames: FrameStore) -> list[EventRate]:
     return rates
 
 
-def overview_of(panel: Panel, paths: ReportPaths, frames: FrameStore, events: EventStore) -> Overview:
-    """A panel's sequence from photograph to recovered DoLP, with the events that lead up to the panel's window."""
-    scenes = SceneStore.open(paths.scenes)
+def overview_of(panel: Panel, scenes: SceneStore, frames: FrameStore, events: EventStore) -> Overview:
+    """A panel's sequence from picture to the DoLP recovered from the events of its window."""
     record = scenes.read(panel.sequence)
-    picture = next(entry for entry in read_manifest(paths.images).pictures if entry.name == record.picture)
-    start_us = max(0, panel.t_us - OVERVIEW_US)
-    pose = Trajectory.from_vector(record.trajectory.numpy()).pose(np.linspace(start_us, panel.t_us, 50) / 1e6)
+    start_us = int(frames.t_us(panel.sequence)[panel.window])
+    trajectory = Trajectory.from_vector(record.trajectory.numpy())
+    path = trajectory.pose(np.linspace(0, record.duration_us / 1e6, 200))
     size = np.array([[record.s0.shape[1]], [record.s0.shape[0]]])
     return Overview(
         name=panel.sequence,
-        photograph=read_thumbnail(paths.images / picture.file, width=600),
-        path=np.stack([pose.x, pose.y]) / size,
-        outline=_outline(pose, scenes.window_height, scenes.window_width) / size,
+        picture=polarization_hsv(record.s0, record.dolp, record.aolp),
+        path=np.stack([path.x, path.y]) / size,
+        outline=_outline(trajectory.pose(np.array([panel.t_us / 1e6])), scenes.window_height, scenes.window_width)
+        / size,
         intensity=frames.intensity(panel.sequence)[panel.window + 1],
         dolp=panel.truth_dolp,
         aolp=panel.truth_aolp,
@@ -176,24 +197,32 @@ def overview_of(panel: Panel, paths: ReportPaths, frames: FrameStore, events: Ev
     )
 
 
-def read_thumbnail(path: Path, width: int) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture of data/images as 8-bit RGB, `width` pixels wide."""
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise FileNotFoundError(f"{path}: expected the picture that manifest.json names; run the stage ingest again")
-    height = round(picture.shape[0] * width / picture.shape[1])
-    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)[..., ::-1].astype(np.uint8)
+def thumbnails(pictures: Sequence[str], scenes: SceneStore) -> list[Thumbnail]:
+    """The first `MOST_THUMBNAILS` of these pictures, from the scenes that they became."""
+    sequence_of = {picture: sequence for sequence, picture in reversed(scenes.picture_of.items())}
+    found = []
+    for picture in pictures[:MOST_THUMBNAILS]:
+        scene = scenes.read(sequence_of[picture])
+        rgb = polarization_hsv(scene.s0, scene.dolp, scene.aolp)
+        size = (THUMBNAIL_WIDTH, round(THUMBNAIL_WIDTH * rgb.shape[0] / rgb.shape[1]))
+        found.append(Thumbnail(picture, cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).astype(np.uint8)))
+    return found
+
+
+def _telling(panels: Sequence[Panel]) -> list[Panel]:
+    """Panels of the network, those whose true DoLP varies most first; dead leaves come after photographs."""
+    shown = [panel for panel in panels if "ours" in panel.dolp]
+    return sorted(shown, key=lambda panel: (panel.generated, -float(panel.truth_dolp.std())))
 
 
 def _outline(pose: Pose, height: int, width: int) -> Float[np.ndarray, "2 corners"]:
-    """Corners of the window at the last pose, in pixels of the scene; the first one twice, to close the line."""
-    last = (pose.x[-1], pose.y[-1], pose.angle[-1], pose.zoom[-1])
-    left, top, along, across = window_to_scene(*last, height, width)
+    """Corners of the window at the first pose, in pixels of the scene; one of them twice, to close the line."""
+    left, top, along, across = window_to_scene(*(float(column[0]) for column in pose), height, width)
     columns, rows = np.array([[0, width, width, 0, 0], [0, 0, height, height, 0]])
     return np.stack([left + columns * along - rows * across, top + columns * across + rows * along])
 
 
-def _panel(file: Path) -> Panel:
+def _panel(file: Path, generated: bool) -> Panel:
     with np.load(file) as arrays:
         tensors = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
 
@@ -202,6 +231,7 @@ def _panel(file: Path) -> Panel:
 
     return Panel(
         sequence=file.stem,
+        generated=generated,
         window=int(tensors["window"]),
         t_us=int(tensors["t_us"]),
         events=tensors["events"],

@@ -14,13 +14,15 @@ import numpy as np
 from cycler import cycler
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from torch import Tensor
 
 from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image
-from polarnet.reports.tables import COLUMNS, METHODS, in_order
+from polarnet.reports.tables import COLUMNS, METHODS, TRIVIAL, in_order
 from polarnet.similarity import mse, psnr
 
 DOTS_PER_INCH = 160
@@ -49,6 +51,9 @@ METHOD_COLOURS = {
     "e2v": "#3d8fd9",
     "ours": "#d6336c",
 }
+TERMS = {"mse": "MSE", "mae": "MAE", "ssim": "1 - SSIM", "lpips": "LPIPS"}
+"""Terms of a loss as a legend shows them."""
+
 OTHER_COLOUR = "#4aa37c"
 
 
@@ -79,10 +84,13 @@ def png(figure: Figure) -> bytes:
 
 
 def comparison_panel(rows: Sequence[PanelScene], path: Path, theme: Theme = LIGHT) -> None:
-    """Write a picture like the paper's Fig. 10: a row a scene; events, truth and each method; MSE and PSNR below."""
+    """Write a picture like the paper's Fig. 10: a row a scene; events, truth and each method; MSE and PSNR below.
+
+    Methods that answer with one value everywhere are left out.
+    """
     if not rows:
         raise ValueError("a comparison panel needs at least one scene, got none")
-    methods = in_order(rows[0].recovered)
+    methods = [method for method in in_order(rows[0].recovered) if method not in TRIVIAL]
     height, width = rows[0].truth.shape
     grid = _TileGrid(len(rows), 2 + len(methods), tile_width=1.35, aspect=height / width)
     figure = _figure(grid.size, theme)
@@ -101,7 +109,7 @@ def comparison_panel(rows: Sequence[PanelScene], path: Path, theme: Theme = LIGH
             if j == 0:
                 axes.set_ylabel(_short(row.name), color=theme.quiet, fontsize=6)
     bar_axes = figure.add_axes(grid.beside())
-    _colour_bar(figure, bar_axes, theme, "vertical", label_size=6)
+    _colour_bar(figure, bar_axes, theme, "vertical", label_size=6.0)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(png(figure))
 
@@ -113,7 +121,13 @@ def training_curves(loss: Sequence[Curve], validation: Sequence[Curve], validati
         left, right = figure.subplots(1, 2)
         for axes, curves, label in ((left, loss, "training loss"), (right, validation, validation_label)):
             for curve in curves:
-                axes.plot([e + 1 for e in curve.epochs], curve.values, marker="o", markersize=3, label=curve.label)
+                axes.plot(
+                    [e + 1 for e in curve.epochs],
+                    curve.values,
+                    marker="o",
+                    markersize=3,
+                    label=TERMS.get(curve.label, curve.label),
+                )
             axes.set_xlabel("epoch")
             axes.set_title(label, loc="left", fontsize=9)
             axes.xaxis.get_major_locator().set_params(integer=True)
@@ -121,6 +135,7 @@ def training_curves(loss: Sequence[Curve], validation: Sequence[Curve], validati
                 axes.legend(frameon=False, fontsize=7, labelcolor=theme.text)
         if all(value > 0 for curve in loss for value in curve.values):
             left.set_yscale("log")
+            _plain_log_ticks(left.yaxis)
     return figure
 
 
@@ -139,6 +154,7 @@ def score_distribution(per_scene: Mapping[str, Mapping[str, Sequence[float]]], t
             axes.set_title(COLUMNS[metric].heading, loc="left", fontsize=9)
             if metric == "mse":
                 axes.set_xscale("log")  # errors of good and bad methods differ by an order of magnitude
+                _plain_log_ticks(axes.xaxis)
             axes.set_yticks(range(len(methods)), [METHODS.get(m, m) for m in methods])
             axes.set_ylim(len(methods) - 0.4, -0.6)
             axes.grid(axis="y", visible=False)
@@ -156,7 +172,7 @@ def dolp_bar(theme: Theme) -> Figure:
     """The legend of `maps.dolp_image`."""
     figure = _figure((2.1, 0.32), theme)
     axes = figure.add_axes((0.06, 0.6, 0.88, 0.38))
-    _colour_bar(figure, axes, theme, "horizontal", label_size=8)
+    _colour_bar(figure, axes, theme, "horizontal", label_size=8.0)
     return figure
 
 
@@ -238,6 +254,13 @@ def _colour_bar(figure: Figure, axes: Axes, theme: Theme, orientation: str, labe
     bar = figure.colorbar(ScalarMappable(cmap=DOLP_COLOURS), cax=axes, orientation=orientation, ticks=[0, 0.5, 1])
     bar.ax.tick_params(labelsize=label_size, length=2, pad=2, colors=theme.quiet)
     bar.outline.set_visible(False)
+
+
+def _plain_log_ticks(axis: Axis) -> None:
+    """1, 2 and 5 of each decade, written out: 0.05, not 5 x 10^-2."""
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_locator(NullLocator())
 
 
 def _strip(axes: Axes, position: int, values: Sequence[float], method: str, theme: Theme) -> None:

@@ -1,4 +1,4 @@
-"""One picture of the whole method: photograph, polarization, four polarizers, four event streams, recovered DoLP."""
+"""The whole method in one figure: photograph, polarization, four polarizers, four event streams, recovered DoLP."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,25 +20,24 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 ON, OFF = "#d0312d", "#1f5fb8"
 MOST_EVENTS = 25_000  # drawn per stream; beyond, every k-th event
-
 # The sheet, in inches. README pages show it about 900 pixels wide: hence few columns and large letters.
 HEIGHT = 4.45
 TOP, BOTTOM = 4.0, 0.2
 GAP = 0.12
 LARGE, MEDIUM, SMALL = ((TOP - BOTTOM - (rows - 1) * GAP) / rows for rows in (2, 3, 4))  # heights of the pictures
 MARGIN = 0.15
-ARROW = 0.6
-PHOTOGRAPH_WIDTH = 2.0
+ARROW = 0.68
+PICTURE_WIDTH = 2.0
 STREAM_WIDTH = 2.1
 
 
 class Overview(NamedTuple):
-    """One test sequence, from the photograph it moved over to what the network made of one of its windows."""
+    """One test sequence, from the picture it moved over to what the network made of one of its windows."""
 
     name: str
-    photograph: UInt8[np.ndarray, "height width 3"]
+    picture: UInt8[np.ndarray, "height width 3"]
     path: Float[np.ndarray, "2 times"]
-    """Of the window's centre while the events fell: x and y in fractions of the photograph's width and height."""
+    """Of the window's centre over the whole sequence: x and y in fractions of the picture's width and height."""
     outline: Float[np.ndarray, "2 corners"]
     """Of the window at the end, in the same fractions."""
     intensity: Float[Tensor, "4 h w"]
@@ -61,11 +60,11 @@ def overview_figure(overview: Overview) -> Figure:
     """The method from left to right, drawn from the data of one sequence."""
     height, width = overview.dolp.shape
     with matplotlib.rc_context(chart_style(LIGHT)):
-        pictures = (LARGE + MEDIUM + SMALL) * width / height + PHOTOGRAPH_WIDTH + STREAM_WIDTH
+        pictures = (LARGE + MEDIUM + SMALL) * width / height + PICTURE_WIDTH + STREAM_WIDTH
         figure = Figure(figsize=(pictures + 4 * ARROW + 2 * MARGIN, HEIGHT), facecolor=LIGHT.face)
         x = MARGIN
-        _photograph(figure, x, overview)
-        x = _arrow(figure, x + PHOTOGRAPH_WIDTH, "HSV")
+        _source(figure, x, overview)
+        x = _arrow(figure, x + PICTURE_WIDTH, "HSV")
         _heading(figure, x, "polarization")
         full = torch.ones_like(overview.dolp)
         _picture(figure, x, _row(0, MEDIUM), MEDIUM, dolp_image(overview.dolp), "DoLP")
@@ -115,12 +114,12 @@ def _picture(figure: Figure, x: float, y: float, height: float, picture: np.ndar
     return axes
 
 
-def _photograph(figure: Figure, x: float, overview: Overview) -> None:
-    """The photograph with the window's way over it, and below how its colours are read."""
-    rows, columns = overview.photograph.shape[:2]
-    height = PHOTOGRAPH_WIDTH * rows / columns
-    _heading(figure, x, "photograph")
-    axes = _picture(figure, x, TOP - height, height, overview.photograph)
+def _source(figure: Figure, x: float, overview: Overview) -> None:
+    """The picture with the window's way over it, and below how its colours are read."""
+    rows, columns = overview.picture.shape[:2]
+    height = PICTURE_WIDTH * rows / columns
+    _heading(figure, x, "picture")
+    axes = _picture(figure, x, TOP - height, height, overview.picture)
     for line in (overview.outline, overview.path):
         across, down = line * np.array([[columns], [rows]])
         axes.plot(across, down, color="black", linewidth=2.4, alpha=0.6)
@@ -136,7 +135,7 @@ def _photograph(figure: Figure, x: float, overview: Overview) -> None:
         wheel.text(across, up, angle, transform=wheel.transAxes, ha=sideways, va=upright, color=LIGHT.quiet, fontsize=9)
     text = "hue → AoLP\nsaturation → DoLP\nvalue → S0"
     style: dict[str, Any] = {"color": LIGHT.quiet, "fontsize": 9.5, "ha": "center", "va": "center", "linespacing": 1.5}
-    _text(figure, x + PHOTOGRAPH_WIDTH / 2, 0.52, text, **style)
+    _text(figure, x + PICTURE_WIDTH / 2, 0.52, text, **style)
 
 
 def _arrow(figure: Figure, x: float, text: str) -> float:
@@ -151,10 +150,10 @@ def _arrow(figure: Figure, x: float, text: str) -> float:
 
 def _cloud(axes: Axes, events: Events, overview: Overview) -> None:
     """Events in space and time: the sensor seen from the side, time running to the right."""
-    step = -(-len(events) // MOST_EVENTS) or 1
+    step = max(1, -(-len(events) // MOST_EVENTS))
     t, x, y, p = (column.numpy(force=True)[::step] for column in (events.t, events.x, events.y, events.p))
     across, up = _oblique((t - overview.start_us) / overview.duration_us, x / events.width, y / events.height)
-    axes.scatter(across, up, s=0.35, c=np.where(p > 0, ON, OFF), alpha=0.5, linewidths=0)
+    axes.scatter(across, up, s=0.4, c=np.where(p > 0, ON, OFF), alpha=0.5, linewidths=0)
     for time in (0.0, 1.0):
         corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]], dtype=float)
         axes.plot(*_oblique(np.full(5, time), corners[:, 0], corners[:, 1]), color=LIGHT.quiet, linewidth=0.6)

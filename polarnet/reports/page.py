@@ -12,13 +12,11 @@ from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from polarnet.reports.artefacts import Artefacts, History, Panel, ReportPaths, read_artefacts, read_thumbnail
+from polarnet.reports.artefacts import Artefacts, History, Panel, ReportPaths, read_artefacts
 from polarnet.reports.figures import (
     DARK,
     LIGHT,
-    PanelScene,
     Theme,
-    comparison_panel,
     dolp_bar,
     png,
     score_distribution,
@@ -53,16 +51,19 @@ from polarnet.reports.tables import (
 from polarnet.simulation.pictures.manifest import SPLITS
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
-THUMBNAIL_WIDTH = 208  # pixels, twice the size shown
-MOST_THUMBNAILS = 24  # of a split
 CARDS = {
-    "psnr": "PSNR of the network's DoLP",
-    "mse": "mean squared error",
+    "psnr": "PSNR, ours",
+    "mse": "MSE",
     "ssim": "SSIM",
-    "corr": "correlation with the truth",
-    "ms_per_window": "per window of four streams",
+    "corr": "correlation",
+    "ms_per_window": "time per window",
 }
-SOURCE_NAMES = {"photograph": "photographs", "dead_leaves": "generated dead leaves", "folder": "from a folder"}
+SOURCE_NAMES = {
+    "photograph": "photographs",
+    "dead_leaves": "generated dead leaves",
+    "folder": "of your own",
+    "polarization": "of measured polarization",
+}
 MOST_EVENT_ROWS = 2
 DISTRIBUTION_METRICS = ("mse", "psnr", "ssim", "corr")
 
@@ -101,7 +102,7 @@ class TileRow(NamedTuple):
 
 
 def write_report(paths: ReportPaths, run: Run, folder: Path) -> Path:
-    """Write index.html, and the two pictures worth keeping on their own: overview.png and comparison.png.
+    """Write index.html, and beside it overview.png, the picture worth keeping on its own.
 
     The page needs no other file and no network. FileNotFoundError that names what is missing and the stage to run.
     """
@@ -111,9 +112,6 @@ def write_report(paths: ReportPaths, run: Run, folder: Path) -> Path:
     if artefacts.overview is not None:
         overview = png(overview_figure(artefacts.overview))
         (folder / "overview.png").write_bytes(overview)
-    if artefacts.panels:
-        rows = [PanelScene(panel.sequence, panel.events, panel.truth_dolp, panel.dolp) for panel in artefacts.panels]
-        comparison_panel(rows, folder / "comparison.png")
     environment = Environment(
         loader=PackageLoader("polarnet.reports", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
@@ -166,7 +164,8 @@ def _cards(metrics: Scores) -> list[Card]:
     cards = []
     for key, label in CARDS.items():
         column = COLUMNS[key]
-        rivals = [f"{METHODS[m]} {column.printed(metrics[m][key])}" for m in ("e2v", "oracle_mean") if m in metrics]
+        others = [m for m in ("e2v", "oracle_mean" if column.ranked else "cf") if m in metrics]
+        rivals = [f"{METHODS[m]} {column.printed(metrics[m][key])}" for m in others]
         cards.append(Card(label, column.printed(metrics["ours"][key]) + column.unit, ", ".join(rivals)))
     return cards
 
@@ -196,7 +195,7 @@ def _polarization_tiles(panel: Panel) -> list[Tile]:
         _tile(intensity_image(s0), "true S0"),
         _tile(dolp_image(panel.truth_dolp), "true DoLP"),
         _tile(polarization_hsv(ones, ones, panel.truth_aolp), "true AoLP"),
-        _tile(polarization_hsv(s0, panel.truth_dolp, panel.truth_aolp), "true S0, DoLP, AoLP"),
+        _tile(polarization_hsv(s0, panel.truth_dolp, panel.truth_aolp), "truth"),
     ]
     return tiles + [
         _tile(polarization_hsv(s0, panel.dolp[method], panel.aolp[method]), METHODS.get(method, method), "with true S0")
@@ -213,14 +212,9 @@ def _event_tiles(panel: Panel) -> list[Tile]:
 
 
 def _thumbnails(artefacts: Artefacts, split: str) -> TileRow:
-    """Photographs before generated pictures, `MOST_THUMBNAILS` at most."""
-    entries = [entry for entry in artefacts.manifest.pictures if entry.split == split]
-    entries.sort(key=lambda entry: entry.source == "dead_leaves")
-    tiles = [
-        Tile(_data_uri(encode_jpeg(read_thumbnail(artefacts.images / entry.file, THUMBNAIL_WIDTH)), "jpeg"), entry.name)
-        for entry in entries[:MOST_THUMBNAILS]
-    ]
-    return TileRow(split, tiles, len(entries) - len(tiles))
+    thumbnails = artefacts.thumbnails[split]
+    tiles = [Tile(_data_uri(encode_jpeg(picture), "jpeg"), name) for name, picture in thumbnails]
+    return TileRow(split, tiles, artefacts.manifest.counts[split] - len(tiles))
 
 
 def _distribution(scene_means: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Chart:

@@ -30,21 +30,22 @@ def facts(root: Path) -> dict[str, str]:
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
     return {
         "commit": _commit(root),
-        "machine": f"{_processor()}, {usable_cores()} cores, {platform.system()} {platform.machine()}",
+        "machine": f"{processor()}, {usable_cores()} cores, {platform.system()} {platform.machine()}",
         "versions": f"Python {platform.python_version()}, {versions}",
     }
 
 
 def _commit(root: Path) -> str:
-    commit = _git(root, "rev-parse", "HEAD")
+    commit = git(root, "rev-parse", "HEAD")
     if not commit:
         return "none: not a git repository with a commit"
     # what the pipeline itself writes is no change of the code
-    changed = _git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!dvc.lock", ":!data")
+    changed = git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!dvc.lock", ":!data")
     return f"{commit}, with uncommitted changes" if changed else commit
 
 
-def _git(root: Path, *arguments: str) -> str:
+def git(root: Path, *arguments: str) -> str:
+    """What a git command prints, empty where it fails."""
     try:
         done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True)
     except FileNotFoundError:  # a machine without git
@@ -52,7 +53,8 @@ def _git(root: Path, *arguments: str) -> str:
     return done.stdout.strip() if done.returncode == 0 else ""
 
 
-def _processor() -> str:
+def processor() -> str:
+    """The processor's name, as the system has it."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]

@@ -46,9 +46,9 @@ def pipeline_block(results: Mapping[str, Any]) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     lines += [
         "",
-        f"`make repro` took {results['repro_minutes']:.1f} minutes and `make test` {results['test_minutes']:.1f} on "
-        f"{results['cores']} cores ({results['machine']}, load {results['load']:.1f} before the start; {versions}; "
-        f"commit `{results['commit'][:10]}`).",
+        f"`make repro` took {results['repro_minutes']:.1f} minutes after a set-up of {results['setup_minutes']:.1f}, "
+        f"`make test` {results['test_minutes']:.1f}, on {results['cores']} cores ({results['machine']}, "
+        f"load {results['load']:.1f} before the start; {versions}; commit `{results['commit'][:10]}`).",
     ]
     if stages := results.get("stage_minutes"):
         lines += ["", "Minutes by stage: " + ", ".join(f"{name} {value:.1f}" for name, value in stages.items()) + "."]
@@ -66,7 +66,7 @@ def _with_blocks(text: str, path: Path, results: Path) -> str:
         name = start["name"]
         if start["end"] or stop is None or not stop["end"] or stop["name"] != name:
             raise ValueError(f"{path}: expected <!-- results:{name} --> ... <!-- /results:{name} -->; close each block")
-        parts += [text[position : start.end()], "\n", _rendered(name, path, results), "\n"]
+        parts += [text[position : start.end()], "\n\n", _rendered(name, path, results), "\n\n"]
         position = stop.start()
     return "".join([*parts, text[position:]])
 
@@ -76,5 +76,5 @@ def _rendered(name: str, path: Path, results: Path) -> str:
         raise ValueError(f"{path}: no renderer for results:{name}; there are {', '.join(RENDERERS)}")
     file = results / f"{name}.json"
     if not file.exists():
-        raise FileNotFoundError(f"{path} shows results:{name}, but {file} is missing; run `polarnet measure {name}`")
+        raise FileNotFoundError(f"{path} shows results:{name}, but {file} is missing; run `polarnet measure`")
     return RENDERERS[name](json.loads(file.read_text(encoding="utf-8"))).strip()

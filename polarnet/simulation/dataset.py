@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from polarnet import __version__
 from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
 from polarnet.runtime import seed_for
@@ -26,7 +27,12 @@ def emulate_scenes(
     stopped.
     """
     source = SceneStore.open(scenes)
-    attributes = {"emulate": asdict(config), "seed": seed, "scenes": source.attributes}
+    attributes = {
+        "emulate": asdict(config),
+        "seed": seed,
+        "scenes": source.attributes,
+        "polarnet": __version__,  # an unfinished store of another version is not gone on with
+    }
     store = EventStore.create(events, source.sequences, source.window_height, source.window_width, attributes)
     task = functools.partial(_emulate_into, scenes=source, events=store, config=config, seed=seed, threads=threads)
     for _ in mapper(task, store.missing()):

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from polarnet.events.stream import Events
 from polarnet.ranges import allowed, check_ranges
-from polarnet.simulation.pixels import exact, v2e
+from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
 from polarnet.simulation.pixels.columns import Columns, empty_columns, trimmed
 from polarnet.simulation.pixels.light import Light, light_of_frames
 
@@ -22,9 +22,13 @@ LARGEST_FIRST_ROOM = 1 << 20  # events
 
 @dataclass(frozen=True)
 class EmulatorConfig:
-    """Section `emulate` of params.yaml. Contrast thresholds are steps of natural-log intensity."""
+    """Section `emulate` of params.yaml. Contrast thresholds are steps of natural-log intensity.
 
-    model: str = field(metadata=allowed(choices=["v2e", "exact"]))
+    A parameter that a model does not have is without effect in it: `esim` has thresholds and the refractory period
+    alone, `dvs_voltmeter` the constants of its camera.
+    """
+
+    model: str = field(metadata=allowed(choices=["v2e", "exact", "esim", "esim_gpu", "dvs_voltmeter"]))
     render_rate_hz: float | None = field(metadata=allowed(above=0))
     """Frames a second of the light that the pixels see; null: a step for each pixel of motion."""
     contrast_threshold_on: float = field(metadata=allowed(low=0.01, high=10))
@@ -36,15 +40,45 @@ class EmulatorConfig:
     leak_rate_hz: float = field(metadata=allowed(low=0))
     """ON events per second of a pixel that sees no change."""
     leak_jitter: float = field(metadata=allowed(low=0, high=1))
-    """Relative standard deviation of the leak."""
+    """Relative standard deviation of the leak: in each frame for `v2e`, in each interval of events for `exact`."""
     noise_rate_cov_decades: float = field(metadata=allowed(low=0))
     """Spread of the leak rate between pixels, as a power of ten."""
     shot_noise_rate_hz: float = field(metadata=allowed(low=0))
     """Noise events per second of a pixel in the dark, ON and OFF together; a quarter of it at full brightness."""
     refractory_period_us: float = field(metadata=allowed(low=0))
+    esim_log_eps: float = field(metadata=allowed(above=0))
+    """Added to intensity in [0, 1] before `esim` takes its logarithm."""
+    voltmeter_camera: str = field(metadata=allowed(choices=tuple(voltmeter.CAMERAS)))
+    randomise: bool
+    """Draw the parameters below anew for each sequence, uniformly (rates and cutoff: in their logarithm)."""
+    random_threshold_on: list[float] = field(metadata=allowed(low=0.01, high=10))
+    random_threshold_off: list[float] = field(metadata=allowed(low=0.01, high=10))
+    random_threshold_sigma: list[float] = field(metadata=allowed(low=0))
+    random_cutoff_hz: list[float] = field(metadata=allowed(above=0))
+    random_leak_rate_hz: list[float] = field(metadata=allowed(above=0))
+    random_shot_noise_rate_hz: list[float] = field(metadata=allowed(above=0))
 
     def __post_init__(self):
         check_ranges(self)
+        for name in (name for name in vars(self) if name.startswith("random_")):
+            bounds = getattr(self, name)
+            if len(bounds) != 2 or bounds[0] > bounds[1]:
+                raise ValueError(f"{name}: expected [lowest, highest], got {list(bounds)}")
+
+
+def randomised(config: EmulatorConfig, generator: np.random.Generator) -> EmulatorConfig:
+    """The configuration of one sequence: `config`, or with values drawn from its ranges if it says `randomise`."""
+    if not config.randomise:
+        return config
+    return replace(
+        config,
+        contrast_threshold_on=float(generator.uniform(*config.random_threshold_on)),
+        contrast_threshold_off=float(generator.uniform(*config.random_threshold_off)),
+        contrast_threshold_sigma=float(generator.uniform(*config.random_threshold_sigma)),
+        cutoff_hz=float(np.exp(generator.uniform(*np.log(config.random_cutoff_hz)))),
+        leak_rate_hz=float(np.exp(generator.uniform(*np.log(config.random_leak_rate_hz)))),
+        shot_noise_rate_hz=float(np.exp(generator.uniform(*np.log(config.random_shot_noise_rate_hz)))),
+    )
 
 
 class PixelModel(NamedTuple):
@@ -54,8 +88,8 @@ class PixelModel(NamedTuple):
     initial: Callable[[int, int, Any, np.uint64, int], Any]
     start: Callable[..., None]
     advance: Callable[..., tuple[Columns, int]]
-    eight_bit: bool
-    """Whether rendered light is rounded to whole digital numbers first."""
+    is_video: bool
+    """Whether it sees light as a video has it: rounded to whole digital numbers, at regular times."""
 
 
 def _v2e_physics(config: EmulatorConfig) -> v2e.Physics:
@@ -72,9 +106,29 @@ def _v2e_physics(config: EmulatorConfig) -> v2e.Physics:
     )
 
 
+def _esim_physics(config: EmulatorConfig) -> esim.Physics:
+    return esim.Physics(
+        config.contrast_threshold_on,
+        config.contrast_threshold_off,
+        config.refractory_period_us,
+        config.esim_log_eps,
+        config.model == "esim_gpu",
+    )
+
+
+def _voltmeter_physics(config: EmulatorConfig) -> voltmeter.Physics:
+    return voltmeter.CAMERAS[config.voltmeter_camera]
+
+
+_ESIM = PixelModel(_esim_physics, esim.initial, esim.start, esim.advance, is_video=False)
 MODELS = {
-    "v2e": PixelModel(_v2e_physics, v2e.initial, v2e.start, v2e.advance, eight_bit=True),
-    "exact": PixelModel(_v2e_physics, exact.initial, exact.start, exact.advance, eight_bit=False),
+    "v2e": PixelModel(_v2e_physics, v2e.initial, v2e.start, v2e.advance, is_video=True),
+    "exact": PixelModel(_v2e_physics, exact.initial, exact.start, exact.advance, is_video=False),
+    "esim": _ESIM,
+    "esim_gpu": _ESIM,
+    "dvs_voltmeter": PixelModel(
+        _voltmeter_physics, voltmeter.initial, voltmeter.start, voltmeter.advance, is_video=False
+    ),
 }
 
 
@@ -126,10 +180,10 @@ def emulate_columns(
     labels: bool = False,
     exact: bool = False,
 ) -> tuple[list[Columns], SensorState]:
-    """As `emulate`, as numpy columns, with the process behind each event (`labels`) and times before rounding (`exact`)."""
+    """As `emulate`, in numpy columns, with each event's process (`labels`) and time before rounding (`exact`)."""
     planes = tuple(range(frames.shape[1])) if planes is None else tuple(planes)
     times = np.asarray(t_us, dtype=np.float64)
-    _check_frames(frames, times, planes, state)
+    _check_frames(frames, times, planes, state, config.model)
     clip = frames.numpy() if frames.dtype == torch.uint8 else frames.to(torch.float32).numpy()
     lights = [light_of_frames(np.ascontiguousarray(clip[:, i])) for i in range(len(planes))]
     height, width = frames.shape[2:]
@@ -186,7 +240,7 @@ def events_of(columns: Columns, height: int, width: int) -> Events:
 
 
 def _check_frames(
-    frames: Tensor, times: Float64[np.ndarray, " m"], planes: tuple[int, ...], state: SensorState | None
+    frames: Tensor, times: Float64[np.ndarray, " m"], planes: tuple[int, ...], state: SensorState | None, model: str
 ) -> None:
     if frames.ndim != 4 or len(frames) != len(times) or len(times) == 0:
         raise ValueError(
@@ -206,6 +260,8 @@ def _check_frames(
             + ("" if state is None else f", the first after the state's {state.t_us}")
             + f", got {times[:5].tolist()}..."
         )
+    if state is not None and state.model != model:
+        raise ValueError(f"emulate: the state is of model {state.model}, the configuration of {model}")
     if state is not None and (*state.planes, state.height, state.width) != (*planes, *frames.shape[2:]):
         raise ValueError(
             f"emulate: the state is of planes {state.planes} of {state.height}x{state.width} pixels, "

@@ -16,6 +16,7 @@ from polarnet.events.frames import (
     check_splits,
     dequantise_angle,
     dequantise_fraction,
+    names_of_split,
     quantise_angle,
     quantise_fraction,
 )
@@ -109,7 +110,10 @@ class SceneStore:
     def write_picture(
         self, picture: str, s0: Float[Tensor, "h w"], dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]
     ) -> None:
-        """Put a picture in its row; ValueError for values out of range or a picture of a size that cannot be."""
+        """Put a picture in its row; one that is there already stays as it is.
+
+        ValueError for values out of range or a picture of a size that cannot be.
+        """
         height, width = self._table.columns["s0"].shape
         if not (self.window_height <= s0.shape[0] <= height and self.window_width <= s0.shape[1] <= width):
             raise ValueError(
@@ -117,19 +121,21 @@ class SceneStore:
                 f"{height}x{width} px, got {s0.shape[0]}x{s0.shape[1]}"
             )
         planes = {"s0": quantise_fraction(s0), "dolp": quantise_fraction(dolp), "aolp": quantise_angle(aolp)}
-        self._table.erase("picture_size", picture)
+        if self._table.is_written("picture_size", picture):
+            return
         for name, steps in planes.items():
             self._table.write(name, picture, steps)
         self._table.write("picture_size", picture, np.array(s0.shape))
 
     def write(self, sequence: str, trajectory: Float64[Tensor, " k"], duration_us: int) -> None:
-        """Put the trajectory of a sequence in its row; its picture may come before or after."""
+        """Put the trajectory of a sequence in its row, if it is not there yet; its picture may come before or after."""
         names = self.trajectory_names
         if len(trajectory) != len(names) or not trajectory.isfinite().all():
             raise ValueError(f"{sequence}: expected {len(names)} finite numbers ({', '.join(names)}), got {trajectory}")
         if duration_us <= 0:
             raise ValueError(f"{sequence}: expected a duration above 0 us, got {duration_us}")
-        self._table.erase("trajectory", sequence)
+        if self._table.is_written("trajectory", sequence):
+            return
         self._table.write("duration_us", sequence, np.array(duration_us))
         self._table.write("trajectory", sequence, trajectory.numpy())
 
@@ -148,7 +154,7 @@ class SceneStore:
 
     def of_split(self, split: str) -> list[str]:
         """The sequences of `train`, `val` or `test`, in the store's order."""
-        return [sequence for sequence in self.sequences if self.splits[sequence] == split]
+        return names_of_split(self.splits, split)
 
     def read(self, sequence: str) -> SceneRecord:
         """Everything about one sequence; ValueError that names the column of damaged data."""

@@ -1,12 +1,13 @@
 """From a scene and a motion to the events behind four polarizers of one sensor, without a clip in between."""
 
+import itertools
 import math
 
-import numba
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from polarnet.events.stream import Events
+from polarnet.simulation.compilation import compiled
 from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, events_of, run
 from polarnet.simulation.motion import Pose, Trajectory, bilinear, window_to_scene
 from polarnet.simulation.pixels.columns import Columns
@@ -15,9 +16,9 @@ from polarnet.simulation.scene import PolarizationScene
 from polarnet.stokes import intensities_from_stokes
 
 POLARIZERS = (0, 1, 2, 3)
-STEP_PX = 1.0  # of an adaptive rate: no pixel of the window moves further in a step
 SLOWEST_RATE_HZ = 30.0  # of an adaptive rate, for a window that stands still
-SPEED_SAMPLES_PER_PX = 8
+SAMPLES_PER_STEP = 8  # of the motion, for each pixel it moves
+STEP_SLACK = 1e-3  # pixels by which a step may be longer than one
 TURNING_CHUNK = 16  # steps that are rendered before their events are made, where the window turns or zooms
 
 
@@ -60,7 +61,7 @@ def synthesize_steps(
     pose = trajectory.pose(t_us * 1e-6)
     _check_inside(scene, pose, t_us, height, width)
     sensor = {"height": height, "width": width, "config": config, "key": key, "planes": POLARIZERS, "threads": threads}
-    if (pose.angle == 0).all() and (pose.zoom == 1).all():
+    if _drifts(pose):
         left, top = pose.x - (width - 1) / 2, pose.y - (height - 1) / 2
         lights = [light_of_scene(plane, top, left) for plane in _scene_behind_polarizers(scene)]
         columns, state = run(lights, t_us.astype(np.float64), state=state, **sensor)
@@ -79,35 +80,66 @@ def synthesize_steps(
 def render_times_us(
     trajectory: Trajectory, duration_us: int, height: int, width: int, config: EmulatorConfig
 ) -> Int64[np.ndarray, " n"]:
-    """When the light is rendered: at `render_rate_hz`, or, if that is null, whenever a pixel has moved by one pixel.
+    """When the light is rendered, from 0 to `duration_us`: `render_rate_hz` times a second.
 
-    The first time is 0, the last `duration_us`. The adaptive rate is never below 30 Hz.
+    If the rate is null: as often as the window moves by a pixel, and at least 30 times a second.
+    Between two pixels of the scene light changes smoothly, and at each pixel its slope jumps. A window that only drifts
+    meets the scene's pixels with all of its own at once, so that pixel models which take light at any time see it
+    just then: at a fixed rate the nearest of the regular times is moved there.
     """
-    if config.render_rate_hz is not None:
-        steps = math.ceil(duration_us * 1e-6 * config.render_rate_hz)
-        times = np.rint(1e6 / config.render_rate_hz * np.arange(steps + 1))
+    samples = 2 + math.ceil(SAMPLES_PER_STEP * duration_us * 1e-6 * max(trajectory.speed_px_s, SLOWEST_RATE_HZ))
+    sampled_us = np.linspace(0, duration_us, samples)
+    pose = trajectory.pose(sampled_us * 1e-6)
+    kinks_us = np.empty(0) if MODELS[config.model].is_video else _pixel_crossings(pose, sampled_us, height, width)
+    if config.render_rate_hz is None:
+        moved = np.hypot(*np.diff(np.stack(_corners(pose, height, width)), axis=-1)).max(axis=0)
+        steps = np.maximum(
+            moved * np.maximum(pose.zoom[1:], pose.zoom[:-1]), SLOWEST_RATE_HZ * 1e-6 * np.diff(sampled_us)
+        )
+        progress = np.concatenate([[0], np.cumsum(steps)])
+        anchors = np.unique(np.concatenate([[0, progress[-1]], np.interp(kinks_us, sampled_us, progress)]))
+        pieces = [np.linspace(a, b, 1 + math.ceil(b - a - STEP_SLACK)) for a, b in itertools.pairwise(anchors)]
+        times = np.interp(np.concatenate(pieces), progress, sampled_us)
     else:
-        samples = 2 + math.ceil(SPEED_SAMPLES_PER_PX * duration_us * 1e-6 * max(trajectory.speed_px_s, SLOWEST_RATE_HZ))
-        t_s = np.linspace(0, duration_us * 1e-6, samples)
-        pose = trajectory.pose(t_s)
-        corners = np.stack(_corners(pose, height, width))  # [x or y, corner, time]
-        moved = np.hypot(*np.diff(corners, axis=-1)).max(axis=0) * np.maximum(pose.zoom[1:], pose.zoom[:-1])
-        progress = np.concatenate([[0], np.cumsum(np.maximum(moved / STEP_PX, SLOWEST_RATE_HZ * np.diff(t_s)))])
-        times = np.rint(1e6 * np.interp(np.linspace(0, progress[-1], math.ceil(progress[-1]) + 1), progress, t_s))
+        regular = np.arange(math.ceil(duration_us * 1e-6 * config.render_rate_hz) + 1) * (1e6 / config.render_rate_hz)
+        times, nearest = regular.copy(), np.rint(kinks_us * 1e-6 * config.render_rate_hz).astype(int)
+        inner = (nearest > 0) & (nearest < len(regular) - 1)
+        times[nearest[inner]] = kinks_us[inner]
     times[-1] = duration_us
-    return np.unique(np.minimum(times, duration_us).astype(np.int64))
+    return np.unique(np.minimum(np.rint(times), duration_us).astype(np.int64))
+
+
+def _pixel_crossings(
+    pose: Pose, sampled_us: Float64[np.ndarray, " n"], height: int, width: int
+) -> Float64[np.ndarray, " m"]:
+    """Times at which the pixels of a drifting window lie on rows or columns of the scene's; none if it turns."""
+    if not _drifts(pose):
+        return np.empty(0)
+    crossings = []
+    for place in (pose.x - (width - 1) / 2, pose.y - (height - 1) / 2):
+        before, after = place[:-1], place[1:]
+        k = np.flatnonzero(np.floor(before) != np.floor(after))
+        line = np.maximum(np.floor(before[k]), np.floor(after[k]))
+        crossings.append(
+            sampled_us[k] + (line - before[k]) / (after[k] - before[k]) * (sampled_us[k + 1] - sampled_us[k])
+        )
+    return np.sort(np.concatenate(crossings))
+
+
+def _drifts(pose: Pose) -> bool:
+    return bool((pose.angle == 0).all() and (pose.zoom == 1).all())
 
 
 def render_intensities(
     scene: PolarizationScene, pose: Pose, height: int, width: int, config: EmulatorConfig
 ) -> UInt8[np.ndarray, "4 n h w"] | Float32[np.ndarray, "4 n h w"]:
     """Digital numbers behind the four polarizers as the window sees them; uint8 where the pixel model wants 8 bits."""
-    frames = np.empty((4, len(pose.x), height, width), np.uint8 if MODELS[config.model].eight_bit else np.float32)
+    frames = np.empty((4, len(pose.x), height, width), np.uint8 if MODELS[config.model].is_video else np.float32)
     _render_turning(np.ascontiguousarray(scene.stokes.numpy()), pose.x, pose.y, pose.angle, pose.zoom, frames)
     return frames
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _render_turning(stokes, x, y, angle, zoom, frames) -> None:  # pragma: no cover (compiled)
     height, width = frames.shape[2:]
     half, rounding = np.float32(FULL_SCALE / 2), np.float32(0.5 if frames.itemsize == 1 else 0.0)

@@ -46,7 +46,7 @@ def e2v_task(config: E2vConfig, lpips: Lpips | None, seed: int) -> Task:
         encode=encode,
         streams=streams,
         unroll=network.unroll,
-        loss=FrameLoss({"mae": 1.0, "ssim": config.ssim, "lpips": config.lpips}, lpips),
+        loss=FrameLoss({"mae": 1.0, "ssim_loss": config.ssim, "lpips": config.lpips}, lpips),
         description={
             "network": config.arch,
             "config": {"bins": config.bins},

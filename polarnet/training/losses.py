@@ -28,16 +28,16 @@ class LossConfig:
 
 
 class FrameLoss:
-    """A weighted sum of terms, each a mean over all frames: mse, mae, ssim (1 - SSIM) and lpips.
+    """A weighted sum of terms, each a mean over all frames: mse, mae, ssim_loss (1 - SSIM, Eq. 7) and lpips.
 
-    Without LPIPS weights its term is left out of `weights`, and so of the sum.
+    Without an LPIPS network its term is left out of `weights`, and so of the sum.
     """
 
     def __init__(self, weights: Mapping[str, float], lpips: Lpips | None):
         known: dict[str, Callable[[Tensor, Tensor], Tensor] | None] = {
             "mse": mse,
             "mae": lambda a, b: (a - b).abs(),
-            "ssim": lambda a, b: 1 - ssim(a, b),
+            "ssim_loss": lambda a, b: 1 - ssim(a, b),
             "lpips": lpips,
         }
         self.weights = {name: weight for name, weight in weights.items() if weight and known[name] is not None}
@@ -55,4 +55,4 @@ class FrameLoss:
 
 def polarization_loss(config: LossConfig, lpips: Lpips | None) -> FrameLoss:
     """The paper's loss, Eq. 9 of Eq. 6, 7 and 8, as a mean over frames where the paper sums."""
-    return FrameLoss({"mse": config.mse, "ssim": config.ssim, "lpips": config.lpips}, lpips)
+    return FrameLoss({"mse": config.mse, "ssim_loss": config.ssim, "lpips": config.lpips}, lpips)

@@ -52,7 +52,7 @@ class Progress:
         for terms in losses:
             if not math.isfinite(terms["total"]):
                 raise FloatingPointError(
-                    f"the loss is {terms['total']} in epoch {self.epoch} after {self.steps} steps; lower "
+                    f"the loss is {terms['total']} in epoch {self.epoch + 1} after {self.steps} steps; lower "
                     "learning_rate, set gradient_norm, or use precision=fp32"
                 )
             sums.update(terms)
@@ -92,8 +92,8 @@ class Recorder:
         optimizer.load_state_dict(content["optimizer"])
         progress = Progress(**content["progress"])
         tqdm.write(f"resuming in epoch {progress.epoch + 1}, from {file}")
-        if progress.history:
-            self._write(progress, network)
+        if progress.history and not progress.sequences:
+            self._write(progress, network)  # what the epoch before had written is gone
         return progress
 
     def keep(

@@ -54,8 +54,9 @@ def test_the_papers_network_has_this_many_parameters():
     network = DolpUNet(PAPER)
     assert count(network.c1) == 4 * 32 * 9 + 32
     assert count(network.g2) == 128 * 9 * 128 * 6 + 3 * 128  # three kernels for the input, three for the state
+    assert count(network.d1) == 64 * 32 + 32 + 32 * 32 * 9 + 32
     assert count(network.p1) == 32 + 1
-    assert count(network) == 2_339_661
+    assert count(network) == 2_293_581
 
 
 def test_every_parameter_has_a_gradient_from_two_windows():

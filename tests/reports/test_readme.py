@@ -5,7 +5,9 @@ import pytest
 from polarnet.reports.readme import update_results_blocks
 
 RESULTS = {
+    "setup_minutes": 1.5,
     "repro_minutes": 12.34,
+    "stage_minutes": {"ingest": 0.25, "train": 8.0},
     "test_minutes": 4.5,
     "cores": 2,
     "load": 0.1,
@@ -31,7 +33,8 @@ def test_the_block_shows_the_committed_results_and_nothing_else_changes(project)
     assert text.startswith("# title\n\n<!-- results:pipeline -->\n")
     assert text.endswith("\n<!-- /results:pipeline -->\n\nafter\n")
     assert "| ours | **0.0200** | **17.00** |" in text
-    assert "`make repro` took 12.3 minutes and `make test` 4.5 on 2 cores (a processor" in text
+    assert "`make repro` took 12.3 minutes after a set-up of 1.5, `make test` 4.5, on 2 cores (a processor" in text
+    assert "Minutes by stage: ingest 0.2, train 8.0." in text
 
 
 def test_a_second_update_changes_nothing(project):
@@ -71,5 +74,5 @@ def test_a_block_without_a_renderer_is_an_error(project):
 
 def test_a_block_without_results_says_which_command_measures_them(project):
     (project / "docs" / "results" / "pipeline.json").unlink()
-    with pytest.raises(FileNotFoundError, match="polarnet measure pipeline"):
+    with pytest.raises(FileNotFoundError, match="run `polarnet measure`"):
         update_results_blocks(project, check=True)

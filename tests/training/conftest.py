@@ -27,6 +27,15 @@ def random_events(generator: np.random.Generator, count: int) -> Events:
     )
 
 
+def smooth_truth(generator: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Intensity, DoLP and AoLP of a scene at rest: ramps across the image."""
+    down, right = torch.meshgrid(torch.linspace(0, 1, HEIGHT), torch.linspace(0, 1, WIDTH), indexing="ij")
+    a, b, c = torch.from_numpy(generator.random((3, 1, 1), dtype=np.float32))
+    fields = [a * down, b * right, c * (down + right) / 2]
+    intensity, dolp, aolp = (field.expand(WINDOWS + 1, HEIGHT, WIDTH) for field in fields)
+    return intensity[:, None].expand(-1, 4, -1, -1), dolp, aolp
+
+
 @pytest.fixture(scope="session")
 def stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Paths of an event store and a frame store of five sequences."""
@@ -37,8 +46,7 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     for name in SPLITS:
         generator = generator_for(1, name, "test")
         events.write(name, [random_events(generator, 400) for _ in range(4)], WINDOWS * WINDOW_US)
-        level = torch.from_numpy(generator.random((WINDOWS + 1, 4, HEIGHT, WIDTH), dtype=np.float32))
-        frames.write(name, t_us, level / 2, level[:, 0], level[:, 1])
+        frames.write(name, t_us, *smooth_truth(generator))
     events.finish()
     frames.finish()
     return folder / "events.zarr", folder / "frames.zarr"

@@ -1,16 +1,22 @@
 """The loop at a size where a whole training takes a second: CPU, fp32."""
 
+import dataclasses
+import json
+import math
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 
+from polarnet.networks.checkpoint import load_checkpoint, load_network
 from polarnet.networks.dolp_unet import DolpUNetConfig
 from polarnet.training.dolp import dolp_task
 from polarnet.training.e2v import E2vConfig, e2v_task
-from polarnet.training.loop import TrainConfig, train
+from polarnet.training.loop import TrainConfig, set_learning_rate, train, validate
 from polarnet.training.losses import LossConfig
 from polarnet.training.recorder import Recorder
+from polarnet.training.sequences import stack
 from polarnet.training.task import Task, describe, open_split
 
 SEED = 7
@@ -50,7 +56,129 @@ def run(task: Task, stores: tuple[Path, Path], folder: Path, config: TrainConfig
     return folder / "out"
 
 
-def test_a(stores, tmp_path):
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+
+
+def test_a_training_leaves_best_and_last_checkpoint_history_and_curves(stores, tmp_path):
     out = run(small_task(), stores, tmp_path)
-    print(*out.rglob("*"), (out/"best.json").read_text(), (out/"history.json").read_text())
-    out = run(e2v_task(E2V, None, SEED), stores, tmp_path/"e", E2V)
+    files = bytes_of(out)
+    assert {"best.safetensors", "best.json", "last.safetensors", "last.json", "history.json"} < files.keys()
+    history = json.loads(files["history.json"])
+    assert [row["epoch"] for row in history] == [0, 1]
+    assert files["live/plots/metrics/val/mse.tsv"].decode().splitlines() == [
+        "step\tmse",
+        *(f"{row['epoch']}\t{row['val']['mse']}" for row in history),
+    ]
+    _, metadata = load_network(out / "best.safetensors")
+    assert metadata["val"]["mse"] == min(row["val"]["mse"] for row in history)
+    assert metadata["training"]["learning_rate"] == TRAIN.learning_rate
+    assert not list((tmp_path / "resume").iterdir())
+
+
+def test_equal_trainings_leave_equal_bytes(stores, tmp_path):
+    first, second = (bytes_of(run(small_task(), stores, tmp_path / name)) for name in ("one", "two"))
+    assert first == second
+
+
+@pytest.mark.parametrize("killed_at", range(1, 12))
+def test_a_training_killed_at_any_step_and_resumed_ends_as_if_nothing_had_happened(
+    stores, tmp_path, undisturbed, killed_at
+):
+    task, calls = small_task(), 0
+
+    def unroll(*arguments: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == killed_at:
+            raise Killed
+        return task.unroll(*arguments)
+
+    with pytest.raises(Killed):
+        run(dataclasses.replace(task, unroll=unroll), stores, tmp_path)
+    assert bytes_of(run(small_task(), stores, tmp_path)) == undisturbed
+
+
+@pytest.fixture(scope="module")
+def undisturbed(stores, tmp_path_factory) -> dict[str, bytes]:
+    return bytes_of(run(small_task(), stores, tmp_path_factory.mktemp("undisturbed")))
+
+
+def test_a_changed_setting_starts_anew(stores, tmp_path):
+    task = small_task()
+    split = open_split(str(stores[0]), str(stores[1]), task.encode)
+    places = {
+        Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, config, tmp_path, SEED)).running
+        for config in (TRAIN, dataclasses.replace(TRAIN, learning_rate=2e-3), dataclasses.replace(TRAIN, epochs=3))
+    }
+    assert len(places) == 3
+
+
+def test_worker_processes_change_nothing(stores, tmp_path, undisturbed):
+    task = small_task()
+    split = open_split(str(stores[0]), str(stores[1]), task.encode)
+    recorder = Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, TRAIN, tmp_path, SEED))
+    train(task, split, TRAIN, recorder, SEED, CPU, workers=2)
+    assert bytes_of(tmp_path / "out") == undisturbed
+
+
+def test_one_sequence_can_be_learnt_by_heart(stores, tmp_path):
+    config = dataclasses.replace(
+        TRAIN, epochs=20, batch_size=1, bptt_windows=2, learning_rate=1e-2, crop=None, symmetries=False
+    )
+    loss = LossConfig(mse=1.0, ssim=0.0, lpips=0.0)
+    task = dolp_task("paper", NETWORK, config, loss, None, SEED)
+    split = open_split(str(stores[0]), str(stores[1]), task.encode)
+    split.train.sequences[1:] = []
+    before = validate(task, split.train, config, CPU, workers=0)["mse"]
+    recorder = Recorder(tmp_path / "out", tmp_path / "resume", {})
+    train(task, split, config, recorder, SEED, CPU, workers=0)
+    assert validate(task, split.train, config, CPU, workers=0)["mse"] < 0.2 * before
+
+
+def test_the_e2v_baseline_trains_in_the_same_loop(stores, tmp_path):
+    out = run(e2v_task(E2V, None, SEED), stores, tmp_path, E2V)
+    tensors, metadata = load_checkpoint(out / "best.safetensors")
+    assert metadata["network"] == "firenet"
+    assert metadata["config"] == {"bins": 5}
+    assert sum(tensor.numel() for tensor in tensors.values()) == 37_777
+
+
+def test_the_e2v_baseline_learns_each_polarizers_intensity_from_its_own_events(stores):
+    task = e2v_task(E2V, None, SEED)
+    split = open_split(str(stores[0]), str(stores[1]), task.encode)
+    batch = stack([split.train[0], split.train[1]])
+    voxels, intensity = task.streams(batch)
+    windows, _, _, height, width = batch.inputs.shape
+    assert voxels.shape == (windows, 2 * 4, 5, height, width)
+    assert torch.equal(voxels[:, 4 + 3], batch.inputs[:, 1, 15:20])  # second sequence, 135 degrees
+    assert torch.equal(intensity[:, 4 + 3], batch.intensity[:, 1, 3])
+
+
+def test_bf16_trains_as_well(stores, tmp_path):
+    run(small_task(), stores, tmp_path, dataclasses.replace(TRAIN, epochs=1, precision="bf16"))
+
+
+def test_a_loss_that_is_not_a_number_stops_the_training(stores, tmp_path):
+    task = small_task()
+    broken = dataclasses.replace(task, unroll=lambda windows, state: (task.unroll(windows, state)[0] * math.nan, None))
+    with pytest.raises(FloatingPointError, match=r"the loss is nan in epoch 1 .*lower learning_rate"):
+        run(broken, stores, tmp_path)
+
+
+def test_the_learning_rate_rises_and_then_falls_along_a_cosine():
+    optimizer = torch.optim.Adam([torch.zeros(1, requires_grad=True)], lr=1.0)
+    config = dataclasses.replace(TRAIN, learning_rate=1.0, warmup=0.25)
+    rates = []
+    for done in (0.0, 0.125, 0.25, 0.5, 1.0):
+        set_learning_rate(optimizer, config, done)
+        rates.append(optimizer.param_groups[0]["lr"])
+    falls = [(1 + math.cos(math.pi * done)) / 2 for done in (0.0, 0.125, 0.25, 0.5, 1.0)]
+    assert rates == pytest.approx([0.0, 0.5 * falls[1], falls[2], 0.5, 0.0])
+
+
+def test_a_constant_rate_without_warm_up_stays_constant():
+    optimizer = torch.optim.Adam([torch.zeros(1, requires_grad=True)], lr=1.0)
+    for done in (0.0, 0.5, 1.0):
+        set_learning_rate(optimizer, dataclasses.replace(TRAIN, schedule="constant", warmup=0.0), done)
+        assert optimizer.param_groups[0]["lr"] == TRAIN.learning_rate

@@ -3,7 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from polarnet.simulation.compilation import compiled
 
 SIGNAL, LEAK, SHOT = 0, 1, 2
 
@@ -47,14 +48,14 @@ def trimmed(columns: Columns, count: int) -> Columns:
     return Columns(*(column[:count] for column in columns))
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def _grown_column(column, used, capacity):
     larger = np.empty(capacity, column.dtype)
     larger[:used] = column[:used]
     return larger
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def with_room(columns, used, more):
     """`columns`, or a copy of twice the size, with room for `more` events after the first `used`."""
     if used + more <= columns.t.size:
@@ -70,7 +71,7 @@ def with_room(columns, used, more):
     )
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def sort_ties(columns, start, stop):
     """Put events start..stop, already in order of t apart from few, into the order (t, y, x, p): an insertion sort."""
     for i in range(start + 1, stop):
@@ -97,7 +98,7 @@ def sort_ties(columns, start, stop):
             columns.exact_us[j] = exact_us
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def _after(columns, i, t, y, x, p):
     if columns.t[i] != t:
         return columns.t[i] > t

@@ -10,24 +10,25 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from polarnet.simulation.compilation import compiled, inlined
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL
 from polarnet.simulation.pixels.light import intensity_rows, linlog
-from polarnet.simulation.pixels.pending import kind_of, pending_events, roomier, write_in_order
+from polarnet.simulation.pixels.pending import event_of, pending_events, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normal, uniform
+from polarnet.simulation.pixels.strips import flag_words, flagged, flags_of, rows_of_strip
 from polarnet.simulation.pixels.v2e import (
     DARK_OFFSET,
     SATURATION,
     SHOT_NOISE_SLOPE,
-    STRIP,
     Physics,
     leak_factor_map,
     threshold_map,
 )
 
 SHOT_NOISE_IN_THE_DARK = 1 - SHOT_NOISE_SLOPE * DARK_OFFSET / SATURATION
+SMALLEST_LAG = np.float32(1e-12)  # below, it is 0: processors are slow with the tiny numbers that decay leads to
 LONG_AGO_US = -1e18
 LOG2_E = np.float32(1 / math.log(2))
 # 2^f - 1 on [-1/2, 1/2]: f times a polynomial (Taylor's to f^6, whose error is below 1e-7)
@@ -52,11 +53,20 @@ class Pixels(NamedTuple):
     leak: np.ndarray
     """the same with the jitter of the time since the last event"""
     last_event_us: np.ndarray
-    events: np.ndarray
-    """int64, fired so far: numbers the draws of the leak's jitter"""
     next_shot_us: np.ndarray
-    shots: np.ndarray
-    """int64, draws of shot noise so far"""
+
+
+class Course(NamedTuple):
+    """Pixels of a strip that are being followed through a step."""
+
+    pixel: np.ndarray
+    """int32, number in the strip"""
+    place: np.ndarray
+    """int64, see `pending`"""
+    change: np.ndarray
+    """float64, at time `now`"""
+    now: np.ndarray
+    """float64, microseconds since the start of the step"""
 
 
 def initial(h: int, w: int, physics: Physics, key: np.uint64, plane: int) -> Pixels:
@@ -75,13 +85,11 @@ def initial(h: int, w: int, physics: Physics, key: np.uint64, plane: int) -> Pix
         leak_nominal=np.float32(physics.leak_rate_hz * 1e-6) * leak_factor * threshold_on,
         leak=zeros.copy(),
         last_event_us=np.full(n, LONG_AGO_US),
-        events=np.zeros(n, np.int64),
         next_shot_us=np.full(n, np.inf),
-        shots=np.zeros(n, np.int64),
     )
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def start(light, pixels, physics, h, w, time_us, key, plane):
     """The first frame: nothing fires, and what has leaked since each pixel's last event is anyone's guess."""
     intensity_rows(light, 0, 0, w, pixels.dn)
@@ -90,23 +98,27 @@ def start(light, pixels, physics, h, w, time_us, key, plane):
     shot_key = key_for(key, randomness.SHOT_NOISE, plane)
     for i in range(h * w):
         if physics.leak_rate_hz > 0:
-            pixels.leak[i] = jittered_leak(pixels.leak_nominal[i], physics.leak_jitter, jitter_key, i, 0)
+            pixels.leak[i] = jittered_leak(pixels.leak_nominal[i], physics.leak_jitter, jitter_key, i, time_us)
             pixels.change[i] = uniform(mixed(phase_key, i)) * pixels.threshold_on[i]
             if pixels.leak[i] > 0:
                 pixels.last_event_us[i] = time_us - pixels.change[i] / pixels.leak[i]
         if physics.shot_noise_rate_hz > 0:
             threshold_on, threshold_off = pixels.threshold_on[i], pixels.threshold_off[i]
-            pixels.next_shot_us[i] = time_us + _until_next_shot(physics, shot_key, i, 0, threshold_on, threshold_off)
+            pixels.next_shot_us[i] = time_us + _until_next_shot(
+                physics, shot_key, i, time_us, threshold_on, threshold_off
+            )
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, columns):
     """Run steps times_us[k] .. times_us[k + 1] under light[offset + k]; the columns and how many events they hold."""
-    rows = min(h, 1 + STRIP // w)
+    rows = rows_of_strip(h, w)
     strip = np.empty((4, rows * w), np.float32)
-    flags, candidates = np.empty(rows * w, np.uint8), np.empty(rows * w + 1, np.int32)
+    m = rows * w
+    words = flag_words(rows * w)
+    course = Course(np.empty(m, np.int32), np.empty(m, np.int64), np.empty(m), np.empty(m))
     keys = key_for(key, randomness.LEAK_JITTER, plane), key_for(key, randomness.SHOT_NOISE, plane)
-    pending = pending_events(h * w)
+    pending = pending_events(h * w, columns.exact_us.size > 0)
     soonest_us = np.array([pixels.next_shot_us[y * w : (y + rows) * w].min() for y in range(0, h, rows)])
     used = 0
     for k in range(times_us.size - 1):
@@ -120,39 +132,39 @@ def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, co
             linlog(dn, response)
             if physics.cutoff_hz > 0:
                 rate = np.float32(2e-6 * math.pi * physics.cutoff_hz * (stop_us - start_us) / SATURATION)
-                _filter(dn, response, pixels.dn[first:stop], pixels.linlog[first:stop], pixels.lag[first:stop], rate, rise)
+                _filter(
+                    dn, response, pixels.dn[first:stop], pixels.linlog[first:stop], pixels.lag[first:stop], rate, rise
+                )
             else:
                 _difference(response, pixels.linlog[first:stop], rise)
-            fires = flags[: stop - first]
-            _flag(pixels, first, rise, np.float32(stop_us - start_us), before, fires)
-            strip_number = y // rows
-            if soonest_us[strip_number] < stop_us:
-                fires |= pixels.next_shot_us[first:stop] < stop_us
-            found = 0
-            for j in range(fires.size):  # without a branch, since which pixels fire is not to be guessed
-                candidates[found] = j
-                found += fires[j]
-            c = 0
-            while True:
-                c, n = _fire(pixels, physics, keys, candidates[:found], c, y, w, before, rise, dn, start_us, stop_us, pending, n)
-                if c == found:
-                    break
-                pending = roomier(pending)
-            if soonest_us[strip_number] < stop_us:
-                soonest_us[strip_number] = pixels.next_shot_us[first:stop].min()
+            change, leak = pixels.change[first:stop], pixels.leak[first:stop]
+            _move(change, leak, rise, np.float32(stop_us - start_us), before)
+            fires = flags_of(words, stop - first)
+            _flag(before, change, pixels.threshold_on[first:stop], pixels.threshold_off[first:stop], fires)
+            shooting = soonest_us[y // rows] < stop_us
+            if shooting:
+                _flag_shots(pixels.next_shot_us[first:stop], stop_us, fires)
+            active = _line_up(words, y, w, before, course)
+            pending, n = _fire(
+                pixels, physics, keys, course, active, rise, dn, first, shooting, start_us, stop_us, pending, n
+            )
+            if shooting:
+                soonest_us[y // rows] = pixels.next_shot_us[first:stop].min()
         base_us = math.floor(start_us)
-        columns, used = write_in_order(pending, n, np.int64(base_us), np.int64(math.ceil(stop_us) - base_us), columns, used)
+        columns, used = write_in_order(
+            pending, n, np.int64(base_us), np.int64(math.ceil(stop_us) - base_us), columns, used
+        )
     return columns, used
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _difference(response, response_before, rise):
     for j in range(rise.size):
         rise[j] = response[j] - response_before[j]
         response_before[j] = response[j]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _filter(dn, response, dn_before, response_before, lag, rate, rise):
     """First-order low-pass of a response that is linear in time, with the bandwidth at the mean light of the step.
 
@@ -169,97 +181,125 @@ def _filter(dn, response, dn_before, response_before, lag, rate, rise):
         decayed = (np.float32(1) - scale) - scale * above_one  # 1 - exp(-a), accurate for small a as well
         step = response[j] - response_before[j]
         lag_after = lag[j] - lag[j] * decayed - step * (decayed / a)
+        lag_after = lag_after if abs(lag_after) > SMALLEST_LAG else np.float32(0)
         rise[j] = step + (lag_after - lag[j])
         lag[j], dn_before[j], response_before[j] = lag_after, dn[j], response[j]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _flag(pixels, first, rise, dt_us, before, fires):
-    """Advance each change by its rise and leak as if nothing fired; flag pixels at or beyond a threshold."""
-    stop = first + rise.size
-    change, leak = pixels.change[first:stop], pixels.leak[first:stop]
-    threshold_on, threshold_off = pixels.threshold_on[first:stop], pixels.threshold_off[first:stop]
+@compiled
+def _move(change, leak, rise, dt_us, before):
+    """Advance each change by its rise and leak as if nothing fired."""
     for j in range(rise.size):
         before[j] = change[j]
-        after = change[j] + (rise[j] + leak[j] * dt_us)
-        change[j] = after
-        fires[j] = (max(before[j], after) >= threshold_on[j]) | (min(before[j], after) <= -threshold_off[j])
+        change[j] += rise[j] + leak[j] * dt_us
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _fire(pixels, physics, keys, candidates, c, y, w, before, rise, dn, start_us, stop_us, pending, n):
-    """Follow the candidates of a strip, from number c on, through a step, each from event to event.
+@compiled
+def _flag(before, after, threshold_on, threshold_off, fires):
+    """Flag pixels that are at or beyond a threshold before or after the step."""
+    for j in range(before.size):
+        highest, lowest = max(before[j], after[j]), min(before[j], after[j])
+        fires[j] = (highest >= threshold_on[j]) | (lowest <= -threshold_off[j])
 
-    Returns the number of the first candidate for which there was no room left, and the number of pending events.
-    Times are in microseconds since the start of the step.
+
+@compiled
+def _flag_shots(next_shot_us, stop_us, fires):
+    for j in range(fires.size):
+        fires[j] |= next_shot_us[j] < stop_us
+
+
+@compiled
+def _line_up(words, y, w, before, course):
+    """Put the flagged pixels of a strip that begins at row y on the course; how many they are."""
+    active, row_start = flagged(words, before.size, course.pixel), 0
+    for a in range(active):
+        j = course.pixel[a]
+        while j >= row_start + w:
+            y, row_start = y + 1, row_start + w
+        course.place[a], course.change[a], course.now[a] = place_of(y, j - row_start), before[j], 0.0
+    return active
+
+
+@compiled
+def _fire(pixels, physics, keys, course, active, rise, dn, first, shooting, start_us, stop_us, pending, n):
+    """Follow the pixels on `course` through a step, in rounds: in each, a pixel fires once at most.
+
+    Rounds instead of pixels, and choices instead of branches, because what a pixel does next is not to be guessed.
+    Times are in microseconds since the start of the step. Returns the pending events and their number.
     """
-    first, row_end, base_us, dt, room = y * w, w, math.floor(start_us), stop_us - start_us, pending.place.size
-    refractory_us, jitter = physics.refractory_s * 1e6, physics.leak_jitter if physics.leak_rate_hz > 0 else 0.0
-    while c < candidates.size:
-        j = candidates[c]
-        while j >= row_end:
-            y, row_end = y + 1, row_end + w
-        i, place, n_before = first + j, np.int32(y << 16 | (j - row_end + w)), n
-        threshold_on, threshold_off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
-        change, slope, leak = np.float64(before[j]), np.float64(rise[j]) / dt, np.float64(pixels.leak[i])
-        now, last, shot = 0.0, pixels.last_event_us[i] - start_us, pixels.next_shot_us[i] - start_us
-        events, shots = pixels.events[i], pixels.shots[i]
-        while n < room:
+    base_us, dt, shot = math.floor(start_us), stop_us - start_us, np.inf
+    refractory_us, per_us = physics.refractory_s * 1e6, 1 / dt
+    jitter = physics.leak_jitter if physics.leak_rate_hz > 0 else 0.0
+    while active > 0:
+        while n + active > pending.events.size:
+            pending = roomier(pending)
+        remaining = 0
+        for a in range(active):
+            j, place, change, now = course.pixel[a], course.place[a], course.change[a], course.now[a]
+            i = first + j
+            last, leak = pixels.last_event_us[i] - start_us, np.float64(pixels.leak[i])
+            threshold_on, threshold_off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
+            slope = rise[j] * per_us + leak
             ready = max(now, last + refractory_us)
-            at_ready = change + (slope + leak) * (ready - now)
-            rising = at_ready >= threshold_on or (at_ready > -threshold_off and slope + leak > 0)
-            excess = at_ready - threshold_on if rising else -threshold_off - at_ready
-            event = ready if excess >= 0 else ready + abs(excess / (slope + leak))
-            label = SIGNAL
-            if not min(event, shot) < dt:
-                break
-            if shot < event:
-                rising, fires = _shot(physics, keys[1], i, shots, threshold_on, threshold_off, dn[j])
-                event, label, shots = shot, SHOT, shots + 2
-                shot += _until_next_shot(physics, keys[1], i, shots, threshold_on, threshold_off)
-                if not fires or event < last + refractory_us:
-                    continue
-                change = 0.0
-            else:
-                if rising and leak * (event - last) > 0.5 * threshold_on:
-                    label = LEAK
-                # a crossing leaves nothing of the change; after waiting, what exceeded the threshold remains
-                change = max(excess, 0.0) if rising else -max(excess, 0.0)
-            pending.offset_us[n], pending.place[n] = np.int32(math.floor(start_us + event) - base_us), place
-            pending.kind[n], pending.exact_us[n] = kind_of(1 if rising else -1, label), start_us + event
-            n += 1
-            now = last = event
+            at_ready = change + slope * (ready - now)
+            on = (at_ready >= threshold_on) | ((at_ready > -threshold_off) & (slope > 0))
+            excess = at_ready - threshold_on if on else -threshold_off - at_ready
+            event = ready + (0.0 if excess >= 0 else abs(excess / slope))
+            fires, again = event < dt, False
+            label = LEAK if on & (leak * (event - last) > 0.5 * threshold_on) else SIGNAL
+            if shooting:
+                shot = pixels.next_shot_us[i] - start_us
+                if shot < min(event, dt):
+                    happens, on = _shot(physics, keys[1], i, start_us + shot, threshold_on, threshold_off, dn[j])
+                    wait = _until_next_shot(physics, keys[1], i, start_us + shot, threshold_on, threshold_off)
+                    pixels.next_shot_us[i] += wait
+                    event, label, excess = shot, SHOT, 0.0
+                    fires = happens & (event >= last + refractory_us)
+                again = pixels.next_shot_us[i] < stop_us
+            pending.events[n] = event_of(np.int64(start_us - base_us + event), place, on, label)
+            if pending.exact_us.size:
+                pending.exact_us[n] = start_us + event
+            n += fires
+            # a crossing leaves nothing of the change; after waiting, what exceeded the threshold remains
+            rest = max(excess, 0.0) if on else -max(excess, 0.0)
+            change, now, last = (rest, event, event) if fires else (change, now, last)
             if jitter > 0:
-                events += 1
-                leak = np.float64(jittered_leak(pixels.leak_nominal[i], jitter, keys[0], i, events))
-        else:
-            return c, n_before
-        pixels.change[i], pixels.leak[i] = change + (slope + leak) * (dt - now), leak
-        pixels.last_event_us[i], pixels.events[i] = start_us + last, events
-        if shots != pixels.shots[i]:
-            pixels.next_shot_us[i], pixels.shots[i] = start_us + shot, shots
-        c += 1
-    return c, n
+                drawn = np.float64(jittered_leak(pixels.leak_nominal[i], jitter, keys[0], i, start_us + event))
+                leak = drawn if fires else leak
+            at_end = change + (rise[j] * per_us + leak) * (dt - now)
+            pixels.change[i], pixels.leak[i], pixels.last_event_us[i] = at_end, leak, start_us + last
+            course.pixel[remaining], course.place[remaining] = j, place
+            course.change[remaining], course.now[remaining] = change, now
+            beyond = (max(change, at_end) >= threshold_on) | (min(change, at_end) <= -threshold_off)
+            remaining += again | (fires & beyond)
+        active = remaining
+    return pending, n
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def jittered_leak(nominal, jitter, key, i, events):
-    """The leak of pixel i between its event number `events` and the next."""
-    return nominal * np.float32(max(1 - jitter * rough_normal(mixed(key, (i << 32) + events)), 0.0))
+@inlined
+def _bits(key, i, time_us):
+    """Random bits of what pixel i draws at a time."""
+    return mixed(key ^ np.uint64(np.float64(time_us).view(np.int64)), i)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _until_next_shot(physics, key, i, draw, threshold_on, threshold_off):
+@compiled
+def jittered_leak(nominal, jitter, key, i, time_us):
+    """The leak of pixel i from its event at this time to its next."""
+    return nominal * np.float32(max(1 - jitter * rough_normal(_bits(key, i, time_us)), 0.0))
+
+
+@compiled
+def _until_next_shot(physics, key, i, time_us, threshold_on, threshold_off):
     """Microseconds to the next event of a Poisson process with the rate that the pixel has in the dark."""
     share = physics.threshold_on / threshold_on + physics.threshold_off / threshold_off
     rate_hz = physics.shot_noise_rate_hz / 2 * SHOT_NOISE_IN_THE_DARK * share
-    return -1e6 * math.log(uniform(mixed(key, (i << 32) + draw))) / rate_hz
+    return -1e6 * math.log(uniform(_bits(key, i, time_us))) / rate_hz
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _shot(physics, key, i, draw, threshold_on, threshold_off, dn):
-    """Whether the shot event that is due is ON, and whether it happens at all at this light."""
+@compiled
+def _shot(physics, key, i, time_us, threshold_on, threshold_off, dn):
+    """Whether the shot event that is due happens at this light, and whether it is ON."""
     on, off = physics.threshold_on / threshold_on, physics.threshold_off / threshold_off
     chance = (1 - SHOT_NOISE_SLOPE * (np.float64(dn) + DARK_OFFSET) / SATURATION) / SHOT_NOISE_IN_THE_DARK
-    u = uniform(mixed(key, (i << 32) + draw + 1))
-    return u < chance * on / (on + off), u < chance
+    u = uniform(_bits(~key, i, time_us))
+    return u < chance, u < chance * on / (on + off)

@@ -7,7 +7,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from polarnet.simulation.compilation import compiled, inlined
 
 BYTES, FLOATS, SCENE = range(3)
 FULL_SCALE = 255.0  # DN
@@ -49,7 +50,7 @@ def light_of_scene(scene: np.ndarray, top: np.ndarray, left: np.ndarray) -> Ligh
     return Light(NO_8BIT, NO_FRAMES, scene, top, left, SCENE)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def intensity_rows(light, k, y, w, dn):
     """Fill `dn` (float32, whole rows of w pixels) with the light at time k from row y on."""
     for r in range(dn.size // w):
@@ -62,9 +63,9 @@ def intensity_rows(light, k, y, w, dn):
             _bilinear_row(light.scene, light.top[k] + (y + r), light.left[k], row)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _bilinear_row(scene, row, column, dn):
-    i, j, w = int(math.floor(row)), int(math.floor(column)), dn.size
+    i, j, w = math.floor(row), math.floor(column), dn.size
     down, right = np.float32(row - i), np.float32(column - j)
     one = np.float32(1)
     w00, w01 = (one - down) * (one - right), (one - down) * right
@@ -76,7 +77,7 @@ def _bilinear_row(scene, row, column, dn):
         dn[x] = (w00 * a[x] + w01 * b[x]) + (w10 * c[x] + w11 * d[x])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def linlog_8bit(dn, linlog):
     """v2e's response to `dn`, which is rounded to whole numbers, as an 8-bit video would hold."""
     for j in range(dn.size):
@@ -85,7 +86,7 @@ def linlog_8bit(dn, linlog):
         linlog[j] = LINLOG_TABLE[np.int32(dn[j]) & 255]
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def linlog_as_v2e(dn, linlog):
     """v2e's response to any DN >= 0, with its rounding: ln(DN) above 20, linear below; double precision inside."""
     for j in range(dn.size):
@@ -114,15 +115,21 @@ SQRT_HALF_BITS, MANTISSA_BITS = np.int32(0x3F3504F3), np.int32(23)
 KNEE_32, SLOPE_32 = np.float32(KNEE), np.float32(math.log(KNEE) / KNEE)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def linlog(dn, response):
-    """v2e's response to any DN >= 0 in float32, right to 1.2 units in the last place; vectorises."""
+@inlined
+def ln(x):
+    """The natural logarithm of a positive float32, right to 1.2 units in the last place; vectorises."""
     p0, p1, p2, p3, p4, p5, p6, p7, p8 = LOG_POLYNOMIAL
+    bits = np.float32(x).view(np.int32)
+    exponent = np.int32(np.int32(bits - SQRT_HALF_BITS) >> MANTISSA_BITS)
+    f = np.float32(np.int32(bits - np.int32(exponent << MANTISSA_BITS)).view(np.float32)) - np.float32(1)
+    e, square = np.float32(exponent), f * f
+    cubic = ((((((((p0 * f + p1) * f + p2) * f + p3) * f + p4) * f + p5) * f + p6) * f + p7) * f + p8) * f * square
+    return (f + ((cubic + e * LN2_LOW) - np.float32(0.5) * square)) + e * LN2_HIGH
+
+
+@compiled
+def linlog(dn, response):
+    """v2e's response to any DN >= 0, in float32 throughout."""
     for j in range(dn.size):
-        bits = np.float32(max(dn[j], KNEE_32)).view(np.int32)
-        exponent = np.int32(np.int32(bits - SQRT_HALF_BITS) >> MANTISSA_BITS)
-        x = np.float32(np.int32(bits - np.int32(exponent << MANTISSA_BITS)).view(np.float32)) - np.float32(1)
-        e, square = np.float32(exponent), x * x
-        cubic = ((((((((p0 * x + p1) * x + p2) * x + p3) * x + p4) * x + p5) * x + p6) * x + p7) * x + p8) * x * square
-        logarithm = (x + ((cubic + e * LN2_LOW) - np.float32(0.5) * square)) + e * LN2_HIGH
+        logarithm = ln(max(dn[j], KNEE_32))
         response[j] = logarithm if dn[j] > KNEE_32 else dn[j] * SLOPE_32

@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from polarnet.simulation.compilation import compiled, inlined
 
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: the increment of SplitMix64 (Steele et al., OOPSLA 2014)
 MIX_1, MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)  # its output function, variant 13
@@ -14,7 +15,7 @@ DIGITS_MEAN, DIGITS_SCALE = np.float32(60.0), np.float32(1 / math.sqrt(170.0))  
 THRESHOLD_ON, THRESHOLD_OFF, NOISE_RATE, LEAK_PHASE, LEAK_JITTER, SHOT_NOISE, FIRST_PASSAGE = range(1, 8)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined
 def mixed(key, counter):
     """64 random bits of draw number `counter` under `key`: the output of SplitMix64 with seed `key`."""
     z = key + GOLDEN * (np.uint64(counter) + np.uint64(1))
@@ -23,26 +24,26 @@ def mixed(key, counter):
     return z ^ (z >> np.uint64(31))
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def key_for(key, purpose, plane):
     """The key of one purpose in one plane, from the key of the sequence."""
     return mixed(mixed(key, purpose), plane)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined
 def uniform(bits):
     """A double in (0, 1) from 64 random bits; never 0 or 1."""
     return (np.float64(bits >> np.uint64(12)) + 0.5) * 2.0**-52
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined
 def rough_normal(bits):
     """Mean 0, variance 1, nearly Gaussian, from 64 random bits: see `rough_normals`."""
     sums = ((bits & DIGITS) + ((bits >> np.uint64(4)) & DIGITS)) * BYTE_SUMS
     return (np.float32((sums >> np.uint64(24)) & np.uint64(255)) - DIGITS_MEAN) * DIGITS_SCALE
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def rough_normals(key, first_pixel, values):
     """Fill `values` (float32) with mean 0, variance 1, nearly Gaussian: standardised sums of eight 4-bit random digits.
 
@@ -58,7 +59,7 @@ def rough_normals(key, first_pixel, values):
         right[j] = (both - low - DIGITS_MEAN) * DIGITS_SCALE
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def normal(u):
     """The standard normal quantile of u in (0, 1): Wichura's AS 241 (PPND7), accurate to about 1e-7."""
     q = u - 0.5
@@ -83,7 +84,7 @@ def normal(u):
     return -x if q < 0 else x
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def normal_map(key, purpose, plane, pixels):
     """One standard normal number per pixel of a plane, float32."""
     key = key_for(key, purpose, plane)

@@ -8,19 +8,19 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL, sort_ties, with_room
 from polarnet.simulation.pixels.light import FLOATS, intensity_rows, linlog_8bit, linlog_as_v2e
 from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normals, uniform
+from polarnet.simulation.pixels.strips import flag_words, flagged, flags_of, rows_of_strip
 
 THRESHOLD_FLOOR = 0.01  # v2e clips drawn thresholds here
 DARK_OFFSET = 20.0  # DN: bandwidth and shot noise follow (DN + 20) / 275
 SATURATION = 275.0
 SHOT_NOISE_SLOPE = 0.75  # shot noise falls by this fraction from dark to bright
 NEARLY = np.float32(1.000001)  # widens a first look at thresholds by more than rounding; exact counts follow
-STRIP = 1500  # pixels, about: worked on together, they stay in the fastest cache
 PIXEL, PLACE, CROSSED, ACCEPTED = range(4)  # columns of the list of firing pixels; PLACE = row * 2^16 + column
 
 
@@ -62,8 +62,12 @@ def initial(h: int, w: int, physics: Physics, key: np.uint64, plane: int) -> Pix
     return Pixels(
         memory=np.zeros(n, real),
         filtered=np.zeros(n, real),
-        threshold_on=threshold_map(physics.threshold_on, physics.threshold_sigma, n, key, randomness.THRESHOLD_ON, plane),
-        threshold_off=threshold_map(physics.threshold_off, physics.threshold_sigma, n, key, randomness.THRESHOLD_OFF, plane),
+        threshold_on=threshold_map(
+            physics.threshold_on, physics.threshold_sigma, n, key, randomness.THRESHOLD_ON, plane
+        ),
+        threshold_off=threshold_map(
+            physics.threshold_off, physics.threshold_sigma, n, key, randomness.THRESHOLD_OFF, plane
+        ),
         leak_factor=leak_factor_map(physics.noise_rate_cov_decades, n, key, plane),
         refractory_since=np.full(n, -physics.refractory_s, np.float32),
         last_event_us=np.zeros(n, np.float64),
@@ -85,7 +89,7 @@ def leak_factor_map(cov_decades: float, n: int, key: np.uint64, plane: int) -> n
     return np.float32(10) ** (np.float32(cov_decades) * randomness.normal_map(key, randomness.NOISE_RATE, plane, n))
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def _respond(light, k, y, w, dn, linlog):
     intensity_rows(light, k, y, w, dn)
     if light.kind == FLOATS:
@@ -94,7 +98,7 @@ def _respond(light, k, y, w, dn, linlog):
         linlog_8bit(dn, linlog)
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def start(light, pixels, physics, h, w, time_us, key, plane):
     """The first frame: filter and memory take its value, nothing fires."""
     dn, linlog = np.empty(h * w, np.float32), np.empty(h * w, np.float32)
@@ -104,12 +108,12 @@ def start(light, pixels, physics, h, w, time_us, key, plane):
     pixels.last_event_us[:] = time_us
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, columns):
     """Run steps times_us[k] .. times_us[k + 1] under light[offset + k]; the columns and how many events they hold."""
-    rows = min(h, 1 + STRIP // w)
+    rows = rows_of_strip(h, w)
     strip = np.empty((3, rows * w), np.float32)
-    flags, candidates = np.empty(rows * w, np.uint8), np.empty(rows * w + 1, np.int32)
+    words, candidates = flag_words(rows * w), np.empty(rows * w, np.int32)
     firing, order = np.empty((h * w + 1, 4), np.int32), np.empty(h * w + 1, np.int32)
     jitter_key, shot_key = key_for(key, randomness.LEAK_JITTER, plane), key_for(key, randomness.SHOT_NOISE, plane)
     ceiling = physics.threshold_on / pixels.threshold_on.min() + physics.threshold_off / pixels.threshold_off.min()
@@ -131,20 +135,24 @@ def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, co
             if physics.leak_rate_hz > 0:
                 rough_normals(step_key, first, noise)
                 _leak(memory, threshold_on, pixels.leak_factor[first:stop], noise, dt, physics)
-            fires = flags[: stop - first]
+            fires = flags_of(words, stop - first)
             _flag(filtered, memory, threshold_on, threshold_off, fires)
-            n, most = _count(filtered, memory, threshold_on, threshold_off, physics, fires, y, w, candidates, firing, n, most)
+            n, most = _count(
+                filtered, memory, threshold_on, threshold_off, physics, words, y, w, candidates, firing, n, most
+            )
         before = used
         columns, used = _emit(pixels, physics, times_us[k], times_us[k + 1], firing, order, n, most, columns, used)
         if dt < 1e-6 * most:
             sort_ties(columns, before, used)
         if physics.shot_noise_rate_hz > 0:
             stop_us = times_us[k + 1]
-            columns, used = _shoot(light, offset + k, pixels, physics, h, w, stop_us, dt, ceiling, mixed(shot_key, step + k), columns, used)
+            columns, used = _shoot(
+                light, offset + k, pixels, physics, h, w, stop_us, dt, ceiling, mixed(shot_key, step + k), columns, used
+            )
     return columns, used
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _filter(linlog, dn, filtered, rate):
     """First-order low-pass whose bandwidth grows with light: rate = 2 pi cutoff dt at full brightness."""
     for j in range(dn.size):
@@ -152,31 +160,33 @@ def _filter(linlog, dn, filtered, rate):
         filtered[j] += share * (linlog[j] - filtered[j])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _leak(memory, threshold_on, leak_factor, noise, dt, physics):
     """The reset switch leaks, so the reference sinks and a dark, motionless scene keeps firing ON events."""
-    one, dt, rate, jitter = np.float32(1), np.float32(dt), np.float32(physics.leak_rate_hz), np.float32(physics.leak_jitter)
+    one, dt, rate, jitter = (
+        np.float32(1),
+        np.float32(dt),
+        np.float32(physics.leak_rate_hz),
+        np.float32(physics.leak_jitter),
+    )
     for j in range(memory.size):
         memory[j] -= dt * (rate * leak_factor[j] * (one - jitter * noise[j])) * threshold_on[j]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _flag(filtered, memory, threshold_on, threshold_off, fires):
     for j in range(filtered.size):
         change = (filtered[j] - memory[j]) * NEARLY
         fires[j] = (change >= threshold_on[j]) | (-change >= threshold_off[j])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _count(filtered, memory, threshold_on, threshold_off, physics, fires, y, w, candidates, firing, n, most):
-    """Append the flagged pixels of a strip that starts at row y, with the thresholds each has crossed, negative for OFF.
+@compiled
+def _count(filtered, memory, threshold_on, threshold_off, physics, words, y, w, candidates, firing, n, most):
+    """Append the flagged pixels of a strip from row y on, with the thresholds each has crossed, negative for OFF.
 
     Returns the length of the list and the largest count.
     """
-    found = 0
-    for j in range(fires.size):  # without a branch, since which pixels fire is not to be guessed
-        candidates[found] = j
-        found += fires[j]
+    found = flagged(words, filtered.size, candidates)
     first, row_end = y * w, w
     exact_nominal = memory.itemsize == 8 and physics.threshold_sigma == 0  # v2e divides float64 by a Python float
     for c in range(found):
@@ -195,7 +205,7 @@ def _count(filtered, memory, threshold_on, threshold_off, physics, fires, y, w, 
     return n, most
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _emit(pixels, physics, start_us, stop_us, firing, order, n, most, columns, used):
     """Events of one step, slot by slot: the busiest pixel of the plane sets the number of slots for all.
 
@@ -213,7 +223,9 @@ def _emit(pixels, physics, start_us, stop_us, firing, order, n, most, columns, u
     for slot in range(1, most + 1):
         exact_us = start_us + (stop_us - start_us) * slot / most
         # torch.linspace, which v2e calls, counts from both ends
-        stamp = first + interval * np.float32(slot - 1) if slot <= most // 2 else last - interval * np.float32(most - slot)
+        stamp = (
+            first + interval * np.float32(slot - 1) if slot <= most // 2 else last - interval * np.float32(most - slot)
+        )
         columns = with_room(columns, used, active + 1)
         t, x, y, p = columns.t[used:], columns.x[used:], columns.y[used:], columns.p[used:]
         t_us, written, remaining = np.int64(np.rint(exact_us)), 0, 0
@@ -239,7 +251,7 @@ def _emit(pixels, physics, start_us, stop_us, firing, order, n, most, columns, u
     return columns, used
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _consume(pixels, firing, n):
     """Move each memory by the thresholds whose events were accepted; the remainder of the change is kept."""
     for a in range(n):
@@ -248,7 +260,7 @@ def _consume(pixels, firing, n):
         pixels.memory[i] += (on if accepted > 0 else off) * np.float32(accepted)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _label(pixels, physics, i, time_us, polarity):
     """LEAK for an ON event of which the leak made more than half a threshold."""
     leaked = physics.leak_rate_hz * pixels.leak_factor[i] * (time_us - pixels.last_event_us[i]) * 1e-6
@@ -256,7 +268,7 @@ def _label(pixels, physics, i, time_us, polarity):
     return LEAK if polarity > 0 and leaked > 0.5 else SIGNAL
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _shoot(light, k, pixels, physics, h, w, stop_us, dt, ceiling, key, columns, used):
     """Shot noise of one step: each pixel fires with a small probability that falls with light.
 

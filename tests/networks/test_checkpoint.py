@@ -1,0 +1,96 @@
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import torch
+
+from polarnet.networks.checkpoint import load_checkpoint, load_network, load_tensors, save_checkpoint
+from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+
+CONFIG = DolpUNetConfig(channels=[4, 4, 4], swin_depth=1, swin_window=4, swin_heads=[1, 1], residual_blocks=1)
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> tuple[Path, DolpUNet]:
+    """A checkpoint of a new network, and that network."""
+    network = DolpUNet(CONFIG, in_channels=8).eval()
+    metadata = {"network": "paper", "config": asdict(CONFIG), "in_channels": 8, "representation": "voxel_grid"}
+    save_checkpoint(tmp_path / "n.safetensors", network.state_dict(), metadata)
+    return tmp_path / "n.safetensors", network
+
+
+def rewrite(path: Path, **changes: object) -> None:
+    """Change entries of the JSON beside a checkpoint."""
+    record = json.loads(path.with_suffix(".json").read_text())
+    path.with_suffix(".json").write_text(json.dumps(record | changes))
+
+
+@torch.no_grad()
+def test_a_network_comes_back_from_its_checkpoint(saved):
+    path, network = saved
+    loaded, metadata = load_network(path)
+    assert metadata["representation"] == "voxel_grid"
+    assert not loaded.training
+    events = torch.randn(1, 8, 12, 16)
+    assert torch.equal(loaded(events)[0].dolp, network(events)[0].dolp)
+
+
+def test_saving_twice_gives_the_same_bytes(saved, tmp_path):
+    path, network = saved
+    metadata = load_checkpoint(path)[1]
+    save_checkpoint(tmp_path / "m.safetensors", network.state_dict(), metadata)
+    for suffix in (".safetensors", ".json"):
+        assert (tmp_path / f"m{suffix}").read_bytes() == path.with_suffix(suffix).read_bytes()
+
+
+def test_half_a_checkpoint_is_refused(saved):
+    path, _ = saved
+    path.with_suffix(".json").unlink()
+    with pytest.raises(FileNotFoundError, match=r"n\.json is missing; a checkpoint is NAME\.safetensors and"):
+        load_network(path)
+
+
+def test_another_file_under_a_checkpoints_name_is_refused(saved):
+    path, _ = saved
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    with pytest.raises(ValueError, match=r"is not the file that n\.json describes"):
+        load_network(path)
+
+
+def test_any_json_is_not_a_checkpoints_json(saved):
+    path, _ = saved
+    path.with_suffix(".json").write_text("[1, 2]")
+    with pytest.raises(ValueError, match="expected a polarnet-checkpoint-1"):
+        load_network(path)
+    path.with_suffix(".json").write_text("{")
+    with pytest.raises(ValueError, match="is not JSON"):
+        load_network(path)
+
+
+def test_a_checkpoint_of_another_kind_of_network_is_refused(saved):
+    path, _ = saved
+    rewrite(path, network="firenet")
+    with pytest.raises(ValueError, match="holds a 'firenet'; expected a DoLP network, one of paper"):
+        load_network(path)
+
+
+def test_tensors_of_another_shape_are_named(saved):
+    path, _ = saved
+    rewrite(path, in_channels=4)
+    with pytest.raises(ValueError, match=r"c1\.weight should be \(4, 4, 3, 3\), is \(4, 8, 3, 3\) \(1 tensors"):
+        load_network(path)
+
+
+def test_missing_tensors_are_named(saved):
+    path, network = saved
+    tensors = network.state_dict()
+    del tensors["p1.bias"]
+    with pytest.raises(ValueError, match=r"p1\.bias should be \(1,\), is absent"):
+        load_tensors(network, tensors, path)
+
+
+def test_a_torch_pickle_is_refused_without_being_read(tmp_path):
+    torch.save({"a": torch.zeros(1)}, tmp_path / "n.pth")
+    with pytest.raises(ValueError, match=r"NAME\.safetensors, got .*n\.pth"):
+        load_checkpoint(tmp_path / "n.pth")

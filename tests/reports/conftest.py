@@ -1,0 +1,118 @@
+"""A pipeline's outputs in miniature: real stores and files, three pictures of 48x72 px, windows of 24x36 px."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet.evaluation.benchmark import Benchmark, Panel, recordings_of, write_benchmark
+from polarnet.evaluation.score import BenchmarkConfig, score_sequence
+from polarnet.events.frames import FrameStore
+from polarnet.events.store import EventStore
+from polarnet.events.stream import Events
+from polarnet.reports.artefacts import ReportPaths
+from polarnet.simulation.motion import MotionConfig
+from polarnet.simulation.pictures.images import write_png
+from polarnet.simulation.pictures.manifest import Manifest, ManifestEntry, Skipped, write_manifest
+from polarnet.simulation.truth import synthesize
+
+SPLITS = {"park": "train", "lake": "val", "tree": "test", "leaf": "test"}
+NO_WEIGHTS = "no weights lie in the hub cache"
+HISTORY = [
+    {"epoch": e, "train": {"total": 1.0 / (e + 1), "mse": 0.1 / (e + 1)}, "val": {"mse": mse, "psnr": 10.0 + e}}
+    for e, mse in enumerate((0.09, 0.04, 0.05))
+]
+
+
+def picture(phase):
+    """Hue from left to right, saturation from top to bottom, so that every DoLP and AoLP occurs."""
+    down, across = np.mgrid[0:1:48j, 0:1:72j].astype(np.float32)
+    hue = 2 * math.pi * (across + phase)[..., None] + np.array([0, -2, 2], dtype=np.float32) * math.pi / 3
+    return (1 - down[..., None] * (0.5 - 0.5 * np.cos(hue))).astype(np.float32)
+
+
+@pytest.fixture(scope="session")
+def source_picture():
+    return picture
+
+
+def write_images(folder):
+    folder.mkdir()
+    entries = []
+    for i, (name, split) in enumerate(SPLITS.items()):
+        write_png(folder / f"{name}.png", picture(i / 5), bits=8)
+        source = "dead_leaves" if name == "leaf" else "photograph"
+        entries.append(
+            ManifestEntry(
+                name=name, file=f"{name}.png", split=split, source=source, origin=f"https://example.org/{name}",
+                licence="CC0-1.0", author="<b>Ann</b>", sha256="0" * 64, bits=8, height=48, width=72,
+                source_height=48, source_width=72, colour_profile=None,
+            )
+        )  # fmt: skip
+    write_manifest(Manifest(tuple(entries), (Skipped("broken.jpg", "cannot be read: ends early"),), 0, 0), folder)
+
+
+def random_events(seed, count, duration_us, height, width):
+    draw = np.random.default_rng(seed)
+    columns = [
+        np.sort(draw.integers(0, duration_us, count)),
+        draw.integers(0, width, count).astype(np.int16),
+        draw.integers(0, height, count).astype(np.int16),
+        (2 * draw.integers(0, 2, count) - 1).astype(np.int8),
+    ]
+    return Events(*map(torch.from_numpy, columns), height, width)
+
+
+def write_events(path, frames):
+    store = EventStore.create(path, frames.sequences, 24, 36, {})
+    for i, sequence in enumerate(frames.sequences):
+        channels = [random_events(4 * i + c, 500, 200_000, 24, 36) for c in range(4)]
+        store.write(sequence, channels, 200_000)
+    store.finish()
+
+
+def run_methods(events, frames, folder):
+    """Benchmark outputs for two constants, E2V (with AoLP) and ours, of the true frames made worse."""
+    methods = ["zeros", "oracle_mean", "e2v", "ours"]
+    config = BenchmarkConfig(methods, warmup_windows=1, precision="fp32", bootstrap_samples=20, panel_scenes=2)
+    rows, panels = [], []
+    for recording in recordings_of("test", events, frames):
+        truth = recording.dolp
+        mean = truth.mean(dim=(-2, -1), keepdim=True)
+        dolp = {"zeros": 0 * truth, "oracle_mean": 0 * truth + mean, "e2v": (truth + mean) / 2, "ours": 0.9 * truth}
+        rows += score_sequence(recording, dolp, 1, None, torch.device("cpu"))
+        k = 3
+        panels.append(
+            Panel(
+                recording.name, recording.scene, k, int(recording.t_us[k + 1]), torch.randn(4, 24, 36), truth[k],
+                recording.aolp[k], recording.s0[k], {m: frames[k] for m, frames in dolp.items()},
+                {"e2v": recording.aolp[k]},
+            )
+        )  # fmt: skip
+    about = {"lpips": {"backbone": "squeeze", "sha256": None, "source": None, "reason": NO_WEIGHTS}}
+    times = dict.fromkeys(methods, 1.5)
+    write_benchmark(folder, Benchmark(rows, times, panels), config, seed=1, about=about)
+
+
+@pytest.fixture(scope="session")
+def paths(tmp_path_factory):
+    data = tmp_path_factory.mktemp("data")
+    paths = ReportPaths(
+        data / "images", data / "scenes.zarr", data / "frames.zarr", data / "events.zarr", data / "train",
+        data / "train_e2v", data / "benchmark",
+    )  # fmt: skip
+    write_images(paths.images)
+    motion = MotionConfig(
+        sequences_per_picture=1, duration_s=0.2, frame_rate_hz=30.0, window_height=24, window_width=36,
+        speed_min_px_s=10.0, speed_max_px_s=20.0, acceleration_max_px_s2=800.0, rotation_max_deg=0.0, zoom_max=1.0,
+    )  # fmt: skip
+    synthesize(paths.images, paths.scenes, paths.frames, motion, 1, map)
+    frames = FrameStore.open(paths.frames)
+    write_events(paths.events, frames)
+    run_methods(EventStore.open(paths.events), frames, paths.benchmark)
+    for folder in (paths.train, paths.train_e2v):
+        folder.mkdir()
+        (folder / "history.json").write_text(json.dumps(HISTORY))
+    return paths

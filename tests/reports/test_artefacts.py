@@ -1,0 +1,88 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.colors import rgb_to_hsv
+
+from polarnet.events.frames import FrameStore
+from polarnet.events.store import EventStore
+from polarnet.reports.artefacts import event_rates, read_artefacts, read_history
+
+
+@pytest.fixture(scope="module")
+def artefacts(paths):
+    return read_artefacts(paths)
+
+
+def test_everything_missing_is_named_with_the_stage_that_makes_it(paths, tmp_path):
+    elsewhere = dataclasses.replace(paths, events=tmp_path / "events.zarr", train=tmp_path / "train")
+    with pytest.raises(FileNotFoundError, match=r"events\.zarr \(stage emulate\).*history\.json \(stage train\)"):
+        read_artefacts(elsewhere)
+
+
+def test_a_panel_holds_the_truth_of_the_window_it_names(artefacts, paths):
+    panel = artefacts.panels[0]
+    frames = FrameStore.open(paths.frames).frames(panel.sequence)
+    assert int(frames.t_us[panel.window + 1]) == panel.t_us
+    assert torch.equal(frames.dolp[panel.window + 1], panel.truth_dolp)
+    assert set(panel.dolp) == {"zeros", "oracle_mean", "e2v", "ours"}
+    assert set(panel.aolp) == {"e2v"}
+
+
+def test_photographs_come_before_dead_leaves(artefacts):
+    assert [panel.sequence for panel in artefacts.panels] == ["tree-00", "leaf-00"]
+    assert artefacts.overview.name == "tree-00"
+
+
+def test_the_overview_shows_the_events_of_the_panels_window(artefacts, paths):
+    overview, panel = artefacts.overview, artefacts.panels[0]
+    assert overview.start_us + overview.duration_us == panel.t_us
+    assert overview.duration_us == pytest.approx(1e6 / 30, abs=1)
+    for stream in overview.streams:
+        assert len(stream) > 0
+        assert int(stream.t.min()) >= overview.start_us
+        assert int(stream.t.max()) < panel.t_us
+
+
+def test_the_outlined_part_of_the_picture_is_what_the_window_shows(artefacts):
+    overview = artefacts.overview
+    height, width = overview.picture.shape[:2]
+    left, top = overview.outline.min(axis=1) * (width, height)
+    right, bottom = overview.outline.max(axis=1) * (width, height)
+    assert (right - left, bottom - top) == pytest.approx((36, 24))
+    assert overview.path.min() >= 0
+    assert overview.path.max() <= 1
+    hue = overview.aolp[12, 18] / torch.pi  # grows to the right in these pictures
+    middle = overview.picture[round(top) + 12, round(left) + 18]
+    assert rgb_to_hsv(middle / 255)[0] == pytest.approx(float(hue), abs=0.05)
+
+
+def test_a_thumbnail_of_a_scene_looks_like_its_picture(artefacts, source_picture):
+    small = artefacts.thumbnails["train"][0]
+    assert small.name == "park"
+    expected = np.rint(255 * source_picture(0.0)).mean(axis=(0, 1))
+    assert small.picture.mean(axis=(0, 1)) == pytest.approx(expected, abs=2)
+
+
+def test_event_rates_count_every_event_of_a_split_once(paths):
+    rates = event_rates(EventStore.open(paths.events), FrameStore.open(paths.frames))
+    assert [(rate.split, rate.sequences, rate.events) for rate in rates] == [
+        ("train", 1, 2000),
+        ("val", 1, 2000),
+        ("test", 2, 4000),
+    ]
+    assert rates[2].per_pixel_second == pytest.approx(4000 / (4 * 24 * 36 * 0.4))
+
+
+def test_the_best_epoch_is_the_one_with_the_lowest_validation_mse(paths):
+    history = read_history(paths.train / "history.json")
+    assert history.best_epoch == 1
+    assert [curve.label for curve in history.loss] == ["total", "mse"]
+    assert history.validation["psnr"].values == [10.0, 11.0, 12.0]
+
+
+def test_a_history_without_epochs_is_an_error(tmp_path):
+    (tmp_path / "history.json").write_text("[]")
+    with pytest.raises(ValueError, match="a row for each epoch"):
+        read_history(tmp_path / "history.json")

@@ -1,0 +1,84 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from polarnet.reports.figures import (
+    DARK,
+    LIGHT,
+    Curve,
+    PanelScene,
+    comparison_panel,
+    dolp_bar,
+    png,
+    score_distribution,
+    score_line,
+    training_curves,
+)
+
+TRUTH = torch.linspace(0, 1, 24 * 36).view(24, 36)
+CURVE = Curve("mse", [0, 1, 2], [0.3, 0.2, 0.1])
+SCORES = {"psnr": {"cf": [7.0, 8.0, 9.0], "ours": [15.0, 16.0, 18.0]}, "mse": {"cf": [0.2, 0.1], "ours": [0.02, 0.03]}}
+
+
+def scene(*methods):
+    return PanelScene("tree", torch.zeros(4, 24, 36), TRUTH, dict.fromkeys(methods, TRUTH / 2))
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda: training_curves([CURVE], [CURVE], "validation", LIGHT),
+        lambda: score_distribution(SCORES, DARK),
+        lambda: dolp_bar(LIGHT),
+    ],
+)
+def test_the_same_figure_gives_the_same_bytes_without_date_or_software(draw):
+    data = png(draw())
+    assert data == png(draw())
+    assert not any(chunk in data for chunk in (b"Software", b"tIME", b"Creation"))
+
+
+def test_a_comparison_panel_gives_the_same_bytes(tmp_path):
+    for name in ("one.png", "two.png"):
+        comparison_panel([scene("cf", "ours")], tmp_path / name)
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+
+
+def test_a_comparison_panel_grows_by_a_row_a_scene_and_a_column_a_method(tmp_path):
+    def size(rows):
+        comparison_panel(rows, tmp_path / "panel.png")
+        return cv2.imread(str(tmp_path / "panel.png")).shape[:2]
+
+    height, width = size([scene("ours")])
+    assert size([scene("ours")] * 2)[0] > 1.5 * height
+    assert size([scene("cf", "ours")])[1] > 1.2 * width
+
+
+def test_constants_have_no_place_in_a_comparison_panel(tmp_path):
+    comparison_panel([scene("ours")], tmp_path / "one.png")
+    comparison_panel([scene("zeros", "oracle_mean", "ours")], tmp_path / "two.png")
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+
+
+def test_a_panel_of_no_scene_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match="at least one scene"):
+        comparison_panel([], tmp_path / "panel.png")
+
+
+def test_a_frame_that_is_off_by_a_tenth_everywhere_scores_an_mse_of_a_hundredth_and_20_db():
+    assert score_line(torch.full((8, 8), 0.6), torch.full((8, 8), 0.5)) == "0.0100 · 20.00 dB"
+
+
+def test_figures_for_a_dark_page_have_light_text_and_no_background():
+    light, dark = (
+        cv2.imdecode(np.frombuffer(png(score_distribution(SCORES, theme)), np.uint8), cv2.IMREAD_UNCHANGED)
+        for theme in (LIGHT, DARK)
+    )
+    assert light[0, 0, 3] == dark[0, 0, 3] == 0
+    assert dark[dark[..., 3] == 255][:, :3].mean() > light[light[..., 3] == 255][:, :3].mean()
+
+
+def test_epochs_count_from_one_on_the_axis():
+    line = training_curves([CURVE], [CURVE], "validation", LIGHT).axes[0].lines[0]
+    assert list(line.get_xdata()) == [1, 2, 3]

@@ -1,0 +1,28 @@
+import numpy as np
+import pytest
+
+from polarnet.reports.artefacts import read_artefacts
+from polarnet.reports.overview import MOST_EVENTS, _oblique, overview_figure, write_overview
+
+
+@pytest.fixture(scope="module")
+def overview(paths):
+    return read_artefacts(paths).overview
+
+
+def test_the_overview_is_written_with_the_same_bytes_each_time(overview, tmp_path):
+    for name in ("one.png", "two.png"):
+        write_overview(overview, tmp_path / name)
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+
+
+def test_every_event_of_a_sparse_stream_is_drawn(overview):
+    clouds = [axes.collections[0] for axes in overview_figure(overview).axes if axes.collections]
+    assert [len(cloud.get_offsets()) for cloud in clouds] == [len(stream) for stream in overview.streams]
+    assert max(len(stream) for stream in overview.streams) < MOST_EVENTS
+
+
+def test_the_space_time_box_fills_the_page_from_corner_to_corner():
+    start, end = np.zeros(1), np.ones(1)
+    assert _oblique(start, start, end) == (0, 0)
+    assert _oblique(end, end, start) == (1, 1)

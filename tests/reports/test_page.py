@@ -1,0 +1,94 @@
+import dataclasses
+import json
+import re
+import shutil
+
+import pytest
+
+from polarnet.reports.page import write_report
+from polarnet.reports.provenance import Run
+
+RUN = Run(
+    "dvc repro",
+    {"seed": 1, "loss": {"mse": 1.0}, "networks": {"paper": {"channels": [32, 64]}}, "lpips": {"path": None}},
+    {"seed": "1", "commit": "abc"},
+)
+
+
+@pytest.fixture(scope="module")
+def folder(paths, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    assert write_report(paths, RUN, folder) == folder / "index.html"
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(folder):
+    return (folder / "index.html").read_text()
+
+
+def test_the_page_needs_no_other_file_and_no_network(page):
+    sources = re.findall(r'(?:src|srcset|href)="([^"]*)"', page)
+    assert sources
+    assert all(source.startswith(("data:", "#")) for source in sources)
+    assert not re.search(r"<script|<link|@import|url\(", page)
+
+
+def test_every_link_leads_to_a_section(page):
+    targets = re.findall(r'href="#(\w+)"', page)
+    assert len(targets) == 9
+    assert all(f'<section id="{target}">' in page for target in targets)
+
+
+def test_every_picture_says_what_it_shows(page):
+    assert all(re.search(r'alt="[^"]+"', tag) for tag in re.findall(r"<img[^>]*>", page))
+
+
+def test_the_network_is_best_here_and_the_papers_table_stands_beside(page):
+    ours = re.search(r'<tr class="m-ours">.*?</tr>', page)[0]
+    assert '<td class="best">' in ours
+    assert "15.56" in page
+    assert "27.48" in page
+
+
+def test_missing_lpips_is_said_with_its_reason_and_never_a_number(page):
+    assert "LPIPS was left out" in page
+    assert page.count("no weights lie in the hub cache") == 3  # warning, table, what was run
+
+
+def test_parameters_are_listed_with_their_full_keys(page):
+    assert "<code>networks.paper.channels</code></td><td>[32, 64]" in page
+    assert "<code>lpips.path</code></td><td>null" in page
+
+
+def test_text_from_files_is_escaped(page):
+    assert "&lt;b&gt;Ann&lt;/b&gt;" in page
+    assert "<b>Ann</b>" not in page
+
+
+def test_skipped_files_are_named(page):
+    assert "broken.jpg" in page
+    assert "cannot be read: ends early" in page
+
+
+def test_a_network_without_aolp_is_not_shown_in_colour(page):
+    assert "recovers DoLP alone" in page
+
+
+def test_the_overview_lies_beside_the_page_for_use_elsewhere(folder):
+    assert sorted(path.name for path in folder.iterdir()) == ["index.html", "overview.png"]
+
+
+def test_a_benchmark_without_panels_and_without_ours_still_gives_a_page(paths, tmp_path):
+    benchmark = tmp_path / "benchmark"
+    shutil.copytree(paths.benchmark, benchmark, ignore=shutil.ignore_patterns("panels"))
+    metrics = json.loads((benchmark / "metrics.json").read_text())
+    del metrics["ours"]
+    (benchmark / "metrics.json").write_text(json.dumps(metrics))
+    page = write_report(dataclasses.replace(paths, benchmark=benchmark), RUN, tmp_path / "report").read_text()
+    assert "kept no window of the network" in page
+    assert 'class="card"' not in page
+
+
+def test_the_same_artefacts_give_the_same_page(paths, page, tmp_path):
+    assert write_report(paths, RUN, tmp_path).read_text() == page

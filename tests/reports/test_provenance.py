@@ -1,0 +1,41 @@
+import subprocess
+
+import pytest
+
+from polarnet.reports.provenance import facts
+
+
+@pytest.fixture
+def project(tmp_path):
+    def git(*arguments):
+        identity = ["-c", "user.name=a", "-c", "user.email=a@example.org"]
+        subprocess.run(["git", *identity, *arguments], cwd=tmp_path, check=True, capture_output=True)
+
+    (tmp_path / "code.py").write_text("1\n")
+    (tmp_path / "dvc.lock").write_text("1\n")
+    git("init", "--quiet")
+    git("add", ".")
+    git("commit", "--quiet", "--message", "one")
+    return tmp_path
+
+
+def test_a_folder_without_a_commit_says_so(tmp_path):
+    assert facts(tmp_path)["commit"] == "none: not a git repository with a commit"
+
+
+def test_a_clean_clone_is_named_by_its_commit_alone(project):
+    assert len(facts(project)["commit"]) == 40
+
+
+def test_edited_code_is_said(project):
+    (project / "code.py").write_text("2\n")
+    assert facts(project)["commit"].endswith(", with uncommitted changes")
+
+
+def test_what_the_pipeline_writes_is_no_edit(project):
+    (project / "dvc.lock").write_text("2\n")
+    assert len(facts(project)["commit"]) == 40
+
+
+def test_versions_name_the_libraries_that_decide_results(tmp_path):
+    assert "torch 2" in facts(tmp_path)["versions"]

@@ -1,0 +1,284 @@
+"""What every pixel model promises: hand-worked ramps, equal bytes however the work is cut, errors that say what to do."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet.events.stream import validate
+from polarnet.simulation.emulator import MODELS, EmulatorConfig, emulate, emulate_columns, randomised
+
+IDEAL = EmulatorConfig(
+    model="exact",
+    render_rate_hz=300.0,
+    contrast_threshold_on=0.2,
+    contrast_threshold_off=0.2,
+    contrast_threshold_sigma=0.0,
+    cutoff_hz=0.0,
+    leak_rate_hz=0.0,
+    leak_jitter=0.0,
+    noise_rate_cov_decades=0.0,
+    shot_noise_rate_hz=0.0,
+    refractory_period_us=0.0,
+    esim_log_eps=0.001,
+    voltmeter_camera="dvs346",
+    randomise=False,
+    random_threshold_on=[0.08, 0.31],
+    random_threshold_off=[0.14, 0.42],
+    random_threshold_sigma=[0.02, 0.06],
+    random_cutoff_hz=[30.0, 300.0],
+    random_leak_rate_hz=[0.01, 0.1],
+    random_shot_noise_rate_hz=[0.001, 5.0],
+)
+NOISY = dataclasses.replace(
+    IDEAL,
+    contrast_threshold_sigma=0.03,
+    cutoff_hz=100.0,
+    leak_rate_hz=2.0,
+    leak_jitter=0.1,
+    noise_rate_cov_decades=0.1,
+    shot_noise_rate_hz=5.0,
+    refractory_period_us=500.0,
+)
+THRESHOLD_MODELS = ["v2e", "exact", "esim", "esim_gpu"]
+
+
+def of(model: str, base: EmulatorConfig = IDEAL, **changes) -> EmulatorConfig:
+    return dataclasses.replace(base, model=model, **changes)
+
+
+def log_ramp(start: float, stop: float, steps: int) -> torch.Tensor:
+    """One pixel whose natural-log digital number goes from start to stop in equal steps."""
+    return torch.linspace(start, stop, steps + 1, dtype=torch.float64).exp().float().view(-1, 1, 1, 1)
+
+
+def moving_clip(dtype: torch.dtype) -> torch.Tensor:
+    """Twelve frames of four planes in which bright and dark bars of 0 to 255 DN drift."""
+    phase = torch.arange(40.0) / 6 - torch.arange(12.0).view(-1, 1, 1, 1) / 3
+    amplitude = torch.linspace(20, 127, 4).view(1, 4, 1, 1) * torch.linspace(0.5, 1, 24).view(1, 1, 24, 1)
+    return (127.5 + amplitude * torch.sin(phase)).to(dtype)
+
+
+def same(a, b) -> bool:
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("t", "x", "y", "p"))
+
+
+@pytest.mark.parametrize("model", THRESHOLD_MODELS)
+@pytest.mark.parametrize(("sign", "polarity"), [(1, 1), (-1, -1)])
+def test_a_log_ramp_of_three_and_a_half_thresholds_fires_three_events(model, sign, polarity):
+    ramp = log_ramp(4.5, 4.5 + sign * 0.7, 10)
+    (events,), _ = emulate(ramp, 1000 * torch.arange(11), of(model, esim_log_eps=1e-9), key=1)
+    assert events.p.tolist() == [polarity] * 3
+
+
+@pytest.mark.parametrize("model", ["exact", "esim", "esim_gpu"])
+def test_events_of_a_log_ramp_are_stamped_where_it_crosses_the_thresholds(model):
+    (columns,), _ = emulate_columns(
+        log_ramp(4.5, 5.2, 10), 7000 * torch.arange(11), of(model, esim_log_eps=1e-9), key=1, exact=True
+    )
+    # 0.7 in 70 ms: 0.2 every 20 ms
+    assert columns.exact_us == pytest.approx([20_000, 40_000, 60_000], abs=0.5)
+    assert columns.t.tolist() == np.floor(columns.exact_us).astype(int).tolist()
+
+
+def test_v2e_spreads_events_over_a_step_as_its_busiest_pixel_asks():
+    frames = torch.tensor([[math.exp(4.0), math.exp(4.0)], [math.exp(4.61), math.exp(4.21)]]).float().view(2, 1, 1, 2)
+    (events,), _ = emulate(frames, torch.tensor([0, 3000]), of("v2e"), key=1)
+    # three events of the first pixel at thirds; the second pixel's only event shares the first slot
+    assert events.t.tolist() == [1000, 1000, 2000, 3000]
+    assert events.x.tolist() == [0, 1, 0, 0]
+
+
+def test_v2e_does_not_consume_what_its_refractory_period_suppresses():
+    frames = torch.tensor([4.0, 4.61, 4.61]).exp().float().view(3, 1, 1, 1)
+    (events,), _ = emulate(frames, torch.tensor([0, 3000, 6000]), of("v2e", refractory_period_us=2500.0), key=1)
+    # slots at 1, 2, 3 ms: only the first is taken; two thresholds remain, tried again at 4.5 and 6 ms
+    assert events.t.tolist() == [1000, 4500]
+
+
+def test_exact_fires_a_delayed_event_when_the_refractory_period_ends():
+    frames = torch.tensor([4.0, 4.61, 4.61]).exp().float().view(3, 1, 1, 1)
+    (columns,), state = emulate_columns(
+        frames, torch.tensor([0, 6100, 9000]), of("exact", refractory_period_us=2500.0), key=1, exact=True
+    )
+    # crossings at 2, 4 and 6 ms; the second has to wait for 4.5, the third for 7 ms
+    assert columns.exact_us == pytest.approx([2000, 4500, 7000], abs=0.5)
+    assert state.pixels[0].change[0] == pytest.approx(0.01, abs=1e-6)
+
+
+def test_exact_forgets_a_delayed_event_when_the_light_goes_back_in_time():
+    frames = torch.tensor([4.0, 4.41, 4.21]).exp().float().view(3, 1, 1, 1)
+    (columns,), _ = emulate_columns(
+        frames, torch.tensor([0, 4100, 6100]), of("exact", refractory_period_us=4000.0), key=1, exact=True
+    )
+    # crossings at 2 and 4 ms; at 6 ms, when the second may fire, only 0.22 - 0.2 of change is left
+    assert columns.exact_us == pytest.approx([2000], abs=0.5)
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact"])
+def test_the_response_is_linear_up_to_20_dn_and_logarithmic_above(model):
+    frames = torch.tensor([0, 10, 20, 21, 255], dtype=torch.uint8).view(1, 1, 1, 5)
+    _, state = emulate(frames, torch.tensor([0]), of(model), key=1)
+    pixels = state.pixels[0]
+    response = pixels.filtered if model == "v2e" else pixels.linlog
+    expected = [0, math.log(20) / 2, math.log(20), math.log(21), math.log(255)]
+    assert response == pytest.approx(expected, abs=6e-7)
+
+
+def test_the_photoreceptor_of_exact_follows_a_step_exponentially_whatever_the_frame_rate():
+    # 255 DN from 26 DN on, at 275 DN of the scale the time constant is 1 / (2 pi 10 Hz) = 15.9 ms
+    def filtered(steps: int) -> float:
+        frames = torch.full((steps + 1, 1, 1, 1), 255.0)
+        frames[0] = 254.999
+        config = of("exact", cutoff_hz=10.0, contrast_threshold_on=5.0, contrast_threshold_off=5.0)
+        _, state = emulate(frames[:1] * 0 + 100.0, torch.tensor([0]), config, key=1)
+        jump_us = torch.cat([torch.tensor([1]), 1 + 20_000 * torch.arange(1, steps + 1) // steps])
+        _, state = emulate(frames, jump_us, config, key=1, state=state)
+        return float(state.pixels[0].change[0])
+
+    expected = math.log(2.55) * (1 - math.exp(-2 * math.pi * 10 * 0.02))
+    assert filtered(1) == pytest.approx(expected, abs=2e-4)
+    assert filtered(200) == pytest.approx(expected, abs=2e-4)
+
+
+@pytest.mark.parametrize("model", list(MODELS))
+def test_a_clip_cut_into_pieces_gives_the_events_of_the_whole(model):
+    frames, t_us = moving_clip(torch.float32), 3333 * torch.arange(12)
+    whole, end = emulate(frames, t_us, of(model, NOISY), key=7)
+    assert sum(map(len, whole)) > 2000
+    pieces, state = [], None
+    for piece in (slice(0, 1), slice(1, 5), slice(5, 12)):
+        events, state = emulate(frames[piece], t_us[piece], of(model, NOISY), key=7, state=state)
+        pieces.append(events)
+    for plane in range(4):
+        for name in ("t", "x", "y", "p"):
+            assert torch.equal(torch.cat([getattr(p[plane], name) for p in pieces]), getattr(whole[plane], name))
+    assert (state.t_us, state.steps) == (end.t_us, end.steps) == (11 * 3333, 11)
+
+
+@pytest.mark.parametrize("model", list(MODELS))
+def test_threads_and_the_order_of_planes_do_not_change_a_byte(model):
+    frames, t_us = moving_clip(torch.float32), 3333 * torch.arange(12)
+    alone, _ = emulate(frames, t_us, of(model, NOISY), key=7)
+    together, _ = emulate(frames, t_us, of(model, NOISY), key=7, threads=2)
+    turned, _ = emulate(frames.flip(1), t_us, of(model, NOISY), key=7, planes=[3, 2, 1, 0])
+    assert all(same(a, b) for a, b in zip(alone, together, strict=True))
+    assert all(same(a, b) for a, b in zip(alone, turned[::-1], strict=True))
+
+
+@pytest.mark.parametrize("model", list(MODELS))
+def test_events_are_valid_and_in_the_order_t_y_x_p(model):
+    events, _ = emulate(moving_clip(torch.uint8), 37.5 * torch.arange(12, dtype=torch.float64), of(model, NOISY), key=3)
+    for plane in events:
+        validate(plane)
+        order = np.lexsort((plane.p, plane.x, plane.y, plane.t))
+        assert np.array_equal(order, np.arange(len(plane)))
+
+
+@pytest.mark.parametrize("model", list(MODELS))
+def test_whole_numbers_mean_the_same_as_bytes_and_as_floats(model):
+    t_us = 3333 * torch.arange(12)
+    from_bytes, _ = emulate(moving_clip(torch.uint8), t_us, of(model, NOISY), key=3)
+    from_floats, _ = emulate(moving_clip(torch.uint8).double(), t_us, of(model, NOISY), key=3)
+    if model.startswith("esim"):  # bytes take the float32 closest to the logarithm, floats a faster one
+        assert [len(e) for e in from_floats] == pytest.approx([len(e) for e in from_bytes], rel=1e-3)
+    else:
+        assert all(same(a, b) for a, b in zip(from_bytes, from_floats, strict=True))
+
+
+@pytest.mark.parametrize("model", list(MODELS))
+def test_what_comes_in_is_not_changed(model):
+    frames, t_us = moving_clip(torch.float32), 3333 * torch.arange(12)
+    _, state = emulate(frames[:6], t_us[:6], of(model, NOISY), key=3)
+    before = [[array.copy() for array in pixels] for pixels in state.pixels]
+    emulate(frames[6:], t_us[6:], of(model, NOISY), key=3, state=state)
+    assert all(
+        np.array_equal(a, b) for p, q in zip(before, state.pixels, strict=True) for a, b in zip(p, q, strict=True)
+    )
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact"])
+def test_every_plane_has_thresholds_of_its_own_around_the_nominal_ones(model):
+    _, state = emulate(torch.full((1, 4, 100, 100), 100.0), torch.tensor([0]), of(model, NOISY), key=3)
+    maps = [values for pixels in state.pixels for values in (pixels.threshold_on, pixels.threshold_off)]
+    for values in maps:
+        assert values.mean() == pytest.approx(0.2, abs=3 * 0.03 / 100)
+        assert values.std() == pytest.approx(0.03, abs=3 * 0.03 / math.sqrt(2) / 100)
+        assert values.min() >= 0.01
+    correlations = np.corrcoef(maps)[np.triu_indices(8, 1)]
+    assert abs(correlations).max() < 4 / 100  # of 28 pairs, standard deviation 1 / 100 each
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact"])
+def test_another_key_is_another_sensor_and_the_same_key_the_same(model):
+    frames, t_us = moving_clip(torch.float32), 3333 * torch.arange(12)
+    (first, *_), _ = emulate(frames, t_us, of(model, NOISY), key=2**64 - 1)
+    (again, *_), _ = emulate(frames, t_us, of(model, NOISY), key=2**64 - 1)
+    (other, *_), _ = emulate(frames, t_us, of(model, NOISY), key=1)
+    assert same(first, again)
+    assert not same(first, other)
+
+
+def test_a_sensor_is_drawn_for_each_sequence_within_the_ranges():
+    wanted = dataclasses.replace(IDEAL, randomise=True)
+    drawn = [randomised(wanted, np.random.default_rng(seed)) for seed in range(200)]
+    for name, bounds in (
+        ("contrast_threshold_on", IDEAL.random_threshold_on),
+        ("contrast_threshold_off", IDEAL.random_threshold_off),
+        ("contrast_threshold_sigma", IDEAL.random_threshold_sigma),
+        ("cutoff_hz", IDEAL.random_cutoff_hz),
+        ("leak_rate_hz", IDEAL.random_leak_rate_hz),
+        ("shot_noise_rate_hz", IDEAL.random_shot_noise_rate_hz),
+    ):
+        values = [getattr(config, name) for config in drawn]
+        assert bounds[0] <= min(values) < max(values) <= bounds[1]
+    assert np.median([config.shot_noise_rate_hz for config in drawn]) == pytest.approx(math.sqrt(0.005), rel=0.6)
+    assert randomised(IDEAL, np.random.default_rng(0)) is IDEAL
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"model": "iebcs"}, "model: expected one of v2e, exact, esim, esim_gpu, dvs_voltmeter"),
+        ({"contrast_threshold_on": 0.0}, "contrast_threshold_on: expected >= 0.01"),
+        ({"leak_jitter": 1.5}, "leak_jitter: expected >= 0 and <= 1"),
+        ({"random_cutoff_hz": [300.0, 30.0]}, "random_cutoff_hz: expected .lowest, highest., got .300.0, 30.0."),
+    ],
+)
+def test_a_configuration_out_of_range_is_refused_by_name(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(IDEAL, **changes)
+
+
+CLIP, TIMES = torch.full((3, 2, 4, 5), 100.0), torch.tensor([0, 10, 20])
+
+
+@pytest.mark.parametrize(
+    ("frames", "t_us", "message"),
+    [
+        (CLIP, torch.tensor([0, 10, 10]), "strictly increasing times"),
+        (CLIP, torch.tensor([0.0, 10.0, float("nan")], dtype=torch.float64), "strictly increasing times"),
+        (CLIP, TIMES[:2], r"one time each .* got frames \(3, 2, 4, 5\) and 2 times"),
+        (CLIP[:0], TIMES[:0], "at least one frame"),
+        (CLIP.to(torch.int64), TIMES, "uint8 or float digital numbers .* got torch.int64"),
+        (CLIP / 0, TIMES, "finite frames"),
+        (-CLIP, TIMES, "negative"),
+    ],
+)
+def test_light_that_makes_no_sense_is_refused(frames, t_us, message):
+    with pytest.raises(ValueError, match=message):
+        emulate(frames, t_us, IDEAL, key=1)
+
+
+def test_a_state_goes_on_with_its_own_sensor_and_later_times_alone():
+    _, state = emulate(CLIP, TIMES, IDEAL, key=1)
+    with pytest.raises(ValueError, match="the first after the state's 20.0"):
+        emulate(CLIP, TIMES, IDEAL, key=1, state=state)
+    with pytest.raises(ValueError, match="the state is of planes .0, 1. of 4x5 pixels"):
+        emulate(CLIP[:, :, :3], TIMES + 100, IDEAL, key=1, state=state)
+    with pytest.raises(ValueError, match="the state is of model exact"):
+        emulate(CLIP, TIMES + 100, of("v2e"), key=1, state=state)
+    with pytest.raises(ValueError, match="2 different plane numbers"):
+        emulate(CLIP, TIMES, IDEAL, key=1, planes=[1, 1])

@@ -1,0 +1,160 @@
+"""Noise has the statistics that the models give it; labels say which process an event came from."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from polarnet.simulation.emulator import EmulatorConfig, emulate_columns
+from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL
+from polarnet.simulation.pixels.randomness import mixed, normal, normal_map, rough_normals, uniform
+
+QUIET = EmulatorConfig(
+    model="exact",
+    render_rate_hz=300.0,
+    contrast_threshold_on=0.2,
+    contrast_threshold_off=0.2,
+    contrast_threshold_sigma=0.0,
+    cutoff_hz=0.0,
+    leak_rate_hz=0.0,
+    leak_jitter=0.0,
+    noise_rate_cov_decades=0.0,
+    shot_noise_rate_hz=0.0,
+    refractory_period_us=0.0,
+    esim_log_eps=0.001,
+    voltmeter_camera="dvs346",
+    randomise=False,
+    random_threshold_on=[0.08, 0.31],
+    random_threshold_off=[0.14, 0.42],
+    random_threshold_sigma=[0.02, 0.06],
+    random_cutoff_hz=[30.0, 300.0],
+    random_leak_rate_hz=[0.01, 0.1],
+    random_shot_noise_rate_hz=[0.001, 5.0],
+)
+SIDE = 64  # pixels
+
+
+def still(config: EmulatorConfig, dn: float, seconds: float, fps: int, **wanted):
+    """Events of 64 x 64 pixels that see a constant light."""
+    t_us = torch.from_numpy(np.rint(np.arange(round(seconds * fps) + 1) * 1e6 / fps))
+    frames = torch.full((1, 1, SIDE, SIDE), dn).expand(len(t_us), -1, -1, -1)
+    (columns,), _ = emulate_columns(frames, t_us, config, key=5, labels=True, exact=True, **wanted)
+    return columns
+
+
+def intervals_s(columns) -> tuple[np.ndarray, np.ndarray]:
+    """Seconds between successive events of a pixel, and to the first event of each pixel."""
+    pixel = columns.y.astype(int) * SIDE + columns.x
+    order = np.lexsort((columns.exact_us, pixel))
+    pixel, t_s = pixel[order], columns.exact_us[order] * 1e-6
+    following = pixel[1:] == pixel[:-1]
+    return np.diff(t_s)[following], t_s[np.concatenate([[True], ~following])]
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact"])
+@pytest.mark.parametrize("dn", [0.0, 20.0, 128.0, 255.0])
+def test_shot_noise_has_the_rate_of_its_light_and_equal_polarities(model, dn):
+    columns = still(dataclasses.replace(QUIET, model=model, shot_noise_rate_hz=5.0), dn, 2.0, 300)
+    expected = 5.0 * (1 - 0.75 * (dn + 20) / 275) * 2.0 * SIDE**2
+    assert len(columns.t) == pytest.approx(expected, abs=3 * math.sqrt(expected))
+    assert columns.p.sum() == pytest.approx(0, abs=3 * math.sqrt(expected))
+    assert (columns.label == SHOT).all()
+
+
+def test_shot_noise_of_exact_is_a_poisson_process_at_any_frame_rate():
+    config = dataclasses.replace(QUIET, shot_noise_rate_hz=5.0)
+    fast, slow = still(config, 0.0, 2.0, 300), still(config, 0.0, 2.0, 10)
+    assert np.array_equal(fast.exact_us, slow.exact_us)
+    rate = 5.0 * (1 - 0.75 * 20 / 275)
+    first = intervals_s(fast)[1]  # of the pixels that fired within two seconds
+    law = stats.truncexpon(2.0 * rate, scale=1 / rate)
+    assert stats.kstest(first, law.cdf).pvalue > 0.01
+
+
+def test_thresholds_tilt_shot_noise_towards_the_lower_one():
+    config = dataclasses.replace(QUIET, shot_noise_rate_hz=5.0, contrast_threshold_sigma=0.05)
+    for model in ("v2e", "exact"):
+        t_us = 1e4 * torch.arange(201, dtype=torch.float64)
+        frames = torch.zeros(1, 1, SIDE, SIDE).expand(201, -1, -1, -1)
+        (columns,), state = emulate_columns(frames, t_us, dataclasses.replace(config, model=model), key=5)
+        inverse = 0.2 / state.pixels[0].threshold_on
+        expected = 2.5 * (1 - 0.75 * 20 / 275) * 2.0 * inverse.sum()
+        assert (columns.p == 1).sum() == pytest.approx(expected, abs=3 * math.sqrt(expected))
+
+
+@pytest.mark.parametrize("fps", [30, 300])
+def test_leak_of_v2e_has_its_rate_and_a_jitter_that_shrinks_with_the_frame_rate(fps):
+    columns = still(dataclasses.replace(QUIET, model="v2e", leak_rate_hz=1.0, leak_jitter=0.1), 100.0, 5.0, fps)
+    intervals, first = intervals_s(columns)
+    assert (columns.p == 1).all()
+    assert (columns.label == LEAK).all()
+    # the jitter of the frames adds up to 0.1 sqrt(dt / R); events are stamped at frames
+    spread = math.sqrt(0.01 / fps + 1 / 6 / fps**2)
+    assert intervals.mean() == pytest.approx(1.0, abs=4 * spread / math.sqrt(len(intervals)) + 0.1 / fps)
+    assert intervals.std() == pytest.approx(spread, rel=0.2)
+    assert first.min() > 0.85  # all pixels start in step: v2e knows no phase
+
+
+@pytest.mark.parametrize("fps", [20, 300])
+def test_leak_of_exact_has_its_rate_a_random_phase_and_the_same_jitter_at_any_frame_rate(fps):
+    columns = still(dataclasses.replace(QUIET, leak_rate_hz=1.0, leak_jitter=0.1), 100.0, 5.0, fps)
+    intervals, first = intervals_s(columns)
+    assert (columns.p == 1).all()
+    assert (columns.label == LEAK).all()
+    # an interval lasts 1 / (1 - 0.1 n): mean 1 + 0.01, standard deviation 0.1 and a little
+    assert intervals.mean() == pytest.approx(1.01, abs=0.005)
+    assert intervals.std() == pytest.approx(0.104, abs=0.004)
+    assert len(first) == SIDE**2
+    assert stats.kstest(first[first < 0.7] / 0.7, "uniform").pvalue > 0.01
+
+
+def test_leak_of_exact_is_the_same_event_for_event_at_any_frame_rate():
+    config = dataclasses.replace(QUIET, leak_rate_hz=1.0, noise_rate_cov_decades=0.1)
+    slow, fast = still(config, 100.0, 3.0, 20), still(config, 100.0, 3.0, 300)
+    assert len(slow.t) == pytest.approx(len(fast.t), abs=2)  # one may fall just beyond the end
+    (between_slow, first_slow), (between_fast, first_fast) = intervals_s(slow), intervals_s(fast)
+    assert first_slow == pytest.approx(first_fast, abs=1e-4)
+    assert np.sort(between_slow) == pytest.approx(np.sort(between_fast), abs=1e-4)
+
+
+def test_leak_rates_spread_over_pixels_by_a_power_of_ten():
+    config = dataclasses.replace(QUIET, leak_rate_hz=1.0, noise_rate_cov_decades=0.1)
+    _, state = emulate_columns(torch.full((1, 1, 100, 100), 9.0), torch.tensor([0]), config, key=5)
+    decades = np.log10(state.pixels[0].leak_nominal / (1e-6 * 0.2))
+    assert decades.mean() == pytest.approx(0, abs=3 * 0.1 / 100)
+    assert decades.std() == pytest.approx(0.1, abs=3 * 0.1 / math.sqrt(2) / 100)
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact", "esim"])
+def test_events_of_a_changing_light_are_labelled_as_signal(model):
+    ramp = torch.linspace(3.5, 5.5, 21).exp().view(-1, 1, 1, 1)
+    config = dataclasses.replace(QUIET, model=model)
+    (columns,), _ = emulate_columns(ramp, 3333 * torch.arange(21), config, key=1, labels=True)
+    assert len(columns.t) >= 9
+    assert (columns.label == SIGNAL).all()
+
+
+def test_uniform_numbers_are_uniform_and_neighbours_are_independent():
+    key = np.uint64(12)
+    values = np.array([uniform(np.uint64(mixed(key, i))) for i in range(20_000)])
+    assert stats.kstest(values, "uniform").pvalue > 0.01
+    assert abs(np.corrcoef(values[:-1], values[1:])[0, 1]) < 3 / math.sqrt(20_000)
+
+
+def test_the_normal_quantile_is_right_from_tail_to_tail():
+    u = np.concatenate([10.0 ** -np.arange(1, 17), np.linspace(0.01, 0.99, 99), 1 - 10.0 ** -np.arange(1, 15)])
+    assert [normal(x) for x in u] == pytest.approx(stats.norm.ppf(u), rel=3e-7, abs=3e-7)
+    assert stats.kstest(normal_map(np.uint64(3), 1, 0, 20_000), "norm").pvalue > 0.01
+
+
+def test_rough_normal_numbers_have_the_moments_they_claim():
+    values = np.empty(200_001, np.float32)
+    rough_normals(np.uint64(4), 0, values)
+    assert values.mean() == pytest.approx(0, abs=3 / math.sqrt(200_000))
+    assert values.var() == pytest.approx(1, abs=3 * math.sqrt(2 / 200_000))
+    assert stats.kurtosis(values) == pytest.approx(-0.15, abs=0.04)
+    assert abs(values).max() <= 4.61
+    assert abs(np.corrcoef(values[:-1], values[1:])[0, 1]) < 3 / math.sqrt(200_000)

@@ -1,0 +1,90 @@
+"""DVS-Voltmeter's events follow the first-passage law of a Brownian motion with drift."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from polarnet.simulation.emulator import EmulatorConfig, emulate_columns
+from polarnet.simulation.pixels.voltmeter import CAMERAS, chance_of_on
+
+CONFIG = EmulatorConfig(
+    model="dvs_voltmeter",
+    render_rate_hz=300.0,
+    contrast_threshold_on=0.2,
+    contrast_threshold_off=0.2,
+    contrast_threshold_sigma=0.0,
+    cutoff_hz=0.0,
+    leak_rate_hz=0.0,
+    leak_jitter=0.0,
+    noise_rate_cov_decades=0.0,
+    shot_noise_rate_hz=0.0,
+    refractory_period_us=0.0,
+    esim_log_eps=0.001,
+    voltmeter_camera="dvs346",
+    randomise=False,
+    random_threshold_on=[0.08, 0.31],
+    random_threshold_off=[0.14, 0.42],
+    random_threshold_sigma=[0.02, 0.06],
+    random_cutoff_hz=[30.0, 300.0],
+    random_leak_rate_hz=[0.01, 0.1],
+    random_shot_noise_rate_hz=[0.001, 5.0],
+)
+SIDE = 50
+
+
+def drift_and_noise(camera: str, before: float, after: float, dt_us: float) -> tuple[float, float]:
+    """Of the voltage, in thresholds per microsecond and per its square root (the paper's Eq. 10)."""
+    k1, k2, k3, k4, k5, k6 = CAMERAS[camera]
+    mean = (before + after) / 2
+    drift = k1 * (after - before) / dt_us / (mean + k2) + k4 + k5 * mean
+    return drift, k3 * math.sqrt(mean) / (mean + k2) + k6
+
+
+def first_events(before: float, after: float, dt_us: int, camera: str) -> tuple[np.ndarray, np.ndarray]:
+    """Microseconds and polarity of the first event of each of 2500 pixels in one long step, in which all of them fire."""
+    frames = torch.tensor([before, after]).view(2, 1, 1, 1).expand(-1, -1, SIDE, SIDE)
+    config = dataclasses.replace(CONFIG, voltmeter_camera=camera)
+    (columns,), _ = emulate_columns(frames, torch.tensor([0, dt_us]), config, key=11, exact=True)
+    pixel = columns.y.astype(int) * SIDE + columns.x
+    firsts = np.unique(pixel[np.argsort(columns.exact_us, kind="stable")], return_index=True)
+    assert len(firsts[0]) == SIDE**2
+    order = np.argsort(columns.exact_us, kind="stable")[firsts[1]]
+    return columns.exact_us[order], columns.p[order]
+
+
+@pytest.mark.parametrize(
+    ("camera", "before", "after", "polarity"),
+    [("dvs346", 60.0, 90.0, 1), ("dvs240", 40.0, 80.0, 1), ("dvs346", 90.0, 20.0, -1)],
+)
+def test_the_time_to_the_first_event_is_inverse_gaussian(camera, before, after, polarity):
+    dt_us = 2_000_000
+    drift, noise = drift_and_noise(camera, before, after, dt_us)
+    times, polarities = first_events(before, after, dt_us, camera)
+    assert (polarities == polarity).all()
+    law = stats.invgauss(mu=noise**2 / abs(drift), scale=1 / noise**2)  # mean 1 / drift, shape 1 / noise^2
+    assert law.mean() == pytest.approx(1 / abs(drift))
+    assert stats.kstest(times, law.cdf).pvalue > 0.01
+
+
+def test_the_first_threshold_to_be_met_is_decided_by_drift_and_distance():
+    # without drift over noise either is as likely; against strong drift none; the limit of weak drift is even
+    assert chance_of_on(0.0, 1e-5, 1.0, 1.0) == 0.5
+    assert chance_of_on(1e-5, 1e-5, 1.0, 1.0) == 1.0
+    assert chance_of_on(-1e-5, 1e-5, 1.0, 1.0) == 0.0
+    assert chance_of_on(1e-16, 1e-5, 1.0, 1.0) == pytest.approx(0.5, abs=1e-3)
+    # (e^2 - 1) / (e^2 - e^-2) for 2 mu / s^2 = 2
+    expected = (math.exp(2) - 1) / (math.exp(2) - math.exp(-2))
+    assert chance_of_on(1e-10, 1e-5, 1.0, 1.0) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_still_bright_scene_leaks_on_events_at_the_rate_of_its_light():
+    # k4 + k5 * 200 = 1.1e-6 thresholds per microsecond: 1.1 ON events a second
+    frames = torch.full((1, 1, SIDE, SIDE), 200.0).expand(91, -1, -1, -1)
+    t_us = torch.from_numpy(np.rint(np.arange(91) * 1e6 / 30))
+    (columns,), _ = emulate_columns(frames, t_us, CONFIG, key=11)
+    assert (columns.p == 1).mean() > 0.99
+    assert len(columns.t) == pytest.approx(1.1 * 3 * SIDE**2, rel=0.12)  # an event may be under way at both ends

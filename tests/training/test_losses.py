@@ -1,0 +1,58 @@
+import pytest
+import torch
+
+from polarnet.lpips import Lpips
+from polarnet.similarity import ssim
+from polarnet.training.losses import FrameLoss, LossConfig, polarization_loss
+
+
+def frames(value: float) -> torch.Tensor:
+    return torch.full((2, 3, 12, 12), value)
+
+
+def test_equal_frames_cost_nothing():
+    truth = torch.rand(2, 3, 12, 12)
+    loss = FrameLoss({"mse": 1.0, "mae": 1.0, "ssim_loss": 1.0}, None)
+    terms = loss(truth, truth)
+    torch.testing.assert_close(loss.total(terms), torch.tensor(0.0), atol=1e-6, rtol=0)
+
+
+def test_constant_frames_half_apart():
+    terms = FrameLoss({"mse": 1.0, "mae": 1.0, "ssim_loss": 1.0}, None)(frames(0.25), frames(0.75))
+    assert terms["mse"].item() == 0.25
+    assert terms["mae"].item() == 0.5
+    luminance = (2 * 0.25 * 0.75 + 0.01**2) / (0.25**2 + 0.75**2 + 0.01**2)  # all that SSIM sees of constants
+    assert terms["ssim_loss"].item() == pytest.approx(1 - luminance, rel=1e-5)
+
+
+def test_the_total_is_equation_9():
+    predicted, truth = torch.rand(2, 1, 2, 12, 12).unbind()
+    loss = polarization_loss(LossConfig(mse=2.0, ssim=3.0, lpips=0.0), None)
+    terms = loss(predicted, truth)
+    expected = 2 * (predicted - truth).square().mean() + 3 * (1 - ssim(predicted, truth)).mean()
+    torch.testing.assert_close(loss.total(terms), expected)
+
+
+def test_lpips_is_weighed_with_the_rest_where_there_is_a_network():
+    torch.manual_seed(0)
+    lpips = Lpips("squeeze")
+    loss = polarization_loss(LossConfig(mse=1.0, ssim=0.0, lpips=10.0), lpips)
+    predicted, truth = torch.rand(1, 2, 32, 32), torch.rand(1, 2, 32, 32)
+    terms = loss(predicted, truth)
+    torch.testing.assert_close(terms["lpips"], lpips(predicted[0], truth[0]).mean())
+    torch.testing.assert_close(loss.total(terms), terms["mse"] + 10 * terms["lpips"])
+
+
+def test_without_a_network_lpips_is_left_out_and_not_made_up():
+    loss = polarization_loss(LossConfig(mse=1.0, ssim=1.0, lpips=10.0), None)
+    assert loss.weights == {"mse": 1.0, "ssim_loss": 1.0}
+    assert list(loss(frames(0.1), frames(0.2))) == ["mse", "ssim_loss"]
+
+
+def test_a_weight_of_zero_is_not_even_computed():
+    assert list(FrameLoss({"mse": 1.0, "ssim_loss": 0.0}, None)(frames(0.1), frames(0.2))) == ["mse"]
+
+
+def test_a_loss_of_nothing_is_refused():
+    with pytest.raises(ValueError, match="mse, ssim, lpips: expected at least one weight > 0"):
+        LossConfig(mse=0.0, ssim=0.0, lpips=0.0)

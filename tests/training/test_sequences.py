@@ -1,0 +1,107 @@
+import math
+
+import pytest
+import torch
+from torch.utils.data import Dataset
+
+from polarnet import stokes
+from polarnet.events.windows import WindowSequence
+from polarnet.runtime import generator_for
+from polarnet.training.sequences import View, batches_of, random_view, seen, shuffled, stack
+
+
+class Listed(Dataset[WindowSequence]):
+    def __init__(self, *sequences: WindowSequence):
+        self.sequences = sequences
+
+    def __getitem__(self, index: int) -> WindowSequence:
+        return self.sequences[index]
+
+
+def sequence(name: str = "s", windows: int = 3, height: int = 6, width: int = 8) -> WindowSequence:
+    """Truth that is exact: intensities follow from S0, DoLP and AoLP, and the inputs are the intensities twice over."""
+    torch.manual_seed(len(name))
+    s0, dolp, fraction = torch.rand(3, windows, height, width)
+    aolp = math.pi * fraction
+    intensity = stokes.intensities_from_stokes(stokes.stokes_from_polarization(s0, dolp, aolp))
+    return WindowSequence(name, intensity.repeat_interleave(2, dim=1), dolp, aolp, intensity)
+
+
+WHOLE = View(top=0, left=0, height=6, width=8, mirror_x=False, mirror_y=False, turn=0, direction=1)
+
+
+def test_the_plain_view_changes_nothing():
+    before = sequence()
+    after = seen(before, WHOLE)
+    for a, b in zip(before[1:], after[1:], strict=True):
+        torch.testing.assert_close(a, b)
+
+
+@pytest.mark.parametrize("turn", range(4))
+@pytest.mark.parametrize("direction", [1, -1])
+def test_renumbered_polarizers_still_obey_the_stokes_equations(turn, direction):
+    before = sequence()
+    after = seen(before, WHOLE._replace(turn=turn, direction=direction))
+    vector = stokes.stokes_from_intensities(after.intensity)
+    torch.testing.assert_close(stokes.dolp(vector), before.dolp, atol=1e-4, rtol=1e-4)
+    difference = torch.remainder(stokes.aolp(vector) - after.aolp + math.pi / 2, math.pi) - math.pi / 2
+    assert (difference.abs() * before.dolp).max() < 1e-4
+    assert torch.equal(after.inputs, after.intensity.repeat_interleave(2, dim=1))
+
+
+def test_a_mirrored_view_is_mirrored_everywhere():
+    before = sequence()
+    after = seen(before, WHOLE._replace(mirror_x=True))
+    assert torch.equal(after.inputs, before.inputs.flip(-1))
+    assert torch.equal(after.dolp, before.dolp.flip(-1))
+    assert torch.equal(after.intensity, before.intensity.flip(-1))
+
+
+def test_a_crop_is_the_same_part_of_inputs_and_truth():
+    before = sequence()
+    after = seen(before, WHOLE._replace(top=2, left=3, height=4, width=5))
+    assert torch.equal(after.inputs, before.inputs[..., 2:6, 3:8])
+    assert torch.equal(after.dolp, before.dolp[..., 2:6, 3:8])
+
+
+def test_a_random_view_is_drawn_from_its_generator_and_stays_inside():
+    for epoch in range(50):
+        view = random_view(20, 30, [16, 17], True, generator_for(1, "s", str(epoch)))
+        assert view == random_view(20, 30, [16, 17], True, generator_for(1, "s", str(epoch)))
+        assert 0 <= view.top <= 4
+        assert 0 <= view.left <= 13
+        assert (view.height, view.width) == (16, 17)
+
+
+def test_without_crop_and_symmetries_the_view_is_the_plain_one():
+    assert random_view(6, 8, None, False, generator_for(1, "s", "0")) == WHOLE
+
+
+def test_a_crop_larger_than_the_image_is_refused():
+    with pytest.raises(ValueError, match="crop: expected at most the 6x8 pixels of the sequences, got 16x16"):
+        random_view(6, 8, [16, 16], True, generator_for(1, "s", "0"))
+
+
+def test_a_batch_has_time_first_and_then_the_sequences():
+    batch = stack([sequence("a"), sequence("bb")])
+    assert batch.names == ["a", "bb"]
+    assert batch.inputs.shape == (3, 2, 8, 6, 8)
+    assert batch.intensity.shape == (3, 2, 4, 6, 8)
+    assert torch.equal(batch.dolp[:, 1], sequence("bb").dolp)
+
+
+def test_a_batch_of_unequal_lengths_is_refused():
+    with pytest.raises(ValueError, match=r"equally many windows, got \[3, 4\]; use batch_size=1"):
+        stack([sequence(windows=3), sequence(windows=4)])
+
+
+def test_the_order_is_a_permutation_that_depends_on_seed_and_epoch():
+    assert sorted(shuffled(9, seed=1, epoch=0)) == list(range(9))
+    assert shuffled(9, seed=1, epoch=0) == shuffled(9, seed=1, epoch=0)
+    assert len({tuple(shuffled(9, seed, epoch)) for seed in (1, 2) for epoch in (0, 1)}) == 4
+
+
+def test_batches_follow_the_order_and_the_last_may_be_small():
+    dataset = Listed(sequence("a"), sequence("bb"), sequence("ccc"))
+    names = [batch.names for batch in batches_of(dataset, [2, 0, 1], batch_size=2, workers=0)]
+    assert names == [["ccc", "a"], ["bb"]]
