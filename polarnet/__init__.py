@@ -1,3 +1,9 @@
 """Degree of linear polarization from event cameras: simulated training data, a recovery network, its benchmark."""
 
+import os
+
+# Before anything loads torch: its OpenMP threads would spin while they wait for one another, and on a machine that does
+# something else as well (a second job, a CI runner) a training step then takes five to ten times as long.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 __version__ = "0.1.0"

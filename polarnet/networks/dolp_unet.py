@@ -1,5 +1,6 @@
 """The paper's end-to-end DoLP recovery network (section 3.3, Fig. 6)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -29,6 +30,8 @@ class DolpUNetConfig:
     """Attention heads of S1 and S2."""
     residual_blocks: int = field(metadata=allowed(low=0))
     """The paper has two, R1 and R2."""
+    input_mixing: str = field(metadata=allowed(choices=("polarizers", "contrasts")))
+    """What C1 sees: the four channels as they are (the paper), or their sum and differences, see `contrasts`."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -42,13 +45,13 @@ class DolpUNetConfig:
 class DolpUNet(nn.Module):
     """Event tensors of the four polarizers to DoLP, window by window, with a recurrent state.
 
-    Inputs are compressed to sign(x) log(1 + |x|): where many events fall into one pixel the tensor reaches tens, where
-    it matters most it is below one. The output is linear, so that no pixel's gradient vanishes near 0 or 1: it can
-    leave [0, 1], and whoever scores or shows it clamps it.
+    C1 sees the four tensors, mixed as `input_mixing` says and `compressed`. The output is linear, so that no pixel's
+    gradient vanishes near 0 or 1: it can leave [0, 1], and whoever scores or shows it clamps it.
     """
 
     def __init__(self, config: DolpUNetConfig, in_channels: int = 4):
         super().__init__()
+        self.mix = INPUT_MIXINGS[config.input_mixing]
         full, half, quarter = config.channels
         depth, window, (heads_half, heads_quarter) = config.swin_depth, config.swin_window, config.swin_heads
         self.c1 = conv3x3(in_channels, full)
@@ -75,7 +78,7 @@ class DolpUNet(nn.Module):
     ) -> tuple[Prediction, list[Tensor]]:
         """t windows of b streams at once: the same numbers as `forward` window by window, in fewer operations."""
         t, b, _, height, width = inputs.shape
-        x = compress(inputs).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+        x = compressed(self.mix(inputs)).flatten(0, 1).contiguous(memory_format=torch.channels_last)
         x = F.pad(x, (0, -width % STRIDE, 0, -height % STRIDE))  # no events there
         state1, state2 = state or self.initial_state(x[:b])
 
@@ -105,6 +108,20 @@ NETWORKS: dict[str, tuple[type[DolpUNet], type[DolpUNetConfig]]] = {"paper": (Do
 """Each network by its name in params.yaml, and the class of its section there."""
 
 
-def compress(events: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
-    """sign(x) log(1 + |x|)."""
-    return torch.sign(events) * torch.log1p(events.abs())
+def contrasts(events: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b c h w"]:
+    """(e0 + e45 + e90 + e135) / 2, e0 - e90, e45 - e135 and (e0 + e90) - (e45 + e135) of the polarizers' tensors.
+
+    Unpolarized light drives the four alike, and far more than polarization sets them apart: given them as they are, a
+    network first has to find the differences, and within 200 steps did not. The last one is no copy of the others:
+    events tell of log intensities, for which I0 + I90 = I45 + I135 does not hold as it stands.
+    """
+    e0, e45, e90, e135 = events.unflatten(-3, (4, -1)).unbind(-4)
+    return torch.cat([(e0 + e45 + e90 + e135) / 2, e0 - e90, e45 - e135, (e0 + e90) - (e45 + e135)], dim=-3)
+
+
+INPUT_MIXINGS: dict[str, Callable[[Tensor], Tensor]] = {"polarizers": lambda events: events, "contrasts": contrasts}
+
+
+def compressed(x: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
+    """sign(x) log(1 + |x|): a pixel with many events reaches tens, while most of what matters is below one."""
+    return torch.sign(x) * torch.log1p(x.abs())

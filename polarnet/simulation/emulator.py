@@ -1,5 +1,6 @@
 """Event-camera emulation: light on the planes of one sensor in, events and the sensor's state out."""
 
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -70,14 +71,21 @@ def randomised(config: EmulatorConfig, generator: np.random.Generator) -> Emulat
     """The configuration of one sequence: `config`, or with values drawn from its ranges if it says `randomise`."""
     if not config.randomise:
         return config
+
+    def between(bounds: list[float]) -> float:
+        return float(generator.uniform(bounds[0], bounds[1]))
+
+    def between_in_logarithm(bounds: list[float]) -> float:
+        return math.exp(between([math.log(bound) for bound in bounds]))
+
     return replace(
         config,
-        contrast_threshold_on=float(generator.uniform(*config.random_threshold_on)),
-        contrast_threshold_off=float(generator.uniform(*config.random_threshold_off)),
-        contrast_threshold_sigma=float(generator.uniform(*config.random_threshold_sigma)),
-        cutoff_hz=float(np.exp(generator.uniform(*np.log(config.random_cutoff_hz)))),
-        leak_rate_hz=float(np.exp(generator.uniform(*np.log(config.random_leak_rate_hz)))),
-        shot_noise_rate_hz=float(np.exp(generator.uniform(*np.log(config.random_shot_noise_rate_hz)))),
+        contrast_threshold_on=between(config.random_threshold_on),
+        contrast_threshold_off=between(config.random_threshold_off),
+        contrast_threshold_sigma=between(config.random_threshold_sigma),
+        cutoff_hz=between_in_logarithm(config.random_cutoff_hz),
+        leak_rate_hz=between_in_logarithm(config.random_leak_rate_hz),
+        shot_noise_rate_hz=between_in_logarithm(config.random_shot_noise_rate_hz),
     )
 
 
@@ -206,19 +214,17 @@ def run(
     """Events of planes under `lights` at times `t_us`, and the state after them; planes are shared among threads."""
     model = MODELS[config.model]
     physics, seed = model.physics(config), np.uint64(key)
-    fresh = state is None
-    times = t_us if fresh else np.concatenate([[state.t_us], t_us])
-    steps = 0 if fresh else state.steps
-    room = int(min(LARGEST_FIRST_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
+    times, steps = (t_us, 0) if state is None else (np.concatenate([[state.t_us], t_us]), state.steps)
+    room = 1 + int(min(LARGEST_FIRST_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
 
     def one_plane(i: int) -> tuple[Columns, Any]:
-        if fresh:
-            pixels = model.initial(height, width, physics, seed, planes[i])
+        if state is None:
+            first, pixels = 1, model.initial(height, width, physics, seed, planes[i])
             model.start(lights[i], pixels, physics, height, width, times[0], seed, planes[i])
         else:
-            pixels = type(state.pixels[i])(*(array.copy() for array in state.pixels[i]))
+            first, pixels = 0, type(state.pixels[i])(*(array.copy() for array in state.pixels[i]))
         columns, used = model.advance(
-            lights[i], int(fresh), pixels, physics, height, width, times, steps, seed, planes[i],
+            lights[i], first, pixels, physics, height, width, times, steps, seed, planes[i],
             empty_columns(room, labels, exact),
         )  # fmt: skip
         return trimmed(columns, used), pixels

@@ -1,5 +1,6 @@
 """From a scene and a motion to the events behind four polarizers of one sensor, without a clip in between."""
 
+import functools
 import itertools
 import math
 
@@ -58,22 +59,25 @@ def synthesize_steps(
     a time. Either way light is interpolated between the scene's Stokes parameters, as `motion.render` does.
     ValueError where the window leaves the scene.
     """
+    if len(t_us) == 0 or (np.diff(t_us) <= 0).any():
+        raise ValueError(f"expected at least one time, and each later than the one before, got {t_us[:5].tolist()}...")
     pose = trajectory.pose(t_us * 1e-6)
     _check_inside(scene, pose, t_us, height, width)
-    sensor = {"height": height, "width": width, "config": config, "key": key, "planes": POLARIZERS, "threads": threads}
+    see = functools.partial(run, height=height, width=width, config=config, key=key, planes=POLARIZERS, threads=threads)
     if _drifts(pose):
         left, top = pose.x - (width - 1) / 2, pose.y - (height - 1) / 2
         lights = [light_of_scene(plane, top, left) for plane in _scene_behind_polarizers(scene)]
-        columns, state = run(lights, t_us.astype(np.float64), state=state, **sensor)
+        columns, state = see(lights, t_us.astype(np.float64), state=state)
         return [events_of(c, height, width) for c in columns], state
     pieces = []
     for first in range(0, len(t_us), TURNING_CHUNK):
         chunk = slice(first, first + TURNING_CHUNK)
         frames = render_intensities(scene, Pose(*(values[chunk] for values in pose)), height, width, config)
         lights = [light_of_frames(frames[plane]) for plane in POLARIZERS]
-        columns, state = run(lights, t_us[chunk].astype(np.float64), state=state, **sensor)
+        columns, state = see(lights, t_us[chunk].astype(np.float64), state=state)
         pieces.append(columns)
     joined = [Columns(*map(np.concatenate, zip(*plane, strict=True))) for plane in zip(*pieces, strict=True)]
+    assert state is not None  # there was at least one time
     return [events_of(c, height, width) for c in joined], state
 
 

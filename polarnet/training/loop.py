@@ -9,22 +9,22 @@ from torch import nn
 
 from polarnet.events.representations import REPRESENTATIONS
 from polarnet.events.windows import WindowDataset
-from polarnet.ranges import allowed, check_ranges
+from polarnet.ranges import allowed
 from polarnet.similarity import correlation, mse, psnr
 from polarnet.training.recorder import Recorder
-from polarnet.training.sequences import Batch, Views, batches_of, shuffled
+from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, kept_in_memory, shuffled
 from polarnet.training.task import Split, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
 
 
 @dataclass(frozen=True)
-class LoopConfig:
+class LoopConfig(ViewConfig):
     """How a network is trained; `train` and `baselines.e2v` of params.yaml have these fields and their own."""
 
     epochs: int = field(metadata=allowed(low=1))
     batch_size: int = field(metadata=allowed(low=1))
-    """Sequences."""
+    """Visits to sequences."""
     bptt_windows: int = field(metadata=allowed(low=1))
     """Windows of one step: gradients are not carried further back, the recurrent state is."""
     learning_rate: float = field(metadata=allowed(above=0))
@@ -37,15 +37,6 @@ class LoopConfig:
     """Gradients that are longer together are shortened to this; null: never."""
     precision: str = field(metadata=allowed(choices=("fp32", "bf16")))
     """Of autocast; weights and Adam are float32 either way."""
-    crop: list[int] | None = field(metadata=allowed(low=16))
-    """Height and width in pixels of the part seen of each sequence, another one in every epoch; null: all of it."""
-    symmetries: bool
-    """Mirror the image and renumber the polarizers at random, which leaves DoLP as it is."""
-
-    def __post_init__(self):
-        check_ranges(self)
-        if self.crop is not None and len(self.crop) != 2:
-            raise ValueError(f"crop: expected height and width, or null, got {self.crop}")
 
 
 @dataclass(frozen=True)
@@ -66,12 +57,13 @@ def train(
     network = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
     progress = recorder.resume(network, optimizer)
+    sequences, workers = kept_in_memory(split.train, workers)
     for epoch in range(progress.epoch, config.epochs):
-        views = Views(split.train, seed, epoch, config.crop, config.symmetries)
-        order = shuffled(len(split.train), seed, epoch)
-        batches = batches_of(views, order[progress.sequences :], config.batch_size, workers)
+        visits = Visits(sequences, config, seed, epoch)
+        order = shuffled(len(visits), seed, epoch)
+        batches = batches_of(visits, order[progress.visits :], config.batch_size, workers)
         for batch in recorder.show(batches, progress, len(order), config.epochs):
-            set_learning_rate(optimizer, config, (epoch + progress.sequences / len(order)) / config.epochs)
+            set_learning_rate(optimizer, config, (epoch + progress.visits / len(order)) / config.epochs)
             losses = train_batch(task, optimizer, batch, config, device)
             progress.add(losses, len(batch.names))
             recorder.keep(progress, network, optimizer)

@@ -36,8 +36,8 @@ class Progress:
 
     epoch: int = 0
     """Epochs that are complete."""
-    sequences: int = 0
-    """Sequences of the current epoch that have been trained on."""
+    visits: int = 0
+    """Visits of the current epoch that have been trained on."""
     steps: int = 0
     """Steps of the optimizer in the current epoch, over which `sums` adds up the loss and its terms."""
     sums: dict[str, float] = field(default_factory=dict)
@@ -46,7 +46,7 @@ class Progress:
     best: dict[str, Tensor] = field(default_factory=dict)
     """The weights of the epoch with the smallest validation MSE."""
 
-    def add(self, losses: Sequence[Mapping[str, float]], sequences: int) -> None:
+    def add(self, losses: Sequence[Mapping[str, float]], visits: int) -> None:
         """Count one batch; FloatingPointError where the loss has become infinite or NaN."""
         sums = Counter(self.sums)
         for terms in losses:
@@ -56,7 +56,7 @@ class Progress:
                     "learning_rate, set gradient_norm, or use precision=fp32"
                 )
             sums.update(terms)
-        self.sums, self.steps, self.sequences = dict(sums), self.steps + len(losses), self.sequences + sequences
+        self.sums, self.steps, self.visits = dict(sums), self.steps + len(losses), self.visits + visits
 
     def end_epoch(self, weights: Mapping[str, Tensor], scores: Mapping[str, float]) -> None:
         """Add a row to the history, keep the weights if they are the best so far, and begin the next epoch."""
@@ -64,7 +64,7 @@ class Progress:
         self.history.append({"epoch": self.epoch, "train": means, "val": dict(scores)})
         if best_row(self.history) is self.history[-1]:
             self.best = {name: tensor.detach().cpu().clone() for name, tensor in weights.items()}
-        self.epoch, self.sequences, self.steps, self.sums = self.epoch + 1, 0, 0, {}
+        self.epoch, self.visits, self.steps, self.sums = self.epoch + 1, 0, 0, {}
 
 
 class Recorder:
@@ -92,7 +92,7 @@ class Recorder:
         optimizer.load_state_dict(content["optimizer"])
         progress = Progress(**content["progress"])
         tqdm.write(f"resuming in epoch {progress.epoch + 1}, from {file}")
-        if progress.history and not progress.sequences:
+        if progress.history and not progress.visits:
             self._write(progress, network)  # what the epoch before had written is gone
         return progress
 
@@ -112,10 +112,10 @@ class Recorder:
         os.replace(self.running / "running.pt.tmp", self.running / "running.pt")
         self.kept_at = time.monotonic()
 
-    def show(self, batches: Iterable[Batch], progress: Progress, sequences: int, epochs: int) -> Iterator[Batch]:
-        """The batches, behind a progress bar that counts sequences."""
+    def show(self, batches: Iterable[Batch], progress: Progress, visits: int, epochs: int) -> Iterator[Batch]:
+        """The batches, behind a progress bar that counts visits to sequences."""
         with tqdm(
-            total=sequences, initial=progress.sequences, desc=f"epoch {progress.epoch + 1}/{epochs}", unit="sequence"
+            total=visits, initial=progress.visits, desc=f"epoch {progress.epoch + 1}/{epochs}", unit="visit"
         ) as bar:
             for batch in batches:
                 yield batch

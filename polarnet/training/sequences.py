@@ -2,16 +2,21 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+import psutil
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from polarnet.events.windows import WindowSequence
+from polarnet.events.windows import WindowDataset, WindowSequence
+from polarnet.ranges import allowed, check_ranges
 from polarnet.runtime import generator_for
+
+Sequences = WindowDataset | list[WindowSequence]
 
 EIGHTH_TURN = math.pi / 4  # between neighbouring polarizers
 
@@ -27,12 +32,14 @@ class Batch(NamedTuple):
 
 
 class View(NamedTuple):
-    """A part of the image, perhaps mirrored, through polarizers that are numbered differently.
+    """Some windows, a part of the image, perhaps mirrored, through polarizers that are numbered differently.
 
     Polarizer j of the view is polarizer (turn + direction * j) mod 4 of the sequence: the sensor's polarizers turned by
     turn * 45 degrees against the scene, and counted the other way round where direction is -1. DoLP does not change.
     """
 
+    start: int
+    windows: int
     top: int
     left: int
     height: int
@@ -45,52 +52,78 @@ class View(NamedTuple):
 
 def seen(sequence: WindowSequence, view: View) -> WindowSequence:
     """The sequence under a view: exactly what the four channels would hold, and its truth."""
-    bottom, right = view.top + view.height, view.left + view.width
+    stop, bottom, right = view.start + view.windows, view.top + view.height, view.left + view.width
     mirrored = [axis for axis, mirror in ((-1, view.mirror_x), (-2, view.mirror_y)) if mirror]
 
     def look(frames: Tensor) -> Tensor:
-        return frames[..., view.top : bottom, view.left : right].flip(mirrored).contiguous()
+        return frames[view.start : stop, ..., view.top : bottom, view.left : right].flip(mirrored).contiguous()
 
     polarizers = [(view.turn + view.direction * j) % 4 for j in range(4)]
-    channels = sequence.inputs.unflatten(1, (4, -1))[:, polarizers].flatten(1, 2)
-    aolp = view.direction * (sequence.aolp - view.turn * EIGHTH_TURN)
-    return WindowSequence(
-        sequence.name,
-        look(channels),
-        look(sequence.dolp),
-        look(torch.remainder(aolp, math.pi)),
-        look(sequence.intensity[:, polarizers]),
-    )
+    inputs = look(sequence.inputs).unflatten(1, (4, -1))[:, polarizers].flatten(1, 2)
+    aolp = view.direction * (look(sequence.aolp) - view.turn * EIGHTH_TURN)
+    intensity = look(sequence.intensity)[:, polarizers]
+    return WindowSequence(sequence.name, inputs, look(sequence.dolp), torch.remainder(aolp, math.pi), intensity)
 
 
-def random_view(
-    height: int, width: int, crop: Sequence[int] | None, symmetries: bool, generator: np.random.Generator
-) -> View:
-    """A crop of (height, width) pixels anywhere, everything where None; mirrored and turned where `symmetries`."""
-    rows, columns = crop or (height, width)
-    if rows > height or columns > width:
-        raise ValueError(f"crop: expected at most the {height}x{width} pixels of the sequences, got {rows}x{columns}")
-    top, left = generator.integers(height - rows + 1), generator.integers(width - columns + 1)
-    mirror_x, mirror_y, turn, reverse = generator.integers([2, 2, 4, 2]) if symmetries else (0, 0, 0, 0)
-    return View(
-        int(top), int(left), rows, columns, bool(mirror_x), bool(mirror_y), int(turn), direction=-1 if reverse else 1
-    )
+@dataclass(frozen=True)
+class ViewConfig:
+    """How a training looks at its sequences; keys of `train` and of `baselines.e2v` in params.yaml."""
+
+    visits: int = field(metadata=allowed(low=1))
+    """To each sequence in an epoch, each with another view."""
+    windows: int | None = field(metadata=allowed(low=1))
+    """In a row that a visit sees, beginning anywhere; null: all."""
+    crop: list[int] | None = field(metadata=allowed(low=16))
+    """Height and width in pixels of the part that a visit sees, anywhere in the image; null: all of it."""
+    symmetries: bool
+    """Mirror the image and renumber the polarizers at random, which leaves DoLP as it is."""
+
+    def __post_init__(self):
+        check_ranges(self)
+        if self.crop is not None and len(self.crop) != 2:
+            raise ValueError(f"crop: expected height and width, or null, got {self.crop}")
 
 
-class Views(Dataset[WindowSequence]):
-    """The sequences of a dataset, each under a view drawn from the seed, the epoch and its name."""
+def random_view(count: int, height: int, width: int, config: ViewConfig, generator: np.random.Generator) -> View:
+    """A view of a sequence of `count` windows; ValueError where the sequence is smaller than what should be seen."""
+    windows, (rows, columns) = config.windows or count, config.crop or (height, width)
+    if windows > count or rows > height or columns > width:
+        raise ValueError(
+            f"windows, crop: expected at most the {count} windows of {height}x{width} pixels of the sequences, "
+            f"got {windows} of {rows}x{columns}"
+        )
+    start, top, left = generator.integers([count - windows + 1, height - rows + 1, width - columns + 1]).tolist()
+    mirror_x, mirror_y, turn, reverse = generator.integers([2, 2, 4, 2]).tolist() if config.symmetries else [0, 0, 0, 0]
+    direction = -1 if reverse else 1
+    return View(start, windows, top, left, rows, columns, bool(mirror_x), bool(mirror_y), turn, direction)
 
-    def __init__(
-        self, dataset: Dataset[WindowSequence], seed: int, epoch: int, crop: Sequence[int] | None, symmetries: bool
-    ):
-        self.dataset, self.seed, self.epoch, self.crop, self.symmetries = dataset, seed, epoch, crop, symmetries
+
+class Visits(Dataset[WindowSequence]):
+    """Every visit of an epoch to some sequences, each under a view drawn from the seed, the epoch and their name."""
+
+    def __init__(self, sequences: Sequences, config: ViewConfig, seed: int, epoch: int):
+        self.sequences, self.config, self.seed, self.epoch = sequences, config, seed, epoch
+
+    def __len__(self) -> int:
+        return self.config.visits * len(self.sequences)
 
     def __getitem__(self, index: int) -> WindowSequence:
-        """Sequence number `index`."""
-        sequence = self.dataset[index]
-        generator = generator_for(self.seed, sequence.name, f"view in epoch {self.epoch}")
-        height, width = sequence.dolp.shape[-2:]
-        return seen(sequence, random_view(height, width, self.crop, self.symmetries, generator))
+        visit, number = divmod(index, len(self.sequences))
+        sequence = self.sequences[number]
+        count, height, width = sequence.dolp.shape
+        generator = generator_for(self.seed, sequence.name, f"visit {visit} in epoch {self.epoch}")
+        return seen(sequence, random_view(count, height, width, self.config, generator))
+
+
+def kept_in_memory(dataset: WindowDataset, workers: int) -> tuple[Sequences, int]:
+    """The sequences of a dataset, read and encoded beforehand if that takes at most half of the free memory.
+
+    Also how many worker processes should read them: none when they are in memory.
+    """
+    bytes_each = sum(tensor.nbytes for tensor in dataset[0][1:])
+    if bytes_each * len(dataset) > psutil.virtual_memory().available / 2:
+        return dataset, workers
+    return [dataset[number] for number in range(len(dataset))], 0
 
 
 def stack(sequences: Sequence[WindowSequence]) -> Batch:

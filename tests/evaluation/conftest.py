@@ -10,7 +10,14 @@ from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
 
 HEIGHT, WIDTH = 18, 20
 WINDOW_US = 1000
-NETWORK = {"channels": [4, 8, 8], "swin_depth": 2, "swin_window": 4, "swin_heads": [2, 2], "residual_blocks": 1}
+NETWORK = {
+    "channels": [4, 8, 8],
+    "swin_depth": 2,
+    "swin_window": 4,
+    "swin_heads": [2, 2],
+    "residual_blocks": 1,
+    "input_mixing": "contrasts",
+}
 
 
 def random_events(generator, windows=4, count=300):

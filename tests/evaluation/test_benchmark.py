@@ -76,13 +76,13 @@ def test_panels_show_one_window_of_different_scenes_and_every_method(stores, con
     benchmark = run_benchmark(*stores, context, wanted, None)
     assert [(p.sequence, p.scene, p.window, p.t_us) for p in benchmark.panels] == [
         ("a1", "lake", 2, 3000),
-        ("b1", "wood", 2, 3000),
+        ("c1", "town", 2, 3000),
     ]
     folder = tmp_path / "benchmark"
     (folder / "panels").mkdir(parents=True)
     (folder / "panels" / "old.npz").touch()
     write_benchmark(folder, benchmark, wanted, 1, {})
-    assert {p.name for p in (folder / "panels").iterdir()} == {"a1.npz", "b1.npz"}
+    assert {p.name for p in (folder / "panels").iterdir()} == {"a1.npz", "c1.npz"}
     with np.load(folder / "panels" / "a1.npz") as panel:
         assert set(panel.files) == {
             *("window", "t_us", "events", "truth_dolp", "truth_aolp", "truth_s0", "dolp_zeros", "dolp_cf", "aolp_cf"),

@@ -1,10 +1,14 @@
 import pytest
 import torch
 
-from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig, compress
+from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig, compressed, contrasts
 
-PAPER = DolpUNetConfig(channels=[32, 64, 128], swin_depth=2, swin_window=5, swin_heads=[2, 4], residual_blocks=2)
-SMALL = DolpUNetConfig(channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1)
+PAPER = DolpUNetConfig(
+    channels=[32, 64, 128], swin_depth=2, swin_window=5, swin_heads=[2, 4], residual_blocks=2, input_mixing="contrasts"
+)
+SMALL = DolpUNetConfig(
+    channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1, input_mixing="contrasts"
+)
 
 
 def small() -> DolpUNet:
@@ -67,10 +71,30 @@ def test_every_parameter_has_a_gradient_from_two_windows():
 
 def test_inputs_are_compressed_logarithmically_with_their_sign():
     torch.testing.assert_close(
-        compress(torch.tensor([[-(torch.e - 1), 0.0, torch.e - 1]])), torch.tensor([[-1.0, 0.0, 1.0]])
+        compressed(torch.tensor([[-(torch.e - 1), 0.0, torch.e - 1]])), torch.tensor([[-1.0, 0.0, 1.0]])
     )
+
+
+def test_light_that_is_not_polarized_has_no_differences():
+    alike = torch.randn(2, 1, 3, 3).expand(2, 4, 3, 3)
+    mean, *differences = contrasts(alike).unbind(1)
+    assert torch.equal(mean, 2 * alike[:, 0])
+    assert all(not difference.any() for difference in differences)
+
+
+def test_the_channels_are_those_of_the_stokes_parameters_for_each_bin_of_its_own():
+    channels = torch.arange(8.0).view(8, 1, 1) ** 2  # two bins of each of the four polarizers
+    expected = [(0 + 4 + 16 + 36) / 2, (1 + 9 + 25 + 49) / 2, 0 - 16, 1 - 25, 4 - 36, 9 - 49, 16 - 40, 26 - 58]
+    assert contrasts(channels).flatten().tolist() == expected
 
 
 def test_heads_that_do_not_divide_the_channels_are_refused():
     with pytest.raises(ValueError, match="swin_heads: expected a divisor of 64 channels, got 3"):
-        DolpUNetConfig(channels=[32, 64, 128], swin_depth=2, swin_window=5, swin_heads=[3, 4], residual_blocks=2)
+        DolpUNetConfig(
+            channels=[32, 64, 128],
+            swin_depth=2,
+            swin_window=5,
+            swin_heads=[3, 4],
+            residual_blocks=2,
+            input_mixing="contrasts",
+        )

@@ -1,4 +1,4 @@
-"""What every pixel model promises: hand-worked ramps, equal bytes however the work is cut, errors that say what to do."""
+"""What every pixel model promises: hand-worked ramps, equal bytes however work is cut, errors that say what to do."""
 
 import dataclasses
 import math
@@ -274,9 +274,9 @@ def test_light_that_makes_no_sense_is_refused(frames, t_us, message):
 
 def test_a_state_goes_on_with_its_own_sensor_and_later_times_alone():
     _, state = emulate(CLIP, TIMES, IDEAL, key=1)
-    with pytest.raises(ValueError, match="the first after the state's 20.0"):
+    with pytest.raises(ValueError, match=r"the first after the state's 20\.0"):
         emulate(CLIP, TIMES, IDEAL, key=1, state=state)
-    with pytest.raises(ValueError, match="the state is of planes .0, 1. of 4x5 pixels"):
+    with pytest.raises(ValueError, match=r"the state is of planes \(0, 1\) of 4x5 pixels"):
         emulate(CLIP[:, :, :3], TIMES + 100, IDEAL, key=1, state=state)
     with pytest.raises(ValueError, match="the state is of model exact"):
         emulate(CLIP, TIMES + 100, of("v2e"), key=1, state=state)

@@ -45,7 +45,7 @@ def drift_and_noise(camera: str, before: float, after: float, dt_us: float) -> t
 
 
 def first_events(before: float, after: float, dt_us: int, camera: str) -> tuple[np.ndarray, np.ndarray]:
-    """Microseconds and polarity of the first event of each of 2500 pixels in one long step, in which all of them fire."""
+    """Microseconds and polarity of the first event of each of 2500 pixels in one long step."""
     frames = torch.tensor([before, after]).view(2, 1, 1, 1).expand(-1, -1, SIDE, SIDE)
     config = dataclasses.replace(CONFIG, voltmeter_camera=camera)
     (columns,), _ = emulate_columns(frames, torch.tensor([0, dt_us]), config, key=11, exact=True)

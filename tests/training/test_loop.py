@@ -22,6 +22,10 @@ from polarnet.training.task import Task, describe, open_split
 SEED = 7
 CPU = torch.device("cpu")
 LOOP: dict[str, Any] = {
+    "visits": 2,
+    "windows": 4,
+    "crop": [16, 20],
+    "symmetries": True,
     "epochs": 2,
     "batch_size": 2,
     "bptt_windows": 3,
@@ -30,12 +34,12 @@ LOOP: dict[str, Any] = {
     "warmup": 0.1,
     "gradient_norm": 1.0,
     "precision": "fp32",
-    "crop": [16, 20],
-    "symmetries": True,
 }
 TRAIN = TrainConfig(**LOOP, representation="event_tensor")
 E2V = E2vConfig(**LOOP, arch="firenet", bins=5, ssim=1.0, lpips=0.0)
-NETWORK = DolpUNetConfig(channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1)
+NETWORK = DolpUNetConfig(
+    channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1, input_mixing="contrasts"
+)
 LOSS = LossConfig(mse=1.0, ssim=1.0, lpips=0.0)
 
 
@@ -81,7 +85,7 @@ def test_equal_trainings_leave_equal_bytes(stores, tmp_path):
     assert first == second
 
 
-@pytest.mark.parametrize("killed_at", range(1, 12))
+@pytest.mark.parametrize("killed_at", range(1, 17))
 def test_a_training_killed_at_any_step_and_resumed_ends_as_if_nothing_had_happened(
     stores, tmp_path, undisturbed, killed_at
 ):
@@ -124,7 +128,7 @@ def test_worker_processes_change_nothing(stores, tmp_path, undisturbed):
 
 def test_one_sequence_can_be_learnt_by_heart(stores, tmp_path):
     config = dataclasses.replace(
-        TRAIN, epochs=20, batch_size=1, bptt_windows=2, learning_rate=1e-2, crop=None, symmetries=False
+        TRAIN, epochs=20, batch_size=1, bptt_windows=2, learning_rate=1e-2, windows=None, crop=None, symmetries=False
     )
     loss = LossConfig(mse=1.0, ssim=0.0, lpips=0.0)
     task = dolp_task("paper", NETWORK, config, loss, None, SEED)

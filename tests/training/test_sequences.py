@@ -5,14 +5,30 @@ import torch
 from torch.utils.data import Dataset
 
 from polarnet import stokes
-from polarnet.events.windows import WindowSequence
+from polarnet.events.frames import FrameStore
+from polarnet.events.representations import event_tensor
+from polarnet.events.store import EventStore
+from polarnet.events.windows import WindowDataset, WindowSequence
 from polarnet.runtime import generator_for
-from polarnet.training.sequences import View, batches_of, random_view, seen, shuffled, stack
+from polarnet.training.sequences import (
+    View,
+    ViewConfig,
+    Visits,
+    batches_of,
+    kept_in_memory,
+    random_view,
+    seen,
+    shuffled,
+    stack,
+)
 
 
 class Listed(Dataset[WindowSequence]):
     def __init__(self, *sequences: WindowSequence):
         self.sequences = sequences
+
+    def __len__(self) -> int:
+        return len(self.sequences)
 
     def __getitem__(self, index: int) -> WindowSequence:
         return self.sequences[index]
@@ -27,7 +43,7 @@ def sequence(name: str = "s", windows: int = 3, height: int = 6, width: int = 8)
     return WindowSequence(name, intensity.repeat_interleave(2, dim=1), dolp, aolp, intensity)
 
 
-WHOLE = View(top=0, left=0, height=6, width=8, mirror_x=False, mirror_y=False, turn=0, direction=1)
+WHOLE = View(start=0, windows=3, top=0, left=0, height=6, width=8, mirror_x=False, mirror_y=False, turn=0, direction=1)
 
 
 def test_the_plain_view_changes_nothing():
@@ -65,21 +81,50 @@ def test_a_crop_is_the_same_part_of_inputs_and_truth():
 
 
 def test_a_random_view_is_drawn_from_its_generator_and_stays_inside():
-    for epoch in range(50):
-        view = random_view(20, 30, [16, 17], True, generator_for(1, "s", str(epoch)))
-        assert view == random_view(20, 30, [16, 17], True, generator_for(1, "s", str(epoch)))
+    config = ViewConfig(visits=1, windows=2, crop=[16, 17], symmetries=True)
+    for visit in range(50):
+        view = random_view(5, 20, 30, config, generator_for(1, "s", str(visit)))
+        assert view == random_view(5, 20, 30, config, generator_for(1, "s", str(visit)))
+        assert 0 <= view.start <= 3
         assert 0 <= view.top <= 4
         assert 0 <= view.left <= 13
-        assert (view.height, view.width) == (16, 17)
+        assert (view.windows, view.height, view.width) == (2, 16, 17)
 
 
-def test_without_crop_and_symmetries_the_view_is_the_plain_one():
-    assert random_view(6, 8, None, False, generator_for(1, "s", "0")) == WHOLE
+def test_without_windows_crop_and_symmetries_the_view_is_the_plain_one():
+    config = ViewConfig(visits=1, windows=None, crop=None, symmetries=False)
+    assert random_view(3, 6, 8, config, generator_for(1, "s", "0")) == WHOLE
+
+
+def test_some_windows_are_the_same_ones_of_inputs_and_truth():
+    before = sequence()
+    after = seen(before, WHOLE._replace(start=1, windows=2))
+    assert torch.equal(after.inputs, before.inputs[1:])
+    assert torch.equal(after.aolp, before.aolp[1:])
+
+
+def test_an_epoch_visits_each_sequence_as_often_as_it_should_under_other_views():
+    config = ViewConfig(visits=3, windows=1, crop=None, symmetries=True)
+    visits = Visits([sequence("a"), sequence("bb")], config, seed=1, epoch=0)
+    seen_so_far = [visits[index] for index in range(len(visits))]
+    assert sorted(one.name for one in seen_so_far) == ["a", "a", "a", "bb", "bb", "bb"]
+    firsts = [one.inputs for one in seen_so_far if one.name == "a"]
+    assert not torch.equal(firsts[0], firsts[1])
+    assert torch.equal(visits[0].inputs, visits[0].inputs)
+
+
+def test_a_dataset_in_memory_is_read_once(stores):
+    dataset = WindowDataset(EventStore.open(stores[0]), FrameStore.open(stores[1]), ["a", "b"], event_tensor)
+    kept, workers = kept_in_memory(dataset, workers=3)
+    assert workers == 0
+    assert kept[1] is kept[1]
+    assert torch.equal(kept[1].inputs, dataset[1].inputs)
 
 
 def test_a_crop_larger_than_the_image_is_refused():
-    with pytest.raises(ValueError, match="crop: expected at most the 6x8 pixels of the sequences, got 16x16"):
-        random_view(6, 8, [16, 16], True, generator_for(1, "s", "0"))
+    config = ViewConfig(visits=1, windows=None, crop=[16, 16], symmetries=True)
+    with pytest.raises(ValueError, match="at most the 3 windows of 6x8 pixels of the sequences, got 3 of 16x16"):
+        random_view(3, 6, 8, config, generator_for(1, "s", "0"))
 
 
 def test_a_batch_has_time_first_and_then_the_sequences():

@@ -53,6 +53,8 @@ class Pixels(NamedTuple):
     leak: np.ndarray
     """the same with the jitter of the time since the last event"""
     last_event_us: np.ndarray
+    events: np.ndarray
+    """int32, fired so far: numbers the draws of the leak's jitter"""
     next_shot_us: np.ndarray
 
 
@@ -85,6 +87,7 @@ def initial(h: int, w: int, physics: Physics, key: np.uint64, plane: int) -> Pix
         leak_nominal=np.float32(physics.leak_rate_hz * 1e-6) * leak_factor * threshold_on,
         leak=zeros.copy(),
         last_event_us=np.full(n, LONG_AGO_US),
+        events=np.zeros(n, np.int32),
         next_shot_us=np.full(n, np.inf),
     )
 
@@ -98,7 +101,7 @@ def start(light, pixels, physics, h, w, time_us, key, plane):
     shot_key = key_for(key, randomness.SHOT_NOISE, plane)
     for i in range(h * w):
         if physics.leak_rate_hz > 0:
-            pixels.leak[i] = jittered_leak(pixels.leak_nominal[i], physics.leak_jitter, jitter_key, i, time_us)
+            pixels.leak[i] = jittered_leak(pixels.leak_nominal[i], physics.leak_jitter, jitter_key, i, 0)
             pixels.change[i] = uniform(mixed(phase_key, i)) * pixels.threshold_on[i]
             if pixels.leak[i] > 0:
                 pixels.last_event_us[i] = time_us - pixels.change[i] / pixels.leak[i]
@@ -264,7 +267,9 @@ def _fire(pixels, physics, keys, course, active, rise, dn, first, shooting, star
             rest = max(excess, 0.0) if on else -max(excess, 0.0)
             change, now, last = (rest, event, event) if fires else (change, now, last)
             if jitter > 0:
-                drawn = np.float64(jittered_leak(pixels.leak_nominal[i], jitter, keys[0], i, start_us + event))
+                number = pixels.events[i] + fires
+                drawn = np.float64(jittered_leak(pixels.leak_nominal[i], jitter, keys[0], i, number))
+                pixels.events[i] = number
                 leak = drawn if fires else leak
             at_end = change + (rise[j] * per_us + leak) * (dt - now)
             pixels.change[i], pixels.leak[i], pixels.last_event_us[i] = at_end, leak, start_us + last
@@ -283,9 +288,9 @@ def _bits(key, i, time_us):
 
 
 @compiled
-def jittered_leak(nominal, jitter, key, i, time_us):
-    """The leak of pixel i from its event at this time to its next."""
-    return nominal * np.float32(max(1 - jitter * rough_normal(_bits(key, i, time_us)), 0.0))
+def jittered_leak(nominal, jitter, key, i, number):
+    """The leak of pixel i from its event of this number to its next."""
+    return nominal * np.float32(max(1 - jitter * rough_normal(mixed(key, (i << 32) + number)), 0.0))
 
 
 @compiled

@@ -4,7 +4,7 @@ import numpy as np
 
 from polarnet.simulation.compilation import compiled
 
-STRIP = 1500  # pixels, about
+STRIP = 4000  # pixels, about
 EIGHT = np.uint64(8)
 BYTE_NUMBERS = np.uint64(0x0001020304050607)  # 256^i times this has i in its highest byte
 

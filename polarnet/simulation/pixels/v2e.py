@@ -155,8 +155,9 @@ def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, co
 @compiled
 def _filter(linlog, dn, filtered, rate):
     """First-order low-pass whose bandwidth grows with light: rate = 2 pi cutoff dt at full brightness."""
+    per_dn = rate / SATURATION
     for j in range(dn.size):
-        share = min(1.0, (np.float64(dn[j]) + DARK_OFFSET) / SATURATION * rate)
+        share = min(1.0, (np.float64(dn[j]) + DARK_OFFSET) * per_dn)
         filtered[j] += share * (linlog[j] - filtered[j])
 
 
@@ -242,7 +243,7 @@ def _emit(pixels, physics, start_us, stop_us, firing, order, n, most, columns, u
                 columns.label[used + written] = _label(pixels, physics, i, exact_us, polarity)
             if columns.exact_us.size:
                 columns.exact_us[used + written] = exact_us
-            written += accepted
+            written += int(accepted)
             order[remaining] = e
             remaining += abs(crossed) > slot
         used += written

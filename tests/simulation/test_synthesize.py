@@ -1,0 +1,199 @@
+"""Rendering and emulation in one go give what each gives on its own."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from skimage import data
+
+from polarnet.events.stream import validate
+from polarnet.simulation.emulator import EmulatorConfig, emulate
+from polarnet.simulation.motion import HARMONICS, Sine, Trajectory, render
+from polarnet.simulation.pixels.light import intensity_rows, light_of_scene
+from polarnet.simulation.scene import scene_from_rgb
+from polarnet.simulation.synthesize import (
+    _scene_behind_polarizers,
+    render_intensities,
+    render_times_us,
+    synthesize_sequence,
+    synthesize_steps,
+)
+from polarnet.stokes import intensities_from_stokes
+
+CONFIG = EmulatorConfig(
+    model="exact",
+    render_rate_hz=300.0,
+    contrast_threshold_on=0.2,
+    contrast_threshold_off=0.2,
+    contrast_threshold_sigma=0.03,
+    cutoff_hz=300.0,
+    leak_rate_hz=0.1,
+    leak_jitter=0.1,
+    noise_rate_cov_decades=0.1,
+    shot_noise_rate_hz=1.0,
+    refractory_period_us=500.0,
+    esim_log_eps=0.001,
+    voltmeter_camera="dvs346",
+    randomise=False,
+    random_threshold_on=[0.08, 0.31],
+    random_threshold_off=[0.14, 0.42],
+    random_threshold_sigma=[0.02, 0.06],
+    random_cutoff_hz=[30.0, 300.0],
+    random_leak_rate_hz=[0.01, 0.1],
+    random_shot_noise_rate_hz=[0.001, 5.0],
+)
+STILL = Sine(0.0, 0.0, 0.0)
+H, W = 24, 32
+
+
+def trajectory(roll: float = 0.0, zoom: float = 0.0, speed: float = 150.0) -> Trajectory:
+    """A window that swings 20 px to either side, 8 px up and down, and turns and zooms as asked."""
+    rest = [STILL] * (HARMONICS - 1)
+    return Trajectory(
+        x=60.3,
+        y=40.7,
+        x_sines=(Sine(20.0, 6.0, 0.3), *rest),
+        y_sines=(Sine(8.0, 9.0, 1.1), *rest),
+        roll=Sine(roll, 5.0, 0.2),
+        zoom=Sine(zoom, 4.0, 0.4),
+        speed_px_s=speed,
+    )
+
+
+@pytest.fixture(scope="module")
+def scene():
+    picture = torch.from_numpy(data.coffee()[::5, ::5].copy()).permute(2, 0, 1).float() / 255
+    return scene_from_rgb(picture)
+
+
+def times_us(n: int = 61) -> np.ndarray:
+    return np.rint(np.arange(n) * 1e6 / 300).astype(np.int64)
+
+
+def same(a, b) -> bool:
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("t", "x", "y", "p"))
+
+
+def test_the_drifting_window_sees_what_render_sees(scene):
+    t_us = times_us()
+    expected = 255 * intensities_from_stokes(render(scene, trajectory(), t_us * 1e-6, H, W))
+    pose = trajectory().pose(t_us * 1e-6)
+    for polarizer, plane in enumerate(_scene_behind_polarizers(scene)):
+        light = light_of_scene(plane, pose.y - (H - 1) / 2, pose.x - (W - 1) / 2)
+        seen = np.empty((len(t_us), H * W), np.float32)
+        for k in range(len(t_us)):
+            intensity_rows(light, k, 0, W, seen[k])
+        assert seen.reshape(-1, H, W) / 255 == pytest.approx(expected[:, polarizer].numpy() / 255, abs=1e-5)
+
+
+def test_the_turning_window_sees_what_render_sees_with_polarizers_that_turn_along(scene):
+    t_us, turning = times_us(31), trajectory(roll=0.3, zoom=0.2)
+    expected = 255 * intensities_from_stokes(render(scene, turning, t_us * 1e-6, H, W)).transpose(0, 1).numpy()
+    seen = render_intensities(scene, turning.pose(t_us * 1e-6), H, W, CONFIG)
+    assert seen == pytest.approx(np.maximum(expected, 0), abs=255e-5)
+    rounded = render_intensities(scene, turning.pose(t_us * 1e-6), H, W, dataclasses.replace(CONFIG, model="v2e"))
+    assert rounded.dtype == np.uint8
+    assert abs(rounded - expected).max() <= 0.501
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact"])
+@pytest.mark.parametrize("turning", [False, True])
+def test_events_are_those_of_the_rendered_clip(scene, model, turning):
+    path, config = trajectory(roll=0.3 * turning, zoom=0.2 * turning), dataclasses.replace(CONFIG, model=model)
+    frames = 255 * intensities_from_stokes(render(scene, path, times_us() * 1e-6, H, W)).clamp(0, 1)
+    if model == "v2e":
+        frames = (frames + 0.5).to(torch.uint8)
+    expected, _ = emulate(frames, torch.from_numpy(times_us()), config, key=5)
+    events, _ = synthesize_steps(scene, path, times_us(), H, W, config, key=5, state=None)
+    for ours, theirs in zip(events, expected, strict=True):
+        validate(ours)
+        assert len(theirs) > 1000
+        a, b = ({*zip(e.t.tolist(), e.x.tolist(), e.y.tolist(), e.p.tolist(), strict=True)} for e in (ours, theirs))
+        # light that differs in its last bit moves few stamps by a microsecond, and fewer pixels across a rounding
+        assert len(a & b) > 0.97 * len(b)
+        assert len(ours) == pytest.approx(len(theirs), rel=2e-3)
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact"])
+@pytest.mark.parametrize("turning", [False, True])
+def test_a_sequence_in_pieces_or_on_two_threads_has_the_same_bytes(scene, model, turning):
+    path, config = trajectory(roll=0.3 * turning, zoom=0.2 * turning), dataclasses.replace(CONFIG, model=model)
+    whole = synthesize_sequence(scene, path, 200_000, H, W, config, key=5)
+    threaded = synthesize_sequence(scene, path, 200_000, H, W, config, key=5, threads=2)
+    assert all(same(a, b) for a, b in zip(whole, threaded, strict=True))
+    t_us, state, pieces = render_times_us(path, 200_000, H, W, config), None, []
+    for first in range(0, len(t_us), 23):
+        events, state = synthesize_steps(scene, path, t_us[first : first + 23], H, W, config, 5, state)
+        pieces.append(events)
+    for polarizer in range(4):
+        for name in ("t", "x", "y", "p"):
+            joined = torch.cat([getattr(piece[polarizer], name) for piece in pieces])
+            assert torch.equal(joined, getattr(whole[polarizer], name))
+
+
+def test_v2e_renders_at_regular_times():
+    t_us = render_times_us(trajectory(), 100_000, H, W, dataclasses.replace(CONFIG, model="v2e"))
+    assert t_us.tolist() == [round(k * 1e6 / 300) for k in range(31)]
+
+
+def test_a_rate_that_does_not_divide_the_duration_ends_with_it():
+    config = dataclasses.replace(CONFIG, model="v2e", render_rate_hz=100.0)
+    assert render_times_us(trajectory(), 25_000, H, W, config).tolist() == [0, 10_000, 20_000, 25_000]
+
+
+def test_exact_renders_as_often_but_when_pixels_meet():
+    t_us = render_times_us(trajectory(), 200_000, H, W, CONFIG)
+    assert len(t_us) == 61
+    assert (t_us[0], t_us[-1]) == (0, 200_000)
+    assert abs(t_us - times_us()).max() <= 1e6 / 300 / 2
+    moved = np.flatnonzero(t_us != times_us())
+    pose = trajectory().pose(t_us[moved] * 1e-6)
+    off_grid = [abs(place - np.rint(place)) for place in (pose.x - (W - 1) / 2, pose.y - (H - 1) / 2)]
+    assert len(moved) > 15
+    assert np.minimum(*off_grid).max() < 1e-3
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact"])
+def test_an_adaptive_rate_takes_steps_of_at_most_a_pixel(model):
+    config = dataclasses.replace(CONFIG, model=model, render_rate_hz=None)
+    path = trajectory(roll=0.3, zoom=0.2, speed=250.0)
+    for motion in (path, trajectory()):
+        t_us = render_times_us(motion, 500_000, H, W, config)
+        pose = motion.pose(t_us * 1e-6)
+        corner = np.hypot(H - 1, W - 1) / 2
+        moved = np.hypot(np.diff(pose.x), np.diff(pose.y)) * pose.zoom[1:]
+        assert moved.max() <= 1.01 + corner * (abs(np.diff(pose.angle)).max() + abs(np.diff(pose.zoom)).max())
+        assert np.diff(t_us).max() <= 1e6 / 30 + 1
+        assert (t_us[0], t_us[-1]) == (0, 500_000)
+
+
+def test_a_window_that_stands_still_is_still_looked_at_thirty_times_a_second():
+    still = Trajectory(60.0, 40.0, (STILL,) * HARMONICS, (STILL,) * HARMONICS, STILL, STILL, speed_px_s=0.0)
+    t_us = render_times_us(still, 1_000_000, H, W, dataclasses.replace(CONFIG, render_rate_hz=None))
+    assert np.diff(t_us) == pytest.approx(1e6 / 30, abs=1)
+
+
+def test_a_window_that_leaves_the_scene_is_refused_with_its_place(scene):
+    far = dataclasses.replace(trajectory(), x=100.0)
+    with pytest.raises(ValueError, match=r"reaches rows .* of a scene of 80x120; use a trajectory made for this scene"):
+        synthesize_sequence(scene, far, 200_000, H, W, CONFIG, key=5)
+
+
+def test_exact_needs_few_frames_for_the_times_of_many(scene):
+    config = dataclasses.replace(
+        CONFIG, contrast_threshold_sigma=0.0, cutoff_hz=0.0, leak_rate_hz=0.0, shot_noise_rate_hz=0.0,
+        refractory_period_us=0.0,
+    )  # fmt: skip
+    many, few = (
+        synthesize_sequence(scene, trajectory(), 200_000, H, W, dataclasses.replace(config, render_rate_hz=rate), key=5)
+        for rate in (4800.0, 300.0)
+    )
+    errors = []
+    for a, b in zip(few, many, strict=True):
+        assert len(a) == pytest.approx(len(b), rel=0.02)
+        for pixel in range(0, H * W, 7):
+            here, there = ((e.y.long() * W + e.x) == pixel for e in (a, b))
+            if torch.equal(a.p[here], b.p[there]):
+                errors.append((a.t[here] - b.t[there]).abs())
+    assert torch.cat(errors).float().mean() < 250
