@@ -67,7 +67,7 @@ def test_a_typo_on_the_command_line_is_refused_with_the_keys_there_are(project_r
 
 
 def test_a_typo_in_params_yaml_is_refused_with_the_keys_there_are(project):
-    edit(project, "  ssim: 1.0\n  lpips: 10.0", "  sim: 1.0\n  lpips: 10.0")
+    edit(project, "  mse: 10.0\n  ssim: 1.0", "  mse: 10.0\n  sim: 1.0")
     with pytest.raises(ValueError, match=r"params.yaml: loss\.sim is not a setting; loss has lpips, mse, ssim"):
         check_keys(project, [])
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32
 
 COVERINGS = 5.0  # summed area of the shapes over that of the picture; exp(-5) of it stays uncovered
-RADIUS_MIN_PX = (12.0, 40.0)  # of the smallest leaves, drawn per picture
+RADIUS_MIN_PX = (10.0, 32.0)  # of the smallest leaves, drawn per picture
 RADIUS_MAX = 0.45  # of the picture's shorter side
 SIDES_MAX = 8
 NOISE_SIZE = 256  # pixels of the noise tile, a power of 2
@@ -57,7 +57,7 @@ def dead_leaves(generator: np.random.Generator, height: int, width: int) -> Floa
     uncovered = np.ones((height, width), dtype=np.float32)
     _paint(picture, uncovered, leaves, _noise_tile(generator))
     picture += uncovered[..., None] * generator.uniform(0.1, 0.9, 3).astype(np.float32)
-    blur = generator.uniform(0.6, 1.2)  # of a lens; without it every edge is one pixel wide
+    blur = generator.uniform(0.3, 0.8)  # of a lens; without it every edge is one pixel wide
     return np.clip(cv2.GaussianBlur(picture, (0, 0), blur), 0, 1).astype(np.float32)
 
 
