@@ -1,6 +1,7 @@
 """The figures that say whether the README's two commands keep their word, measured in a fresh clone."""
 
 import importlib.metadata
+import itertools
 import json
 import os
 import platform
@@ -73,6 +74,6 @@ def _timed(target: str, folder: Path) -> tuple[float, dict[str, float]]:
     ended = time.monotonic()
     if process.returncode:
         raise RuntimeError(f"make {target} failed in a fresh clone; what it printed is above")
-    ends = [start for _, start in marks[1:]] + [ended]
-    stages = {name: round((end - start) / 60, 2) for (name, start), end in zip(marks, ends, strict=True)}
+    spans = itertools.pairwise([*marks, ("", ended)])
+    stages = {name: round((end - start) / 60, 2) for (name, start), (_, end) in spans}
     return round((ended - started) / 60, 2), stages
