@@ -16,7 +16,9 @@ from polarnet.reports.artefacts import Artefacts, History, Panel, ReportPaths, r
 from polarnet.reports.figures import (
     DARK,
     LIGHT,
+    PanelScene,
     Theme,
+    comparison_panel,
     dolp_bar,
     png,
     score_distribution,
@@ -102,7 +104,7 @@ class TileRow(NamedTuple):
 
 
 def write_report(paths: ReportPaths, run: Run, folder: Path) -> Path:
-    """Write index.html, and beside it overview.png, the picture worth keeping on its own.
+    """Write index.html, and beside it the pictures worth keeping on their own: overview.png and comparison.png.
 
     The page needs no other file and no network. FileNotFoundError that names what is missing and the stage to run.
     """
@@ -112,6 +114,9 @@ def write_report(paths: ReportPaths, run: Run, folder: Path) -> Path:
     if artefacts.overview is not None:
         overview = png(overview_figure(artefacts.overview))
         (folder / "overview.png").write_bytes(overview)
+    if artefacts.panels:
+        rows = [PanelScene(panel.sequence, panel.events, panel.truth_dolp, panel.dolp) for panel in artefacts.panels]
+        comparison_panel(rows, folder / "comparison.png")
     environment = Environment(
         loader=PackageLoader("polarnet.reports", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )

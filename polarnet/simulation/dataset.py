@@ -9,8 +9,8 @@ from typing import Any
 from polarnet import __version__
 from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
-from polarnet.runtime import seed_for
-from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.runtime import generator_for, seed_for
+from polarnet.simulation.emulator import EmulatorConfig, randomised
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.simulation.scenes import SceneStore
@@ -44,7 +44,10 @@ def emulate_scenes(
 def emulate_sequence(
     scenes: SceneStore, sequence: str, config: EmulatorConfig, seed: int, threads: int
 ) -> list[Events]:
-    """Events of the four polarizers of one stored sequence; its noise depends on the seed and its name alone."""
+    """Events of the four polarizers of one stored sequence.
+
+    Its noise, and its sensor where `config.randomise`, depend on the seed and its name alone.
+    """
     record = scenes.read(sequence)
     return synthesize_sequence(
         scene_from_polarization(record.s0, record.dolp, record.aolp),
@@ -52,7 +55,7 @@ def emulate_sequence(
         record.duration_us,
         scenes.window_height,
         scenes.window_width,
-        config,
+        randomised(config, generator_for(seed, sequence, "sensor")),
         seed_for(seed, sequence, "emulate"),
         threads,
     )

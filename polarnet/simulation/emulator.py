@@ -17,8 +17,8 @@ from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
 from polarnet.simulation.pixels.columns import Columns, empty_columns, trimmed
 from polarnet.simulation.pixels.light import Light, light_of_frames
 
-EVENTS_PER_PIXEL_AND_STEP = 0.12  # room to begin with; columns grow where a scene is busier
-LARGEST_FIRST_ROOM = 1 << 20  # events
+EVENTS_PER_PIXEL_AND_STEP = 0.5  # room to begin with, far more than usual: what is not written costs no memory
+LARGEST_FIRST_ROOM = 1 << 22  # events; columns grow where a scene is busier
 
 
 @dataclass(frozen=True)

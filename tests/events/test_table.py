@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import shutil
+import threading
 import signal
 import subprocess
 import sys
@@ -136,10 +137,12 @@ def test_whichever_file_a_writer_dies_in_the_rerun_ends_with_the_same_bytes(fini
     deaths = 0
     for n in range(10_000):
         count = iter(range(10_000))
+        one_at_a_time = threading.Lock()  # zarr writes from several threads, which would outlive a death that is acted
 
-        def put_or_die(target, value, exclusive=False, count=count, n=n):
-            if next(count) < n:
-                return put(target, value, exclusive)
+        def put_or_die(target, value, exclusive=False, count=count, n=n, lock=one_at_a_time):
+            with lock:
+                if next(count) < n:
+                    return put(target, value, exclusive)
             target.parent.mkdir(parents=True, exist_ok=True)
             content = bytes(value.as_buffer_like())
             target.with_suffix(".0123.partial").write_bytes(content[: len(content) // (1 + n % 2)])
@@ -152,6 +155,8 @@ def test_whichever_file_a_writer_dies_in_the_rerun_ends_with_the_same_bytes(fini
             _write_missing_and_finish(path)
         except Killed:
             deaths += 1
+            with one_at_a_time:  # the write that was under way has ended, and no other begins
+                pass
         else:
             break
         finally:

@@ -17,7 +17,7 @@ from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL
 from polarnet.simulation.pixels.light import intensity_rows, linlog
 from polarnet.simulation.pixels.pending import event_of, pending_events, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normal, uniform
-from polarnet.simulation.pixels.strips import flag_words, flagged, flags_of, rows_of_strip
+from polarnet.simulation.pixels.strips import SPARE, flag_words, flagged, flags_of, rows_of_strip
 from polarnet.simulation.pixels.v2e import (
     DARK_OFFSET,
     SATURATION,
@@ -63,6 +63,8 @@ class Course(NamedTuple):
 
     pixel: np.ndarray
     """int32, number in the strip"""
+    groups: np.ndarray
+    """int32, scratch"""
     place: np.ndarray
     """int64, see `pending`"""
     change: np.ndarray
@@ -117,9 +119,9 @@ def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, co
     """Run steps times_us[k] .. times_us[k + 1] under light[offset + k]; the columns and how many events they hold."""
     rows = rows_of_strip(h, w)
     strip = np.empty((4, rows * w), np.float32)
-    m = rows * w
+    m = rows * w + SPARE
     words = flag_words(rows * w)
-    course = Course(np.empty(m, np.int32), np.empty(m, np.int64), np.empty(m), np.empty(m))
+    course = Course(np.empty(m, np.int32), np.empty(m, np.int32), np.empty(m, np.int64), np.empty(m), np.empty(m))
     keys = key_for(key, randomness.LEAK_JITTER, plane), key_for(key, randomness.SHOT_NOISE, plane)
     pending = pending_events(h * w, columns.exact_us.size > 0)
     soonest_us = np.array([pixels.next_shot_us[y * w : (y + rows) * w].min() for y in range(0, h, rows)])
@@ -214,12 +216,12 @@ def _flag_shots(next_shot_us, stop_us, fires):
 @compiled
 def _line_up(words, y, w, before, course):
     """Put the flagged pixels of a strip that begins at row y on the course; how many they are."""
-    active, row_start = flagged(words, before.size, course.pixel), 0
+    active, row_start = flagged(words, before.size, course.pixel, course.groups), 0
     for a in range(active):
         j = course.pixel[a]
         while j >= row_start + w:
             y, row_start = y + 1, row_start + w
-        course.place[a], course.change[a], course.now[a] = place_of(y, j - row_start), before[j], 0.0
+        course.place[a], course.change[a], course.now[a] = place_of(y, j - row_start), before[np.uint64(j)], 0.0
     return active
 
 
@@ -239,7 +241,8 @@ def _fire(pixels, physics, keys, course, active, rise, dn, first, shooting, star
         remaining = 0
         for a in range(active):
             j, place, change, now = course.pixel[a], course.place[a], course.change[a], course.now[a]
-            i = first + j
+            i, at = np.uint64(first + j), np.uint64(n)  # unsigned: numba checks other indices for being negative
+            j = np.uint64(j)
             last, leak = pixels.last_event_us[i] - start_us, np.float64(pixels.leak[i])
             threshold_on, threshold_off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
             slope = rise[j] * per_us + leak
@@ -259,9 +262,9 @@ def _fire(pixels, physics, keys, course, active, rise, dn, first, shooting, star
                     event, label, excess = shot, SHOT, 0.0
                     fires = happens & (event >= last + refractory_us)
                 again = pixels.next_shot_us[i] < stop_us
-            pending.events[n] = event_of(np.int64(start_us - base_us + event), place, on, label)
+            pending.events[at] = event_of(np.int64(start_us - base_us + event), place, on, label)
             if pending.exact_us.size:
-                pending.exact_us[n] = start_us + event
+                pending.exact_us[at] = start_us + event
             n += fires
             # a crossing leaves nothing of the change; after waiting, what exceeded the threshold remains
             rest = max(excess, 0.0) if on else -max(excess, 0.0)
@@ -273,8 +276,9 @@ def _fire(pixels, physics, keys, course, active, rise, dn, first, shooting, star
                 leak = drawn if fires else leak
             at_end = change + (rise[j] * per_us + leak) * (dt - now)
             pixels.change[i], pixels.leak[i], pixels.last_event_us[i] = at_end, leak, start_us + last
-            course.pixel[remaining], course.place[remaining] = j, place
-            course.change[remaining], course.now[remaining] = change, now
+            kept = np.uint64(remaining)
+            course.pixel[kept], course.place[kept] = j, place
+            course.change[kept], course.now[kept] = change, now
             beyond = (max(change, at_end) >= threshold_on) | (min(change, at_end) <= -threshold_off)
             remaining += again | (fires & beyond)
         active = remaining
@@ -290,7 +294,9 @@ def _bits(key, i, time_us):
 @compiled
 def jittered_leak(nominal, jitter, key, i, number):
     """The leak of pixel i from its event of this number to its next."""
-    return nominal * np.float32(max(1 - jitter * rough_normal(mixed(key, (i << 32) + number)), 0.0))
+    return nominal * np.float32(
+        max(1 - jitter * rough_normal(mixed(key, (np.uint64(i) << np.uint64(32)) + np.uint64(number))), 0.0)
+    )
 
 
 @compiled

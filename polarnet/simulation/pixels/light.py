@@ -81,9 +81,9 @@ def _bilinear_row(scene, row, column, dn):
 def linlog_8bit(dn, linlog):
     """v2e's response to `dn`, which is rounded to whole numbers, as an 8-bit video would hold."""
     for j in range(dn.size):
-        dn[j] = np.float32(np.int32(dn[j] + np.float32(0.5)))
-    for j in range(dn.size):
-        linlog[j] = LINLOG_TABLE[np.int32(dn[j]) & 255]
+        whole = np.int32(dn[j] + np.float32(0.5)) & np.int32(255)
+        dn[j] = np.float32(whole)
+        linlog[j] = LINLOG_TABLE[whole]
 
 
 @compiled

@@ -88,15 +88,15 @@ def _sort(events, longest_us, in_order):
         shift += 1
     starts = np.zeros((longest_us >> (shift - TIME_SHIFT)) + 2, np.int32)
     for i in range(events.size):
-        starts[(events[i] >> shift) + 1] += 1
+        starts[np.uint64((events[i] >> shift) + 1)] += 1  # unsigned: numba checks other indices for being negative
     total = np.int32(0)
     for b in range(starts.size):
         total += starts[b]
         starts[b] = total
     for i in range(events.size):
-        b = events[i] >> shift
-        in_order[starts[b]] = events[i]
-        starts[b] += 1
+        bucket = np.uint64(events[i] >> shift)
+        in_order[np.uint64(starts[bucket])] = events[i]
+        starts[bucket] += 1
     for i in range(1, events.size):
         event, j = in_order[i], i
         while j > 0 and in_order[j - 1] > event:

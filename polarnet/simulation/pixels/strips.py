@@ -5,8 +5,7 @@ import numpy as np
 from polarnet.simulation.compilation import compiled
 
 STRIP = 4000  # pixels, about
-EIGHT = np.uint64(8)
-BYTE_NUMBERS = np.uint64(0x0001020304050607)  # 256^i times this has i in its highest byte
+SPARE = 8  # entries that `flagged` may write beyond the pixels of a strip
 
 
 @compiled
@@ -29,17 +28,20 @@ def flags_of(words, pixels):
 
 
 @compiled
-def flagged(words, pixels, positions):
+def flagged(words, pixels, positions, groups):
     """Write the positions of the flags that are set, among the first `pixels`, into `positions`; how many they are.
 
-    Few pixels fire in a step: a word without a flag is passed over, and set flags are found by arithmetic.
+    Which pixels fire is not to be guessed, so there is no branch on it. `groups` is scratch; both hold 8 more entries
+    than there are pixels.
     """
-    found = 0
+    marked = 0
     for group in range((pixels + 7) // 8):
-        word = words[group]
-        while word:
-            lowest = word & (~word + np.uint64(1))
-            positions[found] = EIGHT * np.uint64(group) + (lowest * BYTE_NUMBERS >> np.uint64(56))
-            found += 1
-            word ^= lowest
+        groups[np.uint64(marked)] = group  # unsigned: numba checks other indices for being negative
+        marked += words[group] != 0
+    flags, found = words.view(np.uint8), 0
+    for m in range(marked):
+        group = groups[m]
+        for j in range(8 * group, 8 * group + 8):
+            positions[np.uint64(found)] = j
+            found += flags[np.uint64(j)]
     return found

@@ -14,7 +14,7 @@ from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL, sort_ties, with_room
 from polarnet.simulation.pixels.light import FLOATS, intensity_rows, linlog_8bit, linlog_as_v2e
 from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normals, uniform
-from polarnet.simulation.pixels.strips import flag_words, flagged, flags_of, rows_of_strip
+from polarnet.simulation.pixels.strips import SPARE, flag_words, flagged, flags_of, rows_of_strip
 
 THRESHOLD_FLOOR = 0.01  # v2e clips drawn thresholds here
 DARK_OFFSET = 20.0  # DN: bandwidth and shot noise follow (DN + 20) / 275
@@ -113,7 +113,7 @@ def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, co
     """Run steps times_us[k] .. times_us[k + 1] under light[offset + k]; the columns and how many events they hold."""
     rows = rows_of_strip(h, w)
     strip = np.empty((3, rows * w), np.float32)
-    words, candidates = flag_words(rows * w), np.empty(rows * w, np.int32)
+    words, candidates = flag_words(rows * w), np.empty((2, rows * w + SPARE), np.int32)
     firing, order = np.empty((h * w + 1, 4), np.int32), np.empty(h * w + 1, np.int32)
     jitter_key, shot_key = key_for(key, randomness.LEAK_JITTER, plane), key_for(key, randomness.SHOT_NOISE, plane)
     ceiling = physics.threshold_on / pixels.threshold_on.min() + physics.threshold_off / pixels.threshold_off.min()
@@ -187,20 +187,21 @@ def _count(filtered, memory, threshold_on, threshold_off, physics, words, y, w, 
 
     Returns the length of the list and the largest count.
     """
-    found = flagged(words, filtered.size, candidates)
+    found = flagged(words, filtered.size, candidates[0], candidates[1])
     first, row_end = y * w, w
     exact_nominal = memory.itemsize == 8 and physics.threshold_sigma == 0  # v2e divides float64 by a Python float
     for c in range(found):
-        j = candidates[c]
-        while j >= row_end:
+        j = np.uint64(candidates[0, c])  # unsigned: numba checks other indices for being negative
+        while candidates[0, c] >= row_end:
             y, row_end = y + 1, row_end + w
         change = np.float64(filtered[j] - memory[j])
         on, off = np.float64(threshold_on[j]), np.float64(threshold_off[j])
         if exact_nominal:
             on, off = physics.threshold_on, physics.threshold_off
         crossed = np.int32(change / (on if change > 0 else off))
-        firing[n, PIXEL], firing[n, CROSSED], firing[n, ACCEPTED] = first + j, crossed, 0
-        firing[n, PLACE] = y << 16 | (j - row_end + w)
+        entry = np.uint64(n)
+        firing[entry, PIXEL], firing[entry, CROSSED], firing[entry, ACCEPTED] = first + candidates[0, c], crossed, 0
+        firing[entry, PLACE] = y << 16 | (candidates[0, c] - row_end + w)
         n += crossed != 0
         most = max(most, abs(crossed))
     return n, most
@@ -231,20 +232,20 @@ def _emit(pixels, physics, start_us, stop_us, firing, order, n, most, columns, u
         t, x, y, p = columns.t[used:], columns.x[used:], columns.y[used:], columns.p[used:]
         t_us, written, remaining = np.int64(np.rint(exact_us)), 0, 0
         for a in range(active):  # without branches: an event that is suppressed is overwritten by the next
-            e = order[a]
-            i, place, crossed = firing[e, PIXEL], firing[e, PLACE], firing[e, CROSSED]
+            e, at = np.uint64(order[a]), np.uint64(written)
+            i, place, crossed = np.uint64(firing[e, PIXEL]), firing[e, PLACE], firing[e, CROSSED]
             accepted = np.float32(stamp - since[i]) > least
             if refractory:
                 since[i] = stamp if accepted else since[i]
             polarity = np.int32(1) if crossed > 0 else np.int32(-1)
-            t[written], x[written], y[written], p[written] = t_us, place & 0xFFFF, place >> 16, polarity
+            t[at], x[at], y[at], p[at] = t_us, place & 0xFFFF, place >> 16, polarity
             firing[e, ACCEPTED] += polarity if accepted else np.int32(0)
             if columns.label.size and accepted:
                 columns.label[used + written] = _label(pixels, physics, i, exact_us, polarity)
             if columns.exact_us.size:
                 columns.exact_us[used + written] = exact_us
             written += int(accepted)
-            order[remaining] = e
+            order[np.uint64(remaining)] = e
             remaining += abs(crossed) > slot
         used += written
         active = remaining
@@ -256,7 +257,7 @@ def _emit(pixels, physics, start_us, stop_us, firing, order, n, most, columns, u
 def _consume(pixels, firing, n):
     """Move each memory by the thresholds whose events were accepted; the remainder of the change is kept."""
     for a in range(n):
-        i, accepted = firing[a, PIXEL], firing[a, ACCEPTED]
+        i, accepted = np.uint64(firing[a, PIXEL]), firing[a, ACCEPTED]
         on, off = pixels.threshold_on[i], pixels.threshold_off[i]
         pixels.memory[i] += (on if accepted > 0 else off) * np.float32(accepted)
 

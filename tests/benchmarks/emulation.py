@@ -1,0 +1,227 @@
+"""How fast and how true the emulator is: python tests/benchmarks/emulation.py [--write] [--repeats N]
+
+The clip is that of the shared reference figures: scikit-image's coffee photograph mapped to polarization, a window of
+120 x 180 pixels drifting over it at 110 px/s, 300 steps a second, four polarizers, one second; from rendering to
+columns in memory. Seconds are medians of wall-clock time, of a process whose kernels are compiled. Every model and
+number of threads runs in a process of its own, which also gives its peak memory.
+
+Timing errors are those of noiseless pixels with equal thresholds, against `exact` at 4800 steps a second, over the
+pixels whose polarities agree from the first event to the last. `exact` places its steps where pixels meet; its figure
+for regular frames is printed too.
+
+With POLARNET_SHARED set, the golden cases are counted. `--write` merges the figures into docs/results/emulation.json.
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import torch
+from skimage import data
+
+from polarnet.events.stream import Events
+from polarnet.measure import machine_record
+from polarnet.reports.provenance import git
+from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory
+from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
+from polarnet.simulation.synthesize import synthesize_sequence, synthesize_steps
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "docs" / "results" / "emulation.json"
+HEIGHT, WIDTH, DURATION_US, SPEED_PX_S = 120, 180, 1_000_000, 110.0
+STILL = Sine(0.0, 0.0, 0.0)
+DEFAULT = EmulatorConfig(  # v2e's command-line defaults
+    model="v2e",
+    render_rate_hz=300.0,
+    contrast_threshold_on=0.2,
+    contrast_threshold_off=0.2,
+    contrast_threshold_sigma=0.03,
+    cutoff_hz=300.0,
+    leak_rate_hz=0.01,
+    leak_jitter=0.1,
+    noise_rate_cov_decades=0.1,
+    shot_noise_rate_hz=0.001,
+    refractory_period_us=500.0,
+    esim_log_eps=0.001,
+    voltmeter_camera="dvs346",
+    randomise=False,
+    random_threshold_on=[0.08, 0.31],
+    random_threshold_off=[0.14, 0.42],
+    random_threshold_sigma=[0.02, 0.06],
+    random_cutoff_hz=[30.0, 300.0],
+    random_leak_rate_hz=[0.01, 0.1],
+    random_shot_noise_rate_hz=[0.001, 5.0],
+)
+NOISELESS = replace(
+    DEFAULT,
+    contrast_threshold_sigma=0.0,
+    cutoff_hz=0.0,
+    leak_rate_hz=0.0,
+    shot_noise_rate_hz=0.0,
+    refractory_period_us=0.0,
+)
+MODELS = {
+    "v2e_default": DEFAULT,
+    "exact": replace(DEFAULT, model="exact"),
+    "esim": replace(DEFAULT, model="esim"),
+    "dvs_voltmeter": replace(DEFAULT, model="dvs_voltmeter"),
+}
+THREADS = {"seconds_1_thread": 1, "seconds_2_threads": 2}
+
+
+class Drift(Trajectory):
+    """A window that starts in the middle of a scene and moves right at constant speed."""
+
+    def pose(self, t_s: np.ndarray) -> Pose:
+        """The window at times in seconds."""
+        still = np.zeros_like(t_s)
+        return Pose(self.x + self.speed_px_s * t_s, self.y + still, still, still + 1)
+
+
+def benchmark_scene() -> tuple[PolarizationScene, Drift]:
+    """The coffee photograph, 400 x 600, and the motion over it."""
+    scene = scene_from_rgb(torch.from_numpy(data.coffee()).permute(2, 0, 1).float() / 255)
+    x, y = (scene.width - 1) / 2, (scene.height - 1) / 2
+    return scene, Drift(x, y, (STILL,) * HARMONICS, (STILL,) * HARMONICS, STILL, STILL, SPEED_PX_S)
+
+
+def measure_one(name: str, threads: int, repeats: int) -> dict[str, float]:
+    """Figures of one model in this process."""
+    torch.set_num_threads(threads)
+    scene, path = benchmark_scene()
+    seconds = []
+    for _ in range(repeats + 1):  # the first compiles
+        start = time.perf_counter()
+        events = synthesize_sequence(scene, path, DURATION_US, HEIGHT, WIDTH, MODELS[name], 1, threads)
+        seconds.append(time.perf_counter() - start)
+    median, steps = float(np.median(seconds[1:])), DURATION_US * 1e-6 * float(MODELS[name].render_rate_hz or 0)
+    return {
+        "seconds": round(median, 4),
+        "mpixel_updates_per_s": round(4 * HEIGHT * WIDTH * steps / median * 1e-6, 1),
+        "mevents_per_s": round(sum(map(len, events)) / median * 1e-6, 2),
+        "events": sum(map(len, events)),
+        "peak_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+    }
+
+
+def in_own_process(name: str, threads: int, repeats: int) -> dict[str, float]:
+    """`measure_one` in a new process of this script."""
+    command = [sys.executable, __file__, "--one", name, "--threads", str(threads), "--repeats", str(repeats)]
+    environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
+    done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def timing_error_ms(events: list[Events], reference: list[Events]) -> tuple[float, float]:
+    """Mean absolute difference of stamps where a pixel's polarities agree, and the share of events in such pixels."""
+    total_us, compared = 0, 0
+    for ours, theirs in zip(events, reference, strict=True):
+        pairs = zip(_by_pixel(ours), _by_pixel(theirs), strict=True)
+        for (t, p), (u, q) in pairs:
+            if np.array_equal(p, q):
+                total_us += int(abs(t - u).sum())
+                compared += len(t)
+    return total_us / compared / 1000, compared / sum(map(len, reference))
+
+
+def _by_pixel(events: Events) -> list[tuple[np.ndarray, np.ndarray]]:
+    pixel = events.y.numpy().astype(np.int64) * events.width + events.x.numpy()
+    order = np.argsort(pixel, kind="stable")
+    cuts = np.searchsorted(pixel[order], np.arange(1, events.height * events.width))
+    return list(zip(np.split(events.t.numpy()[order], cuts), np.split(events.p.numpy()[order], cuts), strict=True))
+
+
+def measure_timing() -> dict[str, dict[str, float]]:
+    """Timing errors of `exact` and, for comparison, `v2e`."""
+    scene, path = benchmark_scene()
+
+    def at(model: str, rate: float) -> list[Events]:
+        config = replace(NOISELESS, model=model, render_rate_hz=rate)
+        return synthesize_sequence(scene, path, DURATION_US, HEIGHT, WIDTH, config, 1)
+
+    def at_regular_frames(rate: float) -> list[Events]:
+        t_us = np.rint(np.arange(int(rate) + 1) * 1e6 / rate).astype(np.int64)
+        config = replace(NOISELESS, model="exact")
+        return synthesize_steps(scene, path, t_us, HEIGHT, WIDTH, config, 1, None)[0]
+
+    reference = at("exact", 4800.0)
+    figures: dict[str, dict[str, float]] = {"exact": {}, "v2e_default": {}}
+    for rate in (300, 120):
+        for name, events, suffix in (
+            ("exact", at("exact", rate), ""),
+            ("exact", at_regular_frames(rate), "_regular_frames"),
+            ("v2e_default", at("v2e", rate), ""),
+        ):
+            error, share = timing_error_ms(events, reference)
+            figures[name][f"timing_error_ms_{rate}fps{suffix}"] = round(error, 3)
+            figures[name][f"agreeing_share_{rate}fps{suffix}"] = round(share, 3)
+    return figures
+
+
+def golden_cases_passed() -> int:
+    """Of 15 v2e and 8 ESIM cases."""
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / "golden.xml"
+        tests = ROOT / "tests" / "reference" / "test_golden.py"
+        command = [sys.executable, "-m", "pytest", "-q", "-k", "case", f"--junitxml={report}", str(tests)]
+        subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, check=False)  # failures are what is counted
+        cases = ElementTree.parse(report).iter("testcase")
+        return sum("_case[" in case.attrib["name"] and len(case) == 0 for case in cases)  # no failure or skip inside
+
+
+def measure(repeats: int) -> dict[str, Any]:
+    """All figures, printed as they come."""
+    figures: dict[str, Any] = machine_record(ROOT)
+    print(f"{figures['machine']}, {figures['cores']} cores, load {figures['load']}")
+    for name in MODELS:
+        figures[name] = {}
+        for key, threads in THREADS.items():
+            one = in_own_process(name, threads, repeats)
+            figures[name] |= {key: one.pop("seconds")} | (one if threads == 1 else {})
+            print(f"{name:14s} {threads} thread(s): {figures[name][key]:.4f} s  {one}")
+    for name, errors in measure_timing().items():
+        figures[name] |= errors
+        print(name, errors)
+    if os.environ.get("POLARNET_SHARED"):
+        figures["golden_cases_passed"] = golden_cases_passed()
+        print(f"golden cases passed: {figures['golden_cases_passed']} of 23")
+    else:
+        print("POLARNET_SHARED is not set: golden cases not counted")
+    return figures
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/emulation.json")
+    parser.add_argument("--repeats", type=int, default=9, help="runs of which the median counts")
+    parser.add_argument("--one", choices=list(MODELS), help=argparse.SUPPRESS)
+    parser.add_argument("--threads", type=int, default=1, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.one:
+        print(json.dumps(measure_one(arguments.one, arguments.threads, arguments.repeats)))
+        return
+    changed = git(ROOT, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
+    if arguments.write and changed:
+        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    figures = measure(arguments.repeats)
+    if arguments.write:
+        known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+        RESULTS.parent.mkdir(parents=True, exist_ok=True)
+        RESULTS.write_text(json.dumps(known | figures, indent=2) + "\n")
+        print(f"written to {RESULTS.relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    main()
