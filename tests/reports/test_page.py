@@ -75,8 +75,8 @@ def test_a_network_without_aolp_is_not_shown_in_colour(page):
     assert "recovers DoLP alone" in page
 
 
-def test_the_overview_lies_beside_the_page_for_use_elsewhere(folder):
-    assert sorted(path.name for path in folder.iterdir()) == ["index.html", "overview.png"]
+def test_two_pictures_lie_beside_the_page_for_use_elsewhere(folder):
+    assert sorted(path.name for path in folder.iterdir()) == ["comparison.png", "index.html", "overview.png"]
 
 
 def test_a_benchmark_without_panels_and_without_ours_still_gives_a_page(paths, tmp_path):
