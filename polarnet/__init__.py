@@ -2,8 +2,8 @@
 
 import os
 
-# Before anything loads torch: its OpenMP threads would spin while they wait for one another, and on a machine that does
-# something else as well (a second job, a CI runner) a training step then takes five to ten times as long.
+# Before anything loads torch: its OpenMP threads would spin while they wait for one another, and take the cores from
+# whatever they wait for on a machine that does something else as well (a second job, a CI runner).
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __version__ = "0.1.0"

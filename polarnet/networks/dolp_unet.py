@@ -112,7 +112,7 @@ def contrasts(events: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b c h w"]:
     """(e0 + e45 + e90 + e135) / 2, e0 - e90, e45 - e135 and (e0 + e90) - (e45 + e135) of the polarizers' tensors.
 
     Unpolarized light drives the four alike, and far more than polarization sets them apart: given them as they are, a
-    network first has to find the differences, and within 200 steps did not. The last one is no copy of the others:
+    network first has to find the differences. The last one is no copy of the others:
     events tell of log intensities, for which I0 + I90 = I45 + I135 does not hold as it stands.
     """
     e0, e45, e90, e135 = events.unflatten(-3, (4, -1)).unbind(-4)

@@ -160,7 +160,12 @@ def test_the_e2v_baseline_learns_each_polarizers_intensity_from_its_own_events(s
 
 
 def test_bf16_trains_as_well(stores, tmp_path):
-    run(small_task(), stores, tmp_path, dataclasses.replace(TRAIN, epochs=1, precision="bf16"))
+    task = small_task()
+    before = {name: tensor.clone() for name, tensor in task.network.state_dict().items()}
+    run(task, stores, tmp_path, dataclasses.replace(TRAIN, epochs=1, precision="bf16"))
+    after = task.network.state_dict()
+    assert all(tensor.dtype == torch.float32 and tensor.isfinite().all() for tensor in after.values())
+    assert any(not torch.equal(after[name], before[name]) for name in before)
 
 
 def test_a_loss_that_is_not_a_number_stops_the_training(stores, tmp_path):
