@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int64
@@ -11,8 +11,38 @@ from torch.utils.data import Dataset
 
 from polarnet.events.frames import FrameStore
 from polarnet.events.representations import Encode
-from polarnet.events.store import EventStore
 from polarnet.events.stream import Events, slice_count
+
+
+@runtime_checkable
+class EventSource(Protocol):
+    """Where the events of named sequences come from, by time window: a store on disk, or an emulator.
+
+    `polarnet.events.store.EventStore` reads them, `polarnet.simulation.fly.EmulatedEvents` makes them when asked.
+    """
+
+    @property
+    def path(self) -> str:
+        """Of what is read: the store of events, or the scenes that they are made from."""
+
+    @property
+    def sequences(self) -> list[str]:
+        """Their names."""
+
+    @property
+    def height(self) -> int:
+        """Rows of the sensor."""
+
+    @property
+    def width(self) -> int:
+        """Columns of the sensor."""
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """What the events depend on, beside what lies at `path`."""
+
+    def read(self, sequence: str, start_us: int | None = None, stop_us: int | None = None) -> list[Events]:
+        """The four channels of a sequence, or their events with start <= t < stop."""
 
 
 class WindowSequence(NamedTuple):
@@ -57,7 +87,7 @@ def encode_windows(channels: Sequence[Events], t_us: Int64[Tensor, " n"], encode
 class WindowDataset(Dataset[WindowSequence]):
     """Item i: all windows of sequence i, encoded as it is asked for. Frames give the windows' ends and the truth."""
 
-    def __init__(self, events: EventStore, frames: FrameStore, sequences: list[str], encode: Encode):
+    def __init__(self, events: EventSource, frames: FrameStore, sequences: list[str], encode: Encode):
         absent = [name for name in sequences if name not in set(events.sequences) & set(frames.sequences)]
         if absent:
             raise ValueError(f"{', '.join(absent[:8])}: not both in {events.path} and in {frames.path}")

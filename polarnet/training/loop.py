@@ -22,6 +22,8 @@ SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
 class LoopConfig(ViewConfig):
     """How a network is trained; `train` and `baselines.e2v` of params.yaml have these fields and their own."""
 
+    data: str = field(metadata=allowed(choices=("store", "fly")))
+    """store: events from the store on disk; fly: the same events, emulated from the scenes in memory as needed."""
     epochs: int = field(metadata=allowed(low=1))
     batch_size: int = field(metadata=allowed(low=1))
     """Visits to sequences."""
