@@ -33,6 +33,7 @@ def test_the_committed_values_pass(project_root):
     config = load(project_root)
     assert isinstance(config, Config)
     assert dataclasses.is_dataclass(config.emulate)
+    assert config.emulate.model == "exact"
 
 
 @pytest.mark.parametrize(
@@ -97,6 +98,7 @@ def test_the_paper_experiment_holds_the_papers_values(project_root):
     assert (config.synthesize.window_height, config.synthesize.window_width) == (120, 180)
     assert (config.synthesize.duration_s, config.synthesize.frame_rate_hz) == (1.0, 30.0)
     assert (config.emulate.contrast_threshold_on, config.emulate.contrast_threshold_off) == (0.2, 0.2)
+    assert config.emulate.model == "v2e"  # "we use V2E in our experiments", section 3.1
     assert (config.train.learning_rate, config.train.batch_size, config.train.epochs) == (1e-4, 2, 250)
     assert (config.loss.mse, config.loss.ssim, config.loss.lpips) == (1.0, 1.0, 10.0)
     assert (config.lpips.backbone, config.lpips.required) == ("vgg", True)
