@@ -1,3 +1,5 @@
+import subprocess
+
 import pytest
 import torch
 
@@ -69,3 +71,18 @@ def test_a_folder_that_is_no_project_is_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["preset", "smoke"]) == 1
     assert "run this inside a polarnet clone" in capsys.readouterr().err
+
+
+def test_a_run_with_another_sensor_has_a_folder_of_its_own(project_root, monkeypatch, capsys):
+    calls = []
+
+    def ran(command, cwd):
+        calls.append(command)
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr("polarnet.cli.subprocess.run", ran)
+    monkeypatch.chdir(project_root)
+    assert main(["run", "experiment=smoke", "sensor=noisy"]) == 0
+    assert calls[0][2:] == ["stages.ingest", "experiment=smoke", "sensor=noisy", "paths.data=outputs/run/smoke-noisy"]
+    assert len(calls) == 8
+    assert "outputs/run/smoke-noisy/report/index.html" in capsys.readouterr().out
