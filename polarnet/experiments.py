@@ -6,7 +6,7 @@ from typing import Any
 from ruamel.yaml import YAML
 
 BASE = {"experiment": "demo", "sensor": "default"}
-"""Of each group (a folder of conf/), the preset that names every value which others change: none leaks into the next."""
+"""Of each group (a folder of conf/), the preset that names every value which another of it changes: none can leak."""
 
 
 def stage_names(root: Path) -> list[str]:
