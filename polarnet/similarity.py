@@ -1,13 +1,15 @@
 """Similarity of two images, per frame: one definition for the loss and for the table.
 
 Every function takes frames in [0, 1] with any leading axes, gives one number per frame, and is differentiable.
+Where a mask `valid` is given, what the frames hold at other pixels does not matter, and a frame without any valid pixel
+gives NaN.
 The perceptual distance (LPIPS) has weights to find and lives in polarnet/lpips.py; its names are public here too.
 """
 
 import functools
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from polarnet.lpips import Lpips, LpipsConfig, lpips_problem
@@ -18,11 +20,15 @@ __all__ = [
     "correlation",
     "level_mse",
     "lpips_problem",
+    "mean_where",
     "mse",
     "pattern_mse",
     "psnr",
     "ssim",
+    "with_truth_outside",
 ]
+
+Valid = Bool[Tensor, "*b h w"] | None
 
 SSIM_SIGMA = 1.5  # pixels; this and the next three: Wang et al., IEEE TIP 2004
 SSIM_RADIUS = 5  # pixels: an 11 x 11 window
@@ -31,66 +37,88 @@ LEAST_MSE = 1e-10  # half a step of the stored truth (1/65535) squared is 6e-11:
 LEAST_DEVIATION = 1e-6  # a tenth of a step: a frame that varies less is constant
 
 
-def mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def mean_where(values: Float[Tensor, "*b h w"], valid: Valid) -> Float[Tensor, "*b"]:
+    """Mean over the valid pixels of a frame; over all where `valid` is None."""
+    if valid is None:
+        return values.mean(dim=(-2, -1))
+    return torch.where(valid, values, 0.0).sum(dim=(-2, -1)) / valid.sum(dim=(-2, -1))
+
+
+def with_truth_outside(
+    predicted: Float[Tensor, "*b h w"], truth: Float[Tensor, "*b h w"], valid: Valid
+) -> Float[Tensor, "*b h w"]:
+    """`predicted` at valid pixels and `truth` at the others, where nothing is to be said against it then.
+
+    For what looks at whole neighbourhoods: SSIM, and LPIPS, whose average includes the pixels that are not valid.
+    """
+    return predicted if valid is None else torch.where(valid, predicted, truth)
+
+
+def mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Mean squared error."""
-    return (a - b).square().mean(dim=(-2, -1))
+    return mean_where((a - b).square(), valid)
 
 
-def level_mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def level_mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Squared error of the frame's mean: the part of `mse` that a constant offset explains."""
-    return (a - b).mean(dim=(-2, -1)).square()
+    return mean_where(a - b, valid).square()
 
 
-def pattern_mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def pattern_mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """What remains of `mse` once both frames have the same mean: mse = level_mse + pattern_mse."""
-    return mse(_centred(a), _centred(b))
+    return mse(_centred(a, valid), _centred(b, valid), valid)
 
 
-def psnr(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def psnr(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Peak signal-to-noise ratio in dB for the data range 1; 100 dB, not infinity, where the frames agree."""
-    return -10 * torch.log10(mse(a, b).clamp(min=LEAST_MSE))
+    return -10 * torch.log10(mse(a, b, valid).clamp(min=LEAST_MSE))
 
 
-def correlation(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def correlation(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Pearson's correlation over the pixels of a frame, in [-1, 1]; 0 where either frame is constant.
 
     A constant frame shows nothing of the other's pattern, so 0 is its score and no frame is left out.
     """
     dtype = torch.promote_types(a.dtype, b.dtype)
-    a, b = _centred(a.double()), _centred(b.double())
-    variance = a.square().mean(dim=(-2, -1)) * b.square().mean(dim=(-2, -1))
-    varies = (_deviation(a) > LEAST_DEVIATION) & (_deviation(b) > LEAST_DEVIATION)
-    covariance = (a * b).mean(dim=(-2, -1))
-    return torch.where(varies, covariance / torch.where(varies, variance, 1.0).sqrt(), 0.0).to(dtype)
+    a, b = _centred(a.double(), valid), _centred(b.double(), valid)
+    variance = mean_where(a.square(), valid) * mean_where(b.square(), valid)
+    varies = (_deviation(a, valid) > LEAST_DEVIATION) & (_deviation(b, valid) > LEAST_DEVIATION)
+    covariance = mean_where(a * b, valid)
+    constant = torch.zeros_like(covariance)
+    if valid is not None:
+        constant[~valid.any(-1).any(-1)] = torch.nan
+    return torch.where(varies, covariance / torch.where(varies, variance, 1.0).sqrt(), constant).to(dtype)
 
 
-def ssim(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def ssim(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Structural similarity (Wang et al. 2004) for the data range 1, Gaussian window of 11 pixels and sigma 1.5.
 
     The mean over the whole frame, which is mirrored at its borders (the edge pixel is not repeated): torchmetrics'
     `structural_similarity_index_measure`. scikit-image averages the interior alone, where both agree.
+    With a mask: the mean of the map over the valid pixels. Windows of some of them reach other pixels, where `a` is
+    taken to be like `b`, the truth.
     Computed in float32 at least, whatever autocast says: variances are small differences of large means.
     ValueError for a frame smaller than 6 pixels.
     """
     if min(a.shape[-2:]) <= SSIM_RADIUS:
         raise ValueError(f"ssim needs frames of at least {SSIM_RADIUS + 1} pixels a side, got {tuple(a.shape[-2:])}")
     with torch.autocast(a.device.type, enabled=False):
-        a, b = (x if x.dtype == torch.float64 else x.float() for x in (a, b))
+        a, b = (x if x.dtype == torch.float64 else x.float() for x in (with_truth_outside(a, b, valid), b))
         mean_a, mean_b, square_a, square_b, product = _gaussian_means(torch.stack([a, b, a * a, b * b, a * b]))
         variance_a = (square_a - mean_a.square()).clamp(min=0)
         variance_b = (square_b - mean_b.square()).clamp(min=0)
         covariance = product - mean_a * mean_b
         luminance = (2 * mean_a * mean_b + SSIM_K1**2) / (mean_a.square() + mean_b.square() + SSIM_K1**2)
         structure = (2 * covariance + SSIM_K2**2) / (variance_a + variance_b + SSIM_K2**2)
-        return (luminance * structure).mean(dim=(-2, -1))
+        return mean_where(luminance * structure, valid)
 
 
-def _centred(frames: Tensor) -> Tensor:
-    return frames - frames.mean(dim=(-2, -1), keepdim=True)
+def _centred(frames: Tensor, valid: Valid = None) -> Tensor:
+    return frames - mean_where(frames, valid)[..., None, None]
 
 
-def _deviation(centred: Tensor) -> Tensor:
-    return centred.detach().square().mean(dim=(-2, -1)).sqrt()
+def _deviation(centred: Tensor, valid: Valid = None) -> Tensor:
+    return mean_where(centred.detach().square(), valid).sqrt()
 
 
 def _gaussian_means(frames: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:

@@ -15,7 +15,7 @@ from torch import Tensor
 from polarnet.evaluation.methods import METHODS, Recording
 from polarnet.ranges import allowed, check_ranges
 from polarnet.runtime import generator_for
-from polarnet.similarity import Lpips, correlation, level_mse, mse, pattern_mse, psnr, ssim
+from polarnet.similarity import Lpips, correlation, level_mse, mse, pattern_mse, psnr, ssim, with_truth_outside
 
 METRICS = ("mse", "psnr", "ssim", "lpips", "corr", "level_mse", "pattern_mse")
 INTERVAL = (0.025, 0.975)  # quantiles of the bootstrap: 95 %
@@ -80,12 +80,18 @@ def score_sequence(
 ) -> list[FrameScore]:
     """A row per method and window after the warm-up; `recovered` is each method's DoLP, a frame a window.
 
-    Computed on `device`, where `lpips` has to be.
+    Computed on `device`, where `lpips` has to be. Pixels that are not valid count in no score but LPIPS, which sees the
+    truth there in place of the method's answer.
 
-    ValueError, which names the frame, for a score that is not a number: no frame is ever left out.
+    ValueError, which names the frame, for a score that is not a number, or a frame without a valid pixel: no frame is
+    ever left out.
     """
     windows = scored_windows(recording, warmup_windows)
     truth = recording.dolp[warmup_windows:].to(device)
+    valid = None if recording.valid is None else recording.valid[warmup_windows:].to(device)
+    if valid is not None and not (known := valid.any(-1).any(-1)).all():
+        window = warmup_windows + int(known.logical_not().nonzero()[0])
+        raise ValueError(f"{recording.name}, window {window}: no pixel is valid; leave this measurement out")
     for method, frames in recovered.items():
         if frames.shape != recording.dolp.shape:
             raise ValueError(
@@ -93,16 +99,17 @@ def score_sequence(
                 f"got {tuple(frames.shape)}"
             )
     counted = {method: frames[warmup_windows:].to(device) for method, frames in recovered.items()}
-    distances = _lpips_of(counted, truth, lpips)
+    shown = {method: with_truth_outside(frames, truth, valid) for method, frames in counted.items()}
+    distances = _lpips_of(shown, truth, lpips)
     rows = []
     for method, frames in counted.items():
         per_frame = {
-            "mse": mse(frames, truth),
-            "psnr": psnr(frames, truth),
-            "ssim": ssim(frames, truth),
-            "corr": correlation(frames, truth),
-            "level_mse": level_mse(frames, truth),
-            "pattern_mse": pattern_mse(frames, truth),
+            "mse": mse(frames, truth, valid),
+            "psnr": psnr(frames, truth, valid),
+            "ssim": ssim(frames, truth, valid),
+            "corr": correlation(frames, truth, valid),
+            "level_mse": level_mse(frames, truth, valid),
+            "pattern_mse": pattern_mse(frames, truth, valid),
         } | ({} if distances is None else {"lpips": distances[method]})
         columns = {name: values.tolist() for name, values in per_frame.items()}
         for i, window in enumerate(windows):

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -54,6 +54,8 @@ class WindowSequence(NamedTuple):
     dolp: Float[Tensor, "t h w"]
     aolp: Float[Tensor, "t h w"]
     intensity: Float[Tensor, "t 4 h w"]
+    valid: Bool[Tensor, "t h w"] | None = None
+    """Where the truth is known; None: everywhere."""
 
 
 def windows_of(t_us: Int64[Tensor, " n"]) -> list[tuple[int, int]]:
@@ -106,6 +108,7 @@ class WindowDataset(Dataset[WindowSequence]):
 
     def __getitem__(self, i: int) -> WindowSequence:
         name = self.sequences[i]
-        t_us, intensity, dolp, aolp = self.frames.frames(name)
+        t_us, intensity, dolp, aolp, valid = self.frames.frames(name)
         inputs = encode_windows(self.events.read(name), t_us, self.encode)
-        return WindowSequence(name, inputs, dolp[1:], aolp[1:], intensity[1:])
+        known = None if valid is None else valid[1:]
+        return WindowSequence(name, inputs, dolp[1:], aolp[1:], intensity[1:], known)

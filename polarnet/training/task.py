@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from polarnet import __version__
@@ -40,8 +40,10 @@ class Task:
     network: nn.Module
     encode: Encode
     """One polarizer's events in a window, as the network wants them."""
-    streams: Callable[[Batch], tuple[Float[Tensor, "t b c h w"], Float[Tensor, "t b h w"]]]
-    """What the network gets of a batch, and what it should say."""
+    streams: Callable[
+        [Batch], tuple[Float[Tensor, "t b c h w"], Float[Tensor, "t b h w"], Bool[Tensor, "t b h w"] | None]
+    ]
+    """What the network gets of a batch, what it should say, and where that is known (None: everywhere)."""
     unroll: Callable[[Tensor, State], tuple[Float[Tensor, "t b h w"], State]]
     """What it says for windows in a row, and its state after them."""
     loss: FrameLoss

@@ -154,7 +154,8 @@ def test_the_e2v_baseline_learns_each_polarizers_intensity_from_its_own_events(s
     task = e2v_task(E2V, None, SEED)
     split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
     batch = stack([split.train[0], split.train[1]])
-    voxels, intensity = task.streams(batch)
+    voxels, intensity, valid = task.streams(batch)
+    assert valid is None  # no pixel of these stores is masked
     windows, _, _, height, width = batch.inputs.shape
     assert voxels.shape == (windows, 2 * 4, 5, height, width)
     assert torch.equal(voxels[:, 4 + 3], batch.inputs[:, 1, 15:20])  # second sequence, 135 degrees
