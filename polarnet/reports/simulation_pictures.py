@@ -71,6 +71,8 @@ SETTINGS: Mapping[str, dict[str, Any]] = {
         "contrast_threshold_sigma": 0.03,
         "cutoff_hz": 300.0,
         "leak_rate_hz": 0.01,
+        "leak_jitter": 0.1,
+        "noise_rate_cov_decades": 0.1,
         "shot_noise_rate_hz": 0.001,
         "refractory_period_us": 500.0,
     },
@@ -84,8 +86,8 @@ SETTINGS: Mapping[str, dict[str, Any]] = {
 def light_of_one_pixel(t_ms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     """Digital numbers: a slow swell, a quick flash, then steady dim light."""
     swell = 0.7 * (1 - np.cos(2 * math.pi * t_ms.clip(0, 180) / 180)) / 2
-    flash = (_edge(t_ms, 230) - _edge(t_ms, 290)) * 1.3
-    return 70 * np.exp(swell + flash - 0.6 * _edge(t_ms, 340))
+    flash = (_edge(t_ms, 230.0) - _edge(t_ms, 290.0)) * 1.3
+    return 70 * np.exp(swell + flash - 0.6 * _edge(t_ms, 340.0))
 
 
 def _edge(t_ms: Float64[np.ndarray, " n"], at_ms: float) -> Float64[np.ndarray, " n"]:
@@ -220,7 +222,7 @@ def _rows(axes: Axes, labels: Sequence[str]) -> None:
     axes.set_yticks([row + 0.4 for row in range(len(labels))], list(labels))
 
 
-def _ticks(axes: Axes, events: Events, row: float, height: float = 0.8) -> None:
+def _ticks(axes: Axes, events: Events, row: float | int, height: float = 0.8) -> None:
     for polarity, colour in ((1, ON), (-1, OFF)):
         t_ms = events.t[events.p == polarity].numpy() / 1000
         axes.vlines(t_ms, row, row + height, color=colour, linewidth=1.1)

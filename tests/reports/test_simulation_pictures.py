@@ -10,7 +10,7 @@ from polarnet.reports.simulation_pictures import parameters_figure as draw
 
 
 def test_the_events_of_the_pixel_add_up_to_the_change_of_its_log_light():
-    """From the first to the last value the log falls by 0.6, less than a threshold short: three OFF events in sum."""
+    """From the first to the last value the log falls by 0.6, less than a threshold short: so do the events in sum."""
     light = light_of_one_pixel(np.array([0.0, 500.0]))
     assert np.isclose(np.log(light[1] / light[0]), -0.6)
     total = int(pixel_events(QUIET).p.sum()) * QUIET.contrast_threshold_on
