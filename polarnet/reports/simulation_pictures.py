@@ -39,7 +39,7 @@ PIXELS = 12  # side by side under the same light, to show how they differ
 QUIET = replace(SENSORS["clean"], contrast_threshold_sigma=0.0)
 WINDOW_US = (200_000, 233_333)
 COLOURS = 96  # of a picture on disk
-LINE = {"color": LIGHT.quiet, "linewidth": 1.3}
+LINE: dict[str, Any] = {"color": LIGHT.quiet, "linewidth": 1.3}
 
 
 class Variation(NamedTuple):
@@ -241,7 +241,8 @@ def _counts(events: Events) -> torch.Tensor:
 
 def _with(config: EmulatorConfig, name: str, value: float) -> EmulatorConfig:
     names = [f"{name}_on", f"{name}_off"] if name == "contrast_threshold" else [name]
-    return replace(config, **dict.fromkeys(names, value))
+    changed: dict[str, Any] = dict.fromkeys(names, value)
+    return replace(config, **changed)
 
 
 def _photo() -> Path:

@@ -49,8 +49,13 @@ def test_a_scene_gives_what_its_picture_gives():
 
 def test_the_default_presets_are_what_params_yaml_says(project_root):
     config = load(project_root)
-    assert asdict(SENSORS["default"]) == {**asdict(config.emulate), "model": "exact"}
+    assert asdict(SENSORS["default"]) == asdict(config.emulate)
     assert asdict(MOTIONS["default"]) == asdict(config.synthesize)
+
+
+@pytest.mark.parametrize("name", list(SENSORS))
+def test_the_sensors_are_those_of_the_configuration(project_root, name):
+    assert asdict(SENSORS[name]) == asdict(load(project_root, [f"sensor={name}"]).emulate)
 
 
 def test_every_public_name_is_there_and_no_other():
