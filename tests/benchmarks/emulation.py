@@ -10,10 +10,11 @@ pixels whose polarities agree from the first event to the last. `exact` places i
 for regular frames is printed too.
 
 The paper's set is made as a user would make it: `python -m stages.ingest`, `stages.synthesize` and `stages.emulate`
-with experiment=paper on two workers, into a temporary folder, from the builtin photographs and dead leaves; minutes
-are wall-clock time, and peak memory is the largest sum of resident memory of a stage's processes, which counts pages
-that they share once for each. `--paper-set N` makes about N sequences instead of 1000; minutes are those of the number
-stated, never scaled. `--paper-set 0` leaves it out, `--only-paper-set` everything else.
+with experiment=paper on two workers, into a temporary folder, from the builtin photographs and dead leaves. Minutes
+are wall-clock time. Peak memory is the largest that a stage's processes held together, looked at twice a second; pages
+that several of them share (libraries) count once (Linux: proportional set size). `--paper-set N` makes about N
+sequences instead of 1000; minutes are those of the number stated, never scaled. `--paper-set 0` leaves it out,
+`--only-paper-set` everything else.
 
 With POLARNET_SHARED set, the golden cases are counted. `--write` merges the figures into docs/results/emulation.json.
 """
@@ -87,7 +88,7 @@ MODELS = {
     "dvs_voltmeter": replace(DEFAULT, model="dvs_voltmeter"),
 }
 PAPER_SEQUENCES, PAPER_SEQUENCES_A_PICTURE, PAPER_WORKERS = 1000, 5, 2
-MEMORY_SAMPLES_A_SECOND = 5
+MEMORY_SAMPLES_A_SECOND = 2
 THREADS = {"seconds_1_thread": 1, "seconds_2_threads": 2}
 
 
@@ -233,7 +234,7 @@ def _watched(command: list[str]) -> tuple[float, float, float]:
     before, start, peak = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter(), 0
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
         while process.poll() is None:
-            peak = max(peak, _resident_bytes(process.pid))
+            peak = max(peak, _held_bytes(process.pid))
             time.sleep(1 / MEMORY_SAMPLES_A_SECOND)
     if process.returncode:
         raise subprocess.CalledProcessError(process.returncode, command)
@@ -242,11 +243,11 @@ def _watched(command: list[str]) -> tuple[float, float, float]:
     return (time.perf_counter() - start) / 60, cores_s / 60, peak / 2**20
 
 
-def _resident_bytes(pid: int) -> int:
+def _held_bytes(pid: int) -> int:
     total = 0
     try:
         for process in (parent := psutil.Process(pid), *parent.children(recursive=True)):
-            total += process.memory_info().rss
+            total += process.memory_full_info().pss
     except psutil.NoSuchProcess:  # it ended just now; the next look counts the rest
         pass
     return total
