@@ -235,7 +235,7 @@ def _fire(pixels, physics, keys, course, active, rise, dn, first, shooting, star
             i, at = np.uint64(first + j), np.uint64(n)  # unsigned: numba checks other indices for being negative
             j = np.uint64(j)
             last_us = pixels.last_event_us[i]
-            last, leak, next_leak = last_us - start_us, np.float64(pixels.leak[i]), 0.0
+            last, leak, next_leak = last_us - start_us, np.float64(pixels.leak[i]), np.float64(0.0)
             if jitter > 0:  # drawn before the event's own time is known, so that the two need not wait for each other
                 next_leak = np.float64(jittered_leak(pixels.leak_nominal[i], jitter, keys[0], i, last_us))
             threshold_on, threshold_off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
