@@ -53,6 +53,8 @@ class Pixels(NamedTuple):
     leak: np.ndarray
     """the same with the jitter of the time since the last event"""
     last_event_us: np.ndarray
+    events: np.ndarray
+    """int32, fired so far: numbers the draws of the leak's jitter"""
     next_shot_us: np.ndarray
 
 
@@ -87,6 +89,7 @@ def initial(h: int, w: int, physics: Physics, key: np.uint64, plane: int) -> Pix
         leak_nominal=np.float32(physics.leak_rate_hz * 1e-6) * leak_factor * threshold_on,
         leak=zeros.copy(),
         last_event_us=np.full(n, LONG_AGO_US),
+        events=np.zeros(n, np.int32),
         next_shot_us=np.full(n, np.inf),
     )
 
@@ -100,7 +103,7 @@ def start(light, pixels, physics, h, w, time_us, key, plane):
     shot_key = key_for(key, randomness.SHOT_NOISE, plane)
     for i in range(h * w):
         if physics.leak_rate_hz > 0:
-            pixels.leak[i] = jittered_leak(pixels.leak_nominal[i], physics.leak_jitter, jitter_key, i, time_us)
+            pixels.leak[i] = jittered_leak(pixels.leak_nominal[i], physics.leak_jitter, jitter_key, i, 0)
             pixels.change[i] = uniform(mixed(phase_key, i)) * pixels.threshold_on[i]
             if pixels.leak[i] > 0:
                 pixels.last_event_us[i] = time_us - pixels.change[i] / pixels.leak[i]
@@ -234,10 +237,10 @@ def _fire(pixels, physics, keys, course, active, rise, dn, first, shooting, star
             j, place, change, now = course.pixel[a], course.place[a], course.change[a], course.now[a]
             i, at = np.uint64(first + j), np.uint64(n)  # unsigned: numba checks other indices for being negative
             j = np.uint64(j)
-            last_us = pixels.last_event_us[i]
-            last, leak, next_leak = last_us - start_us, np.float64(pixels.leak[i]), np.float64(0.0)
-            if jitter > 0:  # drawn before the event's own time is known, so that the two need not wait for each other
-                next_leak = np.float64(jittered_leak(pixels.leak_nominal[i], jitter, keys[0], i, last_us))
+            last, leak = pixels.last_event_us[i] - start_us, np.float64(pixels.leak[i])
+            number, next_leak = pixels.events[i], leak
+            if jitter > 0:  # drawn before it is known whether there is an event: the two need not wait for each other
+                next_leak = np.float64(jittered_leak(pixels.leak_nominal[i], jitter, keys[0], i, number + 1))
             threshold_on, threshold_off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
             slope = rise[j] * per_us + leak
             ready = max(now, last + refractory_us)
@@ -263,8 +266,8 @@ def _fire(pixels, physics, keys, course, active, rise, dn, first, shooting, star
             # a crossing leaves nothing of the change; after waiting, what exceeded the threshold remains
             rest = max(excess, 0.0) if on else -max(excess, 0.0)
             change, now, last = (rest, event, event) if fires else (change, now, last)
-            if jitter > 0:
-                leak = next_leak if fires else leak
+            pixels.events[i] = number + fires
+            leak = next_leak if fires else leak
             at_end = change + (rise[j] * per_us + leak) * (dt - now)
             pixels.change[i], pixels.leak[i], pixels.last_event_us[i] = at_end, leak, start_us + last
             kept = np.uint64(remaining)
@@ -283,9 +286,11 @@ def _bits(key, i, time_us):
 
 
 @compiled
-def jittered_leak(nominal, jitter, key, i, time_us):
-    """A leak of pixel i, drawn by a time: that of the event before the one that it follows."""
-    return nominal * np.float32(max(1 - jitter * rough_normal(_bits(key, i, time_us)), 0.0))
+def jittered_leak(nominal, jitter, key, i, number):
+    """The leak of pixel i from its event of this number to its next."""
+    return nominal * np.float32(
+        max(1 - jitter * rough_normal(mixed(key, (np.uint64(i) << np.uint64(32)) + np.uint64(number))), 0.0)
+    )
 
 
 @compiled
