@@ -7,8 +7,9 @@ the network itself, its first layer included, is the published one and its resul
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -48,8 +49,8 @@ class E2p(nn.Module):
             raise ValueError(f"this E2P takes {self.bins} bins of even height and width, got {tuple(mosaic.shape[1:])}")
         if min(mosaic.shape[-2:]) < 2 * SMALLEST_SIDE:
             raise ValueError(f"E2P needs at least {2 * SMALLEST_SIDE} rows and columns, got {tuple(mosaic.shape[-2:])}")
-        branches = [self.branches[name] for name in BRANCHES]
-        before = state or [None] * (2 * len(branches))
+        branches: list[Any] = [self.branches[name] for name in BRANCHES]
+        before: Sequence[Tensor | None] = state or [None] * (2 * len(branches))
         mosaic = mosaic.contiguous(memory_format=torch.channels_last)
         first = [branch.G1(branch.head(mosaic), h) for branch, h in zip(branches, before[: len(branches)], strict=True)]
         x = self.fusion_weight1([branch.R1(h) for branch, h in zip(branches, first, strict=True)])
