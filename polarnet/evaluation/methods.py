@@ -359,11 +359,8 @@ def dolp_network(network_of: Callable[[Context], tuple[nn.Module, dict[str, Any]
             with context.autocast():
                 prediction, state = network(window[None].to(context.device), state)
             frames.append(prediction)
-        has_aolp = frames[0].aolp is not None
-        return Polarization(
-            torch.cat([frame.dolp for frame in frames]),
-            torch.cat([frame.aolp for frame in frames]) if has_aolp else None,
-        )
+        angles = [frame.aolp for frame in frames if frame.aolp is not None]
+        return Polarization(torch.cat([frame.dolp for frame in frames]), torch.cat(angles) if angles else None)
 
     return polarization
 
