@@ -31,6 +31,8 @@ class GainConfig:
     """At most this many of the window's pixels are looked at, evenly spread."""
     smallest: float = field(metadata=allowed(above=0, high=1))
     """No gain may fall below this fraction of what would make all four channels equally bright."""
+    pull: float = field(metadata=allowed(low=0))
+    """Towards equal brightness, against the pixels' mean square: holds gains that the pixels hardly determine."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -66,19 +68,20 @@ def solved(residuals: Float[Tensor, "n 4"], config: GainConfig) -> Float[Tensor,
     rows = rows / (length + DARK * length.mean()).clamp(min=torch.finfo(rows.dtype).tiny)
     weights = torch.ones_like(rows[:, :1])
     for _ in range(config.rounds):
-        misfit = (rows @ _smallest(rows.T @ (weights * rows), config.smallest)).abs()[:, None]
+        misfit = (rows @ _smallest(rows.T @ (weights * rows), config.smallest, config.pull)).abs()[:, None]
         weights = 1 / (1 + (misfit / (TO_DEVIATION * misfit.median() + RIDGE)).square())
-    found = _smallest(rows.T @ (weights * rows), config.smallest) / brightness
+    found = _smallest(rows.T @ (weights * rows), config.smallest, config.pull) / brightness
     return found / found.log().mean().exp()
 
 
-def _smallest(form: Float[Tensor, "4 4"], floor: float) -> Float[Tensor, "4"]:
-    """The x with x >= floor / 4 and sum 1 that makes x @ form @ x smallest.
+def _smallest(form: Float[Tensor, "4 4"], floor: float, pull: float) -> Float[Tensor, "4"]:
+    """The x with x >= floor / 4 and sum 1 that makes x @ form @ x + pull trace(form) x @ x smallest.
 
     Exact: the best of the solutions with each choice of entries held at the floor, where they are allowed.
     """
     size = len(form)
-    form = form / form.trace().clamp(min=torch.finfo(form.dtype).tiny) + RIDGE * torch.eye(size, dtype=form.dtype)
+    form = form / form.trace().clamp(min=torch.finfo(form.dtype).tiny)
+    form = form + (RIDGE + pull) * torch.eye(size, dtype=form.dtype)
     lowest = floor / size
     best, best_value = torch.full_like(form[0], 1 / size), float("inf")
     for held in itertools.product((False, True), repeat=size):

@@ -7,7 +7,7 @@ import torch
 from polarnet.baselines.stokes_gain import GainConfig, consistent, gains, solved
 from polarnet.stokes import dolp, intensities_from_stokes, stokes_from_intensities, stokes_from_polarization
 
-CONFIG = GainConfig(window_frames=10, rounds=5, pixels=20_000, smallest=0.1)
+CONFIG = GainConfig(window_frames=10, rounds=5, pixels=20_000, smallest=0.1, pull=0.0)
 HEIGHT, WIDTH = 60, 80
 
 
@@ -97,6 +97,13 @@ def test_gains_stay_positive_whatever_comes():
         found = gains(torch.rand(2, 4, 6, 7) ** 4, CONFIG)
         assert (found > 0).all()
         torch.testing.assert_close(found.log().mean(1), torch.zeros(2, dtype=torch.float64))
+
+
+def test_a_strong_pull_makes_the_channels_equally_bright():
+    _, _, unknown = spoilt(2, 0.1)
+    found = consistent(unknown, dataclasses.replace(CONFIG, pull=1e6))[0]
+    brightness = found.square().mean((1, 2)).sqrt()
+    torch.testing.assert_close(brightness / brightness.mean(), torch.ones(4), atol=1e-4, rtol=0)
 
 
 def test_a_common_factor_changes_nothing():

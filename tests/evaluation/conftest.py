@@ -83,7 +83,7 @@ def context(checkpoints):
         cf=ComplementaryFilterConfig(0.5, 0.1, -0.1, [-0.1, 1.2], "fixed"),
         highpass=HighPassConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5], "fixed"),
         postprocessing=PostprocessingConfig(0.3, 1.0, False, 10, False),
-        gain=GainConfig(10, 5, 20_000, 0.1),
+        gain=GainConfig(10, 5, 20_000, 0.1, 0.0),
         **checkpoints,
         device=torch.device("cpu"),
         precision="fp32",
