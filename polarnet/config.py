@@ -15,6 +15,9 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from polarnet.baselines.complementary_filter import ComplementaryFilterConfig, HighPassConfig
+from polarnet.baselines.postprocessing import PostprocessingConfig
+from polarnet.baselines.stokes_gain import GainConfig
+from polarnet.evaluation.methods import WeightsConfig
 from polarnet.evaluation.score import BenchmarkConfig
 from polarnet.experiments import BASE
 from polarnet.lpips import LpipsConfig, lpips_problem
@@ -24,6 +27,7 @@ from polarnet.runtime import RuntimeConfig, configure
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import MotionConfig
 from polarnet.simulation.pictures.ingest import IngestConfig
+from polarnet.training.e2p import E2pConfig
 from polarnet.training.e2v import E2vConfig
 from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig
@@ -47,7 +51,11 @@ class BaselinesConfig:
 
     cf: ComplementaryFilterConfig
     highpass: HighPassConfig
+    postprocessing: PostprocessingConfig
+    gain: GainConfig
+    weights: WeightsConfig
     e2v: E2vConfig
+    e2p: E2pConfig
 
 
 @dataclass(frozen=True)
@@ -70,6 +78,7 @@ class Paths:
     weights: str
     train: str
     train_e2v: str
+    train_e2p: str
     benchmark: str
     report: str
     resume: str
@@ -100,7 +109,12 @@ class Config:
         if self.network not in known:
             raise ValueError(f"network: expected one of {', '.join(known)}, got {self.network!r}")
         window = [self.synthesize.window_height, self.synthesize.window_width]
-        for key, crop in (("train.crop", self.train.crop), ("baselines.e2v.crop", self.baselines.e2v.crop)):
+        crops = {
+            "train.crop": self.train.crop,
+            "baselines.e2v.crop": self.baselines.e2v.crop,
+            "baselines.e2p.crop": self.baselines.e2p.crop,
+        }
+        for key, crop in crops.items():
             if crop is not None and (crop[0] > window[0] or crop[1] > window[1]):
                 raise ValueError(f"{key}: expected at most the window of section synthesize, {window}, got {crop}")
 

@@ -1,11 +1,12 @@
 """Test sequences, every method -> data/benchmark: the table, a row per frame, and windows to look at."""
 
+import dataclasses
 import json
 from pathlib import Path
 
 from polarnet.config import Config, hydra_stage
 from polarnet.evaluation.benchmark import run_benchmark, train_mean_dolp, write_benchmark
-from polarnet.evaluation.methods import Context
+from polarnet.evaluation.methods import Context, available, checkpoints_of, weights_used
 from polarnet.events.frames import FrameStore
 from polarnet.events.store import EventStore
 from polarnet.reports.tables import as_plain, score_table
@@ -22,18 +23,33 @@ def main(config: Config) -> None:
         train_mean=train_mean,
         cf=config.baselines.cf,
         highpass=config.baselines.highpass,
-        e2v_checkpoint=Path(config.paths.train_e2v) / "best.safetensors",
-        ours_checkpoint=Path(config.paths.train) / "best.safetensors",
+        postprocessing=config.baselines.postprocessing,
+        gain=config.baselines.gain,
+        **checkpoints_of(
+            config.baselines.weights,
+            Path(config.paths.train),
+            Path(config.paths.train_e2v),
+            Path(config.paths.train_e2p),
+        ),
         device=device_of(config.runtime),
         precision=config.benchmark.precision,
     )
     lpips = Lpips.load(config.paths.weights)
-    benchmark = run_benchmark(EventStore.open(config.paths.events), frames, context, config.benchmark, lpips)
+    methods, left_out = available(config.benchmark.methods, context)
+    for method, reason in left_out.items():
+        print(f"{method} is left out: {reason}")
+    settings = dataclasses.replace(config.benchmark, methods=methods)
+    benchmark = run_benchmark(EventStore.open(config.paths.events), frames, context, settings, lpips)
     weights = json.loads((Path(config.paths.weights) / "lpips.json").read_text())
     folder = Path(config.paths.benchmark)
-    metrics = write_benchmark(
-        folder, benchmark, config.benchmark, config.seed, {"lpips": weights, "train_mean": train_mean}
-    )
+    about = {
+        "lpips": weights,
+        "train_mean": train_mean,
+        "left_out": left_out,
+        "weights": weights_used(methods, context),
+        "postprocessing": dataclasses.asdict(context.postprocessing),
+    }
+    metrics = write_benchmark(folder, benchmark, settings, config.seed, about)
     print(as_plain(score_table(metrics, lpips_reason=weights["reason"])))
 
 

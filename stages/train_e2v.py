@@ -12,7 +12,7 @@ from polarnet.training.task import describe, lpips_of, open_events, open_split
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Train FireNet on the training split; a killed run of the same training goes on where it stopped."""
+    """Train `baselines.e2v.arch` on the training split; a killed run of the same training goes on where it stopped."""
     e2v = config.baselines.e2v
     lpips = lpips_of(Path(config.paths.weights), e2v.lpips)
     task = e2v_task(e2v, lpips, config.seed)

@@ -31,10 +31,10 @@ class FireNet(nn.Module):
         super().__init__()
         self.bins = bins
         self.head = Convolution(bins, CHANNELS, kernel_size=3)
-        self.G1 = ConvGRU()
-        self.R1 = ResidualBlock()
-        self.G2 = ConvGRU()
-        self.R2 = ResidualBlock()
+        self.G1 = ConvGRU(CHANNELS)
+        self.R1 = ResidualBlock(CHANNELS)
+        self.G2 = ConvGRU(CHANNELS)
+        self.R2 = ResidualBlock(CHANNELS)
         self.pred = Convolution(CHANNELS, 1, kernel_size=1)
         assert self.pred.conv2d.bias is not None
         nn.init.constant_(self.pred.conv2d.bias, MIDDLE_INTENSITY)
@@ -96,11 +96,11 @@ class Convolution(nn.Module):
 class ConvGRU(nn.Module):
     """reset, update = sigmoid(conv[x, h]); candidate = tanh(conv[x, reset * h]); h <- h + update * (candidate - h)."""
 
-    def __init__(self):
+    def __init__(self, channels: int):
         super().__init__()
-        self.reset_gate = nn.Conv2d(2 * CHANNELS, CHANNELS, 3, padding=1)
-        self.update_gate = nn.Conv2d(2 * CHANNELS, CHANNELS, 3, padding=1)
-        self.out_gate = nn.Conv2d(2 * CHANNELS, CHANNELS, 3, padding=1)
+        self.reset_gate = nn.Conv2d(2 * channels, channels, 3, padding=1)
+        self.update_gate = nn.Conv2d(2 * channels, channels, 3, padding=1)
+        self.out_gate = nn.Conv2d(2 * channels, channels, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "b c h w"], state: Float[Tensor, "b c h w"] | None) -> Float[Tensor, "b c h w"]:
         """The new state; the old one is None at the start, and counts as zeros."""
@@ -114,10 +114,10 @@ class ConvGRU(nn.Module):
 class ResidualBlock(nn.Module):
     """relu(x + conv(relu(conv(x))))."""
 
-    def __init__(self):
+    def __init__(self, channels: int):
         super().__init__()
-        self.conv1 = nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1)
-        self.conv2 = nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1)
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """The same shape."""

@@ -49,6 +49,9 @@ METHOD_COLOURS = {
     "cf": "#e08a1e",
     "highpass": "#b0851f",
     "e2v": "#3d8fd9",
+    "e2vid": "#2f6fb0",
+    "firenet": "#3d8fd9",
+    "e2p": "#7a5cc4",
     "ours": "#d6336c",
 }
 TERMS = {"mse": "MSE", "mae": "MAE", "ssim": "1 - SSIM", "lpips": "LPIPS"}

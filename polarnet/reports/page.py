@@ -169,7 +169,7 @@ def _cards(metrics: Scores) -> list[Card]:
     cards = []
     for key, label in CARDS.items():
         column = COLUMNS[key]
-        others = [m for m in ("e2v", "oracle_mean" if column.ranked else "cf") if m in metrics]
+        others = [m for m in ("e2vid", "firenet", "oracle_mean" if column.ranked else "cf") if m in metrics]
         rivals = [f"{METHODS[m]} {column.printed(metrics[m][key])}" for m in others]
         cards.append(Card(label, column.printed(metrics["ours"][key]) + column.unit, ", ".join(rivals)))
     return cards

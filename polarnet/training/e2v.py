@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
+from polarnet.baselines.e2vid import E2vid
 from polarnet.baselines.firenet import FireNet
 from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.stream import Events
@@ -14,12 +15,14 @@ from polarnet.training.losses import FrameLoss
 from polarnet.training.sequences import Batch
 from polarnet.training.task import Task, initialised
 
+ARCHITECTURES: dict[str, type[FireNet] | type[E2vid]] = {"firenet": FireNet, "e2vid": E2vid}
+
 
 @dataclass(frozen=True)
 class E2vConfig(LoopConfig):
     """Section `baselines.e2v` of params.yaml."""
 
-    arch: str = field(metadata=allowed(choices=("firenet",)))
+    arch: str = field(metadata=allowed(choices=tuple(ARCHITECTURES)))
     bins: int = field(metadata=allowed(low=2))
     """Of the voxel grid."""
     ssim: float = field(metadata=allowed(low=0))
@@ -28,11 +31,11 @@ class E2vConfig(LoopConfig):
 
 
 def e2v_task(config: E2vConfig, lpips: Lpips | None, seed: int) -> Task:
-    """Train a new FireNet; the four polarizers of a sequence are four streams of its batch.
+    """Train a new network of `config.arch`; the four polarizers of a sequence are four streams of its batch.
 
     The truth is the intensity itself, in [0, 1] with I0 + I90 = S0: one scale for the four, as Stokes parameters need.
     """
-    network = initialised(lambda: FireNet(config.bins), seed)
+    network = initialised(lambda: ARCHITECTURES[config.arch](config.bins), seed)
 
     def encode(events: Events, window_us: int) -> Tensor:
         return normalise_nonzero(voxel_grid(events, config.bins))

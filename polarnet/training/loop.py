@@ -22,7 +22,7 @@ SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
 
 @dataclass(frozen=True)
 class LoopConfig(ViewConfig):
-    """How a network is trained; `train` and `baselines.e2v` of params.yaml have these fields and their own."""
+    """How a network is trained: fields of the sections `train`, `baselines.e2v` and `baselines.e2p` of params.yaml."""
 
     data: str = field(metadata=allowed(choices=("store", "fly")))
     """store: events from the store on disk; fly: the same events, emulated from the scenes in memory as needed."""
@@ -122,7 +122,7 @@ def validate(
             with autocast(config.precision, device):
                 predicted, state = task.unroll(windows, state)
                 terms = task.loss(predicted, frames, valid)
-            a, b, known = known_frames(predicted, frames, valid)
+            a, b, known = known_frames(task.scored(predicted), task.scored(frames), valid)
             scores = {"total": task.loss.total(terms), **terms}
             if len(a):
                 scores |= {name: score(a, b, known).mean() for name, score in SCORES.items()}

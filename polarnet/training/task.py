@@ -49,6 +49,8 @@ class Task:
     loss: FrameLoss
     description: Mapping[str, Any]
     """What a checkpoint says of the network and its input: at least "network", "config" and "in_channels"."""
+    scored: Callable[[Tensor], Float[Tensor, "t b h w"]] = lambda frames: frames
+    """Of what it says and should say, the frames that validation scores, and by which the best epoch is chosen."""
 
 
 class Split(NamedTuple):
@@ -101,7 +103,9 @@ def lpips_of(folder: Path, weight: float) -> Lpips | None:
 def describe(task: Task, split: Split, config: Any, weights: Path, seed: int) -> dict[str, Any]:
     """All that decides the weights: what the JSON of a checkpoint says, and what the running checkpoint is keyed by."""
     events, frames = split.train.events, split.train.frames
-    lpips = json.loads((weights / "lpips.json").read_text()) if "lpips" in task.loss.weights else {}
+    lpips = (
+        json.loads((weights / "lpips.json").read_text()) if any("lpips" in term for term in task.loss.weights) else {}
+    )
     return {
         **task.description,
         "training": {"seed": seed, **asdict(config)},

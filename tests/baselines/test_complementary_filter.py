@@ -9,6 +9,7 @@ from polarnet.baselines.complementary_filter import (
     Decay,
     HighPassConfig,
     at_rest,
+    following_ranges,
     integrate,
     log_intensity_at,
     reconstruct_cf,
@@ -20,12 +21,14 @@ LN2 = math.log(2)
 HALVING_PER_MS_HZ = LN2 / (2 * math.pi * 1e-3)  # the cut-off at which log intensity halves every millisecond
 
 
-def cf_config(cutoff_hz=HALVING_PER_MS_HZ, contrast_on=0.1, contrast_off=-0.1, intensity_range=(-0.1, 1.2)):
-    return ComplementaryFilterConfig(cutoff_hz, contrast_on, contrast_off, list(intensity_range))
+def cf_config(
+    cutoff_hz=HALVING_PER_MS_HZ, contrast_on=0.1, contrast_off=-0.1, intensity_range=(-0.1, 1.2), range_rule="fixed"
+):
+    return ComplementaryFilterConfig(cutoff_hz, contrast_on, contrast_off, list(intensity_range), range_rule)
 
 
 def highpass_config(cutoff_hz=HALVING_PER_MS_HZ, decay_per_event=LN2, intensity_range=(-0.5, 1.5)):
-    return HighPassConfig(cutoff_hz, decay_per_event, 0.1, -0.1, list(intensity_range))
+    return HighPassConfig(cutoff_hz, decay_per_event, 0.1, -0.1, list(intensity_range), "fixed")
 
 
 def events_of(*rows, height=2, width=3):
@@ -46,48 +49,79 @@ def times(*t_us):
 
 
 def test_cf_of_a_hand_worked_event_list(hand_list):
-    found = reconstruct_cf(hand_list, times(500, 2000, 3000, 5000), cf_config())
+    found = reconstruct_cf([hand_list], times(500, 2000, 3000, 5000), cf_config())
     # log intensity of (1, 2): 0 | 0.1 / 2 + 0.1 | 0.15 / 2 | (0.15 / 4 - 0.1) / 2; of (0, 0): 0 | 0 | -0.1 | -0.1 / 4
     expected = np.zeros((4, 2, 3))
     expected[:, 1, 2] = [0, 0.15, 0.075, -0.03125]
     expected[:, 0, 0] = [0, 0, -0.1, -0.025]
-    np.testing.assert_allclose(found, (np.exp(expected) - 1 + 0.1) / 1.3, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found[:, 0], (np.exp(expected) - 1 + 0.1) / 1.3, rtol=0, atol=1e-12)
 
 
 def test_highpass_of_a_hand_worked_event_list(hand_list):
-    found = reconstruct_highpass(hand_list, times(500, 2000, 3000, 5000), highpass_config())
+    found = reconstruct_highpass([hand_list], times(500, 2000, 3000, 5000), highpass_config())
     # each event halves once more: (1, 2): 0 | 0.1 / 4 + 0.1 | 0.125 / 2 | (0.125 / 8 - 0.1) / 2
     expected = np.zeros((4, 2, 3))
     expected[:, 1, 2] = [0, 0.125, 0.0625, -0.0421875]
     expected[:, 0, 0] = [0, 0, -0.1, -0.025]
-    np.testing.assert_allclose(found, (1.5 * np.exp(expected) - 1 + 0.5) / 2, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found[:, 0], (1.5 * np.exp(expected) - 1 + 0.5) / 2, rtol=0, atol=1e-12)
 
 
 def test_without_a_cutoff_log_intensity_is_the_sum_of_the_steps(hand_list):
-    found = reconstruct_cf(hand_list, times(9_000_000), cf_config(cutoff_hz=0.0, contrast_on=0.3, contrast_off=-0.2))
-    assert found[0, 1, 2].item() == pytest.approx((math.exp(0.4) - 0.9) / 1.3, abs=1e-12)
+    found = reconstruct_cf([hand_list], times(9_000_000), cf_config(cutoff_hz=0.0, contrast_on=0.3, contrast_off=-0.2))
+    assert found[0, 0, 1, 2].item() == pytest.approx((math.exp(0.4) - 0.9) / 1.3, abs=1e-12)
 
 
 def test_before_any_event_a_filter_shows_log_intensity_zero():
     none = Events.empty(2, 3)
     torch.testing.assert_close(
-        reconstruct_cf(none, times(0, 10), cf_config()), torch.full((2, 2, 3), 0.1 / 1.3, dtype=torch.float64)
+        reconstruct_cf([none], times(0, 10), cf_config()), torch.full((2, 1, 2, 3), 0.1 / 1.3, dtype=torch.float64)
     )
     torch.testing.assert_close(
-        reconstruct_highpass(none, times(0, 10), highpass_config()), torch.full((2, 2, 3), 0.5, dtype=torch.float64)
+        reconstruct_highpass([none], times(0, 10), highpass_config()),
+        torch.full((2, 1, 2, 3), 0.5, dtype=torch.float64),
     )
 
 
 def test_intensities_outside_the_range_are_clipped():
     bright = events_of(*((t, 0, 0, 1) for t in range(9)))
     dark = events_of(*((t, 0, 0, -1) for t in range(9)))
-    assert reconstruct_cf(bright, times(9), cf_config(cutoff_hz=0.0))[0, 0, 0] == 1  # exp(0.9) - 1 = 1.46 > 1.2
-    assert reconstruct_cf(dark, times(9), cf_config(cutoff_hz=0.0))[0, 0, 0] == 0
+    assert reconstruct_cf([bright], times(9), cf_config(cutoff_hz=0.0))[0, 0, 0, 0] == 1  # exp(0.9) - 1 = 1.46 > 1.2
+    assert reconstruct_cf([dark], times(9), cf_config(cutoff_hz=0.0))[0, 0, 0, 0] == 0
+
+
+def test_a_range_has_followed_19_twentieths_of_a_change_after_2_s():
+    darkest, brightest = np.full((3, 1), 1.0), np.full((3, 1), 3.0)
+    low, high = following_ranges(darkest, brightest, times(0, 2_000_000, 4_000_000), [0.0, 2.0])
+    np.testing.assert_allclose(low[:, 0], [0, 0.95, 0.9975], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(high[:, 0], [2, 2.95, 2.9975], rtol=0, atol=1e-12)
+
+
+def ramp(events_a_column):
+    """A row of three pixels: none, one and two times so many ON events."""
+    return events_of(*((k, x, 0, 1) for k in range(2 * events_a_column) for x in range(3) if k < x * events_a_column),
+                     height=1)  # fmt: skip
+
+
+@pytest.mark.parametrize(("rule", "kept"), [("fixed", True), ("common", True), ("per_polarizer", False)])
+def test_only_a_range_per_polarizer_loses_the_ratio_of_the_polarizers(rule, kept):
+    shown = reconstruct_cf([ramp(3), ramp(1)], times(60_000_000), cf_config(cutoff_hz=0.0, range_rule=rule))
+    assert bool(shown[0, 0, 0, 2] > shown[0, 1, 0, 2] + 0.1) == kept
+
+
+def test_an_automatic_range_shows_the_darkest_and_the_brightest_at_the_ends():
+    shown = reconstruct_cf([ramp(1)], times(60_000_000), cf_config(cutoff_hz=0.0, range_rule="common"))[0, 0, 0]
+    torch.testing.assert_close(shown[[0, 2]], torch.tensor([0.0, 1.0], dtype=torch.float64))
+    assert shown[1].item() == pytest.approx(math.expm1(0.1) / math.expm1(0.2), abs=5e-3)  # quantiles lie inside
+
+
+def test_an_image_of_one_value_has_an_automatic_range_too():
+    shown = reconstruct_cf([Events.empty(2, 3)], times(10**12), cf_config(range_rule="common"))
+    assert shown.isfinite().all()
 
 
 def test_asking_for_more_output_times_changes_no_frame(hand_list):
-    sparse = reconstruct_cf(hand_list, times(5000), cf_config())
-    dense = reconstruct_cf(hand_list, torch.arange(0, 5001, 100), cf_config())
+    sparse = reconstruct_cf([hand_list], times(5000), cf_config())
+    dense = reconstruct_cf([hand_list], torch.arange(0, 5001, 100), cf_config())
     assert torch.equal(dense[-1], sparse[0])
 
 

@@ -29,7 +29,7 @@ def test_a_state_is_carried_on_from_one_run_of_windows_to_the_next():
 
 @torch.no_grad()
 def test_a_gru_that_always_updates_forgets_its_state():
-    gru = ConvGRU()
+    gru = ConvGRU(16)
     torch.nn.init.constant_(gru.update_gate.bias, 100.0)
     torch.nn.init.constant_(gru.reset_gate.bias, -100.0)
     x = torch.randn(1, 16, 5, 5)

@@ -2,7 +2,11 @@ import pytest
 import torch
 
 from polarnet.baselines.complementary_filter import ComplementaryFilterConfig, HighPassConfig
+from polarnet.baselines.e2p import E2p
+from polarnet.baselines.e2vid import E2vid
 from polarnet.baselines.firenet import FireNet
+from polarnet.baselines.postprocessing import PostprocessingConfig
+from polarnet.baselines.stokes_gain import GainConfig
 from polarnet.evaluation.methods import Context, Recording
 from polarnet.events.stream import Events
 from polarnet.networks.checkpoint import save_checkpoint
@@ -52,22 +56,35 @@ def recording(make_recording):
     return make_recording()
 
 
-@pytest.fixture
-def context(tmp_path):
-    """Networks that nobody trained, in checkpoints as the training stages write them."""
+@pytest.fixture(scope="session")
+def checkpoints(tmp_path_factory):
+    """Networks that nobody trained, in files as the training stages write them and as their authors did."""
+    folder = tmp_path_factory.mktemp("checkpoints")
     torch.manual_seed(0)
-    network = DolpUNet(DolpUNetConfig(**NETWORK))
     metadata = {"network": "paper", "config": NETWORK, "in_channels": 4, "representation": "event_tensor"}
-    save_checkpoint(tmp_path / "ours.safetensors", network.state_dict(), metadata)
-    save_checkpoint(
-        tmp_path / "e2v.safetensors", FireNet(5).state_dict(), {"network": "firenet", "config": {"bins": 5}}
-    )
+    files = {}
+    for row in ("ours", "paper"):
+        files[f"{row}_checkpoint"] = folder / f"{row}.safetensors"
+        save_checkpoint(folder / f"{row}.safetensors", DolpUNet(DolpUNetConfig(**NETWORK)).state_dict(), metadata)
+    for row, build in {"firenet": FireNet, "e2vid": E2vid, "e2p": E2p}.items():
+        files[f"{row}_checkpoint"] = folder / f"{row}.safetensors"
+        description = {"network": row, "config": {"bins": 5}, "in_channels": 5}
+        save_checkpoint(folder / f"{row}.safetensors", build(5).state_dict(), description)
+    for row, build in {"firenet": FireNet, "firenetplus": FireNet, "e2vid": E2vid}.items():
+        files[f"{row}_published_checkpoint"] = folder / f"{row}.pth.tar"
+        torch.save({"state_dict": build(5).state_dict()}, folder / f"{row}.pth.tar")
+    return files
+
+
+@pytest.fixture
+def context(checkpoints):
     return Context(
         train_mean=0.25,
-        cf=ComplementaryFilterConfig(0.5, 0.1, -0.1, [-0.1, 1.2]),
-        highpass=HighPassConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5]),
-        e2v_checkpoint=tmp_path / "e2v.safetensors",
-        ours_checkpoint=tmp_path / "ours.safetensors",
+        cf=ComplementaryFilterConfig(0.5, 0.1, -0.1, [-0.1, 1.2], "fixed"),
+        highpass=HighPassConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5], "fixed"),
+        postprocessing=PostprocessingConfig(0.3, 1.0, False, 10, False),
+        gain=GainConfig(10, 5, 20_000, 0.1, 0.0),
+        **checkpoints,
         device=torch.device("cpu"),
         precision="fp32",
     )

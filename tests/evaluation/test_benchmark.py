@@ -92,7 +92,7 @@ def test_panels_show_one_window_of_different_scenes_and_every_method(stores, con
 
 
 def test_all_but_the_time_is_the_same_in_two_runs(stores, context, tmp_path):
-    some = config(methods=["cf", "e2v", "ours"])
+    some = config(methods=["cf", "firenet", "ours"])
     for name in ("one", "two"):
         write_benchmark(tmp_path / name, run_benchmark(*stores, context, some, None), some, 1, {})
     for file in ("frames.csv", "details.json", "panels/a1.npz"):

@@ -75,20 +75,20 @@ def write_events(path, frames):
 
 def run_methods(events, frames, folder):
     """Benchmark outputs for two constants, E2V (with AoLP) and ours, of the true frames made worse."""
-    methods = ["zeros", "oracle_mean", "e2v", "ours"]
+    methods = ["zeros", "oracle_mean", "firenet", "ours"]
     config = BenchmarkConfig(methods, warmup_windows=1, precision="fp32", bootstrap_samples=20, panel_scenes=2)
     rows, panels = [], []
     for recording in recordings_of("test", events, frames):
         truth = recording.dolp
         mean = truth.mean(dim=(-2, -1), keepdim=True)
-        dolp = {"zeros": 0 * truth, "oracle_mean": 0 * truth + mean, "e2v": (truth + mean) / 2, "ours": 0.9 * truth}
+        dolp = {"zeros": 0 * truth, "oracle_mean": 0 * truth + mean, "firenet": (truth + mean) / 2, "ours": 0.9 * truth}
         rows += score_sequence(recording, dolp, 1, None, torch.device("cpu"))
         k = 3
         panels.append(
             Panel(
                 recording.name, recording.scene, k, int(recording.t_us[k + 1]), torch.randn(4, 24, 36), truth[k],
                 recording.aolp[k], recording.s0[k], {m: frames[k] for m, frames in dolp.items()},
-                {"e2v": recording.aolp[k]},
+                {"firenet": recording.aolp[k]},
             )
         )  # fmt: skip
     about = {"lpips": {"backbone": "squeeze", "sha256": None, "source": None, "reason": NO_WEIGHTS}}

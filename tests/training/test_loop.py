@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 
+from polarnet.baselines.e2vid import E2vid
 from polarnet.events.store import EventStore
 from polarnet.networks.checkpoint import load_checkpoint, load_network
 from polarnet.networks.dolp_unet import DolpUNetConfig
@@ -148,6 +149,17 @@ def test_the_e2v_baseline_trains_in_the_same_loop(stores, tmp_path):
     assert metadata["network"] == "firenet"
     assert metadata["config"] == {"bins": 5}
     assert sum(tensor.numel() for tensor in tensors.values()) == 37_777
+
+
+def test_e2vid_trains_as_the_e2v_baseline_too(stores, tmp_path):
+    config = dataclasses.replace(E2V, arch="e2vid", epochs=1, visits=1, windows=2)
+    out = run(e2v_task(config, None, SEED), stores, tmp_path, config)
+    tensors, metadata = load_checkpoint(out / "best.safetensors")
+    assert metadata["network"] == "e2vid"
+    network = E2vid(**metadata["config"])
+    network.load_state_dict(tensors)
+    assert network.head.conv2d.weight.grad is None
+    assert tensors["pred.norm_layer.num_batches_tracked"] > 0
 
 
 def test_the_e2v_baseline_learns_each_polarizers_intensity_from_its_own_events(stores):

@@ -1,0 +1,175 @@
+"""E2P: events to intensity, AoLP and DoLP with 512,501 parameters (Mei et al., CVPR 2023).
+
+The published network reads one sensor whose pixels carry polarizers, 90 45 / 135 0 over each 2x2 pixels. Four channels
+that each cover the whole image are laid out as such a sensor of twice the height and width (`interleaved`), so that
+the network itself, its first layer included, is the published one and its result has the channels' own size.
+"""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from polarnet.baselines.firenet import ConvGRU, ResidualBlock
+
+CHANNELS = 32
+BRANCHES = ("intensity", "aolp", "dolp")
+MOSAIC = ((90, 45), (135, 0))  # degrees, over even and odd rows and columns
+CELLS = ((0, 0), (0, 1), (1, 0), (1, 1))  # row and column of a polarizer in its 2x2 pixels
+ATTENTION_KERNEL = 5
+GATE_POOL = 4
+SMALLEST_SIDE = 2 * GATE_POOL  # of the result: the gate halves it and pools by 4
+PUBLISHED_NAME = re.compile(r"(head|G1|G2|R1|R2|pred)_([iad])\.(.*)")
+
+
+class E2p(nn.Module):
+    """Three branches alike, for intensity, AoLP and DoLP, that look at each other through two gates."""
+
+    def __init__(self, bins: int):
+        super().__init__()
+        self.bins = bins
+        self.branches = nn.ModuleDict({name: Branch(bins) for name in BRANCHES})
+        self.fusion_weight1 = CrossBranchGate()
+        self.fusion_weight2 = CrossBranchGate()
+
+    def forward(
+        self, mosaic: Float[Tensor, "b bins h w"], state: list[Tensor] | None = None
+    ) -> tuple[Float[Tensor, "b 3 h//2 w//2"], list[Tensor]]:
+        """Intensity, AoLP and DoLP at the end of one window, and the state for the next; None at the start.
+
+        The voxel grid is taken as it is. AoLP is coded as in `coded_aolp`. Nothing is clamped.
+        """
+        if mosaic.shape[1] != self.bins or mosaic.shape[-1] % 2 or mosaic.shape[-2] % 2:
+            raise ValueError(f"this E2P takes {self.bins} bins of even height and width, got {tuple(mosaic.shape[1:])}")
+        if min(mosaic.shape[-2:]) < 2 * SMALLEST_SIDE:
+            raise ValueError(f"E2P needs at least {2 * SMALLEST_SIDE} rows and columns, got {tuple(mosaic.shape[-2:])}")
+        branches: list[Any] = [self.branches[name] for name in BRANCHES]
+        before: Sequence[Tensor | None] = state or [None] * (2 * len(branches))
+        mosaic = mosaic.contiguous(memory_format=torch.channels_last)
+        first = [branch.G1(branch.head(mosaic), h) for branch, h in zip(branches, before[: len(branches)], strict=True)]
+        x = self.fusion_weight1([branch.R1(h) for branch, h in zip(branches, first, strict=True)])
+        second = [branch.G2(y, h) for branch, y, h in zip(branches, x, before[len(branches) :], strict=True)]
+        x = self.fusion_weight2([branch.R2(h) for branch, h in zip(branches, second, strict=True)])
+        maps = torch.cat([branch.pred(y) for branch, y in zip(branches, x, strict=True)], dim=1)
+        return maps.float(), [*first, *second]
+
+    def unroll(
+        self, mosaics: Float[Tensor, "t b bins h w"], state: list[Tensor] | None = None
+    ) -> tuple[Float[Tensor, "t b 3 h//2 w//2"], list[Tensor]]:
+        """t windows of b streams, one after the other."""
+        maps = []
+        for window in mosaics:
+            frame, state = self(window, state)
+            maps.append(frame)
+        return torch.stack(maps), state or []
+
+    @classmethod
+    def load(cls, path: Path) -> "E2p":
+        """A checkpoint with the authors' names of the tensors, read without running code from it.
+
+        ValueError for one of another network.
+        """
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        tensors = own_names(content.get("state_dict", content))
+        head = tensors.get("branches.dolp.head.pattern1.weight")
+        if head is None:
+            raise ValueError(f"{path} holds no E2P: expected a tensor head_d.pattern1.0.weight")
+        network = cls(bins=head.shape[1])
+        try:
+            network.load_state_dict(tensors)
+        except RuntimeError as error:
+            raise ValueError(f"{path} holds no E2P of the published size: {error}") from None
+        return network.eval()
+
+
+class Branch(nn.Module):
+    """The layers of one of the three maps; `E2p.forward` says how they follow each other."""
+
+    def __init__(self, bins: int):
+        super().__init__()
+        self.head = MosaicHead(bins)
+        self.G1, self.G2 = ConvGRU(CHANNELS), ConvGRU(CHANNELS)
+        self.R1, self.R2 = ResidualBlock(CHANNELS), ResidualBlock(CHANNELS)
+        self.pred = nn.Conv2d(CHANNELS, 1, 3, padding=1)
+        for gru in (self.G1, self.G2):
+            for gate in (gru.reset_gate, gru.update_gate, gru.out_gate):
+                nn.init.orthogonal_(gate.weight)
+                assert gate.bias is not None
+                nn.init.zeros_(gate.bias)
+
+
+class MosaicHead(nn.Module):
+    """Half the size by four 3x3 convolutions, each centred on the pixels of one polarizer; channels then weighted.
+
+    The weights (efficient channel attention) are a sigmoid of a convolution over the channels' means.
+    """
+
+    def __init__(self, bins: int):
+        super().__init__()
+        self.pattern1, self.pattern2, self.pattern3, self.pattern4 = (
+            nn.Conv2d(bins, CHANNELS // 4, 3, stride=2) for _ in CELLS
+        )
+        self.conv = nn.Conv1d(1, 1, ATTENTION_KERNEL, padding=ATTENTION_KERNEL // 2)
+
+    def forward(self, mosaic: Float[Tensor, "b bins h w"]) -> Float[Tensor, "b 32 h//2 w//2"]:
+        """A quarter of the channels for each polarizer, in the order of `CELLS`."""
+        patterns = (self.pattern1, self.pattern2, self.pattern3, self.pattern4)
+        padded = [F.pad(mosaic, (1 - column, column, 1 - row, row)) for row, column in CELLS]
+        x = torch.cat([F.relu(pattern(p)) for pattern, p in zip(patterns, padded, strict=True)], dim=1)
+        weights = torch.sigmoid(self.conv(x.mean(dim=(-2, -1))[:, None]))
+        return x * weights[:, 0, :, None, None]
+
+
+class CrossBranchGate(nn.Module):
+    """Weights every channel of every branch, pixel by pixel, by a number in [0, 1] that depends on all of them."""
+
+    def __init__(self):
+        super().__init__()
+        self.conv1 = nn.Conv2d(len(BRANCHES) * CHANNELS, CHANNELS, 1)
+        self.conv2 = nn.Conv2d(CHANNELS, CHANNELS, 4, stride=2, padding=1)
+        self.conv3 = nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1)
+        self.conv4 = nn.Conv2d(CHANNELS, len(BRANCHES) * CHANNELS, 1)
+
+    def forward(self, branches: list[Tensor]) -> tuple[Tensor, ...]:
+        """The branches, weighted."""
+        x = torch.cat(branches, dim=1)
+        narrow = F.relu(self.conv1(x))
+        coarse = F.relu(self.conv3(F.max_pool2d(F.relu(self.conv2(narrow)), GATE_POOL)))
+        around = F.interpolate(coarse, size=x.shape[-2:], mode="bilinear", align_corners=True)
+        return (x * torch.sigmoid(self.conv4(narrow + around))).chunk(len(BRANCHES), dim=1)
+
+
+def interleaved(channels: Float[Tensor, "*b 4 c h w"]) -> Float[Tensor, "*b c 2*h 2*w"]:
+    """Images behind polarizers at 0, 45, 90 and 135 degrees as one mosaic 90 45 / 135 0."""
+    rows = [torch.stack([channels[..., angle // 45, :, :, :] for angle in row], dim=-1) for row in MOSAIC]
+    cells = torch.stack(rows, dim=-3)  # c, h, 2 rows, w, 2 columns
+    return cells.flatten(-2, -1).flatten(-3, -2)
+
+
+def coded_aolp(aolp: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
+    """AoLP as E2P is taught it: -90 to 90 degrees become 0 to 1."""
+    return torch.remainder(aolp / math.pi + 0.5, 1.0)
+
+
+def decoded_aolp(code: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
+    """`coded_aolp` undone: radians in [0, pi), whatever the code."""
+    angle = math.pi * torch.remainder(code - 0.5, 1.0)
+    return torch.where(angle >= math.pi, 0.0, angle)
+
+
+def own_names(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The authors' names head_d.pattern1.0.weight as ours, branches.dolp.head.pattern1.weight; ours stay."""
+    branch_of = {name[0]: name for name in BRANCHES}
+    renamed = {}
+    for name, tensor in tensors.items():
+        if match := PUBLISHED_NAME.fullmatch(name):
+            layer, letter, rest = match.groups()
+            name = f"branches.{branch_of[letter]}.{layer}.{rest}"
+        renamed[re.sub(r"(pattern\d|fusion_weight\d\.conv\d)\.0\.", r"\1.", name)] = tensor
+    return renamed

@@ -1,0 +1,202 @@
+"""E2VID: events to intensity with 10,712,098 parameters (Rebecq et al., CVPR 2019 and TPAMI 2021).
+
+The network of the published "lightweight" checkpoint, E2VID_lightweight.pth.tar, which `E2vid.load` reads.
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+HEAD_CHANNELS = 32
+ENCODER_CHANNELS = (64, 128, 256)
+RESIDUAL_BLOCKS = 2
+SIZE_MULTIPLE = 2 ** len(ENCODER_CHANNELS)  # each encoder halves height and width
+PUBLISHED_ARCH = "E2VIDRecurrent"
+PUBLISHED_PREFIX = "unetrecurrent."
+PUBLISHED_SETTINGS = {
+    "skip_type": "sum",
+    "recurrent_block_type": "convlstm",
+    "num_encoders": len(ENCODER_CHANNELS),
+    "base_num_channels": HEAD_CHANNELS,
+    "num_residual_blocks": RESIDUAL_BLOCKS,
+    "norm": "BN",
+    "use_upsample_conv": False,
+}
+
+
+class E2vid(nn.Module):
+    """A U-Net whose three encoders remember: convolution to half the size, then a ConvLSTM. Intensity in [0, 1].
+
+    The input is a voxel grid of one polarizer, normalised by `normalise_nonzero`. Skips are added. Layers have the
+    names of the published checkpoint.
+    """
+
+    def __init__(self, bins: int):
+        super().__init__()
+        self.bins = bins
+        sizes = (HEAD_CHANNELS, *ENCODER_CHANNELS)
+        steps = list(itertools.pairwise(sizes))
+        self.head = Convolution(bins, HEAD_CHANNELS, 5, normalised=False)
+        self.encoders = nn.ModuleList(RecurrentEncoder(inputs, outputs) for inputs, outputs in steps)
+        self.resblocks = nn.ModuleList(ResidualBlock(sizes[-1]) for _ in range(RESIDUAL_BLOCKS))
+        self.decoders = nn.ModuleList(Decoder(inputs, outputs) for outputs, inputs in reversed(steps))
+        self.pred = Convolution(HEAD_CHANNELS, 1, 1, normalised=True, relu=False)
+
+    def forward(
+        self, voxels: Float[Tensor, "b bins h w"], state: Sequence[Tensor] | None = None
+    ) -> tuple[Float[Tensor, "b h w"], list[Tensor]]:
+        """Intensity at the end of one window, and the state for the next; None at the start.
+
+        Height and width are reflected up to multiples of 8, and the result cut back.
+        """
+        if voxels.shape[1] != self.bins:
+            raise ValueError(f"this E2VID takes {self.bins} bins, got {voxels.shape[1]}")
+        top, left, padded = reflected(voxels)
+        head = self.head(padded.contiguous(memory_format=torch.channels_last))
+        x, skips, after = head, [], []
+        for i, encoder in enumerate(self.encoders):
+            x, memory = encoder(x, None if state is None else (state[2 * i], state[2 * i + 1]))
+            skips.append(x)
+            after += [x, memory]
+        for block in self.resblocks:
+            x = block(x)
+        for decoder, skip in zip(self.decoders, reversed(skips), strict=True):
+            x = decoder(x + skip)
+        intensity = torch.sigmoid(self.pred(x + head).float())
+        height, width = voxels.shape[-2:]
+        return intensity[:, 0, top : top + height, left : left + width], after
+
+    def unroll(
+        self, voxels: Float[Tensor, "t b bins h w"], state: list[Tensor] | None = None
+    ) -> tuple[Float[Tensor, "t b h w"], list[Tensor]]:
+        """t windows of b streams, one after the other."""
+        frames = []
+        for window in voxels:
+            frame, state = self(window, state)
+            frames.append(frame)
+        return torch.stack(frames), state or []
+
+    @classmethod
+    def load(cls, path: Path) -> "E2vid":
+        """The published checkpoint, read without running code from it; ValueError for one of another network."""
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(content, dict) or "state_dict" not in content:
+            raise ValueError(f"{path} holds no E2VID: expected a dictionary with arch, model and state_dict")
+        _check_settings(path, content)
+        tensors = {name.removeprefix(PUBLISHED_PREFIX): tensor for name, tensor in content["state_dict"].items()}
+        head = tensors.get("head.conv2d.weight")
+        if head is None:
+            raise ValueError(f"{path} holds no E2VID: expected a tensor {PUBLISHED_PREFIX}head.conv2d.weight")
+        network = cls(bins=head.shape[1])
+        try:
+            network.load_state_dict(tensors)
+        except RuntimeError as error:
+            raise ValueError(f"{path} holds no E2VID of the published size: {error}") from None
+        return network.eval()
+
+
+class Convolution(nn.Module):
+    """Convolution, batch normalisation if wanted (which then stands in for the bias), ReLU."""
+
+    def __init__(
+        self, inputs: int, outputs: int, kernel_size: int, *, normalised: bool, stride: int = 1, relu: bool = True
+    ):
+        super().__init__()
+        self.conv2d = nn.Conv2d(inputs, outputs, kernel_size, stride, padding=kernel_size // 2, bias=not normalised)
+        self.norm_layer = nn.BatchNorm2d(outputs) if normalised else None
+        self.relu = relu
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d i j"]:
+        """d channels, at the size that the stride leaves."""
+        x = self.conv2d(x)
+        if self.norm_layer is not None:
+            x = self.norm_layer(x)
+        return F.relu(x) if self.relu else x
+
+
+class RecurrentEncoder(nn.Module):
+    """Half the size by a 5x5 convolution, then a ConvLSTM."""
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        self.conv = Convolution(inputs, outputs, 5, normalised=True, stride=2)
+        self.recurrent_block = ConvLstm(outputs)
+
+    def forward(
+        self, x: Float[Tensor, "b c h w"], state: tuple[Tensor, Tensor] | None
+    ) -> tuple[Float[Tensor, "b d i j"], Float[Tensor, "b d i j"]]:
+        """What the LSTM shows, and its memory."""
+        return self.recurrent_block(self.conv(x), state)
+
+
+class ConvLstm(nn.Module):
+    """i, f, o = sigmoid, g = tanh of conv[x, shown]; memory <- f memory + i g; shown <- o tanh(memory)."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.Gates = nn.Conv2d(2 * channels, 4 * channels, 3, padding=1)
+
+    def forward(
+        self, x: Float[Tensor, "b c h w"], state: tuple[Tensor, Tensor] | None
+    ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b c h w"]]:
+        """What it shows and its memory; both are None at the start, and count as zeros."""
+        shown, memory = (torch.zeros_like(x), torch.zeros_like(x)) if state is None else state
+        i, f, o, g = self.Gates(torch.cat([x, shown.to(x.dtype)], dim=1)).chunk(4, dim=1)
+        memory = torch.sigmoid(f) * memory.to(f.dtype) + torch.sigmoid(i) * torch.tanh(g)
+        return torch.sigmoid(o) * torch.tanh(memory), memory
+
+
+class ResidualBlock(nn.Module):
+    """relu(x + bn(conv(relu(bn(conv(x))))))."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.bn1 = nn.BatchNorm2d(channels)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(channels)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """The same shape."""
+        return F.relu(x + self.bn2(self.conv2(F.relu(self.bn1(self.conv1(x))))))
+
+
+class Decoder(nn.Module):
+    """Twice the size by a transposed 5x5 convolution."""
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        self.transposed_conv2d = nn.ConvTranspose2d(
+            inputs, outputs, 5, stride=2, padding=2, output_padding=1, bias=False
+        )
+        self.norm_layer = nn.BatchNorm2d(outputs)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d 2*h 2*w"]:
+        """d channels."""
+        return F.relu(self.norm_layer(self.transposed_conv2d(x)))
+
+
+def reflected(images: Float[Tensor, "b c h w"]) -> tuple[int, int, Float[Tensor, "b c i j"]]:
+    """How many rows and columns were added above and left, and the images with sides that are multiples of 8."""
+    rows, columns = (-side % SIZE_MULTIPLE for side in images.shape[-2:])
+    top, left = math.ceil(rows / 2), math.ceil(columns / 2)
+    return top, left, F.pad(images, (left, columns - left, top, rows - top), mode="reflect")
+
+
+def _check_settings(path: Path, content: dict) -> None:
+    """The file says which network it holds; E2VID has had several, with equally named tensors."""
+    if content.get("arch", PUBLISHED_ARCH) != PUBLISHED_ARCH:
+        raise ValueError(f"{path} holds no E2VID: its arch is {content['arch']!r}, expected {PUBLISHED_ARCH!r}")
+    settings = content.get("model") or content.get("config", {}).get("model", {})
+    for key, expected in PUBLISHED_SETTINGS.items():
+        if key in settings and settings[key] != expected:
+            raise ValueError(
+                f"{path} holds another E2VID: its {key} is {settings[key]!r}, expected {expected!r}; "
+                f"the published file is E2VID_lightweight.pth.tar"
+            )

@@ -1,0 +1,28 @@
+"""Events (data/events.zarr or made of data/scenes.zarr), data/frames.zarr -> data/train_e2p: the E2P baseline."""
+
+from pathlib import Path
+
+from polarnet.config import Config, hydra_stage
+from polarnet.runtime import device_of, threads_of
+from polarnet.training.e2p import e2p_task
+from polarnet.training.loop import train
+from polarnet.training.recorder import Recorder
+from polarnet.training.task import describe, lpips_of, open_events, open_split
+
+
+@hydra_stage
+def main(config: Config) -> None:
+    """Train E2P on the training split; a killed run of the same training goes on where it stopped."""
+    e2p = config.baselines.e2p
+    lpips = lpips_of(Path(config.paths.weights), max(e2p.lpips, e2p.intensity_lpips))
+    task = e2p_task(e2p, lpips, config.seed)
+    paths, threads = config.paths, threads_of(config.runtime)
+    events = open_events(e2p.data, paths.events, paths.scenes, config.emulate, config.seed, threads)
+    split = open_split(events, paths.frames, task.encode)
+    metadata = describe(task, split, e2p, Path(paths.weights), config.seed)
+    recorder = Recorder(Path(paths.train_e2p), Path(paths.resume), metadata)
+    train(task, split, e2p, recorder, config.seed, device_of(config.runtime), config.runtime.workers)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+import math
+
+import pytest
+import torch
+
+from polarnet.baselines.e2p import E2p, MosaicHead, coded_aolp, decoded_aolp, interleaved, own_names
+
+
+@pytest.fixture(scope="module")
+def network():
+    torch.manual_seed(0)
+    return E2p(5)
+
+
+def test_it_has_the_published_number_of_parameters(network):
+    assert sum(p.numel() for p in network.parameters()) == 512_501
+
+
+def test_four_channels_are_laid_out_as_the_mosaic_90_45_over_135_0():
+    channels = torch.stack([torch.full((1, 2, 3), float(angle)) for angle in (0, 45, 90, 135)])
+    mosaic = interleaved(channels)
+    assert mosaic.shape == (1, 4, 6)
+    assert mosaic[0, 0].tolist() == mosaic[0, 2].tolist() == [90, 45, 90, 45, 90, 45]
+    assert mosaic[0, 1].tolist() == mosaic[0, 3].tolist() == [135, 0, 135, 0, 135, 0]
+
+
+def test_every_pixel_of_a_channel_lands_in_its_own_cell():
+    channels = torch.rand(2, 4, 5, 3, 4)
+    mosaic = interleaved(channels)
+    assert torch.equal(mosaic[:, :, 1::2, 1::2], channels[:, 0])
+    assert torch.equal(mosaic[:, :, 0::2, 1::2], channels[:, 1])
+    assert torch.equal(mosaic[:, :, 0::2, 0::2], channels[:, 2])
+    assert torch.equal(mosaic[:, :, 1::2, 0::2], channels[:, 3])
+
+
+@torch.no_grad()
+def test_each_convolution_of_the_first_layer_is_centred_on_one_polarizer():
+    head = MosaicHead(1)
+    for pattern in (head.pattern1, head.pattern2, head.pattern3, head.pattern4):
+        torch.nn.init.zeros_(pattern.weight)
+        torch.nn.init.zeros_(pattern.bias)
+        pattern.weight[:, 0, 1, 1] = 1.0  # the middle of the 3x3
+    torch.nn.init.zeros_(head.conv.weight)
+    torch.nn.init.zeros_(head.conv.bias)  # every channel weighs sigmoid(0) = 1/2
+    channels = torch.rand(1, 4, 1, 3, 4)
+    found = 2 * head(interleaved(channels))
+    for group, angle in enumerate((90, 45, 135, 0)):
+        torch.testing.assert_close(found[:, 8 * group], channels[:, angle // 45, 0])
+
+
+@torch.no_grad()
+def test_windows_at_once_are_windows_one_by_one_with_the_state_carried(network):
+    torch.manual_seed(1)
+    windows, state = torch.randn(3, 2, 5, 36, 40), None
+    together, last = network.unroll(windows)
+    for window, expected in zip(windows, together, strict=True):
+        maps, state = network(window, state)
+        assert torch.equal(maps, expected)
+    assert together.shape == (3, 2, 3, 18, 20)
+    assert all(torch.equal(a, b) for a, b in zip(last, state, strict=True))
+
+
+@torch.no_grad()
+def test_the_branches_see_each_other_through_the_gates_alone(network):
+    mosaic = torch.randn(1, 5, 32, 32)
+    before, _ = network(mosaic)
+    changed = E2p(5)
+    changed.load_state_dict(network.state_dict())
+    torch.nn.init.zeros_(changed.branches["aolp"].G1.out_gate.weight)
+    after, _ = changed(mosaic)
+    assert not torch.allclose(after[:, 2], before[:, 2])
+    for gate in (changed.fusion_weight1, changed.fusion_weight2):
+        torch.nn.init.zeros_(gate.conv4.weight)
+        torch.nn.init.zeros_(gate.conv4.bias)
+    shut, _ = changed(mosaic)
+    torch.nn.init.ones_(changed.branches["aolp"].G1.out_gate.weight)
+    torch.testing.assert_close(changed(mosaic)[0][:, 2], shut[:, 2])
+
+
+def test_aolp_is_coded_from_minus_90_to_90_degrees():
+    angles = torch.tensor([0.0, 45, 89, 90, 135]).deg2rad().view(5, 1, 1)
+    code = coded_aolp(angles)
+    torch.testing.assert_close(code.flatten(), torch.tensor([90.0, 135, 179, 0, 45]) / 180)
+    torch.testing.assert_close(decoded_aolp(code), angles)
+    outside = decoded_aolp(torch.linspace(-3, 3, 601).view(1, 1, -1))
+    assert 0 <= outside.min() <= outside.max() < math.pi
+
+
+def test_the_authors_names_are_understood(network, tmp_path):
+    """head_i.pattern1.0, head_i.conv, G1_i.reset_gate, R2_i.conv1, pred_i, fusion_weight1.conv1.0 and so on."""
+    letters = {"intensity": "i", "aolp": "a", "dolp": "d"}
+    theirs = {}
+    for name, tensor in network.state_dict().items():
+        parts = name.split(".")
+        if parts[0] == "branches":
+            parts = [f"{parts[2]}_{letters[parts[1]]}", *parts[3:]]
+        if parts[1].startswith("pattern") or (parts[0].startswith("fusion") and parts[1] != "conv4"):
+            parts.insert(2, "0")
+        theirs[".".join(parts)] = tensor
+    assert {"head_i.pattern1.0.weight", "G1_d.reset_gate.bias", "fusion_weight2.conv4.weight"} < theirs.keys()
+    assert {"fusion_weight1.conv1.0.weight", "head_a.conv.bias", "pred_a.weight"} < theirs.keys()
+    assert own_names(theirs).keys() == network.state_dict().keys()
+    torch.save({"state_dict": theirs}, tmp_path / "e2p.pth")
+    loaded = E2p.load(tmp_path / "e2p.pth").state_dict()
+    assert all(torch.equal(loaded[name], tensor) for name, tensor in network.state_dict().items())
+
+
+def test_a_file_that_holds_something_else_is_refused(tmp_path):
+    torch.save({"state_dict": {"weight": torch.zeros(1)}}, tmp_path / "x.pth")
+    with pytest.raises(ValueError, match="holds no E2P"):
+        E2p.load(tmp_path / "x.pth")
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 32, 32), (1, 5, 31, 32)])
+def test_other_inputs_are_refused(network, shape):
+    with pytest.raises(ValueError, match="this E2P takes 5 bins of even height and width"):
+        network(torch.zeros(shape))
+
+
+def test_an_image_that_the_gate_would_pool_away_is_refused(network):
+    with pytest.raises(ValueError, match="at least 16 rows and columns"):
+        network(torch.zeros(1, 5, 14, 32))

@@ -1,0 +1,116 @@
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from polarnet.baselines.stokes_gain import GainConfig, consistent, gains, solved
+from polarnet.stokes import dolp, intensities_from_stokes, stokes_from_intensities, stokes_from_polarization
+
+CONFIG = GainConfig(window_frames=10, rounds=5, pixels=20_000, smallest=0.1, pull=0.0)
+HEIGHT, WIDTH = 60, 80
+
+
+def smooth(generator, low, high):
+    """A field of low frequencies between two values."""
+    coarse = torch.rand(1, 1, 5, 6, generator=generator)
+    fine = torch.nn.functional.interpolate(coarse, (HEIGHT, WIDTH), mode="bicubic").clamp(0, 1)[0, 0]
+    return low + (high - low) * fine
+
+
+def scene(seed):
+    """DoLP and the four intensities behind the polarizers."""
+    generator = torch.Generator().manual_seed(seed)
+    truth = smooth(generator, 0.0, 0.9)
+    stokes = stokes_from_polarization(smooth(generator, 0.1, 1.0), truth, smooth(generator, 0.0, math.pi))
+    return truth, intensities_from_stokes(stokes), generator
+
+
+def psnr(intensities, truth):
+    error = (dolp(stokes_from_intensities(intensities)).clamp(0, 1) - truth).square().mean()
+    return -10 * math.log10(max(error.item(), 1e-12))
+
+
+def spoilt(seed, log_noise):
+    """Truth, and intensities times unknown factors of e^-0.5 to e^0.5 and noise in proportion to them."""
+    truth, intensities, generator = scene(seed)
+    factors = torch.exp(torch.rand(4, generator=generator) - 0.5)
+    noise = torch.exp(log_noise * torch.randn(intensities.shape, generator=generator))
+    return truth, intensities * noise, (intensities * noise * factors[:, None, None])[None]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_without_noise_unknown_factors_are_solved_to_more_than_40_db(seed):
+    truth, _, unknown = spoilt(seed, 0.0)
+    assert psnr(unknown[0], truth) < 28
+    assert psnr(consistent(unknown, CONFIG)[0], truth) > 40
+
+
+@pytest.mark.parametrize(("log_noise", "lost_db"), [(0.05, 1.5), (0.1, 2.5), (0.2, 3.5)])
+def test_with_noise_little_is_lost_against_known_factors(log_noise, lost_db):
+    known, left, solved_for = [], [], []
+    for seed in range(6):
+        truth, true_scale, unknown = spoilt(seed, log_noise)
+        known.append(psnr(true_scale, truth))
+        left.append(psnr(unknown[0], truth))
+        solved_for.append(psnr(consistent(unknown, CONFIG)[0], truth))
+    assert sum(solved_for) / 6 > sum(known) / 6 - lost_db
+    assert sum(solved_for) / 6 > sum(left) / 6 + 1.5
+
+
+def test_a_twentieth_of_wild_pixels_is_outvoted_by_weights_alone():
+    truth, _, unknown = spoilt(1, 0.0)
+    generator = torch.Generator().manual_seed(9)
+    wild = torch.rand(unknown.shape, generator=generator) < 0.05
+    seen = torch.where(wild, torch.rand(unknown.shape, generator=generator), unknown)
+
+    def score(rounds):
+        found = gains(seen, dataclasses.replace(CONFIG, rounds=rounds))
+        return psnr(unknown[0] * found[0, :, None, None], truth)
+
+    assert score(5) > 40
+    assert score(5) > score(0) + 5
+
+
+def test_gains_of_a_hand_worked_pair_of_pixels():
+    # 2 I0 + I90 = I45 + I135 holds at both, and another direction leaves a residual
+    residuals = torch.tensor([[0.5, -1.0, 1.0, -1.0], [1.0, -1.0, 0.0, -1.0], [0.25, -0.75, 1.0, -0.75],
+                              [0.5, -0.75, 0.5, -0.75], [0.5, -0.5, 0.75, -1.25]], dtype=torch.float64)  # fmt: skip
+    found = solved(residuals, CONFIG)
+    torch.testing.assert_close(
+        found / found[1], torch.tensor([2.0, 1.0, 1.0, 1.0], dtype=torch.float64), atol=1e-5, rtol=0
+    )
+    assert found.log().mean().abs() < 1e-9
+
+
+def test_a_frame_looks_at_no_later_one_and_at_no_more_than_its_window():
+    frames = torch.cat([spoilt(seed, 0.1)[2] for seed in range(4)])
+    config = dataclasses.replace(CONFIG, window_frames=2)
+    every = gains(frames, config)
+    torch.testing.assert_close(gains(frames[:3], config), every[:3])
+    torch.testing.assert_close(gains(frames[2:], config)[1:], every[3:])
+
+
+def test_gains_stay_positive_whatever_comes():
+    torch.manual_seed(0)
+    for _ in range(20):
+        found = gains(torch.rand(2, 4, 6, 7) ** 4, CONFIG)
+        assert (found > 0).all()
+        torch.testing.assert_close(found.log().mean(1), torch.zeros(2, dtype=torch.float64))
+
+
+def test_a_strong_pull_makes_the_channels_equally_bright():
+    _, _, unknown = spoilt(2, 0.1)
+    found = consistent(unknown, dataclasses.replace(CONFIG, pull=1e6))[0]
+    brightness = found.square().mean((1, 2)).sqrt()
+    torch.testing.assert_close(brightness / brightness.mean(), torch.ones(4), atol=1e-4, rtol=0)
+
+
+def test_a_common_factor_changes_nothing():
+    _, _, unknown = spoilt(2, 0.1)
+    torch.testing.assert_close(gains(100 * unknown, CONFIG), gains(unknown, CONFIG))
+
+
+@pytest.mark.parametrize("value", [0.0, 0.7])
+def test_equal_channels_need_no_gain(value):
+    torch.testing.assert_close(gains(torch.full((1, 4, 5, 5), value), CONFIG), torch.ones(1, 4, dtype=torch.float64))

@@ -1,0 +1,107 @@
+"""E2P in the loop of every other network, at a size where a training takes seconds."""
+
+import dataclasses
+from typing import Any
+
+import pytest
+import torch
+
+from polarnet.baselines.e2p import coded_aolp
+from polarnet.events.store import EventStore
+from polarnet.lpips import Lpips
+from polarnet.networks.checkpoint import load_checkpoint
+from polarnet.similarity import ssim
+from polarnet.training.e2p import BranchLoss, E2pConfig, e2p_task
+from polarnet.training.loop import train, train_batch, validate
+from polarnet.training.recorder import Recorder
+from polarnet.training.sequences import stack
+from polarnet.training.task import describe, open_split
+
+SEED = 7
+CPU = torch.device("cpu")
+LOOP: dict[str, Any] = {
+    "data": "store",
+    "visits": 1,
+    "windows": 3,
+    "crop": [16, 20],
+    "symmetries": True,
+    "epochs": 1,
+    "batch_size": 2,
+    "bptt_windows": 3,
+    "learning_rate": 1e-3,
+    "schedule": "cosine",
+    "warmup": 0.1,
+    "gradient_norm": 1.0,
+    "precision": "fp32",
+}
+E2P = E2pConfig(**LOOP, bins=5, intensity_lpips=3.0, lpips=0.0, mse=50.0, ssim=1.0)
+
+
+def test_a_training_of_e2p_leaves_a_checkpoint_of_the_published_size(stores, tmp_path):
+    task = e2p_task(E2P, None, SEED)
+    split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
+    recorder = Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, E2P, tmp_path, SEED))
+    train(task, split, E2P, recorder, SEED, CPU, workers=0)
+    tensors, metadata = load_checkpoint(tmp_path / "out" / "best.safetensors")
+    assert metadata["network"] == "e2p"
+    assert sum(tensor.numel() for tensor in tensors.values()) == 512_501
+    assert metadata["loss"] == {"aolp_mse": 50.0, "aolp_ssim_loss": 1.0, "dolp_mse": 50.0, "dolp_ssim_loss": 1.0}
+
+
+def test_one_sequence_can_be_learnt_by_heart(stores):
+    config = dataclasses.replace(E2P, windows=None, crop=None, symmetries=False, learning_rate=1e-2)
+    task = e2p_task(config, None, SEED)
+    split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
+    split.train.sequences[1:] = []
+    before = validate(task, split.train, config, CPU, workers=0)["mse"]
+    optimizer, batch = torch.optim.Adam(task.network.parameters(), lr=1e-2), stack([split.train[0]])
+    for _ in range(12):
+        train_batch(task, optimizer, batch, config, CPU)
+    assert validate(task, split.train, config, CPU, workers=0)["mse"] < 0.2 * before
+
+
+def test_the_truth_is_s0_the_coded_angle_and_dolp_and_dolp_is_scored(stores):
+    task = e2p_task(E2P, None, SEED)
+    split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
+    batch = stack([split.train[0], split.train[1]])
+    mosaic, truth, valid = task.streams(batch)
+    assert valid is None  # no pixel of these stores is masked
+    windows, _, _, height, width = batch.inputs.shape
+    assert mosaic.shape == (windows, 2, 5, 2 * height, 2 * width)
+    assert torch.equal(mosaic[:, :, :, 1::2, 1::2], batch.inputs[:, :, :5])  # 0 degrees
+    assert torch.equal(truth[:, :, 0], batch.intensity[:, :, 0] + batch.intensity[:, :, 2])
+    assert torch.equal(truth[:, :, 1], coded_aolp(batch.aolp))
+    assert torch.equal(task.scored(truth), batch.dolp)
+
+
+def test_the_loss_is_the_published_one():
+    torch.manual_seed(0)
+    lpips = Lpips("squeeze")
+    config = dataclasses.replace(E2P, lpips=1.0)
+    loss = e2p_task(config, lpips, SEED).loss
+    assert isinstance(loss, BranchLoss)
+    predicted, truth = torch.rand(2, 1, 2, 3, 32, 32).unbind()
+    a, b = predicted[0], truth[0]
+    distance = [lpips(a[:, i], b[:, i]).mean() for i in range(3)]
+    polarization = [
+        distance[i] + 50 * (a[:, i] - b[:, i]).square().mean() + (1 - ssim(a[:, i], b[:, i])).mean() for i in (1, 2)
+    ]
+    expected = 3 * distance[0] + sum(polarization)
+    torch.testing.assert_close(loss.total(loss(predicted, truth)), expected, atol=1e-4, rtol=1e-4)
+
+
+def test_pixels_that_are_not_valid_cost_nothing():
+    torch.manual_seed(0)
+    loss = e2p_task(E2P, None, SEED).loss
+    truth = torch.rand(1, 2, 3, 16, 16)
+    valid = torch.rand(1, 2, 16, 16) < 0.7
+    spoilt = torch.where(valid[:, :, None], truth, 5.0)
+    terms = loss(spoilt, truth, valid)
+    assert terms.keys() == {"aolp_mse", "aolp_ssim_loss", "dolp_mse", "dolp_ssim_loss"}
+    assert loss.total(terms).abs() < 1e-4
+    assert loss.total(loss(spoilt, truth)) > 1
+
+
+def test_a_negative_weight_is_refused():
+    with pytest.raises(ValueError, match=r"mse: expected >= 0, got -1\.0"):
+        dataclasses.replace(E2P, mse=-1.0)
