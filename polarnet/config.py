@@ -23,6 +23,7 @@ from polarnet.runtime import RuntimeConfig, configure
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import MotionConfig
 from polarnet.simulation.pictures.ingest import IngestConfig
+from polarnet.simulation.sets import SetsConfig
 from polarnet.training.e2v import E2vConfig
 from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig
@@ -69,9 +70,11 @@ class Paths:
     weights: str
     train: str
     train_e2v: str
+    sets: str
     benchmark: str
     report: str
     resume: str
+    cache: str
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,7 @@ class Config:
     lpips: LpipsConfig
     baselines: BaselinesConfig
     benchmark: BenchmarkConfig
+    sets: SetsConfig
     paths: Paths
     runtime: RuntimeConfig
     cluster: ClusterConfig

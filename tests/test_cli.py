@@ -35,7 +35,7 @@ def test_the_stages_come_in_the_order_they_run_in(capsys, project_root, monkeypa
     monkeypatch.chdir(project_root / "tests")
     assert main(["stages"]) == 0
     assert capsys.readouterr().out.split() == [
-        "ingest", "synthesize", "emulate", "weights", "train", "train_e2v", "benchmark", "report",
+        "ingest", "synthesize", "emulate", "weights", "train", "train_e2v", "sets", "benchmark", "report",
     ]  # fmt: skip
 
 
