@@ -1,6 +1,8 @@
 """The `polarnet` command. Each subcommand is thin: the library does the work."""
 
 import argparse
+import contextlib
+import json
 import os
 import subprocess
 import sys
@@ -68,6 +70,26 @@ def _parser() -> argparse.ArgumentParser:
     docs = commands.add_parser("docs", help="write docs/results/*.json into the tables of README.md and docs/")
     docs.add_argument("--check", action="store_true", help="change nothing; fail where a table is out of date")
     docs.set_defaults(run=_docs)
+
+    benchmark = commands.add_parser(
+        "benchmark",
+        help="every method on a folder of your own photographs or measured scenes, without training",
+        description="Makes event sequences of the scenes, runs every method that has its weights, prints the table and "
+        "writes it with a page. Sizes, motion and sensor are those of params.yaml.",
+    )
+    benchmark.add_argument("--scenes", type=Path, required=True, metavar="FOLDER", help="searched recursively")
+    benchmark.add_argument(
+        "--weights", type=Path, metavar="FILE", help="of the DoLP network; default: the trained ones"
+    )
+    benchmark.add_argument(
+        "--kind", choices=("auto", "photographs", "polarization"), default="auto",
+        help="what lies there; auto takes .npz files and NAME_0, NAME_45, ... for measured polarization",
+    )  # fmt: skip
+    benchmark.add_argument("--out", type=Path, metavar="DIR", help="default: outputs/benchmark/NAME of the folder")
+    benchmark.add_argument(
+        "overrides", nargs="*", help="of params.yaml, as Hydra takes them: synthesize.duration_s=0.5"
+    )
+    benchmark.set_defaults(run=_benchmark)
 
     measure = commands.add_parser("measure", help="time the README's two commands in a fresh clone of HEAD")
     measure.set_defaults(run=_measure)
@@ -157,6 +179,30 @@ def _docs(options: argparse.Namespace) -> int:
     for path in changed:
         print(f"{path}: {'out of date; run polarnet docs' if options.check else 'updated'}")
     return 1 if changed and options.check else 0
+
+
+def _benchmark(options: argparse.Namespace) -> int:
+    from polarnet.config import check_keys, load
+    from polarnet.own_scenes import benchmark_folder
+    from polarnet.reports.tables import as_plain, score_table
+    from polarnet.runtime import configure
+
+    root = project_root()
+    scenes = options.scenes.resolve()
+    out = (options.out or root / "outputs" / "benchmark" / scenes.name).resolve()
+    weights = options.weights.resolve() if options.weights else None
+    with contextlib.chdir(root):  # paths of conf/config.yaml are relative to it
+        check_keys(root, options.overrides)
+        config = load(root, options.overrides)
+        configure(config.runtime, config.seed)
+        command = f"polarnet benchmark --scenes {options.scenes}"
+        metrics, notes = benchmark_folder(config, scenes, options.kind, out, weights, command)
+    reason = json.loads((out / "details.json").read_text())["lpips"]["reason"]
+    print(as_plain(score_table(metrics, lpips_reason=reason)))
+    for note in notes:
+        print(note)
+    print(f"the page: {out / 'index.html'}")
+    return 0
 
 
 def _measure(options: argparse.Namespace) -> int:

@@ -1,6 +1,6 @@
 """Is one method better than another on the same scenes: Wilcoxon's signed-rank test over scenes, and by how much."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -64,11 +64,3 @@ def _correct(comparisons: Sequence[dict[str, Any]]) -> None:
     for i, comparison in enumerate(sorted(comparisons, key=lambda comparison: comparison["p"])):
         reached = max(reached, min(1.0, comparison["p"] * (len(comparisons) - i)))
         comparison["p_holm"] = reached
-
-
-def sentence(label: str, comparison: Mapping[str, Any]) -> str:
-    """A comparison in words, for a report."""
-    return (
-        f"better than {label} in {comparison['better']} of {comparison['scenes']} scenes "
-        f"(effect {comparison['effect']:+.2f}, p = {comparison['p_holm']:.2g})"
-    )

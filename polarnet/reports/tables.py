@@ -25,7 +25,7 @@ class Column:
         """Label with the direction in which the metric improves."""
         return f"{self.label} {'↓' if self.better == 'low' else '↑'}"
 
-    def printed(self, value: float) -> str:
+    def printed(self, value: float | int) -> str:
         """A value with the decimals of its column."""
         return f"{value:.{self.decimals}f}"
 
@@ -36,6 +36,9 @@ COLUMNS = {
     "ssim": Column("SSIM", 4, "high", True, ""),
     "lpips": Column("LPIPS", 4, "low", True, ""),
     "corr": Column("corr.", 3, "high", True, ""),
+    "grad": Column("edges", 3, "high", True, ""),
+    "aolp_deg": Column("AoLP err.", 1, "low", True, "°"),
+    "skill": Column("skill", 3, "high", True, ""),
     "ms_per_window": Column("ms / window", 1, "low", False, " ms"),
 }
 ERROR_PARTS = {
@@ -44,6 +47,13 @@ ERROR_PARTS = {
     "pattern_mse": Column("pattern", 4, "low", True, ""),
 }
 """MSE split in two: level, the squared error of the frame's mean, and pattern, what is left without it."""
+COSTS = {
+    "ms_per_window": COLUMNS["ms_per_window"],
+    "gflop": Column("GFLOP / window", 2, "low", False, " GFLOP"),
+    "params": Column("parameters", 0, "low", False, ""),
+    "peak_mib": Column("peak MiB", 1, "low", False, " MiB"),
+}
+"""What a method costs on the machine of the run."""
 
 METHODS = {
     "zeros": "zeros",
@@ -187,6 +197,16 @@ def standing(scores: Scores) -> list[str]:
     ]
 
 
+def paired_lines(paired: Mapping[str, Mapping[str, Mapping[str, Any]]], metric: str = "mse") -> list[str]:
+    """How `ours` does scene by scene against each other method, from details.json's `paired`; a sentence each."""
+    return [
+        f"{METHODS.get(rival, rival)}: ours is better in {one['better']} of {one['scenes']} scenes "
+        f"(effect {one['effect']:+.2f}, p = {one['p_holm']:.2g})."
+        for rival in in_order(paired)
+        if (one := paired[rival].get(metric))
+    ]
+
+
 def _differences(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> list[str]:
     words = []
     for key, column in COLUMNS.items():
@@ -198,7 +218,7 @@ def _differences(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> list[str]
     return words
 
 
-def _best(column: Column, values: Sequence[float | None]) -> str | None:
+def _best(column: Column, values: Sequence[float | int | None]) -> str | None:
     """The best value as it is printed, so that rows which read the same are bold together."""
     known = [value for value in values if value is not None]
     if not column.ranked or not known:
@@ -206,7 +226,7 @@ def _best(column: Column, values: Sequence[float | None]) -> str | None:
     return column.printed(min(known) if column.better == "low" else max(known))
 
 
-def _cell(column: Column, value: float | None, interval: Sequence[float] | None, best: str | None) -> Cell:
+def _cell(column: Column, value: float | int | None, interval: Sequence[float | int] | None, best: str | None) -> Cell:
     if value is None:
         return Cell("-", "", False)
     ends = "" if interval is None else " to ".join(column.printed(end) for end in interval)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import wilcoxon
 
-from polarnet.evaluation.paired import compared, paired_comparisons, sentence
+from polarnet.evaluation.paired import compared, paired_comparisons
 from polarnet.evaluation.score import METRICS, FrameScore
 
 
@@ -49,8 +49,3 @@ def test_holm_corrects_for_the_number_of_rivals_and_never_falls():
 
 def test_without_the_method_there_is_nothing_to_compare():
     assert paired_comparisons([row("cf", "s", 1.0), row("zeros", "s", 2.0)], "ours") == {}
-
-
-def test_a_comparison_in_words():
-    comparison = {"better": 9, "scenes": 10, "effect": 0.964, "p_holm": 0.0058}
-    assert sentence("CF", comparison) == "better than CF in 9 of 10 scenes (effect +0.96, p = 0.0058)"
