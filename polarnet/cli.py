@@ -97,7 +97,11 @@ def _parser() -> argparse.ArgumentParser:
     benchmark.add_argument("overrides", nargs="*", help="of params.yaml, as Hydra takes them: seed=2")
     benchmark.set_defaults(run=_benchmark)
 
-    measure = commands.add_parser("measure", help="time the README's two commands in a fresh clone of HEAD")
+    measure = commands.add_parser("measure", help="write the figures that README and docs show")
+    measure.add_argument(
+        "what", nargs="?", choices=("pipeline", "benchmark"), default="pipeline",
+        help="pipeline: time the README's two commands in a fresh clone of HEAD; benchmark: what data/benchmark holds",
+    )  # fmt: skip
     measure.set_defaults(run=_measure)
     return parser
 
@@ -230,9 +234,12 @@ def _study(options: argparse.Namespace, config: "Config", out: Path, weights: Pa
 
 
 def _measure(options: argparse.Namespace) -> int:
-    from polarnet.measure import measure_pipeline
+    from polarnet.measure import measure_benchmark, measure_pipeline
 
-    path = measure_pipeline(project_root())
+    root = project_root()
+    path = (
+        measure_pipeline(root) if options.what == "pipeline" else measure_benchmark(root, root / "data" / "benchmark")
+    )
     print(f"wrote {path}; `polarnet docs` brings it into the README")
     return 0
 

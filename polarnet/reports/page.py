@@ -29,6 +29,7 @@ from polarnet.reports.tables import (
     METHODS,
     PAPER_COMPARABILITY,
     PAPER_SOURCE,
+    SET_TITLES,
     Scores,
     paired_lines,
     paper_table,
@@ -61,7 +62,6 @@ SOURCE_NAMES = {
     "polarization": "of measured polarization",
 }
 MOST_EVENT_ROWS = 2
-SET_TITLES = {"simulated": "Simulated", "complex_motion": "Complex motion", "measured": "Measured polarization"}
 SET_ABOUT = {
     "complex_motion": "The same held-out pictures while the camera turns, zooms and moves faster (section sets).",
     "measured": "Scenes whose polarization a camera measured, seen by a simulated event camera: real DoLP and AoLP, "

@@ -26,8 +26,9 @@ class Column:
         return f"{self.label} {'↓' if self.better == 'low' else '↑'}"
 
     def printed(self, value: float | int) -> str:
-        """A value with the decimals of its column."""
-        return f"{value:.{self.decimals}f}"
+        """A value with the decimals of its column; what rounds to 0 has no sign."""
+        text = f"{value:.{self.decimals}f}"
+        return text.removeprefix("-") if float(text) == 0 else text
 
 
 COLUMNS = {
@@ -69,6 +70,9 @@ METHODS = {
 TRIVIAL = ("zeros", "train_mean", "oracle_mean")
 """Methods whose answer is one value everywhere."""
 
+SET_TITLES = {"simulated": "Simulated", "complex_motion": "Complex motion", "measured": "Measured polarization"}
+"""Test sets, in the order of every page."""
+
 PAPER_SOURCE = "Yan et al., Photonics 2024, 11(5), 481, Table 2"
 PAPER_TABLE_2: Mapping[str, Scores] = {
     "simulated": {
@@ -86,10 +90,12 @@ PAPER_COMPARABILITY = (
     "Both tables ask the same question of different pictures: compare how the methods rank and how far apart they "
     "lie, not the numbers themselves. The paper's simulated test set is 50 sequences from photographs of the same "
     "collection as its training set (MIT-Adobe FiveK); its network saw 1000 sequences for 250 epochs; its CF and E2V "
-    "ran with their default parameters. It does not say which windows were scored, how reconstructed intensities were "
-    "scaled before the Stokes formula, or with which settings SSIM and LPIPS were computed. Its real experiment "
-    "is another task again: 32 targets that turn in front of a camera; errors so low for all three methods suggest "
-    "that most of each picture is hardly polarized. What the default parameters share with the paper: contrast "
+    "ran with their default parameters. It does not say which of the two published CF filters it means, whose defaults "
+    "differ by several dB, which windows were scored, how reconstructed intensities were scaled before the Stokes "
+    "formula, or with which settings SSIM and LPIPS were computed; and it shows no constant to beat. Its real "
+    "experiment is another task again: 32 targets that turn in front of a camera; errors so low for all three methods "
+    "suggest that most of each picture is hardly polarized. Measured polarization here has measured DoLP and AoLP, but "
+    "simulated events: it is not that experiment either. What the default parameters share with the paper: contrast "
     "thresholds of 0.2, 120 by 180 pixels, 30 windows a second, photographs read as hue, saturation and value."
 )
 
