@@ -45,8 +45,8 @@ def _parser() -> argparse.ArgumentParser:
     doctor = commands.add_parser("doctor", help="what this machine offers: versions, device, bf16, weights, free disk")
     doctor.set_defaults(run=_doctor)
 
-    preset = commands.add_parser("preset", help="write a named experiment's values into params.yaml, comments kept")
-    preset.add_argument("name", help="a file of conf/experiment: demo, smoke, paper, ...")
+    preset = commands.add_parser("preset", help="write a named experiment or sensor into params.yaml, comments kept")
+    preset.add_argument("name", help="a file of conf/experiment or conf/sensor: demo, smoke, paper, noisy, ...")
     preset.set_defaults(run=_preset)
 
     run = commands.add_parser("run", help="run all stages through Hydra alone, into outputs/run/NAME")
@@ -115,10 +115,11 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 def _preset(options: argparse.Namespace) -> int:
-    from polarnet.experiments import write_preset
+    from polarnet.experiments import group_of, write_preset
 
-    changed = write_preset(project_root(), options.name)
-    print(f"params.yaml now holds experiment {options.name}: {len(changed)} values changed")
+    root = project_root()
+    changed = write_preset(root, options.name)
+    print(f"params.yaml now holds {group_of(root, options.name)} {options.name}: {len(changed)} values changed")
     for line in changed:
         print(f"  {line}")
     return 0
@@ -129,7 +130,8 @@ def _run(options: argparse.Namespace) -> int:
 
     root = project_root()
     chosen = dict(item.split("=", 1) for item in options.overrides if "=" in item)
-    folder = chosen.get("paths.data", f"outputs/run/{chosen.get('experiment', 'demo')}")
+    name = "-".join([chosen.get("experiment", "demo"), *([chosen["sensor"]] if "sensor" in chosen else [])])
+    folder = chosen.get("paths.data", f"outputs/run/{name}")
     overrides = [*options.overrides, *([] if "paths.data" in chosen else [f"paths.data={folder}"])]
     for stage in stage_names(root):
         print(f"== {stage}", flush=True)

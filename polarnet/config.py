@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from polarnet.baselines.complementary_filter import ComplementaryFilterConfig, HighPassConfig
 from polarnet.evaluation.score import BenchmarkConfig
+from polarnet.experiments import BASE
 from polarnet.lpips import LpipsConfig, lpips_problem
 from polarnet.networks.dolp_unet import DolpUNetConfig
 from polarnet.ranges import check_ranges
@@ -142,7 +143,7 @@ def check_keys(root: Path, overrides: list[str]) -> None:
         _check_key(key, "params.yaml")
     for override in overrides:
         key = override.split("=", 1)[0].lstrip("+~").split("@")[0]
-        if key != "experiment" and not key.startswith(("hydra.", "hydra/", "paths.data")):
+        if key not in BASE and not key.startswith(("hydra.", "hydra/", "paths.data")):
             _check_key(key, "command line")
 
 

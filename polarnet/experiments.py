@@ -1,11 +1,12 @@
-"""Named experiments: sets of overrides in conf/experiment, for Hydra as they are and for DVC through params.yaml."""
+"""Named presets: sets of overrides in conf/, for Hydra as they are and for DVC through params.yaml."""
 
 from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
 
-BASE = "demo"  # names every value that any experiment changes, so that one experiment never leaks into the next
+BASE = {"experiment": "demo", "sensor": "default"}
+"""Of each group (a folder of conf/), the preset that names every value which another of it changes: none can leak."""
 
 
 def stage_names(root: Path) -> list[str]:
@@ -13,38 +14,46 @@ def stage_names(root: Path) -> list[str]:
     return list(YAML(typ="safe").load(root / "dvc.yaml")["stages"])
 
 
-def experiment_names(root: Path) -> list[str]:
-    """The named experiments of the project at `root`."""
-    return sorted(path.stem for path in (root / "conf" / "experiment").glob("*.yaml"))
+def preset_names(root: Path, group: str) -> list[str]:
+    """The presets of a group (`experiment`, `sensor`) in the project at `root`."""
+    return sorted(path.stem for path in (root / "conf" / group).glob("*.yaml"))
 
 
-def experiment_values(root: Path, name: str) -> dict[str, Any]:
-    """The values of one experiment by dotted key; ValueError that lists the experiments there are."""
-    path = root / "conf" / "experiment" / f"{name}.yaml"
-    if not path.exists():
-        raise ValueError(f"no experiment {name!r}; there are {', '.join(experiment_names(root))}")
-    return _flat(YAML(typ="safe").load(path) or {})
+def preset_values(root: Path, group: str, name: str) -> dict[str, Any]:
+    """The values of one preset by dotted key."""
+    return _flat(YAML(typ="safe").load(root / "conf" / group / f"{name}.yaml") or {})
+
+
+def group_of(root: Path, name: str) -> str:
+    """The group that has a preset of this name; ValueError that lists the presets there are."""
+    names = {group: preset_names(root, group) for group in BASE}
+    for group, of_group in names.items():
+        if name in of_group:
+            return group
+    listed = "; ".join(f"{group}s {', '.join(of_group)}" for group, of_group in names.items())
+    raise ValueError(f"no preset {name!r}; there are {listed}")
 
 
 def write_preset(root: Path, name: str) -> list[str]:
-    """Write the base experiment's values and then those of `name` into params.yaml, keeping its comments.
+    """Write the values of its group's base preset and then those of `name` into params.yaml, keeping its comments.
 
-    Returns the changes as "key: old -> new". Keys that no experiment names keep what the user gave them.
+    Returns the changes as "key: old -> new". Keys that no preset of the group names keep what the user gave them: a
+    sensor can be written after an experiment.
     """
     yaml = YAML()
     yaml.preserve_quotes = True
     yaml.width = 120
     yaml.representer.add_representer(type(None), lambda r, _: r.represent_scalar("tag:yaml.org,2002:null", "null"))
-    path = root / "params.yaml"
+    path, group = root / "params.yaml", group_of(root, name)
     params = yaml.load(path)
     changed = []
-    for key, value in {**experiment_values(root, BASE), **experiment_values(root, name)}.items():
+    for key, value in {**preset_values(root, group, BASE[group]), **preset_values(root, group, name)}.items():
         *sections, last = key.split(".")
         node = params
         for section in sections:
             node = node[section]
         if last not in node:
-            raise ValueError(f"experiment {name!r} sets {key}, which params.yaml does not have")
+            raise ValueError(f"{group} {name!r} sets {key}, which params.yaml does not have")
         if node[last] != value:
             changed.append(f"{key}: {node[last]} -> {value}")
             node[last] = value

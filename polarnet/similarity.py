@@ -1,6 +1,8 @@
 """Similarity of two images, per frame: one definition for the loss and for the table.
 
 Every function takes frames in [0, 1] with any leading axes, gives one number per frame, and is differentiable.
+Where a mask `valid` is given, what the frames hold at other pixels does not matter, and a frame without any valid pixel
+gives NaN.
 The perceptual distance (LPIPS) has weights to find and lives in polarnet/lpips.py; its names are public here too.
 """
 
@@ -8,7 +10,7 @@ import functools
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from polarnet.lpips import Lpips, LpipsConfig, lpips_problem
@@ -21,12 +23,16 @@ __all__ = [
     "gradient_agreement",
     "level_mse",
     "lpips_problem",
+    "mean_where",
     "mse",
     "pattern_mse",
     "psnr",
     "spread_mse",
     "ssim",
+    "with_truth_outside",
 ]
+
+Valid = Bool[Tensor, "*b h w"] | None
 
 SSIM_SIGMA = 1.5  # pixels; this and the next three: Wang et al., IEEE TIP 2004
 SSIM_RADIUS = 5  # pixels: an 11 x 11 window
@@ -37,67 +43,93 @@ SOBEL_SMOOTH, SOBEL_SLOPE = (0.25, 0.5, 0.25), (-0.5, 0.0, 0.5)  # across and al
 CHANCE_AOLP_DEG = 45.0  # mean error of an angle that knows nothing: the mean of |d| over -90 ... 90 degrees
 
 
-def mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def mean_where(values: Float[Tensor, "*b h w"], valid: Valid) -> Float[Tensor, "*b"]:
+    """Mean over the valid pixels of a frame; over all where `valid` is None."""
+    if valid is None:
+        return values.mean(dim=(-2, -1))
+    return torch.where(valid, values, 0.0).sum(dim=(-2, -1)) / valid.sum(dim=(-2, -1))
+
+
+def with_truth_outside(
+    predicted: Float[Tensor, "*b h w"], truth: Float[Tensor, "*b h w"], valid: Valid
+) -> Float[Tensor, "*b h w"]:
+    """`predicted` at valid pixels and `truth` at the others, where nothing is to be said against it then.
+
+    For what looks at whole neighbourhoods: SSIM, and LPIPS, whose average includes the pixels that are not valid.
+    """
+    return predicted if valid is None else torch.where(valid, predicted, truth)
+
+
+def mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Mean squared error."""
-    return (a - b).square().mean(dim=(-2, -1))
+    return mean_where((a - b).square(), valid)
 
 
-def level_mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def level_mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Squared error of the frame's mean: the part of `mse` that a constant offset explains."""
-    return (a - b).mean(dim=(-2, -1)).square()
+    return mean_where(a - b, valid).square()
 
 
-def pattern_mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def pattern_mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """What remains of `mse` once both frames have the same mean: mse = level_mse + pattern_mse."""
-    return mse(_centred(a), _centred(b))
+    return mse(_centred(a, valid), _centred(b, valid), valid)
 
 
-def spread_mse(truth: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def spread_mse(truth: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """`mse` of the best constant, the frame's own mean: its variance over the pixels, against which skill counts."""
-    return _centred(truth).square().mean(dim=(-2, -1))
+    return mean_where(_centred(truth, valid).square(), valid)
 
 
-def psnr(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def psnr(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Peak signal-to-noise ratio in dB for the data range 1; 100 dB, not infinity, where the frames agree."""
-    return -10 * torch.log10(mse(a, b).clamp(min=LEAST_MSE))
+    return -10 * torch.log10(mse(a, b, valid).clamp(min=LEAST_MSE))
 
 
-def correlation(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def correlation(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Pearson's correlation over the pixels of a frame, in [-1, 1]; 0 where either frame is constant.
 
     A constant frame shows nothing of the other's pattern, so 0 is its score and no frame is left out.
     """
     dtype = torch.promote_types(a.dtype, b.dtype)
-    a, b = _centred(a.double()), _centred(b.double())
-    variance = a.square().mean(dim=(-2, -1)) * b.square().mean(dim=(-2, -1))
-    varies = (_deviation(a) > LEAST_DEVIATION) & (_deviation(b) > LEAST_DEVIATION)
-    covariance = (a * b).mean(dim=(-2, -1))
-    return torch.where(varies, covariance / torch.where(varies, variance, 1.0).sqrt(), 0.0).to(dtype)
+    a, b = _centred(a.double(), valid), _centred(b.double(), valid)
+    variance = mean_where(a.square(), valid) * mean_where(b.square(), valid)
+    varies = (_deviation(a, valid) > LEAST_DEVIATION) & (_deviation(b, valid) > LEAST_DEVIATION)
+    covariance = mean_where(a * b, valid)
+    constant = torch.zeros_like(covariance)
+    if valid is not None:
+        constant[~valid.any(-1).any(-1)] = torch.nan
+    return torch.where(varies, covariance / torch.where(varies, variance, 1.0).sqrt(), constant).to(dtype)
 
 
-def gradient_agreement(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def gradient_agreement(
+    a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None
+) -> Float[Tensor, "*b"]:
     """How well edges agree in place, direction and height: 2 sum(grad a . grad b) / sum(|grad a|^2 + |grad b|^2).
 
     In [-1, 1]: 1 for the same gradients, 0 where either frame has none, -1 for the negative. An edge half as high
     as it should be costs, which `correlation` forgives. The gradients are Sobel's (smoothed central differences) at
-    the interior pixels. The ratio is that of gradient similarity (Liu, Lin & Narwaria, IEEE TIP 2012), here of
-    vectors instead of magnitudes, and pooled over the frame before the division, so that it needs no constant.
+    the interior pixels; with a mask, at those whose eight neighbours are valid as well (0 where there is none).
+    The ratio is that of gradient similarity (Liu, Lin & Narwaria, IEEE TIP 2012), here of vectors instead of
+    magnitudes, and pooled over the frame before the division, so that it needs no constant.
     ValueError for a frame smaller than 3 pixels.
     """
     if min(a.shape[-2:]) < len(SOBEL_SLOPE):
         raise ValueError(f"gradients need frames of at least 3 pixels a side, got {tuple(a.shape[-2:])}")
     dtype = torch.promote_types(a.dtype, b.dtype)
-    gradients = [_sobel(x.double()) for x in (a, b)]
-    (a_x, a_y), (b_x, b_y) = gradients
-    common = (a_x * b_x + a_y * b_y).sum(dim=(-2, -1))
-    energy = [(x.square() + y.square()).sum(dim=(-2, -1)) for x, y in gradients]
-    floor = LEAST_DEVIATION**2 * (a.shape[-2] - 2) * (a.shape[-1] - 2)
+    seen = None if valid is None else _eroded(valid)
+    (a_x, a_y), (b_x, b_y) = (_sobel(x.double()) for x in (a, b))
+
+    def total(values: Tensor) -> Tensor:
+        return (values if seen is None else torch.where(seen, values, 0.0)).sum(dim=(-2, -1))
+
+    common, energy = total(a_x * b_x + a_y * b_y), [total(x.square() + y.square()) for x, y in ((a_x, a_y), (b_x, b_y))]
+    floor = LEAST_DEVIATION**2 * a_x.shape[-2] * a_x.shape[-1]
     varies = (energy[0] > floor) & (energy[1] > floor)
     return torch.where(varies, 2 * common / torch.where(varies, energy[0] + energy[1], 1.0), 0.0).to(dtype)
 
 
 def aolp_error_deg(
-    a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], weight: Float[Tensor, "*b h w"]
+    a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], weight: Float[Tensor, "*b h w"], valid: Valid = None
 ) -> Float[Tensor, "*b"]:
     """Mean of the angle between two AoLP in radians, in degrees [0, 90]: the shorter way round the half circle.
 
@@ -106,39 +138,41 @@ def aolp_error_deg(
     """
     period = math.pi
     between = ((a - b).double() + period / 2).remainder(period) - period / 2
-    weight = weight.double()
-    total = weight.sum(dim=(-2, -1))
-    mean = (between.abs() * weight).sum(dim=(-2, -1)) / torch.where(total > 0, total, 1.0)
+    counted = weight.double() if valid is None else torch.where(valid, weight.double(), 0.0)
+    total = counted.sum(dim=(-2, -1))
+    mean = (between.abs() * counted).sum(dim=(-2, -1)) / torch.where(total > 0, total, 1.0)
     return torch.where(total > 0, mean.rad2deg(), CHANCE_AOLP_DEG).to(torch.promote_types(a.dtype, b.dtype))
 
 
-def ssim(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b"]:
+def ssim(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Structural similarity (Wang et al. 2004) for the data range 1, Gaussian window of 11 pixels and sigma 1.5.
 
     The mean over the whole frame, which is mirrored at its borders (the edge pixel is not repeated): torchmetrics'
     `structural_similarity_index_measure`. scikit-image averages the interior alone, where both agree.
+    With a mask: the mean of the map over the valid pixels. Windows of some of them reach other pixels, where `a` is
+    taken to be like `b`, the truth.
     Computed in float32 at least, whatever autocast says: variances are small differences of large means.
     ValueError for a frame smaller than 6 pixels.
     """
     if min(a.shape[-2:]) <= SSIM_RADIUS:
         raise ValueError(f"ssim needs frames of at least {SSIM_RADIUS + 1} pixels a side, got {tuple(a.shape[-2:])}")
     with torch.autocast(a.device.type, enabled=False):
-        a, b = (x if x.dtype == torch.float64 else x.float() for x in (a, b))
+        a, b = (x if x.dtype == torch.float64 else x.float() for x in (with_truth_outside(a, b, valid), b))
         mean_a, mean_b, square_a, square_b, product = _gaussian_means(torch.stack([a, b, a * a, b * b, a * b]))
         variance_a = (square_a - mean_a.square()).clamp(min=0)
         variance_b = (square_b - mean_b.square()).clamp(min=0)
         covariance = product - mean_a * mean_b
         luminance = (2 * mean_a * mean_b + SSIM_K1**2) / (mean_a.square() + mean_b.square() + SSIM_K1**2)
         structure = (2 * covariance + SSIM_K2**2) / (variance_a + variance_b + SSIM_K2**2)
-        return (luminance * structure).mean(dim=(-2, -1))
+        return mean_where(luminance * structure, valid)
 
 
-def _centred(frames: Tensor) -> Tensor:
-    return frames - frames.mean(dim=(-2, -1), keepdim=True)
+def _centred(frames: Tensor, valid: Valid = None) -> Tensor:
+    return frames - mean_where(frames, valid)[..., None, None]
 
 
-def _deviation(centred: Tensor) -> Tensor:
-    return centred.detach().square().mean(dim=(-2, -1)).sqrt()
+def _deviation(centred: Tensor, valid: Valid = None) -> Tensor:
+    return mean_where(centred.detach().square(), valid).sqrt()
 
 
 def _sobel(frames: Float[Tensor, "*b h w"]) -> tuple[Float[Tensor, "*b i j"], Float[Tensor, "*b i j"]]:
@@ -152,6 +186,13 @@ def _sobel(frames: Float[Tensor, "*b h w"]) -> tuple[Float[Tensor, "*b i j"], Fl
         filtered(filtered(frames, -1, SOBEL_SLOPE), -2, SOBEL_SMOOTH),
         filtered(filtered(frames, -2, SOBEL_SLOPE), -1, SOBEL_SMOOTH),
     )
+
+
+def _eroded(valid: Bool[Tensor, "*b h w"]) -> Bool[Tensor, "*b i j"]:
+    """Interior pixels that are valid with all eight neighbours."""
+    height, width = valid.shape[-2] - 2, valid.shape[-1] - 2
+    shifts = [valid[..., i : i + height, j : j + width] for i in range(3) for j in range(3)]
+    return torch.stack(shifts).all(dim=0)
 
 
 def _gaussian_means(frames: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:

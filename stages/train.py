@@ -1,13 +1,13 @@
-"""data/events.zarr, data/frames.zarr -> data/train: the DoLP network."""
+"""Events (data/events.zarr or made of data/scenes.zarr), data/frames.zarr -> data/train: the DoLP network."""
 
 from pathlib import Path
 
 from polarnet.config import Config, hydra_stage
-from polarnet.runtime import device_of
+from polarnet.runtime import device_of, threads_of
 from polarnet.training.dolp import dolp_task
 from polarnet.training.loop import train
 from polarnet.training.recorder import Recorder
-from polarnet.training.task import describe, lpips_of, open_split
+from polarnet.training.task import describe, lpips_of, open_events, open_split
 
 
 @hydra_stage
@@ -15,9 +15,11 @@ def main(config: Config) -> None:
     """Train `network` on the training split; a killed run of the same training goes on where it stopped."""
     lpips = lpips_of(Path(config.paths.weights), config.loss.lpips)
     task = dolp_task(config.network, config.network_config, config.train, config.loss, lpips, config.seed)
-    split = open_split(config.paths.events, config.paths.frames, task.encode)
-    metadata = describe(task, split, config.train, Path(config.paths.weights), config.seed)
-    recorder = Recorder(Path(config.paths.train), Path(config.paths.resume), metadata)
+    paths, threads = config.paths, threads_of(config.runtime)
+    events = open_events(config.train.data, paths.events, paths.scenes, config.emulate, config.seed, threads)
+    split = open_split(events, paths.frames, task.encode)
+    metadata = describe(task, split, config.train, Path(paths.weights), config.seed)
+    recorder = Recorder(Path(paths.train), Path(paths.resume), metadata)
     train(task, split, config.train, recorder, config.seed, device_of(config.runtime), config.runtime.workers)
 
 

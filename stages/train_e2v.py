@@ -1,13 +1,13 @@
-"""data/events.zarr, data/frames.zarr -> data/train_e2v: the events-to-intensity baseline, on the same sequences."""
+"""Events (data/events.zarr or made of data/scenes.zarr), data/frames.zarr -> data/train_e2v: the E2V baseline."""
 
 from pathlib import Path
 
 from polarnet.config import Config, hydra_stage
-from polarnet.runtime import device_of
+from polarnet.runtime import device_of, threads_of
 from polarnet.training.e2v import e2v_task
 from polarnet.training.loop import train
 from polarnet.training.recorder import Recorder
-from polarnet.training.task import describe, lpips_of, open_split
+from polarnet.training.task import describe, lpips_of, open_events, open_split
 
 
 @hydra_stage
@@ -16,9 +16,11 @@ def main(config: Config) -> None:
     e2v = config.baselines.e2v
     lpips = lpips_of(Path(config.paths.weights), e2v.lpips)
     task = e2v_task(e2v, lpips, config.seed)
-    split = open_split(config.paths.events, config.paths.frames, task.encode)
-    metadata = describe(task, split, e2v, Path(config.paths.weights), config.seed)
-    recorder = Recorder(Path(config.paths.train_e2v), Path(config.paths.resume), metadata)
+    paths, threads = config.paths, threads_of(config.runtime)
+    events = open_events(e2v.data, paths.events, paths.scenes, config.emulate, config.seed, threads)
+    split = open_split(events, paths.frames, task.encode)
+    metadata = describe(task, split, e2v, Path(paths.weights), config.seed)
+    recorder = Recorder(Path(paths.train_e2v), Path(paths.resume), metadata)
     train(task, split, e2v, recorder, config.seed, device_of(config.runtime), config.runtime.workers)
 
 

@@ -187,6 +187,17 @@ def test_an_angle_weighs_as_much_as_the_light_is_polarized():
     assert aolp_error_deg(error, 0 * error, torch.tensor([[0.9, 0.0]])).item() == 0
 
 
+def test_pixels_that_are_not_valid_count_in_no_gradient_angle_or_spread(pair):
+    a, b = pair
+    valid = torch.ones(2, 24, 31, dtype=torch.bool)
+    valid[:, :, 20:] = False
+    spoilt = torch.where(valid, a, 7.0)
+    known, other = a[..., :20], b[..., :20]
+    torch.testing.assert_close(gradient_agreement(spoilt, b, valid), gradient_agreement(known, other))
+    torch.testing.assert_close(aolp_error_deg(spoilt, b, b, valid), aolp_error_deg(known, other, other))
+    torch.testing.assert_close(spread_mse(spoilt, valid), spread_mse(known))
+
+
 def test_without_polarization_an_angle_is_right_by_chance():
     zero = torch.zeros(2, 3, 3)
     assert aolp_error_deg(zero, zero, zero).tolist() == [45.0, 45.0]
@@ -418,3 +429,42 @@ def test_weights_that_are_not_those_of_the_record_are_refused(hub, tmp_path):
 def test_an_unknown_backbone_is_refused():
     with pytest.raises(ValueError, match="backbone: expected one of squeeze, alex, vgg, got 'resnet'"):
         config("resnet")
+
+
+PIXELWISE = [mse, level_mse, pattern_mse, psnr, correlation]
+
+
+@pytest.mark.parametrize("metric", PIXELWISE)
+def test_a_masked_frame_scores_like_the_part_that_is_valid(pair, metric):
+    valid = torch.zeros(2, 24, 31, dtype=torch.bool)
+    valid[:, 3:20, 5:30] = True
+    part = [x[:, 3:20, 5:30] for x in pair]
+    torch.testing.assert_close(metric(*pair, valid), metric(*part), rtol=1e-5, atol=1e-7)
+
+
+def test_masked_ssim_is_the_mean_of_the_map_over_the_valid_pixels(pair):
+    """scikit-image's map, which it makes in its own way; the frames agree where they are masked."""
+    truth, other = pair
+    valid = torch.zeros(24, 31, dtype=torch.bool)
+    valid[6:12, 8:20] = True
+    mixed = torch.where(valid, other, truth)
+    for a, b, score in zip(mixed, truth, ssim(mixed, truth, valid.expand(2, -1, -1)), strict=True):
+        options = {"data_range": 1.0, "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+        _, whole = structural_similarity(a.numpy(), b.numpy(), full=True, **options)
+        assert score.item() == pytest.approx(float(whole[valid.numpy()].mean()), abs=1e-5)
+
+
+@pytest.mark.parametrize("metric", [*PIXELWISE, ssim])
+def test_what_lies_outside_a_mask_does_not_matter(pair, metric):
+    predicted, truth = pair
+    valid = torch.rand(2, 24, 31, generator=torch.Generator().manual_seed(5)) < 0.7
+    spoilt = torch.where(valid, predicted, 1 - predicted)
+    assert not torch.equal(metric(spoilt, truth), metric(predicted, truth))
+    assert torch.equal(metric(spoilt, truth, valid), metric(predicted, truth, valid))
+
+
+@pytest.mark.parametrize("metric", [*PIXELWISE, ssim])
+def test_a_mask_that_masks_nothing_changes_nothing_and_one_that_masks_all_leaves_no_number(pair, metric):
+    everywhere = torch.ones(2, 24, 31, dtype=torch.bool)
+    torch.testing.assert_close(metric(*pair, everywhere), metric(*pair))
+    assert metric(*pair, ~everywhere).isnan().all()

@@ -93,7 +93,8 @@ class BenchmarkSet:
         i0, _, i90, _ = truth.intensity[1:].unbind(1)
         events = self.events.read(sequence)
         scene = self.scene_of(sequence)
-        return Recording(sequence, scene, events, truth.t_us, truth.dolp[1:], truth.aolp[1:], i0 + i90)
+        valid = None if truth.valid is None else truth.valid[1:]
+        return Recording(sequence, scene, events, truth.t_us, truth.dolp[1:], truth.aolp[1:], i0 + i90, valid)
 
     def recordings(self) -> Iterator[Recording]:
         """All of them, one after another."""
@@ -101,8 +102,13 @@ class BenchmarkSet:
 
 
 def train_mean_dolp(frames: FrameStore, warmup_windows: int) -> float:
-    """Mean DoLP of the training split over the windows that a benchmark would score."""
-    return mean_dolp(frames.dolp(name)[1 + warmup_windows :] for name in frames.of_split("train"))
+    """Mean DoLP of the training split over the windows and pixels that a benchmark would score."""
+
+    def scored(name: str) -> Tensor:
+        dolp, valid = frames.dolp(name)[1 + warmup_windows :], frames.valid(name)
+        return dolp if valid is None else dolp[valid[1 + warmup_windows :]]
+
+    return mean_dolp(scored(name) for name in frames.of_split("train"))
 
 
 def run_benchmark(

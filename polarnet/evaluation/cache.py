@@ -30,6 +30,8 @@ def sequence_digest(recording: Recording) -> str:
     parts = [recording.name, recording.scene]
     columns = [column for e in recording.events for column in (e.t, e.x, e.y, e.p)]
     arrays = [*columns, recording.t_us, recording.dolp, recording.aolp, recording.s0]
+    if recording.valid is not None:
+        arrays.append(recording.valid)
     return digest(*parts, *(np.ascontiguousarray(array.numpy()).tobytes() for array in arrays))
 
 

@@ -74,6 +74,7 @@ def first_windows(recording: Recording, count: int) -> Recording:
         dolp=recording.dolp[:count],
         aolp=recording.aolp[:count],
         s0=recording.s0[:count],
+        valid=None if recording.valid is None else recording.valid[:count],
     )
 
 

@@ -226,9 +226,13 @@ def _sliding_scores(
     first = recording.events[0]
     count = max(2, round(per_pixel * first.height * first.width))
     frames = sliding_recovery(recording, network, count, times, carry, context)
-    truth = recording.dolp
+    truth, valid = recording.dolp, recording.valid
     spans = [_span_us(events, count, times[len(times) // 2]) for events in recording.events]
-    scores = {"mse": mse(frames, truth), "psnr": psnr(frames, truth), "corr": correlation(frames, truth)}
+    scores = {
+        "mse": mse(frames, truth, valid),
+        "psnr": psnr(frames, truth, valid),
+        "corr": correlation(frames, truth, valid),
+    }
     return {
         **{name: float(values.mean()) for name, values in scores.items()},
         "change": float(frames.diff(dim=0).abs().mean()),

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from polarnet.baselines.complementary_filter import (
@@ -45,6 +45,8 @@ class Recording:
     """Truth at the end of each window; so are the next two."""
     aolp: Float[Tensor, "n h w"]
     s0: Float[Tensor, "n h w"]
+    valid: Bool[Tensor, "n h w"] | None = None
+    """Where the truth is known, and so scored; None: everywhere."""
 
 
 class Polarization(NamedTuple):
@@ -121,7 +123,7 @@ def train_mean(recording: Recording, context: Context) -> Polarization:
 
 def own_mean(recording: Recording, context: Context) -> Polarization:
     """The best of all constants for each frame, which only the truth can tell."""
-    return Polarization(oracle_mean(recording.dolp))
+    return Polarization(oracle_mean(recording.dolp, recording.valid))
 
 
 def from_intensities(method: IntensityMethod) -> Method:

@@ -13,9 +13,9 @@ from polarnet.runtime import generator_for, seed_for
 from polarnet.simulation.emulator import EmulatorConfig, randomised
 from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
-from polarnet.simulation.scenes import SceneStore
+from polarnet.simulation.scenes import SceneRecord, SceneStore
 from polarnet.simulation.synthesize import synthesize_sequence
-from polarnet.simulation.truth import frames_of
+from polarnet.simulation.truth import frames_of, valid_frames
 
 
 def recording_at(scenes: SceneStore, sequence: str, events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> Recording:
@@ -23,7 +23,7 @@ def recording_at(scenes: SceneStore, sequence: str, events: Sequence[Events], t_
     record = scenes.read(sequence)
     trajectory = Trajectory.from_vector(record.trajectory.numpy())
     scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
-    return _recording(scenes, sequence, record.picture, scene, trajectory, events, t_us)
+    return _recording(scenes, record, scene, trajectory, events, t_us)
 
 
 def resimulated(
@@ -63,18 +63,19 @@ def resimulated(
             seen = synthesize_sequence(scene, trajectory, int(t_us[-1]), *size, sensor, key, threads)
             made.append((sensor, seen))
         events.append(seen[polarizer])
-    return _recording(scenes, sequence, record.picture, scene, trajectory, events, t_us)
+    return _recording(scenes, record, scene, trajectory, events, t_us)
 
 
 def _recording(
     scenes: SceneStore,
-    sequence: str,
-    picture: str,
+    record: SceneRecord,
     scene: PolarizationScene,
     trajectory: Trajectory,
     events: Sequence[Events],
     t_us: Int64[Tensor, " n"],
 ) -> Recording:
-    seen = frames_of(scene, trajectory, t_us.tolist(), scenes.window_height, scenes.window_width)
-    intensity, dolp, aolp = (frames[1:] for frames in seen)
-    return Recording(sequence, picture, events, t_us, dolp, aolp, intensity[:, 0] + intensity[:, 2])
+    size = scenes.window_height, scenes.window_width
+    intensity, dolp, aolp = (frames[1:] for frames in frames_of(scene, trajectory, t_us.tolist(), *size))
+    valid = None if record.valid is None else valid_frames(record.valid, trajectory, t_us.tolist()[1:], *size)
+    s0 = intensity[:, 0] + intensity[:, 2]
+    return Recording(record.name, record.picture, events, t_us, dolp, aolp, s0, valid)

@@ -27,6 +27,7 @@ from polarnet.similarity import (
     psnr,
     spread_mse,
     ssim,
+    with_truth_outside,
 )
 
 METRICS = ("mse", "psnr", "ssim", "lpips", "corr", "grad", "level_mse", "pattern_mse", "aolp_deg", "skill")
@@ -105,9 +106,11 @@ def score_sequence(
 ) -> list[FrameScore]:
     """A row per method and window after the warm-up; `recovered` is each method's polarization, a frame a window.
 
-    Computed on `device`, where `lpips` has to be.
+    Computed on `device`, where `lpips` has to be. Pixels that are not valid count in no score but LPIPS, which sees the
+    truth there in place of the method's answer.
 
-    ValueError, which names the frame, for a score that is not a number: no frame is ever left out.
+    ValueError, which names the frame, for a score that is not a number, or a frame without a valid pixel: no frame is
+    ever left out.
     """
     windows = scored_windows(recording, warmup_windows)
     for method, found in recovered.items():
@@ -126,20 +129,25 @@ def score_sequence(
         for method, found in recovered.items()
     }
     truth, true_aolp = (x[warmup_windows:].to(device) for x in (recording.dolp, recording.aolp))
-    oracle_mse = spread_mse(truth)
-    distances = _lpips_of({method: found.dolp for method, found in counted.items()}, truth, lpips)
+    valid = None if recording.valid is None else scored(recording.valid)
+    if valid is not None and not (known := valid.any(-1).any(-1)).all():
+        window = warmup_windows + int(known.logical_not().nonzero()[0])
+        raise ValueError(f"{recording.name}, window {window}: no pixel is valid; leave this measurement out")
+    oracle_mse = spread_mse(truth, valid)
+    shown = {method: with_truth_outside(found.dolp, truth, valid) for method, found in counted.items()}
+    distances = _lpips_of(shown, truth, lpips)
     rows = []
     for method, (dolp, aolp) in counted.items():
         per_frame: dict[str, Tensor | None] = {
-            "mse": mse(dolp, truth),
-            "psnr": psnr(dolp, truth),
-            "ssim": ssim(dolp, truth),
+            "mse": mse(dolp, truth, valid),
+            "psnr": psnr(dolp, truth, valid),
+            "ssim": ssim(dolp, truth, valid),
             "lpips": None if distances is None else distances[method],
-            "corr": correlation(dolp, truth),
-            "grad": gradient_agreement(dolp, truth),
-            "level_mse": level_mse(dolp, truth),
-            "pattern_mse": pattern_mse(dolp, truth),
-            "aolp_deg": None if aolp is None else aolp_error_deg(aolp, true_aolp, truth),
+            "corr": correlation(dolp, truth, valid),
+            "grad": gradient_agreement(dolp, truth, valid),
+            "level_mse": level_mse(dolp, truth, valid),
+            "pattern_mse": pattern_mse(dolp, truth, valid),
+            "aolp_deg": None if aolp is None else aolp_error_deg(aolp, true_aolp, truth, valid),
             "oracle_mse": oracle_mse,
         }
         columns = {

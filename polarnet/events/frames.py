@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64, UInt16
+from jaxtyping import Bool, Float, Int64, UInt8, UInt16
 from torch import Tensor
 
 from polarnet.events.table import Column, Columns, Table, check_names, create_table, open_table, refuse_missing
@@ -28,6 +28,8 @@ CONVENTIONS = {
     "aolp": "angle of linear polarization in radians, [0, pi): value * pi / 65536",
 }
 
+MASK_CONVENTION = "whether the truth of a pixel is known, 8 pixels of a row a byte, the leftmost in the highest bit"
+
 
 class Frames(NamedTuple):
     """The frames of one sequence."""
@@ -36,6 +38,8 @@ class Frames(NamedTuple):
     intensity: Float[Tensor, "n 4 h w"]
     dolp: Float[Tensor, "n h w"]
     aolp: Float[Tensor, "n h w"]
+    valid: Bool[Tensor, "n h w"] | None = None
+    """Where the truth is known; None: everywhere."""
 
 
 def quantise_fraction(fraction: Float[Tensor, "*shape"]) -> UInt16[np.ndarray, "*shape"]:
@@ -60,6 +64,16 @@ def dequantise_angle(steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*sha
     return torch.from_numpy(steps.astype(np.float32)).mul_(math.pi / ANGLE_STEPS)
 
 
+def pack_mask(valid: Bool[Tensor, "*b h w"]) -> UInt8[np.ndarray, "*b h bytes"]:
+    """8 pixels of a row in a byte."""
+    return np.packbits(valid.numpy(), axis=-1)
+
+
+def unpack_mask(packed: UInt8[np.ndarray, "*b h bytes"], width: int) -> Bool[Tensor, "*b h w"]:
+    """What `pack_mask` packed."""
+    return torch.from_numpy(np.unpackbits(packed, axis=-1, count=width).astype(bool))
+
+
 class FrameStore:
     """Frames of sequences, and which sequences are for training, validation and test; see `create` and `open`."""
 
@@ -70,6 +84,8 @@ class FrameStore:
         self.splits: dict[str, str] = dict(zip(self.sequences, table.attributes["splits"], strict=True))
         self.height: int = table.attributes["height"]
         self.width: int = table.attributes["width"]
+        self.masked: bool = "valid" in table.columns
+        """Whether there may be pixels whose truth is not known."""
         self.attributes: dict[str, Any] = table.attributes["attributes"]
         """What whoever created the store said about it."""
 
@@ -83,10 +99,12 @@ class FrameStore:
         height: int,
         width: int,
         attributes: Mapping[str, Any],
+        masked: bool = False,
     ) -> "FrameStore":
         """A store to write, at PATH.tmp until it is finished, for at most `n_frames` a sequence.
 
-        `splits` maps each sequence to train, val or test. Resumes as `EventStore.create` does.
+        `splits` maps each sequence to train, val or test. A `masked` store says of every pixel whether its truth is
+        known; one that is not holds nothing about it. Resumes as `EventStore.create` does.
         """
         check_names(sequences)
         check_splits(sequences, splits)
@@ -99,6 +117,8 @@ class FrameStore:
             "conventions": CONVENTIONS,
             "attributes": dict(attributes),
         }
+        if masked:
+            metadata |= {"masked": True, "conventions": {**CONVENTIONS, "valid": MASK_CONVENTION}}
         return cls(create_table(path, FORMAT, VERSION, metadata, _columns(metadata)))
 
     @classmethod
@@ -113,12 +133,14 @@ class FrameStore:
         intensity: Float[Tensor, "n 4 h w"],
         dolp: Float[Tensor, "n h w"],
         aolp: Float[Tensor, "n h w"],
+        valid: Bool[Tensor, "n h w"] | None = None,
     ) -> None:
         """Put the frames of a sequence in its row; a sequence that is there already stays as it is.
 
-        ValueError for values out of range or times that do not increase.
+        ValueError for values out of range, times that do not increase, or a mask (None: all pixels are valid) in a
+        store that has none.
         """
-        self._check(t_us, intensity, dolp, aolp)
+        self._check(t_us, intensity, dolp, aolp, valid)
         if self._table.is_written("t_us", sequence):
             return
         values = {
@@ -128,6 +150,9 @@ class FrameStore:
         }
         for name, steps in values.items():
             self._table.write(name, sequence, steps)
+        if self.masked:
+            known = torch.ones(dolp.shape, dtype=torch.bool) if valid is None else valid
+            self._table.write("valid", sequence, pack_mask(known))
         self._table.write("t_us", sequence, t_us.numpy())
 
     def missing(self) -> list[str]:
@@ -160,19 +185,28 @@ class FrameStore:
         """Angle of linear polarization in radians, [0, pi)."""
         return dequantise_angle(self._read("aolp", sequence))
 
+    def valid(self, sequence: str) -> Bool[Tensor, "n h w"] | None:
+        """Where the truth is known; None: everywhere."""
+        return unpack_mask(self._read("valid", sequence), self.width) if self.masked else None
+
     def frames(self, sequence: str) -> Frames:
         """All of a sequence."""
         t_us = self.t_us(sequence)
         window = (slice(len(t_us)),)
-        intensity, dolp, aolp = self._table.read_together(
-            [(name, sequence, window) for name in ("intensity", "dolp", "aolp")]
+        names = ["intensity", "dolp", "aolp", *(["valid"] if self.masked else [])]
+        intensity, dolp, aolp, *packed = self._table.read_together([(name, sequence, window) for name in names])
+        return Frames(
+            t_us,
+            dequantise_fraction(intensity),
+            dequantise_fraction(dolp),
+            dequantise_angle(aolp),
+            unpack_mask(packed[0], self.width) if packed else None,
         )
-        return Frames(t_us, dequantise_fraction(intensity), dequantise_fraction(dolp), dequantise_angle(aolp))
 
     def problems(self, sequence: str) -> list[str]:
         """Damaged or missing data of a sequence."""
         problems = []
-        for read in (self.t_us, self.intensity, self.dolp, self.aolp):
+        for read in (self.t_us, self.intensity, self.dolp, self.aolp, self.valid):
             try:
                 read(sequence)
             except ValueError as error:
@@ -182,7 +216,9 @@ class FrameStore:
     def _read(self, name: str, sequence: str) -> np.ndarray:
         return self._table.read(name, sequence, slice(len(self.t_us(sequence))))
 
-    def _check(self, t_us: Tensor, intensity: Tensor, dolp: Tensor, aolp: Tensor) -> None:
+    def _check(self, t_us: Tensor, intensity: Tensor, dolp: Tensor, aolp: Tensor, valid: Tensor | None) -> None:
+        if valid is not None and not self.masked:
+            raise ValueError(f"{self.path}: got a mask for a store without one; create it with masked=True")
         n, most = len(t_us), self._table.columns["t_us"].shape[0]
         if not 0 < n <= most or (t_us < 0).any() or (t_us.diff() <= 0).any():
             raise ValueError(f"expected 1 to {most} frame times, increasing from 0 or later, got {t_us.tolist()[:40]}")
@@ -190,6 +226,7 @@ class FrameStore:
             ("intensity", intensity, (n, 4, self.height, self.width)),
             ("dolp", dolp, (n, self.height, self.width)),
             ("aolp", aolp, (n, self.height, self.width)),
+            ("valid", dolp if valid is None else valid, (n, self.height, self.width)),
         ):
             if tuple(frames.shape) != shape:
                 raise ValueError(f"expected {name} of shape {shape}, got {tuple(frames.shape)}")
@@ -235,7 +272,7 @@ def _columns(metadata: Mapping[str, Any]) -> Columns:
             shuffle="bitshuffle",
         )
 
-    return {
+    columns = {
         "intensity": pictures(4),
         "dolp": pictures(),
         "aolp": pictures(),
@@ -243,6 +280,19 @@ def _columns(metadata: Mapping[str, Any]) -> Columns:
             metadata["sequences"], (n,), (n,), (n,), "int64", fill=-1, fill_is_data=False, shuffle="shuffle"
         ),
     }
+    if metadata.get("masked"):
+        row = (size[0], -(-size[1] // 8))
+        columns["valid"] = Column(
+            metadata["sequences"],
+            (n, *row),
+            (together, *row),
+            (whole, *row),
+            "uint8",
+            fill=0,
+            fill_is_data=True,
+            shuffle="bitshuffle",
+        )
+    return columns
 
 
 def _check_range(values: Tensor, most: float) -> None:

@@ -104,8 +104,10 @@ class EventStore:
             start + first_at_millisecond(c.t, duration_us) for start, c in zip(offsets[:-1], channels, strict=True)
         ]
         for name in "xytp":
-            values = torch.cat([getattr(channel, name) for channel in channels]).numpy()
-            self._table.write(f"events/{name}", sequence, values)
+            column = f"events/{name}"
+            pieces, dtype = [getattr(channel, name).numpy() for channel in channels], self._table.columns[column].dtype
+            # checked above: nothing is lost in the narrower types of the disk
+            self._table.write(column, sequence, np.concatenate(pieces, dtype=dtype, casting="unsafe"))
         self._table.write("ms_to_idx", sequence, np.stack(index))
         self._table.write("duration_us", sequence, np.array(duration_us))
         self._table.write("offsets", sequence, offsets)

@@ -2,17 +2,47 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from polarnet.events.frames import FrameStore
 from polarnet.events.representations import Encode
-from polarnet.events.store import EventStore
 from polarnet.events.stream import Events, slice_count
+
+
+@runtime_checkable
+class EventSource(Protocol):
+    """Where the events of named sequences come from, by time window: a store on disk, or an emulator.
+
+    `polarnet.events.store.EventStore` reads them, `polarnet.simulation.fly.EmulatedEvents` makes them when asked.
+    """
+
+    @property
+    def path(self) -> str:
+        """Of what is read: the store of events, or the scenes that they are made from."""
+
+    @property
+    def sequences(self) -> list[str]:
+        """Their names."""
+
+    @property
+    def height(self) -> int:
+        """Rows of the sensor."""
+
+    @property
+    def width(self) -> int:
+        """Columns of the sensor."""
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """What the events depend on, beside what lies at `path`."""
+
+    def read(self, sequence: str, start_us: int | None = None, stop_us: int | None = None) -> list[Events]:
+        """The four channels of a sequence, or their events with start <= t < stop."""
 
 
 class WindowSequence(NamedTuple):
@@ -24,6 +54,8 @@ class WindowSequence(NamedTuple):
     dolp: Float[Tensor, "t h w"]
     aolp: Float[Tensor, "t h w"]
     intensity: Float[Tensor, "t 4 h w"]
+    valid: Bool[Tensor, "t h w"] | None = None
+    """Where the truth is known; None: everywhere."""
 
 
 def windows_of(t_us: Int64[Tensor, " n"]) -> list[tuple[int, int]]:
@@ -57,7 +89,7 @@ def encode_windows(channels: Sequence[Events], t_us: Int64[Tensor, " n"], encode
 class WindowDataset(Dataset[WindowSequence]):
     """Item i: all windows of sequence i, encoded as it is asked for. Frames give the windows' ends and the truth."""
 
-    def __init__(self, events: EventStore, frames: FrameStore, sequences: list[str], encode: Encode):
+    def __init__(self, events: EventSource, frames: FrameStore, sequences: list[str], encode: Encode):
         absent = [name for name in sequences if name not in set(events.sequences) & set(frames.sequences)]
         if absent:
             raise ValueError(f"{', '.join(absent[:8])}: not both in {events.path} and in {frames.path}")
@@ -76,6 +108,7 @@ class WindowDataset(Dataset[WindowSequence]):
 
     def __getitem__(self, i: int) -> WindowSequence:
         name = self.sequences[i]
-        t_us, intensity, dolp, aolp = self.frames.frames(name)
+        t_us, intensity, dolp, aolp, valid = self.frames.frames(name)
         inputs = encode_windows(self.events.read(name), t_us, self.encode)
-        return WindowSequence(name, inputs, dolp[1:], aolp[1:], intensity[1:])
+        known = None if valid is None else valid[1:]
+        return WindowSequence(name, inputs, dolp[1:], aolp[1:], intensity[1:], known)

@@ -70,11 +70,67 @@ def benchmark_block(results: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def emulation_block(results: Mapping[str, Any]) -> str:
+    """The pixel models' seconds and timing errors, golden cases and the paper set.
+
+    `results` is docs/results/emulation.json as tests/benchmarks/emulation.py writes it; what it lacks is left out.
+    """
+    models = [name for name, figures in results.items() if "seconds_1_thread" in _mapping(figures)]
+    columns = [
+        (key, label, digits) for key, label, digits in EMULATION_COLUMNS if any(key in results[m] for m in models)
+    ]
+    lines = [
+        "| model | " + " | ".join(label for _, label, _ in columns) + " |",
+        "|---" * (1 + len(columns)) + "|",
+        *(
+            f"| `{model}` | "
+            + " | ".join(f"{results[model][key]:,.{n}f}" if key in results[model] else "-" for key, _, n in columns)
+            + " |"
+            for model in models
+        ),
+        "",
+    ]
+    if "golden_cases_passed" in results:
+        lines += [f"Golden cases of v2e and ESIM met: {results['golden_cases_passed']} of {GOLDEN_CASES}.", ""]
+    if paper := _mapping(results.get("paper_set")):
+        text = f"A set of {paper['sequences']} sequences, from pictures to the event store on disk, took "
+        text += f"{paper['minutes']:.1f} minutes with at most {paper['peak_mib']:,.0f} MiB of memory"
+        if stages := paper.get("stage_minutes"):
+            text += " (" + ", ".join(f"{name} {minutes:.1f}" for name, minutes in stages.items()) + ")"
+        lines += [f"{text}.", ""]
+    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
+    lines.append(
+        f"On {results['cores']} cores ({results['machine']}, load {results['load']:.1f} before the start; {versions}; "
+        f"commit `{results['commit'][:10]}`)."
+    )
+    return "\n".join(lines)
+
+
+GOLDEN_CASES = 23  # 15 of v2e, 8 of ESIM
+EMULATION_COLUMNS = (
+    ("seconds_1_thread", "seconds, 1 thread", 3),
+    ("seconds_2_threads", "2 threads", 3),
+    ("mpixel_updates_per_s", "Mpixel updates / s", 0),
+    ("mevents_per_s", "Mevents / s", 1),
+    ("peak_mib", "peak MiB", 0),
+    ("timing_error_ms_300fps", "timing error at 300 fps, ms", 3),
+    ("timing_error_ms_120fps", "at 120 fps, ms", 3),
+)
+"""Key of a model's figures, heading, decimals."""
+
 RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "pipeline": pipeline_block,
     "benchmark": benchmark_block,
+    "emulation": emulation_block,
 }
 """What writes the block of each name."""
+
+UNMEASURED = {"emulation": "Not measured yet: `python tests/benchmarks/emulation.py --write` does it."}
+"""Blocks that may stand in a document before their results do, and what they say until then."""
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
 
 
 def _with_blocks(text: str, path: Path, results: Path) -> str:
@@ -93,6 +149,8 @@ def _rendered(name: str, path: Path, results: Path) -> str:
     if name not in RENDERERS:
         raise ValueError(f"{path}: no renderer for results:{name}; there are {', '.join(RENDERERS)}")
     file = results / f"{name}.json"
+    if not file.exists() and name in UNMEASURED:
+        return UNMEASURED[name]
     if not file.exists():
         raise FileNotFoundError(f"{path} shows results:{name}, but {file} is missing; run `polarnet measure`")
     return RENDERERS[name](json.loads(file.read_text(encoding="utf-8"))).strip()

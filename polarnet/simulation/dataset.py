@@ -27,18 +27,23 @@ def emulate_scenes(
     stopped.
     """
     source = SceneStore.open(scenes)
-    attributes = {
-        "emulate": asdict(config),
-        "seed": seed,
-        "scenes": source.attributes,
-        "polarnet": __version__,  # an unfinished store of another version is not gone on with
-    }
+    attributes = origin_of(source, config, seed)
     store = EventStore.create(events, source.sequences, source.window_height, source.window_width, attributes)
     task = functools.partial(_emulate_into, scenes=source, events=store, config=config, seed=seed, threads=threads)
     for _ in mapper(task, store.missing()):
         pass
     store.finish()
     return len(store.sequences)
+
+
+def origin_of(scenes: SceneStore, config: EmulatorConfig, seed: int) -> dict[str, Any]:
+    """All that the events of a scene store depend on."""
+    return {
+        "emulate": asdict(config),
+        "seed": seed,
+        "scenes": scenes.attributes,
+        "polarnet": __version__,  # an unfinished store of another version is not gone on with
+    }
 
 
 def emulate_sequence(

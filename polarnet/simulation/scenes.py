@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from polarnet.events.frames import (
@@ -34,6 +34,8 @@ CONVENTIONS = {
     "duration_us": "length of a sequence in microseconds",
 }
 
+MASK_CONVENTION = "1 where the light of a pixel is known, 0 where saturation hid it"
+
 
 class SceneRecord(NamedTuple):
     """One sequence, ready to be rendered."""
@@ -46,6 +48,8 @@ class SceneRecord(NamedTuple):
     aolp: Float[Tensor, "h w"]
     trajectory: Float64[Tensor, " k"]
     duration_us: int
+    valid: Bool[Tensor, "h w"] | None = None
+    """Where the light is known; None: everywhere."""
 
 
 class SceneStore:
@@ -62,6 +66,8 @@ class SceneStore:
         self.window_height: int = metadata["window_height"]
         self.window_width: int = metadata["window_width"]
         self.trajectory_names: list[str] = list(metadata["trajectory"])
+        self.masked: bool = "valid" in table.columns
+        """Whether there may be pixels whose light is not known."""
         self.attributes: dict[str, Any] = metadata["attributes"]
         """What whoever created the store said about it."""
 
@@ -76,12 +82,13 @@ class SceneStore:
         window: tuple[int, int],
         trajectory_names: Sequence[str],
         attributes: Mapping[str, Any],
+        masked: bool = False,
     ) -> "SceneStore":
         """A store to write, at PATH.tmp until it is finished, with a row for each sequence and one for each picture.
 
         `picture_of` maps each sequence to its picture, `splits` each sequence to train, val or test; ValueError where
         two sequences of one picture are in different splits. `largest_picture` and `window` are (height, width) in
-        pixels. Resumes as `EventStore.create` does.
+        pixels. A `masked` store says of every pixel whether its light is known. Resumes as `EventStore.create` does.
         """
         sequences = list(picture_of)
         pictures = sorted(set(picture_of.values()))
@@ -100,6 +107,8 @@ class SceneStore:
             "conventions": CONVENTIONS,
             "attributes": dict(attributes),
         }
+        if masked:
+            metadata |= {"masked": True, "conventions": {**CONVENTIONS, "valid": MASK_CONVENTION}}
         return cls(create_table(path, FORMAT, VERSION, metadata, _columns(metadata)))
 
     @classmethod
@@ -108,12 +117,22 @@ class SceneStore:
         return cls(open_table(path, FORMAT, VERSION, _columns))
 
     def write_picture(
-        self, picture: str, s0: Float[Tensor, "h w"], dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]
+        self,
+        picture: str,
+        s0: Float[Tensor, "h w"],
+        dolp: Float[Tensor, "h w"],
+        aolp: Float[Tensor, "h w"],
+        valid: Bool[Tensor, "h w"] | None = None,
     ) -> None:
-        """Put a picture in its row; one that is there already stays as it is.
+        """Put a picture in its row; one that is there already stays as it is. `valid` None: all its light is known.
 
-        ValueError for values out of range or a picture of a size that cannot be.
+        ValueError for values out of range, a picture of a size that cannot be, or a mask in a store that has none.
         """
+        if valid is not None and (not self.masked or valid.shape != s0.shape):
+            raise ValueError(
+                f"{picture}: expected a mask of {tuple(s0.shape)} in a store created with masked=True, "
+                f"got one of {tuple(valid.shape)}, masked={self.masked}"
+            )
         height, width = self._table.columns["s0"].shape
         if not (self.window_height <= s0.shape[0] <= height and self.window_width <= s0.shape[1] <= width):
             raise ValueError(
@@ -123,6 +142,9 @@ class SceneStore:
         planes = {"s0": quantise_fraction(s0), "dolp": quantise_fraction(dolp), "aolp": quantise_angle(aolp)}
         if self._table.is_written("picture_size", picture):
             return
+        if self.masked:
+            known = torch.ones(s0.shape, dtype=torch.bool) if valid is None else valid
+            planes["valid"] = known.numpy().astype(np.uint8)
         for name, steps in planes.items():
             self._table.write(name, picture, steps)
         self._table.write("picture_size", picture, np.array(s0.shape))
@@ -161,9 +183,8 @@ class SceneStore:
         trajectory = torch.from_numpy(self._table.read("trajectory", sequence))
         picture = self.picture_of[sequence]
         height, width = self._table.read("picture_size", picture).tolist()
-        s0, dolp, aolp = (
-            self._table.read(name, picture, slice(height), slice(width)) for name in ("s0", "dolp", "aolp")
-        )
+        names = ["s0", "dolp", "aolp", *(["valid"] if self.masked else [])]
+        s0, dolp, aolp, *valid = (self._table.read(name, picture, slice(height), slice(width)) for name in names)
         return SceneRecord(
             sequence,
             picture,
@@ -173,6 +194,7 @@ class SceneStore:
             dequantise_angle(aolp),
             trajectory,
             self.duration_us(sequence),
+            torch.from_numpy(valid[0] == 1) if valid else None,
         )
 
     def duration_us(self, sequence: str) -> int:
@@ -212,8 +234,8 @@ def _columns(metadata: Mapping[str, Any]) -> Columns:
     size = tuple(metadata["largest_picture"])
     numbers = (len(metadata["trajectory"]),)
 
-    def plane() -> Column:
-        return Column(metadata["pictures"], size, size, size, "uint16", fill=0, fill_is_data=True, shuffle="bitshuffle")
+    def plane(dtype: str = "uint16") -> Column:
+        return Column(metadata["pictures"], size, size, size, dtype, fill=0, fill_is_data=True, shuffle="bitshuffle")
 
     def row(names: Sequence[str], shape: tuple[int, ...], dtype: str, fill: int | float) -> Column:
         return Column(names, shape, shape, shape, dtype, fill, fill_is_data=False, shuffle="shuffle")
@@ -222,6 +244,7 @@ def _columns(metadata: Mapping[str, Any]) -> Columns:
         "s0": plane(),
         "dolp": plane(),
         "aolp": plane(),
+        **({"valid": plane("uint8")} if metadata.get("masked") else {}),
         "picture_size": row(metadata["pictures"], (2,), "int64", -1),
         "duration_us": row(metadata["sequences"], (), "int64", -1),
         "trajectory": row(metadata["sequences"], numbers, "float64", float("nan")),

@@ -12,7 +12,7 @@ from polarnet.simulation.compilation import compiled
 from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, events_of, run
 from polarnet.simulation.motion import Pose, Trajectory, bilinear, window_to_scene
 from polarnet.simulation.pixels.columns import Columns
-from polarnet.simulation.pixels.light import FULL_SCALE, light_of_frames, light_of_scene
+from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames, light_of_scene
 from polarnet.simulation.scene import PolarizationScene
 from polarnet.stokes import intensities_from_stokes
 
@@ -65,9 +65,7 @@ def synthesize_steps(
     _check_inside(scene, pose, t_us, height, width)
     see = functools.partial(run, height=height, width=width, config=config, key=key, planes=POLARIZERS, threads=threads)
     if _drifts(pose):
-        left, top = pose.x - (width - 1) / 2, pose.y - (height - 1) / 2
-        lights = [light_of_scene(plane, top, left) for plane in _scene_behind_polarizers(scene)]
-        columns, state = see(lights, t_us.astype(np.float64), state=state)
+        columns, state = see(_lights_of_drift(scene, pose, height, width), t_us.astype(np.float64), state=state)
         return [events_of(c, height, width) for c in columns], state
     pieces = []
     for first in range(0, len(t_us), TURNING_CHUNK):
@@ -162,10 +160,18 @@ def _render_turning(stokes, x, y, angle, zoom, frames) -> None:  # pragma: no co
                     frames[plane + 2, k, row, column] = max(half * (s0 - part), np.float32(0)) + rounding
 
 
-def _scene_behind_polarizers(scene: PolarizationScene) -> Float32[np.ndarray, "4 h1 w1"]:
-    """Digital numbers of the whole scene, a row and a column wider, so that interpolation may look past the last."""
-    intensities = intensities_from_stokes(scene.stokes).clamp(min=0) * FULL_SCALE
-    return np.pad(intensities.numpy(), ((0, 0), (0, 1), (0, 1)), mode="edge")
+def _lights_of_drift(scene: PolarizationScene, pose: Pose, height: int, width: int) -> list[Light]:
+    """What falls on the four planes of a window that only drifts, over the part of the scene that it comes to see."""
+    left, top = pose.x - (width - 1) / 2, pose.y - (height - 1) / 2
+    rows, columns = _seen(top, height, scene.height), _seen(left, width, scene.width)
+    intensities = intensities_from_stokes(scene.stokes[:, rows, columns]).clamp(min=0) * FULL_SCALE
+    planes = np.pad(intensities.numpy(), ((0, 0), (0, 1), (0, 1)), mode="edge")
+    return [light_of_scene(plane, top - rows.start, left - columns.start) for plane in planes]
+
+
+def _seen(first: Float64[np.ndarray, " n"], size: int, limit: int) -> slice:
+    """The rows or columns of a scene that a window of `size` needs, whose own first ones lie at `first`."""
+    return slice(math.floor(first.min()), min(math.floor(first.max()) + size + 1, limit))
 
 
 def _corners(pose: Pose, height: int, width: int) -> tuple[Float64[np.ndarray, "4 n"], Float64[np.ndarray, "4 n"]]:

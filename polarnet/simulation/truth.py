@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from polarnet import stokes
@@ -37,6 +37,18 @@ def frames_of(
     """
     seen = render(scene, trajectory, np.asarray(t_us) * 1e-6, height, width)
     return stokes.intensities_from_stokes(seen).clamp(0, 1), stokes.dolp(seen).clamp(0, 1), stokes.aolp(seen)
+
+
+def valid_frames(
+    valid: Bool[Tensor, "h1 w1"], trajectory: Trajectory, t_us: Sequence[int], height: int, width: int
+) -> Bool[Tensor, "n h w"]:
+    """Where a window of a scene shows known light: at pixels whose interpolation uses valid pixels of the scene alone.
+
+    The weights of the interpolation are not negative, so that a masked plane seen through it is 0 just there.
+    """
+    masked = (~valid).float()
+    seen = render(PolarizationScene(masked.expand(3, -1, -1)), trajectory, np.asarray(t_us) * 1e-6, height, width)
+    return seen[:, 0] == 0
 
 
 def synthesize(
@@ -74,6 +86,7 @@ def _create(
     window = config.window_height, config.window_width
     largest = max(entry.height for entry in manifest.pictures), max(entry.width for entry in manifest.pictures)
     names = Trajectory.vector_names()
+    masked = any(entry.masked_fraction for entry in manifest.pictures)  # null for photographs
     scene_store = SceneStore.create(
         scenes,
         picture_of,
@@ -82,10 +95,11 @@ def _create(
         window=window,
         trajectory_names=names,
         attributes=attributes,
+        masked=masked,
     )
     n_frames = len(frame_times_us(config))
     frame_attributes = {**attributes, "scenes": picture_of}
-    frame_store = FrameStore.create(frames, list(picture_of), splits, n_frames, *window, frame_attributes)
+    frame_store = FrameStore.create(frames, list(picture_of), splits, n_frames, *window, frame_attributes, masked)
     return scene_store, frame_store
 
 
@@ -93,8 +107,8 @@ def _synthesize_picture(
     picture: str, images: Path, scenes: SceneStore, frames: FrameStore, config: MotionConfig, seed: int
 ) -> None:
     """Write one picture and all its sequences."""
-    s0, dolp, aolp = _read_polarization(images, picture)
-    scenes.write_picture(picture, s0, dolp, aolp)
+    (s0, dolp, aolp), valid = _read_polarization(images, picture)
+    scenes.write_picture(picture, s0, dolp, aolp, valid if scenes.masked else None)
     height, width = s0.shape
     t_us = frame_times_us(config)
     for sequence in [name for name, of in scenes.picture_of.items() if of == picture]:
@@ -106,17 +120,20 @@ def _synthesize_picture(
         record = scenes.read(sequence)  # quantised: the scene that is emulated, and so the truth
         scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
         seen = frames_of(scene, trajectory, t_us, config.window_height, config.window_width)
-        frames.write(sequence, torch.tensor(t_us), *seen)
+        known = None
+        if record.valid is not None:
+            known = valid_frames(record.valid, trajectory, t_us, config.window_height, config.window_width)
+        frames.write(sequence, torch.tensor(t_us), *seen, known)
 
 
-def _read_polarization(images: Path, picture: str) -> Float[Tensor, "3 h w"]:
-    """(S0, DoLP, AoLP) of a photograph, by its colours, or of a measurement."""
+def _read_polarization(images: Path, picture: str) -> tuple[Float[Tensor, "3 h w"], Bool[Tensor, "h w"] | None]:
+    """(S0, DoLP, AoLP) of a photograph, by its colours, or of a measurement, and where that is known (None: all)."""
     measured = images / f"{picture}.npz"
     if not measured.exists():
-        return polarization_from_rgb(read_rgb(images / f"{picture}.png"))
-    intensities, _ = read_intensities(measured)
+        return polarization_from_rgb(read_rgb(images / f"{picture}.png")), None
+    intensities, valid = read_intensities(measured)
     seen = scene_from_intensities(intensities).stokes
-    return torch.stack([seen[0].clamp(max=1), stokes.dolp(seen).clamp(max=1), stokes.aolp(seen)])
+    return torch.stack([seen[0].clamp(max=1), stokes.dolp(seen).clamp(max=1), stokes.aolp(seen)]), valid
 
 
 def _digest(manifest: Manifest, images: Path) -> str:

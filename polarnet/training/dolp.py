@@ -29,7 +29,7 @@ def dolp_task(
     return Task(
         network=network,
         encode=encode,
-        streams=lambda batch: (batch.inputs, batch.dolp),
+        streams=lambda batch: (batch.inputs, batch.dolp, batch.valid),
         unroll=unroll,
         loss=polarization_loss(loss, lpips),
         description={

@@ -37,9 +37,10 @@ def e2v_task(config: E2vConfig, lpips: Lpips | None, seed: int) -> Task:
     def encode(events: Events, window_us: int) -> Tensor:
         return normalise_nonzero(voxel_grid(events, config.bins))
 
-    def streams(batch: Batch) -> tuple[Tensor, Tensor]:
+    def streams(batch: Batch) -> tuple[Tensor, Tensor, Tensor | None]:
         voxels = batch.inputs.unflatten(2, (4, config.bins))
-        return voxels.flatten(1, 2), batch.intensity.flatten(1, 2)
+        valid = None if batch.valid is None else batch.valid.repeat_interleave(4, dim=1)
+        return voxels.flatten(1, 2), batch.intensity.flatten(1, 2), valid
 
     return Task(
         network=network,

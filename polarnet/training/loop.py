@@ -2,15 +2,17 @@
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from polarnet.events.representations import REPRESENTATIONS
 from polarnet.events.windows import WindowDataset
 from polarnet.ranges import allowed
 from polarnet.similarity import correlation, mse, psnr
+from polarnet.training.losses import known_frames
 from polarnet.training.recorder import Recorder
 from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, kept_in_memory, shuffled
 from polarnet.training.task import Split, Task
@@ -22,6 +24,8 @@ SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
 class LoopConfig(ViewConfig):
     """How a network is trained; `train` and `baselines.e2v` of params.yaml have these fields and their own."""
 
+    data: str = field(metadata=allowed(choices=("store", "fly")))
+    """store: events from the store on disk; fly: the same events, emulated from the scenes in memory as needed."""
     epochs: int = field(metadata=allowed(low=1))
     batch_size: int = field(metadata=allowed(low=1))
     """Visits to sequences."""
@@ -76,12 +80,11 @@ def train_batch(
     task: Task, optimizer: torch.optim.Optimizer, batch: Batch, config: LoopConfig, device: torch.device
 ) -> list[dict[str, float]]:
     """One step for each run of `bptt_windows` windows; the loss and its terms at each."""
-    inputs, truth = (tensor.to(device) for tensor in task.streams(batch))
     state, losses = None, []
-    for windows, frames in zip(inputs.split(config.bptt_windows), truth.split(config.bptt_windows), strict=True):
+    for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
         with autocast(config.precision, device):
             predicted, state = task.unroll(windows, state)
-            terms = task.loss(predicted, frames)
+            terms = task.loss(predicted, frames, valid)
             total = task.loss.total(terms)
         optimizer.zero_grad()
         total.backward()
@@ -93,25 +96,43 @@ def train_batch(
     return losses
 
 
+def runs_of(
+    task: Task, batch: Batch, length: int, device: torch.device
+) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+    """What the network gets, what it should say, and where that is known, `length` windows at a time."""
+    inputs, truth, valid = task.streams(batch)
+    windows, frames = (tensor.to(device).split(length) for tensor in (inputs, truth))
+    masks = [None] * len(frames) if valid is None else valid.to(device).split(length)
+    return zip(windows, frames, masks, strict=True)
+
+
 @torch.no_grad()
 def validate(
     task: Task, dataset: WindowDataset, config: LoopConfig, device: torch.device, workers: int
 ) -> dict[str, float]:
-    """Mean over all frames of the loss, its terms, and mse, psnr and correlation of the frames as they are."""
+    """Mean over all frames of the loss, its terms, and mse, psnr and correlation of the frames as they are.
+
+    Of the valid pixels alone, and without frames that have none. ValueError where no frame has any.
+    """
     task.network.eval()
     sums, count = Counter[str](), 0
     for batch in batches_of(dataset, range(len(dataset)), 1, workers):
-        inputs, truth = (tensor.to(device) for tensor in task.streams(batch))
         state = None
-        for windows, frames in zip(inputs.split(config.bptt_windows), truth.split(config.bptt_windows), strict=True):
+        for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
             with autocast(config.precision, device):
                 predicted, state = task.unroll(windows, state)
-                terms = task.loss(predicted, frames)
+                terms = task.loss(predicted, frames, valid)
+            a, b, known = known_frames(predicted, frames, valid)
             scores = {"total": task.loss.total(terms), **terms}
-            scores |= {name: score(predicted, frames).mean() for name, score in SCORES.items()}
-            sums.update({name: value.item() * frames.shape[0] * frames.shape[1] for name, value in scores.items()})
-            count += frames.shape[0] * frames.shape[1]
+            if len(a):
+                scores |= {name: score(a, b, known).mean() for name, score in SCORES.items()}
+                sums.update({name: value.item() * len(a) for name, value in scores.items()})
+                count += len(a)
     task.network.train()
+    if not count:
+        raise ValueError(
+            f"{dataset.frames.path}: no frame of the validation split has a valid pixel; use other pictures"
+        )
     return {name: value / count for name, value in sums.items()}
 
 

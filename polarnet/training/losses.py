@@ -4,13 +4,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from polarnet.ranges import allowed, check_ranges
-from polarnet.similarity import Lpips, mse, ssim
+from polarnet.similarity import Lpips, mean_where, mse, ssim, with_truth_outside
 
 Frames = Float[Tensor, "t b h w"]
+Valid = Bool[Tensor, "t b h w"] | None
 
 
 @dataclass(frozen=True)
@@ -27,26 +28,39 @@ class LossConfig:
             raise ValueError("mse, ssim, lpips: expected at least one weight > 0, got 0 for all three")
 
 
+def known_frames(predicted: Frames, truth: Frames, valid: Valid) -> tuple[Tensor, Tensor, Tensor | None]:
+    """(predicted, truth, valid) as n frames, without those of which nothing is known."""
+    a, b = predicted.flatten(0, 1), truth.flatten(0, 1)
+    if valid is None:
+        return a, b, None
+    frames = valid.flatten(0, 1)
+    known = frames.any(-1).any(-1)
+    return a[known], b[known], frames[known]
+
+
 class FrameLoss:
     """A weighted sum of terms, each a mean over all frames: mse, mae, ssim_loss (1 - SSIM, Eq. 7) and lpips.
 
-    Without an LPIPS network its term is left out of `weights`, and so of the sum.
+    Without an LPIPS network its term is left out of `weights`, and so of the sum. Pixels that are not valid count in no
+    term, as `polarnet.similarity` says, nor do frames without a valid pixel.
     """
 
     def __init__(self, weights: Mapping[str, float], lpips: Lpips | None):
-        known: dict[str, Callable[[Tensor, Tensor], Tensor] | None] = {
+        known: dict[str, Callable[[Tensor, Tensor, Tensor | None], Tensor] | None] = {
             "mse": mse,
-            "mae": lambda a, b: (a - b).abs(),
-            "ssim_loss": lambda a, b: 1 - ssim(a, b),
-            "lpips": lpips,
+            "mae": lambda a, b, valid: (a - b).abs() if valid is None else mean_where((a - b).abs(), valid),
+            "ssim_loss": lambda a, b, valid: 1 - ssim(a, b, valid),
+            "lpips": None if lpips is None else lambda a, b, valid: lpips(with_truth_outside(a, b, valid), b),
         }
         self.weights = {name: weight for name, weight in weights.items() if weight and known[name] is not None}
         self._terms = {name: term for name in self.weights if (term := known[name]) is not None}
 
-    def __call__(self, predicted: Frames, truth: Frames) -> dict[str, Float[Tensor, ""]]:
-        """The terms by name, without their weights."""
-        a, b = predicted.flatten(0, 1), truth.flatten(0, 1)
-        return {name: term(a, b).mean() for name, term in self._terms.items()}
+    def __call__(self, predicted: Frames, truth: Frames, valid: Valid = None) -> dict[str, Float[Tensor, ""]]:
+        """The terms by name, without their weights; 0 where nothing is known of any frame."""
+        a, b, known = known_frames(predicted, truth, valid)
+        if not len(a):
+            return {name: 0 * predicted.sum() for name in self._terms}
+        return {name: term(a, b, known).mean() for name, term in self._terms.items()}
 
     def total(self, terms: Mapping[str, Float[Tensor, ""]]) -> Float[Tensor, ""]:
         """The weighted sum of terms."""

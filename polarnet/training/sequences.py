@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -29,6 +29,8 @@ class Batch(NamedTuple):
     dolp: Float[Tensor, "t b h w"]
     aolp: Float[Tensor, "t b h w"]
     intensity: Float[Tensor, "t b 4 h w"]
+    valid: Bool[Tensor, "t b h w"] | None = None
+    """Where the truth is known; None: everywhere."""
 
 
 class View(NamedTuple):
@@ -62,7 +64,8 @@ def seen(sequence: WindowSequence, view: View) -> WindowSequence:
     inputs = look(sequence.inputs).unflatten(1, (4, -1))[:, polarizers].flatten(1, 2)
     aolp = view.direction * (look(sequence.aolp) - view.turn * EIGHTH_TURN)
     intensity = look(sequence.intensity)[:, polarizers]
-    return WindowSequence(sequence.name, inputs, look(sequence.dolp), torch.remainder(aolp, math.pi), intensity)
+    valid = None if sequence.valid is None else look(sequence.valid)
+    return WindowSequence(sequence.name, inputs, look(sequence.dolp), torch.remainder(aolp, math.pi), intensity, valid)
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,7 @@ def kept_in_memory(dataset: WindowDataset, workers: int) -> tuple[Sequences, int
 
     Also how many worker processes should read them: none when they are in memory.
     """
-    bytes_each = sum(tensor.nbytes for tensor in dataset[0][1:])
+    bytes_each = sum(tensor.nbytes for tensor in dataset[0][1:] if tensor is not None)
     if bytes_each * len(dataset) > psutil.virtual_memory().available / 2:
         return dataset, workers
     return [dataset[number] for number in range(len(dataset))], 0
@@ -131,8 +134,10 @@ def stack(sequences: Sequence[WindowSequence]) -> Batch:
     lengths = {len(sequence.dolp) for sequence in sequences}
     if len(lengths) > 1:
         raise ValueError(f"a batch needs sequences with equally many windows, got {sorted(lengths)}; use batch_size=1")
-    names, *columns = zip(*sequences, strict=True)
-    return Batch(list(names), *(torch.stack(column, dim=1) for column in columns))
+    names, *columns, masks = zip(*sequences, strict=True)
+    valid = None if masks[0] is None else torch.stack(masks, dim=1)  # all of one store, which has masks or has none
+    inputs, dolp, aolp, intensity = (torch.stack(column, dim=1) for column in columns)
+    return Batch(list(names), inputs, dolp, aolp, intensity, valid)
 
 
 def shuffled(count: int, seed: int, epoch: int) -> list[int]:

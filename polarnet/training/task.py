@@ -9,16 +9,19 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from polarnet import __version__
 from polarnet.events.frames import FrameStore
 from polarnet.events.representations import Encode
 from polarnet.events.store import EventStore
-from polarnet.events.windows import WindowDataset
+from polarnet.events.windows import EventSource, WindowDataset
 from polarnet.runtime import seed_for
 from polarnet.similarity import Lpips
+from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.fly import EmulatedEvents
+from polarnet.simulation.scenes import SceneStore
 from polarnet.training.losses import FrameLoss
 from polarnet.training.sequences import Batch
 
@@ -37,8 +40,10 @@ class Task:
     network: nn.Module
     encode: Encode
     """One polarizer's events in a window, as the network wants them."""
-    streams: Callable[[Batch], tuple[Float[Tensor, "t b c h w"], Float[Tensor, "t b h w"]]]
-    """What the network gets of a batch, and what it should say."""
+    streams: Callable[
+        [Batch], tuple[Float[Tensor, "t b c h w"], Float[Tensor, "t b h w"], Bool[Tensor, "t b h w"] | None]
+    ]
+    """What the network gets of a batch, what it should say, and where that is known (None: everywhere)."""
     unroll: Callable[[Tensor, State], tuple[Float[Tensor, "t b h w"], State]]
     """What it says for windows in a row, and its state after them."""
     loss: FrameLoss
@@ -53,16 +58,25 @@ class Split(NamedTuple):
     val: WindowDataset
 
 
-def open_split(events: str, frames: str, encode: Encode) -> Split:
+def open_events(
+    data: str, events: str, scenes: str, emulate: EmulatorConfig, seed: int, threads: int
+) -> EventStore | EmulatedEvents:
+    """Events as `data` says: `store` reads them, `fly` emulates the scenes in memory; the same to the last bit."""
+    if data == "store":
+        return EventStore.open(events)
+    return EmulatedEvents(SceneStore.open(scenes), emulate, seed, threads)
+
+
+def open_split(events: EventSource, frames: str, encode: Encode) -> Split:
     """The training and the validation sequences of the stores; ValueError where either split is empty."""
-    event_store, frame_store = EventStore.open(events), FrameStore.open(frames)
+    frame_store = FrameStore.open(frames)
     names = {split: frame_store.of_split(split) for split in Split._fields}
     for split, sequences in names.items():
         if not sequences:
             raise ValueError(
                 f"{frames} has no sequence in split {split!r}; ingest more pictures or change the fractions"
             )
-    return Split(**{s: WindowDataset(event_store, frame_store, sequences, encode) for s, sequences in names.items()})
+    return Split(**{s: WindowDataset(events, frame_store, sequences, encode) for s, sequences in names.items()})
 
 
 def initialised(build: Callable[[], Network], seed: int) -> Network:
@@ -98,7 +112,8 @@ def describe(task: Task, split: Split, config: Any, weights: Path, seed: int) ->
             "val_sequences": len(split.val),
             "height": events.height,
             "width": events.width,
-            "events_sha256": content_hash(events.path),
+            "events_from": events.attributes,
+            "events_sha256": content_hash(events.path),  # on the fly: of the scenes that they are made from
             "frames_sha256": content_hash(frames.path),
         },
         "versions": {"polarnet": __version__, "torch": torch.__version__},

@@ -1,4 +1,4 @@
-"""How fast and how true the emulator is: python tests/benchmarks/emulation.py [--write] [--repeats N]
+"""How fast and how true the emulator is: python tests/benchmarks/emulation.py [--write] [--repeats N] [--paper-set N]
 
 The clip is that of the shared reference figures: scikit-image's coffee photograph mapped to polarization, a window of
 120 x 180 pixels drifting over it at 110 px/s, 300 steps a second, four polarizers, one second; from rendering to
@@ -8,6 +8,13 @@ number of threads runs in a process of its own, which also gives its peak memory
 Timing errors are those of noiseless pixels with equal thresholds, against `exact` at 4800 steps a second, over the
 pixels whose polarities agree from the first event to the last. `exact` places its steps where pixels meet; its figure
 for regular frames is printed too.
+
+The paper's set is made as a user would make it: `python -m stages.ingest`, `stages.synthesize` and `stages.emulate`
+with experiment=paper on two workers, into a temporary folder, from the builtin photographs and dead leaves. Minutes
+are wall-clock time. Peak memory is the largest that a stage's processes held together, looked at twice a second; pages
+that several of them share (libraries) count once (Linux: proportional set size). `--paper-set N` makes about N
+sequences instead of 1000; minutes are those of the number stated, never scaled. `--paper-set 0` leaves it out,
+`--only-paper-set` everything else.
 
 With POLARNET_SHARED set, the golden cases are counted. `--write` merges the figures into docs/results/emulation.json.
 """
@@ -26,14 +33,17 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+import psutil
 import torch
 from skimage import data
 
+from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
 from polarnet.measure import machine_record
 from polarnet.reports.provenance import git
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory
+from polarnet.simulation.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.simulation.synthesize import synthesize_sequence, synthesize_steps
 
@@ -77,6 +87,8 @@ MODELS = {
     "esim": replace(DEFAULT, model="esim"),
     "dvs_voltmeter": replace(DEFAULT, model="dvs_voltmeter"),
 }
+PAPER_SEQUENCES, PAPER_SEQUENCES_A_PICTURE, PAPER_WORKERS = 1000, 5, 2
+MEMORY_SAMPLES_A_SECOND = 2
 THREADS = {"seconds_1_thread": 1, "seconds_2_threads": 2}
 
 
@@ -180,10 +192,70 @@ def golden_cases_passed() -> int:
         return sum("_case[" in case.attrib["name"] and len(case) == 0 for case in cases)  # no failure or skip inside
 
 
+def measure_paper_set(sequences: int) -> dict[str, Any]:
+    """Minutes, core minutes and memory of the three stages from RGB to the event store, for about `sequences`."""
+    pictures = max(len(BUILTIN_PHOTOS), sequences // PAPER_SEQUENCES_A_PICTURE)
+    stage_minutes, core_minutes, peak_mib = {}, {}, 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        overrides = [
+            "experiment=paper",
+            "lpips.required=false",  # training's; without it the weights would have to be here
+            "ingest.source=builtin",
+            f"ingest.dead_leaves={pictures - len(BUILTIN_PHOTOS)}",
+            f"synthesize.sequences_per_picture={PAPER_SEQUENCES_A_PICTURE}",
+            f"runtime.workers={PAPER_WORKERS}",
+            f"paths.data={folder}",
+            f"hydra.run.dir={folder}/log",
+        ]
+        for stage in ("ingest", "synthesize", "emulate"):
+            command = [sys.executable, "-m", f"stages.{stage}", *overrides]
+            minutes, core_minutes[stage], mib = _watched(command)
+            stage_minutes[stage], peak_mib = round(minutes, 3), max(peak_mib, mib)
+            print(f"{stage}: {minutes:.2f} min, {core_minutes[stage]:.2f} core minutes, {mib:.0f} MiB")
+        store = EventStore.open(Path(folder) / "events.zarr")
+        events = sum(sum(store.count(sequence)) for sequence in store.sequences)
+        stored_mib = sum(file.stat().st_size for file in Path(store.path).rglob("*") if file.is_file()) / 2**20
+    return {
+        "sequences": len(store.sequences),
+        "sequences_per_picture": PAPER_SEQUENCES_A_PICTURE,
+        "workers": PAPER_WORKERS,
+        "minutes": round(sum(stage_minutes.values()), 2),
+        "stage_minutes": stage_minutes,
+        "stage_core_minutes": {stage: round(minutes, 3) for stage, minutes in core_minutes.items()},
+        "peak_mib": round(peak_mib),
+        "events": events,
+        "event_store_mib": round(stored_mib),
+        "load": round(os.getloadavg()[0], 2),
+    }
+
+
+def _watched(command: list[str]) -> tuple[float, float, float]:
+    """Run a command: its minutes, the minutes of all cores, and its peak memory in MiB with all its children."""
+    before, start, peak = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter(), 0
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+        while process.poll() is None:
+            peak = max(peak, _held_bytes(process.pid))
+            time.sleep(1 / MEMORY_SAMPLES_A_SECOND)
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cores_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return (time.perf_counter() - start) / 60, cores_s / 60, peak / 2**20
+
+
+def _held_bytes(pid: int) -> int:
+    total = 0
+    try:
+        for process in (parent := psutil.Process(pid), *parent.children(recursive=True)):
+            total += process.memory_full_info().pss
+    except psutil.NoSuchProcess:  # it ended just now; the next look counts the rest
+        pass
+    return total
+
+
 def measure(repeats: int) -> dict[str, Any]:
-    """All figures, printed as they come."""
-    figures: dict[str, Any] = machine_record(ROOT)
-    print(f"{figures['machine']}, {figures['cores']} cores, load {figures['load']}")
+    """All figures of the models, printed as they come."""
+    figures: dict[str, Any] = {}
     for name in MODELS:
         figures[name] = {}
         for key, threads in THREADS.items():
@@ -206,6 +278,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/emulation.json")
     parser.add_argument("--repeats", type=int, default=9, help="runs of which the median counts")
+    parser.add_argument(
+        "--paper-set", type=int, default=PAPER_SEQUENCES, metavar="N", help="sequences of the paper's set to make"
+    )
+    parser.add_argument("--only-paper-set", action="store_true", help="measure nothing else")
     parser.add_argument("--one", choices=list(MODELS), help=argparse.SUPPRESS)
     parser.add_argument("--threads", type=int, default=1, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -215,7 +291,13 @@ def main() -> None:
     changed = git(ROOT, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
     if arguments.write and changed:
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
-    figures = measure(arguments.repeats)
+    figures: dict[str, Any] = machine_record(ROOT)
+    print(f"{figures['machine']}, {figures['cores']} cores, load {figures['load']}")
+    if not arguments.only_paper_set:
+        figures |= measure(arguments.repeats)
+    if arguments.paper_set:
+        figures["paper_set"] = measure_paper_set(arguments.paper_set)
+        print("paper_set", figures["paper_set"])
     if arguments.write:
         known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
         RESULTS.parent.mkdir(parents=True, exist_ok=True)

@@ -4,6 +4,7 @@ import math
 import pytest
 import torch
 
+from polarnet.baselines.trivial import oracle_mean
 from polarnet.evaluation.methods import METHODS, Polarization, e2v_intensities, from_intensities, recover
 from polarnet.events.representations import event_tensor
 from polarnet.events.stream import Events
@@ -97,3 +98,13 @@ def test_a_network_that_was_not_trained_is_missed_by_its_methods_alone(recording
     recover("cf", recording, without)
     with pytest.raises(FileNotFoundError, match=r"none.safetensors is missing"):
         recover("ours", recording, without)
+
+
+def test_the_oracle_knows_the_mean_of_the_valid_pixels_alone():
+    truth = torch.rand(3, 4, 5)
+    valid = truth < 0.6
+    valid[1] = False
+    best = oracle_mean(truth, valid)
+    for frame, mean, where in zip(truth, best, valid, strict=True):
+        expected = frame[where].mean() if where.any() else torch.tensor(0.0)
+        torch.testing.assert_close(mean, expected.expand(4, 5))

@@ -131,7 +131,7 @@ def test_skill_is_a_ratio_of_means_against_the_oracle_mean():
     rows = [row("x", 0.1, oracle_mse=0.2), row("y", 0.3, oracle_mse=0.6)]
     rows += [row("x", 0.2, "best", oracle_mse=0.2), row("y", 0.6, "best", oracle_mse=0.6)]
     table = summary(rows, 100, 0)
-    assert table["m"]["skill"] == pytest.approx(0.5)  # 1 - 0.2 / 0.4, not the mean of 0.5 and 0.5 by chance:
+    assert table["m"]["skill"] == pytest.approx(0.5)  # 1 - 0.2 / 0.4
     assert table["best"]["skill"] == pytest.approx(0)
     assert table["m"]["skill_ci"] == pytest.approx([0.5, 0.5])
     uneven = [row("x", 0.1, oracle_mse=0.1), row("y", 0.1, oracle_mse=0.9)]
@@ -200,3 +200,32 @@ def test_frames_are_written_one_a_line_with_empty_cells_for_what_is_not_known(tm
 def test_settings_out_of_range_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         config(**change)
+
+
+def test_masked_pixels_count_in_no_score(make_recording):
+    recording, other = make_recording(seed=1), make_recording(seed=2).dolp
+    valid = torch.rand(recording.dolp.shape, generator=torch.Generator().manual_seed(3)) < 0.7
+    masked = dataclasses.replace(recording, valid=valid)
+    torch.manual_seed(0)
+    lpips = Lpips("squeeze")
+    spoilt = torch.where(valid, other, 1 - other)
+    rows, again = (score_sequence(masked, {"m": Polarization(frames)}, 1, lpips, CPU) for frames in (other, spoilt))
+    assert rows == again
+    for r in rows:
+        where = valid[r.window]
+        difference = (other - recording.dolp)[r.window][where]
+        assert r.mse == pytest.approx(difference.square().mean().item(), rel=1e-5)
+        assert r.level_mse == pytest.approx(difference.mean().square().item(), rel=1e-4, abs=1e-9)
+        mixed = torch.where(where, other[r.window], recording.dolp[r.window])
+        assert r.lpips == pytest.approx(lpips(mixed[None], recording.dolp[r.window][None]).item(), rel=1e-4)
+    unmasked = score_sequence(recording, {"m": Polarization(other)}, 1, lpips, CPU)
+    assert all(a.ssim != b.ssim for a, b in zip(rows, unmasked, strict=True))
+
+
+def test_a_frame_without_a_valid_pixel_is_not_left_out_silently(recording):
+    valid = torch.ones_like(recording.dolp, dtype=torch.bool)
+    valid[2] = False
+    masked = dataclasses.replace(recording, valid=valid)
+    with pytest.raises(ValueError, match="window 2: no pixel is valid"):
+        score_sequence(masked, {"m": Polarization(recording.dolp)}, 1, None, CPU)
+    assert len(score_sequence(masked, {"m": Polarization(recording.dolp)}, 3, None, CPU)) == 1

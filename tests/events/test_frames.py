@@ -144,3 +144,34 @@ def test_a_flipped_byte_is_found_and_named(finished, tmp_path):
     chunk.write_bytes(content)
     (problem,) = verify_frames(damaged)
     assert "b, column aolp is unreadable" in problem
+
+
+def masks(seed: int, n: int = FRAMES) -> torch.Tensor:
+    return torch.rand(n, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(seed)) < 0.5
+
+
+def test_a_mask_comes_back_as_it_was_whatever_the_width(tmp_path):
+    store = store_at(tmp_path / "frames.zarr", masked=True)
+    store.write("a", *frames_of(1), masks(1))
+    store.write("b", *frames_of(2, n=33))  # nothing masked
+    store.finish()
+    assert WIDTH % 8
+    read = FrameStore.open(tmp_path / "frames.zarr")
+    assert torch.equal(read.valid("a"), masks(1))
+    assert torch.equal(read.frames("a").valid, masks(1))
+    assert read.frames("b").valid.shape == (33, HEIGHT, WIDTH)
+    assert read.valid("b").all()
+    assert verify_frames(tmp_path / "frames.zarr") == []
+    (chunk,) = (file for file in (tmp_path / "frames.zarr" / "valid" / "c" / "0").rglob("*") if file.is_file())
+    chunk.write_bytes(chunk.read_bytes()[:-1])
+    assert any("a, column valid is unreadable" in problem for problem in verify_frames(tmp_path / "frames.zarr"))
+
+
+def test_without_masks_nothing_is_stored_about_them(finished, tmp_path):
+    store = FrameStore.open(finished)
+    assert not store.masked
+    assert store.valid("a") is None
+    assert store.frames("a").valid is None
+    assert not (finished / "valid").exists()
+    with pytest.raises(ValueError, match="got a mask for a store without one"):
+        store_at(tmp_path / "frames.zarr").write("a", *frames_of(1), masks(1))

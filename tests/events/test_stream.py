@@ -112,6 +112,16 @@ def test_validate_names_the_first_event_that_cannot_be(make_events, bad, message
         validate(make_events([(10, 0, 0, 1), bad], 2, 3))
 
 
+@pytest.mark.parametrize("place", [1, 500, 999])
+@pytest.mark.parametrize(("column", "value"), [("t", -1), ("x", 3), ("x", -1), ("y", 2), ("y", -1), ("p", 0), ("p", 2)])
+def test_validate_finds_one_wrong_event_wherever_it_is(make_events, place, column, value):
+    events = make_events([(10 + i // 3, i % 3, i % 2, 1 - i % 2 * 2) for i in range(1000)], 2, 3)
+    assert validate(events) is events
+    getattr(events, column)[place] = value
+    with pytest.raises(ValueError, match=f"event {place} of 1000"):
+        validate(events)
+
+
 def test_validate_hands_back_good_events(make_random_events):
     events = make_random_events(2, 100, 1000, 5, 5)
     assert validate(events) is events

@@ -7,10 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from hydra.errors import ConfigCompositionException
 
+from polarnet.cli import main
 from polarnet.config import Config, check_keys, load
-from polarnet.experiments import BASE, experiment_names, experiment_values, write_preset
+from polarnet.experiments import BASE, preset_names, preset_values, write_preset
+from polarnet.simulation.emulator import EmulatorConfig, emulate
 
 
 @pytest.fixture
@@ -33,6 +36,7 @@ def test_the_committed_values_pass(project_root):
     config = load(project_root)
     assert isinstance(config, Config)
     assert dataclasses.is_dataclass(config.emulate)
+    assert config.emulate.model == "exact"
 
 
 @pytest.mark.parametrize(
@@ -81,14 +85,15 @@ def test_a_stage_stops_before_it_runs_anything(project_root, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_every_experiment_composes(project_root, monkeypatch):
-    for name in experiment_names(project_root):
-        config = load(project_root, [f"experiment={name}"])
-        for key, value in experiment_values(project_root, name).items():
+@pytest.mark.parametrize("group", BASE)
+def test_every_preset_composes(project_root, group):
+    for name in preset_names(project_root, group):
+        config = load(project_root, [f"{group}={name}"])
+        for key, value in preset_values(project_root, group, name).items():
             node = config
             for part in key.split("."):
                 node = getattr(node, part)
-            assert node == value, f"experiment {name}: {key}"
+            assert node == value, f"{group} {name}: {key}"
 
 
 def test_the_paper_experiment_holds_the_papers_values(project_root):
@@ -97,6 +102,7 @@ def test_the_paper_experiment_holds_the_papers_values(project_root):
     assert (config.synthesize.window_height, config.synthesize.window_width) == (120, 180)
     assert (config.synthesize.duration_s, config.synthesize.frame_rate_hz) == (1.0, 30.0)
     assert (config.emulate.contrast_threshold_on, config.emulate.contrast_threshold_off) == (0.2, 0.2)
+    assert config.emulate.model == "v2e"  # "we use V2E in our experiments", section 3.1
     assert (config.train.learning_rate, config.train.batch_size, config.train.epochs) == (1e-4, 2, 250)
     assert (config.loss.mse, config.loss.ssim, config.loss.lpips) == (1.0, 1.0, 10.0)
     assert (config.lpips.backbone, config.lpips.required) == ("vgg", True)
@@ -113,11 +119,18 @@ def test_the_paper_experiment_refuses_to_start_without_vgg_weights(project_root,
     assert not (tmp_path / "data").exists()
 
 
-def test_the_base_experiment_is_what_params_yaml_holds_and_covers_what_others_change(project_root, project):
-    assert write_preset(project, BASE) == []
-    base = set(experiment_values(project_root, BASE))
-    for name in experiment_names(project_root):
-        assert set(experiment_values(project_root, name)) <= base, name
+@pytest.mark.parametrize("group", BASE)
+def test_the_base_preset_is_what_params_yaml_holds_and_covers_what_others_change(project_root, project, group):
+    assert write_preset(project, BASE[group]) == []
+    base = set(preset_values(project_root, group, BASE[group]))
+    for name in preset_names(project_root, group):
+        assert set(preset_values(project_root, group, name)) <= base, name
+
+
+def test_the_base_experiment_undoes_a_sensor_too_and_no_sensor_is_called_like_an_experiment(project_root):
+    demo, default = (preset_values(project_root, group, name) for group, name in BASE.items())
+    assert set(default) <= set(demo)
+    assert not set(preset_names(project_root, "experiment")) & set(preset_names(project_root, "sensor"))
 
 
 def test_a_preset_keeps_comments_and_unrelated_values_and_the_base_undoes_it(project):
@@ -129,10 +142,67 @@ def test_a_preset_keeps_comments_and_unrelated_values_and_the_base_undoes_it(pro
     assert "seed: 7 " in text
     assert text.count("#") == original.count("#")
     assert load(project).seed == 7
-    write_preset(project, BASE)
+    write_preset(project, BASE["experiment"])
     assert (project / "params.yaml").read_text() == original.replace("seed: 1 ", "seed: 7 ")
 
 
 def test_an_unknown_preset_lists_the_ones_there_are(project):
-    with pytest.raises(ValueError, match="no experiment 'papper'; there are demo, paper, smoke"):
+    with pytest.raises(ValueError, match="no preset 'papper'; there are experiments demo, paper, smoke; sensors clean"):
         write_preset(project, "papper")
+
+
+# thresholds, sigma, cutoff, leak, shot noise (Hz), refractory period (us), jitter, spread: v2e's defaults, --dvs_params
+SENSORS = {
+    "default": (0.2, 0.2, 0.03, 300.0, 0.01, 0.001, 500.0, 0.1, 0.1),
+    "clean": (0.2, 0.2, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "noisy": (0.2, 0.2, 0.05, 30.0, 0.1, 5.0, 0.0, 0.1, 0.1),
+}
+
+
+def sensor_of(emulate: EmulatorConfig) -> tuple[float, ...]:
+    return (
+        emulate.contrast_threshold_on,
+        emulate.contrast_threshold_off,
+        emulate.contrast_threshold_sigma,
+        emulate.cutoff_hz,
+        emulate.leak_rate_hz,
+        emulate.shot_noise_rate_hz,
+        emulate.refractory_period_us,
+        emulate.leak_jitter,
+        emulate.noise_rate_cov_decades,
+    )
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_sensor_is_v2es_for_hydra_and_for_dvc_alike_and_leaves_the_rest_as_it_was(project, monkeypatch, name):
+    edit(project, "  randomise: false", "  randomise: true")
+    edit(project, "  model: exact", "  model: esim")
+    check_keys(project, [f"sensor={name}"])
+    by_hydra = load(project, ["experiment=smoke", f"sensor={name}"])
+    assert sensor_of(by_hydra.emulate) == SENSORS[name]
+    assert (by_hydra.emulate.model, by_hydra.emulate.randomise) == ("esim", False)
+    monkeypatch.chdir(project)
+    assert main(["preset", "smoke"]) == 0
+    assert main(["preset", name]) == 0
+    by_dvc = load(project)
+    assert dataclasses.replace(by_hydra.emulate, model="exact") == by_dvc.emulate  # the experiment has its own model
+    assert by_dvc.synthesize == by_hydra.synthesize
+
+
+def test_the_next_experiment_puts_a_sensor_back(project):
+    original = (project / "params.yaml").read_text()
+    assert len(write_preset(project, "noisy")) == 5
+    write_preset(project, "demo")
+    assert (project / "params.yaml").read_text() == original
+
+
+def test_a_clean_sensor_sees_nothing_in_still_light_and_a_noisy_one_what_its_rates_say(project_root):
+    still = torch.full((2, 1, 100, 100), 0.0)  # dark, where shot noise has its full rate
+    counts = {}
+    for name in SENSORS:
+        config = load(project_root, [f"sensor={name}"]).emulate
+        (events,), _ = emulate(still, torch.tensor([0, 1_000_000]), config, key=1)
+        counts[name] = len(events)
+    assert counts["clean"] == 0
+    assert counts["default"] < 1000
+    assert counts["noisy"] == pytest.approx(5.1 * 100 * 100, rel=0.05)  # shot noise and leak, events a second

@@ -76,3 +76,43 @@ def test_a_block_without_results_says_which_command_measures_them(project):
     (project / "docs" / "results" / "pipeline.json").unlink()
     with pytest.raises(FileNotFoundError, match="run `polarnet measure`"):
         update_results_blocks(project, check=True)
+
+
+EMULATION = {
+    "machine": "a processor",
+    "cores": 2,
+    "load": 0.4,
+    "versions": {"python": "3.11", "numba": "0.68.1"},
+    "commit": "abc1234567890",
+    "v2e_default": {"seconds_1_thread": 0.0912, "seconds_2_threads": 0.0497, "timing_error_ms_300fps": 1.75},
+    "exact": {"seconds_1_thread": 0.1104, "seconds_2_threads": 0.0605, "timing_error_ms_300fps": 0.21},
+    "esim": {"seconds_1_thread": 0.05, "seconds_2_threads": 0.03},
+    "golden_cases_passed": 22,
+    "paper_set": {"sequences": 1000, "minutes": 4.25, "peak_mib": 1234, "stage_minutes": {"ingest": 0.5}},
+}
+EMULATION_PAGE = "<!-- results:emulation -->\n<!-- /results:emulation -->\n"
+
+
+def test_the_emulation_block_has_a_row_a_model_and_what_the_paper_set_took(project):
+    (project / "docs" / "results" / "emulation.json").write_text(json.dumps(EMULATION))
+    page = project / "docs" / "scaling.md"
+    page.write_text(EMULATION_PAGE)
+    assert page in update_results_blocks(project, check=False)
+    text = page.read_text()
+    assert "| model | seconds, 1 thread | 2 threads | timing error at 300 fps, ms |" in text
+    assert "| `exact` | 0.110 | 0.060 | 0.210 |" in text
+    assert "| `esim` | 0.050 | 0.030 | - |" in text
+    assert "met: 22 of 23" in text
+    assert "A set of 1000 sequences" in text
+    assert "took 4.2 minutes with at most 1,234 MiB of memory (ingest 0.5)" in text
+    assert "On 2 cores (a processor, load 0.4" in text
+    assert "commit `abc1234567`" in text
+
+
+def test_the_emulation_block_says_how_to_measure_while_nobody_has(project):
+    (project / "docs" / "scaling.md").write_text(EMULATION_PAGE)
+    update_results_blocks(project, check=False)
+    assert (
+        "Not measured yet: `python tests/benchmarks/emulation.py --write`" in (project / "docs/scaling.md").read_text()
+    )
+    assert update_results_blocks(project, check=True) == []

@@ -120,3 +120,24 @@ def test_a_flipped_byte_is_found_and_named(finished):
         assert "leaves, column dolp is unreadable" in problem
     finally:
         chunk.write_bytes(content)
+
+
+def test_a_mask_comes_back_with_its_picture_and_one_that_has_none_is_valid_everywhere(tmp_path):
+    store = create(tmp_path / "scenes.zarr", masked=True)
+    for name in store.sequences:
+        store.write(name, torch.zeros(3, dtype=torch.float64), 1)
+    valid = torch.rand(10, 14, generator=torch.Generator().manual_seed(1)) < 0.5
+    store.write_picture("coffee", *planes(1, 20, 30))
+    store.write_picture("leaves", *planes(2, 10, 14), valid)
+    store.finish()
+    read = SceneStore.open(tmp_path / "scenes.zarr")
+    assert torch.equal(read.read("leaves-0").valid, valid)
+    assert read.read("coffee-0").valid.all()
+    assert verify_scenes(tmp_path / "scenes.zarr") == []
+
+
+def test_without_masks_nothing_is_stored_about_them(finished, tmp_path):
+    assert SceneStore.open(finished).read("leaves-0").valid is None
+    assert not (finished / "valid").exists()
+    with pytest.raises(ValueError, match=r"a store created with masked=True, got one of .*masked=False"):
+        create(tmp_path / "scenes.zarr").write_picture("leaves", *planes(2, 10, 14), torch.ones(10, 14).bool())

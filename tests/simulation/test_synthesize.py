@@ -10,10 +10,10 @@ from skimage import data
 from polarnet.events.stream import validate
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.motion import HARMONICS, Sine, Trajectory, render
-from polarnet.simulation.pixels.light import intensity_rows, light_of_scene
+from polarnet.simulation.pixels.light import intensity_rows
 from polarnet.simulation.scene import scene_from_rgb
 from polarnet.simulation.synthesize import (
-    _scene_behind_polarizers,
+    _lights_of_drift,
     render_intensities,
     render_times_us,
     synthesize_sequence,
@@ -79,8 +79,7 @@ def test_the_drifting_window_sees_what_render_sees(scene):
     t_us = times_us()
     expected = 255 * intensities_from_stokes(render(scene, trajectory(), t_us * 1e-6, H, W))
     pose = trajectory().pose(t_us * 1e-6)
-    for polarizer, plane in enumerate(_scene_behind_polarizers(scene)):
-        light = light_of_scene(plane, pose.y - (H - 1) / 2, pose.x - (W - 1) / 2)
+    for polarizer, light in enumerate(_lights_of_drift(scene, pose, H, W)):
         seen = np.empty((len(t_us), H * W), np.float32)
         for k in range(len(t_us)):
             intensity_rows(light, k, 0, W, seen[k])

@@ -10,11 +10,19 @@ import torch
 from PIL import Image
 
 from polarnet.events.frames import FrameStore
-from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us
+from polarnet.simulation.motion import (
+    HARMONICS,
+    MotionConfig,
+    Sine,
+    Trajectory,
+    frame_times_us,
+    random_trajectory,
+    render,
+)
 from polarnet.simulation.pictures.ingest import IngestConfig, ingest
-from polarnet.simulation.scene import scene_from_polarization
+from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.scenes import SceneStore
-from polarnet.simulation.truth import frames_of, synthesize
+from polarnet.simulation.truth import frames_of, synthesize, valid_frames
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
 
 CONFIG = MotionConfig(
@@ -134,3 +142,44 @@ def test_another_setting_is_not_mixed_with_what_an_interrupted_run_left(images, 
     faster = dataclasses.replace(CONFIG, speed_min_px_s=150.0)
     run(images, tmp_path, faster, lambda function, items: redone.extend(items) or [function(item) for item in items])
     assert len(redone) == 5
+
+
+STILL = Sine(0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "expected"),
+    [
+        (7.5, 5.5, [(4, 3)]),  # on the scene's pixels: one pixel shows the masked one
+        (7.75, 5.5, [(4, 2), (4, 3)]),  # between columns: two mix with it
+        (7.5, 5.75, [(3, 3), (4, 3)]),
+        (7.75, 5.75, [(3, 2), (3, 3), (4, 2), (4, 3)]),
+    ],
+)
+def test_a_pixel_is_valid_unless_its_interpolation_uses_a_masked_one(x, y, expected):
+    valid = torch.ones(12, 16, dtype=torch.bool)
+    valid[7, 8] = False
+    rest = (STILL,) * HARMONICS
+    trajectory = Trajectory(x, y, rest, rest, STILL, STILL, speed_px_s=1.0)
+    (seen,) = valid_frames(valid, trajectory, [0], height=6, width=6)  # its first pixel looks at (x, y) - 2.5
+    assert [tuple(place) for place in (~seen).nonzero().tolist()] == expected
+
+
+def test_the_mask_of_a_turning_window_is_that_of_its_weights():
+    """Light from masked pixels alone: what a valid pixel shows does not change when they do."""
+    generator = torch.Generator().manual_seed(1)
+    light = torch.rand(3, 60, 80, generator=generator)
+    valid = torch.rand(60, 80, generator=generator) < 0.98
+    trajectory = random_trajectory(CONFIG, 60, 80, np.random.default_rng(4))
+    seen = valid_frames(valid, trajectory, [0, 50_000, 100_000], 24, 36)
+    t_s = np.array([0, 0.05, 0.1])
+    changed = torch.where(valid, light, light + 1)
+    before, after = (render(PolarizationScene(planes), trajectory, t_s, 24, 36)[:, 0] for planes in (light, changed))
+    assert torch.equal(seen, before == after)
+    assert 0.8 < seen.float().mean() < 0.98
+
+
+def test_photographs_have_no_mask(stores):
+    scenes, frames = stores
+    assert not scenes.masked
+    assert not frames.masked

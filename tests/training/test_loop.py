@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 
+from polarnet.events.store import EventStore
 from polarnet.networks.checkpoint import load_checkpoint, load_network
 from polarnet.networks.dolp_unet import DolpUNetConfig
 from polarnet.training.dolp import dolp_task
@@ -22,6 +23,7 @@ from polarnet.training.task import Task, describe, open_split
 SEED = 7
 CPU = torch.device("cpu")
 LOOP: dict[str, Any] = {
+    "data": "store",
     "visits": 2,
     "windows": 4,
     "crop": [16, 20],
@@ -53,7 +55,7 @@ def small_task() -> Task:
 
 def run(task: Task, stores: tuple[Path, Path], folder: Path, config: TrainConfig | E2vConfig = TRAIN) -> Path:
     """A whole training that keeps a running checkpoint after every batch; the folder of its outputs."""
-    split = open_split(str(stores[0]), str(stores[1]), task.encode)
+    split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
     metadata = describe(task, split, config, folder, SEED)
     recorder = Recorder(folder / "out", folder / "resume", metadata, keep_every_s=0.0)
     train(task, split, config, recorder, SEED, CPU, workers=0)
@@ -110,7 +112,7 @@ def undisturbed(stores, tmp_path_factory) -> dict[str, bytes]:
 
 def test_a_changed_setting_starts_anew(stores, tmp_path):
     task = small_task()
-    split = open_split(str(stores[0]), str(stores[1]), task.encode)
+    split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
     places = {
         Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, config, tmp_path, SEED)).running
         for config in (TRAIN, dataclasses.replace(TRAIN, learning_rate=2e-3), dataclasses.replace(TRAIN, epochs=3))
@@ -120,7 +122,7 @@ def test_a_changed_setting_starts_anew(stores, tmp_path):
 
 def test_worker_processes_change_nothing(stores, tmp_path, undisturbed):
     task = small_task()
-    split = open_split(str(stores[0]), str(stores[1]), task.encode)
+    split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
     recorder = Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, TRAIN, tmp_path, SEED))
     train(task, split, TRAIN, recorder, SEED, CPU, workers=2)
     assert bytes_of(tmp_path / "out") == undisturbed
@@ -132,7 +134,7 @@ def test_one_sequence_can_be_learnt_by_heart(stores, tmp_path):
     )
     loss = LossConfig(mse=1.0, ssim=0.0, lpips=0.0)
     task = dolp_task("paper", NETWORK, config, loss, None, SEED)
-    split = open_split(str(stores[0]), str(stores[1]), task.encode)
+    split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
     split.train.sequences[1:] = []
     before = validate(task, split.train, config, CPU, workers=0)["mse"]
     recorder = Recorder(tmp_path / "out", tmp_path / "resume", {})
@@ -150,9 +152,10 @@ def test_the_e2v_baseline_trains_in_the_same_loop(stores, tmp_path):
 
 def test_the_e2v_baseline_learns_each_polarizers_intensity_from_its_own_events(stores):
     task = e2v_task(E2V, None, SEED)
-    split = open_split(str(stores[0]), str(stores[1]), task.encode)
+    split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
     batch = stack([split.train[0], split.train[1]])
-    voxels, intensity = task.streams(batch)
+    voxels, intensity, valid = task.streams(batch)
+    assert valid is None  # no pixel of these stores is masked
     windows, _, _, height, width = batch.inputs.shape
     assert voxels.shape == (windows, 2 * 4, 5, height, width)
     assert torch.equal(voxels[:, 4 + 3], batch.inputs[:, 1, 15:20])  # second sequence, 135 degrees

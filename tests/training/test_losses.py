@@ -56,3 +56,39 @@ def test_a_weight_of_zero_is_not_even_computed():
 def test_a_loss_of_nothing_is_refused():
     with pytest.raises(ValueError, match="mse, ssim, lpips: expected at least one weight > 0"):
         LossConfig(mse=0.0, ssim=0.0, lpips=0.0)
+
+
+def test_masked_pixels_and_frames_count_in_no_term_and_get_no_gradient():
+    torch.manual_seed(0)
+    lpips = Lpips("squeeze")
+    loss = FrameLoss({"mse": 1.0, "mae": 1.0, "ssim_loss": 1.0, "lpips": 1.0}, lpips)
+    truth = torch.rand(2, 2, 32, 32)
+    predicted = torch.rand(2, 2, 32, 32, requires_grad=True)
+    valid = torch.rand(2, 2, 32, 32) < 0.8
+    valid[1, 1] = False
+    terms = loss(predicted, truth, valid)
+    spoilt = torch.where(valid, predicted, 1 - predicted)
+    assert all(torch.equal(terms[name], term) for name, term in loss(spoilt, truth, valid).items())
+    of_three = [p[v] - t[v] for p, t, v in zip(*(x.flatten(0, 1)[:3] for x in (predicted, truth, valid)), strict=True)]
+    torch.testing.assert_close(terms["mse"], torch.stack([d.square().mean() for d in of_three]).mean())
+    torch.testing.assert_close(terms["mae"], torch.stack([d.abs().mean() for d in of_three]).mean())
+    loss.total(terms).backward()
+    assert (predicted.grad[~valid] == 0).all()
+    assert (predicted.grad[valid] != 0).float().mean() > 0.99
+
+
+def test_a_batch_of_which_nothing_is_known_costs_nothing_and_can_be_trained_on():
+    loss = FrameLoss({"mse": 1.0, "ssim_loss": 1.0}, None)
+    predicted = torch.rand(1, 2, 12, 12, requires_grad=True)
+    total = loss.total(loss(predicted, torch.rand(1, 2, 12, 12), torch.zeros(1, 2, 12, 12, dtype=torch.bool)))
+    total.backward()
+    assert total.item() == 0
+    assert (predicted.grad == 0).all()
+
+
+def test_an_all_valid_mask_gives_the_plain_loss():
+    predicted, truth = torch.rand(2, 2, 3, 12, 12).unbind()
+    loss = FrameLoss({"mse": 1.0, "mae": 1.0, "ssim_loss": 1.0}, None)
+    masked, plain = loss(predicted, truth, torch.ones(2, 3, 12, 12, dtype=torch.bool)), loss(predicted, truth)
+    for name in plain:
+        torch.testing.assert_close(masked[name], plain[name])

@@ -150,3 +150,12 @@ def test_batches_follow_the_order_and_the_last_may_be_small():
     dataset = Listed(sequence("a"), sequence("bb"), sequence("ccc"))
     names = [batch.names for batch in batches_of(dataset, [2, 0, 1], batch_size=2, workers=0)]
     assert names == [["ccc", "a"], ["bb"]]
+
+
+def test_a_mask_is_cropped_mirrored_and_stacked_with_its_truth():
+    masked = [s._replace(valid=s.dolp > 0.3) for s in (sequence("a"), sequence("bb"))]
+    after = seen(masked[0], WHOLE._replace(mirror_x=True, mirror_y=True, turn=3, direction=-1, top=1, height=4))
+    assert torch.equal(after.valid, after.dolp > 0.3)
+    batch = stack(masked)
+    assert torch.equal(batch.valid, batch.dolp > 0.3)
+    assert stack([sequence("a"), sequence("bb")]).valid is None

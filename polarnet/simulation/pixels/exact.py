@@ -53,8 +53,6 @@ class Pixels(NamedTuple):
     leak: np.ndarray
     """the same with the jitter of the time since the last event"""
     last_event_us: np.ndarray
-    events: np.ndarray
-    """int32, fired so far: numbers the draws of the leak's jitter"""
     next_shot_us: np.ndarray
 
 
@@ -89,7 +87,6 @@ def initial(h: int, w: int, physics: Physics, key: np.uint64, plane: int) -> Pix
         leak_nominal=np.float32(physics.leak_rate_hz * 1e-6) * leak_factor * threshold_on,
         leak=zeros.copy(),
         last_event_us=np.full(n, LONG_AGO_US),
-        events=np.zeros(n, np.int32),
         next_shot_us=np.full(n, np.inf),
     )
 
@@ -103,7 +100,7 @@ def start(light, pixels, physics, h, w, time_us, key, plane):
     shot_key = key_for(key, randomness.SHOT_NOISE, plane)
     for i in range(h * w):
         if physics.leak_rate_hz > 0:
-            pixels.leak[i] = jittered_leak(pixels.leak_nominal[i], physics.leak_jitter, jitter_key, i, 0)
+            pixels.leak[i] = jittered_leak(pixels.leak_nominal[i], physics.leak_jitter, jitter_key, i, time_us)
             pixels.change[i] = uniform(mixed(phase_key, i)) * pixels.threshold_on[i]
             if pixels.leak[i] > 0:
                 pixels.last_event_us[i] = time_us - pixels.change[i] / pixels.leak[i]
@@ -143,9 +140,9 @@ def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, co
             else:
                 _difference(response, pixels.linlog[first:stop], rise)
             change, leak = pixels.change[first:stop], pixels.leak[first:stop]
-            _move(change, leak, rise, np.float32(stop_us - start_us), before)
+            threshold_on, threshold_off = pixels.threshold_on[first:stop], pixels.threshold_off[first:stop]
             fires = flags_of(words, stop - first)
-            _flag(before, change, pixels.threshold_on[first:stop], pixels.threshold_off[first:stop], fires)
+            _move(change, leak, rise, np.float32(stop_us - start_us), before, threshold_on, threshold_off, fires)
             shooting = soonest_us[y // rows] < stop_us
             if shooting:
                 _flag_shots(pixels.next_shot_us[first:stop], stop_us, fires)
@@ -192,19 +189,13 @@ def _filter(dn, response, dn_before, response_before, lag, rate, rise):
 
 
 @compiled
-def _move(change, leak, rise, dt_us, before):
-    """Advance each change by its rise and leak as if nothing fired."""
+def _move(change, leak, rise, dt_us, before, threshold_on, threshold_off, fires):
+    """Advance each change by its rise and leak as if nothing fired; flag pixels beyond a threshold at either end."""
     for j in range(rise.size):
-        before[j] = change[j]
-        change[j] += rise[j] + leak[j] * dt_us
-
-
-@compiled
-def _flag(before, after, threshold_on, threshold_off, fires):
-    """Flag pixels that are at or beyond a threshold before or after the step."""
-    for j in range(before.size):
-        highest, lowest = max(before[j], after[j]), min(before[j], after[j])
-        fires[j] = (highest >= threshold_on[j]) | (lowest <= -threshold_off[j])
+        start = change[j]
+        stop = start + (rise[j] + leak[j] * dt_us)
+        fires[j] = (max(start, stop) >= threshold_on[j]) | (min(start, stop) <= -threshold_off[j])
+        before[j], change[j] = start, stop
 
 
 @compiled
@@ -243,7 +234,10 @@ def _fire(pixels, physics, keys, course, active, rise, dn, first, shooting, star
             j, place, change, now = course.pixel[a], course.place[a], course.change[a], course.now[a]
             i, at = np.uint64(first + j), np.uint64(n)  # unsigned: numba checks other indices for being negative
             j = np.uint64(j)
-            last, leak = pixels.last_event_us[i] - start_us, np.float64(pixels.leak[i])
+            last_us = pixels.last_event_us[i]
+            last, leak, next_leak = last_us - start_us, np.float64(pixels.leak[i]), 0.0
+            if jitter > 0:  # drawn before the event's own time is known, so that the two need not wait for each other
+                next_leak = np.float64(jittered_leak(pixels.leak_nominal[i], jitter, keys[0], i, last_us))
             threshold_on, threshold_off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
             slope = rise[j] * per_us + leak
             ready = max(now, last + refractory_us)
@@ -270,10 +264,7 @@ def _fire(pixels, physics, keys, course, active, rise, dn, first, shooting, star
             rest = max(excess, 0.0) if on else -max(excess, 0.0)
             change, now, last = (rest, event, event) if fires else (change, now, last)
             if jitter > 0:
-                number = pixels.events[i] + fires
-                drawn = np.float64(jittered_leak(pixels.leak_nominal[i], jitter, keys[0], i, number))
-                pixels.events[i] = number
-                leak = drawn if fires else leak
+                leak = next_leak if fires else leak
             at_end = change + (rise[j] * per_us + leak) * (dt - now)
             pixels.change[i], pixels.leak[i], pixels.last_event_us[i] = at_end, leak, start_us + last
             kept = np.uint64(remaining)
@@ -292,11 +283,9 @@ def _bits(key, i, time_us):
 
 
 @compiled
-def jittered_leak(nominal, jitter, key, i, number):
-    """The leak of pixel i from its event of this number to its next."""
-    return nominal * np.float32(
-        max(1 - jitter * rough_normal(mixed(key, (np.uint64(i) << np.uint64(32)) + np.uint64(number))), 0.0)
-    )
+def jittered_leak(nominal, jitter, key, i, time_us):
+    """A leak of pixel i, drawn by a time: that of the event before the one that it follows."""
+    return nominal * np.float32(max(1 - jitter * rough_normal(_bits(key, i, time_us)), 0.0))
 
 
 @compiled

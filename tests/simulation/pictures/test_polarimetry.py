@@ -25,6 +25,7 @@ from polarnet.simulation.pictures.polarimetry import (
     write_intensities,
 )
 from polarnet.simulation.scene import scene_from_intensities
+from polarnet.simulation.scenes import SceneStore
 from polarnet.simulation.truth import synthesize
 from polarnet.stokes import aolp, dolp
 
@@ -207,6 +208,43 @@ def test_intensities_survive_the_way_through_their_file(tmp_path):
     assert np.array_equal(valid.numpy(), measured.valid)
 
 
+MOTION = MotionConfig(
+    sequences_per_picture=1,
+    duration_s=0.2,
+    frame_rate_hz=30.0,
+    window_height=20,
+    window_width=30,
+    speed_min_px_s=30.0,
+    speed_max_px_s=60.0,
+    acceleration_max_px_s2=2000.0,
+    rotation_max_deg=0.0,
+    zoom_max=1.0,
+)
+
+
+def test_saturated_pixels_stay_masked_down_to_the_frames(tmp_path):
+    """A lamp of 8x8 pixels moves over the frames as up to 8x8 pixels, or 9 where it lies between them."""
+    (tmp_path / "measured").mkdir()
+    dark, lamp = light(), light()
+    lamp[:, 16:24, 26:34] = 255
+    save_npz(tmp_path / "measured" / "dark.npz", dark)
+    save_npz(tmp_path / "measured" / "lamp.npz", lamp)
+    manifest = ingest(dataclasses.replace(CONFIG, root=str(tmp_path / "measured")), 1, tmp_path / "images", map)
+    share = {entry.origin: entry.masked_fraction for entry in manifest.pictures}
+    assert sorted(share.values()) == [0, pytest.approx(64 / (40 * 60), abs=1e-6)]
+    synthesize(tmp_path / "images", tmp_path / "scenes.zarr", tmp_path / "frames.zarr", MOTION, 1, map)
+    scenes, frames = SceneStore.open(tmp_path / "scenes.zarr"), FrameStore.open(tmp_path / "frames.zarr")
+    masked = {name: ~frames.valid(name) for name in frames.sequences}
+    (shown,) = (name for name in masked if masked[name].any())
+    assert sum(map(torch.Tensor.any, masked.values())) == 1  # the dark one has a mask too, of nothing
+    assert torch.equal(~scenes.read(shown).valid, torch.from_numpy(lamp.min(axis=0) == 255))
+    for frame in masked[shown]:
+        rows, columns = frame.any(1).sum().item(), frame.any(0).sum().item()
+        assert frame.sum().item() == rows * columns
+        assert max(rows, columns) <= 9
+    assert frames.dolp(shown)[~masked[shown]].mean().item() == pytest.approx(0.6, abs=0.005)
+
+
 def test_a_measurement_becomes_a_scene_whose_frames_show_its_polarization(tmp_path):
     """From files to ground truth; 40x60 is smaller than 80x120 and used as it is."""
     (tmp_path / "measured").mkdir()
@@ -222,20 +260,9 @@ def test_a_measurement_becomes_a_scene_whose_frames_show_its_polarization(tmp_pa
     # I45 + I90 - I0 - I135 over S0, for 30 degrees: 0.6 (cos 30 + cos 120 - cos 60 - cos 210) / 2 = 0.22
     assert "the angles do not fit: the median of |I0 + I90 - I45 - I135| / S0 is 0.2" in skipped.reason
 
-    motion = MotionConfig(
-        sequences_per_picture=1,
-        duration_s=0.2,
-        frame_rate_hz=30.0,
-        window_height=20,
-        window_width=30,
-        speed_min_px_s=30.0,
-        speed_max_px_s=60.0,
-        acceleration_max_px_s2=2000.0,
-        rotation_max_deg=0.0,
-        zoom_max=1.0,
-    )
-    synthesize(tmp_path / "images", tmp_path / "scenes.zarr", tmp_path / "frames.zarr", motion, 1, map)
+    synthesize(tmp_path / "images", tmp_path / "scenes.zarr", tmp_path / "frames.zarr", MOTION, 1, map)
     frames = FrameStore.open(tmp_path / "frames.zarr")
+    assert not frames.masked
     assert frames.dolp(frames.sequences[0]).mean().item() == pytest.approx(0.6, abs=0.005)
     assert math.degrees(frames.aolp(frames.sequences[0]).mean()) == pytest.approx(30, abs=0.2)
 

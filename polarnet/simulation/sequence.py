@@ -1,0 +1,46 @@
+"""One picture, in memory, to the events of four polarizers and the truth that belongs to them."""
+
+from typing import NamedTuple
+
+from jaxtyping import Float, Int64
+from torch import Tensor, tensor
+
+from polarnet.events.stream import Events
+from polarnet.runtime import generator_for, seed_for
+from polarnet.simulation.emulator import EmulatorConfig, randomised
+from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory
+from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
+from polarnet.simulation.synthesize import synthesize_sequence
+from polarnet.simulation.truth import frames_of
+
+
+class Simulation(NamedTuple):
+    """What a moving sensor behind four polarizers reported, and what it looked at."""
+
+    events: list[Events]
+    """Behind the polarizers at 0, 45, 90 and 135 degrees, in microseconds from the start of the motion."""
+    t_us: Int64[Tensor, " n"]
+    """Times of the true frames, microseconds."""
+    intensities: Float[Tensor, "n 4 h w"]
+    """Behind the four polarizers, in [0, 1]."""
+    dolp: Float[Tensor, "n h w"]
+    aolp: Float[Tensor, "n h w"]
+    """Radians in [0, pi)."""
+    trajectory: Trajectory
+
+
+def simulate(
+    picture: Float[Tensor, "3 h w"] | PolarizationScene, motion: MotionConfig, sensor: EmulatorConfig, seed: int
+) -> Simulation:
+    """Let a window move over a picture in [0, 1], or over a scene, and see it through event-camera pixels.
+
+    Hue becomes AoLP, saturation DoLP and value S0, as in the pipeline. The same arguments give the same numbers.
+    ValueError where the picture is too small for the window and its motion.
+    """
+    scene = picture if isinstance(picture, PolarizationScene) else scene_from_rgb(picture)
+    trajectory = random_trajectory(motion, scene.height, scene.width, generator_for(seed, "picture", "motion"))
+    t_us, size = frame_times_us(motion), (motion.window_height, motion.window_width)
+    sensor = randomised(sensor, generator_for(seed, "picture", "sensor"))
+    key = seed_for(seed, "picture", "emulate")
+    events = synthesize_sequence(scene, trajectory, t_us[-1], *size, sensor, key)
+    return Simulation(events, tensor(t_us), *frames_of(scene, trajectory, t_us, *size), trajectory)

@@ -1,0 +1,248 @@
+"""The emulate stage killed with SIGKILL, by itself and on a Dask cluster: the rerun redoes only what is missing.
+
+Stages start in children of a process that has imported the stage once, so that ten deaths take seconds and not a
+minute. With POLARNET_SLOW=1 the same deaths befall `python -m stages.emulate` with two workers, each from a cold start.
+"""
+
+import functools
+import hashlib
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from skimage import data
+
+SEQUENCES = 10
+KILLS = 10
+PATIENCE_S = 120.0
+SEED = 20
+
+
+class Running(NamedTuple):
+    """A stage in a process group of its own."""
+
+    pid: int
+    wait: Callable[[], int]
+    """Blocks until it has ended; its exit status, negative for a signal."""
+
+
+@pytest.fixture(scope="module")
+def folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data folder whose scenes are ten motions of a window over the coffee photograph."""
+    from polarnet.config import load
+    from polarnet.simulation.motion import MotionConfig, Trajectory, random_trajectory
+    from polarnet.simulation.scene import polarization_from_rgb
+    from polarnet.simulation.scenes import SceneStore
+
+    motion: MotionConfig = load(
+        project_root, ["synthesize.window_height=60", "synthesize.window_width=90", "synthesize.duration_s=0.5"]
+    ).synthesize
+    picture = torch.from_numpy(data.coffee()[100:300, 150:450]).permute(2, 0, 1).float() / 255
+    folder = tmp_path_factory.mktemp("interrupted") / "data"
+    names = [f"coffee-{i}" for i in range(SEQUENCES)]
+    scenes = SceneStore.create(
+        folder / "scenes.zarr",
+        dict.fromkeys(names, "coffee"),
+        dict.fromkeys(names, "train"),
+        largest_picture=(200, 300),
+        window=(motion.window_height, motion.window_width),
+        trajectory_names=Trajectory.vector_names(),
+        attributes={},
+    )
+    scenes.write_picture("coffee", *polarization_from_rgb(picture))
+    for number, name in enumerate(names):
+        trajectory = random_trajectory(motion, 200, 300, np.random.default_rng(number))
+        scenes.write(name, torch.from_numpy(trajectory.to_vector()), round(1e6 * motion.duration_s))
+    scenes.finish()
+    return folder
+
+
+def overrides(folder: Path, events: Path) -> list[str]:
+    return [f"paths.data={folder}", f"paths.events={events}", f"hydra.run.dir={events.parent / 'log'}"]
+
+
+def run_stage(arguments: list[str]) -> None:
+    """In a child that was forked from a process which had imported the stage."""
+    os.setpgid(0, 0)
+    import stages.emulate
+
+    sys.argv = ["stages.emulate", *arguments]
+    stages.emulate.main()
+
+
+@pytest.fixture(scope="module")
+def start_forked() -> Callable[[list[str]], Running]:
+    forkserver = multiprocessing.get_context("forkserver")
+    forkserver.set_forkserver_preload(["stages.emulate", "distributed"])
+
+    def start(arguments: list[str]) -> Running:
+        process = forkserver.Process(target=run_stage, args=([*arguments, "runtime.threads=1"],))
+        process.start()
+        pid = process.pid
+        assert pid is not None
+        until(lambda: os.getpgid(pid) == pid)  # else the signal would find no such group
+
+        def wait() -> int:
+            process.join(PATIENCE_S)
+            assert process.exitcode is not None, "the stage hangs"
+            return process.exitcode
+
+        return Running(pid, wait)
+
+    return start
+
+
+@pytest.fixture(scope="module")
+def start_cold(project_root: Path) -> Callable[[list[str]], Running]:
+    if not os.environ.get("POLARNET_SLOW"):
+        pytest.skip("POLARNET_SLOW is not set: ten cold starts take two minutes")
+
+    def start(arguments: list[str]) -> Running:
+        command = [sys.executable, "-m", "stages.emulate", *arguments, "runtime.workers=2"]
+        process = subprocess.Popen(
+            command, cwd=project_root, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, process_group=0
+        )
+        return Running(process.pid, lambda: process.wait(PATIENCE_S))
+
+    return start
+
+
+def digest(folder: Path) -> dict[str, str]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def finished(unfinished: Path) -> set[int]:
+    """Numbers of the sequences that are whole: their offsets are written last."""
+    return {int(path.name) for path in (unfinished / "offsets" / "c").glob("[0-9]*") if any(path.rglob("0"))}
+
+
+def identities(store: Path, numbers: set[int]) -> dict[str, tuple[int, int]]:
+    """Inode and time of every file of these sequences: another one if it is written again, even with equal bytes."""
+    chunks = [path for number in numbers for path in store.rglob(f"c/{number}/**/*") if path.is_file()]
+    return {str(path.relative_to(store)): (path.stat().st_ino, path.stat().st_mtime_ns) for path in chunks}
+
+
+def until(true: Callable[[], bool], still_worth_it: Callable[[], bool] = lambda: True) -> None:
+    start = time.monotonic()
+    while not true() and still_worth_it():
+        assert time.monotonic() - start < PATIENCE_S, "nothing happens"
+        time.sleep(0.001)
+
+
+class Undisturbed(NamedTuple):
+    """What a run leaves that nothing interrupts, and its pace."""
+
+    digests: dict[str, str]
+    seconds_to_first: float
+    seconds_each: float
+
+
+@pytest.fixture(scope="module")
+def undisturbed(folder: Path, start_forked: Callable[[list[str]], Running]) -> Undisturbed:
+    events = folder.parent / "undisturbed" / "events.zarr"
+    start_forked(overrides(folder, events.with_name("warm.zarr"))).wait()  # compiles what is not compiled yet
+    start = time.monotonic()
+    running = start_forked(overrides(folder, events))
+    until(lambda: bool(finished(events.with_name("events.zarr.tmp"))))
+    first = time.monotonic()
+    assert running.wait() == 0
+    return Undisturbed(digest(events), first - start, (time.monotonic() - first) / (SEQUENCES - 1))
+
+
+@pytest.mark.parametrize("start", ["start_forked", "start_cold"])
+def test_ten_deaths_at_random_moments_change_no_byte_and_no_finished_sequence(
+    folder, start, undisturbed, tmp_path, request
+):
+    """Half of the deaths come before a run has finished anything, half up to 1.5 sequences after its first."""
+    begin = request.getfixturevalue(start)
+    events, unfinished = tmp_path / "events.zarr", tmp_path / "events.zarr.tmp"
+    generator = np.random.default_rng(SEED)
+    known: dict[str, tuple[int, int]] = {}
+    deaths = []
+    while len(deaths) < KILLS:
+        done = len(finished(unfinished))
+        running = begin(overrides(folder, events))
+        if len(deaths) % 2:
+            until(lambda done=done: len(finished(unfinished)) > done, lambda: not events.exists())
+            time.sleep(generator.uniform(0, 1.5 * undisturbed.seconds_each))
+        else:
+            time.sleep(generator.uniform(0, undisturbed.seconds_to_first))
+        os.killpg(running.pid, signal.SIGKILL)
+        status = running.wait()
+        if events.exists():  # it was quicker than its death: begin anew
+            assert identities(events, set(range(SEQUENCES))).items() >= known.items()
+            shutil.rmtree(events)
+            known = {}
+            continue
+        assert status == -signal.SIGKILL
+        assert identities(unfinished, finished(unfinished)).items() >= known.items()
+        known = identities(unfinished, finished(unfinished))
+        deaths.append(len(finished(unfinished)))
+    assert max(deaths) > 0
+    assert begin(overrides(folder, events)).wait() == 0
+    assert identities(events, set(range(SEQUENCES))).items() >= known.items()
+    assert digest(events) == undisturbed.digests
+    assert not unfinished.exists()
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator:
+    """A Dask cluster of one worker, to begin with; workers fork as the stages above do."""
+    dask = pytest.importorskip("dask")
+    distributed = pytest.importorskip("distributed")
+    forking = dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"})
+    with forking, distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        yield cluster
+
+
+def over_dask(folder: Path, events: Path, cluster) -> None:
+    """The emulate stage, in this process, on the workers of a cluster."""
+    from polarnet.cluster import pmap
+    from polarnet.config import load
+    from polarnet.simulation.dataset import emulate_scenes
+
+    config = load(Path(__file__).resolve().parents[2])
+    mapper = functools.partial(pmap, workers=1, label="emulate", address=cluster.scheduler_address)
+    assert emulate_scenes(folder / "scenes.zarr", events, config.emulate, config.seed, mapper, 1) == SEQUENCES
+
+
+def test_one_and_three_dask_workers_and_one_killed_half_way_give_the_bytes_of_one_process(
+    folder, undisturbed, cluster, tmp_path
+):
+    over_dask(folder, tmp_path / "one.zarr", cluster)
+    assert digest(tmp_path / "one.zarr") == undisturbed.digests
+
+    cluster.scale(3)
+    cluster.wait_for_workers(3)
+    over_dask(folder, tmp_path / "three.zarr", cluster)
+    assert digest(tmp_path / "three.zarr") == undisturbed.digests
+
+    events, unfinished = tmp_path / "killed.zarr", tmp_path / "killed.zarr.tmp"
+    done_at_death: list[int] = []
+
+    def kill_one_worker() -> None:
+        until(lambda: len(finished(unfinished)) >= 2)
+        busiest = max(cluster.scheduler.workers.values(), key=lambda worker: len(worker.processing))
+        os.kill(pids[busiest.address], signal.SIGKILL)
+        done_at_death.append(len(finished(unfinished)))
+
+    with cluster.get_client() as client:
+        pids = client.run(os.getpid)
+    killer = threading.Thread(target=kill_one_worker)
+    killer.start()
+    over_dask(folder, events, cluster)
+    killer.join()
+    assert 2 <= done_at_death[0] < SEQUENCES
+    assert digest(events) == undisturbed.digests

@@ -1,0 +1,91 @@
+"""Events made in memory are those that the emulate stage stores."""
+
+import dataclasses
+import pickle
+
+import pytest
+import torch
+
+from polarnet.events.store import EventStore
+from polarnet.events.stream import Events
+from polarnet.simulation import fly
+from polarnet.simulation.fly import EmulatedEvents
+from polarnet.simulation.scenes import SceneStore
+
+
+@pytest.fixture
+def emulated(simulated) -> list[str]:
+    """Names of the sequences that were emulated since the test began."""
+    return []
+
+
+@pytest.fixture
+def source(simulated, emulated, monkeypatch) -> EmulatedEvents:
+    def counted(scenes, sequence, *arguments):
+        emulated.append(sequence)
+        return emulate_sequence(scenes, sequence, *arguments)
+
+    emulate_sequence = fly.emulate_sequence
+    monkeypatch.setattr(fly, "emulate_sequence", counted)
+    return EmulatedEvents(SceneStore.open(simulated.scenes), simulated.emulate, simulated.seed, kept=2)
+
+
+def same(some: list[Events], others: list[Events]) -> bool:
+    return all(
+        torch.equal(getattr(a, name), getattr(b, name)) and getattr(a, name).dtype == getattr(b, name).dtype
+        for a, b in zip(some, others, strict=True)
+        for name in "txyp"
+    )
+
+
+WINDOWS = [(None, None), (0, 33_333), (33_333, 66_667), (190_000, None), (None, 1), (-5, 10_000), (90_000, 20_000)]
+
+
+@pytest.mark.parametrize(("start_us", "stop_us"), WINDOWS)
+def test_every_window_holds_the_stored_events_whoever_is_asked(simulated, source, start_us, stop_us):
+    store = EventStore.open(simulated.events)
+    assert (source.sequences, source.height, source.width) == (store.sequences, store.height, store.width)
+    for name in store.sequences:
+        assert same(source.read(name, start_us, stop_us), store.read(name, start_us, stop_us)), name
+    assert sum(store.count("a-0")) > 1000  # there is something to compare
+
+
+def test_what_the_events_depend_on_is_what_the_store_says(simulated, source):
+    assert source.attributes == EventStore.open(simulated.events).attributes
+
+
+def test_a_sequence_is_emulated_once_for_all_its_windows_and_forgotten_after_two_others(source, emulated):
+    source.read("a-0", 0, 50_000)
+    source.read("a-0", 50_000, 90_000)
+    source.read("b-0")
+    source.read("a-0")
+    assert emulated == ["a-0", "b-0"]
+    source.read("c-0")  # b was asked for longest ago
+    source.read("a-0")
+    source.read("b-0")
+    assert emulated == ["a-0", "b-0", "c-0", "b-0"]
+
+
+def test_a_copy_in_another_process_takes_no_events_along(source):
+    fresh = len(pickle.dumps(source))
+    events = source.read("a-0")
+    assert len(pickle.dumps(source)) < fresh + 0.1 * sum(channel.t.nbytes for channel in events)
+    assert same(pickle.loads(pickle.dumps(source)).read("a-0"), events)
+
+
+def test_another_seed_gives_other_events(simulated, source):
+    other = EmulatedEvents(SceneStore.open(simulated.scenes), simulated.emulate, simulated.seed + 1)
+    assert not all(len(a) == len(b) for a, b in zip(source.read("a-0"), other.read("a-0"), strict=True))
+
+
+def test_an_unknown_sequence_and_an_empty_memory_are_refused(simulated, source):
+    with pytest.raises(ValueError, match="expected one of its sequences, got 'lake'"):
+        source.read("lake")
+    with pytest.raises(ValueError, match="at least one sequence to keep"):
+        EmulatedEvents(SceneStore.open(simulated.scenes), simulated.emulate, simulated.seed, kept=0)
+
+
+def test_threads_change_nothing(simulated, source):
+    threaded = EmulatedEvents(SceneStore.open(simulated.scenes), simulated.emulate, simulated.seed, threads=3)
+    assert dataclasses.asdict(simulated.emulate)["randomise"]
+    assert same(source.read("d-0"), threaded.read("d-0"))

@@ -1,0 +1,156 @@
+"""Both ways to feed a training give the same numbers."""
+
+import dataclasses
+import shutil
+from typing import Any
+
+import pytest
+import torch
+
+from polarnet.events.frames import FrameStore
+from polarnet.networks.dolp_unet import DolpUNetConfig
+from polarnet.training.dolp import dolp_task
+from polarnet.training.e2v import E2vConfig, e2v_task
+from polarnet.training.loop import TrainConfig, train_batch, validate
+from polarnet.training.losses import LossConfig
+from polarnet.training.sequences import Visits, batches_of
+from polarnet.training.task import Split, Task, describe, open_events, open_split
+
+SEED = 5
+LOOP: dict[str, Any] = {
+    "data": "store",
+    "visits": 1,
+    "windows": 4,
+    "crop": [16, 20],
+    "symmetries": True,
+    "epochs": 1,
+    "batch_size": 2,
+    "bptt_windows": 2,
+    "learning_rate": 1e-3,
+    "schedule": "constant",
+    "warmup": 0.0,
+    "gradient_norm": 1.0,
+    "precision": "fp32",
+}
+NETWORK = DolpUNetConfig(
+    channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1, input_mixing="contrasts"
+)
+TRAIN = TrainConfig(**LOOP, representation="event_tensor")
+E2V = E2vConfig(**LOOP, arch="firenet", bins=3, ssim=1.0, lpips=0.0)
+
+
+def dolp() -> Task:
+    return dolp_task("paper", NETWORK, TRAIN, LossConfig(mse=1.0, ssim=1.0, lpips=0.0), None, SEED)
+
+
+def e2v() -> Task:
+    return e2v_task(E2V, None, SEED)
+
+
+def split_of(simulated, data: str, task: Task) -> Split:
+    events = open_events(
+        data, str(simulated.events), str(simulated.scenes), simulated.emulate, simulated.seed, threads=1
+    )
+    return open_split(events, str(simulated.frames), task.encode)
+
+
+@pytest.mark.parametrize(("new_task", "config"), [(dolp, TRAIN), (e2v, E2V)])
+def test_two_steps_on_the_fly_are_two_steps_from_the_store_to_the_last_bit(simulated, new_task, config):
+    weights, inputs = [], []
+    for data in ("store", "fly"):
+        task = new_task()
+        visits = Visits(split_of(simulated, data, task).train, config, SEED, epoch=0)
+        batch = next(batches_of(visits, [2, 0], config.batch_size, workers=0))
+        optimizer = torch.optim.Adam(task.network.parameters(), lr=config.learning_rate)
+        assert len(train_batch(task, optimizer, batch, config, torch.device("cpu"))) == 2
+        weights.append(task.network.state_dict())
+        inputs.append(batch)
+    assert inputs[0].names == inputs[1].names
+    assert inputs[0].inputs.abs().sum() > 0
+    assert all(torch.equal(a, b) for a, b in zip(inputs[0][1:5], inputs[1][1:5], strict=True))
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+    assert any(not torch.equal(weights[0][name], tensor) for name, tensor in new_task().network.state_dict().items())
+
+
+def test_validation_sequences_are_the_same_too_read_by_workers(simulated):
+    task = dolp()
+    stored, fly = (split_of(simulated, data, task).val for data in ("store", "fly"))
+    (batch,) = batches_of(fly, range(len(fly)), 1, workers=1)
+    assert torch.equal(batch.inputs[:, 0], stored[0].inputs)
+
+
+def test_no_event_file_is_needed_on_the_fly(simulated, tmp_path):
+    for path in (simulated.scenes, simulated.frames):
+        shutil.copytree(path, tmp_path / path.name)
+    moved = simulated._replace(
+        scenes=tmp_path / "scenes.zarr", frames=tmp_path / "frames.zarr", events=tmp_path / "events.zarr"
+    )
+    assert len(split_of(moved, "fly", dolp()).train[0].inputs) == 6
+    with pytest.raises(FileNotFoundError):
+        split_of(moved, "store", dolp())
+
+
+def test_a_checkpoint_tells_what_its_events_were_made_from(simulated, tmp_path):
+    task = dolp()
+    described = {}
+    for data in ("store", "fly"):
+        config = dataclasses.replace(TRAIN, data=data)
+        described[data] = describe(task, split_of(simulated, data, task), config, tmp_path, SEED)
+        assert described[data]["training"]["data"] == data
+        assert described[data]["data"]["events_from"]["emulate"] == dataclasses.asdict(simulated.emulate)
+    assert described["store"]["data"]["events_sha256"] != described["fly"]["data"]["events_sha256"]
+
+
+@pytest.fixture
+def masked(simulated, tmp_path):
+    """The simulated sequences with the left third of all frames masked, and all of the first three frames."""
+    source = FrameStore.open(simulated.frames)
+    frames = FrameStore.create(
+        tmp_path / "masked.zarr", source.sequences, source.splits, 7, source.height, source.width, {}, masked=True
+    )
+    for name in source.sequences:
+        truth = source.frames(name)
+        valid = torch.ones_like(truth.dolp, dtype=torch.bool)
+        valid[..., :8] = False
+        valid[:3] = False
+        frames.write(name, *truth[:4], valid)
+    frames.finish()
+    return simulated._replace(frames=tmp_path / "masked.zarr")
+
+
+def test_training_and_validation_leave_masked_pixels_out(masked, simulated):
+    task, cpu = dolp(), torch.device("cpu")
+    split = split_of(masked, "store", task)
+    (val,) = split.val
+    assert val.valid.shape == val.dolp.shape
+    assert val.valid.float().mean() == pytest.approx(4 / 6 * 2 / 3)
+    with torch.no_grad():
+        predicted, _ = task.unroll(val.inputs[:, None], None)
+    expected = (predicted[2:, 0, :, 8:] - val.dolp[2:, :, 8:]).square().mean().item()
+    config = dataclasses.replace(TRAIN, bptt_windows=6)
+    assert validate(task, split.val, config, cpu, workers=0)["mse"] == pytest.approx(expected, rel=1e-4)
+    plain = validate(task, split_of(simulated, "store", task).val, config, cpu, workers=0)["mse"]
+    assert plain != pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("of_e2v", [False, True])
+def test_what_the_truth_says_at_masked_pixels_does_not_change_the_weights(masked, of_e2v):
+    config = E2V if of_e2v else TRAIN
+    weights = []
+    for spoil in (False, True):
+        if of_e2v:
+            task = e2v_task(dataclasses.replace(E2V, ssim=0.0), None, SEED)
+        else:  # SSIM looks at neighbours, and so at the truth of masked pixels
+            task = dolp_task("paper", NETWORK, TRAIN, LossConfig(mse=1.0, ssim=0.0, lpips=0.0), None, SEED)
+        visits = Visits(split_of(masked, "store", task).train, config, SEED, epoch=0)
+        batch = next(batches_of(visits, [0, 1], config.batch_size, workers=0))
+        assert not batch.valid.all()
+        if spoil:
+            batch = batch._replace(
+                dolp=torch.where(batch.valid, batch.dolp, 1 - batch.dolp),
+                intensity=torch.where(batch.valid[:, :, None], batch.intensity, 1 - batch.intensity),
+            )
+        optimizer = torch.optim.Adam(task.network.parameters(), lr=config.learning_rate)
+        train_batch(task, optimizer, batch, config, torch.device("cpu"))
+        weights.append(task.network.state_dict())
+    assert all(torch.equal(weights[0][name], tensor) for name, tensor in weights[1].items())
