@@ -105,7 +105,7 @@ def _log_ticks(axes: Axes, values: Sequence[float]) -> None:
     for value in shown:
         if not kept or np.log(value / kept[-1]) > np.log(shown[-1] / shown[0]) / 9:
             kept.append(value)
-    axes.set_xticks(kept, [f"{value:.2g}" for value in kept])
+    axes.set_xticks(kept, [f"{value:.3g}" if value >= 100 else f"{value:.2g}" for value in kept])
     axes.xaxis.set_minor_locator(NullLocator())
 
 
