@@ -165,5 +165,5 @@ def test_a_run_with_another_sensor_has_a_folder_of_its_own(project_root, monkeyp
     monkeypatch.chdir(project_root)
     assert main(["run", "experiment=smoke", "sensor=noisy"]) == 0
     assert calls[0][2:] == ["stages.ingest", "experiment=smoke", "sensor=noisy", "paths.data=outputs/run/smoke-noisy"]
-    assert len(calls) == 8
+    assert len(calls) == 9
     assert "outputs/run/smoke-noisy/report/index.html" in capsys.readouterr().out
