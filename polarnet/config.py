@@ -27,6 +27,7 @@ from polarnet.runtime import RuntimeConfig, configure
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import MotionConfig
 from polarnet.simulation.pictures.ingest import IngestConfig
+from polarnet.simulation.sets import SetsConfig
 from polarnet.training.e2p import E2pConfig
 from polarnet.training.e2v import E2vConfig
 from polarnet.training.loop import TrainConfig
@@ -79,9 +80,11 @@ class Paths:
     train: str
     train_e2v: str
     train_e2p: str
+    sets: str
     benchmark: str
     report: str
     resume: str
+    cache: str
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,7 @@ class Config:
     lpips: LpipsConfig
     baselines: BaselinesConfig
     benchmark: BenchmarkConfig
+    sets: SetsConfig
     paths: Paths
     runtime: RuntimeConfig
     cluster: ClusterConfig

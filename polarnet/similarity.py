@@ -7,6 +7,7 @@ The perceptual distance (LPIPS) has weights to find and lives in polarnet/lpips.
 """
 
 import functools
+import math
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,13 +18,16 @@ from polarnet.lpips import Lpips, LpipsConfig, lpips_problem
 __all__ = [
     "Lpips",
     "LpipsConfig",
+    "aolp_error_deg",
     "correlation",
+    "gradient_agreement",
     "level_mse",
     "lpips_problem",
     "mean_where",
     "mse",
     "pattern_mse",
     "psnr",
+    "spread_mse",
     "ssim",
     "with_truth_outside",
 ]
@@ -35,6 +39,8 @@ SSIM_RADIUS = 5  # pixels: an 11 x 11 window
 SSIM_K1, SSIM_K2 = 0.01, 0.03
 LEAST_MSE = 1e-10  # half a step of the stored truth (1/65535) squared is 6e-11: nothing finer is known
 LEAST_DEVIATION = 1e-6  # a tenth of a step: a frame that varies less is constant
+SOBEL_SMOOTH, SOBEL_SLOPE = (0.25, 0.5, 0.25), (-0.5, 0.0, 0.5)  # across and along; a ramp has its slope per pixel
+CHANCE_AOLP_DEG = 45.0  # mean error of an angle that knows nothing: the mean of |d| over -90 ... 90 degrees
 
 
 def mean_where(values: Float[Tensor, "*b h w"], valid: Valid) -> Float[Tensor, "*b"]:
@@ -69,6 +75,11 @@ def pattern_mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: V
     return mse(_centred(a, valid), _centred(b, valid), valid)
 
 
+def spread_mse(truth: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
+    """`mse` of the best constant, the frame's own mean: its variance over the pixels, against which skill counts."""
+    return mean_where(_centred(truth, valid).square(), valid)
+
+
 def psnr(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Peak signal-to-noise ratio in dB for the data range 1; 100 dB, not infinity, where the frames agree."""
     return -10 * torch.log10(mse(a, b, valid).clamp(min=LEAST_MSE))
@@ -88,6 +99,49 @@ def correlation(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: V
     if valid is not None:
         constant[~valid.any(-1).any(-1)] = torch.nan
     return torch.where(varies, covariance / torch.where(varies, variance, 1.0).sqrt(), constant).to(dtype)
+
+
+def gradient_agreement(
+    a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None
+) -> Float[Tensor, "*b"]:
+    """How well edges agree in place, direction and height: 2 sum(grad a . grad b) / sum(|grad a|^2 + |grad b|^2).
+
+    In [-1, 1]: 1 for the same gradients, 0 where either frame has none, -1 for the negative. An edge half as high
+    as it should be costs, which `correlation` forgives. The gradients are Sobel's (smoothed central differences) at
+    the interior pixels; with a mask, at those whose eight neighbours are valid as well (0 where there is none).
+    The ratio is that of gradient similarity (Liu, Lin & Narwaria, IEEE TIP 2012), here of vectors instead of
+    magnitudes, and pooled over the frame before the division, so that it needs no constant.
+    ValueError for a frame smaller than 3 pixels.
+    """
+    if min(a.shape[-2:]) < len(SOBEL_SLOPE):
+        raise ValueError(f"gradients need frames of at least 3 pixels a side, got {tuple(a.shape[-2:])}")
+    dtype = torch.promote_types(a.dtype, b.dtype)
+    seen = None if valid is None else _eroded(valid)
+    (a_x, a_y), (b_x, b_y) = (_sobel(x.double()) for x in (a, b))
+
+    def total(values: Tensor) -> Tensor:
+        return (values if seen is None else torch.where(seen, values, 0.0)).sum(dim=(-2, -1))
+
+    common, energy = total(a_x * b_x + a_y * b_y), [total(x.square() + y.square()) for x, y in ((a_x, a_y), (b_x, b_y))]
+    floor = LEAST_DEVIATION**2 * a_x.shape[-2] * a_x.shape[-1]
+    varies = (energy[0] > floor) & (energy[1] > floor)
+    return torch.where(varies, 2 * common / torch.where(varies, energy[0] + energy[1], 1.0), 0.0).to(dtype)
+
+
+def aolp_error_deg(
+    a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], weight: Float[Tensor, "*b h w"], valid: Valid = None
+) -> Float[Tensor, "*b"]:
+    """Mean of the angle between two AoLP in radians, in degrees [0, 90]: the shorter way round the half circle.
+
+    `weight` is the true DoLP, as an angle matters as much as light is polarized. A frame without any polarization
+    has no angle and nobody can be right or wrong: it counts as chance, 45 degrees, so that no frame is left out.
+    """
+    period = math.pi
+    between = ((a - b).double() + period / 2).remainder(period) - period / 2
+    counted = weight.double() if valid is None else torch.where(valid, weight.double(), 0.0)
+    total = counted.sum(dim=(-2, -1))
+    mean = (between.abs() * counted).sum(dim=(-2, -1)) / torch.where(total > 0, total, 1.0)
+    return torch.where(total > 0, mean.rad2deg(), CHANCE_AOLP_DEG).to(torch.promote_types(a.dtype, b.dtype))
 
 
 def ssim(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
@@ -119,6 +173,26 @@ def _centred(frames: Tensor, valid: Valid = None) -> Tensor:
 
 def _deviation(centred: Tensor, valid: Valid = None) -> Tensor:
     return mean_where(centred.detach().square(), valid).sqrt()
+
+
+def _sobel(frames: Float[Tensor, "*b h w"]) -> tuple[Float[Tensor, "*b i j"], Float[Tensor, "*b i j"]]:
+    """(along rows, along columns), per pixel, at the interior pixels."""
+
+    def filtered(x: Tensor, dim: int, taps: tuple[float, ...]) -> Tensor:
+        n = x.shape[dim] - len(taps) + 1
+        return torch.stack([tap * x.narrow(dim, k, n) for k, tap in enumerate(taps) if tap]).sum(dim=0)
+
+    return (
+        filtered(filtered(frames, -1, SOBEL_SLOPE), -2, SOBEL_SMOOTH),
+        filtered(filtered(frames, -2, SOBEL_SLOPE), -1, SOBEL_SMOOTH),
+    )
+
+
+def _eroded(valid: Bool[Tensor, "*b h w"]) -> Bool[Tensor, "*b i j"]:
+    """Interior pixels that are valid with all eight neighbours."""
+    height, width = valid.shape[-2] - 2, valid.shape[-1] - 2
+    shifts = [valid[..., i : i + height, j : j + width] for i in range(3) for j in range(3)]
+    return torch.stack(shifts).all(dim=0)
 
 
 def _gaussian_means(frames: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:

@@ -1,7 +1,11 @@
+import json
+import subprocess
+
 import pytest
 
-from polarnet.measure import _timed, machine_record, measure_pipeline
+from polarnet.measure import BENCHMARK_KEYS, _timed, machine_record, measure_benchmark, measure_pipeline
 from polarnet.reports.provenance import git
+from polarnet.reports.readme import benchmark_block
 
 
 def test_the_minutes_of_a_target_are_those_of_its_stages(tmp_path):
@@ -31,3 +35,45 @@ def test_a_tree_with_changes_is_not_measured(tmp_path):
     git(tmp_path, "add", "file")
     with pytest.raises(RuntimeError, match="uncommitted changes"):
         measure_pipeline(tmp_path)
+
+
+def write_results(folder):
+    folder.mkdir(parents=True)
+    ours = dict.fromkeys(BENCHMARK_KEYS, 0.5) | {"lpips": None, "mse_ci": [0.4, 0.6], "params": 7}
+    (folder / "metrics.json").write_text(json.dumps({"zeros": {"mse": 1.0}, "ours": ours}))
+    pairs = {"zeros": {"mse": {"scenes": 6, "better": 6, "effect": 1.0, "p": 0.03125, "p_holm": 0.03125}}}
+    about = {"frames": 12, "warmup_windows": 5, "precision": "fp32", "scenes": ["a"] * 6, "paired": pairs}
+    (folder / "details.json").write_text(json.dumps(about | {"lpips": {"reason": "none here"}}))
+
+
+@pytest.fixture
+def measured_project(tmp_path):
+    """A repository with one commit and both sets' results in data/."""
+    (tmp_path / "file").write_text("one")
+    identity = ["-c", "user.name=a", "-c", "user.email=a@example.org"]
+    for command in (["init", "--quiet"], ["add", "file"], [*identity, "commit", "--quiet", "-m", "one"]):
+        subprocess.run(["git", *command], cwd=tmp_path, check=True)
+    write_results(tmp_path / "data" / "benchmark")
+    write_results(tmp_path / "data" / "benchmark" / "sets" / "measured")
+    return tmp_path
+
+
+def test_benchmark_results_are_sets_then_methods_then_figures(measured_project):
+    path = measure_benchmark(measured_project, measured_project / "data" / "benchmark")
+    results = json.loads(path.read_text())
+    assert {"simulated", "measured", "machine", "commit"} <= set(results)
+    for name in ("simulated", "measured"):
+        assert set(results[name]) == {"zeros", "ours"}
+        assert set(results[name]["ours"]) == set(BENCHMARK_KEYS)
+        assert results[name]["ours"]["params"] == 7
+        assert results[name]["zeros"]["gflop"] is None
+    block = benchmark_block(results)
+    assert "**Simulated**: 6 scenes, 12 frames" in block
+    assert "**Measured polarization**" in block
+    assert "zeros: ours is better in 6 of 6 scenes (effect +1.00, p = 0.031)." in block
+
+
+def test_a_set_that_was_not_run_is_asked_for(tmp_path, measured_project):
+    (measured_project / "data" / "benchmark" / "sets" / "measured" / "metrics.json").unlink()
+    with pytest.raises(RuntimeError, match=r"no results of measured; run `dvc repro` with benchmark.sets"):
+        measure_benchmark(measured_project, measured_project / "data" / "benchmark")

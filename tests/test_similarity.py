@@ -11,12 +11,26 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
-from skimage.metrics import structural_similarity
+from skimage.filters import sobel_h, sobel_v
+from skimage.metrics import mean_squared_error, peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from polarnet import lpips
 from polarnet.lpips import BACKBONES, Weights, find_weights, write_weights
-from polarnet.similarity import Lpips, LpipsConfig, correlation, level_mse, lpips_problem, mse, pattern_mse, psnr, ssim
+from polarnet.similarity import (
+    Lpips,
+    LpipsConfig,
+    aolp_error_deg,
+    correlation,
+    gradient_agreement,
+    level_mse,
+    lpips_problem,
+    mse,
+    pattern_mse,
+    psnr,
+    spread_mse,
+    ssim,
+)
 
 SHARED = os.environ.get("POLARNET_SHARED")
 needs_shared = pytest.mark.skipif(SHARED is None, reason="POLARNET_SHARED names no folder of reference material")
@@ -122,9 +136,80 @@ def test_ssim_of_a_frame_smaller_than_half_its_window_is_refused():
         ssim(torch.zeros(5, 40), torch.zeros(5, 40))
 
 
+def test_mse_and_psnr_are_those_of_scikit_image(pair):
+    a, b = (x.double() for x in pair)
+    for i in range(2):
+        pictures = b[i].numpy(), a[i].numpy()
+        assert mse(a, b)[i].item() == pytest.approx(mean_squared_error(*pictures), rel=1e-12)
+        assert psnr(a, b)[i].item() == pytest.approx(peak_signal_noise_ratio(*pictures, data_range=1), rel=1e-12)
+
+
+def test_the_spread_is_the_error_of_the_frames_own_mean(pair):
+    _, b = pair
+    torch.testing.assert_close(spread_mse(b), mse(b.mean(dim=(-2, -1), keepdim=True).expand_as(b), b))
+
+
+def test_gradients_of_equal_ramps_agree_and_half_as_steep_a_one_agrees_less():
+    ramp = torch.linspace(0, 1, 9).expand(7, 9)
+    assert gradient_agreement(ramp, ramp + 0.1).item() == pytest.approx(1)
+    assert gradient_agreement(ramp, 0.5 * ramp).item() == pytest.approx(2 * 0.5 / (1 + 0.25))
+    assert gradient_agreement(ramp, -ramp).item() == pytest.approx(-1)
+    assert gradient_agreement(ramp, torch.linspace(0, 1, 7)[:, None].expand(7, 9)).item() == pytest.approx(0, abs=1e-7)
+
+
+def test_gradient_agreement_is_that_of_scikit_images_sobel(pair):
+    a, b = (x.double() for x in pair)
+    # scikit-image's kernels sum to 1 on either side of the centre; ours take the slope per pixel: half as much
+    along = [[f(x[0].numpy())[1:-1, 1:-1] for f in (sobel_h, sobel_v)] for x in (a, b)]
+    common = sum((x * y).sum() for x, y in zip(*along, strict=True))
+    energy = sum((x * x).sum() for gradient in along for x in gradient)
+    assert gradient_agreement(a, b)[0].item() == pytest.approx(2 * common / energy, rel=1e-12)
+
+
+def test_a_constant_frame_agrees_with_no_gradient():
+    assert gradient_agreement(torch.full((5, 5), 1 / 3), torch.rand(5, 5)).item() == 0
+    with pytest.raises(ValueError, match="at least 3 pixels a side"):
+        gradient_agreement(torch.zeros(2, 9), torch.zeros(2, 9))
+
+
+@pytest.mark.parametrize(
+    ("a_deg", "b_deg", "error"), [(10, 30, 20), (175, 5, 10), (0, 90, 90), (0, 180, 0), (1, 179, 2), (40, 140, 80)]
+)
+def test_the_angle_between_two_orientations_goes_the_shorter_way_round(a_deg, b_deg, error):
+    a, b = (torch.full((1, 2, 2), float(np.deg2rad(x)), dtype=torch.float64) for x in (a_deg, b_deg))
+    assert aolp_error_deg(a, b, torch.ones(1, 2, 2)).item() == pytest.approx(error, abs=1e-9)
+    assert aolp_error_deg(b, a, torch.ones(1, 2, 2)).item() == pytest.approx(error, abs=1e-9)
+
+
+def test_an_angle_weighs_as_much_as_the_light_is_polarized():
+    error = torch.tensor([[0.0, np.deg2rad(40)]])
+    assert aolp_error_deg(error, 0 * error, torch.tensor([[0.9, 0.3]])).item() == pytest.approx(10, abs=1e-5)
+    assert aolp_error_deg(error, 0 * error, torch.tensor([[0.9, 0.0]])).item() == 0
+
+
+def test_pixels_that_are_not_valid_count_in_no_gradient_angle_or_spread(pair):
+    a, b = pair
+    valid = torch.ones(2, 24, 31, dtype=torch.bool)
+    valid[:, :, 20:] = False
+    spoilt = torch.where(valid, a, 7.0)
+    known, other = a[..., :20], b[..., :20]
+    torch.testing.assert_close(gradient_agreement(spoilt, b, valid), gradient_agreement(known, other))
+    torch.testing.assert_close(aolp_error_deg(spoilt, b, b, valid), aolp_error_deg(known, other, other))
+    torch.testing.assert_close(spread_mse(spoilt, valid), spread_mse(known))
+
+
+def test_without_polarization_an_angle_is_right_by_chance():
+    zero = torch.zeros(2, 3, 3)
+    assert aolp_error_deg(zero, zero, zero).tolist() == [45.0, 45.0]
+    random = torch.rand(1, 300, 300, generator=torch.Generator().manual_seed(0)) * torch.pi
+    assert aolp_error_deg(random, torch.zeros(1, 300, 300), torch.ones(1, 300, 300)).item() == pytest.approx(
+        45, abs=0.3
+    )
+
+
 def test_leading_axes_are_kept(pair):
     a, b = (x.view(1, 2, 24, 31) for x in pair)
-    for score in (mse, psnr, ssim, correlation, level_mse, pattern_mse):
+    for score in (mse, psnr, ssim, correlation, level_mse, pattern_mse, gradient_agreement):
         assert score(a, b).shape == (1, 2)
 
 

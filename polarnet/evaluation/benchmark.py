@@ -1,20 +1,25 @@
-"""The benchmark: every method on every test sequence, scored, timed, and a few windows kept to be looked at."""
+"""The benchmark: every method on every sequence of a test set, scored, its cost measured, a few windows to look at."""
 
+import dataclasses
+import functools
 import json
+import platform
 import shutil
-import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
-from tqdm import tqdm
 
 from polarnet.baselines.trivial import mean_dolp
-from polarnet.evaluation.methods import Context, Recording, Recovered, recover
+from polarnet.evaluation.cache import FORMAT, Cache, sequence_digest
+from polarnet.evaluation.cost import Cost, cost_of
+from polarnet.evaluation.methods import METHODS, Context, Polarization, Recording, recover
+from polarnet.evaluation.paired import paired_comparisons
 from polarnet.evaluation.score import (
     METRICS,
     BenchmarkConfig,
@@ -29,6 +34,7 @@ from polarnet.events.frames import FrameStore
 from polarnet.events.representations import event_tensor
 from polarnet.events.store import EventStore
 from polarnet.events.windows import encode_windows
+from polarnet.fingerprint import code_digest, digest, method_digest, value_digest
 from polarnet.similarity import Lpips
 
 
@@ -52,23 +58,47 @@ class Panel:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """All that was measured."""
+    """All that was measured on one test set."""
 
     rows: Sequence[FrameScore]
-    ms_per_window: Mapping[str, float]
-    """Median over sequences, after one call that is not counted; with the making of the input."""
+    costs: Mapping[str, Cost]
     panels: Sequence[Panel]
 
 
-def recordings_of(split: str, events: EventStore, frames: FrameStore) -> Iterator[Recording]:
-    """Its sequences, in the store's order. A frame store that names no scenes has one for each sequence."""
-    scenes = frames.attributes.get("scenes", {})
-    for name in frames.of_split(split):
-        truth = frames.frames(name)
+@dataclass(frozen=True)
+class BenchmarkSet:
+    """Sequences with truth that methods are tested on."""
+
+    name: str
+    events: EventStore
+    frames: FrameStore
+
+    @property
+    def sequences(self) -> list[str]:
+        """Those of the test split, in the store's order; ValueError where there is none."""
+        names = self.frames.of_split("test")
+        if not names:
+            raise ValueError(
+                f"{self.frames.path} has no test sequence; raise ingest.test_fraction or ingest more pictures"
+            )
+        return names
+
+    def scene_of(self, sequence: str) -> str:
+        """The source picture of a sequence. A frame store that names no scenes has one for each sequence."""
+        return self.frames.attributes.get("scenes", {}).get(sequence, sequence)
+
+    def recording(self, sequence: str) -> Recording:
+        """One sequence with its truth."""
+        truth = self.frames.frames(sequence)
         i0, _, i90, _ = truth.intensity[1:].unbind(1)
+        events = self.events.read(sequence)
+        scene = self.scene_of(sequence)
         valid = None if truth.valid is None else truth.valid[1:]
-        scene = scenes.get(name, name)
-        yield Recording(name, scene, events.read(name), truth.t_us, truth.dolp[1:], truth.aolp[1:], i0 + i90, valid)
+        return Recording(sequence, scene, events, truth.t_us, truth.dolp[1:], truth.aolp[1:], i0 + i90, valid)
+
+    def recordings(self) -> Iterator[Recording]:
+        """All of them, one after another."""
+        return map(self.recording, self.sequences)
 
 
 def train_mean_dolp(frames: FrameStore, warmup_windows: int) -> float:
@@ -82,32 +112,84 @@ def train_mean_dolp(frames: FrameStore, warmup_windows: int) -> float:
 
 
 def run_benchmark(
-    events: EventStore, frames: FrameStore, context: Context, config: BenchmarkConfig, lpips: Lpips | None
+    test_set: BenchmarkSet,
+    context: Context,
+    config: BenchmarkConfig,
+    lpips: Lpips | None,
+    cache: Path,
+    mapper: Callable[..., Iterable[Any]] = map,
 ) -> Benchmark:
-    """Run and score `config.methods` on the test split; ValueError where it has no sequence."""
-    names = frames.of_split("test")
-    if not names:
-        raise ValueError(f"{frames.path} has no test sequence; raise ingest.test_fraction or ingest more pictures")
+    """Run and score `config.methods` on a test set; ValueError where it has no sequence.
+
+    What `cache` holds of the same method, sequence and code is not made again (see `Cache`), so that a new method costs
+    its own time alone. `mapper` is `polarnet.cluster.pmap` with its workers bound, or the built-in `map`; each of its
+    tasks is one sequence. Costs are measured here, one method after another, on the first sequence.
+    """
+    names = test_set.sequences
     if lpips is not None:
         lpips = lpips.to(context.device)
-    shown = _spread(names, config.panel_scenes, frames.attributes.get("scenes", {}))
+    kept = Cache(cache / test_set.name)
+    digests = {method: method_digest(METHODS[method], context) for method in config.methods}
+    task = functools.partial(
+        _recover_and_score, test_set=test_set, context=context, digests=digests, config=config, lpips=lpips, cache=kept
+    )
+    rows = [row for of_sequence in mapper(task, names) for row in of_sequence]
+    costs = _costs(test_set.recording(names[0]), context, digests, kept)
+    shown = _spread(names, config.panel_scenes, {name: test_set.scene_of(name) for name in names})
+    panels = [_panel(test_set.recording(name), digests, kept, config.warmup_windows) for name in names if name in shown]
+    kept.forget([*names])
+    return Benchmark(rows, costs, panels)
+
+
+def _recover_and_score(
+    sequence: str,
+    test_set: BenchmarkSet,
+    context: Context,
+    digests: Mapping[str, str],
+    config: BenchmarkConfig,
+    lpips: Lpips | None,
+    cache: Cache,
+) -> list[FrameScore]:
+    """The rows of every method on one sequence, made where the cache has none."""
+    recording = test_set.recording(sequence)
+    keys = _prediction_keys(recording, digests)
+    scoring = digest(code_digest(score_sequence), str(config.warmup_windows), _lpips_digest(lpips))
     rows: list[FrameScore] = []
-    panels: list[Panel] = []
-    ms_per_window: dict[str, list[float]] = {method: [] for method in config.methods}
-    for i, recording in enumerate(
-        tqdm(recordings_of("test", events, frames), "benchmark", len(names), unit="sequence")
-    ):
-        if i == 0:
-            for method in config.methods:
-                recover(method, recording, context)  # loads, compiles and allocates
-        recovered = {method: recover(method, recording, context) for method in config.methods}
-        for method, found in recovered.items():
-            ms_per_window[method].append(1000 * found.seconds / len(recording.dolp))
-        dolp = {method: found.dolp for method, found in recovered.items()}
-        rows += score_sequence(recording, dolp, config.warmup_windows, lpips, context.device)
-        if recording.name in shown:
-            panels.append(_panel(recording, recovered, config.warmup_windows))
-    return Benchmark(rows, {method: statistics.median(ms) for method, ms in ms_per_window.items()}, panels)
+    for method, key in keys.items():
+        score_key = digest(key, scoring)
+        if (known := cache.scores(method, sequence, score_key)) is None:
+            if (found := cache.prediction(method, sequence, key)) is None:
+                recovered = recover(method, recording, context)
+                found = cache.write_prediction(method, sequence, key, Polarization(recovered.dolp, recovered.aolp))
+            known = score_sequence(recording, {method: found}, config.warmup_windows, lpips, context.device)
+            cache.write_scores(method, sequence, score_key, known)
+        rows += known
+    return rows
+
+
+def _prediction_keys(recording: Recording, digests: Mapping[str, str]) -> dict[str, str]:
+    of_sequence = sequence_digest(recording)
+    return {method: digest(FORMAT, of_method, of_sequence) for method, of_method in digests.items()}
+
+
+def _lpips_digest(lpips: Lpips | None) -> str:
+    if lpips is None:
+        return "none"
+    return digest(lpips.backbone, *(f"{name}={value_digest(t)}" for name, t in lpips.state_dict().items()))
+
+
+def _costs(recording: Recording, context: Context, digests: Mapping[str, str], cache: Cache) -> dict[str, Cost]:
+    """Each method's, from the cache where this machine has measured it with as many threads."""
+    device = torch.cuda.get_device_name(context.device) if context.device.type == "cuda" else "cpu"
+    here = digest(platform.node(), platform.machine(), device, str(torch.get_num_threads()))
+    costs = {}
+    for method, key in _prediction_keys(recording, digests).items():
+        cost_key = digest(key, here)
+        if (cost := cache.cost(method, cost_key)) is None:
+            cost = cost_of(method, recording, context)
+            cache.write_cost(method, cost_key, cost)
+        costs[method] = cost
+    return costs
 
 
 def write_benchmark(
@@ -117,7 +199,7 @@ def write_benchmark(
     shutil.rmtree(folder / "panels", ignore_errors=True)  # a run before may have shown other scenes
     (folder / "panels").mkdir(parents=True)
     metrics: dict[str, dict[str, Any]] = {
-        method: {**scores, "ms_per_window": benchmark.ms_per_window[method]}
+        method: {**scores, **dataclasses.asdict(benchmark.costs[method])}
         for method, scores in summary(benchmark.rows, config.bootstrap_samples, seed).items()
     }
     means = {metric: scene_means(benchmark.rows, metric) for metric in METRICS}
@@ -129,7 +211,8 @@ def write_benchmark(
         "warmup_windows": config.warmup_windows,
         "precision": config.precision,
         "bootstrap_samples": config.bootstrap_samples,
-        "scene_means": {metric: of_methods for metric, of_methods in means.items() if of_methods is not None},
+        "scene_means": {metric: of_methods for metric, of_methods in means.items() if of_methods},
+        "paired": paired_comparisons(benchmark.rows, "ours"),
     }
     for name, content in (("metrics", metrics), ("details", details)):
         (folder / f"{name}.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
@@ -146,10 +229,15 @@ def _spread(names: Sequence[str], count: int, scenes: Mapping[str, str]) -> set[
     return {first[round(i * (len(first) - 1) / max(count - 1, 1))] for i in range(count)}
 
 
-def _panel(recording: Recording, recovered: Mapping[str, Recovered], warmup_windows: int) -> Panel:
+def _panel(recording: Recording, digests: Mapping[str, str], cache: Cache, warmup_windows: int) -> Panel:
     """The middle one of the scored windows."""
     windows = scored_windows(recording, warmup_windows)
     k = windows[len(windows) // 2]
+    found: dict[str, Polarization] = {}
+    for method, key in _prediction_keys(recording, digests).items():
+        if (prediction := cache.prediction(method, recording.name, key)) is None:
+            raise RuntimeError(f"{cache.folder}: {method} on {recording.name} is gone; something else clears the cache")
+        found[method] = prediction
     return Panel(
         recording.name,
         recording.scene,
@@ -159,8 +247,8 @@ def _panel(recording: Recording, recovered: Mapping[str, Recovered], warmup_wind
         recording.dolp[k],
         recording.aolp[k],
         recording.s0[k],
-        {method: found.dolp[k] for method, found in recovered.items()},
-        {method: found.aolp[k] for method, found in recovered.items() if found.aolp is not None},
+        {method: polarization.dolp[k] for method, polarization in found.items()},
+        {method: polarization.aolp[k] for method, polarization in found.items() if polarization.aolp is not None},
     )
 
 

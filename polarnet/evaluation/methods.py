@@ -36,17 +36,18 @@ from polarnet.networks.blocks import Prediction
 from polarnet.networks.checkpoint import load_checkpoint, load_network, load_tensors
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
 
-NEEDED: Mapping[str, str | None] = {
-    "firenet": "firenet",
-    "firenet_published": "firenet",
-    "firenetplus_published": "firenet",
-    "e2vid": "e2vid",
-    "e2vid_published": "e2vid",
-    "e2p": "e2p",
-    "paper": None,
-    "ours": None,
+NEEDED: Mapping[str, tuple[str, ...]] = {
+    "e2v": ("firenet", "e2vid"),
+    "firenet": ("firenet",),
+    "firenet_published": ("firenet",),
+    "firenetplus_published": ("firenet",),
+    "e2vid": ("e2vid",),
+    "e2vid_published": ("e2vid",),
+    "e2p": ("e2p",),
+    "paper": (),
+    "ours": (),
 }
-"""Rows that need weights, and which network they should hold; None: any network that recovers DoLP."""
+"""Rows that need weights, and the networks they may be of; none named: any network that recovers DoLP."""
 
 GAIN = "+gain"
 
@@ -58,6 +59,8 @@ class WeightsConfig:
     A .safetensors is a checkpoint of polarnet's own, anything else a file as its authors published it.
     """
 
+    e2v: str | None
+    """null: what stage train_e2v left, whichever network it is."""
     firenet: str | None
     """null: what stage train_e2v left, if baselines.e2v.arch is firenet."""
     e2vid: str | None
@@ -121,8 +124,9 @@ class Context:
     highpass: HighPassConfig
     postprocessing: PostprocessingConfig
     gain: GainConfig
-    firenet_checkpoint: Path | None
+    e2v_checkpoint: Path | None
     """Like the others: the file of a row's weights; `checkpoints_of` finds them. None: there is none."""
+    firenet_checkpoint: Path | None
     e2vid_checkpoint: Path | None
     e2p_checkpoint: Path | None
     firenet_published_checkpoint: Path | None
@@ -133,6 +137,14 @@ class Context:
     device: torch.device
     precision: str
     """Of the networks: fp32, or bf16 autocast."""
+
+    @cached_property
+    def e2v(self) -> FireNet | E2vid:
+        """The events-to-intensity network that is trained here, whichever it is."""
+        path = _present(self.e2v_checkpoint)
+        held = load_checkpoint(path)[1]["network"]
+        network = baseline(FireNet, "firenet", path) if held == "firenet" else baseline(E2vid, "e2vid", path)
+        return network.to(self.device)
 
     @cached_property
     def firenet(self) -> FireNet:
@@ -184,7 +196,7 @@ Network = TypeVar("Network", FireNet, E2vid, E2p)
 
 def checkpoints_of(config: WeightsConfig, train: Path, train_e2v: Path, train_e2p: Path) -> dict[str, Path | None]:
     """The fields `<row>_checkpoint` of `Context`: the configuration's files, else what the training stages left."""
-    trained = {"firenet": train_e2v, "e2vid": train_e2v, "e2p": train_e2p, "ours": train}
+    trained = {"e2v": train_e2v, "firenet": train_e2v, "e2vid": train_e2v, "e2p": train_e2p, "ours": train}
     found = {row: folder / "best.safetensors" for row, folder in trained.items()}
     return {
         f"{row}_checkpoint": Path(file) if (file := getattr(config, row, None)) else found.get(row) for row in NEEDED
@@ -227,13 +239,13 @@ def why_absent(method: str, context: Context) -> str | None:
     row = method.removesuffix(GAIN)
     if row not in NEEDED:
         return None
-    path, kind = _checkpoint(row, context), NEEDED[row]
+    path, kinds = _checkpoint(row, context), NEEDED[row]
     if path is None:
         return f"no weights are given: set baselines.weights.{row} to their file"
     if not path.exists():
         return f"{path} is not there"
-    if kind is not None and path.suffix == ".safetensors" and (held := load_checkpoint(path)[1]["network"]) != kind:
-        return f"{path} holds a {held}: train with baselines.e2v.arch={kind}, or set baselines.weights.{row}"
+    if kinds and path.suffix == ".safetensors" and (held := load_checkpoint(path)[1]["network"]) not in kinds:
+        return f"{path} holds a {held}: train with baselines.e2v.arch={kinds[0]}, or set baselines.weights.{row}"
     return None
 
 
@@ -373,6 +385,7 @@ def _voxel_grids(recording: Recording, bins: int) -> Float[Tensor, "n 4 bins h w
 INTENSITY_METHODS: dict[str, IntensityMethod] = {
     "cf": cf_intensities,
     "highpass": highpass_intensities,
+    "e2v": clipped(network_intensities(lambda context: context.e2v)),
     "e2vid": clipped(network_intensities(lambda context: context.e2vid)),
     "e2vid_published": published(network_intensities(lambda context: context.e2vid_published)),
     "firenet": clipped(network_intensities(lambda context: context.firenet)),

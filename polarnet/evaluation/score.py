@@ -1,23 +1,39 @@
-"""Scores of recovered DoLP: a row per frame, means over frames, then over scenes, with a bootstrap interval."""
+"""Scores of recovered polarization: a row per frame, means over frames, then over scenes, with bootstrap intervals."""
 
 import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from polarnet.evaluation.methods import METHODS, Recording
+from polarnet.evaluation.methods import METHODS, Polarization, Recording
 from polarnet.ranges import allowed, check_ranges
 from polarnet.runtime import generator_for
-from polarnet.similarity import Lpips, correlation, level_mse, mse, pattern_mse, psnr, ssim, with_truth_outside
+from polarnet.similarity import (
+    LEAST_MSE,
+    Lpips,
+    aolp_error_deg,
+    correlation,
+    gradient_agreement,
+    level_mse,
+    mse,
+    pattern_mse,
+    psnr,
+    spread_mse,
+    ssim,
+    with_truth_outside,
+)
 
-METRICS = ("mse", "psnr", "ssim", "lpips", "corr", "level_mse", "pattern_mse")
+METRICS = ("mse", "psnr", "ssim", "lpips", "corr", "grad", "level_mse", "pattern_mse", "aolp_deg", "skill")
+SETS = ("simulated", "complex_motion", "measured")
+"""The pipeline's own held-out sequences, the same pictures under harder motion, and measured polarization."""
+
 INTERVAL = (0.025, 0.975)  # quantiles of the bootstrap: 95 %
 FRAMES_AT_ONCE = 8  # of LPIPS: bounds the memory that its features need
 
@@ -27,6 +43,8 @@ class BenchmarkConfig:
     """Section `benchmark` of params.yaml."""
 
     methods: list[str] = field(metadata=allowed(choices=tuple(METHODS)))
+    sets: list[str] = field(metadata=allowed(choices=SETS))
+    """Test sets; simulated is always among them."""
     warmup_windows: int = field(metadata=allowed(low=0))
     """First windows of a sequence that no score counts, for every method alike: nothing has moved far enough yet."""
     precision: str = field(metadata=allowed(choices=("fp32", "bf16")))
@@ -39,6 +57,8 @@ class BenchmarkConfig:
         check_ranges(self)
         if not self.methods or len(set(self.methods)) != len(self.methods):
             raise ValueError(f"methods: expected at least one and none twice, got {self.methods}")
+        if SETS[0] not in self.sets or len(set(self.sets)) != len(self.sets):
+            raise ValueError(f"sets: expected {SETS[0]} and others, none twice, got {self.sets}")
 
 
 class FrameScore(NamedTuple):
@@ -56,8 +76,14 @@ class FrameScore(NamedTuple):
     lpips: float | None
     """None without LPIPS weights."""
     corr: float
+    grad: float
+    """`similarity.gradient_agreement`."""
     level_mse: float
     pattern_mse: float
+    aolp_deg: float | None
+    """`similarity.aolp_error_deg`, weighted by the true DoLP; None where the method gives no angle."""
+    oracle_mse: float
+    """MSE of the true frame's own mean: no score, but what skill is measured against."""
 
 
 def scored_windows(recording: Recording, warmup_windows: int) -> range:
@@ -73,12 +99,12 @@ def scored_windows(recording: Recording, warmup_windows: int) -> range:
 @torch.no_grad()
 def score_sequence(
     recording: Recording,
-    recovered: Mapping[str, Float[Tensor, "n h w"]],
+    recovered: Mapping[str, Polarization],
     warmup_windows: int,
     lpips: Lpips | None,
     device: torch.device,
 ) -> list[FrameScore]:
-    """A row per method and window after the warm-up; `recovered` is each method's DoLP, a frame a window.
+    """A row per method and window after the warm-up; `recovered` is each method's polarization, a frame a window.
 
     Computed on `device`, where `lpips` has to be. Pixels that are not valid count in no score but LPIPS, which sees the
     truth there in place of the method's answer.
@@ -87,49 +113,78 @@ def score_sequence(
     ever left out.
     """
     windows = scored_windows(recording, warmup_windows)
-    truth = recording.dolp[warmup_windows:].to(device)
-    valid = None if recording.valid is None else recording.valid[warmup_windows:].to(device)
+    for method, found in recovered.items():
+        for frames in found:
+            if frames is not None and frames.shape != recording.dolp.shape:
+                raise ValueError(
+                    f"{method} on {recording.name}: expected frames of {tuple(recording.dolp.shape)}, "
+                    f"got {tuple(frames.shape)}"
+                )
+
+    def scored(frames: Tensor) -> Tensor:
+        return frames[warmup_windows:].to(device)
+
+    counted = {
+        method: Polarization(scored(found.dolp), None if found.aolp is None else scored(found.aolp))
+        for method, found in recovered.items()
+    }
+    truth, true_aolp = (x[warmup_windows:].to(device) for x in (recording.dolp, recording.aolp))
+    valid = None if recording.valid is None else scored(recording.valid)
     if valid is not None and not (known := valid.any(-1).any(-1)).all():
         window = warmup_windows + int(known.logical_not().nonzero()[0])
         raise ValueError(f"{recording.name}, window {window}: no pixel is valid; leave this measurement out")
-    for method, frames in recovered.items():
-        if frames.shape != recording.dolp.shape:
-            raise ValueError(
-                f"{method} on {recording.name}: expected frames of {tuple(recording.dolp.shape)}, "
-                f"got {tuple(frames.shape)}"
-            )
-    counted = {method: frames[warmup_windows:].to(device) for method, frames in recovered.items()}
-    shown = {method: with_truth_outside(frames, truth, valid) for method, frames in counted.items()}
+    oracle_mse = spread_mse(truth, valid)
+    shown = {method: with_truth_outside(found.dolp, truth, valid) for method, found in counted.items()}
     distances = _lpips_of(shown, truth, lpips)
     rows = []
-    for method, frames in counted.items():
-        per_frame = {
-            "mse": mse(frames, truth, valid),
-            "psnr": psnr(frames, truth, valid),
-            "ssim": ssim(frames, truth, valid),
-            "corr": correlation(frames, truth, valid),
-            "level_mse": level_mse(frames, truth, valid),
-            "pattern_mse": pattern_mse(frames, truth, valid),
-        } | ({} if distances is None else {"lpips": distances[method]})
-        columns = {name: values.tolist() for name, values in per_frame.items()}
+    for method, (dolp, aolp) in counted.items():
+        per_frame: dict[str, Tensor | None] = {
+            "mse": mse(dolp, truth, valid),
+            "psnr": psnr(dolp, truth, valid),
+            "ssim": ssim(dolp, truth, valid),
+            "lpips": None if distances is None else distances[method],
+            "corr": correlation(dolp, truth, valid),
+            "grad": gradient_agreement(dolp, truth, valid),
+            "level_mse": level_mse(dolp, truth, valid),
+            "pattern_mse": pattern_mse(dolp, truth, valid),
+            "aolp_deg": None if aolp is None else aolp_error_deg(aolp, true_aolp, truth, valid),
+            "oracle_mse": oracle_mse,
+        }
+        columns = {
+            name: [None] * len(windows) if values is None else values.tolist() for name, values in per_frame.items()
+        }
         for i, window in enumerate(windows):
-            scores = {"lpips": None} | {name: values[i] for name, values in columns.items()}
+            scores: dict[str, Any] = {name: values[i] for name, values in columns.items()}
             t_us = int(recording.t_us[window + 1])
             rows.append(_finite(FrameScore(method, recording.scene, recording.name, window, t_us, **scores)))
     return rows
 
 
-def scene_means(rows: Iterable[FrameScore], metric: str) -> dict[str, dict[str, float]] | None:
-    """Method, then scene: the mean over the scene's frames; None where the metric was not computed."""
-    gathered: dict[str, dict[str, list[float]]] = {}
+def scene_means(rows: Iterable[FrameScore], metric: str) -> dict[str, dict[str, float]]:
+    """Method, then scene: the mean over the scene's frames, of any column or metric.
+
+    The skill of a scene is 1 - its MSE / the MSE of the oracle mean. A method without the metric is left out;
+    ValueError where it has the metric for some frames alone.
+    """
+    if metric == "skill":
+        rows = list(rows)
+        errors, oracles = scene_means(rows, "mse"), scene_means(rows, "oracle_mse")
+        return {
+            method: {scene: _skill(error, oracles[method][scene]) for scene, error in scenes.items()}
+            for method, scenes in errors.items()
+        }
+    gathered: dict[str, dict[str, list[float | None]]] = {}
     for row in rows:
-        if (value := getattr(row, metric)) is None:
-            return None
-        gathered.setdefault(row.method, {}).setdefault(row.scene, []).append(value)
-    return {
-        method: {scene: math.fsum(values) / len(values) for scene, values in sorted(scenes.items())}
-        for method, scenes in gathered.items()
-    }
+        gathered.setdefault(row.method, {}).setdefault(row.scene, []).append(getattr(row, metric))
+    means: dict[str, dict[str, float]] = {}
+    for method, scenes in gathered.items():
+        missing = sum(values.count(None) for values in scenes.values())
+        if missing == sum(map(len, scenes.values())):
+            continue
+        if missing:
+            raise ValueError(f"{method} has no {metric} for {missing} of its frames; a metric leaves no frame out")
+        means[method] = {scene: math.fsum(values) / len(values) for scene, values in sorted(scenes.items())}  # type: ignore[arg-type]
+    return means
 
 
 def summary(
@@ -138,25 +193,32 @@ def summary(
     """Method, then metric: the mean over scenes, and as `<metric>_ci` its 95 % bootstrap interval over scenes.
 
     A scene is one source picture, however many sequences were made from it: those are not independent. All methods
-    and metrics see the same resampled scenes. A metric that was not computed is None and has no interval.
-    ValueError where a method lacks a scene.
+    and metrics see the same resampled scenes. Skill is 1 - mean MSE / mean MSE of the oracle mean, over the same
+    scenes: a ratio of means, as a scene that hardly varies would otherwise outweigh all others. A metric that was not
+    computed is None and has no interval. ValueError where a method lacks a scene.
     """
     methods = list(dict.fromkeys(row.method for row in rows))
     scenes = sorted({row.scene for row in rows})
     generator = generator_for(seed, "benchmark", "bootstrap")
     resampled = generator.integers(0, len(scenes), (bootstrap_samples, len(scenes)))
     table: dict[str, dict[str, float | list[float] | None]] = {method: {} for method in methods}
+    oracles = scene_means(rows, "oracle_mse")
     for metric in METRICS:
-        means = scene_means(rows, metric)
+        means = scene_means(rows, "mse" if metric == "skill" else metric)
         for method in methods:
-            if means is None:
+            if method not in means:
                 table[method][metric] = None
                 continue
             if list(means[method]) != scenes:
                 raise ValueError(f"{method} has no score for {sorted(set(scenes) - set(means[method]))}")
             values = np.array(list(means[method].values()))
-            table[method][metric] = float(values.mean())
-            table[method][f"{metric}_ci"] = np.quantile(values[resampled].mean(axis=1), INTERVAL).tolist()
+            mean, samples = values.mean(), values[resampled].mean(axis=1)
+            if metric == "skill":
+                oracle = np.array(list(oracles[method].values()))
+                mean = _skill(mean, oracle.mean())
+                samples = _skill(samples, oracle[resampled].mean(axis=1))
+            table[method][metric] = float(mean)
+            table[method][f"{metric}_ci"] = np.quantile(samples, INTERVAL).tolist()
     return table
 
 
@@ -166,6 +228,11 @@ def write_frames(path: Path, rows: Iterable[FrameScore]) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(FrameScore._fields)
         writer.writerows(rows)
+
+
+def _skill(error: Any, oracle: Any) -> Any:
+    """1 for no error, 0 for that of the oracle mean; a truth without any pattern is held to what PSNR resolves."""
+    return 1 - error / np.maximum(oracle, LEAST_MSE)
 
 
 def _lpips_of(
@@ -183,7 +250,7 @@ def _lpips_of(
 
 
 def _finite(row: FrameScore) -> FrameScore:
-    for metric in METRICS:
+    for metric in FrameScore._fields[FrameScore._fields.index("mse") :]:
         value = getattr(row, metric)
         if value is not None and not math.isfinite(value):
             raise ValueError(

@@ -95,6 +95,15 @@ class History(NamedTuple):
     best_epoch: int
 
 
+class SetResults(NamedTuple):
+    """What the benchmark gave on a test set."""
+
+    name: str
+    metrics: Mapping[str, Mapping[str, Any]]
+    details: Mapping[str, Any]
+    panels: Sequence[Panel]
+
+
 @dataclass(frozen=True)
 class Artefacts:
     """Everything the page shows."""
@@ -104,6 +113,8 @@ class Artefacts:
     details: Mapping[str, Any]
     """data/benchmark/details.json: what was scored, and each scene's mean."""
     panels: Sequence[Panel]
+    sets: Sequence[SetResults]
+    """Test sets beyond the simulated one."""
     ours: History
     e2v: History
     rates: Sequence[EventRate]
@@ -137,6 +148,7 @@ def read_artefacts(paths: ReportPaths) -> Artefacts:
         metrics=_json(paths.benchmark / "metrics.json"),
         details=_json(paths.benchmark / "details.json"),
         panels=panels,
+        sets=[read_set(folder) for folder in sorted(paths.benchmark.glob("sets/*")) if folder.is_dir()],
         ours=read_history(paths.train / "history.json"),
         e2v=read_history(paths.train_e2v / "history.json"),
         rates=event_rates(events, frames),
@@ -145,6 +157,16 @@ def read_artefacts(paths: ReportPaths) -> Artefacts:
             split: thumbnails([entry.name for entry in pictures if entry.split == split], scenes) for split in SPLITS
         },
     )
+
+
+def read_set(folder: Path) -> SetResults:
+    """What `write_benchmark` left in a folder; its name is that of details.json, or the folder's."""
+    for name in ("metrics.json", "details.json"):
+        if not (folder / name).exists():
+            raise FileNotFoundError(f"{folder / name} is missing; run the benchmark of this test set again")
+    details = _json(folder / "details.json")
+    panels = [_panel(file, generated=False) for file in sorted((folder / "panels").glob("*.npz"))]
+    return SetResults(details.get("set", folder.name), _json(folder / "metrics.json"), details, panels)
 
 
 def read_history(path: Path) -> History:

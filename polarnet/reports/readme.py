@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from polarnet.reports.tables import as_markdown, score_table, standing
+from polarnet.reports.tables import COLUMNS, COSTS, SET_TITLES, as_markdown, paired_lines, score_table, standing
 
 MARKER = re.compile(r"<!-- (?P<end>/?)results:(?P<name>[\w-]+) -->")
 
@@ -52,6 +52,21 @@ def pipeline_block(results: Mapping[str, Any]) -> str:
     ]
     if stages := results.get("stage_minutes"):
         lines += ["", "Minutes by stage: " + ", ".join(f"{name} {value:.1f}" for name, value in stages.items()) + "."]
+    return "\n".join(lines)
+
+
+def benchmark_block(results: Mapping[str, Any]) -> str:
+    """A table for each test set of docs/results/benchmark.json, and how `ours` does scene by scene."""
+    lines = []
+    for name, title in SET_TITLES.items():
+        if name not in results:
+            continue
+        about = results["about"][name]
+        lines += [f"**{title}**: {about['scenes']} scenes, {about['frames']} frames", ""]
+        lines += [as_markdown(score_table(results[name], about["lpips_reason"], {**COLUMNS, **COSTS})), ""]
+        lines += [f"- {line}" for line in paired_lines(results["paired"][name])] + [""]
+    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
+    lines.append(f"On {results['cores']} cores ({results['machine']}; {versions}; commit `{results['commit'][:10]}`).")
     return "\n".join(lines)
 
 
@@ -105,6 +120,7 @@ EMULATION_COLUMNS = (
 
 RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "pipeline": pipeline_block,
+    "benchmark": benchmark_block,
     "emulation": emulation_block,
 }
 """What writes the block of each name."""

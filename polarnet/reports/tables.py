@@ -25,9 +25,10 @@ class Column:
         """Label with the direction in which the metric improves."""
         return f"{self.label} {'↓' if self.better == 'low' else '↑'}"
 
-    def printed(self, value: float) -> str:
-        """A value with the decimals of its column."""
-        return f"{value:.{self.decimals}f}"
+    def printed(self, value: float | int) -> str:
+        """A value with the decimals of its column; what rounds to 0 has no sign."""
+        text = f"{value:.{self.decimals}f}"
+        return text.removeprefix("-") if float(text) == 0 else text
 
 
 COLUMNS = {
@@ -36,6 +37,9 @@ COLUMNS = {
     "ssim": Column("SSIM", 4, "high", True, ""),
     "lpips": Column("LPIPS", 4, "low", True, ""),
     "corr": Column("corr.", 3, "high", True, ""),
+    "grad": Column("edges", 3, "high", True, ""),
+    "aolp_deg": Column("AoLP err.", 1, "low", True, "°"),
+    "skill": Column("skill", 3, "high", True, ""),
     "ms_per_window": Column("ms / window", 1, "low", False, " ms"),
 }
 ERROR_PARTS = {
@@ -44,6 +48,13 @@ ERROR_PARTS = {
     "pattern_mse": Column("pattern", 4, "low", True, ""),
 }
 """MSE split in two: level, the squared error of the frame's mean, and pattern, what is left without it."""
+COSTS = {
+    "ms_per_window": COLUMNS["ms_per_window"],
+    "gflop": Column("GFLOP / window", 2, "low", False, " GFLOP"),
+    "params": Column("parameters", 0, "low", False, ""),
+    "peak_mib": Column("peak MiB", 1, "low", False, " MiB"),
+}
+"""What a method costs on the machine of the run."""
 
 METHODS = {
     "zeros": "zeros",
@@ -54,6 +65,7 @@ METHODS = {
     "cf+gain": "CF, gains solved",
     "highpass+gain": "high-pass, gains solved",
     "e2v": "E2V",
+    "e2v+gain": "E2V, gains solved",
     "e2vid": "E2VID",
     "e2vid+gain": "E2VID, gains solved",
     "e2vid_published": "E2VID, published weights",
@@ -73,6 +85,9 @@ METHODS = {
 TRIVIAL = ("zeros", "train_mean", "oracle_mean")
 """Methods whose answer is one value everywhere."""
 
+SET_TITLES = {"simulated": "Simulated", "complex_motion": "Complex motion", "measured": "Measured polarization"}
+"""Test sets, in the order of every page."""
+
 PAPER_SOURCE = "Yan et al., Photonics 2024, 11(5), 481, Table 2"
 PAPER_TABLE_2: Mapping[str, Scores] = {
     "simulated": {
@@ -90,10 +105,12 @@ PAPER_COMPARABILITY = (
     "Both tables ask the same question of different pictures: compare how the methods rank and how far apart they "
     "lie, not the numbers themselves. The paper's simulated test set is 50 sequences from photographs of the same "
     "collection as its training set (MIT-Adobe FiveK); its network saw 1000 sequences for 250 epochs; its CF and E2V "
-    "ran with their default parameters. It does not say which windows were scored, how reconstructed intensities were "
-    "scaled before the Stokes formula, or with which settings SSIM and LPIPS were computed. Its real experiment "
-    "is another task again: 32 targets that turn in front of a camera; errors so low for all three methods suggest "
-    "that most of each picture is hardly polarized. What the default parameters share with the paper: contrast "
+    "ran with their default parameters. It does not say which of the two published CF filters it means, whose defaults "
+    "differ by several dB, which windows were scored, how reconstructed intensities were scaled before the Stokes "
+    "formula, or with which settings SSIM and LPIPS were computed; and it shows no constant to beat. Its real "
+    "experiment is another task again: 32 targets that turn in front of a camera; errors so low for all three methods "
+    "suggest that most of each picture is hardly polarized. Measured polarization here has measured DoLP and AoLP, but "
+    "simulated events: it is not that experiment either. What the default parameters share with the paper: contrast "
     "thresholds of 0.2, 120 by 180 pixels, 30 windows a second, photographs read as hue, saturation and value."
 )
 
@@ -201,6 +218,16 @@ def standing(scores: Scores) -> list[str]:
     ]
 
 
+def paired_lines(paired: Mapping[str, Mapping[str, Mapping[str, Any]]], metric: str = "mse") -> list[str]:
+    """How `ours` does scene by scene against each other method, from details.json's `paired`; a sentence each."""
+    return [
+        f"{METHODS.get(rival, rival)}: ours is better in {one['better']} of {one['scenes']} scenes "
+        f"(effect {one['effect']:+.2f}, p = {one['p_holm']:.2g})."
+        for rival in in_order(paired)
+        if (one := paired[rival].get(metric))
+    ]
+
+
 def _differences(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> list[str]:
     words = []
     for key, column in COLUMNS.items():
@@ -212,7 +239,7 @@ def _differences(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> list[str]
     return words
 
 
-def _best(column: Column, values: Sequence[float | None]) -> str | None:
+def _best(column: Column, values: Sequence[float | int | None]) -> str | None:
     """The best value as it is printed, so that rows which read the same are bold together."""
     known = [value for value in values if value is not None]
     if not column.ranked or not known:
@@ -220,7 +247,7 @@ def _best(column: Column, values: Sequence[float | None]) -> str | None:
     return column.printed(min(known) if column.better == "low" else max(known))
 
 
-def _cell(column: Column, value: float | None, interval: Sequence[float] | None, best: str | None) -> Cell:
+def _cell(column: Column, value: float | int | None, interval: Sequence[float | int] | None, best: str | None) -> Cell:
     if value is None:
         return Cell("-", "", False)
     ends = "" if interval is None else " to ".join(column.printed(end) for end in interval)

@@ -70,6 +70,7 @@ def checkpoints(tmp_path_factory):
         files[f"{row}_checkpoint"] = folder / f"{row}.safetensors"
         description = {"network": row, "config": {"bins": 5}, "in_channels": 5}
         save_checkpoint(folder / f"{row}.safetensors", build(5).state_dict(), description)
+    files["e2v_checkpoint"] = files["firenet_checkpoint"]
     for row, build in {"firenet": FireNet, "firenetplus": FireNet, "e2vid": E2vid}.items():
         files[f"{row}_published_checkpoint"] = folder / f"{row}.pth.tar"
         torch.save({"state_dict": build(5).state_dict()}, folder / f"{row}.pth.tar")

@@ -5,20 +5,31 @@ import math
 import pytest
 import torch
 
-from polarnet.evaluation.score import METRICS, BenchmarkConfig, FrameScore, score_sequence, summary, write_frames
+from polarnet.evaluation.methods import Polarization
+from polarnet.evaluation.score import (
+    METRICS,
+    BenchmarkConfig,
+    FrameScore,
+    scene_means,
+    score_sequence,
+    summary,
+    write_frames,
+)
 from polarnet.similarity import Lpips, psnr, ssim
 
 CPU = torch.device("cpu")
 
 
-def row(scene, value, method="m", sequence=None, window=0, lpips=None):
-    scores = dict.fromkeys(METRICS, value) | {"lpips": lpips}
+def row(scene, value, method="m", sequence=None, window=0, lpips=None, aolp_deg=None, oracle_mse=0.5):
+    scores = {name: value for name in METRICS if name != "skill"} | {"lpips": lpips, "aolp_deg": aolp_deg}
+    scores["oracle_mse"] = oracle_mse
     return FrameScore(method, scene, sequence or scene, window, 0, **scores)
 
 
 def config(**changes):
     values = {
         "methods": ["zeros"],
+        "sets": ["simulated"],
         "warmup_windows": 1,
         "precision": "fp32",
         "bootstrap_samples": 10,
@@ -29,7 +40,7 @@ def config(**changes):
 
 def test_a_constant_offset_scores_its_square_as_level(recording):
     recording = dataclasses.replace(recording, dolp=0.5 * recording.dolp)
-    rows = score_sequence(recording, {"m": recording.dolp + 0.1}, 0, None, CPU)
+    rows = score_sequence(recording, {"m": Polarization(recording.dolp + 0.1)}, 0, None, CPU)
     assert [r.window for r in rows] == [0, 1, 2, 3]
     assert [r.t_us for r in rows] == [1000, 2000, 3000, 4000]
     for r in rows:
@@ -43,7 +54,7 @@ def test_a_constant_offset_scores_its_square_as_level(recording):
 
 def test_rows_hold_the_metrics_of_their_own_frame(make_recording):
     recording, other = make_recording(seed=1), make_recording(seed=2)
-    rows = score_sequence(recording, {"m": other.dolp}, 1, None, CPU)
+    rows = score_sequence(recording, {"m": Polarization(other.dolp)}, 1, None, CPU)
     for r in rows:
         pair = other.dolp[r.window], recording.dolp[r.window]
         assert r.ssim == pytest.approx(ssim(*pair).item(), rel=1e-5)
@@ -53,7 +64,7 @@ def test_rows_hold_the_metrics_of_their_own_frame(make_recording):
 def test_warm_up_windows_count_for_no_method(recording):
     spoilt = recording.dolp.clone()
     spoilt[:2] = float("nan")
-    rows = score_sequence(recording, {"a": spoilt, "b": recording.dolp}, 2, None, CPU)
+    rows = score_sequence(recording, {"a": Polarization(spoilt), "b": Polarization(recording.dolp)}, 2, None, CPU)
     assert [(r.method, r.window) for r in rows] == [("a", 2), ("a", 3), ("b", 2), ("b", 3)]
 
 
@@ -62,26 +73,26 @@ def test_a_frame_that_is_not_a_number_is_named_not_dropped(recording, bad):
     spoilt = recording.dolp.clone()
     spoilt[3, 5, 5] = bad
     with pytest.raises(ValueError, match=r"m on a, window 3: mse is (nan|inf)"):
-        score_sequence(recording, {"m": spoilt}, 0, None, CPU)
+        score_sequence(recording, {"m": Polarization(spoilt)}, 0, None, CPU)
 
 
 def test_a_sequence_with_nothing_left_after_the_warm_up_is_refused(recording):
     with pytest.raises(
         ValueError, match=r"a has 4 windows and the first 4 are warm-up.*lower benchmark.warmup_windows"
     ):
-        score_sequence(recording, {"m": recording.dolp}, 4, None, CPU)
+        score_sequence(recording, {"m": Polarization(recording.dolp)}, 4, None, CPU)
 
 
 def test_frames_of_another_size_are_refused(recording):
     with pytest.raises(ValueError, match=r"m on a: expected frames of \(4, 18, 20\), got \(3, 18, 20\)"):
-        score_sequence(recording, {"m": recording.dolp[:3]}, 0, None, CPU)
+        score_sequence(recording, {"m": Polarization(recording.dolp[:3])}, 0, None, CPU)
 
 
 def test_lpips_in_chunks_is_lpips_frame_by_frame(make_recording):
     torch.manual_seed(0)
     lpips = Lpips("squeeze")
     recording, other = make_recording(windows=10), make_recording(windows=10, seed=1)
-    rows = score_sequence(recording, {"m": other.dolp}, 0, lpips, CPU)
+    rows = score_sequence(recording, {"m": Polarization(other.dolp)}, 0, lpips, CPU)
     for r in rows:
         k = slice(r.window, r.window + 1)
         assert r.lpips == pytest.approx(lpips(other.dolp[k], recording.dolp[k]).item(), rel=1e-4)
@@ -116,6 +127,43 @@ def test_the_order_of_rows_changes_nothing():
     assert summary(rows, 50, 0) == summary(rows[::-1], 50, 0)
 
 
+def test_skill_is_a_ratio_of_means_against_the_oracle_mean():
+    rows = [row("x", 0.1, oracle_mse=0.2), row("y", 0.3, oracle_mse=0.6)]
+    rows += [row("x", 0.2, "best", oracle_mse=0.2), row("y", 0.6, "best", oracle_mse=0.6)]
+    table = summary(rows, 100, 0)
+    assert table["m"]["skill"] == pytest.approx(0.5)  # 1 - 0.2 / 0.4
+    assert table["best"]["skill"] == pytest.approx(0)
+    assert table["m"]["skill_ci"] == pytest.approx([0.5, 0.5])
+    uneven = [row("x", 0.1, oracle_mse=0.1), row("y", 0.1, oracle_mse=0.9)]
+    assert summary(uneven, 10, 0)["m"]["skill"] == pytest.approx(1 - 0.1 / 0.5)
+    assert scene_means(uneven, "skill")["m"] == pytest.approx({"x": 0.0, "y": 1 - 0.1 / 0.9})
+
+
+def test_the_oracle_mean_has_skill_0_and_the_truth_skill_1(make_recording):
+    recording = make_recording()
+    mean = recording.dolp.mean(dim=(-2, -1), keepdim=True).expand_as(recording.dolp)
+    answers = {"mean": Polarization(mean), "truth": Polarization(recording.dolp)}
+    table = summary(score_sequence(recording, answers, 1, None, CPU), 10, 0)
+    assert table["mean"]["skill"] == pytest.approx(0, abs=1e-6)
+    assert table["truth"]["skill"] == 1
+
+
+def test_the_angle_is_scored_where_there_is_one(recording):
+    turned = (recording.aolp + math.pi / 18) % math.pi
+    answers = {"m": Polarization(recording.dolp, turned), "without": Polarization(recording.dolp)}
+    rows = score_sequence(recording, answers, 0, None, CPU)
+    assert [r.aolp_deg for r in rows[:4]] == pytest.approx([10.0] * 4, abs=1e-3)
+    table = summary(rows, 10, 0)
+    assert table["m"]["aolp_deg"] == pytest.approx(10, abs=1e-3)
+    assert table["without"]["aolp_deg"] is None
+    assert "without" not in scene_means(rows, "aolp_deg")
+
+
+def test_an_angle_for_some_frames_alone_is_refused():
+    with pytest.raises(ValueError, match="m has no aolp_deg for 1 of its frames"):
+        scene_means([row("x", 1.0, aolp_deg=3.0), row("y", 1.0)], "aolp_deg")
+
+
 def test_lpips_that_was_not_computed_is_null_without_an_interval():
     table = summary([row("x", 1.0), row("y", 2.0)], 10, 0)["m"]
     assert table["lpips"] is None
@@ -143,6 +191,8 @@ def test_frames_are_written_one_a_line_with_empty_cells_for_what_is_not_known(tm
         ({"methods": ["zeros", "magic"]}, "methods: expected one of zeros, train_mean, .*, got"),
         ({"methods": ["zeros", "zeros"]}, "methods: expected at least one and none twice"),
         ({"methods": []}, "methods: expected at least one and none twice"),
+        ({"sets": ["measured"]}, "sets: expected simulated and others, none twice"),
+        ({"sets": ["simulated", "real"]}, "sets: expected one of simulated, complex_motion, measured, got"),
         ({"warmup_windows": -1}, "warmup_windows: expected >= 0, got -1"),
         ({"precision": "fp16"}, "precision: expected one of fp32, bf16, got 'fp16'"),
     ],
@@ -159,7 +209,7 @@ def test_masked_pixels_count_in_no_score(make_recording):
     torch.manual_seed(0)
     lpips = Lpips("squeeze")
     spoilt = torch.where(valid, other, 1 - other)
-    rows, again = (score_sequence(masked, {"m": frames}, 1, lpips, CPU) for frames in (other, spoilt))
+    rows, again = (score_sequence(masked, {"m": Polarization(frames)}, 1, lpips, CPU) for frames in (other, spoilt))
     assert rows == again
     for r in rows:
         where = valid[r.window]
@@ -168,7 +218,7 @@ def test_masked_pixels_count_in_no_score(make_recording):
         assert r.level_mse == pytest.approx(difference.mean().square().item(), rel=1e-4, abs=1e-9)
         mixed = torch.where(where, other[r.window], recording.dolp[r.window])
         assert r.lpips == pytest.approx(lpips(mixed[None], recording.dolp[r.window][None]).item(), rel=1e-4)
-    unmasked = score_sequence(recording, {"m": other}, 1, lpips, CPU)
+    unmasked = score_sequence(recording, {"m": Polarization(other)}, 1, lpips, CPU)
     assert all(a.ssim != b.ssim for a, b in zip(rows, unmasked, strict=True))
 
 
@@ -177,5 +227,5 @@ def test_a_frame_without_a_valid_pixel_is_not_left_out_silently(recording):
     valid[2] = False
     masked = dataclasses.replace(recording, valid=valid)
     with pytest.raises(ValueError, match="window 2: no pixel is valid"):
-        score_sequence(masked, {"m": recording.dolp}, 1, None, CPU)
-    assert len(score_sequence(masked, {"m": recording.dolp}, 3, None, CPU)) == 1
+        score_sequence(masked, {"m": Polarization(recording.dolp)}, 1, None, CPU)
+    assert len(score_sequence(masked, {"m": Polarization(recording.dolp)}, 3, None, CPU)) == 1

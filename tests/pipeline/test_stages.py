@@ -41,6 +41,7 @@ GENERATED = ("images", "scenes.zarr", "frames.zarr", "events.zarr")
 
 def run_stage(root: Path, stage: str, data: Path, *overrides: str) -> str:
     command = [sys.executable, "-m", f"stages.{stage}", *TINY, f"paths.data={data}", f"paths.resume={data / 'resume'}",
+               f"paths.cache={data / 'cache'}",
                f"hydra.run.dir={data / 'logs' / stage}", *overrides]  # fmt: skip
     done = subprocess.run(command, cwd=root, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.evaluation.benchmark import Benchmark, Panel, recordings_of, write_benchmark
+from polarnet.evaluation.benchmark import Benchmark, BenchmarkSet, Panel, write_benchmark
+from polarnet.evaluation.cost import Cost
+from polarnet.evaluation.methods import Polarization
 from polarnet.evaluation.score import BenchmarkConfig, score_sequence
 from polarnet.events.frames import FrameStore
 from polarnet.events.store import EventStore
@@ -75,14 +77,18 @@ def write_events(path, frames):
 
 def run_methods(events, frames, folder):
     """Benchmark outputs for two constants, E2V (with AoLP) and ours, of the true frames made worse."""
-    methods = ["zeros", "oracle_mean", "firenet", "ours"]
-    config = BenchmarkConfig(methods, warmup_windows=1, precision="fp32", bootstrap_samples=20, panel_scenes=2)
+    methods = ["zeros", "oracle_mean", "e2v", "ours"]
+    config = BenchmarkConfig(
+        methods, ["simulated"], warmup_windows=1, precision="fp32", bootstrap_samples=20, panel_scenes=2
+    )
     rows, panels = [], []
-    for recording in recordings_of("test", events, frames):
+    for recording in BenchmarkSet("simulated", events, frames).recordings():
         truth = recording.dolp
         mean = truth.mean(dim=(-2, -1), keepdim=True)
-        dolp = {"zeros": 0 * truth, "oracle_mean": 0 * truth + mean, "firenet": (truth + mean) / 2, "ours": 0.9 * truth}
-        rows += score_sequence(recording, dolp, 1, None, torch.device("cpu"))
+        dolp = {"zeros": 0 * truth, "oracle_mean": 0 * truth + mean, "e2v": (truth + mean) / 2, "ours": 0.9 * truth}
+        answers = {method: Polarization(frames) for method, frames in dolp.items()}
+        answers["e2v"] = Polarization(dolp["e2v"], recording.aolp)
+        rows += score_sequence(recording, answers, 1, None, torch.device("cpu"))
         k = 3
         panels.append(
             Panel(
@@ -92,8 +98,8 @@ def run_methods(events, frames, folder):
             )
         )  # fmt: skip
     about = {"lpips": {"backbone": "squeeze", "sha256": None, "source": None, "reason": NO_WEIGHTS}}
-    times = dict.fromkeys(methods, 1.5)
-    write_benchmark(folder, Benchmark(rows, times, panels), config, seed=1, about=about)
+    costs = dict.fromkeys(methods, Cost(1.5, None, 0, 0.25)) | {"ours": Cost(1.5, 10.4, 37_777, 12.0)}
+    write_benchmark(folder, Benchmark(rows, costs, panels), config, seed=1, about=about)
 
 
 @pytest.fixture(scope="session")

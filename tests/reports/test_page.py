@@ -92,3 +92,14 @@ def test_a_benchmark_without_panels_and_without_ours_still_gives_a_page(paths, t
 
 def test_the_same_artefacts_give_the_same_page(paths, page, tmp_path):
     assert write_report(paths, RUN, tmp_path).read_text() == page
+
+
+def test_a_further_test_set_has_its_table_and_its_pictures(paths, tmp_path):
+    benchmark = tmp_path / "benchmark"
+    shutil.copytree(paths.benchmark, benchmark)
+    shutil.copytree(paths.benchmark, benchmark / "sets" / "measured")
+    page = write_report(dataclasses.replace(paths, benchmark=benchmark), RUN, tmp_path / "report").read_text()
+    assert page.count("Measured polarization") >= 3  # heading, caption, pictures
+    assert "Scenes whose polarization a camera measured" in page
+    assert "ours is better in" in page
+    assert "10.40" in page  # GFLOP of ours

@@ -1,0 +1,98 @@
+"""The benchmark as a configuration asks for it: what methods get, and on which test sets they run."""
+
+import dataclasses
+import functools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from polarnet.cluster import pmap
+from polarnet.config import Config
+from polarnet.evaluation.benchmark import BenchmarkSet, run_benchmark, train_mean_dolp, write_benchmark
+from polarnet.evaluation.methods import Context, available, checkpoints_of, weights_used
+from polarnet.events.frames import FrameStore
+from polarnet.events.store import EventStore
+from polarnet.runtime import device_of
+from polarnet.similarity import Lpips
+
+
+def context_of(config: Config, train_mean: float, weights: Path | None = None) -> Context:
+    """What methods get; `weights` replaces those of `ours` that the pipeline trained."""
+    checkpoints = checkpoints_of(
+        config.baselines.weights,
+        Path(config.paths.train),
+        Path(config.paths.train_e2v),
+        Path(config.paths.train_e2p),
+    )
+    return Context(
+        train_mean=train_mean,
+        cf=config.baselines.cf,
+        highpass=config.baselines.highpass,
+        postprocessing=config.baselines.postprocessing,
+        gain=config.baselines.gain,
+        **checkpoints | ({"ours_checkpoint": weights} if weights else {}),
+        device=device_of(config.runtime),
+        precision=config.benchmark.precision,
+    )
+
+
+def mapper_of(config: Config, label: str) -> Callable[..., list[Any]]:
+    """A map over sequences, as the configuration shares them out."""
+    return functools.partial(pmap, workers=config.runtime.workers, label=label, address=config.cluster.address)
+
+
+def pipeline_set(config: Config, name: str) -> BenchmarkSet:
+    """One of `benchmark.sets`, as the pipeline made it."""
+    if name == "simulated":
+        return BenchmarkSet(name, EventStore.open(config.paths.events), FrameStore.open(config.paths.frames))
+    return made_set(name, Path(config.paths.sets) / name)
+
+
+def made_set(name: str, folder: Path) -> BenchmarkSet:
+    """A set that `polarnet.simulation.sets` made under `folder`."""
+    return BenchmarkSet(name, EventStore.open(folder / "events.zarr"), FrameStore.open(folder / "frames.zarr"))
+
+
+def set_folder(config: Config, name: str) -> Path:
+    """Where the results of a set lie: the simulated one's in the benchmark's folder, others below it."""
+    folder = Path(config.paths.benchmark)
+    return folder if name == "simulated" else folder / "sets" / name
+
+
+def run_pipeline_benchmark(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
+    """Run all of `benchmark.sets` and write what each gave; set, then method: the metrics."""
+    train_mean = train_mean_dolp(FrameStore.open(config.paths.frames), config.benchmark.warmup_windows)
+    context = context_of(config, train_mean)
+    lpips = Lpips.load(config.paths.weights)
+    methods, left_out = available(config.benchmark.methods, context)
+    for method, reason in left_out.items():
+        print(f"{method} is left out: {reason}")
+    settings = dataclasses.replace(config.benchmark, methods=methods)
+    about = {
+        "lpips": lpips_record(config),
+        "train_mean": train_mean,
+        "left_out": left_out,
+        "weights": weights_used(methods, context),
+        "postprocessing": dataclasses.asdict(context.postprocessing),
+    }
+    results = {}
+    (Path(config.paths.benchmark) / "sets").mkdir(parents=True, exist_ok=True)
+    for name in config.benchmark.sets:
+        benchmark = run_benchmark(
+            pipeline_set(config, name), context, settings, lpips, cache_of(config), mapper_of(config, name)
+        )
+        results[name] = write_benchmark(
+            set_folder(config, name), benchmark, settings, config.seed, {"set": name} | about
+        )
+    return results
+
+
+def cache_of(config: Config) -> Path:
+    """Where predictions and scores are kept between runs."""
+    return Path(config.paths.cache) / "benchmark"
+
+
+def lpips_record(config: Config) -> dict[str, Any]:
+    """What the stage weights found: backbone, sha256, source, and the reason where there are none."""
+    return json.loads((Path(config.paths.weights) / "lpips.json").read_text())

@@ -1,0 +1,248 @@
+"""How many events DoLP needs (paper, section 5 and Fig. 11), and how often it can be recovered from overlapping events.
+
+Three questions, each on the test sequences:
+
+- since the start of the motion: quality against the events per pixel that have come so far (Fig. 11a; the paper's
+  answer is about one);
+- the length of the windows that the events are cut into;
+- windows of the last N events of each polarizer, recovered every fraction of a millisecond (Fig. 11b).
+
+Events per pixel are the mean over the four polarizers, as in the paper.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from polarnet.evaluation.methods import Context, Polarization, Recording, recover
+from polarnet.evaluation.resimulate import recording_at
+from polarnet.evaluation.score import FrameScore, scene_means, score_sequence
+from polarnet.events.store import EventStore
+from polarnet.events.stream import Events
+from polarnet.similarity import correlation, mse, psnr
+from polarnet.simulation.scenes import SceneStore
+
+BIN_EDGES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 13.0, 20.0, math.inf)
+"""Of events per pixel since the start; finer below 2, where the paper sees the change."""
+SHOWN = ("mse", "psnr", "ssim", "corr", "skill")
+EVENTS_PER_PIXEL = (0.25, 0.5, 1.0, 2.0)
+"""Sizes of the overlapping windows."""
+
+
+def events_per_pixel(events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """How many events a pixel has seen before each time, on average over pixels and polarizers."""
+    counts = torch.stack([torch.searchsorted(e.t, t_us, right=True) for e in events]).double().mean(dim=0)
+    return (counts / (events[0].height * events[0].width)).float()
+
+
+def since_start(recordings: Iterable[Recording], methods: Sequence[str], context: Context) -> dict[str, list[dict]]:
+    """Method, then bin of events per pixel since the start: frames, scenes and mean scores; no window is warm-up.
+
+    A bin's means are over frames, then scenes; bins that no frame falls into are left out.
+    """
+    rows: dict[int, list[FrameScore]] = {}
+    rates: dict[int, list[float]] = {}
+    for recording in tqdm(list(recordings), "events since the start", unit="sequence"):
+        answers = {method: _answer(method, recording, context) for method in methods}
+        per_pixel = events_per_pixel(recording.events, recording.t_us[1:]).tolist()
+        for row in score_sequence(recording, answers, 0, None, context.device):
+            k = int(np.searchsorted(BIN_EDGES, per_pixel[row.window], side="right")) - 1
+            rows.setdefault(k, []).append(row)
+            rates.setdefault(k, []).append(per_pixel[row.window])
+    return {
+        method: [
+            {
+                "from": BIN_EDGES[k],
+                "to": BIN_EDGES[k + 1] if math.isfinite(BIN_EDGES[k + 1]) else None,
+                "events_per_pixel": float(np.mean(rates[k])),
+                **_means([row for row in rows[k] if row.method == method]),
+            }
+            for k in sorted(rows)
+        ]
+        for method in methods
+    }
+
+
+def by_window_length(
+    scenes: SceneStore,
+    events: EventStore,
+    sequences: Sequence[str],
+    lengths_us: Sequence[int],
+    settle_us: int,
+    methods: Sequence[str],
+    context: Context,
+) -> dict[str, list[dict]]:
+    """Method, then window length: mean scores of the windows that end later than `settle_us`, and events per window.
+
+    The truth is rendered at each window's own end. ValueError where no window of a length ends after `settle_us`.
+    """
+    table: dict[str, list[dict]] = {method: [] for method in methods}
+    for length_us in tqdm(lengths_us, "window length", unit="length"):
+        rows: list[FrameScore] = []
+        per_window: list[float] = []
+        for sequence in sequences:
+            end_us = scenes.duration_us(sequence)
+            t_us = torch.arange(0, end_us + 1, length_us)
+            warmup = int((t_us[1:] <= settle_us).sum())
+            if len(t_us) < 2 or warmup >= len(t_us) - 1:
+                raise ValueError(
+                    f"{sequence}: windows of {length_us} us leave none after the first {settle_us} us of {end_us} us"
+                )
+            recording = recording_at(scenes, sequence, events.read(sequence), t_us)
+            answers = {method: _answer(method, recording, context) for method in methods}
+            rows += score_sequence(recording, answers, warmup, None, context.device)
+            per_window.append(float(events_per_pixel(recording.events, t_us).diff().mean()))
+        for method in methods:
+            of_method = [row for row in rows if row.method == method]
+            entry = {"window_us": length_us, "events_per_pixel": float(np.mean(per_window)), **_means(of_method)}
+            table[method].append(entry)
+    return table
+
+
+def _answer(method: str, recording: Recording, context: Context) -> Polarization:
+    found = recover(method, recording, context)
+    return Polarization(found.dolp, found.aolp)
+
+
+def _means(rows: Sequence[FrameScore]) -> dict[str, Any]:
+    means = {metric: scene_means(rows, metric) for metric in SHOWN}
+    scores = {metric: float(np.mean([*next(iter(of.values())).values()])) for metric, of in means.items() if of}
+    return {"frames": len(rows), "scenes": len({row.scene for row in rows}), **scores}
+
+
+class SlidingEventTensor:
+    """The event tensor (paper Eq. 5) of the last `count` events of one polarizer, updated by what comes and goes.
+
+    Two integers a pixel are kept, the sum of polarities and of polarity times time, to which an event that comes is
+    added and from which one that leaves is taken: the work of a step is in proportion to the events of the step, not
+    of the window, and as integers do not round, the tensor is that of a window cut out anew.
+    """
+
+    def __init__(self, events: Events, count: int):
+        if count < 2:
+            raise ValueError(f"count: expected at least 2 events, got {count}")
+        self.events = events
+        self.count = count
+        self.first = self.stop = 0
+        pixels = events.height * events.width
+        self._polarity = torch.zeros(pixels, dtype=torch.int64)
+        self._moment = torch.zeros(pixels, dtype=torch.int64)
+
+    def advance(self, t_us: int) -> None:
+        """Let the events before `t_us` come, and the oldest go, so that `count` stay; time only goes forward."""
+        stop = int(torch.searchsorted(self.events.t, t_us))
+        if stop < self.stop:
+            raise ValueError(f"time only goes forward: {t_us} us is before what was seen already")
+        first = max(self.first, stop - self.count)
+        self._add(max(self.stop, first), stop, 1)
+        self._add(self.first, min(first, self.stop), -1)
+        self.first, self.stop = first, stop
+
+    def tensor(self) -> Float[Tensor, "h w"]:
+        """Polarities summed per pixel, each weighted by its time since the window's first event, in window lengths.
+
+        The window ends with its last event; 0 everywhere while fewer than two events have come.
+        """
+        height, width = self.events.height, self.events.width
+        if self.stop - self.first < 2:
+            return torch.zeros(height, width)
+        start = self.events.t[self.first]
+        length = (self.events.t[self.stop - 1] - start).clamp(min=1)
+        weighted = (self._moment - start * self._polarity).double() / length
+        return weighted.float().view(height, width)
+
+    def _add(self, first: int, stop: int, sign: int) -> None:
+        if first >= stop:
+            return
+        events = self.events
+        pixel = events.y[first:stop].long() * events.width + events.x[first:stop].long()
+        polarity = sign * events.p[first:stop].long()
+        self._polarity.index_add_(0, pixel, polarity)
+        self._moment.index_add_(0, pixel, polarity * events.t[first:stop])
+
+
+@torch.no_grad()
+def sliding_recovery(
+    recording: Recording, network: nn.Module, count: int, t_us: Sequence[int], carry: bool, context: Context
+) -> Float[Tensor, "n h w"]:
+    """DoLP at times `t_us` from the last `count` events of each polarizer, by a network that takes event tensors.
+
+    `carry`: whether the network's state goes from one overlapping window to the next, or each stands alone.
+    """
+    windows = [SlidingEventTensor(events, count) for events in recording.events]
+    state, frames = None, []
+    for t in t_us:
+        for window in windows:
+            window.advance(t)
+        inputs = torch.stack([window.tensor() for window in windows])[None].to(context.device)
+        with context.autocast():
+            prediction, after = network(inputs, state)
+        state = after if carry else None
+        frames.append(prediction.dolp[0].float().clamp(0, 1).cpu())
+    return torch.stack(frames)
+
+
+def by_sliding_window(
+    scenes: SceneStore,
+    events: EventStore,
+    sequences: Sequence[str],
+    span_us: tuple[int, int],
+    spacing_us: int,
+    context: Context,
+) -> list[dict]:
+    """For each of `EVENTS_PER_PIXEL`, with the state carried on and without: mean scores of a frame every `spacing_us`.
+
+    `change` is the mean absolute difference of consecutive frames, which of a steady recovery is small, beside that
+    of the truth. ValueError where the network takes something else than event tensors.
+    """
+    network, metadata = context.ours
+    if metadata["representation"] != "event_tensor":
+        raise ValueError(
+            f"overlapping windows are updated as event tensors; the network takes {metadata['representation']}"
+        )
+    times = list(range(span_us[0], span_us[1] + 1, spacing_us))
+    table = []
+    recordings = [
+        recording_at(scenes, name, events.read(name), torch.tensor([times[0] - spacing_us, *times]))
+        for name in tqdm(sequences, "truth", unit="sequence")
+    ]
+    for per_pixel in tqdm(EVENTS_PER_PIXEL, "overlapping windows", unit="size"):
+        for carry in (False, True):
+            found = [_sliding_scores(one, network, per_pixel, times, carry, context) for one in recordings]
+            means = {name: float(np.mean([scores[name] for scores in found])) for name in found[0]}
+            table.append({"events_per_pixel": per_pixel, "carry": carry, "spacing_us": spacing_us, **means})
+    return table
+
+
+def _sliding_scores(
+    recording: Recording, network: nn.Module, per_pixel: float, times: Sequence[int], carry: bool, context: Context
+) -> Mapping[str, float]:
+    first = recording.events[0]
+    count = max(2, round(per_pixel * first.height * first.width))
+    frames = sliding_recovery(recording, network, count, times, carry, context)
+    truth, valid = recording.dolp, recording.valid
+    spans = [_span_us(events, count, times[len(times) // 2]) for events in recording.events]
+    scores = {
+        "mse": mse(frames, truth, valid),
+        "psnr": psnr(frames, truth, valid),
+        "corr": correlation(frames, truth, valid),
+    }
+    return {
+        **{name: float(values.mean()) for name, values in scores.items()},
+        "change": float(frames.diff(dim=0).abs().mean()),
+        "true_change": float(truth.diff(dim=0).abs().mean()),
+        "window_ms": float(np.mean(spans)) / 1000,
+    }
+
+
+def _span_us(events: Events, count: int, t_us: int) -> int:
+    """How long the last `count` events before a time took to come."""
+    stop = int(torch.searchsorted(events.t, t_us))
+    window = events.t[max(0, stop - count) : stop]
+    return int(window[-1] - window[0]) if len(window) else 0

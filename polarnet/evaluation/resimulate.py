@@ -1,0 +1,81 @@
+"""Recordings made anew from stored scenes: other window lengths, other sensors, other speeds; all in memory."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Int64
+from torch import Tensor
+
+from polarnet.evaluation.methods import Recording
+from polarnet.events.stream import Events
+from polarnet.runtime import generator_for, seed_for
+from polarnet.simulation.emulator import EmulatorConfig, randomised
+from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory
+from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
+from polarnet.simulation.scenes import SceneRecord, SceneStore
+from polarnet.simulation.synthesize import synthesize_sequence
+from polarnet.simulation.truth import frames_of, valid_frames
+
+
+def recording_at(scenes: SceneStore, sequence: str, events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> Recording:
+    """A stored sequence's events with its exact truth at the times `t_us`, which bound its windows."""
+    record = scenes.read(sequence)
+    trajectory = Trajectory.from_vector(record.trajectory.numpy())
+    scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
+    return _recording(scenes, record, scene, trajectory, events, t_us)
+
+
+def resimulated(
+    scenes: SceneStore,
+    sequence: str,
+    motion: MotionConfig,
+    emulate: Sequence[EmulatorConfig],
+    seed: int,
+    speed: float = 1.0,
+    threads: int = 1,
+) -> Recording:
+    """A stored sequence seen again, behind polarizers whose sensors may differ: one configuration for each of the four.
+
+    The noise is that of the stored sequence. `speed` other than 1 lets the window move over the same picture at so
+    many times the configured speed, along another path.
+    """
+    record = scenes.read(sequence)
+    scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
+    trajectory = Trajectory.from_vector(record.trajectory.numpy())
+    if speed != 1:
+        quicker = dataclasses.replace(
+            motion,
+            speed_min_px_s=speed * motion.speed_min_px_s,
+            speed_max_px_s=speed * motion.speed_max_px_s,
+            acceleration_max_px_s2=speed**2 * motion.acceleration_max_px_s2,  # the same path takes 1 / speed the time
+        )
+        trajectory = random_trajectory(quicker, scene.height, scene.width, generator_for(seed, sequence, "motion"))
+    t_us = torch.tensor(frame_times_us(motion))
+    events: list[Events] = []
+    made: list[tuple[EmulatorConfig, list[Events]]] = []
+    for polarizer, config in enumerate(emulate):
+        sensor = randomised(config, generator_for(seed, sequence, "sensor"))
+        seen = next((of_all for known, of_all in made if known == sensor), None)
+        if seen is None:
+            key = seed_for(seed, sequence, "emulate")
+            size = scenes.window_height, scenes.window_width
+            seen = synthesize_sequence(scene, trajectory, int(t_us[-1]), *size, sensor, key, threads)
+            made.append((sensor, seen))
+        events.append(seen[polarizer])
+    return _recording(scenes, record, scene, trajectory, events, t_us)
+
+
+def _recording(
+    scenes: SceneStore,
+    record: SceneRecord,
+    scene: PolarizationScene,
+    trajectory: Trajectory,
+    events: Sequence[Events],
+    t_us: Int64[Tensor, " n"],
+) -> Recording:
+    size = scenes.window_height, scenes.window_width
+    intensity, dolp, aolp = (frames[1:] for frames in frames_of(scene, trajectory, t_us.tolist(), *size))
+    valid = None if record.valid is None else valid_frames(record.valid, trajectory, t_us.tolist()[1:], *size)
+    s0 = intensity[:, 0] + intensity[:, 2]
+    return Recording(record.name, record.picture, events, t_us, dolp, aolp, s0, valid)

@@ -1,0 +1,77 @@
+"""The benchmark on a folder of a user's own: photographs or measured polarization, scored without training."""
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any
+
+from polarnet.benchmarking import context_of, lpips_record, made_set, mapper_of
+from polarnet.config import Config
+from polarnet.evaluation.benchmark import run_benchmark, train_mean_dolp, write_benchmark
+from polarnet.evaluation.methods import METHODS, Context, why_absent
+from polarnet.events.frames import FrameStore
+from polarnet.fingerprint import reach
+from polarnet.reports.set_page import write_set_page
+from polarnet.runtime import threads_of
+from polarnet.similarity import Lpips
+from polarnet.simulation.sets import Recipe, make_folder_set
+
+
+def benchmark_folder(
+    config: Config, root: Path, kind: str, out: Path, weights: Path | None, command: str
+) -> tuple[dict[str, dict[str, Any]], list[str]]:
+    """Run the benchmark on a folder of photographs or measured scenes, without training; (metrics, notes).
+
+    `out` gets metrics.json, details.json, frames.csv, panels and index.html, and in `out`/work what they were made
+    from, so that a run that was stopped goes on and a second one with other weights makes only what is new. Methods
+    whose weights are not there are left out, and `notes` says so. `weights` is a checkpoint of the DoLP network; None:
+    the one that the pipeline trained. ValueError where nothing in the folder can be used.
+    """
+    if weights is not None and not weights.is_file():
+        raise ValueError(
+            f"--weights {weights}: expected a checkpoint of the DoLP network (.safetensors), there is none"
+        )
+    recipe = Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads_of(config.runtime))
+    work = out / "work"
+    try:
+        make_folder_set(root, kind, work, recipe, functools.partial(mapper_of, config))
+    except ValueError as error:
+        raise ValueError(f"--scenes {root}: nothing to test on. {error}") from error
+    notes: list[str] = []
+    train_mean = _train_mean(config)
+    context = context_of(config, train_mean or 0.0, weights)
+    wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
+    methods = [method for method in wanted if _runs(method, context, train_mean, notes)]
+    lpips, record = _lpips_if_there(config)
+    settings = dataclasses.replace(config.benchmark, methods=methods)
+    test_set = made_set(root.resolve().name, work)
+    benchmark = run_benchmark(test_set, context, settings, lpips, work / "cache", mapper_of(config, "benchmark"))
+    about = {"set": test_set.name, "lpips": record, "train_mean": train_mean, "left_out": notes}
+    metrics = write_benchmark(out, benchmark, settings, config.seed, about)
+    write_set_page(out, test_set.name, command, notes)
+    return metrics, notes
+
+
+def _train_mean(config: Config) -> float | None:
+    """Of the pipeline's training split; None where the pipeline has not made it."""
+    frames = Path(config.paths.frames)
+    return train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None
+
+
+def _runs(method: str, context: Context, train_mean: float | None, notes: list[str]) -> bool:
+    """Whether all is there that a method needs; adds to `notes` what is not."""
+    if reason := why_absent(method, context):
+        remedy = "give --weights FILE or run `dvc repro`" if method == "ours" else "run `dvc repro` for what it trains"
+        notes.append(f"{method} was left out: {reason}; {remedy}.")
+        return False
+    if train_mean is None and "train_mean" in reach(METHODS[method], type(context)).fields:  # type: ignore[arg-type]
+        notes.append(f"{method} was left out: the training split is not there; run `dvc repro synthesize`.")
+        return False
+    return True
+
+
+def _lpips_if_there(config: Config) -> tuple[Lpips | None, dict[str, Any]]:
+    if (Path(config.paths.weights) / "lpips.json").exists():
+        return Lpips.load(config.paths.weights), lpips_record(config)
+    reason = f"{config.paths.weights} is not there; run `dvc repro weights`"
+    return None, {"backbone": config.lpips.backbone, "sha256": None, "source": None, "reason": reason}

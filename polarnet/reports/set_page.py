@@ -1,0 +1,59 @@
+"""The page of one test set, as `polarnet benchmark --scenes` writes it: table, scenes, what each method makes of it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from polarnet.reports.artefacts import read_set
+from polarnet.reports.figures import PanelScene, comparison_panel, dolp_bar
+from polarnet.reports.maps import encode_png, hue_wheel
+from polarnet.reports.tables import (
+    COSTS,
+    ERROR_PARTS,
+    PAPER_COMPARABILITY,
+    PAPER_SOURCE,
+    paired_lines,
+    paper_table,
+    score_table,
+    standing,
+)
+from polarnet.reports.tiles import TileRow, chart, data_uri, distribution, panel_tiles, polarization_tiles
+
+
+def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str]) -> Path:
+    """Write index.html and comparison.png beside the metrics.json, details.json and panels that lie in `folder`.
+
+    `notes` are sentences that a reader of the table has to know, such as which methods did not run and why.
+    """
+    results = read_set(folder)
+    reason = results.details["lpips"]["reason"]
+    if results.panels:
+        rows = [PanelScene(panel.sequence, panel.events, panel.truth_dolp, panel.dolp) for panel in results.panels]
+        comparison_panel(rows, folder / "comparison.png")
+    environment = Environment(
+        loader=PackageLoader("polarnet.reports", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    page = environment.get_template("set.html.jinja").render(
+        title=title,
+        command=command,
+        notes=notes,
+        details=results.details,
+        scores=score_table(results.metrics, reason),
+        error_parts=score_table(results.metrics, columns=ERROR_PARTS),
+        costs=score_table(results.metrics, columns=COSTS),
+        standing=standing(results.metrics),
+        paired=paired_lines(results.details["paired"]),
+        paper_simulated=paper_table("simulated"),
+        paper_real=paper_table("real"),
+        paper_source=PAPER_SOURCE,
+        comparability=PAPER_COMPARABILITY,
+        distribution=distribution(results.details["scene_means"]),
+        dolp_bar=chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
+        wheel=data_uri(encode_png(hue_wheel(192)), "png"),
+        panels=[TileRow(panel.sequence, panel_tiles(panel)) for panel in results.panels],
+        polarization=[TileRow(panel.sequence, polarization_tiles(panel)) for panel in results.panels],
+    )
+    path = folder / "index.html"
+    path.write_text(page, encoding="utf-8")
+    return path

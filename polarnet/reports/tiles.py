@@ -1,0 +1,118 @@
+"""Pictures of a page: panels of the benchmark as rows of tiles, and figures drawn for light and dark."""
+
+import base64
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from matplotlib.figure import Figure
+
+from polarnet.reports.artefacts import Panel
+from polarnet.reports.figures import DARK, LIGHT, Theme, png, score_distribution, score_line
+from polarnet.reports.maps import (
+    dolp_image,
+    encode_png,
+    event_full_scale,
+    event_image,
+    intensity_image,
+    polarization_hsv,
+)
+from polarnet.reports.tables import METHODS, TRIVIAL, in_order
+from polarnet.stokes import POLARIZER_ANGLES_DEG
+
+DISTRIBUTION_METRICS = ("mse", "psnr", "ssim", "corr")
+
+
+class Tile(NamedTuple):
+    """A picture with what stands below it."""
+
+    source: str
+    label: str
+    detail: str = ""
+
+
+class Chart(NamedTuple):
+    """A figure drawn for a light and for a dark page."""
+
+    light: str
+    dark: str
+    alt: str
+
+
+class TileRow(NamedTuple):
+    """Pictures of one scene or split."""
+
+    name: str
+    tiles: Sequence[Tile]
+    more: int = 0
+    """Pictures that are left out."""
+
+
+def panel_tiles(panel: Panel) -> list[Tile]:
+    """Events, truth, and every method that is not a constant."""
+    full_scale = event_full_scale(panel.events)
+    tiles = [
+        tile(event_image(panel.events[0], full_scale), "events, 0°", f"{panel.t_us / 1000:.0f} ms"),
+        tile(dolp_image(panel.truth_dolp), "truth"),
+    ]
+    methods = [method for method in in_order(panel.dolp) if method not in TRIVIAL]
+    return tiles + [
+        tile(
+            dolp_image(panel.dolp[method]),
+            METHODS.get(method, method),
+            score_line(panel.dolp[method], panel.truth_dolp),
+        )
+        for method in methods
+    ]
+
+
+def polarization_tiles(panel: Panel) -> list[Tile]:
+    """The truth's S0, DoLP and AoLP, alone and as one colour picture; then every method that has AoLP, lit by S0."""
+    ones, s0 = torch.ones_like(panel.truth_s0), panel.truth_s0
+    tiles = [
+        tile(intensity_image(s0), "true S0"),
+        tile(dolp_image(panel.truth_dolp), "true DoLP"),
+        tile(polarization_hsv(ones, ones, panel.truth_aolp), "true AoLP"),
+        tile(polarization_hsv(s0, panel.truth_dolp, panel.truth_aolp), "truth"),
+    ]
+    return tiles + [
+        tile(polarization_hsv(s0, panel.dolp[method], panel.aolp[method]), METHODS.get(method, method), "with true S0")
+        for method in in_order(panel.aolp)
+    ]
+
+
+def event_tiles(panel: Panel) -> list[Tile]:
+    """The window's events behind each polarizer, on one scale."""
+    full_scale = event_full_scale(panel.events)
+    return [
+        tile(event_image(events, full_scale), f"{angle}°")
+        for events, angle in zip(panel.events, POLARIZER_ANGLES_DEG, strict=True)
+    ]
+
+
+def distribution(scene_means: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Chart:
+    """Every scene of a test set, from metric, then method, then scene."""
+    shown = {
+        metric: {method: list(scenes.values()) for method, scenes in scene_means[metric].items()}
+        for metric in DISTRIBUTION_METRICS
+        if metric in scene_means
+    }
+    return chart(lambda theme: score_distribution(shown, theme), "scores of each method, a dot a scene")
+
+
+def chart(draw: Callable[[Theme], Figure], alt: str) -> Chart:
+    """A figure for either theme, inside the page."""
+    light, dark = (data_uri(png(draw(theme)), "png") for theme in (LIGHT, DARK))
+    return Chart(light, dark, alt)
+
+
+def tile(picture: UInt8[np.ndarray, "h w 3"], label: str, detail: str = "") -> Tile:
+    """A picture, inside the page."""
+    return Tile(data_uri(encode_png(picture), "png"), label, detail)
+
+
+def data_uri(content: bytes, kind: str) -> str:
+    """A picture file's content as an address."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"

@@ -1,0 +1,147 @@
+"""Test sets beside the pipeline's own: harder motion over held-out pictures, measured polarization, a user's folder.
+
+A set is a folder with images, scenes.zarr, frames.zarr and events.zarr, made by the same code as the pipeline's own.
+"""
+
+import dataclasses
+import functools
+import json
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from polarnet.fingerprint import code_digest, digest, value_digest
+from polarnet.ranges import allowed, check_ranges
+from polarnet.simulation.dataset import emulate_scenes
+from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.motion import MotionConfig
+from polarnet.simulation.pictures.images import picture_extensions
+from polarnet.simulation.pictures.ingest import IngestConfig, ingest
+from polarnet.simulation.pictures.manifest import read_manifest, write_manifest
+from polarnet.simulation.pictures.polarimetry import group_by_measurement
+from polarnet.simulation.truth import synthesize
+
+MADE = "made.json"
+KINDS = ("auto", "photographs", "polarization")
+
+MakeMapper = Callable[[str], Callable[..., Iterable[Any]]]
+"""`polarnet.cluster.pmap` with its workers bound, for a label; or one that gives the built-in `map`."""
+
+
+@dataclass(frozen=True)
+class SetsConfig:
+    """Section `sets` of params.yaml: how test sets beyond `simulated` differ from it."""
+
+    measured_root: str
+    """Folder of the measured polarization of `measured`, searched recursively."""
+    rotation_max_deg: float = field(metadata=allowed(low=0, high=90))
+    """This and the next four: the motion of `complex_motion`."""
+    zoom_max: float = field(metadata=allowed(low=1, high=16))
+    speed_min_px_s: float = field(metadata=allowed(above=0))
+    speed_max_px_s: float = field(metadata=allowed(above=0))
+    acceleration_max_px_s2: float = field(metadata=allowed(above=0))
+
+    def __post_init__(self):
+        check_ranges(self)
+        if self.speed_max_px_s < self.speed_min_px_s:
+            raise ValueError(f"speed_max_px_s: expected >= speed_min_px_s {self.speed_min_px_s}, got {self}")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How sequences are made of pictures: the sections of params.yaml that decide it."""
+
+    ingest: IngestConfig
+    motion: MotionConfig
+    emulate: EmulatorConfig
+    seed: int
+    threads: int
+    """Of each task; changes no result."""
+
+
+def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Recipe, mapper: MakeMapper) -> bool:
+    """The test pictures of `images` again, under the motion of `sets`. False where they lie there already."""
+    names = ("rotation_max_deg", "zoom_max", "speed_min_px_s", "speed_max_px_s", "acceleration_max_px_s2")
+    motion = dataclasses.replace(recipe.motion, **{name: getattr(sets, name) for name in names})
+    fill = functools.partial(_held_out, images)
+    return _make(folder, dataclasses.replace(recipe, motion=motion), mapper, fill, value_digest(images))
+
+
+def make_folder_set(root: Path, kind: str, folder: Path, recipe: Recipe, mapper: MakeMapper) -> bool:
+    """Every photograph or measured scene under `root`, for testing alone. False where they lie there already.
+
+    `kind` is photographs, polarization, or auto, which looks at the files. ValueError that says what was expected where
+    none can be used.
+    """
+    if not root.is_dir():
+        raise ValueError(f"{root}: expected a folder of photographs or of measured polarization, it is none")
+    source = "polarization" if (kind if kind != "auto" else kind_of(root)) == "polarization" else "folder"
+    chosen = dataclasses.replace(
+        recipe.ingest, source=source, root=str(root), limit=None, val_fraction=0.0, test_fraction=1.0
+    )
+    recipe = dataclasses.replace(recipe, ingest=chosen)
+    return _make(folder, recipe, mapper, lambda recipe, images, m: _ingested(recipe, images, m), value_digest(root))
+
+
+def kind_of(root: Path) -> str:
+    """`polarization` where the folder holds .npz files or pictures of four angles of one thing, else `photographs`.
+
+    Raw mosaics look like photographs: name their kind.
+    """
+    files = sorted(path for path in root.rglob("*") if path.is_file())
+    if any(path.suffix.lower() == ".npz" for path in files):
+        return "polarization"
+    pictures = [path for path in files if path.suffix.lower().lstrip(".") in picture_extensions()]
+    return "polarization" if any(len(group) == 4 for group in group_by_measurement(pictures)) else "photographs"
+
+
+def _make(
+    folder: Path,
+    recipe: Recipe,
+    mapper: MakeMapper,
+    fill: Callable[[Recipe, Path, MakeMapper], None],
+    source: str,
+) -> bool:
+    """Fill `folder`, going on where a run of the same recipe stopped; a folder of another recipe is emptied first."""
+    sections = {name: asdict(getattr(recipe, name)) for name in ("ingest", "motion", "emulate")}
+    settings = json.dumps(sections | {"seed": recipe.seed}, sort_keys=True)
+    key = digest(settings, source, code_digest(synthesize, emulate_scenes, ingest))
+    note = folder / MADE
+    if note.exists():
+        known = json.loads(note.read_text())
+        if known == {"key": key, "complete": True}:
+            return False
+        if known.get("key") != key:
+            shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    note.write_text(json.dumps({"key": key, "complete": False}))
+    images, scenes, frames, events = (folder / name for name in ("images", "scenes.zarr", "frames.zarr", "events.zarr"))
+    if not (images / "manifest.json").exists():
+        fill(recipe, images, mapper)
+    if not (scenes.exists() and frames.exists()):
+        synthesize(images, scenes, frames, recipe.motion, recipe.seed, mapper("synthesize"))
+    if not events.exists():
+        emulate_scenes(scenes, events, recipe.emulate, recipe.seed, mapper("emulate"), recipe.threads)
+    note.write_text(json.dumps({"key": key, "complete": True}))
+    return True
+
+
+def _ingested(recipe: Recipe, images: Path, mapper: MakeMapper) -> None:
+    ingest(recipe.ingest, recipe.seed, images, mapper("ingest"))
+
+
+def _held_out(source: Path, recipe: Recipe, images: Path, mapper: MakeMapper) -> None:
+    """The test pictures of `source` and a manifest of them alone."""
+    manifest = read_manifest(source)
+    kept = tuple(entry for entry in manifest.pictures if entry.split == "test")
+    if not kept:
+        raise ValueError(f"{source} has no test picture; raise ingest.test_fraction or ingest more pictures")
+    temporary = images.with_name(f"{images.name}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir()
+    for entry in kept:
+        shutil.copy(source / entry.file, temporary / entry.file)
+    write_manifest(dataclasses.replace(manifest, pictures=kept), temporary)
+    temporary.rename(images)

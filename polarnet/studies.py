@@ -1,0 +1,74 @@
+"""The event budget and the sensitivity, on the pipeline's test sequences: JSON and a figure each."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from polarnet.benchmarking import context_of, pipeline_set
+from polarnet.config import Config
+from polarnet.evaluation.benchmark import train_mean_dolp
+from polarnet.evaluation.event_budget import by_sliding_window, by_window_length, since_start
+from polarnet.evaluation.methods import METHODS, why_absent
+from polarnet.evaluation.sensitivity import sensitivity
+from polarnet.reports.figures import LIGHT, png
+from polarnet.reports.studies import event_budget_figure, sensitivity_figure
+from polarnet.runtime import threads_of
+from polarnet.simulation.scenes import SceneStore
+
+WINDOW_LENGTHS_US = (5_000, 10_000, 20_000, 33_333, 50_000, 100_000)
+SPACING_US = 500
+SLIDING_FRAMES = 60
+STUDIED = ("oracle_mean", "cf", "highpass", "ours")
+
+
+def run_event_budget(
+    config: Config, out: Path, methods: Sequence[str], limit: int | None, weights: Path | None
+) -> dict[str, Any]:
+    """Write event_budget.json and event_budget.png to `out`; ValueError where `ours` has no weights."""
+    sequences, context, tests, scenes = _prepared(config, methods, limit, weights)
+    if reason := why_absent("ours", context):
+        raise ValueError(f"the event budget needs the DoLP network: {reason}; give --weights FILE")
+    end_us = min(scenes.duration_us(name) for name in sequences)
+    settle_us = round(config.benchmark.warmup_windows * 1e6 / config.synthesize.frame_rate_hz)
+    lengths = [length for length in WINDOW_LENGTHS_US if settle_us + length <= end_us]
+    first = min(end_us // 2, end_us - SPACING_US)
+    span = (first, min(first + SLIDING_FRAMES * SPACING_US, end_us))
+    results = {
+        "methods": list(methods),
+        "sequences": list(sequences),
+        "since_start": since_start((tests.recording(name) for name in sequences), methods, context),
+        "window_length": by_window_length(scenes, tests.events, sequences, lengths, settle_us, methods, context),
+        "sliding": by_sliding_window(scenes, tests.events, sequences, span, SPACING_US, context),
+    }
+    return _written(out, "event_budget", results, png(event_budget_figure(results, LIGHT)))
+
+
+def run_sensitivity(
+    config: Config, out: Path, methods: Sequence[str], limit: int | None, weights: Path | None
+) -> dict[str, Any]:
+    """Write sensitivity.json and sensitivity.png to `out`."""
+    sequences, context, _, scenes = _prepared(config, methods, limit, weights)
+    table = sensitivity(
+        scenes, sequences, config.synthesize, config.emulate, config.seed, config.benchmark.warmup_windows, methods,
+        context, threads=threads_of(config.runtime),
+    )  # fmt: skip
+    results = {"methods": list(methods), "sequences": list(sequences), "settings": table}
+    return _written(out, "sensitivity", results, png(sensitivity_figure(table, LIGHT)))
+
+
+def _prepared(config: Config, methods: Sequence[str], limit: int | None, weights: Path | None) -> Any:
+    unknown = [method for method in methods if method not in METHODS]
+    if unknown or not methods:
+        raise ValueError(f"--methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown) or 'none'}")
+    tests = pipeline_set(config, "simulated")
+    scenes = SceneStore.open(config.paths.scenes)
+    context = context_of(config, train_mean_dolp(tests.frames, config.benchmark.warmup_windows), weights)
+    return tests.sequences[:limit], context, tests, scenes
+
+
+def _written(out: Path, name: str, results: dict[str, Any], picture: bytes) -> dict[str, Any]:
+    out.mkdir(parents=True, exist_ok=True)
+    (out / f"{name}.json").write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")
+    (out / f"{name}.png").write_bytes(picture)
+    return results

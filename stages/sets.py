@@ -1,0 +1,32 @@
+"""data/images and measured polarization -> data/sets: the test sets of benchmark.sets beyond the simulated one."""
+
+import functools
+from pathlib import Path
+
+from polarnet.cluster import pmap
+from polarnet.config import Config, hydra_stage
+from polarnet.runtime import threads_of
+from polarnet.simulation.sets import Recipe, make_complex_motion, make_folder_set
+
+
+@hydra_stage
+def main(config: Config) -> None:
+    """Make what is asked for and not there yet."""
+    folder = Path(config.paths.sets)
+    folder.mkdir(parents=True, exist_ok=True)
+    threads = threads_of(config.runtime)
+    recipe = Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads)
+
+    def mapper(label: str) -> functools.partial:
+        return functools.partial(pmap, workers=config.runtime.workers, label=label, address=config.cluster.address)
+
+    if "complex_motion" in config.benchmark.sets:
+        make_complex_motion(Path(config.paths.images), folder / "complex_motion", config.sets, recipe, mapper)
+    if "measured" in config.benchmark.sets:
+        make_folder_set(Path(config.sets.measured_root), "polarization", folder / "measured", recipe, mapper)
+    made = [name for name in config.benchmark.sets if name != "simulated"]
+    print(f"test sets beyond simulated: {', '.join(made) or 'none asked for'}")
+
+
+if __name__ == "__main__":
+    main()

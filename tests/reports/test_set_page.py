@@ -1,0 +1,34 @@
+import re
+import shutil
+
+import pytest
+
+from polarnet.reports.set_page import write_set_page
+
+
+@pytest.fixture(scope="module")
+def page(paths, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("set") / "results"
+    shutil.copytree(paths.benchmark, folder)
+    path = write_set_page(folder, "my <holidays>", "polarnet benchmark --scenes x", ["e2vid was left out: no weights."])
+    assert (folder / "comparison.png").exists()
+    return path.read_text()
+
+
+def test_the_page_needs_no_other_file(page):
+    sources = re.findall(r'(?:src|srcset|href)="([^"]*)"', page)
+    assert sources
+    assert all(source.startswith(("data:", "#")) for source in sources)
+
+
+def test_the_page_shows_the_table_the_papers_and_what_was_left_out(page):
+    assert "my &lt;holidays&gt;" in page
+    assert "e2vid was left out" in page
+    assert "15.56" in page
+    assert "no weights lie in the hub cache" in page
+    assert "oracle mean" in page
+
+
+def test_a_folder_without_results_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="run the benchmark of this test set again"):
+        write_set_page(tmp_path, "x", "y", [])

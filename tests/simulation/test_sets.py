@@ -1,0 +1,107 @@
+import json
+
+import numpy as np
+import pytest
+
+from polarnet.config import load
+from polarnet.events.frames import FrameStore
+from polarnet.events.store import EventStore
+from polarnet.runtime import generator_for
+from polarnet.simulation.motion import Trajectory
+from polarnet.simulation.pictures.dead_leaves import dead_leaves
+from polarnet.simulation.pictures.images import write_png
+from polarnet.simulation.pictures.manifest import Manifest, ManifestEntry, write_manifest
+from polarnet.simulation.scenes import SceneStore
+from polarnet.simulation.sets import MADE, Recipe, SetsConfig, kind_of, make_complex_motion, make_folder_set
+
+SMALL = [
+    "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.1", "synthesize.window_height=60",
+    "synthesize.window_width=90", "synthesize.speed_min_px_s=10.0", "synthesize.speed_max_px_s=20.0",
+]  # fmt: skip
+
+
+@pytest.fixture
+def recipe(project_root):
+    config = load(project_root, SMALL)
+    return Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads=1)
+
+
+@pytest.fixture
+def images(tmp_path):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    entries = []
+    for name, split in (("seen", "train"), ("held-out", "test")):
+        write_png(folder / f"{name}.png", dead_leaves(generator_for(1, name, "picture"), 100, 150), bits=8)
+        entries.append(
+            ManifestEntry(name, f"{name}.png", split, "folder", name, None, None, "0" * 64, 8, 100, 150, 100, 150, None)
+        )
+    write_manifest(Manifest(tuple(entries), (), 0, 0), folder)
+    return folder
+
+
+def plain(label):
+    return map
+
+
+def harder(**changes):
+    values = {"rotation_max_deg": 30.0, "zoom_max": 1.2, "speed_min_px_s": 40.0, "speed_max_px_s": 60.0}
+    return SetsConfig(**{"measured_root": "nowhere", **values, "acceleration_max_px_s2": 2000.0, **changes})
+
+
+def test_complex_motion_shows_held_out_pictures_alone_turning_and_zooming(images, tmp_path, recipe):
+    folder = tmp_path / "complex_motion"
+    assert make_complex_motion(images, folder, harder(), recipe, plain)
+    frames, events = FrameStore.open(folder / "frames.zarr"), EventStore.open(folder / "events.zarr")
+    assert frames.of_split("test") == events.sequences == ["held-out-00"]
+    scenes = SceneStore.open(folder / "scenes.zarr")
+    trajectory = Trajectory.from_vector(scenes.read("held-out-00").trajectory.numpy())
+    assert trajectory.roll.amplitude > 0
+    assert trajectory.zoom.amplitude > 0
+    assert 40 <= trajectory.speed_px_s <= 60
+    assert sum(events.count("held-out-00")) > 100
+
+
+def test_a_set_is_made_once_and_again_only_when_its_recipe_changes(images, tmp_path, recipe):
+    folder = tmp_path / "complex_motion"
+    assert make_complex_motion(images, folder, harder(), recipe, plain)
+    assert not make_complex_motion(images, folder, harder(), recipe, plain)
+    assert make_complex_motion(images, folder, harder(zoom_max=1.1), recipe, plain)
+    write_png(images / "held-out.png", np.full((100, 150, 3), 0.5, dtype=np.float32), bits=8)
+    assert make_complex_motion(images, folder, harder(zoom_max=1.1), recipe, plain)
+
+
+def test_a_set_that_was_interrupted_goes_on(images, tmp_path, recipe):
+    folder = tmp_path / "complex_motion"
+    make_complex_motion(images, folder, harder(), recipe, plain)
+    note = json.loads((folder / MADE).read_text())
+    (folder / MADE).write_text(json.dumps(note | {"complete": False}))
+    before = (folder / "frames.zarr" / "zarr.json").stat().st_mtime_ns
+    assert make_complex_motion(images, folder, harder(), recipe, plain)
+    assert (folder / "frames.zarr" / "zarr.json").stat().st_mtime_ns == before
+
+
+def test_every_picture_of_a_folder_is_for_testing(tmp_path, recipe):
+    photographs = tmp_path / "photographs" / "deeper"
+    photographs.mkdir(parents=True)
+    for name in ("a", "b", "c"):
+        write_png(photographs / f"{name}.png", dead_leaves(generator_for(1, name, "picture"), 100, 150), bits=8)
+    assert make_folder_set(tmp_path / "photographs", "auto", tmp_path / "set", recipe, plain)
+    assert len(FrameStore.open(tmp_path / "set" / "frames.zarr").of_split("test")) == 3
+
+
+def test_the_kind_is_seen_in_the_names(tmp_path):
+    (tmp_path / "one.jpg").touch()
+    assert kind_of(tmp_path) == "photographs"
+    for angle in (0, 45, 90, 135):
+        (tmp_path / f"plate_{angle}.png").touch()
+    assert kind_of(tmp_path) == "polarization"
+    for path in tmp_path.iterdir():
+        path.unlink()
+    (tmp_path / "plate.npz").touch()
+    assert kind_of(tmp_path) == "polarization"
+
+
+def test_speeds_the_wrong_way_round_are_refused():
+    with pytest.raises(ValueError, match="speed_max_px_s: expected >= speed_min_px_s 40"):
+        harder(speed_max_px_s=30.0)

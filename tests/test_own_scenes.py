@@ -1,0 +1,123 @@
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet.cli import main
+from polarnet.networks.checkpoint import save_checkpoint
+from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.runtime import generator_for
+from polarnet.simulation.pictures.dead_leaves import dead_leaves
+from polarnet.simulation.pictures.images import write_png
+
+TINY = [
+    "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.2", "synthesize.window_height=60",
+    "synthesize.window_width=90", "benchmark.methods=[zeros,train_mean,oracle_mean,cf,ours]",
+    "benchmark.warmup_windows=1", "benchmark.bootstrap_samples=10", "benchmark.panel_scenes=1", "runtime.threads=1",
+]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def usual_kernels():
+    """The command asks torch for deterministic kernels; later tests of this process need not."""
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    folder = tmp_path / "holidays"
+    folder.mkdir()
+    for name in ("beach", "hill"):
+        write_png(folder / f"{name}.png", dead_leaves(generator_for(1, name, "picture"), 100, 150), bits=8)
+    (folder / "notes.txt").write_text("no picture")
+    return folder
+
+
+@pytest.fixture
+def weights(tmp_path):
+    torch.manual_seed(0)
+    config = {
+        "channels": [4, 8, 8], "swin_depth": 2, "swin_window": 5, "swin_heads": [2, 2], "residual_blocks": 1,
+        "input_mixing": "contrasts",
+    }  # fmt: skip
+    path = tmp_path / "mine.safetensors"
+    metadata = {"network": "paper", "config": config, "in_channels": 4, "representation": "event_tensor"}
+    save_checkpoint(path, DolpUNet(DolpUNetConfig(**config)).state_dict(), metadata)
+    return path
+
+
+def run(project_root, monkeypatch, scenes, out, *arguments):
+    monkeypatch.chdir(project_root)
+    paths = [f"paths.data={out.parent / 'nothing'}"]
+    return main(["benchmark", "--scenes", str(scenes), "--out", str(out), *arguments, *TINY, *paths])
+
+
+def test_a_folder_of_photographs_is_scored_with_given_weights(
+    photographs, weights, project_root, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    assert run(project_root, monkeypatch, photographs, out, "--weights", str(weights)) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert set(metrics) == {"zeros", "oracle_mean", "cf", "ours"}  # nobody made a training split
+    details = json.loads((out / "details.json").read_text())
+    assert len(details["scenes"]) == 2
+    assert details["set"] == "holidays"
+    printed = capsys.readouterr().out
+    assert "train_mean was left out: the training split is not there" in printed
+    assert "oracle mean" in printed
+    page = (out / "index.html").read_text()
+    assert "train_mean was left out" in page
+    assert 'src="http' not in page
+    assert (out / "comparison.png").exists()
+    made = {path: path.stat().st_mtime_ns for path in (out / "work").rglob("*") if path.suffix in (".npz", ".png")}
+    assert run(project_root, monkeypatch, photographs, out) == 0  # without weights: ours is left out, nothing is remade
+    assert set(json.loads((out / "metrics.json").read_text())) == {"zeros", "oracle_mean", "cf"}
+    assert "ours was left out" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in made} == made
+
+
+def test_nothing_usable_says_what_was_expected(project_root, tmp_path, monkeypatch, capsys):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    (empty / "letter.doc").write_text("Dear all")
+    assert run(project_root, monkeypatch, empty, tmp_path / "out") == 1
+    error = capsys.readouterr().err
+    assert "nothing to test on" in error
+    assert "found 0 pictures and 1 other files" in error
+    assert run(project_root, monkeypatch, tmp_path / "nowhere", tmp_path / "out") == 1
+    assert "expected a folder of photographs or of measured polarization" in capsys.readouterr().err
+
+
+def test_weights_that_are_not_there_are_named(photographs, project_root, tmp_path, monkeypatch, capsys):
+    assert run(project_root, monkeypatch, photographs, tmp_path / "out", "--weights", str(tmp_path / "w")) == 1
+    assert "expected a checkpoint of the DoLP network (.safetensors)" in capsys.readouterr().err
+
+
+def test_measured_polarization_is_found_and_scored(project_root, tmp_path, monkeypatch):
+    folder = tmp_path / "measured"
+    folder.mkdir()
+    across = np.linspace(0, np.pi, 150)[None, :] * np.ones((100, 1))
+    s0, degree = 0.8, np.linspace(0.1, 0.6, 100)[:, None]
+    angles = {f"I{a}": s0 / 2 * (1 + degree * np.cos(2 * (np.deg2rad(a) - across))) for a in (0, 45, 90, 135)}
+    np.savez(folder / "plate.npz", **angles)
+    out = tmp_path / "out"
+    assert run(project_root, monkeypatch, folder, out) == 0
+    manifest = json.loads((out / "work" / "images" / "manifest.json").read_text())
+    assert [picture["source"] for picture in manifest["pictures"]] == ["polarization"]
+    assert json.loads((out / "metrics.json").read_text())["oracle_mean"]["skill"] == pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.skipif("POLARNET_SHARED" not in os.environ, reason="POLARNET_SHARED names no reference material")
+def test_a_scene_that_a_camera_measured(project_root, tmp_path, monkeypatch):
+    folder = tmp_path / "camera"
+    folder.mkdir()
+    shutil.copy(Path(os.environ["POLARNET_SHARED"]) / "data" / "polarization" / "wan_Scene1_HT.npz", folder)
+    out = tmp_path / "out"
+    assert run(project_root, monkeypatch, folder, out) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["oracle_mean"]["mse"] <= metrics["zeros"]["mse"]
