@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from polarnet.events.stream import LARGEST_SIDE, Events, concatenate
-from polarnet.recordings.formats import text
+from polarnet.recordings.formats import celex5_bin, celex5_csv, text
 from polarnet.recordings.repair import repaired
 from polarnet.recordings.source import Block, Choices, RecordingError, Source
 
@@ -29,7 +29,9 @@ class Format(NamedTuple):
 
 
 FORMATS = {
+    "celex5_csv": Format("CSV of a CeleX-5", celex5_csv.matches, celex5_csv.open_celex5_csv),
     "text": Format("lines `t x y p`", text.matches, text.open_text),
+    "celex5_bin": Format("BIN of a CeleX-5", celex5_bin.matches, celex5_bin.open_celex5_bin),
 }
 """In the order in which a file of unknown format is tried."""
 
@@ -64,7 +66,8 @@ class RecordingReader:
         self.repairs.clear()
         blocks = repaired(self.path.name, self._source, self.repairs)
         for block in _cut(blocks, self._chunk_events):
-            yield Events(*(torch.from_numpy(column) for column in block), self.height, self.width)
+            t, x, y, p = map(torch.from_numpy, block)
+            yield Events(t, x, y, p, self.height, self.width)
 
 
 def open_recording(

@@ -59,7 +59,7 @@ def _with_sign(block: Block, darker: int | None, counts: Counter[str]) -> Block:
     known = brighter if darker is None else brighter | (block.p == darker)
     bad = len(known) - np.count_nonzero(known)
     if bad:
-        counts["bad_polarity"] += bad
+        counts["bad_polarity"] += int(bad)
         block, brighter = _select(block, known), brighter[known]
     return block._replace(p=np.where(brighter, np.int8(1), np.int8(-1)))
 
@@ -72,7 +72,7 @@ def _on_sensor(name: str, block: Block, source: Source, counts: Counter[str]) ->
     inside = (block.x >= 0) & (block.x < source.width) & (block.y >= 0) & (block.y < source.height)
     outside = len(inside) - np.count_nonzero(inside)
     if outside:
-        counts["out_of_range"] += outside
+        counts["out_of_range"] += int(outside)
         block = _select(block, inside)
     return block._replace(
         t=block.t.astype(np.int64, copy=False),
@@ -142,7 +142,7 @@ class _Clock:
     def _refuse(self, t_us: int, newest_us: int, place: int) -> None:
         raise RecordingError(
             f"{self.name}: after event {place}, time goes back by {newest_us - t_us} us, from {newest_us} to {t_us} "
-            f"us, and goes on from there: the camera's clock was set anew, or recordings were joined; cut the file there"
+            f"us, and stays there: the camera's clock was set anew, or recordings were joined; cut the file there"
         )
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Int64
 
 from polarnet.recordings.source import BLOCK_EVENTS, RecordingError
 
+HEAD_BYTES = 4096  # of a file; enough to see what its lines are
 BLOCK_BYTES = 2**22
 LONGEST_LINE = 2**12  # bytes
 
@@ -57,7 +58,8 @@ class Line(NamedTuple):
 
 def numbers_of(head: bytes) -> list[Line]:
     """The lines of numbers among the first bytes of a file; none where most of its lines are something else."""
-    found, others, place = [], 0, 0
+    found: list[Line] = []
+    others, place = 0, 0
     for line in head.splitlines(keepends=True):
         place += len(line)
         if len(line) == len(head) > LONGEST_LINE // 2 or (place == len(head) and found and not line.endswith(b"\n")):
@@ -79,6 +81,36 @@ def _rows(data: bytes, shift: np.ndarray, counts: Counter[str], damage: str) -> 
         counts[damage] += unreadable
         if filled:
             yield rows[:filled]
+
+
+def lines_of(table: Int64[np.ndarray, "n columns"], separator: str) -> bytes:
+    """Whole numbers as lines of text."""
+    out = np.empty(table.size * (_DIGITS + 3), np.uint8)
+    return out[: _write(np.ascontiguousarray(table), ord(separator), out)].tobytes()
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _write(table, separator, out):
+    place = 0
+    for row in table:
+        for column in range(len(row)):
+            value = row[column]
+            if value < 0:
+                out[place] = 45
+                place += 1
+                value = -value
+            first = place
+            while True:
+                out[place] = 48 + value % 10
+                place += 1
+                value //= 10
+                if value == 0:
+                    break
+            out[first:place] = out[first:place][::-1].copy()
+            out[place] = separator if column < len(row) - 1 else _END
+            place += 1
+    return place
 
 
 @numba.njit(nogil=True, cache=True)

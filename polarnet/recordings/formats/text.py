@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from polarnet.recordings.formats.lines import number_blocks, numbers_of
+from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
 from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size
 
-HEAD_BYTES = 4096
 COLUMNS = ("t", "x", "y", "p")
 MICROSECONDS = 6  # decimals of a second
 
