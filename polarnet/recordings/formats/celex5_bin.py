@@ -227,18 +227,11 @@ def _decode_1(data, groups, state, last_adc, polarity, t, x, y, p):
     found, orphans, unchanged = 0, 0, 0
     height, width = last_adc.shape
     for i in range(groups):
-        a, b, c, d = (
-            np.int64(data[7 * i]),
-            np.int64(data[7 * i + 1]),
-            np.int64(data[7 * i + 2]),
-            np.int64(data[7 * i + 3]),
-        )
+        a, b, c, d = data[7 * i], data[7 * i + 1], data[7 * i + 2], data[7 * i + 3]
         low = np.int64(data[7 * i + 4]) | np.int64(data[7 * i + 5]) << 8 | np.int64(data[7 * i + 6]) << 16
-        items = (
-            (b << 6 | low >> 6 & 63) << 14 | a << 6 | low & 63,
-            (d << 6 | low >> 18) << 14 | c << 6 | low >> 12 & 63,
-        )
-        for item in items:
+        first = np.int64(b) << 20 | (low >> 6 & 63) << 14 | np.int64(a) << 6 | low & 63
+        second = np.int64(d) << 20 | low >> 18 << 14 | np.int64(c) << 6 | low >> 12 & 63
+        for item in (first, second):
             kind = item & 3
             if kind == ROW:
                 row = item >> 18

@@ -1,4 +1,4 @@
-"""BIN files of a CeleX-5, written: for simulated cameras and for tests of the reader. `celex5_bin` says what is in them."""
+"""BIN files of a CeleX-5, written: for simulated cameras, and for tests of the reader in `celex5_bin`."""
 
 from collections.abc import Iterable
 from pathlib import Path
