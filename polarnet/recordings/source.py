@@ -22,7 +22,7 @@ REPAIRS = {
     "out_of_range": "events that are not on the sensor: left out",
     "time_glitches": "events far from the time of those before and after them: left out",
     "unsorted": "events a little earlier than the one before: put in order",
-    "pauses": "seconds or longer without any event: kept as they are",
+    "pauses": "pauses of a second or more between events: kept",
 }
 """What readers count. No event is ever given another time, pixel or polarity."""
 
