@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from polarnet.events.stream import LARGEST_SIDE, Events, concatenate
-from polarnet.recordings.formats import celex5_bin, celex5_csv, dat, faery, hdf5, store, text
+from polarnet.recordings.formats import celex5_bin, celex5_csv, dat, evt, faery, hdf5, store, text
 from polarnet.recordings.repair import repaired
 from polarnet.recordings.source import Block, Choices, RecordingError, Source
 
@@ -34,7 +34,7 @@ FORMATS = {
     "dsec": Format("HDF5 of DSEC", hdf5.matches_dsec, hdf5.open_dsec),
     "aedat4": Format("AEDAT4 of iniVation", faery.matches_aedat4, faery.open_aedat4),
     "event_stream": Format("Event Stream (.es)", faery.matches_event_stream, faery.open_event_stream),
-    "evt": Format("EVT2, EVT2.1 and EVT3 of Prophesee", faery.matches_evt, faery.open_evt),
+    "evt": Format("EVT2, EVT2.1 and EVT3 of Prophesee", evt.matches, evt.open_evt),
     "dat": Format("DAT of Prophesee", dat.matches, dat.open_dat),
     "celex5_csv": Format("CSV of a CeleX-5", celex5_csv.matches, celex5_csv.open_celex5_csv),
     "text": Format("lines `t x y p`", text.matches, text.open_text),

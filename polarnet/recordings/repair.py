@@ -19,6 +19,8 @@ LOOKAHEAD = 8  # events that tell a wrong time from a clock that was set anew
 MOST_HELD = 2**22  # events kept back for late ones
 TOLERATED_SHARE = 0.01  # of the events of a file, of each kind of damage
 TOLERATED_COUNT = 8  # in files too short for a share
+HARMLESS = ("no_change", "unsorted", "pauses")
+FIRST_PAUSE_US = 3_600_000_000  # after one event at the start: it is the time of that event that is wrong
 LARGEST_TIME = 2**60  # microseconds; differences still fit into int64
 
 
@@ -41,6 +43,9 @@ def repaired(name: str, source: Source, counts: Counter[str]) -> Iterator[Block]
     nothing = Block(np.empty(0, np.int64), *(np.empty(0, dtype) for dtype in (np.int16, np.int16, np.int8)))
     yield from _filled(clock.ordered(nothing, counts, last=True))
     _refuse_much_damage(name, counts, seen)
+    damage = {kind: count for kind, count in counts.items() if count and kind not in HARMLESS}
+    if damage and seen == 0:
+        raise RecordingError(f"{name}: no event can be read in it: {damage}; is the format right?")
 
 
 def _filled(block: Block) -> Iterator[Block]:
@@ -163,20 +168,22 @@ def _judge(t, keep, newest, started, floor):
         representable = -LARGEST_TIME < now < LARGEST_TIME
         after = t[i + 1 : i + 1 + LOOKAHEAD]
         if not started or now > newest:
-            with_past = 0
+            otherwise = 0
             for later in after:
-                if later < now - LATE_US and (not started or later >= earliest):
-                    with_past += 1
-            if representable and 2 * with_past <= len(after):
+                if (later < now - LATE_US and (not started or later >= earliest)) or (
+                    not started and later > now + FIRST_PAUSE_US
+                ):
+                    otherwise += 1
+            if representable and 2 * otherwise <= len(after):
                 pauses += started and now - newest > PAUSE_US
                 newest, started = now, True
                 continue
         elif representable:
-            with_past = 0
+            otherwise = 0
             for later in after:
                 if later >= earliest:
-                    with_past += 1
-            if 2 * with_past < len(after):
+                    otherwise += 1
+            if 2 * otherwise < len(after):
                 return newest, glitches, unsorted, pauses, i
         keep[i] = False
         glitches += 1
