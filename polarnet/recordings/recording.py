@@ -1,6 +1,5 @@
 """Files of event cameras as events: whole with `read_recording`, in chunks of constant memory with `open_recording`."""
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -34,7 +33,7 @@ FORMATS = {
     "dsec": Format("HDF5 of DSEC", hdf5.matches_dsec, hdf5.open_dsec),
     "aedat4": Format("AEDAT4 of iniVation", faery.matches_aedat4, faery.open_aedat4),
     "event_stream": Format("Event Stream (.es)", faery.matches_event_stream, faery.open_event_stream),
-    "evt": Format("EVT2, EVT2.1 and EVT3 of Prophesee", evt.matches, evt.open_evt),
+    "evt": Format("EVT2 and EVT3 of Prophesee", evt.matches, evt.open_evt),
     "dat": Format("DAT of Prophesee", dat.matches, dat.open_dat),
     "celex5_csv": Format("CSV of a CeleX-5", celex5_csv.matches, celex5_csv.open_celex5_csv),
     "text": Format("lines `t x y p`", text.matches, text.open_text),
@@ -105,8 +104,8 @@ def open_recording(
             raise ValueError(f"expected a {name} of 1 to {LARGEST_SIDE} px, got {side}")
     if chunk_events < 1:
         raise ValueError(f"expected at least one event in a chunk, got {chunk_events}")
-    if clock_mhz is not None and not 0 < clock_mhz < math.inf:
-        raise ValueError(f"expected a clock of more than 0 MHz, got {clock_mhz}")
+    if clock_mhz is not None and not 0.001 <= clock_mhz <= 10_000:
+        raise ValueError(f"expected a clock of 0.001 to 10000 MHz, got {clock_mhz}")
     if assume_polarity not in (None, 1, -1):
         raise ValueError(f"expected a polarity of 1 or -1 to assume, got {assume_polarity}")
     choices = Choices(height, width, part, clock_mhz, assume_polarity)
@@ -150,7 +149,7 @@ def detect_format(path: Path) -> str:
         if not head:
             raise RecordingError(f"{path.name}: the file is empty")
     for name, form in FORMATS.items():
-        if form.matches(path, head):
+        if (name == "store" or head) and form.matches(path, head):
             return name
     raise RecordingError(
         f"{path.name}: its content is of none of the formats {', '.join(FORMATS)}; if it is one of them, say which"

@@ -51,7 +51,7 @@ class Choices:
     width: int | None = None
     part: str | None = None
     """SEQUENCE/ANGLE of an event store."""
-    clock_mhz: float | None = None
+    clock_mhz: float | int | None = None
     """Of a CeleX-5 that did not run at its usual clock."""
     assume_polarity: int | None = None
     """+1 or -1 for all events of a file that does not say which, None to refuse such a file."""

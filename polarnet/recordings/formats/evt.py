@@ -13,7 +13,6 @@ from typing import NamedTuple, no_type_check
 import numba
 import numpy as np
 
-from polarnet.recordings.formats.faery import open_evt21
 from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size
 
 LONGEST_HEADER = 2**16
@@ -40,11 +39,9 @@ def matches(path: Path, head: bytes) -> bool:
 
 
 def open_evt(path: Path, choices: Choices) -> Source:
-    """The events of EVT2, EVT2.1 (through faery) or EVT3; the sensor's size from the header or its name there."""
+    """The events of EVT2 or EVT3; the sensor's size from the header, or from the sensor's name there."""
     header = _header(path)
     height, width = sensor_size(path, choices, header.height, header.width)
-    if header.version == "2.1":
-        return open_evt21(path, height, width)
     word, decode = {"2": ("<u4", _decode_2), "3": ("<u2", _decode_3)}[header.version]
     size = np.dtype(word).itemsize
 
@@ -74,8 +71,8 @@ def _header(path: Path) -> Header:
     header = data[:start]
     version = re.search(rb"% (?:evt |format EVT)(\d(?:\.\d)?)", header)
     number = version[1].decode().removesuffix(".0") if version else "none"
-    if number not in ("2", "2.1", "3"):
-        raise RecordingError(f"{path.name}: expected a header of % lines that states EVT 2, 2.1 or 3, got {number}")
+    if number not in ("2", "3"):
+        raise RecordingError(f"{path.name}: expected a header of % lines that states EVT 2 or 3, got {number}")
     return Header(number, *_size(header), start)
 
 

@@ -1,4 +1,4 @@
-"""Formats that the package faery reads: AEDAT4 of iniVation, Event Stream, and EVT2.1 of Prophesee.
+"""Formats that the package faery reads: AEDAT4 of iniVation, and Event Stream.
 
 Its decoder of EVT3 holds times back where the sensor's clock steps back, so EVT2 and EVT3 are read in `evt`.
 """
@@ -29,26 +29,20 @@ def matches_event_stream(path: Path, head: bytes) -> bool:
 
 def open_aedat4(path: Path, choices: Choices) -> Source:
     """The first stream of events of the file; its times are microseconds since 1970."""
-    return _source(path, choices, {"file_type": "aedat"}, states_size=True)
+    return _source(path, choices, "aedat")
 
 
 def open_event_stream(path: Path, choices: Choices) -> Source:
     """The changes of a DVS or ATIS."""
-    return _source(path, choices, {"file_type": "es"}, states_size=True)
+    return _source(path, choices, "es")
 
 
-def open_evt21(path: Path, height: int, width: int) -> Source:
-    """EVT2.1 of Prophesee; `polarnet.recordings.formats.evt` reads its header."""
-    options = {"file_type": "evt", "version_fallback": "evt2.1", "dimensions_fallback": (width, height)}
-    return _source(path, Choices(height, width), options, states_size=False)
-
-
-def _source(path: Path, choices: Choices, options: dict[str, Any], *, states_size: bool) -> Source:
-    width, height = _guarded(path, lambda: _decoder(path, options).dimensions()) if states_size else (None, None)
+def _source(path: Path, choices: Choices, file_type: str) -> Source:
+    width, height = _guarded(path, lambda: _decoder(path, file_type).dimensions())
     height, width = sensor_size(path, choices, height, width)
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        packets = iter(_guarded(path, lambda: _decoder(path, options)))
+        packets = iter(_guarded(path, lambda: _decoder(path, file_type)))
         waiting, count = [], 0  # packets are small
         while (packet := _guarded(path, lambda: next(packets, None))) is not None:
             waiting.append(packet)
@@ -67,12 +61,12 @@ def _block(packets: list[np.ndarray]) -> Block:
     return Block(joined["t"], joined["x"], joined["y"], joined["on"].view(np.uint8))
 
 
-def _decoder(path: Path, options: dict[str, Any]) -> Any:
+def _decoder(path: Path, file_type: str) -> Any:
     try:
         import faery
     except ImportError:
         raise RuntimeError(f"{path.name}: this format needs faery: pip install 'polarnet[recordings]'") from None
-    return faery.events_stream_from_file(path, **options)
+    return faery.events_stream_from_file(path, file_type=file_type)
 
 
 def _guarded(path: Path, call: Any) -> Any:

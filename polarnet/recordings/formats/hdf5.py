@@ -12,6 +12,7 @@ from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingEr
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 DSEC_COLUMNS = ("events/t", "events/x", "events/y", "events/p")
+LARGEST = 2**53  # whole number
 E2P_COLUMNS = 4  # of /events: t in microseconds, x, y, p of 0 or 1
 
 
@@ -73,9 +74,7 @@ def open_e2p(path: Path, choices: Choices) -> Source:
         if "sensor_resolution" in file.attrs:
             size = np.ravel(file.attrs["sensor_resolution"])
             if size.shape != (2,):
-                raise RecordingError(
-                    f"{path.name}: expected sensor_resolution as width and height, got {size.tolist()}"
-                )
+                raise RecordingError(f"{path.name}: expected width and height as sensor_resolution, got {size}")
             width, height = (_whole(path, "sensor_resolution", side) for side in size)
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
@@ -122,7 +121,13 @@ def _attribute(path: Path, file: Any, name: str) -> int | None:
 
 def _whole(path: Path, name: str, value: Any) -> int:
     value = np.asarray(value)
-    if value.shape != () or value.dtype.kind not in "iuf" or not np.isfinite(value) or int(value) != value:
+    if (
+        value.shape != ()
+        or value.dtype.kind not in "iuf"
+        or not np.isfinite(value)
+        or int(value) != value
+        or abs(int(value)) > LARGEST
+    ):
         raise RecordingError(f"{path.name}: expected a whole number as {name}, got {value}")
     return int(value)
 
