@@ -1,8 +1,14 @@
 """HDF5 files of two kinds: events as DSEC stores them, and the recordings of a polarization camera of E2P (PDAVIS)."""
 
+import contextlib
+import importlib.util
+import os
+import pickle
+import subprocess
+import sys
+import threading
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +20,9 @@ MAGIC = b"\x89HDF\r\n\x1a\n"
 DSEC_COLUMNS = ("events/t", "events/x", "events/y", "events/p")
 LARGEST = 2**53  # whole number
 E2P_COLUMNS = 4  # of /events: t in microseconds, x, y, p of 0 or 1
+PATIENCE_S = 60  # for a block; a damaged file can send the library round in circles
+
+Description = dict[str, Any]
 
 
 def matches_e2p(path: Path, head: bytes) -> bool:
@@ -21,8 +30,7 @@ def matches_e2p(path: Path, head: bytes) -> bool:
     if not head.startswith(MAGIC):
         return False
     try:
-        with _opened(path) as file:
-            return hasattr(file["events"], "shape")
+        return "events" in _described(path)["tables"]
     except (RecordingError, RuntimeError):
         return False  # `open_dsec` says why
 
@@ -37,22 +45,19 @@ def open_dsec(path: Path, choices: Choices) -> Source:
 
     DSEC itself does not state the size of its sensors, 480 x 640; files that polarnet writes do.
     """
-    with _opened(path) as file:
-        absent = [name for name in DSEC_COLUMNS if name not in file]
-        if absent:
-            raise RecordingError(f"{path.name}: expected DSEC's HDF5, there is no {', '.join(absent)}")
-        lengths = [_length(path, file[name], 1) for name in DSEC_COLUMNS]
-        if len(set(lengths)) > 1:
-            raise RecordingError(f"{path.name}: its columns t, x, y, p have different lengths, {lengths}")
-        offset_us = _whole(path, "t_offset", file["t_offset"][()]) if "t_offset" in file else 0
-        height, width = (_attribute(path, file, name) for name in ("height", "width"))
+    description = _described(path)
+    absent = [name for name in DSEC_COLUMNS if name not in description["tables"]]
+    if absent:
+        raise RecordingError(f"{path.name}: expected DSEC's HDF5, there is no {', '.join(absent)}")
+    lengths = [_length(path, description, name, 1) for name in DSEC_COLUMNS]
+    if len(set(lengths)) > 1:
+        raise RecordingError(f"{path.name}: its columns t, x, y, p have different lengths, {lengths}")
+    offset_us = _whole(path, description, "t_offset") or 0
+    height, width = (_whole(path, description, name) for name in ("height", "width"))
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        with _opened(path) as file:
-            columns = [file[name] for name in DSEC_COLUMNS]
-            for start in range(0, lengths[0], BLOCK_EVENTS):
-                t, x, y, p = (column[start : start + BLOCK_EVENTS] for column in columns)
-                yield Block(_microseconds(path, t) + offset_us, x, y, p)
+        for t, x, y, p in _read(path, DSEC_COLUMNS, lengths[0]):
+            yield Block(_microseconds(path, t) + offset_us, x, y, p)
 
     return Source(*sensor_size(path, choices, height, width), blocks)
 
@@ -62,77 +67,115 @@ def open_e2p(path: Path, choices: Choices) -> Source:
 
     The pixels lie behind polarizers, rows 90 45 / 135 0 degrees from the upper left; the events are those of all.
     """
-    with _opened(path) as file:
-        if "events" not in file or not hasattr(file["events"], "shape"):
-            raise RecordingError(f"{path.name}: expected E2P's HDF5, there is no table /events")
-        length = _length(path, file["events"], 2)
-        if file["events"].shape[1] != E2P_COLUMNS:
-            raise RecordingError(
-                f"{path.name}: expected the four columns t, x, y, p of /events, got {file['events'].shape[1]}"
-            )
-        height = width = None
-        if "sensor_resolution" in file.attrs:
-            size = np.ravel(file.attrs["sensor_resolution"])
-            if size.shape != (2,):
-                raise RecordingError(f"{path.name}: expected width and height as sensor_resolution, got {size}")
-            width, height = (_whole(path, "sensor_resolution", side) for side in size)
+    description = _described(path)
+    if "events" not in description["tables"]:
+        raise RecordingError(f"{path.name}: expected E2P's HDF5, there is no table /events")
+    length = _length(path, description, "events", 2)
+    columns = description["tables"]["events"][0][1]
+    if columns != E2P_COLUMNS:
+        raise RecordingError(f"{path.name}: expected the four columns t, x, y, p of /events, got {columns}")
+    size = description["values"].get("sensor_resolution")
+    if size is not None and not (isinstance(size, list) and len(size) == 2):
+        raise RecordingError(f"{path.name}: expected width and height as sensor_resolution, got {size}")
+    width, height = (None, None) if size is None else (_number(path, "sensor_resolution", side) for side in size)
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        with _opened(path) as file:
-            for start in range(0, length, BLOCK_EVENTS):
-                t, x, y, p = np.ascontiguousarray(file["events"][start : start + BLOCK_EVENTS].T)
-                yield Block(_microseconds(path, t), x, y, p)
+        for (table,) in _read(path, ("events",), length):
+            t, x, y, p = np.ascontiguousarray(table.T)
+            yield Block(_microseconds(path, t), x, y, p)
 
     return Source(*sensor_size(path, choices, height, width), blocks)
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """An HDF5 file; whatever the library says about a damaged one becomes a RecordingError."""
+def _described(path: Path) -> Description:
+    tables = [*DSEC_COLUMNS, "events"]
+    return _worker.ask(path, "describe", (tables, ["t_offset", "height", "width", "sensor_resolution"]))
+
+
+def _read(path: Path, tables: tuple[str, ...], length: int) -> Iterator[list[np.ndarray]]:
     try:
-        import h5py
-    except ImportError:
-        raise RuntimeError(f"{path.name}: HDF5 needs h5py: pip install 'polarnet[hdf5]'") from None
-    with suppress(ImportError):
-        import hdf5plugin  # noqa: F401  # the compression of DSEC's own files
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except RecordingError:
-        raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, AttributeError) as error:
-        raise RecordingError(
-            f"{path.name}: HDF5 cannot read it: {error}; it is damaged, or compressed in a way that needs "
-            f"pip install 'polarnet[recordings]'"
-        ) from error
+        for start in range(0, length, BLOCK_EVENTS):
+            yield _worker.ask(path, "read", (tables, start, start + BLOCK_EVENTS))
+    finally:
+        with contextlib.suppress(RecordingError, RuntimeError):
+            _worker.ask(path, "close", ())
 
 
-def _length(path: Path, table: Any, dimensions: int) -> int:
-    if not hasattr(table, "shape") or table.shape is None or len(table.shape) != dimensions:
-        raise RecordingError(f"{path.name}: expected {table.name} as a table of {dimensions} dimensions")
-    if table.dtype.kind not in "iufb":
-        raise RecordingError(f"{path.name}: expected numbers in {table.name}, got {table.dtype}")
-    return int(table.shape[0])
+def _length(path: Path, description: Description, name: str, dimensions: int) -> int:
+    shape, kind = description["tables"][name]
+    if len(shape) != dimensions:
+        raise RecordingError(f"{path.name}: expected {name} as a table of {dimensions} dimensions, got {len(shape)}")
+    if kind not in "iufb":
+        raise RecordingError(f"{path.name}: expected numbers in {name}, got type {kind!r}")
+    return shape[0]
 
 
-def _attribute(path: Path, file: Any, name: str) -> int | None:
-    return _whole(path, name, file.attrs[name]) if name in file.attrs else None
+def _whole(path: Path, description: Description, name: str) -> int | None:
+    value = description["values"].get(name)
+    return None if value is None else _number(path, name, value)
 
 
-def _whole(path: Path, name: str, value: Any) -> int:
-    value = np.asarray(value)
-    if (
-        value.shape != ()
-        or value.dtype.kind not in "iuf"
-        or not np.isfinite(value)
-        or int(value) != value
-        or abs(int(value)) > LARGEST
-    ):
+def _number(path: Path, name: str, value: Any) -> int:
+    if not isinstance(value, (int, float)) or not abs(value) <= LARGEST or int(value) != value:
         raise RecordingError(f"{path.name}: expected a whole number as {name}, got {value}")
     return int(value)
 
 
 def _microseconds(path: Path, t: np.ndarray) -> np.ndarray:
-    if t.dtype.kind == "f" and not (np.equal(t, np.floor(t)).all() and (np.abs(t) < 2.0**53).all()):
+    if t.dtype.kind == "f" and not (np.equal(t, np.floor(t)).all() and (np.abs(t) < LARGEST).all()):
         raise RecordingError(f"{path.name}: expected whole microseconds as times")
     return t.astype(np.int64)
+
+
+class _Worker:
+    """The process that reads, started when it is first needed and again after a crash; one request at a time."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._owner = 0
+        self._lock = threading.Lock()
+
+    def ask(self, path: Path, task: str, arguments: tuple) -> Any:
+        """The worker's answer; RecordingError with what HDF5 said, or where it crashed or took too long."""
+        if sys.modules.get("h5py", True) is None or importlib.util.find_spec("h5py") is None:
+            raise RuntimeError(f"{path.name}: HDF5 needs h5py: pip install 'polarnet[hdf5]'")
+        with self._lock:
+            process = self._running()
+            assert process.stdin is not None
+            assert process.stdout is not None
+            deadline = threading.Timer(PATIENCE_S, process.kill)
+            deadline.start()
+            try:
+                pickle.dump((str(path.absolute()), task, arguments), process.stdin)
+                process.stdin.flush()
+                kind, answer = pickle.load(process.stdout)
+            except (EOFError, BrokenPipeError, pickle.UnpicklingError):
+                process.kill()
+                process.wait()
+                self._process = None
+                raise RecordingError(
+                    f"{path.name}: HDF5 cannot read it: the library crashed or took over {PATIENCE_S} s; it is damaged"
+                ) from None
+            finally:
+                deadline.cancel()
+        if kind == "error":
+            raise RecordingError(
+                f"{path.name}: HDF5 cannot read it: {answer}; it is damaged, or compressed in a way that needs "
+                f"pip install 'polarnet[recordings]'"
+            )
+        return answer
+
+    def _running(self) -> "subprocess.Popen[bytes]":
+        if self._owner != os.getpid() or self._process is None or self._process.poll() is not None:
+            self._owner = os.getpid()  # a fork must not share its parent's
+            script = Path(__file__).with_name("hdf5_worker.py")
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", str(script)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+            )
+        return self._process
+
+
+_worker = _Worker()
