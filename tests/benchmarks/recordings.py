@@ -1,4 +1,4 @@
-"""How fast recordings are read, and in how much memory: python tests/benchmarks/recordings.py [--write] [--events N ...]
+"""How fast recordings are read, and in how much memory: python tests/benchmarks/recordings.py [--write] [--events N]
 
 For each size, a file of random events of a 1280 x 720 sensor (CeleX-5: 1280 x 800), 1 M a second, is written to a
 temporary folder, part by part, and read in chunks, in a process of its own whose kernels are compiled. Seconds are the
@@ -158,9 +158,8 @@ def read_expelliarmus(path: Path) -> int:
 def read_eventcv(path: Path) -> int:
     import eventcv
 
-    link = path.with_name(
-        "for_eventcv" + {".evt2": ".raw", ".evt3": ".raw", ".dat": ".dat", ".text": ".txt"}[path.suffix]
-    )
+    suffix = {".evt2": ".raw", ".evt3": ".raw", ".dat": ".dat", ".text": ".txt"}[path.suffix]  # it goes by the name
+    link = path.with_name(f"for_eventcv_{path.stem}{suffix}")
     link.unlink(missing_ok=True)
     link.symlink_to(path)
     return len(eventcv.load(str(link), sensor_size=(WIDTH, HEIGHT)).numpy())
@@ -218,7 +217,7 @@ def in_own_process(reader: str, path: Path, small: Path, repeats: int) -> dict[s
 
 def measure(sizes: list[int], names: list[str], repeats: int) -> dict[str, Any]:
     """All figures, printed as they come."""
-    figures: dict[str, Any] = {"machine": machine_record(ROOT), "readers": {}}
+    figures: dict[str, Any] = machine_record(ROOT) | {"readers": {}}
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
             for size in sizes:
@@ -268,10 +267,8 @@ def main() -> None:
     figures = measure(sorted(arguments.events), arguments.readers, arguments.repeats)
     if arguments.write:
         known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-        known["readers"] = known.get("readers", {}) | figures["readers"]
-        known["readers_machine"] = figures["machine"]
         RESULTS.parent.mkdir(parents=True, exist_ok=True)
-        RESULTS.write_text(json.dumps(known, indent=2) + "\n")
+        RESULTS.write_text(json.dumps(known | figures, indent=2) + "\n")
         print(f"written to {RESULTS.relative_to(ROOT)}")
 
 
