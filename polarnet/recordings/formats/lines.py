@@ -146,9 +146,16 @@ def _parse(buffer, start, shift, rows):
 @no_type_check
 def _number(buffer, place, shift):
     """The number at `place`, times 10**shift; where it ends, and whether it is one."""
-    size = len(buffer)
+    size, start = len(buffer), place
     negative = buffer[place] == 45
-    place += negative or buffer[place] == 43
+    place += negative
+    value, first = 0, place
+    while place < size and 48 <= buffer[place] <= 57 and place - first < _DIGITS:
+        value = 10 * value + (buffer[place] - 48)
+        place += 1
+    if shift == 0 and place > first and (place == size or _ends(buffer[place])):
+        return -value if negative else value, place, True
+    place = start + (negative or buffer[start] == 43)
     value, digits, seen, exponent, point = 0, 0, 0, shift, False
     while place < size:
         code = buffer[place]
