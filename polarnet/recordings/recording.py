@@ -35,8 +35,8 @@ FORMATS = {
     "event_stream": Format("Event Stream (.es)", faery.matches_event_stream, faery.open_event_stream),
     "evt": Format("EVT2 and EVT3 of Prophesee", evt.matches, evt.open_evt),
     "dat": Format("DAT of Prophesee", dat.matches, dat.open_dat),
-    "celex5_csv": Format("CSV of a CeleX-5", celex5_csv.matches, celex5_csv.open_celex5_csv),
     "text": Format("lines `t x y p`", text.matches, text.open_text),
+    "celex5_csv": Format("CSV of a CeleX-5", celex5_csv.matches, celex5_csv.open_celex5_csv),
     "celex5_bin": Format("BIN of a CeleX-5", celex5_bin.matches, celex5_bin.open_celex5_bin),
 }
 """In the order in which a file of unknown format is tried."""

@@ -40,6 +40,12 @@ def test_times_are_seconds_with_a_point_and_microseconds_without(tmp_path, text,
     assert found[:3] == [t, [1, 1], [2, 2]]
 
 
+@pytest.mark.parametrize("names", ["x,y,p,t", "# x y polarity timestamp", "X;Y;on;time\r"])
+def test_a_first_line_of_names_tells_the_order(tmp_path, names):
+    (tmp_path / "e.txt").write_text(f"{names}\n1,2,1,0.000005\n3,4,0,0.000006\n")
+    assert columns(tmp_path / "e.txt", height=12, width=18) == ([[5, 6], [1, 3], [2, 4], [1, -1]], {})
+
+
 def test_numbers_are_those_that_numpy_writes(tmp_path):
     generator = np.random.default_rng(0)
     t = np.sort(generator.integers(0, 10**7, 500)) / 1e6
