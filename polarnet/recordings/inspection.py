@@ -10,11 +10,12 @@ from jaxtyping import Bool, Int64, UInt16
 from polarnet.events.stream import Events
 from polarnet.recordings.formats.celex5_bin import celex5_pictures
 from polarnet.recordings.recording import FORMATS, RecordingReader
-from polarnet.recordings.source import REPAIRS
+from polarnet.recordings.source import REPAIRS, RecordingError
 
 HOT_FACTOR = 10  # times as many events as the pixels around it, and as the mean pixel
 HOT_COUNT = 8  # events at least
 NEIGHBOURHOOD = 5  # pixels, of which the median counts
+MOST_PIXELS = 2**25
 SHORTEST_US = 1000  # that a rate is taken over
 EVENTS_PER_PIXEL = 0.15  # of the part that is shown: enough to see edges, little enough that they do not smear
 
@@ -45,8 +46,13 @@ class Inspection:
 
 
 def inspect_recording(reader: RecordingReader) -> Inspection:
-    """Read a recording once, in constant memory."""
+    """Read a recording once, in constant memory; RecordingError where it fails, or no sensor is as large as it says."""
     pixels = reader.height * reader.width
+    if pixels > MOST_PIXELS:
+        raise RecordingError(
+            f"{reader.path.name}: no event camera has {reader.width} x {reader.height} px: the size that was given "
+            f"is wrong, or the file is damaged"
+        )
     counts = np.zeros(pixels, np.int64)
     busiest = _Busiest(pixels)
     on = off = 0

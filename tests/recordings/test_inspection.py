@@ -8,6 +8,7 @@ from polarnet.recordings.formats.celex5_bin_writer import write_celex5_pictures
 from polarnet.recordings.formats.celex5_csv import write_celex5_csv
 from polarnet.recordings.inspection import findings, hot_pixels, inspect_recording
 from polarnet.recordings.recording import open_recording
+from polarnet.recordings.source import RecordingError
 
 
 def test_counts_rates_and_time_are_those_of_the_events(tmp_path, make_random_events):
@@ -100,3 +101,9 @@ def test_inspect_of_a_mode_without_polarity_says_what_to_do(tmp_path, capsys):
         main(["inspect", str(tmp_path / "e.csv"), "--assume-polarity", "1", "--picture", str(tmp_path / "p.png")]) == 0
     )
     assert "events      2: 2 ON, 0 OFF" in capsys.readouterr().out
+
+
+def test_a_sensor_larger_than_any_is_refused(tmp_path):
+    (tmp_path / "e.txt").write_text("32767 32767\n1 2 3 1\n")
+    with pytest.raises(RecordingError, match="no event camera has 32767 x 32767 px"):
+        inspect_recording(open_recording(tmp_path / "e.txt"))
