@@ -67,8 +67,8 @@ def test_e2p_is_a_table_of_t_x_y_p_with_width_before_height(tmp_path):
     [
         ({"x": None}, "there is no events/x"),
         ({"x": [1, 2, 3]}, "different lengths"),
-        ({"y": [[1, 2]]}, "expected /events/y as a table of 1 dimensions"),
-        ({"p": np.array([b"a", b"b"])}, "expected numbers in /events/p"),
+        ({"y": [[1, 2]]}, "expected events/y as a table of 1 dimensions"),
+        ({"p": np.array([b"a", b"b"])}, "expected numbers in events/p"),
         ({"t": [0.5, 1.0]}, "expected whole microseconds"),
         ({"x": [0.5, 1.0]}, "x and y to be whole numbers"),
         ({"offset": "noon"}, "expected a whole number as t_offset"),
