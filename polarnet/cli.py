@@ -71,6 +71,17 @@ def _parser() -> argparse.ArgumentParser:
     import_.add_argument("store", type=Path, help="written anew")
     import_.set_defaults(run=_import)
 
+    inspect = commands.add_parser("inspect", help="what is in a camera's file, and a picture of its busiest moment")
+    inspect.add_argument("file", type=Path)
+    inspect.add_argument("--format", help="where the content does not show it: text, celex5_csv, celex5_bin, dat, ...")
+    inspect.add_argument("--height", type=int, help="of the sensor, where the file does not say it")
+    inspect.add_argument("--width", type=int)
+    inspect.add_argument("--part", metavar="SEQUENCE/ANGLE", help="of an event store")
+    inspect.add_argument("--clock-mhz", type=float, help="of a CeleX-5, where it was not 100 MHz")
+    inspect.add_argument("--assume-polarity", type=int, choices=(1, -1), help="of events that come without one")
+    inspect.add_argument("--picture", type=Path, help="where to write the PNG (default: FILE.png here)")
+    inspect.set_defaults(run=_inspect)
+
     docs = commands.add_parser("docs", help="write docs/results/*.json into the tables of README.md and docs/")
     docs.add_argument("--check", action="store_true", help="change nothing; fail where a table is out of date")
     docs.set_defaults(run=_docs)
@@ -181,6 +192,21 @@ def _import(options: argparse.Namespace) -> int:
 
     import_store(options.folder, options.store)
     print(f"{options.folder} -> {options.store}")
+    return 0
+
+
+def _inspect(options: argparse.Namespace) -> int:
+    from polarnet.recordings.inspection import findings, inspect_recording
+    from polarnet.recordings.recording import open_recording
+    from polarnet.reports.recordings import recording_picture
+
+    chosen = {name: getattr(options, name) for name in ("height", "width", "part", "clock_mhz", "assume_polarity")}
+    inspection = inspect_recording(open_recording(options.file, options.format, **chosen))
+    for finding in findings(inspection):
+        print(finding)
+    path = options.picture or Path(f"{options.file.name}.png")
+    path.write_bytes(recording_picture(inspection))
+    print(f"picture     {path}")
     return 0
 
 

@@ -1,0 +1,1 @@
+"""Files from real cameras, read as events."""

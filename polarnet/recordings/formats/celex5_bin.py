@@ -1,0 +1,289 @@
+"""Raw files of a CeleX-5 (BIN, little endian): packages of events or of a full picture, as the sensor sends them.
+
+A header (data type: bit 0 loop mode, bit 1 IMU; the modes of the sensor; the event format; the time of day; how many
+packages), then packages: a length, that many bytes, and with an IMU also the computer's time in milliseconds and the
+IMU's samples. The last byte of a package is 0 for a full picture.
+
+The sensor sends 14 bit words, four in 7 bytes: the high 8 bits of each, then the low 6 of all. Event format 2 has one
+item a word, format 1 one in two words. The two lowest bits of an item tell what it is. Time stamps wrap around.
+"""
+
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple, no_type_check
+
+import numba
+import numpy as np
+from jaxtyping import UInt8, UInt16
+
+from polarnet.recordings.formats.celex5 import CLOCK_MHZ, HEIGHT, WHITE, WIDTH, microseconds, polarity_to_assume
+from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size
+
+HEADER = struct.Struct("<8B I")
+LENGTH = struct.Struct("<I")
+STAMP = struct.Struct("<q I")  # the computer's time in milliseconds, how many samples of the IMU follow
+IMU_SAMPLE_BYTES = 32
+LOOP, IMU = 1, 2  # bits of the data type
+
+OFF_PIXEL, IN_PIXEL, INTENSITY, FULL_PICTURE = range(4)
+MODES = ("Event Off-Pixel Timestamp", "Event In-Pixel Timestamp", "Event Intensity", "Full Picture",
+         "Optical Flow", "Optical Flow FPN", "Multi-Read Optical Flow")  # fmt: skip
+STAMP_BITS = {1: 16, 2: 12}
+"""Of a time stamp, by event format."""
+
+PICTURE_BYTES = HEIGHT * WIDTH * 3 // 2 + 1
+LARGEST_PACKAGE = 2_048_000  # bytes; what the vendor's library has room for
+
+ROW, COLUMN, TIME = 2, 1, 3  # what an item is
+
+
+class Header(NamedTuple):
+    """The first 12 bytes of a file."""
+
+    data_type: int
+    loop_a: int
+    """The mode, where the sensor was not in loop mode."""
+    loop_b: int
+    loop_c: int
+    event_format: int
+    hour: int
+    minute: int
+    second: int
+    packages: int
+
+
+class Picture(NamedTuple):
+    """A full picture."""
+
+    t_us: int | None
+    """The computer's time when it came, to the millisecond; None in files without it."""
+    intensity: UInt16[np.ndarray, "800 1280"]
+    """0 to 4095, brighter is larger."""
+
+
+def matches(path: Path, head: bytes) -> bool:
+    """Whether header and first length can be those of a BIN file."""
+    if len(head) < HEADER.size:
+        return False
+    header = Header(*HEADER.unpack_from(head))
+    length = LENGTH.unpack_from(head, HEADER.size)[0] if len(head) >= HEADER.size + LENGTH.size else 1
+    return _plausible(header) and 0 < length <= LARGEST_PACKAGE
+
+
+def open_celex5_bin(path: Path, choices: Choices) -> Source:
+    """The events of a BIN file of event format 1 or 2. Format 2 and some modes have no polarity and are refused.
+
+    A pixel's polarity is the sign of the change of its intensity; its first event compares with 0, so is brighter.
+    Time 0 is the first time stamp. What full pictures are between the events is left out; `celex5_pictures` reads them.
+    """
+    header = _header(path)
+    if header.event_format not in STAMP_BITS:
+        raise RecordingError(
+            f"{path.name}: the events are of format {header.event_format}, whose intensities are wrong "
+            f"by the vendor's own word; record in event format 1"
+        )
+    if header.data_type & LOOP:
+        raise RecordingError(
+            f"{path.name}: recorded in loop mode, where the time stamps of events do not run on during pictures; "
+            f"record events and pictures each in a mode of their own"
+        )
+    mode = MODES[header.loop_a] if header.loop_a < len(MODES) else MODES[INTENSITY]
+    polarity = 0
+    if header.event_format == 2 or header.loop_a in (OFF_PIXEL, IN_PIXEL):
+        polarity = polarity_to_assume(path, mode if header.event_format == 1 else f"{mode}, event format 2", choices)
+    height, width = sensor_size(path, choices, HEIGHT, WIDTH)
+    clock_mhz = choices.clock_mhz or CLOCK_MHZ
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        decoder = _Decoder(header.event_format, polarity)
+        for _, package in _packages(path, counts):
+            if package[-1] == 0:
+                decoder.forget_row()
+            else:
+                t, x, y, p = decoder.events(package[:-1], counts)
+                yield Block(microseconds(t, clock_mhz), x, y, p)
+
+    return Source(height, width, blocks)
+
+
+def celex5_pictures(path: Path) -> Iterator[Picture]:
+    """The full pictures of a BIN file, in order; RecordingError where it is none, or damaged."""
+    counts: Counter[str] = Counter()
+    for t_ms, package in _packages(path, counts):
+        if package[-1] == 0:
+            if len(package) != PICTURE_BYTES:
+                raise RecordingError(
+                    f"{path.name}: expected {PICTURE_BYTES} bytes of a full picture, got {len(package)}; "
+                    f"the file is damaged"
+                )
+            yield Picture(None if t_ms is None else 1000 * t_ms, _unpacked(package[:-1]))
+
+
+def _unpacked(data: np.ndarray) -> np.ndarray:
+    """Two 12 bit pixels from 3 bytes: their high 8 bits, then the low 4 of the first, then those of the second.
+
+    The sensor counts darkness. Its mode stands in place of the high bits of pixel (0, 0), which gets the next one's
+    value.
+    """
+    first, second, low = data.reshape(-1, 3).T.astype(np.uint16)
+    pixels = np.stack([first << 4 | low & 15, second << 4 | low >> 4], axis=1)
+    picture = np.uint16(WHITE) - pixels.reshape(HEIGHT, WIDTH)
+    picture[0, 0] = picture[0, 1]
+    return picture
+
+
+def _header(path: Path) -> Header:
+    with path.open("rb") as file:
+        head = file.read(HEADER.size)
+    if len(head) < HEADER.size:
+        raise RecordingError(f"{path.name}: expected a header of {HEADER.size} bytes, the file ends after {len(head)}")
+    header = Header(*HEADER.unpack(head))
+    if not _plausible(header):
+        raise RecordingError(f"{path.name}: its header is not that of a BIN file of a CeleX-5: {header}")
+    return header
+
+
+def _plausible(header: Header) -> bool:
+    return (
+        header.data_type <= LOOP | IMU
+        and header.event_format <= 2
+        and header.hour < 24
+        and header.minute < 60
+        and header.second < 60
+        and all(mode < len(MODES) + 1 or mode == 255 for mode in (header.loop_a, header.loop_b, header.loop_c))
+    )
+
+
+def _packages(path: Path, counts: Counter[str]) -> Iterator[tuple[int | None, UInt8[np.ndarray, " bytes"]]]:
+    """The computer's time in milliseconds and the bytes of each package."""
+    header = _header(path)
+    with path.open("rb") as file:
+        file.seek(HEADER.size)
+        number = 0
+        while start := file.read(LENGTH.size):
+            length = LENGTH.unpack(start)[0] if len(start) == LENGTH.size else 1
+            if not 0 < length <= LARGEST_PACKAGE:
+                raise RecordingError(
+                    f"{path.name}: package {number} before byte {file.tell()} states a length of {length} bytes, "
+                    f"expected up to {LARGEST_PACKAGE}; the file is damaged there and what follows cannot be found"
+                )
+            package = file.read(length)
+            if len(start) < LENGTH.size or len(package) < length:
+                counts["cut_tail"] += 1
+                return
+            t_ms = None
+            if header.data_type & IMU:
+                t_ms = _skip_imu(path, file)
+            yield t_ms, np.frombuffer(package, np.uint8)
+            number += 1
+
+
+def _skip_imu(path: Path, file: BinaryIO) -> int | None:
+    """The computer's time in milliseconds, past it and the IMU's samples; None where the file ends before."""
+    stamp = file.read(STAMP.size)
+    if len(stamp) < STAMP.size:
+        return None
+    t_ms, samples = STAMP.unpack(stamp)
+    if samples * IMU_SAMPLE_BYTES > LARGEST_PACKAGE or not abs(t_ms) < 2**43:
+        raise RecordingError(f"{path.name}: a package has {samples} IMU samples at {t_ms} ms; the file is damaged")
+    file.seek(samples * IMU_SAMPLE_BYTES, 1)
+    return t_ms
+
+
+class _Decoder:
+    """What must be known from earlier packages: row and time, and the intensity of each pixel."""
+
+    def __init__(self, event_format: int, polarity: int):
+        self._format = event_format
+        self._polarity = polarity
+        self._state = np.array([-1, -1, 0])  # row, last time stamp, ticks since the first
+        self._last_adc = np.zeros((HEIGHT, WIDTH), np.uint16)
+
+    def forget_row(self) -> None:
+        """After something else than events."""
+        self._state[0] = -1
+
+    def events(self, data: np.ndarray, counts: Counter[str]) -> tuple[np.ndarray, ...]:
+        """Ticks, columns, rows and polarities of the events of a package."""
+        groups = len(data) // 7
+        counts["unreadable_packages"] += len(data) % 7 != 0
+        most = groups * (4 if self._format == 2 else 2)
+        t, x, y, p = (np.empty(most, dtype) for dtype in (np.int64, np.int16, np.int16, np.int8))
+        if self._format == 1:
+            found, orphans, unchanged = _decode_1(data, groups, self._state, self._last_adc, self._polarity, t, x, y, p)
+        else:
+            found, orphans, unchanged = _decode_2(data, groups, self._state, self._polarity, t, x, y, p)
+        counts.update({"orphans": orphans, "no_change": unchanged})
+        return t[:found], x[:found], y[:found], p[:found]
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _decode_1(data, groups, state, last_adc, polarity, t, x, y, p):
+    """Items of 28 bits: row and time stamp, or intensity and column."""
+    row, stamp, now = state
+    found, orphans, unchanged = 0, 0, 0
+    height, width = last_adc.shape
+    for i in range(groups):
+        a, b, c, d = data[7 * i], data[7 * i + 1], data[7 * i + 2], data[7 * i + 3]
+        low = np.int64(data[7 * i + 4]) | np.int64(data[7 * i + 5]) << 8 | np.int64(data[7 * i + 6]) << 16
+        first = np.int64(b) << 20 | (low >> 6 & 63) << 14 | np.int64(a) << 6 | low & 63
+        second = np.int64(d) << 20 | low >> 18 << 14 | np.int64(c) << 6 | low >> 12 & 63
+        for item in (first, second):
+            kind = item & 3
+            if kind == ROW:
+                row = item >> 18
+                tick = item >> 2 & 0xFFFF
+                if stamp >= 0:
+                    now += (tick - stamp) & 0xFFFF
+                stamp = tick
+            elif kind == COLUMN:
+                if row < 0:
+                    orphans += 1
+                    continue
+                adc = 4095 - (item >> 16)
+                column = item >> 5 & 0x7FF
+                sign = polarity
+                if sign == 0:
+                    sign = 1
+                    if row < height and column < width:
+                        before = np.int64(last_adc[row, column])
+                        last_adc[row, column] = adc
+                        sign = 1 if adc > before else -1 if adc < before else 0
+                if sign == 0:
+                    unchanged += 1
+                else:
+                    t[found], x[found], y[found], p[found] = now, column, row, sign
+                    found += 1
+    state[:] = row, stamp, now
+    return found, orphans, unchanged
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _decode_2(data, groups, state, polarity, t, x, y, p):
+    """Items of 14 bits: row, column or time stamp."""
+    row, stamp, now = state
+    found, orphans = 0, 0
+    for i in range(groups):
+        low = np.int64(data[7 * i + 4]) | np.int64(data[7 * i + 5]) << 8 | np.int64(data[7 * i + 6]) << 16
+        for k in range(4):
+            item = np.int64(data[7 * i + k]) << 6 | low >> 6 * k & 63
+            kind = item & 3
+            if kind == ROW:
+                row = item >> 4
+            elif kind == TIME:
+                tick = item >> 2
+                if stamp >= 0:
+                    now += (tick - stamp) & 0xFFF
+                stamp = tick
+            elif kind == COLUMN:
+                if row < 0 or stamp < 0:
+                    orphans += 1
+                    continue
+                t[found], x[found], y[found], p[found] = now, item >> 3, row, polarity
+                found += 1
+    state[:] = row, stamp, now
+    return found, orphans, 0

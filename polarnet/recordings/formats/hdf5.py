@@ -1,0 +1,181 @@
+"""HDF5 files of two kinds: events as DSEC stores them, and the recordings of a polarization camera of E2P (PDAVIS)."""
+
+import contextlib
+import importlib.util
+import os
+import pickle
+import subprocess
+import sys
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, sensor_size
+
+MAGIC = b"\x89HDF\r\n\x1a\n"
+DSEC_COLUMNS = ("events/t", "events/x", "events/y", "events/p")
+LARGEST = 2**53  # whole number
+E2P_COLUMNS = 4  # of /events: t in microseconds, x, y, p of 0 or 1
+PATIENCE_S = 60  # for a block; a damaged file can send the library round in circles
+
+Description = dict[str, Any]
+
+
+def matches_e2p(path: Path, head: bytes) -> bool:
+    """Whether the file has one table of events."""
+    if not head.startswith(MAGIC):
+        return False
+    try:
+        return "events" in _described(path)["tables"]
+    except (RecordingError, RuntimeError):
+        return False  # `open_dsec` says why
+
+
+def matches_dsec(path: Path, head: bytes) -> bool:
+    """Whether it is an HDF5 file, of whatever else."""
+    return head.startswith(MAGIC)
+
+
+def open_dsec(path: Path, choices: Choices) -> Source:
+    """Columns events/{t,x,y,p} (Gehrig et al. 2021), at times t + t_offset; p is 1 or 0.
+
+    DSEC itself does not state the size of its sensors, 480 x 640; files that polarnet writes do.
+    """
+    description = _described(path)
+    absent = [name for name in DSEC_COLUMNS if name not in description["tables"]]
+    if absent:
+        raise RecordingError(f"{path.name}: expected DSEC's HDF5, there is no {', '.join(absent)}")
+    lengths = [_length(path, description, name, 1) for name in DSEC_COLUMNS]
+    if len(set(lengths)) > 1:
+        raise RecordingError(f"{path.name}: its columns t, x, y, p have different lengths, {lengths}")
+    offset_us = _whole(path, description, "t_offset") or 0
+    height, width = (_whole(path, description, name) for name in ("height", "width"))
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        for t, x, y, p in _read(path, DSEC_COLUMNS, lengths[0]):
+            yield Block(_microseconds(path, t) + offset_us, x, y, p)
+
+    return Source(*sensor_size(path, choices, height, width), blocks)
+
+
+def open_e2p(path: Path, choices: Choices) -> Source:
+    """The table /events of E2P (Mei et al. 2023): rows t, x, y, p; the attribute sensor_resolution is width, height.
+
+    The pixels lie behind polarizers, rows 90 45 / 135 0 degrees from the upper left; the events are those of all.
+    """
+    description = _described(path)
+    if "events" not in description["tables"]:
+        raise RecordingError(f"{path.name}: expected E2P's HDF5, there is no table /events")
+    length = _length(path, description, "events", 2)
+    columns = description["tables"]["events"][0][1]
+    if columns != E2P_COLUMNS:
+        raise RecordingError(f"{path.name}: expected the four columns t, x, y, p of /events, got {columns}")
+    size = description["values"].get("sensor_resolution")
+    if size is not None and not (isinstance(size, list) and len(size) == 2):
+        raise RecordingError(f"{path.name}: expected width and height as sensor_resolution, got {size}")
+    width, height = (None, None) if size is None else (_number(path, "sensor_resolution", side) for side in size)
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        for (table,) in _read(path, ("events",), length):
+            t, x, y, p = np.ascontiguousarray(table.T)
+            yield Block(_microseconds(path, t), x, y, p)
+
+    return Source(*sensor_size(path, choices, height, width), blocks)
+
+
+def _described(path: Path) -> Description:
+    tables = [*DSEC_COLUMNS, "events"]
+    return _worker.ask(path, "describe", (tables, ["t_offset", "height", "width", "sensor_resolution"]))
+
+
+def _read(path: Path, tables: tuple[str, ...], length: int) -> Iterator[list[np.ndarray]]:
+    try:
+        for start in range(0, length, BLOCK_EVENTS):
+            yield _worker.ask(path, "read", (tables, start, start + BLOCK_EVENTS))
+    finally:
+        with contextlib.suppress(RecordingError, RuntimeError):
+            _worker.ask(path, "close", ())
+
+
+def _length(path: Path, description: Description, name: str, dimensions: int) -> int:
+    shape, kind = description["tables"][name]
+    if len(shape) != dimensions:
+        raise RecordingError(f"{path.name}: expected {name} as a table of {dimensions} dimensions, got {len(shape)}")
+    if kind not in "iufb":
+        raise RecordingError(f"{path.name}: expected numbers in {name}, got type {kind!r}")
+    return shape[0]
+
+
+def _whole(path: Path, description: Description, name: str) -> int | None:
+    value = description["values"].get(name)
+    return None if value is None else _number(path, name, value)
+
+
+def _number(path: Path, name: str, value: Any) -> int:
+    if not isinstance(value, (int, float)) or not abs(value) <= LARGEST or int(value) != value:
+        raise RecordingError(f"{path.name}: expected a whole number as {name}, got {value}")
+    return int(value)
+
+
+def _microseconds(path: Path, t: np.ndarray) -> np.ndarray:
+    if t.dtype.kind == "f" and not (np.equal(t, np.floor(t)).all() and (np.abs(t) < LARGEST).all()):
+        raise RecordingError(f"{path.name}: expected whole microseconds as times")
+    return t.astype(np.int64)
+
+
+class _Worker:
+    """The process that reads, started when it is first needed and again after a crash; one request at a time."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._owner = 0
+        self._lock = threading.Lock()
+
+    def ask(self, path: Path, task: str, arguments: tuple) -> Any:
+        """The worker's answer; RecordingError with what HDF5 said, or where it crashed or took too long."""
+        if sys.modules.get("h5py", True) is None or importlib.util.find_spec("h5py") is None:
+            raise RuntimeError(f"{path.name}: HDF5 needs h5py: pip install 'polarnet[hdf5]'")
+        with self._lock:
+            process = self._running()
+            assert process.stdin is not None
+            assert process.stdout is not None
+            deadline = threading.Timer(PATIENCE_S, process.kill)
+            deadline.start()
+            try:
+                pickle.dump((str(path.absolute()), task, arguments), process.stdin)
+                process.stdin.flush()
+                kind, answer = pickle.load(process.stdout)
+            except (EOFError, BrokenPipeError, pickle.UnpicklingError):
+                process.kill()
+                process.wait()
+                self._process = None
+                raise RecordingError(
+                    f"{path.name}: HDF5 cannot read it: the library crashed or took over {PATIENCE_S} s; it is damaged"
+                ) from None
+            finally:
+                deadline.cancel()
+        if kind == "error":
+            raise RecordingError(
+                f"{path.name}: HDF5 cannot read it: {answer}; it is damaged, or compressed in a way that needs "
+                f"pip install 'polarnet[recordings]'"
+            )
+        return answer
+
+    def _running(self) -> "subprocess.Popen[bytes]":
+        if self._owner != os.getpid() or self._process is None or self._process.poll() is not None:
+            self._owner = os.getpid()  # a fork must not share its parent's
+            script = Path(__file__).with_name("hdf5_worker.py")
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", str(script)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+            )
+        return self._process
+
+
+_worker = _Worker()

@@ -1,0 +1,205 @@
+"""Lines of decimal numbers to columns of whole numbers, at the speed of the disk and in blocks."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple, no_type_check
+
+import numba
+import numpy as np
+from jaxtyping import Int64
+
+from polarnet.recordings.source import BLOCK_EVENTS, RecordingError
+
+HEAD_BYTES = 4096  # of a file; enough to see what its lines are
+BLOCK_BYTES = 2**22
+LONGEST_LINE = 2**12  # bytes
+
+_SEPARATORS = re.compile(rb"[,;]")
+_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_DIGITS = 18  # that int64 holds whatever they are; further ones are less than a microsecond
+_LARGEST = 2**60
+_END, _COMMENT = 10, 35  # line feed, #
+
+
+def number_blocks(
+    path: Path, decimals: tuple[int, ...], skip_bytes: int, counts: Counter[str]
+) -> Iterator[Int64[np.ndarray, "n columns"]]:
+    """The lines of a file from byte `skip_bytes` as rows of len(decimals) whole numbers.
+
+    Column i is multiplied by 10**decimals[i]; where decimals[i] > 0 the rest is rounded, else a fraction makes the line
+    unreadable. Numbers are separated by blanks, commas or semicolons; # starts a comment. What is not such a line is
+    left out and counted as `unreadable_lines`; an unreadable rest after the last line end, as `cut_tail`.
+    """
+    shift = np.array(decimals, np.int64)
+    with path.open("rb") as file:
+        file.seek(skip_bytes)
+        rest = b""
+        while data := file.read(BLOCK_BYTES):
+            data = rest + data
+            end = data.rfind(b"\n") + 1
+            rest = data[end:]
+            if len(rest) > LONGEST_LINE:
+                raise RecordingError(
+                    f"{path.name}: expected lines of numbers, got {len(rest)} bytes without the end of a line"
+                )
+            yield from _rows(data[:end], shift, counts, "unreadable_lines")
+        yield from _rows(rest, shift, counts, "cut_tail")
+
+
+class Line(NamedTuple):
+    """A line of numbers at the head of a file."""
+
+    words: list[str]
+    end: int
+    """Where the next line starts, bytes from the start of the file."""
+
+
+def numbers_of(head: bytes) -> list[Line]:
+    """The lines of numbers among the first bytes of a file; none where most of its lines are something else."""
+    found: list[Line] = []
+    others, place = 0, 0
+    for line in head.splitlines(keepends=True):
+        place += len(line)
+        if len(line) == len(head) > LONGEST_LINE // 2 or (place == len(head) and found and not line.endswith(b"\n")):
+            break  # cut off by the size of the head
+        words = _SEPARATORS.sub(b" ", line.split(b"#")[0]).split()
+        if words and all(map(_NUMBER.fullmatch, words)):
+            found.append(Line([word.decode() for word in words], place))
+        elif words:
+            others += 1
+    return found if len(found) >= others else []
+
+
+def _rows(data: bytes, shift: np.ndarray, counts: Counter[str], damage: str) -> Iterator[np.ndarray]:
+    buffer = np.frombuffer(data, np.uint8)
+    start = 0
+    while start < len(buffer):
+        rows = np.empty((BLOCK_EVENTS, len(shift)), np.int64)
+        filled, start, unreadable = _parse(buffer, start, shift, rows)
+        counts[damage] += unreadable
+        if filled:
+            yield rows[:filled]
+
+
+def lines_of(table: Int64[np.ndarray, "n columns"], separator: str) -> bytes:
+    """Whole numbers as lines of text."""
+    out = np.empty(table.size * (_DIGITS + 3), np.uint8)
+    return out[: _write(np.ascontiguousarray(table), ord(separator), out)].tobytes()
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _write(table, separator, out):
+    place = 0
+    for row in table:
+        for column in range(len(row)):
+            value = row[column]
+            if value < 0:
+                out[place] = 45
+                place += 1
+                value = -value
+            first = place
+            while True:
+                out[place] = 48 + value % 10
+                place += 1
+                value //= 10
+                if value == 0:
+                    break
+            out[first:place] = out[first:place][::-1].copy()
+            out[place] = separator if column < len(row) - 1 else _END
+            place += 1
+    return place
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _parse(buffer, start, shift, rows):
+    """Fill `rows` from the lines at `start`; how many were filled, where the next line starts, how many were not."""
+    place, filled, unreadable = start, 0, 0
+    size, columns = len(buffer), len(shift)
+    while place < size and filled < len(rows):
+        column, good = 0, True
+        while place < size and buffer[place] != _END:
+            code = buffer[place]
+            if code == _COMMENT:
+                while place < size and buffer[place] != _END:
+                    place += 1
+            elif _ends(code):
+                place += 1
+            else:
+                value, place, whole = _number(buffer, place, shift[column] if column < columns else 0)
+                good = good and whole
+                if column < columns:
+                    rows[filled, column] = value
+                column += 1
+        place += 1
+        if good and column == columns:
+            filled += 1
+        elif column:
+            unreadable += 1
+    return filled, place, unreadable
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _number(buffer, place, shift):
+    """The number at `place`, times 10**shift; where it ends, and whether it is one."""
+    size, start = len(buffer), place
+    negative = buffer[place] == 45
+    place += negative
+    value, first = 0, place
+    while place < size and 48 <= buffer[place] <= 57 and place - first < _DIGITS:
+        value = 10 * value + (buffer[place] - 48)
+        place += 1
+    if shift == 0 and place > first and (place == size or _ends(buffer[place])):
+        return -value if negative else value, place, True
+    place = start + (negative or buffer[start] == 43)
+    value, digits, seen, exponent, point = 0, 0, 0, shift, False
+    while place < size:
+        code = buffer[place]
+        if 48 <= code <= 57:
+            seen += 1
+            if digits < _DIGITS:
+                value = 10 * value + (code - 48)
+                digits += value > 0
+                exponent -= point
+            else:
+                exponent += not point
+        elif code == 46 and not point:
+            point = True
+        else:
+            break
+        place += 1
+    good = seen > 0
+    if place < size and (buffer[place] == 101 or buffer[place] == 69):
+        place += 1
+        sign = -1 if place < size and buffer[place] == 45 else 1
+        place += place < size and (buffer[place] == 45 or buffer[place] == 43)
+        power, first = 0, place
+        while place < size and 48 <= buffer[place] <= 57:
+            power = min(10 * power + (buffer[place] - 48), 1000)
+            place += 1
+        good = good and place > first
+        exponent += sign * power
+    while exponent > 0 and value != 0 and good:
+        good = value < _LARGEST // 10
+        value, exponent = 10 * value, exponent - 1
+    tenths = 0
+    while exponent < 0 and value != 0:
+        good = good and (shift > 0 or value % 10 == 0)
+        tenths = value % 10
+        value, exponent = value // 10, exponent + 1
+    value += tenths >= 5
+    good = good and value < _LARGEST
+    while place < size and not _ends(buffer[place]):
+        good = False
+        place += 1
+    return -value if negative else value, place, good
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+@no_type_check
+def _ends(code):
+    return code in (32, 44, 59, 9, 13, _END, _COMMENT)

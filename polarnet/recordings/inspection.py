@@ -1,0 +1,175 @@
+"""What is in a recording: how much of what, for how long, which pixels are hot, and how it looks when it is busiest."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Int64, UInt16
+
+from polarnet.events.stream import Events
+from polarnet.recordings.formats.celex5_bin import celex5_pictures
+from polarnet.recordings.recording import FORMATS, RecordingReader
+from polarnet.recordings.source import REPAIRS, RecordingError
+
+HOT_FACTOR = 10  # times as many events as the pixels around it, and as the mean pixel
+HOT_COUNT = 8  # events at least
+NEIGHBOURHOOD = 5  # pixels, of which the median counts
+MOST_PIXELS = 2**25
+SHORTEST_US = 1000  # that a rate is taken over
+EVENTS_PER_PIXEL = 0.15  # of the part that is shown: enough to see edges, little enough that they do not smear
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What a recording holds."""
+
+    format: str
+    height: int
+    width: int
+    on: int
+    off: int
+    start_us: int | None
+    """Time of the first event; None where there is none."""
+    stop_us: int | None
+    counts: Int64[np.ndarray, "h w"]
+    """Events of each pixel."""
+    hot: Bool[np.ndarray, "h w"]
+    busiest: Int64[np.ndarray, "h w"]
+    """Signed counts of the busiest part: the consecutive events, 0.15 a pixel, that took the least time."""
+    busiest_rate_hz: float
+    """Events per second in it."""
+    repairs: Mapping[str, int]
+    pictures: int
+    """Full pictures between or instead of events."""
+    first_picture: UInt16[np.ndarray, "h w"] | None
+
+
+def inspect_recording(reader: RecordingReader) -> Inspection:
+    """Read a recording once, in constant memory; RecordingError where it fails, or no sensor is as large as it says."""
+    pixels = reader.height * reader.width
+    if pixels > MOST_PIXELS:
+        raise RecordingError(
+            f"{reader.path.name}: no event camera has {reader.width} x {reader.height} px: the size that was given "
+            f"is wrong, or the file is damaged"
+        )
+    counts = np.zeros(pixels, np.int64)
+    busiest = _Busiest(pixels)
+    on = off = 0
+    start_us = stop_us = None
+    for events in reader:
+        pixel = events.y.numpy().astype(np.int64) * reader.width + events.x.numpy()
+        counts += np.bincount(pixel, minlength=pixels)
+        on += int((events.p > 0).sum())
+        off += int((events.p < 0).sum())
+        start_us = int(events.t[0]) if start_us is None else start_us
+        stop_us = int(events.t[-1])
+        busiest.add(events, pixel)
+    pictures, first_picture = 0, None
+    if reader.format == "celex5_bin":
+        for picture in celex5_pictures(reader.path):
+            first_picture = picture.intensity if pictures == 0 else first_picture
+            pictures += 1
+    shape = reader.height, reader.width
+    signed, rate_hz = busiest.found()
+    return Inspection(
+        format=reader.format,
+        height=reader.height,
+        width=reader.width,
+        on=on,
+        off=off,
+        start_us=start_us,
+        stop_us=stop_us,
+        counts=counts.reshape(shape),
+        hot=hot_pixels(counts.reshape(shape)),
+        busiest=signed.reshape(shape),
+        busiest_rate_hz=rate_hz,
+        repairs={kind: count for kind, count in reader.repairs.items() if count},
+        pictures=pictures,
+        first_picture=first_picture,
+    )
+
+
+def hot_pixels(counts: Int64[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels with at least 8 events and over 10 times as many as the median around them and as the mean pixel."""
+    around = cv2.medianBlur(np.minimum(counts, 2**24).astype(np.float32), NEIGHBOURHOOD)
+    usual = np.maximum(around, counts.mean())
+    return (counts >= HOT_COUNT) & (counts > HOT_FACTOR * usual)
+
+
+def findings(inspection: Inspection) -> Iterator[str]:
+    """Lines for a person."""
+    events = inspection.on + inspection.off
+    yield f"format      {inspection.format}: {FORMATS[inspection.format].words}"
+    yield f"sensor      {inspection.width} x {inspection.height} px"
+    if inspection.pictures:
+        yield f"pictures    {inspection.pictures}"
+    yield f"events      {events:,}: {inspection.on:,} ON, {inspection.off:,} OFF"
+    if inspection.start_us is not None and inspection.stop_us is not None:
+        seconds = (inspection.stop_us - inspection.start_us) / 1e6
+        yield f"time        {inspection.start_us:,} to {inspection.stop_us:,} us, {seconds:.6f} s"
+        if seconds > 0:
+            yield f"rate        {_rate(inspection.on / seconds)} ON, {_rate(inspection.off / seconds)} OFF; " + (
+                f"up to {_rate(inspection.busiest_rate_hz)} together"
+            )
+    yield f"hot pixels  {_hot(inspection)}"
+    pauses = inspection.repairs.get("pauses", 0)
+    yield f"time jumps  {pauses} {REPAIRS['pauses']}" if pauses else "time jumps  none"
+    repairs = {kind: count for kind, count in inspection.repairs.items() if kind != "pauses"}
+    for kind, count in repairs.items():
+        yield f"repaired    {count:,} {REPAIRS[kind]}"
+    if not repairs:
+        yield "repaired    nothing"
+
+
+def _rate(rate_hz: float) -> str:
+    for unit, name in ((1e6, "M"), (1e3, "k")):
+        if rate_hz >= unit:
+            return f"{rate_hz / unit:.2f} {name}ev/s"
+    return f"{rate_hz:.1f} ev/s"
+
+
+def _hot(inspection: Inspection) -> str:
+    rows, columns = np.nonzero(inspection.hot)
+    if not len(rows):
+        return "none"
+    counts = inspection.counts[rows, columns]
+    order = np.argsort(-counts, kind="stable")[:4]
+    share = counts.sum() / max(1, inspection.counts.sum())
+    worst = ", ".join(f"x {columns[i]} y {rows[i]}: {counts[i]:,}" for i in order)
+    return f"{len(rows)} with {share:.1%} of the events ({worst}{', ...' if len(rows) > len(order) else ''})"
+
+
+class _Busiest:
+    """Finds the consecutive events that took the least time, among parts that follow each other."""
+
+    def __init__(self, pixels: int):
+        self._size = max(1, round(EVENTS_PER_PIXEL * pixels))
+        self._image = np.zeros(pixels, np.int64)
+        self._count, self._start_us, self._stop_us = 0, 0, 0
+        self._best: np.ndarray | None = None
+        self._best_us = 0
+
+    def add(self, events: Events, pixel: Int64[np.ndarray, " n"]) -> None:
+        start = 0
+        while start < len(events):
+            stop = min(len(events), start + self._size - self._count)
+            if self._count == 0:
+                self._start_us = int(events.t[start])
+            signs = events.p[start:stop].numpy().astype(np.float64)
+            self._image += np.bincount(pixel[start:stop], signs, len(self._image)).astype(np.int64)
+            self._count += stop - start
+            self._stop_us = int(events.t[stop - 1])
+            start = stop
+            if self._count == self._size:
+                took_us = self._stop_us - self._start_us
+                if self._best is None or took_us < self._best_us:
+                    self._best, self._best_us = self._image.copy(), took_us
+                self._image[:] = 0
+                self._count = 0
+
+    def found(self) -> tuple[np.ndarray, float]:
+        """The signed image, and events per second; of all events where there were too few for one part."""
+        if self._best is not None:
+            return self._best, self._size / max(SHORTEST_US, self._best_us) * 1e6
+        return self._image, self._count / max(SHORTEST_US, self._stop_us - self._start_us) * 1e6

@@ -1,0 +1,178 @@
+"""Files of event cameras as events: whole with `read_recording`, in chunks of constant memory with `open_recording`."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from polarnet.events.stream import LARGEST_SIDE, Events, concatenate
+from polarnet.recordings.formats import celex5_bin, celex5_csv, dat, evt, faery, hdf5, store, text
+from polarnet.recordings.repair import repaired
+from polarnet.recordings.source import Block, Choices, RecordingError, Source
+
+HEAD_BYTES = 4096  # of a file; enough for every format to know its own
+CHUNK_EVENTS = 2**20
+
+
+class Format(NamedTuple):
+    """How files of one format are known, and opened."""
+
+    words: str
+    matches: Callable[[Path, bytes], bool]
+    """Whether a file that starts with these bytes is of this format."""
+    open: Callable[[Path, Choices], Source]
+
+
+FORMATS = {
+    "store": Format("our own event store", store.matches, store.open_store),
+    "e2p": Format("HDF5 of E2P, for the PDAVIS", hdf5.matches_e2p, hdf5.open_e2p),
+    "dsec": Format("HDF5 of DSEC", hdf5.matches_dsec, hdf5.open_dsec),
+    "aedat4": Format("AEDAT4 of iniVation", faery.matches_aedat4, faery.open_aedat4),
+    "event_stream": Format("Event Stream (.es)", faery.matches_event_stream, faery.open_event_stream),
+    "evt": Format("EVT2 and EVT3 of Prophesee", evt.matches, evt.open_evt),
+    "dat": Format("DAT of Prophesee", dat.matches, dat.open_dat),
+    "text": Format("lines `t x y p`", text.matches, text.open_text),
+    "celex5_csv": Format("CSV of a CeleX-5", celex5_csv.matches, celex5_csv.open_celex5_csv),
+    "celex5_bin": Format("BIN of a CeleX-5", celex5_bin.matches, celex5_bin.open_celex5_bin),
+}
+"""In the order in which a file of unknown format is tried."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A whole file."""
+
+    events: Events
+    format: str
+    repairs: Mapping[str, int]
+    """How often each repair of `polarnet.recordings.source.REPAIRS` was needed; without those that were not."""
+
+
+class RecordingReader:
+    """A file as consecutive chunks of events, each but the last of `chunk_events`; `open_recording` makes one.
+
+    Iterating reads the file from its start, in memory that does not grow with it, and may raise RecordingError where
+    the file turns out to be damaged. `repairs` counts what was repaired up to the chunk that came last.
+    """
+
+    def __init__(self, path: Path, form: str, source: Source, chunk_events: int):
+        self.path = path
+        self.format = form
+        self.height = source.height
+        self.width = source.width
+        self.repairs: Counter[str] = Counter()
+        self._source = source
+        self._chunk_events = chunk_events
+
+    def __iter__(self) -> Iterator[Events]:
+        self.repairs.clear()
+        blocks = repaired(self.path.name, self._source, self.repairs)
+        for block in _cut(blocks, self._chunk_events):
+            t, x, y, p = map(torch.from_numpy, block)
+            yield Events(t, x, y, p, self.height, self.width)
+
+
+def open_recording(
+    path: str | Path,
+    format: str | None = None,
+    *,
+    height: int | None = None,
+    width: int | None = None,
+    part: str | None = None,
+    clock_mhz: float | int | None = None,
+    assume_polarity: int | None = None,
+    chunk_events: int = CHUNK_EVENTS,
+) -> RecordingReader:
+    """A file to read chunk by chunk.
+
+    `format` is a key of FORMATS; None tells it by the content. `height` and `width` are needed where the file does not
+    say them. `part` is SEQUENCE/ANGLE of an event store, `clock_mhz` the clock of a CeleX-5 whose BIN file counts its
+    ticks, `assume_polarity` (+1 or -1) the polarity of all events of a file that has none and is refused without it.
+
+    RecordingError where the file is of no known format or cannot be events; RuntimeError that says what to install
+    where an optional package is missing.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    for name, side in (("height", height), ("width", width)):
+        if side is not None and not 0 < side <= LARGEST_SIDE:
+            raise ValueError(f"expected a {name} of 1 to {LARGEST_SIDE} px, got {side}")
+    if chunk_events < 1:
+        raise ValueError(f"expected at least one event in a chunk, got {chunk_events}")
+    if clock_mhz is not None and not 0.001 <= clock_mhz <= 10_000:
+        raise ValueError(f"expected a clock of 0.001 to 10000 MHz, got {clock_mhz}")
+    if assume_polarity not in (None, 1, -1):
+        raise ValueError(f"expected a polarity of 1 or -1 to assume, got {assume_polarity}")
+    choices = Choices(height, width, part, clock_mhz, assume_polarity)
+    form = detect_format(path) if format is None else format
+    if form not in FORMATS:
+        raise ValueError(f"expected a format of {', '.join(FORMATS)}, got {form!r}")
+    return RecordingReader(path, form, FORMATS[form].open(path, choices), chunk_events)
+
+
+def read_recording(
+    path: str | Path,
+    format: str | None = None,
+    *,
+    height: int | None = None,
+    width: int | None = None,
+    part: str | None = None,
+    clock_mhz: float | int | None = None,
+    assume_polarity: int | None = None,
+) -> Recording:
+    """All of a file; the arguments and errors are those of `open_recording`."""
+    reader = open_recording(
+        path,
+        format,
+        height=height,
+        width=width,
+        part=part,
+        clock_mhz=clock_mhz,
+        assume_polarity=assume_polarity,
+    )
+    chunks = list(reader)
+    events = concatenate(chunks) if chunks else Events.empty(reader.height, reader.width)
+    return Recording(events, reader.format, {kind: count for kind, count in reader.repairs.items() if count})
+
+
+def detect_format(path: Path) -> str:
+    """The key of FORMATS that a file's first bytes show; RecordingError where it is none of them."""
+    head = b""
+    if path.is_file():
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+        if not head:
+            raise RecordingError(f"{path.name}: the file is empty")
+    for name, form in FORMATS.items():
+        if (name == "store" or head) and form.matches(path, head):
+            return name
+    raise RecordingError(
+        f"{path.name}: its content is of none of the formats {', '.join(FORMATS)}; if it is one of them, say which"
+    )
+
+
+def _cut(blocks: Iterator[Block], size: int) -> Iterator[Block]:
+    """The same events in blocks of `size`, the last one of what is left."""
+    waiting: list[Block] = []
+    count = 0
+    for block in blocks:
+        waiting.append(block)
+        count += len(block.t)
+        if count < size:
+            continue
+        joined = _joined(waiting)
+        for start in range(0, count - size + 1, size):
+            yield Block(*(column[start : start + size] for column in joined))
+        waiting = [Block(*(column[count - count % size :] for column in joined))]
+        count %= size
+    if count:
+        yield _joined(waiting)
+
+
+def _joined(blocks: list[Block]) -> Block:
+    return blocks[0] if len(blocks) == 1 else Block(*map(np.concatenate, zip(*blocks, strict=True)))

@@ -1,0 +1,48 @@
+import sys
+
+import numpy as np
+import pytest
+
+from polarnet.recordings.recording import read_recording
+from polarnet.recordings.source import RecordingError
+
+ROWS = [(5, 1, 2, True), (9, 345, 259, False), (9, 3, 4, True)]
+
+
+def write(path, **options):
+    faery = pytest.importorskip("faery")
+    events = np.array(ROWS, faery.EVENTS_DTYPE)
+    faery.events_stream_from_array(events, (346, 260)).to_file(path, **options)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "form"),
+    [
+        ("e.aedat4", {}, "aedat4"),
+        ("e.es", {}, "event_stream"),
+        ("e.raw", {"version": "evt3"}, "evt"),
+        ("e.raw", {"version": "evt2"}, "evt"),
+        ("e.dat", {"version": "dat2"}, "dat"),
+    ],
+)
+def test_files_that_faery_writes_are_read(tmp_path, name, options, form):
+    recording = read_recording(write(tmp_path / name, **options))
+    events = recording.events
+    assert (recording.format, events.height, events.width, recording.repairs) == (form, 260, 346, {})
+    assert (events.t - events.t[0]).tolist() == [0, 4, 4]
+    assert [events.x.tolist(), events.y.tolist(), events.p.tolist()] == [[1, 345, 3], [2, 259, 4], [1, -1, 1]]
+
+
+def test_a_cut_file_is_refused_with_what_the_library_says(tmp_path):
+    path = write(tmp_path / "e.aedat4")
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(RecordingError, match=r"e\.aedat4: faery cannot read it: "):
+        read_recording(path)
+
+
+def test_without_the_library_the_error_names_the_extra(tmp_path, monkeypatch):
+    (tmp_path / "e.aedat4").write_bytes(b"#!AER-DAT4.0\r\n" + bytes(100))
+    monkeypatch.setitem(sys.modules, "faery", None)
+    with pytest.raises(RuntimeError, match=r"e\.aedat4: .*pip install 'polarnet\[recordings\]'"):
+        read_recording(tmp_path / "e.aedat4")

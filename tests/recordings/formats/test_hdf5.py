@@ -1,0 +1,103 @@
+import sys
+
+import numpy as np
+import pytest
+
+from polarnet.events.exchange import write_hdf5
+from polarnet.recordings.recording import read_recording
+from polarnet.recordings.source import RecordingError
+
+h5py = pytest.importorskip("h5py")
+
+
+def write_dsec(path, offset=None, **columns):
+    names = {"t": [3, 9], "x": [639, 0], "y": [479, 0], "p": [1, 0]} | columns
+    with h5py.File(path, "w") as file:
+        for name, values in names.items():
+            if values is not None:
+                file[f"events/{name}"] = np.asarray(values)
+        if offset is not None:
+            file["t_offset"] = offset
+    return path
+
+
+def write_e2p(path, events, resolution=(346, 260)):
+    with h5py.File(path, "w") as file:
+        file["events"] = np.asarray(events, np.uint32)
+        if resolution:
+            file.attrs["sensor_resolution"] = resolution
+    return path
+
+
+def test_dsec_that_polarnet_exports_reads_back_equal(tmp_path, make_random_events, same_events):
+    events = make_random_events(0, 3000, 10**6, 12, 18)
+    write_hdf5(tmp_path / "e.h5", events, 10**6)
+    recording = read_recording(tmp_path / "e.h5")
+    assert recording.format == "dsec"
+    assert same_events(recording.events, events)
+
+
+def test_dsecs_own_files_begin_at_their_offset_and_need_the_size_of_the_sensor(tmp_path):
+    path = write_dsec(tmp_path / "e.h5", np.int64(49_599_300_523))
+    with pytest.raises(RecordingError, match=r"e\.h5: the file does not say how large the sensor is"):
+        read_recording(path)
+    events = read_recording(path, height=480, width=640).events
+    assert events.t.tolist() == [49_599_300_526, 49_599_300_532]
+    assert events.p.tolist() == [1, -1]
+
+
+def test_dsecs_own_compression_is_read(tmp_path):
+    hdf5plugin = pytest.importorskip("hdf5plugin")
+    with h5py.File(tmp_path / "e.h5", "w") as file:
+        for name in "txyp":
+            file.create_dataset(f"events/{name}", data=np.arange(2), chunks=(2,), **hdf5plugin.Blosc())
+    assert read_recording(tmp_path / "e.h5", height=4, width=4).events.t.tolist() == [0, 1]
+
+
+def test_e2p_is_a_table_of_t_x_y_p_with_width_before_height(tmp_path):
+    recording = read_recording(write_e2p(tmp_path / "e.h5", [[5, 345, 1, 1], [9, 0, 259, 0]]))
+    events = recording.events
+    assert (recording.format, events.height, events.width) == ("e2p", 260, 346)
+    assert [events.t.tolist(), events.x.tolist(), events.y.tolist()] == [[5, 9], [345, 0], [1, 259]]
+    assert events.p.tolist() == [1, -1]
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"x": None}, "there is no events/x"),
+        ({"x": [1, 2, 3]}, "different lengths"),
+        ({"y": [[1, 2]]}, "expected events/y as a table of 1 dimensions"),
+        ({"p": np.array([b"a", b"b"])}, "expected numbers in events/p"),
+        ({"t": [0.5, 1.0]}, "expected whole microseconds"),
+        ({"x": [0.5, 1.0]}, "x and y to be whole numbers"),
+        ({"offset": "noon"}, "expected a whole number as t_offset"),
+        ({"offset": np.uint64(2**63)}, "expected a whole number as t_offset"),
+    ],
+)
+def test_other_columns_are_refused_by_name(tmp_path, columns, message):
+    with pytest.raises(RecordingError, match=rf"e\.h5: .*{message}"):
+        read_recording(write_dsec(tmp_path / "e.h5", **columns), height=480, width=640)
+
+
+def test_e2p_of_another_shape_is_refused(tmp_path):
+    with pytest.raises(RecordingError, match="the four columns t, x, y, p of /events, got 3"):
+        read_recording(write_e2p(tmp_path / "a.h5", [[1, 2, 3]]))
+    with pytest.raises(RecordingError, match="expected width and height as sensor_resolution"):
+        read_recording(write_e2p(tmp_path / "b.h5", [[1, 2, 3, 1]], (1, 2, 3)))
+    with pytest.raises(RecordingError, match="there is no table /events"):
+        read_recording(write_dsec(tmp_path / "c.h5"), "e2p")
+
+
+def test_a_damaged_file_is_refused_with_what_hdf5_says(tmp_path):
+    path = write_dsec(tmp_path / "e.h5")
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(RecordingError, match=r"e\.h5: HDF5 cannot read it: .*truncated"):
+        read_recording(path, height=480, width=640)
+
+
+def test_without_h5py_the_error_names_the_extra(tmp_path, monkeypatch):
+    path = write_dsec(tmp_path / "e.h5")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(RuntimeError, match=r"pip install 'polarnet\[hdf5\]'"):
+        read_recording(path, height=480, width=640)

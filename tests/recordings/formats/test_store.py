@@ -1,0 +1,48 @@
+import pytest
+
+from polarnet.events.store import EventStore
+from polarnet.recordings.formats import store as store_format
+from polarnet.recordings.recording import read_recording
+from polarnet.recordings.source import RecordingError
+
+
+@pytest.fixture
+def channels(make_random_events):
+    return [make_random_events(k, 500 + 100 * k, 90_000, 12, 18) for k in range(4)]
+
+
+@pytest.fixture
+def store(tmp_path, channels):
+    store = EventStore.create(tmp_path / "events.zarr", ["lake", "wood"], 12, 18, {})
+    for name in store.sequences:
+        store.write(name, channels, 90_500)
+    store.finish()
+    return tmp_path / "events.zarr"
+
+
+@pytest.mark.parametrize(("angle", "channel"), [(0, 0), (45, 1), (90, 2), (135, 3)])
+def test_a_channel_reads_back_equal(store, channels, same_events, monkeypatch, angle, channel):
+    monkeypatch.setattr(store_format, "BLOCK_EVENTS", 64)
+    recording = read_recording(store, part=f"wood/{angle}")
+    assert recording.format == "store"
+    assert same_events(recording.events, channels[channel])
+
+
+@pytest.mark.parametrize("part", [None, "lake", "lake/44", "sea/45", "45"])
+def test_the_parts_are_named_where_none_is_chosen(store, part):
+    with pytest.raises(RecordingError, match=r"say which part .* of lake, wood and an angle of 0, 45, 90, 135"):
+        read_recording(store, part=part)
+
+
+def test_a_damaged_store_is_refused_with_the_sequence(store):
+    chunk = next(path for path in (store / "events" / "x" / "c" / "1").rglob("*") if path.is_file())
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 3] ^= 1
+    chunk.write_bytes(content)
+    with pytest.raises(RecordingError, match="wood, column events/x is unreadable"):
+        read_recording(store, part="wood/0")
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path):
+    with pytest.raises(RecordingError, match="of none of the formats"):
+        read_recording(tmp_path)

@@ -1,0 +1,109 @@
+import cv2
+import numpy as np
+import pytest
+
+from polarnet.cli import main
+from polarnet.events.stream import merge
+from polarnet.recordings.formats.celex5_bin_writer import write_celex5_pictures
+from polarnet.recordings.formats.celex5_csv import write_celex5_csv
+from polarnet.recordings.inspection import findings, hot_pixels, inspect_recording
+from polarnet.recordings.recording import open_recording
+from polarnet.recordings.source import RecordingError
+
+
+def test_counts_rates_and_time_are_those_of_the_events(tmp_path, make_random_events):
+    events = make_random_events(0, 4000, 2_000_000)
+    write_celex5_csv(tmp_path / "e.csv", events)
+    inspection = inspect_recording(open_recording(tmp_path / "e.csv", chunk_events=333))
+    assert (inspection.format, inspection.height, inspection.width) == ("celex5_csv", 800, 1280)
+    assert (inspection.on, inspection.off) == (int((events.p > 0).sum()), int((events.p < 0).sum()))
+    assert (inspection.start_us, inspection.stop_us) == (int(events.t[0]), int(events.t[-1]))
+    assert inspection.counts.sum() == 4000
+    assert inspection.counts[int(events.y[7]), int(events.x[7])] >= 1
+    assert not inspection.hot.any()
+
+
+def test_the_picture_is_of_the_consecutive_events_that_took_the_least_time(tmp_path, make_events):
+    """On 20 x 10 pixels it shows 30 events: here those of the second 3 ms, all at one pixel."""
+    slow = [(1000 * k, k % 20, 2, 1) for k in range(30)]
+    quick = [(50_000 + 100 * k, 5, 7, -1) for k in range(30)]
+    later = [(100_000 + 1000 * k, k % 20, 3, 1) for k in range(30)]
+    path = tmp_path / "e.txt"
+    path.write_text("20 10\n" + "".join(f"{t} {x} {y} {p}\n" for t, x, y, p in slow + quick + later))
+    inspection = inspect_recording(open_recording(path, chunk_events=7))
+    assert np.argwhere(inspection.busiest).tolist() == [[7, 5]]
+    assert inspection.busiest[7, 5] == -30
+    assert inspection.busiest_rate_hz == pytest.approx(30 / 0.0029)
+
+
+def test_a_recording_of_few_events_is_shown_whole(tmp_path):
+    (tmp_path / "e.txt").write_text("20 10\n1 2 3 1\n2 2 3 0\n3 4 5 1\n")
+    inspection = inspect_recording(open_recording(tmp_path / "e.txt"))
+    assert np.argwhere(inspection.busiest).tolist() == [[5, 4]]
+
+
+def test_a_pixel_that_fires_on_its_own_is_hot_and_a_busy_edge_is_not():
+    counts = np.ones((40, 60), np.int64)
+    counts[10:13] = 50  # an edge that passes
+    counts[30, 20] = 100
+    assert np.argwhere(hot_pixels(counts)).tolist() == [[30, 20]]
+
+
+def test_a_still_sensor_has_no_hot_pixels():
+    assert not hot_pixels(np.zeros((8, 8), np.int64)).any()
+
+
+def test_findings_say_what_was_repaired_and_how_often(tmp_path):
+    (tmp_path / "e.txt").write_text("20 10\n5 2 3 1\n4 2 3 0\n6 2 x 1\n3000000 4 5 1\n")
+    lines = "\n".join(findings(inspect_recording(open_recording(tmp_path / "e.txt"))))
+    for words in (
+        "format      text: lines `t x y p`",
+        "sensor      20 x 10 px",
+        "events      3: 2 ON, 1 OFF",
+        "time        4 to 3,000,000 us, 2.999996 s",
+        "time jumps  1 pauses of a second or more",
+        "repaired    1 events a little earlier than the one before: put in order",
+        "repaired    1 lines that are not the numbers",
+    ):
+        assert words in lines
+
+
+def test_inspect_prints_the_findings_and_writes_a_picture_without_hot_pixels(
+    tmp_path, make_events, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    edge = make_events([(k, k % 50, 20, 1 - 2 * (k % 2)) for k in range(100)], 800, 1280)
+    hot = make_events([(k, 700, 300, 1) for k in range(100)], 800, 1280)
+    write_celex5_csv(tmp_path / "capture.csv", merge([edge, hot]))
+    assert main(["inspect", "capture.csv"]) == 0
+    printed = capsys.readouterr().out
+    assert "hot pixels  1 with 50.0% of the events (x 700 y 300: 100)" in printed
+    picture = cv2.imread(str(tmp_path / "capture.csv.png"))
+    assert picture.shape == (800, 1280, 3)
+    coloured = np.argwhere((picture != 255).any(axis=-1))
+    assert np.unique(coloured[:, 0]).tolist() == [20]
+
+
+def test_inspect_of_pictures_shows_the_first(tmp_path, capsys):
+    picture = np.zeros((800, 1280), np.uint16)
+    picture[:, 640:] = 4095
+    write_celex5_pictures(tmp_path / "p.bin", [picture, np.zeros_like(picture)], [0, 33_000])
+    assert main(["inspect", str(tmp_path / "p.bin"), "--picture", str(tmp_path / "p.png")]) == 0
+    assert "pictures    2" in capsys.readouterr().out
+    assert cv2.imread(str(tmp_path / "p.png"))[400, [10, 1000], 0].tolist() == [0, 255]
+
+
+def test_inspect_of_a_mode_without_polarity_says_what_to_do(tmp_path, capsys):
+    (tmp_path / "e.csv").write_text("10,20,5\n11,21,7\n")
+    assert main(["inspect", str(tmp_path / "e.csv")]) == 1
+    assert "have no polarity" in capsys.readouterr().err
+    assert (
+        main(["inspect", str(tmp_path / "e.csv"), "--assume-polarity", "1", "--picture", str(tmp_path / "p.png")]) == 0
+    )
+    assert "events      2: 2 ON, 0 OFF" in capsys.readouterr().out
+
+
+def test_a_sensor_larger_than_any_is_refused(tmp_path):
+    (tmp_path / "e.txt").write_text("32767 32767\n1 2 3 1\n")
+    with pytest.raises(RecordingError, match="no event camera has 32767 x 32767 px"):
+        inspect_recording(open_recording(tmp_path / "e.txt"))

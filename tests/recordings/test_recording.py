@@ -1,0 +1,133 @@
+import numpy as np
+import pytest
+import torch
+
+from polarnet.recordings.formats.celex5_csv import write_celex5_csv
+from polarnet.recordings.recording import FORMATS, open_recording, read_recording
+from polarnet.recordings.source import RecordingError
+
+SAMPLES = {
+    "aedat4/tonic_sample.aedat4": ("aedat4", 111_954, 240, 320),
+    "prophesee/evt2.raw": ("evt", 521_252, 480, 640),
+    "prophesee/evt3_sample.raw": ("evt", 219_596, 720, 1280),
+    "event_stream/dvs.es": ("event_stream", 473_225, 240, 320),
+}
+"""Events, height and width as the reference notes give them (EVT2: those of the sensor that its header names)."""
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", SAMPLES)
+def test_a_sample_has_the_number_of_events_that_other_readers_found(shared, name):
+    if SAMPLES[name][0] != "evt":
+        pytest.importorskip("faery")
+    recording = read_recording(shared / "data" / "recordings" / name)
+    events = recording.events
+    assert (recording.format, len(events), events.height, events.width) == SAMPLES[name]
+    assert recording.repairs == {}
+
+
+@pytest.mark.shared
+def test_a_dat_sample_is_read_once_the_size_of_the_sensor_is_given(shared):
+    path = shared / "data" / "recordings" / "prophesee" / "sample_ncars.dat"
+    with pytest.raises(RecordingError, match=r"sample_ncars\.dat: .*give height and width"):
+        read_recording(path)
+    recording = read_recording(path, height=240, width=304)
+    assert (recording.format, len(recording.events), recording.repairs) == ("dat", 2009, {})
+
+
+@pytest.mark.shared
+def test_an_evt3_file_equals_its_decoded_columns_up_to_turns_of_a_clock_that_did_not_turn(shared):
+    """The reference's decoder takes each step back of the low time word, by 3 to 11 us, for a turn of 4096 us.
+
+    The file's high time words grow by 2, so its last events are at 2863 * 4096 + 609 us.
+    """
+    folder = shared / "data" / "recordings" / "prophesee"
+    expected = np.load(folder / "evt3_sample_expected.npy")
+    events = read_recording(folder / "evt3_sample.raw").events
+    assert np.array_equal(events.x.numpy(), expected["x"])
+    assert np.array_equal(events.y.numpy(), expected["y"])
+    assert np.array_equal(events.p.numpy() > 0, expected["p"] == 1)
+    later = expected["t"] - events.t.numpy()
+    assert np.unique(later).tolist() == [4096 * k for k in range(12)]
+    assert (np.diff(later) >= 0).all()
+    assert int(events.t[-1]) == 2863 * 4096 + 609
+
+
+@pytest.mark.parametrize("chunk_events", [1, 7, 999, 1000, 10**6])
+def test_chunks_hold_the_same_events_whatever_their_size(tmp_path, make_random_events, chunk_events):
+    events = make_random_events(0, 1000, 10**6)
+    write_celex5_csv(tmp_path / "e.csv", events)
+    chunks = list(open_recording(tmp_path / "e.csv", chunk_events=chunk_events))
+    assert {len(chunk) for chunk in chunks[:-1]} <= {chunk_events}
+    assert 0 < len(chunks[-1]) <= chunk_events
+    for name in "txyp":
+        assert torch.equal(torch.cat([getattr(chunk, name) for chunk in chunks]), getattr(events, name))
+
+
+def test_iterating_again_starts_again_and_counts_again(tmp_path):
+    (tmp_path / "e.txt").write_text("18 12\n5 1 2 1\n4 1 2 1\n6 1 2 0\n")
+    reader = open_recording(tmp_path / "e.txt")
+    for _ in range(2):
+        (chunk,) = reader
+        assert chunk.t.tolist() == [4, 5, 6]
+        assert reader.repairs["unsorted"] == 1
+
+
+def test_a_recording_without_events_is_an_empty_stream_of_its_sensor(tmp_path):
+    (tmp_path / "e.txt").write_text("18 12\n")
+    recording = read_recording(tmp_path / "e.txt")
+    assert (len(recording.events), recording.events.height, recording.events.width) == (0, 12, 18)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "the file is empty"),
+        (b"\x00\x01\x02\xff" * 100, "of none of the formats store, e2p, dsec, aedat4"),
+        (b"Dear reader,\nthis is a letter.\n", "of none of the formats"),
+        (b"1,2,3,4,5,6\n", "of none of the formats"),
+    ],
+)
+def test_content_of_no_known_format_is_refused_by_name(tmp_path, content, message):
+    (tmp_path / "what.dat").write_bytes(content)
+    with pytest.raises(RecordingError, match=rf"what\.dat: .*{message}"):
+        read_recording(tmp_path / "what.dat")
+
+
+def test_a_format_that_is_named_is_taken_without_a_look_at_the_content(tmp_path):
+    (tmp_path / "e.csv").write_text("10,20,4000,1\n11,21,4001,0\n")
+    assert open_recording(tmp_path / "e.csv", "text", height=4002, width=40).format == "text"
+    with pytest.raises(ValueError, match=r"expected a format of store, .*, got 'celex'"):
+        read_recording(tmp_path / "e.csv", "celex")
+
+
+def test_every_format_refuses_content_of_another_by_name(tmp_path):
+    for name in FORMATS:
+        path = tmp_path / f"{name}.bin"
+        path.write_bytes(b"\x93NUMPY\x01\x00 something else entirely " * 8)
+        try:
+            with pytest.raises(RecordingError, match=rf"{name}\.bin"):
+                read_recording(path, name, height=10, width=10)
+        except RuntimeError as error:  # an extra that is not installed
+            assert "pip install" in str(error)  # noqa: PT017
+
+
+def test_impossible_arguments_are_refused_before_reading(tmp_path):
+    with pytest.raises(FileNotFoundError, match="there is no such file"):
+        open_recording(tmp_path / "nothing.csv")
+    (tmp_path / "e.txt").write_text("5 1 2 1\n")
+    for arguments, message in (
+        ({"height": 0, "width": 4}, "expected a height of 1 to 32767 px, got 0"),
+        ({"chunk_events": 0}, "at least one event"),
+        ({"clock_mhz": 0.0}, r"a clock of 0\.001 to 10000 MHz"),
+        ({"assume_polarity": 0}, "a polarity of 1 or -1"),
+        ({}, "give height and width"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            open_recording(tmp_path / "e.txt", **arguments)
+
+
+def test_a_size_that_differs_from_the_files_is_refused(tmp_path):
+    (tmp_path / "e.txt").write_text("18 12\n5 1 2 1\n")
+    with pytest.raises(RecordingError, match="the file states a height of 12 px, 13 was given"):
+        read_recording(tmp_path / "e.txt", height=13, width=18)
