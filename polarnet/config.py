@@ -19,6 +19,7 @@ from polarnet.evaluation.score import BenchmarkConfig
 from polarnet.lpips import LpipsConfig, lpips_problem
 from polarnet.networks.dolp_unet import DolpUNetConfig
 from polarnet.ranges import check_ranges
+from polarnet.recordings.dot import RecordingsConfig
 from polarnet.runtime import RuntimeConfig, configure
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import MotionConfig
@@ -71,6 +72,9 @@ class Paths:
     train_e2v: str
     benchmark: str
     report: str
+    imported: str
+    calibrated: str
+    benchmark_recordings: str
     resume: str
 
 
@@ -89,6 +93,7 @@ class Config:
     lpips: LpipsConfig
     baselines: BaselinesConfig
     benchmark: BenchmarkConfig
+    recordings: RecordingsConfig
     paths: Paths
     runtime: RuntimeConfig
     cluster: ClusterConfig

@@ -7,6 +7,7 @@ The scene drifts from right to left at constant speed. Above it runs a bright st
 from the right: the region in the upper right corner is bright until then. Each capture starts at a random time before.
 """
 
+import dataclasses
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -69,11 +70,11 @@ class RigTruth(NamedTuple):
     """When the mean in the landmark's region falls below the dark level, by each capture's own clock."""
     hot: frozenset[tuple[int, int]]
     """Rows and columns of hot pixels."""
-    t_us: Int64[np.ndarray, " n"]
-    """Of the frames below, from the landmark on."""
-    dolp: Float32[Tensor, "n h w"]
-    """What the reduced crop sees of the scene, without any noise."""
-    intensity: Float32[Tensor, "n 4 h w"]
+    scene: PolarizationScene
+    """What the sensor moves over, with stripe and landmark."""
+    path: "Drift"
+    landmark_us: int
+    """By the clock of the motion."""
 
 
 class Drift(Trajectory):
@@ -129,8 +130,8 @@ def write_rig(
         pictures = _pictures(scene, path, t_us + begin_us, polarizer, config, recordings, generator)
         write_celex5_pictures(folder / f"{capture}.bin", pictures, t_us.tolist())
 
-    truth = RigTruth(start_us, hot, *_true_frames(scene, path, landmark_us, config, recordings))
-    _write_truth(folder, truth, config)
+    truth = RigTruth(start_us, hot, scene, path, landmark_us)
+    _write_truth(folder, truth, config, recordings)
     return truth
 
 
@@ -154,21 +155,26 @@ def rig_scene(
     return PolarizationScene(torch.from_numpy(scene)), path
 
 
-def true_polarization(
-    scene: PolarizationScene, path: Drift, t_us: Int64[np.ndarray, " n"], recordings: RecordingsConfig
-) -> Float32[Tensor, "n 3 h w"]:
-    """Stokes pictures of the crop at times of the motion, averaged over areas to the final size."""
-    height, width = recordings.crop
-    centred = recordings.sensor[0] / 2 - recordings.crop_corner[0] - height / 2
-    centred_x = recordings.sensor[1] / 2 - recordings.crop_corner[1] - width / 2
-    moved = Drift(path.x - centred_x, path.y - centred, path.x_sines, path.y_sines, path.roll, path.zoom,
-                  path.speed_px_s)  # fmt: skip
+def true_intensity(
+    truth: RigTruth, t_us: Int64[np.ndarray, " n"], recordings: RecordingsConfig
+) -> Float32[Tensor, "n 4 h w"]:
+    """What the reduced crop sees behind the four polarizers at times from the landmark on, without any noise, 0 to 1."""
+    (height, width), (top, left) = recordings.crop, recordings.crop_corner
+    # the centre of the crop, seen from that of the sensor
+    right, down = left + (width - recordings.sensor[1]) / 2, top + (height - recordings.sensor[0]) / 2
+    path = dataclasses.replace(truth.path, x=truth.path.x + right, y=truth.path.y + down)
     frames = []
-    for t in t_us:
-        seen = render(scene, moved, np.array([t * 1e-6]), height, width)[0].permute(1, 2, 0).numpy()
-        small = cv2.resize(np.ascontiguousarray(seen), recordings.size[::-1], interpolation=cv2.INTER_AREA)
+    for t in t_us.tolist():
+        seen = render(truth.scene, path, np.array([(t + truth.landmark_us) * 1e-6]), height, width)[0]
+        planes = np.ascontiguousarray(stokes.intensities_from_stokes(seen).clamp(0, 1).permute(1, 2, 0).numpy())
+        small = cv2.resize(planes, tuple(recordings.size[::-1]), interpolation=cv2.INTER_AREA)
         frames.append(torch.from_numpy(small).permute(2, 0, 1))
     return torch.stack(frames)
+
+
+def true_dolp(truth: RigTruth, t_us: Int64[np.ndarray, " n"], recordings: RecordingsConfig) -> Float32[Tensor, "n h w"]:
+    """Of these intensities."""
+    return stokes.dolp(stokes.stokes_from_intensities(true_intensity(truth, t_us, recordings))).clamp(0, 1)
 
 
 def _landmark_us(scene: PolarizationScene, path: Drift, recordings: RecordingsConfig) -> int:
@@ -225,22 +231,16 @@ def _hot_events(
     return Events(*map(torch.from_numpy, (t[order], x, y, p)), height, width)
 
 
-def _true_frames(
-    scene: PolarizationScene, path: Drift, landmark_us: int, config: RigConfig, recordings: RecordingsConfig
-) -> tuple[Int64[np.ndarray, " n"], Float32[Tensor, "n h w"], Float32[Tensor, "n 4 h w"]]:
+def _write_truth(folder: Path, truth: RigTruth, config: RigConfig, recordings: RecordingsConfig) -> None:
     count = int(config.duration_s * recordings.frame_rate_hz) + 1
     t_us = np.rint(np.arange(count) * 1e6 / recordings.frame_rate_hz).astype(np.int64)
-    seen = true_polarization(scene, path, t_us + landmark_us, recordings)
-    return t_us, stokes.dolp(seen).clamp(0, 1), stokes.intensities_from_stokes(seen).clamp(0, 1)
-
-
-def _write_truth(folder: Path, truth: RigTruth, config: RigConfig) -> None:
-    np.savez(folder / "truth.npz", t_us=truth.t_us, dolp=truth.dolp.numpy())
+    dolp = true_dolp(truth, t_us, recordings).numpy()
+    np.savez(folder / "truth.npz", t_us=t_us, dolp=dolp)
     content = {
         "start_us": dict(truth.start_us),
         "speed_px_s": config.speed_px_s,
         "hot_pixels": sorted(truth.hot),
-        "mean_dolp": round(float(truth.dolp.mean()), 6),
+        "mean_dolp": round(float(dolp.mean()), 6),
         "dolp": "truth.npz: t_us from the landmark on, dolp of each of these times",
     }
     (folder / "truth.json").write_text(json.dumps(content, indent=2) + "\n")
