@@ -1,4 +1,4 @@
-"""A simulated rig (paper, section 4): a scene moves across a CeleX-5 eight times; eight files, and what is true of them.
+"""A simulated rig (paper, section 4): a scene moves across a CeleX-5 eight times; eight files, and what is true.
 
 It stands above `simulation`, which makes the light and the events, and above `recordings`, which knows the files: those
 two never import each other. What reads the files again sees nothing of this module.
@@ -158,7 +158,7 @@ def rig_scene(
 def true_intensity(
     truth: RigTruth, t_us: Int64[np.ndarray, " n"], recordings: RecordingsConfig
 ) -> Float32[Tensor, "n 4 h w"]:
-    """What the reduced crop sees behind the four polarizers at times from the landmark on, without any noise, 0 to 1."""
+    """What the reduced crop sees behind the polarizers at times from the landmark on, without any noise, 0 to 1."""
     (height, width), (top, left) = recordings.crop, recordings.crop_corner
     # the centre of the crop, seen from that of the sensor
     right, down = left + (width - recordings.sensor[1]) / 2, top + (height - recordings.sensor[0]) / 2

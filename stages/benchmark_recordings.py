@@ -8,7 +8,7 @@ from polarnet.evaluation.benchmark import run_benchmark, train_mean_dolp, write_
 from polarnet.evaluation.methods import Context
 from polarnet.events.frames import FrameStore
 from polarnet.events.store import EventStore
-from polarnet.recordings.targets import switched_off
+from polarnet.recordings.status import start_over
 from polarnet.reports.tables import as_plain, score_table
 from polarnet.runtime import device_of
 from polarnet.similarity import Lpips
@@ -18,7 +18,7 @@ from polarnet.similarity import Lpips
 def main(config: Config) -> None:
     """Recover, score, print: as the stage `benchmark`, whose networks and training mean these are."""
     folder, calibrated = Path(config.paths.benchmark_recordings), Path(config.paths.calibrated)
-    switched_off(folder)
+    start_over(folder, enabled=config.recordings.enabled)
     if not config.recordings.enabled:
         print("recordings.enabled is false")
         return
@@ -38,7 +38,6 @@ def main(config: Config) -> None:
     weights = json.loads((Path(config.paths.weights) / "lpips.json").read_text())
     about = {"lpips": weights, "train_mean": train_mean}
     metrics = write_benchmark(folder, benchmark, config.benchmark, config.seed, about)
-    (folder / "status.json").unlink()
     print(as_plain(score_table(metrics, lpips_reason=weights["reason"])))
 
 

@@ -4,7 +4,8 @@ import dataclasses
 from pathlib import Path
 
 from polarnet.config import Config, hydra_stage
-from polarnet.recordings.targets import calibrate_targets, switched_off
+from polarnet.recordings.status import start_over
+from polarnet.recordings.targets import calibrate_targets
 from polarnet.reports.calibration import draw_calibration
 
 
@@ -13,7 +14,7 @@ def main(config: Config) -> None:
     """Find start times, write both stores, and draw what they were found by."""
     out = Path(config.paths.calibrated)
     if not config.recordings.enabled:
-        switched_off(out)
+        start_over(out, enabled=False)
         print("recordings.enabled is false")
         return
     about = {"recordings": dataclasses.asdict(config.recordings)}

@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from polarnet.config import Config, hydra_stage
-from polarnet.recordings.targets import import_targets, switched_off
+from polarnet.recordings.imported import import_targets
+from polarnet.recordings.status import start_over
 
 
 @hydra_stage
@@ -11,7 +12,7 @@ def main(config: Config) -> None:
     """Decode every target, or say that recordings are switched off."""
     out = Path(config.paths.imported)
     if not config.recordings.enabled:
-        switched_off(out)
+        start_over(out, enabled=False)
         print("recordings.enabled is false")
         return
     try:

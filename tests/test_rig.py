@@ -23,7 +23,8 @@ from polarnet.recordings.dot import (
     read_event_capture,
     read_intensity_capture,
 )
-from polarnet.recordings.targets import calibrate_targets, import_targets, spread_us
+from polarnet.recordings.imported import import_targets
+from polarnet.recordings.targets import calibrate_targets, spread_us
 from polarnet.reports.calibration import draw_calibration
 from polarnet.rig import RigConfig, true_dolp, write_rig
 from polarnet.simulation.pictures.dead_leaves import dead_leaves

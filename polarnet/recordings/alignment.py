@@ -130,9 +130,7 @@ def best_lag(
             at_b = spread_at(b)
     lag_us = (low + high) / 2
     change = changes(found, lag_us, t_us, logs)
-    return Lag(
-        lag_us, agreement(found.polarity, change), searched, agreements, thresholds(found.polarity, change)
-    )
+    return Lag(lag_us, agreement(found.polarity, change), searched, agreements, thresholds(found.polarity, change))
 
 
 @numba.njit(nogil=True, cache=True)

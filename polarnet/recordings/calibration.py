@@ -73,9 +73,7 @@ def redundancy_shifts(
     Least squares, linearised in the shifts (Gauss-Newton), with mean 0; shifts that the scene does not determine,
     because all four see the same, stay near 0.
     """
-    stacks = [
-        _Stack(capture, start, config) for capture, start in zip(captures, start_us.tolist(), strict=True)
-    ]
+    stacks = [_Stack(capture, start, config) for capture, start in zip(captures, start_us.tolist(), strict=True)]
     first, last = max(stack.t_us[0] for stack in stacks), min(stack.t_us[-1] for stack in stacks)
     margin = 1000 * config.refine_within_ms / 2
     count = int((last - first - 2 * margin) / stacks[0].period_us)
@@ -106,9 +104,7 @@ class _Stack:
         self.period_us = float(np.median(np.diff(self.t_us)))
         self.frames = np.stack([reduced(picture, config) for picture in capture.pictures[chosen]])
 
-    def at(
-        self, t_us: Float64[np.ndarray, " n"]
-    ) -> tuple[Float32[np.ndarray, "n h w"], Float32[np.ndarray, "n h w"]]:
+    def at(self, t_us: Float64[np.ndarray, " n"]) -> tuple[Float32[np.ndarray, "n h w"], Float32[np.ndarray, "n h w"]]:
         """Pictures and their change per microsecond, by linear interpolation."""
         k = np.clip(np.searchsorted(self.t_us, t_us, side="right") - 1, 0, len(self.t_us) - 2)
         step = self.t_us[k + 1] - self.t_us[k]

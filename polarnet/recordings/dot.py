@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-
 from jaxtyping import Float32, Float64, Int64, UInt16
 from torch import Tensor
 
@@ -254,5 +253,3 @@ def targets_of(root: Path) -> list[str]:
     if not names:
         raise RecordingError(f"{root}: expected a folder for each target with its eight captures, there is none")
     return names
-
-

@@ -44,7 +44,9 @@ def register(reference: Float32[np.ndarray, "h w"], moving: Float32[np.ndarray, 
     if reference.shape != moving.shape:
         raise RecordingError(f"expected two event images of one size, got {reference.shape} and {moving.shape}")
     (shift_x, shift_y), _ = cv2.phaseCorrelate(
-        reference.astype(np.float64), moving.astype(np.float64), cv2.createHanningWindow(reference.shape[::-1], cv2.CV_64F)
+        reference.astype(np.float64),
+        moving.astype(np.float64),
+        cv2.createHanningWindow(reference.shape[::-1], cv2.CV_64F),
     )
     warp = np.array([[1, 0, shift_x], [0, 1, shift_y], [0, 0, 1]], np.float32)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, ITERATIONS, CHANGE)
@@ -57,7 +59,9 @@ def register(reference: Float32[np.ndarray, "h w"], moving: Float32[np.ndarray, 
         to_coarse = np.diag([1 / scale, 1 / scale, 1]).astype(np.float32)
         coarse = to_coarse @ warp @ np.linalg.inv(to_coarse)
         try:
-            correlation, coarse = cv2.findTransformECC(a, b, coarse.astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria, None, BLUR)
+            correlation, coarse = cv2.findTransformECC(
+                a, b, coarse.astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria, None, BLUR
+            )
         except cv2.error as error:
             raise RecordingError(
                 "the two event images show too little in common to lay them on each other; record something with many "

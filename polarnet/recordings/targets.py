@@ -1,13 +1,10 @@
-"""Division-of-time captures from files to the stores that every later stage reads: imported, then on one clock.
+"""Imported division-of-time captures on one clock, in the stores that every later stage reads.
 
-`import_targets` decodes the eight files of every target once. `calibrate_targets` finds the start times and writes
-`events.zarr` and `frames.zarr`, the same stores as those of simulated sequences, with every target in the split `test`.
+They are the same as those of simulated sequences, `events.zarr` and `frames.zarr`; all targets are in the split `test`.
 """
 
-import hashlib
 import itertools
 import json
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,30 +24,16 @@ from polarnet.recordings.dot import (
     INTENSITY_CAPTURES,
     IntensityCapture,
     RecordingsConfig,
-    find_captures,
-    given_starts,
     landmark_starts,
-    read_event_capture,
-    read_intensity_capture,
     reduced,
     region_negative_times_us,
-    targets_of,
 )
+from polarnet.recordings.imported import Target, open_target, shifted
 from polarnet.recordings.pixels import hot_pixels, without_pixels
 from polarnet.recordings.source import RecordingError
+from polarnet.recordings.status import start_over
 
-STATUS_FILE = "status.json"
 WHITE = 255.0  # of reduced pictures
-
-
-class Target(NamedTuple):
-    """The eight captures of one target as `import_targets` left them."""
-
-    name: str
-    events: Mapping[str, Events]
-    intensities: Mapping[str, IntensityCapture]
-    given: Mapping[str, int]
-    """Start times set by hand."""
 
 
 class Calibrated(NamedTuple):
@@ -72,64 +55,16 @@ class Calibrated(NamedTuple):
     duration_us: int
 
 
-def import_targets(root: Path, out: Path, config: RecordingsConfig) -> list[str]:
-    """Decode every target of `root` into `out`; their names.
-
-    `out` gets events.zarr (the four event captures of a target as its channels, each by its own clock from its first
-    event on), a folder of pictures for each target, and status.json. RecordingError where a file is missing or damaged.
-    """
-    names = targets_of(root)
-    _start_over(out, enabled=True)
-    attributes = {
-        "sensor": list(config.sensor),
-        "files": {name: {key: _digest(path) for key, path in find_captures(root / name).items()} for name in names},
-    }
-    store = EventStore.create(out / "events.zarr", names, config.sensor[0], config.sensor[1], attributes)
-    for name in names:
-        files = find_captures(root / name)
-        channels, origins = [], {}
-        for capture in EVENT_CAPTURES:
-            events = read_event_capture(files[capture], config)
-            origins[capture] = int(events.t[0]) if len(events) else 0
-            channels.append(_shifted(events, origins[capture]))
-        store.write(name, channels, max((int(e.t[-1]) for e in channels if len(e)), default=0))
-        folder = out / name
-        folder.mkdir()
-        for capture in INTENSITY_CAPTURES:
-            pictures = read_intensity_capture(files[capture], config)
-            np.save(folder / f"{capture}.npy", pictures.pictures)
-            np.savez(folder / f"{capture}_times.npz", t_us=pictures.t_us, region=pictures.region)
-        content = {"origin_us": origins, "given_us": given_starts(root / name)}
-        (folder / "clocks.json").write_text(json.dumps(content, indent=2) + "\n")
-    store.finish()
-    return names
-
-
-def open_target(imported: Path, name: str) -> Target:
-    """A target again, its events by the clocks of their files; pictures are mapped into memory, not read."""
-    folder = imported / name
-    clocks = json.loads((folder / "clocks.json").read_text())
-    channels = EventStore.open(imported / "events.zarr").read(name)
-    events = {
-        capture: _shifted(channel, -clocks["origin_us"][capture])
-        for capture, channel in zip(EVENT_CAPTURES, channels, strict=True)
-    }
-    intensities = {}
-    for capture in INTENSITY_CAPTURES:
-        with np.load(folder / f"{capture}_times.npz") as times:
-            pictures = np.load(folder / f"{capture}.npy", mmap_mode="r")
-            intensities[capture] = IntensityCapture(times["t_us"], pictures, times["region"])
-    return Target(name, events, intensities, clocks["given_us"])
-
-
-def calibrate_targets(imported: Path, out: Path, config: RecordingsConfig, about: Mapping[str, Any]) -> list[Calibrated]:
+def calibrate_targets(
+    imported: Path, out: Path, config: RecordingsConfig, about: Mapping[str, Any]
+) -> list[Calibrated]:
     """Put every imported target on one clock and write events.zarr, frames.zarr and calibration.json into `out`.
 
     `about` becomes the stores' attributes.
     """
     source = EventStore.open(imported / "events.zarr")
     names, (height, width) = source.sequences, config.size
-    _start_over(out, enabled=True)
+    start_over(out, enabled=True)
     longest_us = max(source.duration_us(name) for name in names)
     events = EventStore.create(out / "events.zarr", names, height, width, about)
     frames = FrameStore.create(
@@ -199,16 +134,16 @@ def calibrate_target(target: Target, config: RecordingsConfig) -> tuple[Calibrat
 def aligned(
     target: Target, found: Calibrated, config: RecordingsConfig
 ) -> tuple[list[Events], Int64[Tensor, " n"], Float32[Tensor, "n 4 h w"]]:
-    """Events of the four channels of a target without hot pixels from the common start on, and at each frame time the four intensities in [0, 1].
+    """The sequence of a target without hot pixels: events of its four channels, frame times, intensities in [0, 1].
 
-    Events: the crop, reduced by `downscale` with the rule `keep_event_rate`. Intensities: reduced pictures, linearly
-    interpolated between the two that were taken before and after.
+    Events: those of the crop from the common start on, reduced by `downscale` with the rule `keep_event_rate`.
+    Intensities: reduced pictures, interpolated between those taken before and after the frame's time.
     """
     t_us = frame_times_us(found.duration_us, config)
     channels = []
     for capture in EVENT_CAPTURES:
         events, start = target.events[capture], found.start_us[capture]
-        during = _shifted(slice_time(events, start, start + int(t_us[-1]) + 1), start)
+        during = shifted(slice_time(events, start, start + int(t_us[-1]) + 1), start)
         part = crop(during, *config.crop_corner, *config.crop)
         channels.append(downscale(part, config.size[0], config.size[1], keep_rate=config.keep_event_rate))
     planes = [interpolated(target.intensities[c], t_us + found.start_us[c], config) for c in INTENSITY_CAPTURES]
@@ -232,26 +167,6 @@ def frame_times_us(duration_us: int, config: RecordingsConfig) -> Int64[np.ndarr
     """Times of ground-truth frames, from the start on."""
     count = int(duration_us * 1e-6 * config.frame_rate_hz) + 1
     return np.rint(np.arange(count) * 1e6 / config.frame_rate_hz).astype(np.int64)
-
-
-def switched_off(out: Path) -> None:
-    """What a stage leaves where recordings are not in use: a folder that says so."""
-    _start_over(out, enabled=False)
-
-
-def _start_over(out: Path, *, enabled: bool) -> None:
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir(parents=True)
-    (out / STATUS_FILE).write_text(json.dumps({"enabled": enabled}) + "\n")
-
-
-def _shifted(events: Events, origin_us: int) -> Events:
-    return Events(events.t - origin_us, events.x, events.y, events.p, events.height, events.width)
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _record(found: Calibrated) -> dict[str, Any]:

@@ -23,7 +23,9 @@ def draw_calibration(found: Calibrated, config: RecordingsConfig, path: Path) ->
     _draw_landmark_pictures(pictures, found, config)
     _draw_lags(lags, found)
     _draw_thresholds(levels, found)
-    figure.suptitle(f"{found.name}: {found.duration_us * 1e-6:.2f} s, hot pixels {', '.join(map(str, found.hot.values()))}")
+    figure.suptitle(
+        f"{found.name}: {found.duration_us * 1e-6:.2f} s, hot pixels {', '.join(map(str, found.hot.values()))}"
+    )
     path.write_bytes(png(figure))
 
 

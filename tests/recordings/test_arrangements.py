@@ -45,11 +45,11 @@ def test_four_files_in_any_order_become_the_channels_0_45_90_135(tmp_path):
 
 def test_an_angle_that_is_missing_or_twice_there_is_refused(tmp_path):
     with pytest.raises(RecordingError, match=r"one file for each of 0, 45, 90 and 135 degrees, got \[0, 45, 90\]"):
-        read_four({angle: tmp_path / "a" for angle in (0, 45, 90)})
+        read_four(dict.fromkeys((0, 45, 90), tmp_path / "a"))
     with pytest.raises(RecordingError, match=r"got \[0, 45, 90, 135, 180\]"):
-        read_four({angle: tmp_path / "a" for angle in (0, 45, 90, 135, 180)})
+        read_four(dict.fromkeys((0, 45, 90, 135, 180), tmp_path / "a"))
     with pytest.raises(RecordingError, match="a start for each of the angles"):
-        read_four({angle: tmp_path / "a" for angle in ANGLES}, {0: 1})
+        read_four(dict.fromkeys(ANGLES, tmp_path / "a"), {0: 1})
 
 
 @pytest.mark.parametrize("order", ["90 45 / 135 0", "0 45 / 90 135"])
@@ -57,9 +57,7 @@ def test_a_mosaic_gives_each_channel_the_pixels_of_its_angle(order):
     mosaic = parse_mosaic(order)
     y, x = (axis.ravel() for axis in np.indices((5, 6)))  # every pixel once; the last row is of no cell
     t = torch.arange(30)
-    events = Events(
-        t, *(torch.from_numpy(c.astype(np.int16)) for c in (x, y)), torch.ones(30, dtype=torch.int8), 5, 6
-    )
+    events = Events(t, *(torch.from_numpy(c.astype(np.int16)) for c in (x, y)), torch.ones(30, dtype=torch.int8), 5, 6)
     channels = split_mosaic(events, mosaic)
     assert sum(map(len, channels)) == 24
     for angle, channel in zip(ANGLES, channels, strict=True):

@@ -55,7 +55,9 @@ def test_an_intensity_capture_starts_with_the_first_picture_whose_mean_is_below_
 
 
 def test_a_region_that_is_never_or_always_dark_has_no_start(config):
-    with pytest.raises(RecordingError, match=r"a: no picture is darker than 30 .* darkest has mean 31\.0; set the start"):
+    with pytest.raises(
+        RecordingError, match=r"a: no picture is darker than 30 .* darkest has mean 31\.0; set the start"
+    ):
         intensity_start_us("a", pictures([100.0, 31.0]), config)
     with pytest.raises(RecordingError, match=r"a: the first picture is dark .* already \(mean 3\.0\)"):
         intensity_start_us("a", pictures([3.0, 4.0]), config)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float32, Float64, Shaped
 from torch import Tensor
 
 from polarnet.simulation.pictures.images import UnreadablePicture, read_channels
-from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, parse_mosaic
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 
 ANGLE_SUFFIX = re.compile(r"(?P<name>.+)_0*(?P<angle>0|45|90|135)")
 WHITE_LEVELS = (2**10 - 1, 2**12 - 1, 2**14 - 1, 2**16 - 1)  # of sensors whose values come as 16 bits
