@@ -62,11 +62,13 @@ def register(reference: Float32[np.ndarray, "h w"], moving: Float32[np.ndarray, 
             correlation, coarse = cv2.findTransformECC(
                 a, b, coarse.astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria, None, BLUR
             )
-        except cv2.error as error:
+        except cv2.error:
+            correlation = 0.0
+        if not correlation > 0:  # false for NaN too
             raise RecordingError(
                 "the two event images show too little in common to lay them on each other; record something with many "
-                f"edges that moves in front of both cameras ({error.err})"
-            ) from None
+                "edges that moves in front of both cameras"
+            )
         warp = (np.linalg.inv(to_coarse) @ coarse @ to_coarse).astype(np.float32)
     homography = np.linalg.inv(warp.astype(np.float64))
     return Registration(homography / homography[2, 2], float(correlation))

@@ -1,8 +1,8 @@
 """How well a simulated rig is calibrated: python tests/benchmarks/rig.py [--write] [--targets N] [--full]
 
 Each target is another picture: photographs of scikit-image and dead leaves. Its eight captures, written as CeleX-5
-files with random delays, sensor noise and hot pixels, go through `import_recordings` and `calibrate`. Printed: errors of
-start times by the landmark (in pictures of the camera) and refined (in milliseconds, but for what all eight have in
+files with random delays, sensor noise and hot pixels, are imported and calibrated as the stages do it. Printed: errors
+of start times by the landmark (in pictures of the camera) and refined (in milliseconds, but for what all eight have in
 common, as the zero of their clock is a convention), the root mean square difference of the DoLP from the scene's own,
 thresholds, and the benchmark's table, with the networks in data/train and data/train_e2v where there are any.
 
