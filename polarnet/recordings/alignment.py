@@ -16,6 +16,7 @@ from jaxtyping import Float32, Float64, Int8, Int64, UInt16
 from polarnet.events.stream import Events
 
 DARKEST = 64.0  # of 4095: the logarithm of less is mostly noise
+BRIGHT = 400.0  # of 4095: in darker pixels a sensor answers less than the logarithm, so its threshold is another
 LARGEST_CHANGE = 1.0  # natural-log intensity; more between two events is no step of one threshold
 MOST_STEPS = 300_000
 STEP_US = 2_000  # of the first search
@@ -35,7 +36,7 @@ class Steps(NamedTuple):
 
 
 class Thresholds(NamedTuple):
-    """Contrast thresholds of a channel, steps of natural-log intensity; NaN where no event says anything."""
+    """Contrast thresholds of a channel in its bright pixels, steps of natural-log intensity; NaN without any event."""
 
     on: float
     off: float
@@ -130,7 +131,8 @@ def best_lag(
             at_b = spread_at(b)
     lag_us = (low + high) / 2
     change = changes(found, lag_us, t_us, logs)
-    return Lag(lag_us, agreement(found.polarity, change), searched, agreements, thresholds(found.polarity, change))
+    of_bright = changes(found, lag_us, t_us, np.where(logs < np.log(np.float32(BRIGHT)), np.float32(np.nan), logs))
+    return Lag(lag_us, agreement(found.polarity, change), searched, agreements, thresholds(found.polarity, of_bright))
 
 
 @numba.njit(nogil=True, cache=True)
@@ -168,4 +170,4 @@ def _changes(before, after, pixel, lag, times, logs):
 def _at(t, pixel, times, logs):
     k = min(np.searchsorted(times, t, side="right") - 1, len(times) - 2)
     share = (t - times[k]) / (times[k + 1] - times[k])
-    return (1 - share) * logs[k, pixel] + share * logs[k + 1, pixel]
+    return logs[k, pixel] + share * (logs[k + 1, pixel] - logs[k, pixel])

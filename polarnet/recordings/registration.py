@@ -36,7 +36,7 @@ def event_image(events: Events) -> Float32[np.ndarray, "h w"]:
     return image / max(float(image.max()), 1e-6)
 
 
-def register(reference: Float32[np.ndarray, "h w"], moving: Float32[np.ndarray, "h w"]) -> Registration:
+def register(reference: Float32[np.ndarray, "h w"], moving: Float32[np.ndarray, "h2 w2"]) -> Registration:
     """The homography that takes pixels of `moving` to those of `reference`.
 
     RecordingError where the images do not show the same: no shift of one correlates with the other.
