@@ -35,6 +35,7 @@ from polarnet.simulation.synthesize import synthesize_sequence
 
 STRIPE_S0, LANDMARK_S0 = 0.8, 0.04  # unpolarized
 SHORTEST_DELAY_S = 0.08  # between the start of a capture and the landmark
+HOT_HZ = (1500.0, 3000.0)
 BORDER = 2  # pixels of scene around what is seen
 _STILL = Sine(0.0, 0.0, 0.0)
 
@@ -55,7 +56,7 @@ class RigConfig:
     read_noise: float = field(metadata=allowed(low=0))
     """Of a picture, in steps of 12 bits."""
     hot_pixels: int = field(metadata=allowed(low=0))
-    """In event captures, each firing a few hundred times a second; the same ones in all four."""
+    """In event captures, each firing a few thousand times a second; the same ones in all four."""
     file_type: str = field(metadata=allowed(choices=("bin", "csv")))
     """Of event captures; pictures are BIN always."""
 
@@ -221,14 +222,15 @@ def _hot_events(
 ) -> Events:
     times, pixels = [np.empty(0, np.int64)], [np.empty((0, 2), np.int16)]
     for pixel in sorted(hot):
-        count = generator.poisson(generator.uniform(200, 800) * total_us * 1e-6)
+        count = generator.poisson(generator.uniform(*HOT_HZ) * total_us * 1e-6)
         times.append(generator.integers(0, total_us, count))
         pixels.append(np.tile(np.array(pixel, np.int16), (count, 1)))
     t, yx = np.concatenate(times), np.concatenate(pixels)
     order = np.argsort(t, kind="stable")
     p = np.where(generator.random(len(t)) < 0.5, np.int8(1), np.int8(-1))
     y, x = np.ascontiguousarray(yx[order].T)
-    return Events(*map(torch.from_numpy, (t[order], x, y, p)), height, width)
+    from_numpy = torch.from_numpy
+    return Events(from_numpy(t[order]), from_numpy(x), from_numpy(y), from_numpy(p), height, width)
 
 
 def _write_truth(folder: Path, truth: RigTruth, config: RigConfig, recordings: RecordingsConfig) -> None:

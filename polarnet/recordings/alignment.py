@@ -132,6 +132,8 @@ def best_lag(
     lag_us = (low + high) / 2
     change = changes(found, lag_us, t_us, logs)
     of_bright = changes(found, lag_us, t_us, np.where(logs < np.log(np.float32(BRIGHT)), np.float32(np.nan), logs))
+    # of quicker steps the pictures show too little: between two of them the light did not change evenly
+    of_bright[found.after_us - found.before_us < np.median(np.diff(t_us))] = np.nan
     return Lag(lag_us, agreement(found.polarity, change), searched, agreements, thresholds(found.polarity, of_bright))
 
 

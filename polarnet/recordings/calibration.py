@@ -125,6 +125,6 @@ def _lag(
     """By how much the pictures run later than the events, from these starts."""
     chosen = pictures_after(capture, picture_start_us)
     t_us = capture.t_us[chosen] - picture_start_us + event_start_us
-    found = steps(events, config.crop_corner, tuple(config.crop), int(t_us[0]), int(t_us[-1]))
+    found = steps(events, config.crop_corner, (config.crop[0], config.crop[1]), int(t_us[0]), int(t_us[-1]))
     logs = logarithms(capture.pictures[chosen])
     return best_lag(found, t_us, logs, 1000 * config.refine_within_ms)

@@ -58,9 +58,10 @@ def register(reference: Float32[np.ndarray, "h w"], moving: Float32[np.ndarray, 
         a, b = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (reference, moving))
         to_coarse = np.diag([1 / scale, 1 / scale, 1]).astype(np.float32)
         coarse = to_coarse @ warp @ np.linalg.inv(to_coarse)
+        everywhere = np.ones(a.shape, np.uint8)
         try:
             correlation, coarse = cv2.findTransformECC(
-                a, b, coarse.astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria, None, BLUR
+                a, b, coarse.astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria, everywhere, BLUR
             )
         except cv2.error:
             correlation = 0.0

@@ -13,7 +13,7 @@ PERIOD_US = 16_667
 
 def log_light(t_s, pixel):
     """Smooth, different in every pixel."""
-    return 5.5 + np.sin(2 * np.pi * (3 + pixel / 7) * t_s + pixel) + 0.4 * np.sin(2 * np.pi * 7.3 * t_s + 2 * pixel)
+    return 6.6 + np.sin(2 * np.pi * (3 + pixel / 7) * t_s + pixel) + 0.4 * np.sin(2 * np.pi * 7.3 * t_s + 2 * pixel)
 
 
 @pytest.fixture(scope="module")
