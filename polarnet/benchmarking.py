@@ -62,30 +62,31 @@ def set_folder(config: Config, name: str) -> Path:
 
 def run_pipeline_benchmark(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
     """Run all of `benchmark.sets` and write what each gave; set, then method: the metrics."""
+    (Path(config.paths.benchmark) / "sets").mkdir(parents=True, exist_ok=True)
+    return {
+        name: run_on(config, pipeline_set(config, name), set_folder(config, name)) for name in config.benchmark.sets
+    }
+
+
+def run_on(config: Config, test_set: BenchmarkSet, folder: Path) -> dict[str, dict[str, Any]]:
+    """Run the methods whose weights are there on a set, write what they gave to `folder`; method: the metrics."""
     train_mean = train_mean_dolp(FrameStore.open(config.paths.frames), config.benchmark.warmup_windows)
     context = context_of(config, train_mean)
-    lpips = Lpips.load(config.paths.weights)
     methods, left_out = available(config.benchmark.methods, context)
     for method, reason in left_out.items():
         print(f"{method} is left out: {reason}")
     settings = dataclasses.replace(config.benchmark, methods=methods)
+    lpips, mapper = Lpips.load(config.paths.weights), mapper_of(config, test_set.name)
+    benchmark = run_benchmark(test_set, context, settings, lpips, cache_of(config), mapper)
     about = {
+        "set": test_set.name,
         "lpips": lpips_record(config),
         "train_mean": train_mean,
         "left_out": left_out,
         "weights": weights_used(methods, context),
         "postprocessing": dataclasses.asdict(context.postprocessing),
     }
-    results = {}
-    (Path(config.paths.benchmark) / "sets").mkdir(parents=True, exist_ok=True)
-    for name in config.benchmark.sets:
-        benchmark = run_benchmark(
-            pipeline_set(config, name), context, settings, lpips, cache_of(config), mapper_of(config, name)
-        )
-        results[name] = write_benchmark(
-            set_folder(config, name), benchmark, settings, config.seed, {"set": name} | about
-        )
-    return results
+    return write_benchmark(folder, benchmark, settings, config.seed, about)
 
 
 def cache_of(config: Config) -> Path:

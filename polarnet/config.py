@@ -23,6 +23,7 @@ from polarnet.experiments import BASE
 from polarnet.lpips import LpipsConfig, lpips_problem
 from polarnet.networks.dolp_unet import DolpUNetConfig
 from polarnet.ranges import check_ranges
+from polarnet.recordings.dot import RecordingsConfig
 from polarnet.runtime import RuntimeConfig, configure
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import MotionConfig
@@ -83,6 +84,9 @@ class Paths:
     sets: str
     benchmark: str
     report: str
+    imported: str
+    calibrated: str
+    benchmark_recordings: str
     resume: str
     cache: str
 
@@ -103,6 +107,7 @@ class Config:
     baselines: BaselinesConfig
     benchmark: BenchmarkConfig
     sets: SetsConfig
+    recordings: RecordingsConfig
     paths: Paths
     runtime: RuntimeConfig
     cluster: ClusterConfig

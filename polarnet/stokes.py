@@ -1,12 +1,16 @@
 """Polarization optics: Stokes vectors, DoLP, AoLP and what a polarizer lets through (paper Eq. 1-4)."""
 
 import math
+import re
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 POLARIZER_ANGLES_DEG = (0, 45, 90, 135)
+
+Mosaic = tuple[tuple[int, int], tuple[int, int]]
+"""Polarizer angles over 2x2 pixels: of the even row, then of the odd one."""
 
 
 def stokes_from_intensities(intensities: Float[Tensor, "*b 4 h w"]) -> Float[Tensor, "*b 3 h w"]:
@@ -55,3 +59,12 @@ def aolp(stokes: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
     angle = torch.atan2(s2, s1) / 2
     folded = torch.where(angle < 0, angle + math.pi, angle)
     return torch.where(folded >= math.pi, 0.0, folded)  # -1e-9 + pi rounds to pi
+
+
+def parse_mosaic(order: str) -> Mosaic:
+    """Angles of a 2x2 mosaic from text like "90 45 / 135 0": the even row, then the odd; ValueError otherwise."""
+    match = re.fullmatch(r"\s*(\d+)\s+(\d+)\s*/\s*(\d+)\s+(\d+)\s*", order)
+    angles = [int(angle) for angle in match.groups()] if match else []
+    if sorted(angles) != sorted(POLARIZER_ANGLES_DEG):
+        raise ValueError(f'mosaic: expected the angles 0, 45, 90 and 135 like "90 45 / 135 0", got {order!r}')
+    return (angles[0], angles[1]), (angles[2], angles[3])

@@ -41,6 +41,7 @@ def test_the_stages_come_in_the_order_they_run_in(capsys, project_root, monkeypa
     assert main(["stages"]) == 0
     assert capsys.readouterr().out.split() == [
         "ingest", "synthesize", "emulate", "weights", "train", "train_e2v", "train_e2p", "sets", "benchmark", "report",
+        "import_recordings", "calibrate", "benchmark_recordings",
     ]  # fmt: skip
 
 

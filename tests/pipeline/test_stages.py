@@ -31,7 +31,7 @@ TINY = [
     "baselines.e2p.crop=null",
     "baselines.e2p.visits=1",
     "baselines.e2p.windows=3",
-    "benchmark.methods=[zeros,train_mean,oracle_mean,cf,highpass,cf+gain,firenet,e2vid,firenet_published,e2p,ours]",
+    "benchmark.methods=[zeros,train_mean,oracle_mean,cf,highpass,cf+gain,e2v,e2vid,firenet_published,e2p,ours]",
     "benchmark.warmup_windows=1",
     "benchmark.bootstrap_samples=20",
     "benchmark.panel_scenes=1",
@@ -64,10 +64,10 @@ def data(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_benchmark_has_a_row_for_every_method_and_says_that_lpips_is_missing(data):
     metrics = json.loads((data / "benchmark" / "metrics.json").read_text())
-    assert set(metrics) == {"zeros", "train_mean", "oracle_mean", "cf", "highpass", "cf+gain", "firenet", "e2p", "ours"}
+    assert set(metrics) == {"zeros", "train_mean", "oracle_mean", "cf", "highpass", "cf+gain", "e2v", "e2p", "ours"}
     details = json.loads((data / "benchmark" / "details.json").read_text())
     assert set(details["left_out"]) == {"e2vid", "firenet_published"}
-    assert set(details["weights"]) == {"firenet", "e2p", "ours"}
+    assert set(details["weights"]) == {"e2v", "e2p", "ours"}
     weights = json.loads((data / "weights" / "lpips.json").read_text())
     for method, row in metrics.items():
         assert {"mse", "psnr", "ssim", "lpips", "corr", "ms_per_window"} <= set(row), method

@@ -29,11 +29,11 @@ from polarnet.simulation.pictures.images import (
 from polarnet.simulation.pictures.manifest import Manifest, ManifestEntry, Skipped, split_by_content, write_manifest
 from polarnet.simulation.pictures.polarimetry import (
     group_by_measurement,
-    parse_mosaic,
     read_measurement,
     shrink,
     write_intensities,
 )
+from polarnet.stokes import parse_mosaic
 
 logger = logging.getLogger(__name__)
 

@@ -16,14 +16,12 @@ from jaxtyping import Bool, Float32, Float64, Shaped
 from torch import Tensor
 
 from polarnet.simulation.pictures.images import UnreadablePicture, read_channels
-from polarnet.stokes import POLARIZER_ANGLES_DEG
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 
 ANGLE_SUFFIX = re.compile(r"(?P<name>.+)_0*(?P<angle>0|45|90|135)")
 WHITE_LEVELS = (2**10 - 1, 2**12 - 1, 2**14 - 1, 2**16 - 1)  # of sensors whose values come as 16 bits
 STEPS = 2**16 - 1  # of the files written here
 NPZ_KEYS = tuple(f"I{angle}" for angle in POLARIZER_ANGLES_DEG)
-
-Mosaic = tuple[tuple[int, int], tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -34,15 +32,6 @@ class Measurement:
     valid: Bool[np.ndarray, "h w"]  # False where saturation hides what the light was
     residual: float  # median of |I0 + I90 - I45 - I135| / S0 over unsaturated, lit pixels; 0 for ideal polarizers
     saturated: float  # share of pixels with at least one saturated angle
-
-
-def parse_mosaic(order: str) -> Mosaic:
-    """Angles of a 2x2 mosaic from text like "90 45 / 135 0": the even row, then the odd; ValueError otherwise."""
-    match = re.fullmatch(r"\s*(\d+)\s+(\d+)\s*/\s*(\d+)\s+(\d+)\s*", order)
-    angles = [int(angle) for angle in match.groups()] if match else []
-    if sorted(angles) != sorted(POLARIZER_ANGLES_DEG):
-        raise ValueError(f'mosaic: expected the angles 0, 45, 90 and 135 like "90 45 / 135 0", got {order!r}')
-    return (angles[0], angles[1]), (angles[2], angles[3])
 
 
 def group_by_measurement(files: Sequence[Path]) -> list[tuple[Path, ...]]:

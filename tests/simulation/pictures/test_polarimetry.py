@@ -18,7 +18,6 @@ from polarnet.simulation.pictures.polarimetry import (
     Measurement,
     demosaic,
     group_by_measurement,
-    parse_mosaic,
     read_intensities,
     read_measurement,
     shrink,
@@ -27,7 +26,7 @@ from polarnet.simulation.pictures.polarimetry import (
 from polarnet.simulation.scene import scene_from_intensities
 from polarnet.simulation.scenes import SceneStore
 from polarnet.simulation.truth import synthesize
-from polarnet.stokes import aolp, dolp
+from polarnet.stokes import aolp, dolp, parse_mosaic
 
 SONY = parse_mosaic("90 45 / 135 0")
 ANGLES = (0, 45, 90, 135)

@@ -1,0 +1,175 @@
+"""Start times of eight captures, finer than a picture: events and intensity changes must agree over the whole picture.
+
+Between two events of a pixel its log intensity has changed by one contrast threshold, in the direction of the second
+event, whatever the light did in between. So where the clocks of an event capture and an intensity capture behind the
+same polarizer agree, the change that the pictures show between two events, counted in the direction of the second, is
+the same over the whole picture, and is the threshold. Sums of events per picture would not do: an event comes after its
+change, which makes them late by milliseconds.
+"""
+
+from typing import NamedTuple, no_type_check
+
+import numba
+import numpy as np
+from jaxtyping import Float32, Float64, Int8, Int64, UInt16
+
+from polarnet.events.stream import Events
+
+DARKEST = 64.0  # of 4095: the logarithm of less is mostly noise
+BRIGHT = 400.0  # of 4095: in darker pixels a sensor answers less than the logarithm, so its threshold is another
+LARGEST_CHANGE = 1.0  # natural-log intensity; more between two events is no step of one threshold
+MOST_STEPS = 300_000
+STEP_US = 2_000  # of the first search
+FINEST_US = 20.0
+GOLDEN = (5**0.5 - 1) / 2
+
+
+class Steps(NamedTuple):
+    """Pairs of consecutive events of a pixel of the crop."""
+
+    before_us: Int64[np.ndarray, " n"]
+    after_us: Int64[np.ndarray, " n"]
+    pixel: Int64[np.ndarray, " n"]
+    """Row by row."""
+    polarity: Int8[np.ndarray, " n"]
+    """Of the second."""
+
+
+class Thresholds(NamedTuple):
+    """Contrast thresholds of a channel in its bright pixels, steps of natural-log intensity; NaN without any event."""
+
+    on: float
+    off: float
+
+
+class Lag(NamedTuple):
+    """How much later one capture runs than was thought, against another."""
+
+    lag_us: float
+    agreement: float
+    """Correlation of polarities and changes there, -1 to 1."""
+    searched_us: Float64[np.ndarray, " n"]
+    """The lags of the first search ..."""
+    agreements: Float64[np.ndarray, " n"]
+    """... and the agreement at each."""
+    thresholds: Thresholds
+
+
+def steps(events: Events, corner: tuple[int, int], crop: tuple[int, int], start_us: int, stop_us: int) -> Steps:
+    """All pairs between two times, or every so many of them that 300,000 remain."""
+    found = _steps(events.t.numpy(), events.x.numpy(), events.y.numpy(), events.p.numpy(), *corner, *crop)
+    inside = (found[0] >= start_us) & (found[1] < stop_us)
+    sample = np.flatnonzero(inside)
+    sample = sample[:: max(1, -(-len(sample) // MOST_STEPS))]
+    return Steps(*(column[sample] for column in found))
+
+
+def logarithms(pictures: UInt16[np.ndarray, "n h w"]) -> Float32[np.ndarray, "n hw"]:
+    """Log intensity of each pixel, a row for each picture; NaN where it is too dark."""
+    values = pictures.reshape(len(pictures), -1).astype(np.float32)
+    values[values < DARKEST] = np.nan
+    return np.log(values, out=values)
+
+
+def changes(
+    found: Steps, lag_us: float | int, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"]
+) -> Float64[np.ndarray, " m"]:
+    """Change of log intensity over each step as the pictures taken at `t_us` show it `lag_us` later.
+
+    Between pictures it is interpolated. NaN where a step is not between the pictures, or too dark.
+    """
+    return _changes(found.before_us, found.after_us, found.pixel, float(lag_us), t_us.astype(np.float64), logs)
+
+
+def agreement(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) -> float:
+    """Correlation of polarities with changes: 1 if every change is one and the same threshold. Large changes count as
+    less, NaN not at all; 0 where nothing is left."""
+    known = np.isfinite(change)
+    clipped = np.clip(change[known], -LARGEST_CHANGE, LARGEST_CHANGE)
+    norm = np.sqrt(np.dot(clipped, clipped) * len(clipped))
+    return float(np.dot(polarity[known], clipped) / norm) if norm > 0 else 0.0
+
+
+def spread(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) -> float:
+    """Variance of the changes in the direction of the polarities, large ones clipped: only noise is left of it where
+    every change is one threshold. Unlike `agreement`, noise in the pictures does not move its extremum."""
+    known = np.isfinite(change)
+    return float(np.var(np.clip(polarity[known] * change[known], -LARGEST_CHANGE, LARGEST_CHANGE)))
+
+
+def thresholds(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) -> Thresholds:
+    """The medians of the changes between events, for each polarity of the second."""
+    on, off = (change[np.isfinite(change) & (polarity == sign)] * sign for sign in (1, -1))
+    return Thresholds(*(float(np.median(values)) if len(values) else np.nan for values in (on, off)))
+
+
+def best_lag(
+    found: Steps, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"], within_us: float | int
+) -> Lag:
+    """How much later the pictures' clock runs than the events': the lag at which they agree best.
+
+    A regular search every 2 ms for the largest agreement, then golden sections for the smallest spread, to 20 us.
+    """
+
+    def spread_at(lag_us: float) -> float:
+        return spread(found.polarity, changes(found, lag_us, t_us, logs))
+
+    searched = np.arange(-within_us, within_us + STEP_US / 2, STEP_US)
+    agreements = np.array([agreement(found.polarity, changes(found, lag, t_us, logs)) for lag in searched.tolist()])
+    best = float(searched[int(agreements.argmax())])
+    low, high = best - 2 * STEP_US, best + 2 * STEP_US
+    a, b = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+    at_a, at_b = spread_at(a), spread_at(b)
+    while high - low > FINEST_US:
+        if at_a < at_b:
+            high, b, at_b = b, a, at_a
+            a = high - GOLDEN * (high - low)
+            at_a = spread_at(a)
+        else:
+            low, a, at_a = a, b, at_b
+            b = low + GOLDEN * (high - low)
+            at_b = spread_at(b)
+    lag_us = (low + high) / 2
+    change = changes(found, lag_us, t_us, logs)
+    of_bright = changes(found, lag_us, t_us, np.where(logs < np.log(np.float32(BRIGHT)), np.float32(np.nan), logs))
+    # of quicker steps the pictures show too little: between two of them the light did not change evenly
+    of_bright[found.after_us - found.before_us < np.median(np.diff(t_us))] = np.nan
+    return Lag(lag_us, agreement(found.polarity, change), searched, agreements, thresholds(found.polarity, of_bright))
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _steps(t, x, y, p, top, left, height, width):
+    last = np.full(height * width, -1, np.int64)
+    before, after, pixel = (np.empty(len(t), np.int64), np.empty(len(t), np.int64), np.empty(len(t), np.int64))
+    polarity = np.empty(len(t), np.int8)
+    n = 0
+    for i in range(len(t)):
+        row, column = np.int64(y[i]) - top, np.int64(x[i]) - left
+        if 0 <= row < height and 0 <= column < width:
+            place = row * width + column
+            if last[place] >= 0:
+                before[n], after[n], pixel[n], polarity[n] = t[last[place]], t[i], place, p[i]
+                n += 1
+            last[place] = i
+    return before[:n], after[:n], pixel[:n], polarity[:n]
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _changes(before, after, pixel, lag, times, logs):
+    out = np.full(len(before), np.nan)
+    for i in range(len(before)):
+        start, stop = before[i] + lag, after[i] + lag
+        if start < times[0] or stop > times[-1]:
+            continue
+        out[i] = _at(stop, pixel[i], times, logs) - _at(start, pixel[i], times, logs)
+    return out
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _at(t, pixel, times, logs):
+    k = min(np.searchsorted(times, t, side="right") - 1, len(times) - 2)
+    share = (t - times[k]) / (times[k + 1] - times[k])
+    return logs[k, pixel] + share * (logs[k + 1, pixel] - logs[k, pixel])

@@ -1,0 +1,120 @@
+"""How polarizers stand before a sensor, and what that makes of files: four channels on one clock, in an event store.
+
+Four files, one an angle (four cameras, or one camera four times), in any order; one file of a camera with a mosaic of
+polarizers on its pixels (division of focal plane). Division-of-time captures: `polarnet.recordings.targets`.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from polarnet.events.store import EventStore
+from polarnet.events.stream import Events
+from polarnet.recordings.recording import read_recording
+from polarnet.recordings.registration import warp_events
+from polarnet.recordings.source import RecordingError
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
+
+
+def read_four(
+    files: Mapping[int, Path],
+    start_us: Mapping[int, int] | None = None,
+    homographies: Mapping[int, Float64[np.ndarray, "3 3"]] | None = None,
+) -> list[Events]:
+    """The four channels, in the order 0, 45, 90, 135 degrees, of files by polarizer angle (degrees, of any half turn).
+
+    `start_us` says when the common clock starts, by each file's own clock (none given: the clocks are one, and start
+    with the first event of all); what comes earlier is left out. `homographies` lay cameras on the reference
+    (`polarnet.recordings.registration`). RecordingError where an angle is missing, there twice, or of another sensor.
+    """
+    by_angle = {angle % 180: angle for angle in files}
+    if sorted(by_angle) != list(POLARIZER_ANGLES_DEG) or len(by_angle) != len(files):
+        raise RecordingError(f"expected one file for each of 0, 45, 90 and 135 degrees, got {sorted(files)}")
+    if start_us is not None and set(start_us) != set(files):
+        raise RecordingError(f"expected a start for each of the angles {sorted(files)}, got {sorted(start_us)}")
+    channels = []
+    for angle in POLARIZER_ANGLES_DEG:
+        key = by_angle[angle]
+        events = read_recording(files[key]).events
+        if homographies is not None and key in homographies:
+            events = warp_events(events, homographies[key])
+        channels.append(events)
+    sizes = {(channel.height, channel.width) for channel in channels}
+    if len(sizes) > 1:
+        raise RecordingError(f"expected four files of one size of sensor, got {sorted(sizes)} (height, width)")
+    if start_us is None:
+        first = first_time_us(channels)
+        return [since(channel, first) for channel in channels]
+    return [since(c, start_us[by_angle[a]]) for c, a in zip(channels, POLARIZER_ANGLES_DEG, strict=True)]
+
+
+def split_mosaic(events: Events, mosaic: Mosaic) -> list[Events]:
+    """The four channels, in the order 0, 45, 90, 135 degrees, of a sensor with polarizers on its pixels.
+
+    Each has half of the sensor's rows and columns: a pixel for every 2x2 cell, which fires when that angle's pixel in
+    the cell does. No event is added, moved in time or left out but those of an odd last row or column. The four pixels
+    of a cell look at places half a cell apart, so an edge crosses them one after the other.
+    """
+    height, width = events.height // 2, events.width // 2
+    if not (height and width):
+        raise RecordingError(f"expected a mosaic of at least 2x2 pixels, got {events.height}x{events.width}")
+    row, column = events.y & 1, events.x & 1
+    complete = (events.y < 2 * height) & (events.x < 2 * width)
+    places = {mosaic[r][c]: (r, c) for r in (0, 1) for c in (0, 1)}
+    channels = []
+    for angle in POLARIZER_ANGLES_DEG:
+        r, c = places[angle]
+        own = complete & (row == r) & (column == c)
+        x, y = events.x[own] // 2, events.y[own] // 2
+        channels.append(Events(events.t[own], x, y, events.p[own], height, width))
+    return channels
+
+
+def read_mosaic(path: Path, mosaic: Mosaic) -> list[Events]:
+    """The four channels of one file of a camera with a mosaic; time starts with its first event."""
+    channels = split_mosaic(read_recording(path).events, mosaic)
+    first = first_time_us(channels)
+    return [since(channel, first) for channel in channels]
+
+
+def first_time_us(channels: Sequence[Events]) -> int:
+    """Of all events; 0 where there are none."""
+    return min((int(channel.t[0]) for channel in channels if len(channel)), default=0)
+
+
+def since(events: Events, start_us: int) -> Events:
+    """Events from a time on, which is their time 0."""
+    first = int(torch.searchsorted(events.t, torch.tensor(start_us)))
+    return Events(
+        events.t[first:] - start_us,
+        events.x[first:],
+        events.y[first:],
+        events.p[first:],
+        events.height,
+        events.width,
+    )
+
+
+def write_store(path: Path, sequences: Mapping[str, Sequence[Events]]) -> None:
+    """Sequences of four channels from time 0 on as an event store; each lasts until its last event."""
+    sizes = {(channel.height, channel.width) for channels in sequences.values() for channel in channels}
+    if len(sizes) != 1:
+        raise RecordingError(f"expected sequences of one size of sensor, got {sorted(sizes)} (height, width)")
+    attributes = {"events_sha256": {name: _digest(channels) for name, channels in sequences.items()}}
+    store = EventStore.create(path, list(sequences), *sizes.pop(), attributes)
+    for name, channels in sequences.items():
+        store.write(name, channels, max((int(c.t[-1]) for c in channels if len(c)), default=0))
+    store.finish()
+
+
+def _digest(channels: Sequence[Events]) -> str:
+    """Of all columns: an interrupted store of other events must not be gone on with."""
+    digest = hashlib.sha256()
+    for channel in channels:
+        for column in (channel.t, channel.x, channel.y, channel.p):
+            digest.update(len(column).to_bytes(8, "little") + column.numpy().tobytes())
+    return digest.hexdigest()

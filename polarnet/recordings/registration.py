@@ -1,0 +1,92 @@
+"""Four separate cameras laid on one another: a homography between two event images, and events moved by it.
+
+The cameras look at the same scene from nearly the same place, so that one homography holds for scenes that are flat or
+far away. It is found where the two event images correlate best (Evangelidis and Psarakis 2008, in OpenCV), from coarse
+to fine: images of different polarizers differ in brightness, but their edges lie at the same places.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64
+
+from polarnet.events.stream import Events
+from polarnet.recordings.pixels import event_counts
+from polarnet.recordings.source import RecordingError
+
+SCALES = (4, 2, 1)
+SMALLEST_SIDE = 48  # pixels; coarser images show too little
+BLUR = 5  # pixels, of the images while they are compared
+ITERATIONS, CHANGE = 200, 1e-6
+
+
+class Registration(NamedTuple):
+    """How pixels of one camera (x, y, 1) are found in another's picture."""
+
+    homography: Float64[np.ndarray, "3 3"]
+    correlation: float
+    """Of the two event images where they overlap, after."""
+
+
+def event_image(events: Events) -> Float32[np.ndarray, "h w"]:
+    """log(1 + events) of each pixel, so that busy edges do not outshine the others; 0 to 1."""
+    image = np.log1p(event_counts(events).astype(np.float32))
+    return image / max(float(image.max()), 1e-6)
+
+
+def register(reference: Float32[np.ndarray, "h w"], moving: Float32[np.ndarray, "h2 w2"]) -> Registration:
+    """The homography that takes pixels of `moving` to those of `reference`.
+
+    RecordingError where the images do not show the same: no shift of one correlates with the other.
+    """
+    if reference.shape != moving.shape:
+        raise RecordingError(f"expected two event images of one size, got {reference.shape} and {moving.shape}")
+    (shift_x, shift_y), _ = cv2.phaseCorrelate(
+        reference.astype(np.float64),
+        moving.astype(np.float64),
+        cv2.createHanningWindow(reference.shape[::-1], cv2.CV_64F),
+    )
+    warp = np.array([[1, 0, shift_x], [0, 1, shift_y], [0, 0, 1]], np.float32)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, ITERATIONS, CHANGE)
+    correlation = 0.0
+    for scale in SCALES:
+        size = reference.shape[1] // scale, reference.shape[0] // scale
+        if scale > 1 and min(size) < SMALLEST_SIDE:
+            continue
+        a, b = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (reference, moving))
+        to_coarse = np.diag([1 / scale, 1 / scale, 1]).astype(np.float32)
+        coarse = to_coarse @ warp @ np.linalg.inv(to_coarse)
+        everywhere = np.ones(a.shape, np.uint8)
+        try:
+            correlation, coarse = cv2.findTransformECC(
+                a, b, coarse.astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria, everywhere, BLUR
+            )
+        except cv2.error:
+            correlation = 0.0
+        if not correlation > 0:  # false for NaN too
+            raise RecordingError(
+                "the two event images show too little in common to lay them on each other; record something with many "
+                "edges that moves in front of both cameras"
+            )
+        warp = (np.linalg.inv(to_coarse) @ coarse @ to_coarse).astype(np.float32)
+    homography = np.linalg.inv(warp.astype(np.float64))
+    return Registration(homography / homography[2, 2], float(correlation))
+
+
+def warp_events(events: Events, homography: Float64[np.ndarray, "3 3"]) -> Events:
+    """Events at the nearest pixel of the reference camera; those that it does not see are left out."""
+    xy = np.stack([events.x.numpy(), events.y.numpy(), np.ones(len(events))])
+    x, y, w = homography @ xy
+    column, row = np.rint(x / w), np.rint(y / w)
+    seen = (w > 0) & (column >= 0) & (column < events.width) & (row >= 0) & (row < events.height)
+    keep = torch.from_numpy(seen)
+    return Events(
+        events.t[keep],
+        torch.from_numpy(column[seen].astype(np.int16)),
+        torch.from_numpy(row[seen].astype(np.int16)),
+        events.p[keep],
+        events.height,
+        events.width,
+    )

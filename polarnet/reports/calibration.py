@@ -1,0 +1,98 @@
+"""Pictures of calibrations: what start times were found by, thresholds, hot pixels, and cameras laid on each other."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from polarnet.recordings.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
+from polarnet.recordings.targets import Calibrated
+from polarnet.reports.figures import png
+
+COLOURS = ("#d6336c", "#e08a1e", "#3d8fd9", "#4aa37c")
+SHOWN_MS = 60.0  # around the start
+
+
+def draw_calibration(found: Calibrated, config: RecordingsConfig, path: Path) -> None:
+    """Write a picture of one target: the landmark in events and in pictures, agreement against lag, thresholds."""
+    figure = Figure(figsize=(10, 6.4), layout="constrained")
+    events, pictures, lags, levels = figure.subplots(2, 2).reshape(-1).tolist()
+    _draw_landmark_events(events, found, config)
+    _draw_landmark_pictures(pictures, found, config)
+    _draw_lags(lags, found)
+    _draw_thresholds(levels, found)
+    figure.suptitle(
+        f"{found.name}: {found.duration_us * 1e-6:.2f} s, hot pixels {', '.join(map(str, found.hot.values()))}"
+    )
+    path.write_bytes(png(figure))
+
+
+def draw_hot_pixels(counts: np.ndarray, hot: Bool[np.ndarray, "h w"], path: Path) -> None:
+    """Write a picture of how often each pixel fired, with the hot ones ringed."""
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.subplots()
+    shown = axes.imshow(np.log1p(counts), cmap="gray")
+    rows, columns = np.nonzero(hot)
+    axes.scatter(columns, rows, s=60, facecolors="none", edgecolors=COLOURS[0])
+    axes.set_title(f"{len(rows)} hot pixels")
+    figure.colorbar(shown, ax=axes, label="log(1 + events)")
+    path.write_bytes(png(figure))
+
+
+def draw_registration(
+    reference: Float32[np.ndarray, "h w"],
+    before: Float32[np.ndarray, "h w"],
+    after: Float32[np.ndarray, "h w"],
+    path: Path,
+) -> None:
+    """Write event images of two cameras over each other, before and after: one red, one cyan, grey where they agree."""
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    for axes, moving, title in zip(figure.subplots(1, 2), (before, after), ("before", "after"), strict=True):
+        scale = max(float(reference.max()), float(moving.max()), 1e-6)
+        axes.imshow(np.stack([reference, moving, moving], axis=-1) / scale)
+        axes.set_title(title)
+        axes.set_axis_off()
+    path.write_bytes(png(figure))
+
+
+def _draw_landmark_events(axes: Axes, found: Calibrated, config: RecordingsConfig) -> None:
+    for capture, colour in zip(EVENT_CAPTURES, COLOURS, strict=True):
+        t_ms = (found.region_events_us[capture] - found.start_us[capture]) / 1000
+        axes.step(t_ms, np.arange(1, len(t_ms) + 1), where="post", color=colour, label=capture)
+    axes.axhline(config.negative_events, color="0.6", linewidth=0.8)
+    axes.set(xlim=(-SHOWN_MS, SHOWN_MS), xlabel="ms from the start", ylabel="negative events in the region")
+    axes.legend(fontsize=8)
+
+
+def _draw_landmark_pictures(axes: Axes, found: Calibrated, config: RecordingsConfig) -> None:
+    for capture, colour in zip(INTENSITY_CAPTURES, COLOURS, strict=True):
+        t_us, region = found.region_pictures[capture]
+        axes.plot((t_us - found.start_us[capture]) / 1000, region, ".-", color=colour, label=capture)
+    axes.axhline(config.dark_level, color="0.6", linewidth=0.8)
+    axes.set(xlim=(-SHOWN_MS, SHOWN_MS), xlabel="ms from the start", ylabel="mean in the region, of 255")
+    axes.legend(fontsize=8)
+
+
+def _draw_lags(axes: Axes, found: Calibrated) -> None:
+    axes.set(xlabel="lag of pictures against events, ms from the landmark's", ylabel="agreement")
+    if found.alignment is None:
+        axes.set_title("not refined")
+        return
+    for lag, colour in zip(found.alignment.lags, COLOURS, strict=True):
+        axes.plot(lag.searched_us / 1000, lag.agreements, color=colour)
+        axes.axvline(lag.lag_us / 1000, color=colour, linewidth=0.8)
+    axes.set_title(f"I0 - I45 + I90 - I135: {100 * found.alignment.residual:.2f} % of their mean")
+
+
+def _draw_thresholds(axes: Axes, found: Calibrated) -> None:
+    axes.set(ylabel="contrast threshold, log intensity")
+    if found.alignment is None:
+        return
+    place = np.arange(len(EVENT_CAPTURES))
+    for offset, name in ((-0.2, "on"), (0.2, "off")):
+        values = [getattr(lag.thresholds, name) for lag in found.alignment.lags]
+        axes.bar(place + offset, values, 0.38, label=name.upper(), color=COLOURS[0] if name == "on" else COLOURS[2])
+    axes.set_xticks(place, EVENT_CAPTURES)
+    axes.legend(fontsize=8)

@@ -1,0 +1,31 @@
+"""data/imported -> data/calibrated: real targets on one clock, in the stores that simulated sequences lie in."""
+
+import dataclasses
+from pathlib import Path
+
+from polarnet.config import Config, hydra_stage
+from polarnet.recordings.status import start_over
+from polarnet.recordings.targets import calibrate_targets
+from polarnet.reports.calibration import draw_calibration
+
+
+@hydra_stage
+def main(config: Config) -> None:
+    """Find start times, write both stores, and draw what they were found by."""
+    out = Path(config.paths.calibrated)
+    if not config.recordings.enabled:
+        start_over(out, enabled=False)
+        print("recordings.enabled is false")
+        return
+    about = {"recordings": dataclasses.asdict(config.recordings)}
+    try:
+        found = calibrate_targets(Path(config.paths.imported), out, config.recordings, about)
+    except ValueError as error:
+        raise SystemExit(str(error)) from None
+    for target in found:
+        draw_calibration(target, config.recordings, out / f"{target.name}.png")
+        print(f"{target.name}: {target.duration_us * 1e-6:.2f} s, hot pixels {sum(target.hot.values())}")
+
+
+if __name__ == "__main__":
+    main()

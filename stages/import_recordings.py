@@ -1,0 +1,26 @@
+"""data/recordings -> data/imported: the eight captures of every real target, decoded; nothing while switched off."""
+
+from pathlib import Path
+
+from polarnet.config import Config, hydra_stage
+from polarnet.recordings.imported import import_targets
+from polarnet.recordings.status import start_over
+
+
+@hydra_stage
+def main(config: Config) -> None:
+    """Decode every target, or say that recordings are switched off."""
+    out = Path(config.paths.imported)
+    if not config.recordings.enabled:
+        start_over(out, enabled=False)
+        print("recordings.enabled is false")
+        return
+    try:
+        names = import_targets(Path(config.recordings.root), out, config.recordings)
+    except ValueError as error:
+        raise SystemExit(str(error)) from None
+    print(f"{len(names)} targets: {', '.join(names)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,184 @@
+"""How well a simulated rig is calibrated: python tests/benchmarks/rig.py [--write] [--targets N] [--full]
+
+Each target is another picture: photographs of scikit-image and dead leaves. Its eight captures, written as CeleX-5
+files with random delays, sensor noise and hot pixels, are imported and calibrated as the stages do it. Printed: errors
+of start times by the landmark (in pictures of the camera) and refined (in milliseconds, but for what all eight have in
+common, as the zero of their clock is a convention), the root mean square difference of the DoLP from the scene's own,
+thresholds, and the benchmark's table, with the networks in data/train and data/train_e2v where there are any.
+
+The sensor is a quarter of a CeleX-5 in each direction (200 x 320, pictures of 30 x 45), with --full all of it (800 x
+1280, pictures of 120 x 180). `--write` merges the figures into docs/results/recordings.json.
+"""
+
+import argparse
+import json
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from skimage import data
+
+from polarnet.config import Config, load
+from polarnet.evaluation.benchmark import run_benchmark
+from polarnet.evaluation.methods import Context
+from polarnet.evaluation.score import summary
+from polarnet.events.frames import FrameStore
+from polarnet.events.store import EventStore
+from polarnet.measure import machine_record
+from polarnet.recordings.dot import RecordingsConfig
+from polarnet.recordings.imported import import_targets
+from polarnet.recordings.targets import Calibrated, calibrate_targets, spread_us
+from polarnet.reports.calibration import draw_calibration
+from polarnet.reports.provenance import git
+from polarnet.reports.tables import as_plain, score_table
+from polarnet.rig import RigConfig, RigTruth, true_dolp, write_rig
+from polarnet.runtime import generator_for
+from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.pictures.dead_leaves import dead_leaves
+from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "docs" / "results" / "recordings.json"
+PHOTOGRAPHS = (data.coffee, data.chelsea, data.astronaut, data.rocket)
+QUARTER = {"sensor": [200, 320], "region": [45, 2], "crop": [120, 180], "size": [30, 45]}
+RIG = RigConfig(
+    speed_px_s=100.0,
+    longest_delay_s=0.35,
+    duration_s=0.55,
+    picture_rate_hz=60.0,
+    full_well_electrons=20000.0,
+    read_noise=2.0,
+    hot_pixels=5,
+    file_type="bin",
+)
+FULL_RIG = replace(RIG, speed_px_s=240.0, picture_rate_hz=100.0)
+
+
+def scene_of(k: int) -> PolarizationScene:
+    """The picture of target `k`, its value in 0.1 to 0.95: a black pixel has no DoLP that could be measured."""
+    if k % 2 == 0 and k // 2 < len(PHOTOGRAPHS):
+        rgb = torch.from_numpy(PHOTOGRAPHS[k // 2]()).float() / 255
+    else:
+        rgb = torch.from_numpy(dead_leaves(generator_for(1, str(k), "picture"), 400, 600))
+    return scene_from_rgb(0.1 + 0.85 * rgb.permute(2, 0, 1))
+
+
+def measured(
+    folder: Path, count: int, rig: RigConfig, recordings: RecordingsConfig, emulator: EmulatorConfig, pictures: Path
+) -> Iterator[tuple[RigTruth, Calibrated, float]]:
+    """Truth, calibration and squared DoLP error of each target; one at a time on disk, stores of all in `folder`."""
+    for k in range(count):
+        name = f"target-{k:02d}"
+        raw, imported, out = folder / "raw", folder / "imported", folder / name
+        truth = write_rig(raw / name, scene_of(k), rig, recordings, emulator, seed=1, threads=2)
+        start = time.perf_counter()
+        import_targets(raw, imported, recordings)
+        (found,) = calibrate_targets(imported, out, recordings, {})
+        seconds = time.perf_counter() - start
+        draw_calibration(found, recordings, pictures / f"{name}.png")
+        frames = FrameStore.open(out / "frames.zarr")
+        zero_us = np.mean([found.start_us[capture] - start for capture, start in truth.start_us.items()])
+        expected = true_dolp(truth, frames.t_us(name).numpy() + round(float(zero_us)), recordings)
+        squared = float((frames.dolp(name) - expected).pow(2).mean())
+        for left in (raw, imported):
+            shutil.rmtree(left)
+        report(name, truth, found, rig, squared, seconds)
+        yield truth, found, squared
+
+
+def report(name: str, truth: RigTruth, found: Calibrated, rig: RigConfig, squared: float, seconds: float) -> None:
+    """A line of figures."""
+    assert found.alignment is not None
+    refined_ms = np.abs(spread_us(found.start_us, truth.start_us)).max() / 1000
+    thresholds = [f"{lag.thresholds.on:.3f}/{lag.thresholds.off:.3f}" for lag in found.alignment.lags]
+    print(
+        f"{name}: landmark {landmark_frames(truth, found, rig):.2f} pictures, refined {refined_ms:.2f} ms, "
+        f"DoLP {squared**0.5:.4f}, thresholds {' '.join(thresholds)}, hot {list(found.hot.values())}, "
+        f"imported and calibrated in {seconds:.1f} s",
+        flush=True,
+    )
+
+
+def landmark_frames(truth: RigTruth, found: Calibrated, rig: RigConfig) -> float:
+    """The largest error of the landmark's start times, in pictures."""
+    errors = [abs(found.landmark_us[capture] - start) for capture, start in truth.start_us.items()]
+    return max(errors) * 1e-6 * rig.picture_rate_hz
+
+
+def print_table(folder: Path, names: list[str], config: Config) -> None:
+    """The benchmark's table over all targets, each in a store of its own."""
+    trained = {"e2v": Path(config.paths.train_e2v), "ours": Path(config.paths.train)}
+    checkpoints = {method: ROOT / path / "best.safetensors" for method, path in trained.items()}
+    absent = [method for method, path in checkpoints.items() if not path.exists()]
+    context = Context(
+        train_mean=0.3,
+        cf=config.baselines.cf,
+        highpass=config.baselines.highpass,
+        e2v_checkpoint=checkpoints["e2v"],
+        ours_checkpoint=checkpoints["ours"],
+        device=torch.device("cpu"),
+        precision="fp32",
+    )
+    methods = [m for m in config.benchmark.methods if m not in (*absent, "train_mean")]
+    benchmark = replace(config.benchmark, methods=methods, panel_scenes=0)
+    rows, ms = [], {}
+    for name in names:
+        stores = EventStore.open(folder / name / "events.zarr"), FrameStore.open(folder / name / "frames.zarr")
+        one = run_benchmark(*stores, context, benchmark, None)
+        rows += one.rows
+        ms = dict(one.ms_per_window)
+    scores = summary(rows, benchmark.bootstrap_samples, config.seed)
+    print(as_plain(score_table({m: {**s, "ms_per_window": ms[m]} for m, s in scores.items()}, "not loaded here")))
+    if absent:
+        print(f"not trained here: {', '.join(absent)}")
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
+    parser.add_argument("--targets", type=int, default=8, help="of eight captures each")
+    parser.add_argument("--full", action="store_true", help="the whole sensor")
+    parser.add_argument("--cutoff-hz", type=float, default=3000.0, help="of the photoreceptor; a slow one adds a delay")
+    parser.add_argument("--pictures", type=Path, default=ROOT / "outputs" / "rig", help="where diagnoses are drawn")
+    arguments = parser.parse_args()
+    changed = git(ROOT, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
+    if arguments.write and changed:
+        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    config = load(ROOT)
+    recordings = replace(config.recordings, enabled=True, **({} if arguments.full else QUARTER))
+    rig = FULL_RIG if arguments.full else RIG
+    emulator = replace(config.emulate, model="exact", cutoff_hz=arguments.cutoff_hz)
+    arguments.pictures.mkdir(parents=True, exist_ok=True)
+    record: dict[str, Any] = machine_record(ROOT)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        found = list(measured(folder, arguments.targets, rig, recordings, emulator, arguments.pictures))
+        print_table(folder, [one.name for _, one, _ in found], config)
+    figures = {
+        "captures": 8 * len(found),
+        "sensor": list(recordings.sensor),
+        "photoreceptor_cutoff_hz": arguments.cutoff_hz,
+        "start_error_frames_max": round(max(landmark_frames(truth, one, rig) for truth, one, _ in found), 3),
+        "refined_error_ms_max": round(
+            max(float(np.abs(spread_us(one.start_us, truth.start_us)).max()) for truth, one, _ in found) / 1000, 3
+        ),
+        "dolp_rms": round(float(np.mean([squared for _, _, squared in found])) ** 0.5, 5),
+        "dolp_rms_max": round(max(squared for _, _, squared in found) ** 0.5, 5),
+    }
+    print(json.dumps(figures, indent=2))
+    if arguments.write:
+        known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+        RESULTS.parent.mkdir(parents=True, exist_ok=True)
+        RESULTS.write_text(json.dumps({**known, **record, "rig": figures}, indent=2) + "\n")
+        print(f"written to {RESULTS.relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    main()

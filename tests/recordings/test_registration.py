@@ -1,0 +1,68 @@
+"""Cameras laid on each other by their event images."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from polarnet.events.stream import Events
+from polarnet.recordings.registration import event_image, register, warp_events
+from polarnet.recordings.source import RecordingError
+from polarnet.reports.calibration import draw_hot_pixels, draw_registration
+
+HEIGHT, WIDTH = 120, 160
+TRUE = np.array([[1.01, 0.015, 3.2], [-0.012, 0.99, -2.4], [2e-5, -3e-5, 1.0]])
+
+
+@pytest.fixture(scope="module")
+def images():
+    """Edges of rectangles as one camera sees them, and as another whose pixels TRUE takes to the first's."""
+    generator = np.random.default_rng(5)
+    reference = np.zeros((HEIGHT, WIDTH), np.float32)
+    for _ in range(40):
+        x, y = generator.integers(0, [WIDTH, HEIGHT])
+        w, h = generator.integers(8, 40, 2)
+        cv2.rectangle(reference, (int(x), int(y)), (int(x + w), int(y + h)), float(generator.uniform(0.3, 1)), 1)
+    reference = cv2.GaussianBlur(reference, (0, 0), 1)
+    return reference, cv2.warpPerspective(reference, np.linalg.inv(TRUE), (WIDTH, HEIGHT))
+
+
+def corners_apart(homography):
+    corners = np.array([[[10, 10], [WIDTH - 10, 10], [10, HEIGHT - 10], [WIDTH - 10, HEIGHT - 10]]], np.float64)
+    return np.abs(cv2.perspectiveTransform(corners, homography) - cv2.perspectiveTransform(corners, TRUE)).max()
+
+
+def test_the_homography_between_two_cameras_is_found_to_a_fraction_of_a_pixel(images, tmp_path):
+    reference, moving = images
+    found = register(reference, 0.6 * moving)  # another polarizer: not as bright
+    assert corners_apart(np.eye(3)) > 2
+    assert corners_apart(found.homography) < 0.2
+    assert found.correlation > 0.95
+    after = cv2.warpPerspective(moving, found.homography, (WIDTH, HEIGHT))
+    draw_registration(reference, moving, after, tmp_path / "registration.png")
+    draw_hot_pixels(np.ones((5, 5)), np.eye(5, dtype=bool), tmp_path / "hot.png")
+    assert all((tmp_path / name).stat().st_size > 5000 for name in ("registration.png", "hot.png"))
+
+
+def test_events_are_moved_to_the_reference_camera_and_those_it_does_not_see_left_out():
+    x, y = (torch.tensor(values, dtype=torch.int16) for values in ([0, 5, 159], [0, 6, 119]))
+    events = Events(torch.arange(3), x, y, torch.tensor([1, -1, 1], dtype=torch.int8), HEIGHT, WIDTH)
+    shift = np.array([[1.0, 0, 3], [0, 1, -2], [0, 0, 1]])
+    moved = warp_events(events, shift)
+    assert (moved.t.tolist(), moved.x.tolist(), moved.y.tolist(), moved.p.tolist()) == ([1], [8], [4], [-1])
+
+
+def test_event_images_hold_all_pixels_between_0_and_1():
+    x = torch.tensor([2, 2, 3], dtype=torch.int16)
+    image = event_image(Events(torch.arange(3), x, x, torch.ones(3, dtype=torch.int8), 5, 6))
+    assert image[2, 2] == 1
+    assert image[3, 3] == pytest.approx(np.log(2) / np.log(3))
+    assert np.count_nonzero(image) == 2
+    assert not event_image(Events.empty(5, 6)).any()
+
+
+def test_images_that_have_nothing_in_common_are_refused(images):
+    with pytest.raises(RecordingError, match="too little in common"):
+        register(images[0], np.zeros_like(images[0]))
+    with pytest.raises(RecordingError, match="of one size"):
+        register(images[0], images[0][:-1])

@@ -1,0 +1,170 @@
+"""The simulated rig end to end: eight files, their start times, the ground truth, the stores, the benchmark."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet.baselines.complementary_filter import ComplementaryFilterConfig, HighPassConfig
+from polarnet.config import load
+from polarnet.evaluation.benchmark import run_benchmark
+from polarnet.evaluation.methods import Context
+from polarnet.evaluation.score import BenchmarkConfig
+from polarnet.events.frames import FrameStore
+from polarnet.events.store import EventStore
+from polarnet.recordings.dot import (
+    EVENT_CAPTURES,
+    INTENSITY_CAPTURES,
+    RecordingsConfig,
+    find_captures,
+    read_event_capture,
+    read_intensity_capture,
+)
+from polarnet.recordings.imported import import_targets
+from polarnet.recordings.targets import calibrate_targets, spread_us
+from polarnet.reports.calibration import draw_calibration
+from polarnet.rig import RigConfig, true_dolp, write_rig
+from polarnet.simulation.pictures.dead_leaves import dead_leaves
+from polarnet.simulation.scene import scene_from_rgb
+
+PICTURE_RATE_HZ = 60.0
+SMALL = {
+    "enabled": True,
+    "sensor": [96, 160],
+    "region": [24, 2],
+    "negative_events": 24,
+    "crop": [64, 96],
+    "size": [16, 24],
+}
+RIG = RigConfig(
+    speed_px_s=80.0,
+    longest_delay_s=0.25,
+    duration_s=0.3,
+    picture_rate_hz=PICTURE_RATE_HZ,
+    full_well_electrons=20000.0,
+    read_noise=2.0,
+    hot_pixels=3,
+    file_type="bin",
+)
+
+
+@pytest.fixture(scope="module")
+def config(project_root) -> RecordingsConfig:
+    return replace(load(project_root).recordings, **SMALL)
+
+
+@pytest.fixture(scope="module")
+def rig(project_root, config, tmp_path_factory):
+    """A folder with one target, and what is true of it."""
+    root = tmp_path_factory.mktemp("rig")
+    emulator = replace(load(project_root).emulate, model="exact", cutoff_hz=3000.0)
+    picture = dead_leaves(np.random.default_rng(3), 96, 200)
+    scene = scene_from_rgb(torch.from_numpy(picture).permute(2, 0, 1) * 0.85 + 0.1)
+    return root, write_rig(root / "one", scene, RIG, config, emulator, seed=1)
+
+
+@pytest.fixture(scope="module")
+def calibrated(rig, config, tmp_path_factory):
+    root, truth = rig
+    folder = tmp_path_factory.mktemp("calibrated")
+    import_targets(root, folder / "imported", config)
+    (found,) = calibrate_targets(folder / "imported", folder / "out", config, {})
+    return folder / "out", found, truth
+
+
+def test_the_rig_writes_eight_captures_and_says_what_is_true_of_them(rig):
+    root, truth = rig
+    assert set(find_captures(root / "one")) == {*EVENT_CAPTURES, *INTENSITY_CAPTURES}
+    written = json.loads((root / "one" / "truth.json").read_text())
+    assert written["start_us"] == dict(truth.start_us)
+    assert len(set(truth.start_us.values())) == 8  # random delays
+    assert all(80_000 <= start <= 250_000 for start in truth.start_us.values())
+    with np.load(root / "one" / "truth.npz") as frames:
+        assert frames["dolp"].shape == (10, 16, 24)
+        assert frames["dolp"].mean() == pytest.approx(written["mean_dolp"], abs=1e-6)
+
+
+def test_the_landmark_darkens_the_region_at_the_true_start_and_fires_negative_events(rig, config):
+    root, truth = rig
+    files = find_captures(root / "one")
+    pictures = read_intensity_capture(files["intensity_90"], config)
+    before = pictures.t_us < truth.start_us["intensity_90"]
+    assert (pictures.region[before] > config.dark_level).all()
+    assert (pictures.region[~before] < config.dark_level).all()
+    events = read_event_capture(files["events_90"], config)
+    region = (events.x >= 158) & (events.y < 24) & (events.p < 0)
+    near = (events.t - truth.start_us["events_90"]).abs() < 50_000
+    assert int((region & near).sum()) > 10 * int((region & ~near).sum())
+
+
+def test_start_times_by_the_landmark_are_right_within_one_picture(calibrated):
+    _, found, truth = calibrated
+    for capture, start in truth.start_us.items():
+        assert abs(found.landmark_us[capture] - start) <= 1e6 / PICTURE_RATE_HZ, capture
+
+
+def test_refined_start_times_are_right_within_a_millisecond(calibrated):
+    _, found, truth = calibrated
+    by_landmark = np.abs(spread_us(found.landmark_us, truth.start_us)).max()
+    refined = np.abs(spread_us(found.start_us, truth.start_us)).max()
+    assert refined < 1000 < by_landmark
+
+
+def test_the_ground_truth_is_the_scenes_own(calibrated, config):
+    out, found, truth = calibrated
+    store = FrameStore.open(out / "frames.zarr")
+    # time 0 is where the landmark's events have it, a little before the mean of the region is dark
+    zero_us = np.mean([found.start_us[capture] - start for capture, start in truth.start_us.items()])
+    assert abs(zero_us) < 1e6 / PICTURE_RATE_HZ
+    t_us = store.t_us("one").numpy()
+    assert len(t_us) >= 8
+    expected = true_dolp(truth, t_us + round(zero_us), config)
+    assert float((store.dolp("one") - expected).pow(2).mean().sqrt()) < 0.01
+    assert float(expected.std()) > 0.05
+
+
+def test_thresholds_and_hot_pixels_come_out_as_they_were_put_in(calibrated):
+    _, found, truth = calibrated
+    assert found.alignment is not None
+    for lag in found.alignment.lags:
+        assert lag.thresholds.on == pytest.approx(0.2, rel=0.15)
+        assert lag.thresholds.off == pytest.approx(0.2, rel=0.15)
+    assert set(found.hot.values()) == {len(truth.hot)}
+
+
+def test_a_start_set_by_hand_stays(rig, config, tmp_path):
+    root, truth = rig
+    imported = tmp_path / "imported"
+    (root / "one" / "starts.json").write_text(json.dumps({"intensity_45": truth.start_us["intensity_45"]}))
+    try:
+        import_targets(root, imported, config)
+    finally:
+        (root / "one" / "starts.json").unlink()
+    (found,) = calibrate_targets(imported, tmp_path / "out", config, {})
+    assert found.start_us["intensity_45"] == truth.start_us["intensity_45"]
+
+
+def test_the_stores_are_benchmarked_like_simulated_sequences_and_the_diagnosis_is_drawn(calibrated, config, tmp_path):
+    out, found, _ = calibrated
+    events, frames = EventStore.open(out / "events.zarr"), FrameStore.open(out / "frames.zarr")
+    assert (events.height, events.width) == (frames.height, frames.width) == (16, 24)
+    assert all(count > 100 for count in events.count("one"))
+    context = Context(
+        train_mean=0.2,
+        cf=ComplementaryFilterConfig(0.5, 0.1, -0.1, [-0.1, 1.2]),
+        highpass=HighPassConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5]),
+        e2v_checkpoint=Path("none"),
+        ours_checkpoint=Path("none"),
+        device=torch.device("cpu"),
+        precision="fp32",
+    )
+    benchmark = run_benchmark(
+        events, frames, context, BenchmarkConfig(["zeros", "oracle_mean", "cf", "highpass"], 2, "fp32", 20, 1), None
+    )
+    of_method = {row.method: row.mse for row in benchmark.rows}
+    assert set(of_method) == {"zeros", "oracle_mean", "cf", "highpass"}
+    draw_calibration(found, config, tmp_path / "one.png")
+    assert (tmp_path / "one.png").stat().st_size > 10_000
