@@ -144,6 +144,6 @@ def _decode_3(words, state, t, x, y, p):
                 if value >> k & 1:
                     t[found], x[found], y[found], p[found] = now, base + k, row, polarity
                     found += 1
-            base += pixels
+            base = min(base + pixels, 2048)  # off every sensor; more would not fit into int16
     state[:] = high, turns, low, row, base, polarity
     return found, orphans

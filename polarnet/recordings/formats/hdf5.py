@@ -77,7 +77,9 @@ def open_e2p(path: Path, choices: Choices) -> Source:
     size = description["values"].get("sensor_resolution")
     if size is not None and not (isinstance(size, list) and len(size) == 2):
         raise RecordingError(f"{path.name}: expected width and height as sensor_resolution, got {size}")
-    width, height = (None, None) if size is None else (_number(path, "sensor_resolution", side) for side in size)
+    height = width = None
+    if size is not None:
+        width, height = (_number(path, "sensor_resolution", side) for side in size)
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
         for (table,) in _read(path, ("events",), length):

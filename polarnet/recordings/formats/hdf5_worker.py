@@ -7,6 +7,7 @@ starts quickly.
 import contextlib
 import pickle
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import h5py
@@ -38,7 +39,7 @@ def close(files: Files, name: str) -> None:
         files.pop(name).close()
 
 
-TASKS = {"describe": describe, "read": read, "close": close}
+TASKS: dict[str, Callable[..., Any]] = {"describe": describe, "read": read, "close": close}
 
 
 def described(file: h5py.File, tables: list[str], attributes: list[str]) -> dict[str, Any]:
