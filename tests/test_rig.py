@@ -2,19 +2,14 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from polarnet.baselines.complementary_filter import ComplementaryFilterConfig, HighPassConfig
+from polarnet.benchmarking import context_of, made_set
 from polarnet.config import load
 from polarnet.evaluation.benchmark import run_benchmark
-from polarnet.evaluation.methods import Context
-from polarnet.evaluation.score import BenchmarkConfig
-from polarnet.events.frames import FrameStore
-from polarnet.events.store import EventStore
 from polarnet.recordings.dot import (
     EVENT_CAPTURES,
     INTENSITY_CAPTURES,
@@ -147,24 +142,17 @@ def test_a_start_set_by_hand_stays(rig, config, tmp_path):
     assert found.start_us["intensity_45"] == truth.start_us["intensity_45"]
 
 
-def test_the_stores_are_benchmarked_like_simulated_sequences_and_the_diagnosis_is_drawn(calibrated, config, tmp_path):
+def test_the_stores_are_benchmarked_like_simulated_sequences_and_the_diagnosis_is_drawn(
+    calibrated, config, tmp_path, project_root
+):
     out, found, _ = calibrated
-    events, frames = EventStore.open(out / "events.zarr"), FrameStore.open(out / "frames.zarr")
-    assert (events.height, events.width) == (frames.height, frames.width) == (16, 24)
-    assert all(count > 100 for count in events.count("one"))
-    context = Context(
-        train_mean=0.2,
-        cf=ComplementaryFilterConfig(0.5, 0.1, -0.1, [-0.1, 1.2]),
-        highpass=HighPassConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5]),
-        e2v_checkpoint=Path("none"),
-        ours_checkpoint=Path("none"),
-        device=torch.device("cpu"),
-        precision="fp32",
-    )
-    benchmark = run_benchmark(
-        events, frames, context, BenchmarkConfig(["zeros", "oracle_mean", "cf", "highpass"], 2, "fp32", 20, 1), None
-    )
-    of_method = {row.method: row.mse for row in benchmark.rows}
-    assert set(of_method) == {"zeros", "oracle_mean", "cf", "highpass"}
+    test_set = made_set("recordings", out)
+    assert (test_set.events.height, test_set.events.width) == (16, 24)
+    assert all(count > 100 for count in test_set.events.count("one"))
+    whole = load(project_root, [f"paths.data={tmp_path}"])
+    methods = ["zeros", "oracle_mean", "cf", "highpass"]
+    settings = replace(whole.benchmark, methods=methods, warmup_windows=2, bootstrap_samples=20, panel_scenes=1)
+    benchmark = run_benchmark(test_set, context_of(whole, 0.2), settings, None, tmp_path / "cache")
+    assert {row.method for row in benchmark.rows} == set(methods)
     draw_calibration(found, config, tmp_path / "one.png")
     assert (tmp_path / "one.png").stat().st_size > 10_000

@@ -94,7 +94,7 @@ def run_methods(events, frames, folder):
             Panel(
                 recording.name, recording.scene, k, int(recording.t_us[k + 1]), torch.randn(4, 24, 36), truth[k],
                 recording.aolp[k], recording.s0[k], {m: frames[k] for m, frames in dolp.items()},
-                {"firenet": recording.aolp[k]},
+                {"e2v": recording.aolp[k]},
             )
         )  # fmt: skip
     about = {"lpips": {"backbone": "squeeze", "sha256": None, "source": None, "reason": NO_WEIGHTS}}

@@ -26,8 +26,8 @@ def test_a_panel_holds_the_truth_of_the_window_it_names(artefacts, paths):
     frames = FrameStore.open(paths.frames).frames(panel.sequence)
     assert int(frames.t_us[panel.window + 1]) == panel.t_us
     assert torch.equal(frames.dolp[panel.window + 1], panel.truth_dolp)
-    assert set(panel.dolp) == {"zeros", "oracle_mean", "firenet", "ours"}
-    assert set(panel.aolp) == {"firenet"}
+    assert set(panel.dolp) == {"zeros", "oracle_mean", "e2v", "ours"}
+    assert set(panel.aolp) == {"e2v"}
 
 
 def test_photographs_come_before_dead_leaves(artefacts):
