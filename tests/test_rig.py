@@ -10,6 +10,7 @@ import torch
 from polarnet.benchmarking import context_of, made_set
 from polarnet.config import load
 from polarnet.evaluation.benchmark import run_benchmark
+from polarnet.events.frames import FrameStore
 from polarnet.recordings.dot import (
     EVENT_CAPTURES,
     INTENSITY_CAPTURES,
