@@ -16,7 +16,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,12 @@ import numpy as np
 import torch
 from skimage import data
 
+from polarnet.benchmarking import context_of, made_set
 from polarnet.config import Config, load
 from polarnet.evaluation.benchmark import run_benchmark
-from polarnet.evaluation.methods import Context
+from polarnet.evaluation.methods import available
 from polarnet.evaluation.score import summary
 from polarnet.events.frames import FrameStore
-from polarnet.events.store import EventStore
 from polarnet.measure import machine_record
 from polarnet.recordings.dot import RecordingsConfig
 from polarnet.recordings.imported import import_targets
@@ -113,30 +113,21 @@ def landmark_frames(truth: RigTruth, found: Calibrated, rig: RigConfig) -> float
 
 def print_table(folder: Path, names: list[str], config: Config) -> None:
     """The benchmark's table over all targets, each in a store of its own."""
-    trained = {"e2v": Path(config.paths.train_e2v), "ours": Path(config.paths.train)}
-    checkpoints = {method: ROOT / path / "best.safetensors" for method, path in trained.items()}
-    absent = [method for method, path in checkpoints.items() if not path.exists()]
-    context = Context(
-        train_mean=0.3,
-        cf=config.baselines.cf,
-        highpass=config.baselines.highpass,
-        e2v_checkpoint=checkpoints["e2v"],
-        ours_checkpoint=checkpoints["ours"],
-        device=torch.device("cpu"),
-        precision="fp32",
-    )
-    methods = [m for m in config.benchmark.methods if m not in (*absent, "train_mean")]
+    context = context_of(config, train_mean=0.0)
+    wanted = [
+        method for method in config.benchmark.methods if method != "train_mean"
+    ]  # there is no training split here
+    methods, absent = available(wanted, context)
     benchmark = replace(config.benchmark, methods=methods, panel_scenes=0)
-    rows, ms = [], {}
+    rows, costs = [], {}
     for name in names:
-        stores = EventStore.open(folder / name / "events.zarr"), FrameStore.open(folder / name / "frames.zarr")
-        one = run_benchmark(*stores, context, benchmark, None)
+        one = run_benchmark(made_set(name, folder / name), context, benchmark, None, folder / "cache")
         rows += one.rows
-        ms = dict(one.ms_per_window)
+        costs = {method: asdict(cost) for method, cost in one.costs.items()}
     scores = summary(rows, benchmark.bootstrap_samples, config.seed)
-    print(as_plain(score_table({m: {**s, "ms_per_window": ms[m]} for m, s in scores.items()}, "not loaded here")))
-    if absent:
-        print(f"not trained here: {', '.join(absent)}")
+    print(as_plain(score_table({m: {**s, **costs[m]} for m, s in scores.items()}, "not loaded here")))
+    for method, reason in absent.items():
+        print(f"{method} is left out: {reason}")
 
 
 def main() -> None:
