@@ -41,9 +41,9 @@ from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
 from polarnet.measure import machine_record
 from polarnet.reports.provenance import git
-from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory
 from polarnet.simulation.pictures.builtin import BUILTIN_PHOTOS
+from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.simulation.synthesize import synthesize_sequence, synthesize_steps
 
@@ -51,28 +51,7 @@ ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "docs" / "results" / "emulation.json"
 HEIGHT, WIDTH, DURATION_US, SPEED_PX_S = 120, 180, 1_000_000, 110.0
 STILL = Sine(0.0, 0.0, 0.0)
-DEFAULT = EmulatorConfig(  # v2e's command-line defaults
-    model="v2e",
-    render_rate_hz=300.0,
-    contrast_threshold_on=0.2,
-    contrast_threshold_off=0.2,
-    contrast_threshold_sigma=0.03,
-    cutoff_hz=300.0,
-    leak_rate_hz=0.01,
-    leak_jitter=0.1,
-    noise_rate_cov_decades=0.1,
-    shot_noise_rate_hz=0.001,
-    refractory_period_us=500.0,
-    esim_log_eps=0.001,
-    voltmeter_camera="dvs346",
-    randomise=False,
-    random_threshold_on=[0.08, 0.31],
-    random_threshold_off=[0.14, 0.42],
-    random_threshold_sigma=[0.02, 0.06],
-    random_cutoff_hz=[30.0, 300.0],
-    random_leak_rate_hz=[0.01, 0.1],
-    random_shot_noise_rate_hz=[0.001, 5.0],
-)
+DEFAULT = replace(SENSORS["default"], model="v2e")  # v2e's command-line defaults
 NOISELESS = replace(
     DEFAULT,
     contrast_threshold_sigma=0.0,

@@ -9,29 +9,9 @@ import torch
 
 from polarnet.events.stream import validate
 from polarnet.simulation.emulator import MODELS, EmulatorConfig, emulate, emulate_columns, randomised
+from polarnet.simulation.presets import SENSORS
 
-IDEAL = EmulatorConfig(
-    model="exact",
-    render_rate_hz=300.0,
-    contrast_threshold_on=0.2,
-    contrast_threshold_off=0.2,
-    contrast_threshold_sigma=0.0,
-    cutoff_hz=0.0,
-    leak_rate_hz=0.0,
-    leak_jitter=0.0,
-    noise_rate_cov_decades=0.0,
-    shot_noise_rate_hz=0.0,
-    refractory_period_us=0.0,
-    esim_log_eps=0.001,
-    voltmeter_camera="dvs346",
-    randomise=False,
-    random_threshold_on=[0.08, 0.31],
-    random_threshold_off=[0.14, 0.42],
-    random_threshold_sigma=[0.02, 0.06],
-    random_cutoff_hz=[30.0, 300.0],
-    random_leak_rate_hz=[0.01, 0.1],
-    random_shot_noise_rate_hz=[0.001, 5.0],
-)
+IDEAL = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma=0.0)
 NOISY = dataclasses.replace(
     IDEAL,
     contrast_threshold_sigma=0.03,

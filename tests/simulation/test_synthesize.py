@@ -8,9 +8,10 @@ import torch
 from skimage import data
 
 from polarnet.events.stream import validate
-from polarnet.simulation.emulator import EmulatorConfig, emulate
+from polarnet.simulation.emulator import emulate
 from polarnet.simulation.motion import HARMONICS, Sine, Trajectory, render
 from polarnet.simulation.pixels.light import intensity_rows
+from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.scene import scene_from_rgb
 from polarnet.simulation.synthesize import (
     _lights_of_drift,
@@ -21,28 +22,7 @@ from polarnet.simulation.synthesize import (
 )
 from polarnet.stokes import intensities_from_stokes
 
-CONFIG = EmulatorConfig(
-    model="exact",
-    render_rate_hz=300.0,
-    contrast_threshold_on=0.2,
-    contrast_threshold_off=0.2,
-    contrast_threshold_sigma=0.03,
-    cutoff_hz=300.0,
-    leak_rate_hz=0.1,
-    leak_jitter=0.1,
-    noise_rate_cov_decades=0.1,
-    shot_noise_rate_hz=1.0,
-    refractory_period_us=500.0,
-    esim_log_eps=0.001,
-    voltmeter_camera="dvs346",
-    randomise=False,
-    random_threshold_on=[0.08, 0.31],
-    random_threshold_off=[0.14, 0.42],
-    random_threshold_sigma=[0.02, 0.06],
-    random_cutoff_hz=[30.0, 300.0],
-    random_leak_rate_hz=[0.01, 0.1],
-    random_shot_noise_rate_hz=[0.001, 5.0],
-)
+CONFIG = dataclasses.replace(SENSORS["default"], leak_rate_hz=0.1, shot_noise_rate_hz=1.0)
 STILL = Sine(0.0, 0.0, 0.0)
 H, W = 24, 32
 

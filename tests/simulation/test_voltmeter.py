@@ -8,31 +8,11 @@ import pytest
 import torch
 from scipy import stats
 
-from polarnet.simulation.emulator import EmulatorConfig, emulate_columns
+from polarnet.simulation.emulator import emulate_columns
 from polarnet.simulation.pixels.voltmeter import CAMERAS, chance_of_on
+from polarnet.simulation.presets import SENSORS
 
-CONFIG = EmulatorConfig(
-    model="dvs_voltmeter",
-    render_rate_hz=300.0,
-    contrast_threshold_on=0.2,
-    contrast_threshold_off=0.2,
-    contrast_threshold_sigma=0.0,
-    cutoff_hz=0.0,
-    leak_rate_hz=0.0,
-    leak_jitter=0.0,
-    noise_rate_cov_decades=0.0,
-    shot_noise_rate_hz=0.0,
-    refractory_period_us=0.0,
-    esim_log_eps=0.001,
-    voltmeter_camera="dvs346",
-    randomise=False,
-    random_threshold_on=[0.08, 0.31],
-    random_threshold_off=[0.14, 0.42],
-    random_threshold_sigma=[0.02, 0.06],
-    random_cutoff_hz=[30.0, 300.0],
-    random_leak_rate_hz=[0.01, 0.1],
-    random_shot_noise_rate_hz=[0.001, 5.0],
-)
+CONFIG = dataclasses.replace(SENSORS["clean"], model="dvs_voltmeter", contrast_threshold_sigma=0.0)
 SIDE = 50
 
 
