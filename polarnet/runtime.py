@@ -63,6 +63,23 @@ def device_of(config: RuntimeConfig) -> torch.device:
     return device
 
 
+def bf16_units(device: torch.device) -> list[str]:
+    """What of this device computes in bfloat16; nothing where torch would only emulate it, slower than float32."""
+    if device.type == "cuda":
+        return ["CUDA"] if torch.cuda.is_bf16_supported(including_emulation=False) else []
+    if device.type != "cpu" or not torch.backends.mkldnn.is_available():
+        return []
+    units = {"AMX": torch.cpu._is_amx_tile_supported(), "AVX512-BF16": torch.cpu._is_avx512_bf16_supported()}
+    return [name for name, there in units.items() if there]
+
+
+def precision_on(device: torch.device, precision: str) -> str:
+    """fp32 or bf16: `precision` itself, or where it is auto, bf16 if the device has units for it."""
+    if precision == "auto":
+        return "bf16" if bf16_units(device) else "fp32"
+    return precision
+
+
 def configure(config: RuntimeConfig, seed: int) -> torch.device:
     """Set threads, seed torch, ask torch for deterministic kernels; the device to run on."""
     limit_threads(config.threads or usable_cores())

@@ -1,6 +1,8 @@
 import pytest
+import torch
 
-from polarnet.runtime import RuntimeConfig, device_of, generator_for, seed_for
+from polarnet import runtime
+from polarnet.runtime import RuntimeConfig, bf16_units, device_of, generator_for, precision_on, seed_for
 
 
 def test_a_seed_depends_on_each_of_its_three_parts_and_on_nothing_else():
@@ -26,3 +28,14 @@ def test_a_missing_gpu_is_refused_with_the_way_out():
 def test_zero_workers_are_refused():
     with pytest.raises(ValueError, match="workers: expected >= 1, got 0"):
         RuntimeConfig(device="cpu", threads=1, workers=0)
+
+
+@pytest.mark.parametrize(("units", "precision"), [([], "fp32"), (["AMX"], "bf16")])
+def test_automatic_precision_is_bf16_only_where_the_device_has_units_for_it(monkeypatch, units, precision):
+    monkeypatch.setattr(runtime, "bf16_units", lambda device: units)
+    cpu = torch.device("cpu")
+    assert [precision_on(cpu, asked) for asked in ("auto", "fp32", "bf16")] == [precision, "fp32", "bf16"]
+
+
+def test_a_device_that_is_neither_a_processor_nor_cuda_has_no_bf16_units_that_we_know_of():
+    assert bf16_units(torch.device("meta")) == []

@@ -95,7 +95,7 @@ def test_a_checkpoint_tells_what_its_events_were_made_from(simulated, tmp_path):
     described = {}
     for data in ("store", "fly"):
         config = dataclasses.replace(TRAIN, data=data)
-        described[data] = describe(task, split_of(simulated, data, task), config, tmp_path, SEED)
+        described[data] = describe(task, split_of(simulated, data, task), config, tmp_path, SEED, torch.device("cpu"))
         assert described[data]["training"]["data"] == data
         assert described[data]["data"]["events_from"]["emulate"] == dataclasses.asdict(simulated.emulate)
     assert described["store"]["data"]["events_sha256"] != described["fly"]["data"]["events_sha256"]
