@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,25 @@ def machine_record(root: Path) -> dict[str, Any]:
         "versions": {"python": platform.python_version()} | {n: importlib.metadata.version(n) for n in VERSIONS_OF},
         "commit": git(root, "rev-parse", "HEAD"),
     }
+
+
+def uncommitted(root: Path) -> str:
+    """Changed files of the project at `root` but for docs/results; empty where a figure may name its commit."""
+    return git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
+
+
+def write_section(root: Path, name: str, section: str, figures: Mapping[str, Any], record: Mapping[str, Any]) -> Path:
+    """Write `figures` as one section of docs/results/NAME.json and the machine's record beside it; the rest stays.
+
+    The record (`machine_record`, taken before measuring) becomes `measured.SECTION`: sections may be of different days.
+    """
+    path = root / "docs" / "results" / f"{name}.json"
+    known = json.loads(path.read_text()) if path.exists() else {}
+    known["measured"] = dict(sorted({**known.get("measured", {}), section: dict(record)}.items()))
+    known[section] = dict(figures)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(dict(sorted(known.items())), indent=2, allow_nan=False) + "\n")
+    return path
 
 
 def measure_pipeline(root: Path) -> Path:

@@ -3,7 +3,7 @@ import subprocess
 
 import pytest
 
-from polarnet.measure import BENCHMARK_KEYS, _timed, machine_record, measure_benchmark, measure_pipeline
+from polarnet.measure import BENCHMARK_KEYS, _timed, machine_record, measure_benchmark, measure_pipeline, write_section
 from polarnet.reports.provenance import git
 from polarnet.reports.readme import benchmark_block
 
@@ -27,6 +27,18 @@ def test_figures_name_their_machine_and_commit(project_root):
     record = machine_record(project_root)
     assert set(record) == {"machine", "cores", "load", "versions", "commit"}
     assert record["commit"] == git(project_root, "rev-parse", "HEAD")
+
+
+def test_a_section_of_the_results_is_replaced_and_the_others_stay(tmp_path):
+    write_section(tmp_path, "recordings", "rig", {"captures": 8, "old": 1}, {"commit": "a"})
+    write_section(tmp_path, "recordings", "fuzz", {"cases_per_reader": 10}, {"commit": "b"})
+    path = write_section(tmp_path, "recordings", "rig", {"captures": 32}, {"commit": "c"})
+    assert path == tmp_path / "docs" / "results" / "recordings.json"
+    assert json.loads(path.read_text()) == {
+        "fuzz": {"cases_per_reader": 10},
+        "measured": {"fuzz": {"commit": "b"}, "rig": {"commit": "c"}},
+        "rig": {"captures": 32},
+    }
 
 
 def test_a_tree_with_changes_is_not_measured(tmp_path):

@@ -39,8 +39,7 @@ from skimage import data
 
 from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
-from polarnet.measure import machine_record
-from polarnet.reports.provenance import git
+from polarnet.measure import machine_record, uncommitted
 from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory
 from polarnet.simulation.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.simulation.presets import SENSORS
@@ -267,8 +266,7 @@ def main() -> None:
     if arguments.one:
         print(json.dumps(measure_one(arguments.one, arguments.threads, arguments.repeats)))
         return
-    changed = git(ROOT, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
-    if arguments.write and changed:
+    if arguments.write and (changed := uncommitted(ROOT)):
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
     figures: dict[str, Any] = machine_record(ROOT)
     print(f"{figures['machine']}, {figures['cores']} cores, load {figures['load']}")

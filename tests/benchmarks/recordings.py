@@ -28,14 +28,12 @@ import torch
 
 from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
-from polarnet.measure import machine_record
+from polarnet.measure import machine_record, uncommitted, write_section
 from polarnet.recordings.formats.celex5_bin_writer import write_celex5_bin
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.recording import open_recording
-from polarnet.reports.provenance import git
 
 ROOT = Path(__file__).resolve().parents[2]
-RESULTS = ROOT / "docs" / "results" / "recordings.json"
 PART = 1_000_000  # events that are written at a time, and microseconds that they take
 SMALL = 20_000  # events: enough to compile every kernel
 HEIGHT, WIDTH = 720, 1280
@@ -215,9 +213,9 @@ def in_own_process(reader: str, path: Path, small: Path, repeats: int) -> dict[s
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def measure(sizes: list[int], names: list[str], repeats: int) -> dict[str, Any]:
+def measure(sizes: list[int], names: list[str], repeats: int) -> dict[str, dict[str, Any]]:
     """All figures, printed as they come."""
-    figures: dict[str, Any] = machine_record(ROOT) | {"readers": {}}
+    figures: dict[str, dict[str, Any]] = {}
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
             for size in sizes:
@@ -229,7 +227,7 @@ def measure(sizes: list[int], names: list[str], repeats: int) -> dict[str, Any]:
                 for reader in ["own", *libraries]:
                     key = name if reader == "own" else f"{reader}_{name}"
                     one = in_own_process(reader, path, small, repeats if size == sizes[0] else 1)
-                    figure = figures["readers"].setdefault(key, {"peak_mib": {}})
+                    figure = figures.setdefault(key, {"peak_mib": {}})
                     speed = one["events"] / one["seconds"] / 1e6
                     figure.setdefault("mevents_per_s", round(speed, 2))
                     figure["peak_mib"][f"{size / 1e6:g}M"] = round(one["mib"])
@@ -261,15 +259,13 @@ def main() -> None:
         reader, path, small = arguments.one
         print(json.dumps(measure_one(reader, Path(path), Path(small), arguments.repeats)))
         return
-    changed = git(ROOT, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
-    if arguments.write and changed:
+    if arguments.write and (changed := uncommitted(ROOT)):
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    record = machine_record(ROOT)
     figures = measure(sorted(arguments.events), arguments.readers, arguments.repeats)
     if arguments.write:
-        known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-        RESULTS.parent.mkdir(parents=True, exist_ok=True)
-        RESULTS.write_text(json.dumps(known | figures, indent=2) + "\n")
-        print(f"written to {RESULTS.relative_to(ROOT)}")
+        path = write_section(ROOT, "recordings", "readers", figures, record)
+        print(f"written to {path.relative_to(ROOT)}")
 
 
 if __name__ == "__main__":

@@ -30,12 +30,11 @@ from polarnet.evaluation.benchmark import run_benchmark
 from polarnet.evaluation.methods import available
 from polarnet.evaluation.score import summary
 from polarnet.events.frames import FrameStore
-from polarnet.measure import machine_record
+from polarnet.measure import machine_record, uncommitted, write_section
 from polarnet.recordings.dot import RecordingsConfig
 from polarnet.recordings.imported import import_targets
 from polarnet.recordings.targets import Calibrated, calibrate_targets, spread_us
 from polarnet.reports.calibration import draw_calibration
-from polarnet.reports.provenance import git
 from polarnet.reports.tables import as_plain, score_table
 from polarnet.rig import RigConfig, RigTruth, true_dolp, write_rig
 from polarnet.runtime import generator_for
@@ -44,7 +43,6 @@ from polarnet.simulation.pictures.dead_leaves import dead_leaves
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 
 ROOT = Path(__file__).resolve().parents[2]
-RESULTS = ROOT / "docs" / "results" / "recordings.json"
 PHOTOGRAPHS = (data.coffee, data.chelsea, data.astronaut, data.rocket)
 QUARTER = {"sensor": [200, 320], "region": [45, 2], "crop": [120, 180], "size": [30, 45]}
 RIG = RigConfig(
@@ -139,8 +137,7 @@ def main() -> None:
     parser.add_argument("--cutoff-hz", type=float, default=3000.0, help="of the photoreceptor; a slow one adds a delay")
     parser.add_argument("--pictures", type=Path, default=ROOT / "outputs" / "rig", help="where diagnoses are drawn")
     arguments = parser.parse_args()
-    changed = git(ROOT, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
-    if arguments.write and changed:
+    if arguments.write and (changed := uncommitted(ROOT)):
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
     config = load(ROOT)
     recordings = replace(config.recordings, enabled=True, **({} if arguments.full else QUARTER))
@@ -165,10 +162,8 @@ def main() -> None:
     }
     print(json.dumps(figures, indent=2))
     if arguments.write:
-        known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-        RESULTS.parent.mkdir(parents=True, exist_ok=True)
-        RESULTS.write_text(json.dumps({**known, **record, "rig": figures}, indent=2) + "\n")
-        print(f"written to {RESULTS.relative_to(ROOT)}")
+        path = write_section(ROOT, "recordings", "rig", figures, record)
+        print(f"written to {path.relative_to(ROOT)}")
 
 
 if __name__ == "__main__":
