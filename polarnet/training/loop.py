@@ -48,7 +48,8 @@ class LoopConfig(ViewConfig):
 class TrainConfig(LoopConfig):
     """Section `train` of params.yaml."""
 
-    representation: str = field(metadata=allowed(choices=tuple(REPRESENTATIONS)))
+    representation: str | None = field(metadata=allowed(choices=tuple(REPRESENTATIONS)))
+    """Of the events in a window; null: the one that the network was made for."""
 
 
 def train(
