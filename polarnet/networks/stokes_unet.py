@@ -58,8 +58,8 @@ class StokesUNet(nn.Module):
     The redundancy's candidates for (s1, s2) are mixed by weights that the U-Net chooses at each place, together with a
     constant: coarse, but on the true scale. Fine structure comes from the events themselves, because e0 - e90 counts
     how 2 atanh(s1) has changed at a pixel: (s1, s2) are moved by their sums, times gains that the U-Net chooses too.
-    What it adds last is free. DoLP is not the length of (s1, s2): where these are uncertain their mean is short, as is
-    a mean over angles. The outputs are linear, as those of the paper's network are.
+    What it adds last, when it has seen the result, is free. DoLP is not the length of (s1, s2): where these are
+    uncertain their mean is short, as is a mean over angles. The outputs are linear, as those of the paper's network.
     """
 
     representation = "event_counts"
@@ -91,6 +91,8 @@ class StokesUNet(nn.Module):
         self.up_half = UpBlock(quarter, half)
         self.at_half = ResidualBlock(half)
         self.gains = nn.Conv2d(half, 4 * len(SURROUNDINGS) * memories, kernel_size=1)
+        self.look = conv3x3(half + 4 * 3, half)
+        self.refine = ResidualBlock(half)
         self.add = nn.Conv2d(half, 4 * 4, kernel_size=1)
         self.constant = nn.Parameter(torch.tensor(MIDDLE_DOLP))
         for last in (self.choose, self.gains, self.add):
@@ -129,11 +131,15 @@ class StokesUNet(nn.Module):
         y4 = self.at_quarter(self.up_quarter(self.after(g8), skip=g4))
         mixed = self._mixed(candidates, self.choose(y4).float().softmax(1))
         y2 = self.at_half(self.up_half(y4, skip=x2))
-        gains, added = (F.pixel_shuffle(last(y2), 2).float() for last in (self.gains, self.add))
+        gains = F.pixel_shuffle(self.gains(y2), 2).float()
         coarse = F.interpolate(mixed, scale_factor=4, mode="bilinear")
         moved = _moved(coarse[:, :2], events, gains)
-        dolp = coarse[:, 2] + length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)) + added[:, 2]
-        s1, s2 = (moved + added[:, :2]).unbind(1)
+        dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
+        fine = torch.cat([moved, dolp], dim=1)
+        seen = torch.cat([y2, F.pixel_unshuffle(fine, 2).to(y2.dtype)], dim=1)
+        added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(seen)))), 2).float()
+
+        s1, s2, dolp = (fine + added[:, :3]).unbind(1)
         aolp = torch.remainder(torch.atan2(s2, s1) / 2, math.pi)
         maps = [dolp, aolp, LOG_VARIANCE + added[:, 3], torch.stack([s1, s2], dim=1)]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
