@@ -79,6 +79,9 @@ def _parser() -> argparse.ArgumentParser:
     inspect.add_argument("--part", metavar="SEQUENCE/ANGLE", help="of an event store")
     inspect.add_argument("--clock-mhz", type=float, help="of a CeleX-5, where it was not 100 MHz")
     inspect.add_argument("--assume-polarity", type=int, choices=(1, -1), help="of events that come without one")
+    inspect.add_argument(
+        "--hot-pixel-factor", type=float, default=4.0, help="hot: as many times the events of the busiest around (4)"
+    )
     inspect.add_argument("--picture", type=Path, help="where to write the PNG (default: FILE.png here)")
     inspect.set_defaults(run=_inspect)
 
@@ -201,7 +204,7 @@ def _inspect(options: argparse.Namespace) -> int:
     from polarnet.reports.recordings import recording_picture
 
     chosen = {name: getattr(options, name) for name in ("height", "width", "part", "clock_mhz", "assume_polarity")}
-    inspection = inspect_recording(open_recording(options.file, options.format, **chosen))
+    inspection = inspect_recording(open_recording(options.file, options.format, **chosen), options.hot_pixel_factor)
     for finding in findings(inspection):
         print(finding)
     path = options.picture or Path(f"{options.file.name}.png")

@@ -3,18 +3,15 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Int64, UInt16
 
 from polarnet.events.stream import Events
 from polarnet.recordings.formats.celex5_bin import celex5_pictures
+from polarnet.recordings.pixels import hot_pixels
 from polarnet.recordings.recording import FORMATS, RecordingReader
 from polarnet.recordings.source import REPAIRS, RecordingError
 
-HOT_FACTOR = 10  # times as many events as the pixels around it, and as the mean pixel
-HOT_COUNT = 8  # events at least
-NEIGHBOURHOOD = 5  # pixels, of which the median counts
 MOST_PIXELS = 2**25
 SHORTEST_US = 1000  # that a rate is taken over
 EVENTS_PER_PIXEL = 0.15  # of the part that is shown: enough to see edges, little enough that they do not smear
@@ -45,8 +42,11 @@ class Inspection:
     first_picture: UInt16[np.ndarray, "h w"] | None
 
 
-def inspect_recording(reader: RecordingReader) -> Inspection:
-    """Read a recording once, in constant memory; RecordingError where it fails, or no sensor is as large as it says."""
+def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) -> Inspection:
+    """Read a recording once, in constant memory; RecordingError where it fails, or no sensor is as large as it says.
+
+    `hot_pixel_factor` is that of `polarnet.recordings.pixels.hot_pixels`.
+    """
     pixels = reader.height * reader.width
     if pixels > MOST_PIXELS:
         raise RecordingError(
@@ -81,20 +81,13 @@ def inspect_recording(reader: RecordingReader) -> Inspection:
         start_us=start_us,
         stop_us=stop_us,
         counts=counts.reshape(shape),
-        hot=hot_pixels(counts.reshape(shape)),
+        hot=hot_pixels(counts.reshape(shape), ((stop_us or 0) - (start_us or 0)) * 1e-6, hot_pixel_factor),
         busiest=signed.reshape(shape),
         busiest_rate_hz=rate_hz,
         repairs={kind: count for kind, count in reader.repairs.items() if count},
         pictures=pictures,
         first_picture=first_picture,
     )
-
-
-def hot_pixels(counts: Int64[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels with at least 8 events and over 10 times as many as the median around them and as the mean pixel."""
-    around = cv2.medianBlur(np.minimum(counts, 2**24).astype(np.float32), NEIGHBOURHOOD)
-    usual = np.maximum(around, counts.mean())
-    return (counts >= HOT_COUNT) & (counts > HOT_FACTOR * usual)
 
 
 def findings(inspection: Inspection) -> Iterator[str]:

@@ -2,34 +2,34 @@
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int32
+from jaxtyping import Bool, Int
 
 from polarnet.events.stream import Events
 
 NEIGHBOURHOOD = 5  # pixels, square
 SLOWEST_HOT_HZ = 20.0  # a pixel that fires less does no harm
+FEWEST_EVENTS = 8  # of fewer nothing can be said
 
 
-def event_counts(events: Events) -> Int32[np.ndarray, "h w"]:
+def event_counts(events: Events) -> Int[np.ndarray, "h w"]:
     """How often each pixel fired."""
     pixel = events.y.long() * events.width + events.x.long()
     counts = torch.bincount(pixel, minlength=events.height * events.width)
-    return counts.view(events.height, events.width).int().numpy()
+    return counts.view(events.height, events.width).numpy()
 
 
-def hot_pixels(events: Events, factor: float | int) -> Bool[np.ndarray, "h w"]:
-    """Pixels that fire more than `factor` times as often as the third busiest of the 5x5 pixels around them.
+def hot_pixels(counts: Int[np.ndarray, "h w"], duration_s: float, factor: float | int) -> Bool[np.ndarray, "h w"]:
+    """Pixels that fired more than `factor` times as often as the third busiest of the 5x5 pixels around them.
 
-    The third: thin lines and their ends are not hot, two hot neighbours are. Pixels of less than 20 Hz never are.
+    `counts` are the events of each pixel in `duration_s`. The third: thin lines and their ends are not hot, two hot
+    neighbours are. Pixels of less than 20 Hz, or 8 events, never are.
     """
-    counts = event_counts(events)
-    if not len(events):
-        return np.zeros(counts.shape, np.bool_)
     border = NEIGHBOURHOOD // 2
     around = np.lib.stride_tricks.sliding_window_view(np.pad(counts, border), (NEIGHBOURHOOD, NEIGHBOURHOOD))
-    third = np.partition(around.reshape(*counts.shape, -1), -3, axis=-1)[..., -3]
-    duration_s = float(events.t[-1] - events.t[0]) * 1e-6
-    return counts > np.maximum(factor * third, SLOWEST_HOT_HZ * duration_s)
+    hot = (counts >= FEWEST_EVENTS) & (counts > SLOWEST_HOT_HZ * duration_s)
+    third = np.partition(around[hot].reshape(-1, NEIGHBOURHOOD**2), -3, axis=-1)[:, -3]
+    hot[hot] = counts[hot] > factor * third
+    return hot
 
 
 def without_pixels(events: Events, bad: Bool[np.ndarray, "h w"]) -> Events:

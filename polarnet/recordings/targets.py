@@ -29,7 +29,7 @@ from polarnet.recordings.dot import (
     region_negative_times_us,
 )
 from polarnet.recordings.imported import Target, open_target, shifted
-from polarnet.recordings.pixels import hot_pixels, without_pixels
+from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.status import start_over
 
@@ -97,7 +97,8 @@ def calibrate_target(target: Target, config: RecordingsConfig) -> tuple[Calibrat
     for capture, events in target.events.items():
         bad = np.zeros((events.height, events.width), np.bool_)
         if config.hot_pixel_factor is not None:
-            bad = hot_pixels(events, config.hot_pixel_factor)
+            duration_s = float(events.t[-1] - events.t[0]) * 1e-6 if len(events) else 0.0
+            bad = hot_pixels(event_counts(events), duration_s, config.hot_pixel_factor)
         clean[capture], hot[capture] = without_pixels(events, bad), int(bad.sum())
     try:
         starts = landmark_starts(clean, target.intensities, config, target.given)

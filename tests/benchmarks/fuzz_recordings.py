@@ -1,64 +1,129 @@
 """How many damaged files each reader survives: python tests/benchmarks/fuzz_recordings.py [--write] [--cases N]
 
-Runs tests/recordings/test_fuzz.py with N cases a reader (minutes a reader) and counts those that ended in events or in
-a RecordingError. `--write` puts the smallest count of all readers into docs/results/recordings.json, as
-`fuzz.cases_per_reader`, unless one failed.
+Each reader gets N damaged copies of a small file (hypothesis; tests/recordings/damaged_files.py) in a process of its
+own, a thousand at a time, and a line says how they ended. A file that ends in anything but events or a RecordingError
+is made as small as it gets, and left in outputs/fuzz with what happened.
+
+What has been run is kept in outputs/fuzz, so that a run that was ended goes on where it was, as long as the commit and
+the tree are the same. `--write` puts each reader's cases into docs/results/recordings.json as `fuzz.readers.NAME`, and
+the smallest of all readers as `fuzz.cases_per_reader`; readers left out of this run keep the figures they have there,
+with the commit they were measured at.
 """
 
 import argparse
 import json
-import os
+import shutil
 import subprocess
 import sys
 import tempfile
+import time
+import traceback
+from collections import Counter
 from pathlib import Path
-from xml.etree import ElementTree
+from typing import Any
+
+from hypothesis import HealthCheck, given, seed, settings
+from hypothesis import strategies as st
+
+from polarnet.measure import machine_record, uncommitted, write_section
+from polarnet.recordings.formats import isolated
+from polarnet.recordings.recording import FORMATS
 
 ROOT = Path(__file__).resolve().parents[2]
-RESULTS = ROOT / "docs" / "results" / "recordings.json"
+KEPT = ROOT / "outputs" / "fuzz"
+BATCH = 1000  # cases that one line reports
+PATIENCE_S = 5  # with libraries that a damaged file sends round in circles; the file takes a millisecond
 
 
-def survived(cases: int, form: str) -> int | None:
-    """Cases of a reader that passed; None where one failed. In a process of its own, for a crash would end it."""
+def run_cases(form: str, first: int, cases: int) -> None:
+    """In a process of its own: a line of JSON for each batch from number `first` on."""
+    sys.path[:0] = [str(ROOT / "tests" / "recordings")]
+    from conftest import random_events
+    from damaged_files import DAMAGE, EVENTS, Sample
+
+    isolated.PATIENCE_S = PATIENCE_S
     with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder) / "fuzz.xml"
-        test = f"tests/recordings/test_fuzz.py::test_a_damaged_file_ends_in_events_or_in_the_reason[{form}]"
-        command = [sys.executable, "-m", "pytest", "-q", f"--junitxml={report}", test]
-        environment = os.environ | {"POLARNET_FUZZ_CASES": str(cases)}
-        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-        if report.exists():
-            for item in ElementTree.parse(report).iter("property"):
-                if item.attrib["name"] == "cases":
-                    return int(item.attrib["value"])
-        print(f"{form}: exit status {done.returncode}\n{done.stdout[-1500:]}{done.stderr[:1500]}")
-        return None
+        sample = Sample(form, Path(folder), random_events(0, EVENTS, 300_000, 260, 346))
+        for batch in range(first, -(-cases // BATCH)):
+            try:
+                endings = run_batch(sample, DAMAGE, batch, min(BATCH, cases - batch * BATCH))
+            except Exception:
+                failed = KEPT / f"{form}.failed"
+                shutil.rmtree(failed, ignore_errors=True)
+                (shutil.copytree if sample.path.is_dir() else shutil.copy)(sample.path, failed)
+                (KEPT / f"{form}.txt").write_text(traceback.format_exc())
+                sys.exit(f"{form}: an ending that is none; see {failed} and {form}.txt beside it")
+            print(json.dumps({"batches": batch + 1, "endings": endings}), flush=True)
+
+
+def run_batch(sample: Any, damage_of: st.SearchStrategy, batch: int, cases: int) -> Counter[str]:
+    """How the cases that the batch's number draws end; whatever a reader raises beyond RecordingError."""
+    endings: Counter[str] = Counter()
+
+    @seed(batch)
+    @settings(max_examples=cases, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+    @given(damage_of, st.integers(0, 50), st.booleans(), st.integers(1, 100))
+    def one_case(damage: Any, number: int, says_format: bool, chunk_events: int) -> None:
+        endings[sample.ending(damage, number, says_format, chunk_events)] += 1
+
+    one_case()
+    return endings
+
+
+def fuzz(form: str, cases: int, state: str) -> dict[str, Any]:
+    """Cases and endings of a reader, printed and kept as they come; those kept of the same `state` are not run again.
+
+    Exits with what the reader's process said where it ended in another way.
+    """
+    kept = KEPT / f"{form}.json"
+    found = json.loads(kept.read_text()) if kept.exists() else {}
+    if found.get("state") != state or found["cases"] > cases or found["cases"] % BATCH:
+        found = {"state": state, "batches": 0, "cases": 0, "seconds": 0.0, "endings": {}}
+    command = [sys.executable, __file__, "--one", form, str(found["batches"]), str(cases)]
+    start, before_s = time.monotonic(), found["seconds"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            one = json.loads(line)
+            endings = Counter(found["endings"]) + Counter(one["endings"])
+            found |= {"batches": one["batches"], "cases": endings.total(), "endings": dict(sorted(endings.items()))}
+            found["seconds"] = round(before_s + time.monotonic() - start, 1)
+            kept.write_text(json.dumps(found))
+            print(f"{form:14s} {found['cases']:6d} cases in {found['seconds']:6.1f} s: {found['endings']}", flush=True)
+    if process.returncode:
+        sys.exit(f"{form}: after {found['cases']} cases its process ended with status {process.returncode}")
+    return found
 
 
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="into docs/results/recordings.json")
+    parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
     parser.add_argument("--cases", type=int, default=10_000, help="for each reader")
-    parser.add_argument("--forms", nargs="*", default=[], help="only these readers; not with --write")
+    parser.add_argument("--readers", nargs="*", choices=list(FORMATS), default=list(FORMATS))
+    parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.write and arguments.forms:
-        parser.error("--write counts all readers; leave out --forms")
-    from polarnet.recordings.recording import FORMATS
-
-    found = {}
-    for form in arguments.forms or FORMATS:
-        cases = survived(arguments.cases, form)
-        if cases is None:
-            sys.exit(f"{form} did not pass")
-        found[form] = cases
-        print(f"{form:14s} {cases} cases passed", flush=True)
-    print(f"{min(found.values())} cases a reader passed, of {len(found)} readers")
+    KEPT.mkdir(parents=True, exist_ok=True)
+    if arguments.one:
+        form, first, cases = arguments.one
+        run_cases(form, int(first), int(cases))
+        return
+    changed = uncommitted(ROOT)
+    if arguments.write and changed:
+        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    record = machine_record(ROOT)
+    found = {form: fuzz(form, arguments.cases, f"{record['commit']} {changed}") for form in arguments.readers}
+    print(f"{min(one['cases'] for one in found.values())} cases a reader passed, of {len(found)} readers")
     if arguments.write:
-        known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-        known["fuzz"] = {"cases_per_reader": min(found.values())}
-        RESULTS.parent.mkdir(parents=True, exist_ok=True)
-        RESULTS.write_text(json.dumps(known, indent=2) + "\n")
-        print(f"written to {RESULTS.relative_to(ROOT)}")
+        results = ROOT / "docs" / "results" / "recordings.json"
+        known = json.loads(results.read_text()) if results.exists() else {}
+        readers = known.get("fuzz", {}).get("readers", {}) | {
+            form: {key: one[key] for key in ("cases", "endings", "seconds")} | {"commit": record["commit"]}
+            for form, one in found.items()
+        }
+        least = min(readers[form]["cases"] if form in readers else 0 for form in FORMATS)
+        path = write_section(ROOT, "recordings", "fuzz", {"cases_per_reader": least, "readers": readers}, record)
+        print(f"written to {path.relative_to(ROOT)}")
 
 
 if __name__ == "__main__":

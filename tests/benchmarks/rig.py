@@ -3,11 +3,13 @@
 Each target is another picture: photographs of scikit-image and dead leaves. Its eight captures, written as CeleX-5
 files with random delays, sensor noise and hot pixels, are imported and calibrated as the stages do it. Printed: errors
 of start times by the landmark (in pictures of the camera) and refined (in milliseconds, but for what all eight have in
-common, as the zero of their clock is a convention), the root mean square difference of the DoLP from the scene's own,
-thresholds, and the benchmark's table, with the networks in data/train and data/train_e2v where there are any.
+common, as the zero of their clock is a convention; that is `clock_zero_ms_max`), the root mean square difference of the
+DoLP from the scene's own, thresholds, and the benchmark's table, with the networks that `--data` has in train and
+train_e2v.
 
 The sensor is a quarter of a CeleX-5 in each direction (200 x 320, pictures of 30 x 45), with --full all of it (800 x
-1280, pictures of 120 x 180). `--write` merges the figures into docs/results/recordings.json.
+1280, pictures of 120 x 180). `--write` merges the figures into docs/results/recordings.json as section `rig`, or
+`rig_full`.
 """
 
 import argparse
@@ -30,7 +32,7 @@ from polarnet.evaluation.benchmark import run_benchmark
 from polarnet.evaluation.methods import available
 from polarnet.evaluation.score import summary
 from polarnet.events.frames import FrameStore
-from polarnet.measure import machine_record, uncommitted, write_section
+from polarnet.measure import BENCHMARK_KEYS, machine_record, uncommitted, write_section
 from polarnet.recordings.dot import RecordingsConfig
 from polarnet.recordings.imported import import_targets
 from polarnet.recordings.targets import Calibrated, calibrate_targets, spread_us
@@ -81,8 +83,7 @@ def measured(
         seconds = time.perf_counter() - start
         draw_calibration(found, recordings, pictures / f"{name}.png")
         frames = FrameStore.open(out / "frames.zarr")
-        zero_us = np.mean([found.start_us[capture] - start for capture, start in truth.start_us.items()])
-        expected = true_dolp(truth, frames.t_us(name).numpy() + round(float(zero_us)), recordings)
+        expected = true_dolp(truth, frames.t_us(name).numpy() + round(clock_zero_us(truth, found)), recordings)
         squared = float((frames.dolp(name) - expected).pow(2).mean())
         for left in (raw, imported):
             shutil.rmtree(left)
@@ -109,8 +110,13 @@ def landmark_frames(truth: RigTruth, found: Calibrated, rig: RigConfig) -> float
     return max(errors) * 1e-6 * rig.picture_rate_hz
 
 
-def print_table(folder: Path, names: list[str], config: Config) -> None:
-    """The benchmark's table over all targets, each in a store of its own."""
+def clock_zero_us(truth: RigTruth, found: Calibrated) -> float:
+    """How much later the captures' common clock begins than the landmark."""
+    return float(np.mean([found.start_us[capture] - start for capture, start in truth.start_us.items()]))
+
+
+def benchmarked(folder: Path, names: list[str], config: Config) -> dict[str, dict[str, Any]]:
+    """The benchmark's scores over all targets, each in a store of its own, printed as a table."""
     context = context_of(config, train_mean=0.0)
     wanted = [
         method for method in config.benchmark.methods if method != "train_mean"
@@ -126,6 +132,7 @@ def print_table(folder: Path, names: list[str], config: Config) -> None:
     print(as_plain(score_table({m: {**s, **costs[m]} for m, s in scores.items()}, "not loaded here")))
     for method, reason in absent.items():
         print(f"{method} is left out: {reason}")
+    return {method: {key: scores[method].get(key) for key in BENCHMARK_KEYS} for method in scores}
 
 
 def main() -> None:
@@ -135,11 +142,12 @@ def main() -> None:
     parser.add_argument("--targets", type=int, default=8, help="of eight captures each")
     parser.add_argument("--full", action="store_true", help="the whole sensor")
     parser.add_argument("--cutoff-hz", type=float, default=3000.0, help="of the photoreceptor; a slow one adds a delay")
+    parser.add_argument("--data", type=Path, default=ROOT / "data", help="where trained networks are looked for")
     parser.add_argument("--pictures", type=Path, default=ROOT / "outputs" / "rig", help="where diagnoses are drawn")
     arguments = parser.parse_args()
     if arguments.write and (changed := uncommitted(ROOT)):
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
-    config = load(ROOT)
+    config = load(ROOT, [f"paths.data={arguments.data.absolute()}"])
     recordings = replace(config.recordings, enabled=True, **({} if arguments.full else QUARTER))
     rig = FULL_RIG if arguments.full else RIG
     emulator = replace(config.emulate, model="exact", cutoff_hz=arguments.cutoff_hz)
@@ -148,7 +156,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         found = list(measured(folder, arguments.targets, rig, recordings, emulator, arguments.pictures))
-        print_table(folder, [one.name for _, one, _ in found], config)
+        scores = benchmarked(folder, [one.name for _, one, _ in found], config)
     figures = {
         "captures": 8 * len(found),
         "sensor": list(recordings.sensor),
@@ -157,12 +165,14 @@ def main() -> None:
         "refined_error_ms_max": round(
             max(float(np.abs(spread_us(one.start_us, truth.start_us)).max()) for truth, one, _ in found) / 1000, 3
         ),
+        "clock_zero_ms_max": round(max(abs(clock_zero_us(truth, one)) for truth, one, _ in found) / 1000, 3),
         "dolp_rms": round(float(np.mean([squared for _, _, squared in found])) ** 0.5, 5),
         "dolp_rms_max": round(max(squared for _, _, squared in found) ** 0.5, 5),
+        "benchmark": scores,
     }
     print(json.dumps(figures, indent=2))
     if arguments.write:
-        path = write_section(ROOT, "recordings", "rig", figures, record)
+        path = write_section(ROOT, "recordings", "rig_full" if arguments.full else "rig", figures, record)
         print(f"written to {path.relative_to(ROOT)}")
 
 

@@ -19,7 +19,7 @@ SCENES = {"t1": "photo", "a1": "lake", "a2": "lake", "b1": "wood", "c1": "town"}
 
 
 @pytest.fixture
-def test_set(make_recording, tmp_path):
+def five_scenes(make_recording, tmp_path):
     splits = {name: "train" if name.startswith("t") else "test" for name in SCENES}
     frames = FrameStore.create(tmp_path / "frames.zarr", list(SCENES), splits, 5, 18, 20, {"scenes": SCENES})
     events = EventStore.create(tmp_path / "events.zarr", list(SCENES), 18, 20, {})
@@ -46,8 +46,8 @@ def config(**changes):
     return BenchmarkConfig(**{**values, "panel_scenes": 2, **changes})
 
 
-def test_a_recording_is_a_test_sequence_with_the_truth_at_the_end_of_each_window(test_set, make_recording):
-    recordings = list(test_set.recordings())
+def test_a_recording_is_a_test_sequence_with_the_truth_at_the_end_of_each_window(five_scenes, make_recording):
+    recordings = list(five_scenes.recordings())
     assert [(r.name, r.scene) for r in recordings] == [("a1", "lake"), ("a2", "lake"), ("b1", "wood"), ("c1", "town")]
     made = make_recording("a1", seed=1)
     torch.testing.assert_close(recordings[0].dolp, made.dolp, atol=1e-5, rtol=0)
@@ -55,13 +55,13 @@ def test_a_recording_is_a_test_sequence_with_the_truth_at_the_end_of_each_window
     assert torch.equal(recordings[0].events[3].t, made.events[3].t)
 
 
-def test_the_training_mean_counts_training_frames_after_the_warm_up(test_set, make_recording):
+def test_the_training_mean_counts_training_frames_after_the_warm_up(five_scenes, make_recording):
     expected = make_recording("t1", seed=0).dolp[1:].mean().item()
-    assert train_mean_dolp(test_set.frames, 1) == pytest.approx(expected, abs=1e-5)
+    assert train_mean_dolp(five_scenes.frames, 1) == pytest.approx(expected, abs=1e-5)
 
 
-def test_the_whole_benchmark_on_small_test_set(test_set, context, tmp_path):
-    benchmark = run_benchmark(test_set, context, config(), None, tmp_path / "cache")
+def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
+    benchmark = run_benchmark(five_scenes, context, config(), None, tmp_path / "cache")
     folder = tmp_path / "benchmark"
     returned = write_benchmark(folder, benchmark, config(), 1, {"lpips": {"reason": "no weights"}, "train_mean": 0.25})
     metrics = json.loads((folder / "metrics.json").read_text())
@@ -91,9 +91,9 @@ def test_the_whole_benchmark_on_small_test_set(test_set, context, tmp_path):
     assert set(details["scene_means"]["ssim"]["cf"]) == {"lake", "town", "wood"}
 
 
-def test_panels_show_one_window_of_different_scenes_and_every_method(test_set, context, tmp_path):
+def test_panels_show_one_window_of_different_scenes_and_every_method(five_scenes, context, tmp_path):
     wanted = config(methods=["zeros", "cf"])
-    benchmark = run_benchmark(test_set, context, wanted, None, tmp_path / "cache")
+    benchmark = run_benchmark(five_scenes, context, wanted, None, tmp_path / "cache")
     assert [(p.sequence, p.scene, p.window, p.t_us) for p in benchmark.panels] == [
         ("a1", "lake", 2, 3000),
         ("c1", "town", 2, 3000),
@@ -111,20 +111,20 @@ def test_panels_show_one_window_of_different_scenes_and_every_method(test_set, c
         assert panel["dolp_cf"].dtype == np.float32
 
 
-def test_all_but_the_time_is_the_same_in_two_runs(test_set, context, tmp_path):
+def test_all_but_the_time_is_the_same_in_two_runs(five_scenes, context, tmp_path):
     some = config(methods=["cf", "e2v", "ours"])
     for name in ("one", "two"):
-        found = run_benchmark(test_set, context, some, None, tmp_path / f"cache_{name}")
+        found = run_benchmark(five_scenes, context, some, None, tmp_path / f"cache_{name}")
         write_benchmark(tmp_path / name, found, some, 1, {})
     for file in ("frames.csv", "details.json", "panels/a1.npz"):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
 
 
-def test_no_test_sequence_is_an_error(test_set, context, tmp_path):
+def test_no_test_sequence_is_an_error(five_scenes, context, tmp_path):
     frames = FrameStore.create(tmp_path / "f.zarr", ["t1"], {"t1": "train"}, 5, 18, 20, {})
-    frames.write("t1", *test_set.frames.frames("t1"))
+    frames.write("t1", *five_scenes.frames.frames("t1"))
     frames.finish()
-    without = BenchmarkSet("simulated", test_set.events, FrameStore.open(tmp_path / "f.zarr"))
+    without = BenchmarkSet("simulated", five_scenes.events, FrameStore.open(tmp_path / "f.zarr"))
     with pytest.raises(ValueError, match=r"has no test sequence; raise ingest.test_fraction"):
         run_benchmark(without, context, config(), None, tmp_path / "cache")
 
@@ -142,42 +142,42 @@ def ran(monkeypatch):
     return ran
 
 
-def test_a_second_run_recovers_nothing_and_a_new_method_recovers_itself_alone(test_set, context, tmp_path, ran):
-    first = run_benchmark(test_set, context, config(methods=["zeros", "cf"]), None, tmp_path / "cache")
+def test_a_second_run_recovers_nothing_and_a_new_method_recovers_itself_alone(five_scenes, context, tmp_path, ran):
+    first = run_benchmark(five_scenes, context, config(methods=["zeros", "cf"]), None, tmp_path / "cache")
     assert len(ran) == 2 * 4
     ran.clear()
-    again = run_benchmark(test_set, context, config(methods=["zeros", "cf"]), None, tmp_path / "cache")
+    again = run_benchmark(five_scenes, context, config(methods=["zeros", "cf"]), None, tmp_path / "cache")
     assert ran == []
     assert again.rows == first.rows
     assert again.costs == first.costs
-    more = run_benchmark(test_set, context, config(methods=["zeros", "cf", "highpass"]), None, tmp_path / "cache")
+    more = run_benchmark(five_scenes, context, config(methods=["zeros", "cf", "highpass"]), None, tmp_path / "cache")
     assert {method for method, _ in ran} == {"highpass"}
     assert [row for row in more.rows if row.method != "highpass"] == list(first.rows)
 
 
-def test_a_changed_parameter_recovers_the_methods_that_use_it(test_set, context, tmp_path, ran):
+def test_a_changed_parameter_recovers_the_methods_that_use_it(five_scenes, context, tmp_path, ran):
     chosen = config(methods=["zeros", "cf", "highpass"])
-    run_benchmark(test_set, context, chosen, None, tmp_path / "cache")
+    run_benchmark(five_scenes, context, chosen, None, tmp_path / "cache")
     ran.clear()
     other = dataclasses.replace(context, cf=dataclasses.replace(context.cf, cutoff_hz=1.0))
-    run_benchmark(test_set, other, chosen, None, tmp_path / "cache")
+    run_benchmark(five_scenes, other, chosen, None, tmp_path / "cache")
     assert {method for method, _ in ran} == {"cf"}
 
 
-def test_another_warm_up_or_lpips_scores_anew_without_recovering(test_set, context, tmp_path, ran):
-    run_benchmark(test_set, context, config(methods=["cf"]), None, tmp_path / "cache")
+def test_another_warm_up_or_lpips_scores_anew_without_recovering(five_scenes, context, tmp_path, ran):
+    run_benchmark(five_scenes, context, config(methods=["cf"]), None, tmp_path / "cache")
     ran.clear()
     torch.manual_seed(0)
     changed = config(methods=["cf"], warmup_windows=2)
-    found = run_benchmark(test_set, context, changed, Lpips("squeeze"), tmp_path / "cache")
+    found = run_benchmark(five_scenes, context, changed, Lpips("squeeze"), tmp_path / "cache")
     assert ran == []
     assert len(found.rows) == 4 * 2
     assert all(row.lpips is not None for row in found.rows)
 
 
-def test_two_processes_give_the_rows_of_one(test_set, context, tmp_path):
+def test_two_processes_give_the_rows_of_one(five_scenes, context, tmp_path):
     chosen = config(methods=["zeros", "cf"])
     mapper = functools.partial(pmap, workers=2, label="test")
-    one = run_benchmark(test_set, context, chosen, None, tmp_path / "one")
-    two = run_benchmark(test_set, context, chosen, None, tmp_path / "two", mapper)
+    one = run_benchmark(five_scenes, context, chosen, None, tmp_path / "one")
+    two = run_benchmark(five_scenes, context, chosen, None, tmp_path / "two", mapper)
     assert one.rows == two.rows

@@ -6,15 +6,17 @@ from polarnet.cli import main
 from polarnet.events.stream import merge
 from polarnet.recordings.formats.celex5_bin_writer import write_celex5_pictures
 from polarnet.recordings.formats.celex5_csv import write_celex5_csv
-from polarnet.recordings.inspection import findings, hot_pixels, inspect_recording
+from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
+
+FACTOR = 4
 
 
 def test_counts_rates_and_time_are_those_of_the_events(tmp_path, make_random_events):
     events = make_random_events(0, 4000, 2_000_000)
     write_celex5_csv(tmp_path / "e.csv", events)
-    inspection = inspect_recording(open_recording(tmp_path / "e.csv", chunk_events=333))
+    inspection = inspect_recording(open_recording(tmp_path / "e.csv", chunk_events=333), FACTOR)
     assert (inspection.format, inspection.height, inspection.width) == ("celex5_csv", 800, 1280)
     assert (inspection.on, inspection.off) == (int((events.p > 0).sum()), int((events.p < 0).sum()))
     assert (inspection.start_us, inspection.stop_us) == (int(events.t[0]), int(events.t[-1]))
@@ -30,7 +32,7 @@ def test_the_picture_is_of_the_consecutive_events_that_took_the_least_time(tmp_p
     later = [(100_000 + 1000 * k, k % 20, 3, 1) for k in range(30)]
     path = tmp_path / "e.txt"
     path.write_text("20 10\n" + "".join(f"{t} {x} {y} {p}\n" for t, x, y, p in slow + quick + later))
-    inspection = inspect_recording(open_recording(path, chunk_events=7))
+    inspection = inspect_recording(open_recording(path, chunk_events=7), FACTOR)
     assert np.argwhere(inspection.busiest).tolist() == [[7, 5]]
     assert inspection.busiest[7, 5] == -30
     assert inspection.busiest_rate_hz == pytest.approx(30 / 0.0029)
@@ -38,24 +40,13 @@ def test_the_picture_is_of_the_consecutive_events_that_took_the_least_time(tmp_p
 
 def test_a_recording_of_few_events_is_shown_whole(tmp_path):
     (tmp_path / "e.txt").write_text("20 10\n1 2 3 1\n2 2 3 0\n3 4 5 1\n")
-    inspection = inspect_recording(open_recording(tmp_path / "e.txt"))
+    inspection = inspect_recording(open_recording(tmp_path / "e.txt"), FACTOR)
     assert np.argwhere(inspection.busiest).tolist() == [[5, 4]]
-
-
-def test_a_pixel_that_fires_on_its_own_is_hot_and_a_busy_edge_is_not():
-    counts = np.ones((40, 60), np.int64)
-    counts[10:13] = 50  # an edge that passes
-    counts[30, 20] = 100
-    assert np.argwhere(hot_pixels(counts)).tolist() == [[30, 20]]
-
-
-def test_a_still_sensor_has_no_hot_pixels():
-    assert not hot_pixels(np.zeros((8, 8), np.int64)).any()
 
 
 def test_findings_say_what_was_repaired_and_how_often(tmp_path):
     (tmp_path / "e.txt").write_text("20 10\n5 2 3 1\n4 2 3 0\n6 2 x 1\n3000000 4 5 1\n")
-    lines = "\n".join(findings(inspect_recording(open_recording(tmp_path / "e.txt"))))
+    lines = "\n".join(findings(inspect_recording(open_recording(tmp_path / "e.txt"), FACTOR)))
     for words in (
         "format      text: lines `t x y p`",
         "sensor      20 x 10 px",
@@ -106,4 +97,4 @@ def test_inspect_of_a_mode_without_polarity_says_what_to_do(tmp_path, capsys):
 def test_a_sensor_larger_than_any_is_refused(tmp_path):
     (tmp_path / "e.txt").write_text("32767 32767\n1 2 3 1\n")
     with pytest.raises(RecordingError, match="no event camera has 32767 x 32767 px"):
-        inspect_recording(open_recording(tmp_path / "e.txt"))
+        inspect_recording(open_recording(tmp_path / "e.txt"), FACTOR)

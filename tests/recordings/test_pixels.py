@@ -20,11 +20,16 @@ def busy(generator, height=20, width=30, each=20):
     return Events(*map(torch.from_numpy, columns), height, width), counts
 
 
+def hot_of(events):
+    """Those of a recording of a second."""
+    return hot_pixels(event_counts(events), 1.0, 5)
+
+
 def test_a_pixel_that_fires_much_more_than_those_around_it_is_hot_and_an_edge_is_not():
     events, counts = busy(np.random.default_rng(0))
     assert np.array_equal(event_counts(events), counts)
-    assert np.argwhere(hot_pixels(events, 5)).tolist() == [[3, 4]]
-    clean = without_pixels(events, hot_pixels(events, 5))
+    assert np.argwhere(hot_of(events)).tolist() == [[3, 4]]
+    clean = without_pixels(events, hot_of(events))
     assert len(clean) == len(events) - 900
     assert event_counts(clean)[3, 4] == 0
     assert (clean.t.diff() >= 0).all()
@@ -32,11 +37,29 @@ def test_a_pixel_that_fires_much_more_than_those_around_it_is_hot_and_an_edge_is
 
 def test_nothing_is_hot_where_nothing_fires():
     empty = Events.empty(20, 30)
-    assert not hot_pixels(empty, 5).any()
-    assert len(without_pixels(empty, hot_pixels(empty, 5))) == 0
+    assert not hot_of(empty).any()
+    assert len(without_pixels(empty, hot_of(empty))) == 0
 
 
 def test_a_pixel_that_fires_now_and_then_in_a_quiet_recording_is_not_hot():
     t = torch.arange(10) * 100_000
     x = torch.full((10,), 7, dtype=torch.int16)
-    assert not hot_pixels(Events(t, x, x, torch.ones(10, dtype=torch.int8), 20, 30), 5).any()
+    assert not hot_of(Events(t, x, x, torch.ones(10, dtype=torch.int8), 20, 30)).any()
+
+
+def test_one_factor_more_than_the_third_busiest_around_is_hot_and_thin_lines_are_not():
+    counts = np.ones((40, 60), np.int64)
+    counts[10:13] = 50  # an edge that passes
+    counts[25, 5:30] = 50  # a line of one pixel
+    counts[34, 20] = 100
+    counts[34, 40:42] = 100  # two neighbours
+    assert np.argwhere(hot_pixels(counts, 1.0, 5)).tolist() == [[34, 20], [34, 40], [34, 41]]
+
+
+def test_a_few_events_in_no_time_are_not_hot():
+    counts = np.zeros((8, 8), np.int64)
+    counts[3, 4] = 7
+    assert not hot_pixels(counts, 1e-6, 4).any()
+    counts[3, 4] = 8
+    assert hot_pixels(counts, 1e-6, 4).any()
+    assert not hot_pixels(counts, 1.0, 4).any()

@@ -3,18 +3,24 @@
 Its decoder of EVT3 holds times back where the sensor's clock steps back, so EVT2 and EVT3 are read in `evt`.
 """
 
+import contextlib
+import itertools
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from polarnet.recordings.formats.isolated import IsolatedLibrary
 from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size
 
 AEDAT4 = b"#!AER-DAT4"
 EVENT_STREAM = b"Event Stream"
-GATHERED_EVENTS = 2**16
+
+_library = IsolatedLibrary(
+    "faery", "faery", "recordings", Path(__file__).with_name("faery_tasks.py"), "the file is damaged"
+)
+_readers = itertools.count()
 
 
 def matches_aedat4(path: Path, head: bytes) -> bool:
@@ -38,46 +44,19 @@ def open_event_stream(path: Path, choices: Choices) -> Source:
 
 
 def _source(path: Path, choices: Choices, file_type: str) -> Source:
-    width, height = _guarded(path, lambda: _decoder(path, file_type).dimensions())
-    height, width = sensor_size(path, choices, height, width)
+    height, width = sensor_size(path, choices, *_library.ask(path, "size", file_type))
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        packets = iter(_guarded(path, lambda: _decoder(path, file_type)))
-        waiting, count = [], 0  # packets are small
-        while (packet := _guarded(path, lambda: next(packets, None))) is not None:
-            waiting.append(packet)
-            count += len(packet)
-            if count >= GATHERED_EVENTS:
-                yield _block(waiting)
-                waiting, count = [], 0
-        if count:
-            yield _block(waiting)
+        reader = next(_readers)
+        try:
+            for number in itertools.count():
+                columns = _library.ask(path, "block", file_type, reader, number)
+                if columns is None:
+                    return
+                t, x, y, on = columns
+                yield Block(t, x, y, on.view(np.uint8))
+        finally:
+            with contextlib.suppress(RecordingError, RuntimeError):
+                _library.ask(path, "close", reader)
 
     return Source(height, width, blocks)
-
-
-def _block(packets: list[np.ndarray]) -> Block:
-    joined = np.concatenate(packets)
-    return Block(joined["t"], joined["x"], joined["y"], joined["on"].view(np.uint8))
-
-
-def _decoder(path: Path, file_type: str) -> Any:
-    try:
-        import faery
-    except ImportError:
-        raise RuntimeError(f"{path.name}: this format needs faery: pip install 'polarnet[recordings]'") from None
-    return faery.events_stream_from_file(path, file_type=file_type)
-
-
-def _guarded(path: Path, call: Any) -> Any:
-    """What faery answers; whatever it raises about a damaged file becomes a RecordingError."""
-    try:
-        return call()
-    except (RuntimeError, RecordingError) as error:
-        if isinstance(error.__context__, ImportError):
-            raise
-        raise RecordingError(f"{path.name}: faery cannot read it: {error}") from error
-    except BaseException as error:  # a panic of its Rust code is no Exception
-        if isinstance(error, (KeyboardInterrupt, SystemExit, GeneratorExit)):
-            raise
-        raise RecordingError(f"{path.name}: faery cannot read it: {error}") from error

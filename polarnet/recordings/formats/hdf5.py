@@ -1,12 +1,6 @@
 """HDF5 files of two kinds: events as DSEC stores them, and the recordings of a polarization camera of E2P (PDAVIS)."""
 
 import contextlib
-import importlib.util
-import os
-import pickle
-import subprocess
-import sys
-import threading
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,15 +8,23 @@ from typing import Any
 
 import numpy as np
 
+from polarnet.recordings.formats.isolated import IsolatedLibrary
 from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, sensor_size
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 DSEC_COLUMNS = ("events/t", "events/x", "events/y", "events/p")
 LARGEST = 2**53  # whole number
 E2P_COLUMNS = 4  # of /events: t in microseconds, x, y, p of 0 or 1
-PATIENCE_S = 60  # for a block; a damaged file can send the library round in circles
 
 Description = dict[str, Any]
+
+_library = IsolatedLibrary(
+    "HDF5",
+    "h5py",
+    "hdf5",
+    Path(__file__).with_name("hdf5_tasks.py"),
+    "the file is damaged, or compressed in a way that needs pip install 'polarnet[recordings]'",
+)
 
 
 def matches_e2p(path: Path, head: bytes) -> bool:
@@ -91,16 +93,16 @@ def open_e2p(path: Path, choices: Choices) -> Source:
 
 def _described(path: Path) -> Description:
     tables = [*DSEC_COLUMNS, "events"]
-    return _worker.ask(path, "describe", (tables, ["t_offset", "height", "width", "sensor_resolution"]))
+    return _library.ask(path, "describe", tables, ["t_offset", "height", "width", "sensor_resolution"])
 
 
 def _read(path: Path, tables: tuple[str, ...], length: int) -> Iterator[list[np.ndarray]]:
     try:
         for start in range(0, length, BLOCK_EVENTS):
-            yield _worker.ask(path, "read", (tables, start, start + BLOCK_EVENTS))
+            yield _library.ask(path, "read", tables, start, start + BLOCK_EVENTS)
     finally:
         with contextlib.suppress(RecordingError, RuntimeError):
-            _worker.ask(path, "close", ())
+            _library.ask(path, "close")
 
 
 def _length(path: Path, description: Description, name: str, dimensions: int) -> int:
@@ -127,57 +129,3 @@ def _microseconds(path: Path, t: np.ndarray) -> np.ndarray:
     if t.dtype.kind == "f" and not (np.equal(t, np.floor(t)).all() and (np.abs(t) < LARGEST).all()):
         raise RecordingError(f"{path.name}: expected whole microseconds as times")
     return t.astype(np.int64)
-
-
-class _Worker:
-    """The process that reads, started when it is first needed and again after a crash; one request at a time."""
-
-    def __init__(self) -> None:
-        self._process: subprocess.Popen[bytes] | None = None
-        self._owner = 0
-        self._lock = threading.Lock()
-
-    def ask(self, path: Path, task: str, arguments: tuple) -> Any:
-        """The worker's answer; RecordingError with what HDF5 said, or where it crashed or took too long."""
-        if sys.modules.get("h5py", True) is None or importlib.util.find_spec("h5py") is None:
-            raise RuntimeError(f"{path.name}: HDF5 needs h5py: pip install 'polarnet[hdf5]'")
-        with self._lock:
-            process = self._running()
-            assert process.stdin is not None
-            assert process.stdout is not None
-            deadline = threading.Timer(PATIENCE_S, process.kill)
-            deadline.start()
-            try:
-                pickle.dump((str(path.absolute()), task, arguments), process.stdin)
-                process.stdin.flush()
-                kind, answer = pickle.load(process.stdout)
-            except (EOFError, BrokenPipeError, pickle.UnpicklingError):
-                process.kill()
-                process.wait()
-                self._process = None
-                raise RecordingError(
-                    f"{path.name}: HDF5 cannot read it: the library crashed or took over {PATIENCE_S} s; it is damaged"
-                ) from None
-            finally:
-                deadline.cancel()
-        if kind == "error":
-            raise RecordingError(
-                f"{path.name}: HDF5 cannot read it: {answer}; it is damaged, or compressed in a way that needs "
-                f"pip install 'polarnet[recordings]'"
-            )
-        return answer
-
-    def _running(self) -> "subprocess.Popen[bytes]":
-        if self._owner != os.getpid() or self._process is None or self._process.poll() is not None:
-            self._owner = os.getpid()  # a fork must not share its parent's
-            script = Path(__file__).with_name("hdf5_worker.py")
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", str(script)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-            )
-        return self._process
-
-
-_worker = _Worker()

@@ -3,7 +3,7 @@ import sys
 import numpy as np
 import pytest
 
-from polarnet.recordings.recording import read_recording
+from polarnet.recordings.recording import open_recording, read_recording
 from polarnet.recordings.source import RecordingError
 
 ROWS = [(5, 1, 2, True), (9, 345, 259, False), (9, 3, 4, True)]
@@ -39,6 +39,27 @@ def test_a_cut_file_is_refused_with_what_the_library_says(tmp_path):
     path.write_bytes(path.read_bytes()[:40])
     with pytest.raises(RecordingError, match=r"e\.aedat4: faery cannot read it: "):
         read_recording(path)
+
+
+def test_damage_that_crashes_the_library_ends_in_events_or_in_the_reason(tmp_path):
+    """Bytes that state sizes and places: some of them end the process that faery runs in, and none ours."""
+    sound = write(tmp_path / "e.aedat4").read_bytes()
+    path, reasons = tmp_path / "damaged.aedat4", []
+    for place in range(len(sound) // 2, len(sound), 3):
+        path.write_bytes(sound[:place] + b"\xff" + sound[place + 1 :])
+        try:
+            assert len(read_recording(path).events) <= len(ROWS)
+        except RecordingError as error:
+            reasons.append(str(error))
+    assert len(reasons) > 20
+    assert all(reason.startswith("damaged.aedat4: ") for reason in reasons)
+
+
+def test_two_readers_of_one_file_do_not_disturb_each_other(tmp_path):
+    path = write(tmp_path / "e.es")
+    one, two = iter(open_recording(path, chunk_events=1)), iter(open_recording(path, chunk_events=1))
+    found = [int(next(reader).x[0]) for reader in (one, two, two, one, one, two)]
+    assert found == [1, 1, 345, 345, 3, 3]
 
 
 def test_without_the_library_the_error_names_the_extra(tmp_path, monkeypatch):

@@ -1,12 +1,6 @@
-"""A process of its own that reads HDF5 files: the library can crash on a damaged one, which must not end ours.
-
-Requests come on standard input and answers go to standard output, both pickled. Imports nothing of polarnet, so that it
-starts quickly.
-"""
+"""What the process of HDF5 does; see `isolated_worker`."""
 
 import contextlib
-import pickle
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -17,23 +11,24 @@ with contextlib.suppress(ImportError):
     import hdf5plugin  # noqa: F401  # the compression of DSEC's own files
 
 
-Files = dict[str, h5py.File]
+files: dict[str, h5py.File] = {}
+"""Files that are being read."""
 
 
-def describe(files: Files, name: str, tables: list[str], attributes: list[str]) -> dict[str, Any]:
+def describe(name: str, tables: list[str], attributes: list[str]) -> dict[str, Any]:
     """Shape and kind of number of each table that is there; scalars and attributes that are there."""
     with h5py.File(name, "r") as file:
         return described(file, tables, attributes)
 
 
-def read(files: Files, name: str, tables: list[str], start: int, stop: int) -> list[np.ndarray]:
+def read(name: str, tables: list[str], start: int, stop: int) -> list[np.ndarray]:
     """The rows from start to stop of each table; the file stays open."""
     if name not in files:
         files[name] = h5py.File(name, "r")
     return [files[name][table][start:stop] for table in tables]
 
 
-def close(files: Files, name: str) -> None:
+def close(name: str) -> None:
     """Let go of the file."""
     if name in files:
         files.pop(name).close()
@@ -61,25 +56,3 @@ def described(file: h5py.File, tables: list[str], attributes: list[str]) -> dict
 def plain(value: np.ndarray) -> Any:
     """Numbers as Python's, whatever else as text."""
     return value.tolist() if value.dtype.kind in "iuf" and value.size <= 8 else str(value)[:80]
-
-
-def serve() -> None:
-    """Answer until the input ends."""
-    requests, answers = sys.stdin.buffer, sys.stdout.buffer
-    files: dict[str, h5py.File] = {}
-    reply: tuple[str, Any]
-    while True:
-        try:
-            name, task, arguments = pickle.load(requests)
-        except EOFError:
-            return
-        try:
-            reply = ("answer", TASKS[task](files, name, *arguments))
-        except Exception as error:  # HDF5 has many
-            reply = ("error", f"{type(error).__name__}: {error}"[:500])
-        pickle.dump(reply, answers, protocol=5)
-        answers.flush()
-
-
-if __name__ == "__main__":
-    serve()

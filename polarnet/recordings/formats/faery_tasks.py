@@ -1,0 +1,52 @@
+"""What the process of faery does; see `isolated_worker`."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import faery
+import numpy as np
+
+GATHERED_EVENTS = 2**16  # of an answer; the packets of a file are small
+
+streams: dict[int, tuple[int, Iterator[np.ndarray]]] = {}
+"""Files that are being read, by the number of the reader: blocks that were handed out, and the packets that follow."""
+
+
+def size(path: str, file_type: str) -> tuple[int, int]:
+    """Height and width of the sensor."""
+    width, height = faery.events_stream_from_file(path, file_type=file_type).dimensions()
+    return height, width
+
+
+def block(path: str, file_type: str, reader: int, number: int) -> list[np.ndarray] | None:
+    """Columns t, x, y, on of a reader's next block; None after the last.
+
+    `number` is how many came before: where the process crashed on another file in between, they are read once more.
+    """
+    done, packets = streams.get(reader, (-1, iter(())))
+    if done != number:
+        packets = iter(faery.events_stream_from_file(path, file_type=file_type))
+        for _ in range(number):
+            gathered(packets)
+    found = gathered(packets)
+    streams[reader] = number + 1, packets
+    if not found:
+        return None
+    return [np.concatenate([packet[name] for packet in found]) for name in ("t", "x", "y", "on")]
+
+
+def gathered(packets: Iterator[np.ndarray]) -> list[np.ndarray]:
+    """Packets of about as many events as an answer has; none at the end."""
+    found, count = [], 0
+    while count < GATHERED_EVENTS and (packet := next(packets, None)) is not None:
+        found.append(packet)
+        count += len(packet)
+    return found
+
+
+def close(path: str, reader: int) -> None:
+    """Let go of the file."""
+    streams.pop(reader, None)
+
+
+TASKS: dict[str, Callable[..., Any]] = {"size": size, "block": block, "close": close}
