@@ -20,7 +20,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from polarnet.evaluation.methods import Context, Polarization, Recording, recover
+from polarnet.evaluation.methods import Context, Polarization, Recording, degree, recover
 from polarnet.evaluation.resimulate import recording_at
 from polarnet.evaluation.score import FrameScore, scene_means, score_sequence
 from polarnet.events.store import EventStore
@@ -145,7 +145,7 @@ def sliding_recovery(
         with context.autocast():
             prediction, after = network(inputs, state)
         state = after if carry else None
-        frames.append(prediction.dolp[0].float().clamp(0, 1).cpu())
+        frames.append(degree(prediction.dolp[0]).cpu())
     return torch.stack(frames)
 
 
