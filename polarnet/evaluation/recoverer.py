@@ -1,9 +1,9 @@
 """DoLP and AoLP window by window, as events come: every method of the benchmark as a stream.
 
-Networks learn on windows that follow each other, 1/30 s long in the paper, and their state is to summarise all that came
-before the present window. Overlapping windows therefore must neither be short ones (their event tensors would be of
-another kind) nor hand the state from each to the next (most events would count many times). `StateHistory` keeps it
-right: a window starts from the state that the windows up to its own start left.
+Networks learn on windows that follow each other, 1/30 s long in the paper, and their state is to summarise all that
+came before the present window. For DoLP more often than that, windows must neither be shorter (their event tensors
+would be of another kind) nor hand the state from each to the next while they overlap (most events would count many
+times). `StateHistory` keeps it right: a window begins with the state that the windows up to its own start left.
 """
 
 from collections import deque
@@ -105,8 +105,8 @@ class WindowRecoverer:
         self.reset()
 
     def step(self, window: EventWindow) -> Prediction:
-        """DoLP in [0, 1] and, where the network has one, AoLP in radians, at the end of a window; h w, on the device."""
-        return Prediction(*(None if found is None else found[0] for found in self.step_many([window])))
+        """DoLP in [0, 1] and, where the network has one, AoLP in radians, at a window's end; h w, on the device."""
+        return each_map(self.step_many([window]), lambda batch: batch[0])
 
     @torch.inference_mode()
     def step_many(self, windows: Sequence[EventWindow]) -> Prediction:
@@ -128,7 +128,7 @@ class WindowRecoverer:
             found, state = self._forward(inputs, self._history.before(windows[0]))
         self._history.after(windows[0], state)
         self.windows += 1
-        return Prediction(degree(found.dolp), *(None if other is None else other.float() for other in found[1:]))
+        return each_map(found, Tensor.float)._replace(dolp=degree(found.dolp))
 
     def _inputs(self, window: EventWindow, sliding: Sequence[SlidingEventTensor]) -> Float[Tensor, "c h w"]:
         if self._encode is event_tensor:
@@ -158,7 +158,7 @@ class Recoverer(WindowRecoverer):
 
 
 class FilterRecoverer:
-    """A per-pixel filter as a stream. It takes every event once, when it first comes, so windows do not matter to it."""
+    """A per-pixel filter as a stream. It takes each event once, when it first comes, so windows do not matter to it."""
 
     def __init__(self, step: Step, config: Any, gain: GainConfig | None):
         self.windows = 0
@@ -179,6 +179,11 @@ class FilterRecoverer:
         self.windows += 1
         found, self._images = polarization_of(image, self._images, self._gain)
         return found
+
+
+def each_map(found: Prediction, change: Callable[[Tensor], Tensor]) -> Prediction:
+    """What a method says, with each of its maps changed alike."""
+    return Prediction(change(found.dolp), *(None if one is None else change(one) for one in found[1:]))
 
 
 def polarization_of(
@@ -208,7 +213,7 @@ def intensity_forward(
             raw = (*raw, image)[-shown.auto_hdr_frames if shown.auto_hdr else -1 :]
             image = postprocessed(torch.stack(raw), shown)[-1]
         found, images = polarization_of(image, images, gain)
-        return Prediction(*(None if one is None else one[None] for one in found)), (inner, raw, images)
+        return each_map(found, lambda one: one[None]), (inner, raw, images)
 
     return forward
 
@@ -225,8 +230,10 @@ def e2p_forward(network: E2p) -> Forward:
 
 
 FILTERS: dict[str, Step] = {"cf": step_cf, "highpass": step_highpass}
-STREAMED = (*FILTERS, *(f"{name}{GAIN}" for name in FILTERS), *NEEDED) + tuple(
-    f"{name}{GAIN}" for name in NEEDED if name not in ("e2p", "paper", "ours")
+_POLARIZATION = ("e2p", "paper", "ours")  # networks that say DoLP themselves, and need no gain
+STREAMED = (
+    *(f"{row}{gain}" for row in (*FILTERS, *NEEDED) if row not in _POLARIZATION for gain in ("", GAIN)),
+    *_POLARIZATION,
 )
 """The methods that `stream_of` knows: all of the benchmark but the constants."""
 
