@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import functools
 import json
 import os
 import subprocess
@@ -84,6 +85,55 @@ def _parser() -> argparse.ArgumentParser:
     )
     inspect.add_argument("--picture", type=Path, help="where to write the PNG (default: FILE.png here)")
     inspect.set_defaults(run=_inspect)
+
+    recover = commands.add_parser(
+        "recover",
+        help="DoLP and AoLP of recordings, or of a camera that runs: frames, pictures, a video and a page",
+        description="INPUT is four files, one a polarizer, with --angles; one file of a camera with polarizers on its "
+        "pixels, with --mosaic; an event store; a folder of division-of-time captures; or, with --live, lines "
+        "`t x y p angle` of a file that grows or of standard input (-).",
+    )
+    recover.add_argument("input", nargs="+", metavar="INPUT")
+    recover.add_argument("--angles", nargs=4, type=int, metavar="DEG", help="polarizers of the four files, in order")
+    recover.add_argument(
+        "--mosaic", metavar="'A B / C D'", help="polarizers of 2x2 pixels: even row / odd row, degrees"
+    )
+    recover.add_argument("--sequence", metavar="NAME", help="of an event store with several")
+    recover.add_argument("--live", action="store_true", help="recover while events come, and show the latency")
+    recover.add_argument(
+        "--idle", type=float, default=5.0, metavar="S", help="a live file that stops growing has ended"
+    )
+    recover.add_argument(
+        "--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce files to so many pixels"
+    )
+    recover.add_argument(
+        "--window", default="33.333ms",
+        help="a time (33.3ms) or a number of events of all polarizers (20000ev); networks are trained on 1/30 s",
+    )  # fmt: skip
+    recover.add_argument("--step", help="time between the ends of overlapping windows, from 0.1ms; default: no overlap")
+    recover.add_argument(
+        "--weights", type=Path, metavar="FILE", help="of the network; default: shipped, or trained here"
+    )
+    recover.add_argument("--method", help="instead of the network: cf, highpass, cf+gain, e2v, ... of the benchmark")
+    recover.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N")
+    recover.add_argument("--precision", choices=("fp32", "bf16"), default="fp32", help="of the networks")
+    recover.add_argument("--out", type=Path, metavar="FOLDER", help="default: outputs/recover/NAME")
+    recover.add_argument("--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), help="default: zarr png mp4")
+    recover.add_argument("--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video")
+    recover.add_argument("--format", help="of files, where the content does not show it; like the next for inspect")
+    recover.add_argument("--height", type=int, help="of the sensor, where the files do not say it")
+    recover.add_argument("--width", type=int)
+    recover.add_argument("--clock-mhz", type=float)
+    recover.add_argument("--assume-polarity", type=int, choices=(1, -1))
+    recover.set_defaults(run=_recover)
+
+    replay = commands.add_parser(
+        "replay", help="a stored sequence as live lines, at its own pace: polarnet recover --live"
+    )
+    replay.add_argument("store", help="folder, zip or fsspec URL")
+    replay.add_argument("sequence")
+    replay.add_argument("--speed", type=float, default=1.0, help="times as fast as recorded")
+    replay.set_defaults(run=_replay)
 
     docs = commands.add_parser("docs", help="write docs/results/*.json into the tables of README.md and docs/")
     docs.add_argument("--check", action="store_true", help="change nothing; fail where a table is out of date")
@@ -210,6 +260,58 @@ def _inspect(options: argparse.Namespace) -> int:
     path = options.picture or Path(f"{options.file.name}.png")
     path.write_bytes(recording_picture(inspection))
     print(f"picture     {path}")
+    return 0
+
+
+def _recover(options: argparse.Namespace) -> int:
+    from polarnet.config import load
+    from polarnet.events.streaming import WindowRule, parse_window
+    from polarnet.recordings.recording import read_recording
+    from polarnet.recover import Arrangement, facts_of, open_files, open_live, open_stream, recover
+    from polarnet.reports.recovery import RecoveryWriter
+    from polarnet.stokes import parse_mosaic
+
+    config = functools.cache(lambda: load(project_root()))
+    length_us, events = parse_window(options.window)
+    step_us, step_events = parse_window(options.step) if options.step else (None, None)
+    if step_events is not None:
+        raise ValueError(f"--step: expected a time such as 0.1ms, got {options.step}")
+    rule = WindowRule(length_us, events, step_us)
+    stream, words = open_stream(options.method, options.weights, options.device, options.precision, config)
+    name = "live" if options.live else Path(options.input[0]).stem
+    out = options.out or Path("outputs") / "recover" / name
+    mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
+    lines = None
+    if options.live:
+        if len(options.input) != 1 or options.size or options.angles:
+            raise ValueError("--live: expected one file or - and, where it has one, a --mosaic; nothing else of files")
+        source, lines = open_live(options.input[0], mosaic, options.idle)
+    else:
+        sides = ("format", "height", "width", "clock_mhz", "assume_polarity")
+        read = functools.partial(read_recording, **{side: getattr(options, side) for side in sides})
+        arrangement = Arrangement(options.angles, mosaic, options.sequence)
+        size = (options.size[0], options.size[1]) if options.size else None
+        source = open_files([Path(path) for path in options.input], arrangement, read, size, out / "work", config)
+    writer = RecoveryWriter(out, options.write or ("zarr", "png", "mp4"), options.video_rate)
+    summary = recover(source, rule, stream, writer)
+    facts = facts_of(source, rule, words, summary)
+    for key, value in facts.items():
+        print(f"{key:11s} {value}")
+    left_out = {kind: count for kind, count in lines.counts.items() if count} if lines else {}
+    notes = [f"Lines that were left out: {left_out}."] if left_out else []
+    print(*notes, f"the page: {writer.write_page(source.name, facts, notes)}", sep="\n")
+    return 0
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from polarnet.events.store import EventStore
+    from polarnet.recover import replay
+
+    def write(data: bytes) -> None:
+        sys.stdout.buffer.write(data)
+        sys.stdout.buffer.flush()
+
+    replay(EventStore.open(options.store), options.sequence, options.speed, write)
     return 0
 
 

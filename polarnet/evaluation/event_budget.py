@@ -20,11 +20,12 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from polarnet.evaluation.methods import Context, Polarization, Recording, recover
+from polarnet.evaluation.methods import Context, Polarization, Recording, degree, recover
 from polarnet.evaluation.resimulate import recording_at
 from polarnet.evaluation.score import FrameScore, scene_means, score_sequence
 from polarnet.events.store import EventStore
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, slice_count
+from polarnet.events.streaming import SlidingEventTensor
 from polarnet.similarity import correlation, mse, psnr
 from polarnet.simulation.scenes import SceneStore
 
@@ -116,55 +117,16 @@ def _means(rows: Sequence[FrameScore]) -> dict[str, Any]:
     return {"frames": len(rows), "scenes": len({row.scene for row in rows}), **scores}
 
 
-class SlidingEventTensor:
-    """The event tensor (paper Eq. 5) of the last `count` events of one polarizer, updated by what comes and goes.
+def move_to_last(sliding: SlidingEventTensor, events: Events, count: int, t_us: int) -> Float[Tensor, "h w"]:
+    """The event tensor of the last `count` of the events before `t_us`; time only goes forward.
 
-    Two integers a pixel are kept, the sum of polarities and of polarity times time, to which an event that comes is
-    added and from which one that leaves is taken: the work of a step is in proportion to the events of the step, not
-    of the window, and as integers do not round, the tensor is that of a window cut out anew.
+    The window ends with its last event; 0 everywhere while fewer than two events have come.
     """
-
-    def __init__(self, events: Events, count: int):
-        if count < 2:
-            raise ValueError(f"count: expected at least 2 events, got {count}")
-        self.events = events
-        self.count = count
-        self.first = self.stop = 0
-        pixels = events.height * events.width
-        self._polarity = torch.zeros(pixels, dtype=torch.int64)
-        self._moment = torch.zeros(pixels, dtype=torch.int64)
-
-    def advance(self, t_us: int) -> None:
-        """Let the events before `t_us` come, and the oldest go, so that `count` stay; time only goes forward."""
-        stop = int(torch.searchsorted(self.events.t, t_us))
-        if stop < self.stop:
-            raise ValueError(f"time only goes forward: {t_us} us is before what was seen already")
-        first = max(self.first, stop - self.count)
-        self._add(max(self.stop, first), stop, 1)
-        self._add(self.first, min(first, self.stop), -1)
-        self.first, self.stop = first, stop
-
-    def tensor(self) -> Float[Tensor, "h w"]:
-        """Polarities summed per pixel, each weighted by its time since the window's first event, in window lengths.
-
-        The window ends with its last event; 0 everywhere while fewer than two events have come.
-        """
-        height, width = self.events.height, self.events.width
-        if self.stop - self.first < 2:
-            return torch.zeros(height, width)
-        start = self.events.t[self.first]
-        length = (self.events.t[self.stop - 1] - start).clamp(min=1)
-        weighted = (self._moment - start * self._polarity).double() / length
-        return weighted.float().view(height, width)
-
-    def _add(self, first: int, stop: int, sign: int) -> None:
-        if first >= stop:
-            return
-        events = self.events
-        pixel = events.y[first:stop].long() * events.width + events.x[first:stop].long()
-        polarity = sign * events.p[first:stop].long()
-        self._polarity.index_add_(0, pixel, polarity)
-        self._moment.index_add_(0, pixel, polarity * events.t[first:stop])
+    stop = int(torch.searchsorted(events.t, t_us))
+    first = max(0, stop - count)
+    sliding.move_to(first, slice_count(events, first, stop))
+    times = sliding.window.t
+    return sliding.tensor(max(1, int(times[-1] - times[0])) if len(times) else 1)
 
 
 @torch.no_grad()
@@ -175,16 +137,15 @@ def sliding_recovery(
 
     `carry`: whether the network's state goes from one overlapping window to the next, or each stands alone.
     """
-    windows = [SlidingEventTensor(events, count) for events in recording.events]
+    windows = [SlidingEventTensor(events.height, events.width) for events in recording.events]
     state, frames = None, []
     for t in t_us:
-        for window in windows:
-            window.advance(t)
-        inputs = torch.stack([window.tensor() for window in windows])[None].to(context.device)
+        tensors = [move_to_last(w, events, count, t) for w, events in zip(windows, recording.events, strict=True)]
+        inputs = torch.stack(tensors)[None].to(context.device)
         with context.autocast():
             prediction, after = network(inputs, state)
         state = after if carry else None
-        frames.append(prediction.dolp[0].float().clamp(0, 1).cpu())
+        frames.append(degree(prediction.dolp[0]).cpu())
     return torch.stack(frames)
 
 

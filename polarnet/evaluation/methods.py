@@ -272,9 +272,14 @@ def recover(method: str, recording: Recording, context: Context) -> Recovered:
     """Run one of `METHODS`, clamp its DoLP, and take the time: from events in memory to frames in memory."""
     start = time.perf_counter()
     found = METHODS[method](recording, context)
-    recovered = found.dolp.float().clamp(0, 1).cpu()
+    recovered = degree(found.dolp).cpu()
     seconds = time.perf_counter() - start
     return Recovered(recovered, None if found.aolp is None else found.aolp.float().cpu(), seconds)
+
+
+def degree(dolp: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
+    """What a method says, as a degree of polarization: in [0, 1], float32."""
+    return dolp.float().clamp(0, 1)
 
 
 def zeros(recording: Recording, context: Context) -> Polarization:
