@@ -13,12 +13,11 @@ def test_events_per_pixel_is_the_mean_over_polarizers_of_what_has_come(recording
 
 
 def test_frames_of_overlapping_windows_stand_alone_unless_the_state_is_carried(recording, context):
-    network, _ = context.ours
     times = list(range(2000, 2400, 100))
-    alone = sliding_recovery(recording, network, 50, times, False, context)
+    alone = sliding_recovery(recording, 50, times, False, context)
     assert alone.shape == (4, 18, 20)
-    torch.testing.assert_close(alone[-1], sliding_recovery(recording, network, 50, times[-1:], False, context)[0])
-    carried = sliding_recovery(recording, network, 50, times, True, context)
+    torch.testing.assert_close(alone[-1], sliding_recovery(recording, 50, times[-1:], False, context)[0])
+    carried = sliding_recovery(recording, 50, times, True, context)
     torch.testing.assert_close(carried[0], alone[0])
     assert not torch.equal(carried[-1], alone[-1])
 
