@@ -83,7 +83,7 @@ def test_it_costs_at_most_three_times_what_the_papers_network_costs():
         return counter.get_total_flops()
 
     shipped = StokesUNetConfig(
-        channels=[32, 64, 96], memories=[0.0, 0.6, 0.87], decays=[0.8, 0.98], scales=[1, 3, 9, 0]
+        channels=[32, 64, 96], memories=[0.0, 0.6, 0.85, 0.97], decays=[0.8, 0.98], scales=[1, 3, 9, 0]
     )
     paper = DolpUNetConfig(
         channels=[32, 64, 128],
