@@ -150,7 +150,7 @@ def _parser() -> argparse.ArgumentParser:
     asked.add_argument("--scenes", type=Path, metavar="FOLDER", help="photographs or measurements, in all subfolders")
     asked.add_argument("--event-budget", action="store_true", help="quality against events per pixel (paper, Fig. 11)")
     asked.add_argument("--sensitivity", action="store_true", help="quality against mismatch, noise, speed, channels")
-    benchmark.add_argument("--weights", type=Path, metavar="FILE", help="of the DoLP network; default: trained here")
+    benchmark.add_argument("--weights", type=Path, metavar="FILE", help="of the DoLP network; default: trained here, else shipped")
     benchmark.add_argument(
         "--kind", choices=("auto", "photographs", "polarization"), default="auto",
         help="what lies in FOLDER; auto takes .npz files and NAME_0, NAME_45, ... for measured polarization",
