@@ -1,8 +1,20 @@
+import platform
+import resource
+
+import numpy as np
 import pytest
 import torch
 
 from polarnet import runtime
-from polarnet.runtime import RuntimeConfig, bf16_units, device_of, generator_for, precision_on, seed_for
+from polarnet.runtime import (
+    RuntimeConfig,
+    bf16_units,
+    device_of,
+    generator_for,
+    keep_freed_memory,
+    precision_on,
+    seed_for,
+)
 
 
 def test_a_seed_depends_on_each_of_its_three_parts_and_on_nothing_else():
@@ -39,3 +51,13 @@ def test_automatic_precision_is_bf16_only_where_the_device_has_units_for_it(monk
 
 def test_a_device_that_is_neither_a_processor_nor_cuda_has_no_bf16_units_that_we_know_of():
     assert bf16_units(torch.device("meta")) == []
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators are left as they are")
+def test_a_large_array_takes_the_memory_of_the_one_before():
+    keep_freed_memory()
+    bytes_each = 2**26
+    np.ones(bytes_each, np.uint8)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    np.ones(bytes_each, np.uint8)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before < bytes_each / resource.getpagesize() / 4

@@ -219,7 +219,7 @@ def baseline(build: type[Network], kind: str, path: Path | None) -> Network:
 def dolp_checkpoint(path: Path | None, device: torch.device) -> tuple[nn.Module, dict[str, Any]]:
     """A network that turns events into DoLP, and its checkpoint's metadata."""
     network, metadata = load_network(_present(path))
-    return network.to(device), metadata
+    return network.to(device, memory_format=torch.channels_last), metadata  # type: ignore[call-overload]
 
 
 def _present(path: Path | None) -> Path:
