@@ -85,7 +85,8 @@ def write_dsec(path: Path, count: int) -> None:
 
     with h5py.File(path, "w") as file:
         types = {"t": "u4", "x": "u2", "y": "u2", "p": "u1"}
-        columns = [file.create_dataset(f"events/{n}", (count,), t, chunks=(min(count, 2**16),)) for n, t in types.items()]
+        chunk = (min(count, 2**16),)
+        columns = [file.create_dataset(f"events/{n}", (count,), t, chunks=chunk) for n, t in types.items()]
         for k, part in enumerate(parts(count)):
             for column, values in zip(columns, part, strict=True):
                 column[k * PART : k * PART + len(values)] = values

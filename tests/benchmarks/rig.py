@@ -128,8 +128,8 @@ def benchmarked(folder: Path, names: list[str], config: Config) -> dict[str, dic
         one = run_benchmark(made_set(name, folder / name), context, benchmark, None, folder / "cache")
         rows += one.rows
         costs = {method: asdict(cost) for method, cost in one.costs.items()}
-    scores = summary(rows, benchmark.bootstrap_samples, config.seed)
-    print(as_plain(score_table({m: {**s, **costs[m]} for m, s in scores.items()}, "not loaded here")))
+    scores = {m: {**s, **costs[m]} for m, s in summary(rows, benchmark.bootstrap_samples, config.seed).items()}
+    print(as_plain(score_table(scores, "not loaded here")))
     for method, reason in absent.items():
         print(f"{method} is left out: {reason}")
     return {method: {key: scores[method].get(key) for key in BENCHMARK_KEYS} for method in scores}
