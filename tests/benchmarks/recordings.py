@@ -1,11 +1,11 @@
 """How fast recordings are read, and in how much memory: python tests/benchmarks/recordings.py [--write] [--full]
 
-For each format and size, a file of random events of a 1280 x 720 sensor (CeleX-5: 1280 x 800), 1 M a second, is written
-to a temporary folder and read by polarnet in chunks, and by each library that is installed (faery; `pip install eventcv
-expelliarmus aedat dv-processing`) whole or in packets, as it does. Every reader is a process of its own, whose kernels
-are compiled. Seconds are the shortest of the repeats, from opening to the last chunk; the file is in the disk cache.
-Memory is the most that the process and those it started held, added up, less what they held when they had read a small
-file (Linux: high-water marks of resident memory).
+For each format and size, a file of random events of a 1280 x 720 sensor (CeleX-5: 1280 x 800, AEDAT-2: 346 x 260), 1 M
+a second, is written to a temporary folder and read by polarnet in chunks, and by each library that is installed (faery;
+`pip install eventcv expelliarmus aedat dv-processing`) whole or in packets, as it does. Every reader is a process of
+its own, whose kernels are compiled. Seconds are the shortest of the repeats, from opening to the last chunk; the file
+is in the disk cache. Memory is the most that the process and those it started held, added up, less what they held when
+they had read a small file (Linux: high-water marks of resident memory).
 
 Sizes are 1 M and 10 M events, with --full 100 M too (3 GB of disk; a store is written whole, so 8 GB of memory). Speed
 is that of the smallest. `--write` puts `readers.NAME.mevents_per_s` and `readers.NAME.peak_mib` of each size into
@@ -127,6 +127,13 @@ def write_dat(path: Path, count: int) -> None:
             file.write(np.stack([t, x | y << 14 | p << 28], axis=1).astype("<u4").tobytes())
 
 
+def write_aedat2(path: Path, count: int) -> None:
+    with path.open("wb") as file:
+        file.write(b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis346blue\r\n")
+        for t, x, y, p in parts(count):
+            file.write(np.stack([(y % 260) << 22 | (x % 346) << 12 | p << 11, t], axis=1).astype(">u4").tobytes())
+
+
 def write_store(path: Path, count: int) -> None:
     t, x, y, p = np.concatenate(list(parts(count)), axis=1)
     types = (np.int64, np.int16, np.int16, np.int8)
@@ -184,7 +191,9 @@ def read_eventcv(path: Path) -> int:
 
 def named(path: Path) -> Path:
     """The same file under the ending that libraries expect, which go by the name."""
-    link = path.with_suffix({".evt2": ".raw", ".evt3": ".raw", ".text": ".txt"}.get(path.suffix, path.suffix))
+    link = path.with_suffix(
+        {".evt2": ".raw", ".evt3": ".raw", ".text": ".txt", ".aedat2": ".aedat"}.get(path.suffix, path.suffix)
+    )
     if not link.exists():
         link.hardlink_to(path)  # some look where a symbolic one leads
     return link
@@ -220,13 +229,14 @@ FILES: dict[str, Callable[[Path, int], None]] = {
     "evt2": write_evt2,
     "evt3": write_evt3,
     "dat": write_dat,
+    "aedat2": write_aedat2,
     "aedat4": write_by_faery(".aedat4"),
     "event_stream": write_by_faery(".es"),
 }
 LIBRARIES: dict[str, tuple[Callable[[Path], int], tuple[str, ...]]] = {
     "faery": (read_faery, ("evt2", "evt3", "dat", "aedat4", "event_stream")),
     "expelliarmus": (read_expelliarmus, ("evt2", "evt3", "dat")),
-    "eventcv": (read_eventcv, ("text", "evt2", "evt3", "dat", "aedat4")),
+    "eventcv": (read_eventcv, ("text", "evt2", "evt3", "dat", "aedat2", "aedat4")),
     "aedat": (read_aedat, ("aedat4",)),
     "dv_processing": (read_dv_processing, ("aedat4",)),
     "numpy": (read_numpy, ("text",)),
