@@ -84,6 +84,7 @@ def _parser() -> argparse.ArgumentParser:
         "--hot-pixel-factor", type=float, default=4.0, help="hot: as many times the events of the busiest around (4)"
     )
     inspect.add_argument("--picture", type=Path, help="where to write the PNG (default: FILE.png here)")
+    inspect.add_argument("--hot-pixels", type=Path, metavar="PNG", help="where to draw how often each pixel fired")
     inspect.set_defaults(run=_inspect)
 
     recover = commands.add_parser(
@@ -134,6 +135,12 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument("sequence")
     replay.add_argument("--speed", type=float, default=1.0, help="times as fast as recorded")
     replay.set_defaults(run=_replay)
+
+    register = commands.add_parser("register", help="lay one camera's recording on another's: the homography")
+    register.add_argument("reference", type=Path)
+    register.add_argument("file", type=Path)
+    register.add_argument("--picture", type=Path, help="where to write a PNG of both event images, before and after")
+    register.set_defaults(run=_register)
 
     docs = commands.add_parser("docs", help="write docs/results/*.json into the tables of README.md and docs/")
     docs.add_argument("--check", action="store_true", help="change nothing; fail where a table is out of date")
@@ -260,6 +267,24 @@ def _inspect(options: argparse.Namespace) -> int:
     path = options.picture or Path(f"{options.file.name}.png")
     path.write_bytes(recording_picture(inspection))
     print(f"picture     {path}")
+    if options.hot_pixels:
+        from polarnet.reports.calibration import draw_hot_pixels
+
+        draw_hot_pixels(inspection.counts, inspection.hot, options.hot_pixels)
+        print(f"hot pixels  {options.hot_pixels}")
+    return 0
+
+
+def _register(options: argparse.Namespace) -> int:
+    from polarnet.recordings.recording import read_recording
+    from polarnet.recordings.registration import event_image, register, warped
+    from polarnet.reports.calibration import draw_registration
+
+    reference, moving = (event_image(read_recording(path).events) for path in (options.reference, options.file))
+    found = register(reference, moving)
+    print(json.dumps({"homography": found.homography.tolist(), "correlation": found.correlation}, indent=2))
+    if options.picture:
+        draw_registration(reference, moving, warped(moving, found.homography), options.picture)
     return 0
 
 

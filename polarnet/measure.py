@@ -37,13 +37,18 @@ def uncommitted(root: Path) -> str:
     return git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
 
 
+def read_results(root: Path, name: str) -> dict[str, Any]:
+    """What docs/results/NAME.json holds; empty where it is not there yet."""
+    path = root / "docs" / "results" / f"{name}.json"
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
 def write_section(root: Path, name: str, section: str, figures: Mapping[str, Any], record: Mapping[str, Any]) -> Path:
     """Write `figures` as one section of docs/results/NAME.json and the machine's record beside it; the rest stays.
 
     The record (`machine_record`, taken before measuring) becomes `measured.SECTION`: sections may be of different days.
     """
-    path = root / "docs" / "results" / f"{name}.json"
-    known = json.loads(path.read_text()) if path.exists() else {}
+    path, known = root / "docs" / "results" / f"{name}.json", read_results(root, name)
     known["measured"] = dict(sorted({**known.get("measured", {}), section: dict(record)}.items()))
     known[section] = dict(figures)
     path.parent.mkdir(parents=True, exist_ok=True)

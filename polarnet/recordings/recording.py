@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from polarnet.events.stream import LARGEST_SIDE, Events, concatenate
-from polarnet.recordings.formats import celex5_bin, celex5_csv, dat, evt, faery, hdf5, store, text
+from polarnet.recordings.formats import aedat2, celex5_bin, celex5_csv, dat, evt, faery, hdf5, store, text
 from polarnet.recordings.repair import repaired
 from polarnet.recordings.source import Block, Choices, RecordingError, Source
 
@@ -32,6 +32,7 @@ FORMATS = {
     "e2p": Format("HDF5 of E2P, for the PDAVIS", hdf5.matches_e2p, hdf5.open_e2p),
     "dsec": Format("HDF5 of DSEC", hdf5.matches_dsec, hdf5.open_dsec),
     "aedat4": Format("AEDAT4 of iniVation", faery.matches_aedat4, faery.open_aedat4),
+    "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", aedat2.matches, aedat2.open_aedat2),
     "event_stream": Format("Event Stream (.es)", faery.matches_event_stream, faery.open_event_stream),
     "evt": Format("EVT2 and EVT3 of Prophesee", evt.matches, evt.open_evt),
     "dat": Format("DAT of Prophesee", dat.matches, dat.open_dat),

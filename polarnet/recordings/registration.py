@@ -75,6 +75,11 @@ def register(reference: Float32[np.ndarray, "h w"], moving: Float32[np.ndarray, 
     return Registration(homography / homography[2, 2], float(correlation))
 
 
+def warped(image: Float32[np.ndarray, "h w"], homography: Float64[np.ndarray, "3 3"]) -> Float32[np.ndarray, "h w"]:
+    """An event image as the reference camera would see it; 0 where it sees nothing of it."""
+    return cv2.warpPerspective(image, homography, image.shape[::-1])
+
+
 def warp_events(events: Events, homography: Float64[np.ndarray, "3 3"]) -> Events:
     """Events at the nearest pixel of the reference camera; those that it does not see are left out."""
     xy = np.stack([events.x.numpy(), events.y.numpy(), np.ones(len(events))])

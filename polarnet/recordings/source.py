@@ -12,6 +12,8 @@ from polarnet.events.stream import LARGEST_SIDE
 
 BLOCK_EVENTS = 2**18  # what a format decodes at a time; what a reader's user gets is cut anew
 
+WRAP_US = 2**32  # of time stamps of 32 bits
+
 REPAIRS = {
     "unreadable_lines": "lines that are not the numbers they should be: left out",
     "unreadable_packages": "packages whose length or content cannot be right: left out",
@@ -64,6 +66,16 @@ class Source:
     height: int
     width: int
     blocks: Callable[[Counter[str]], Iterator[Block]]
+
+
+def running_on(t: np.ndarray, turns: int, before: int) -> tuple[np.ndarray, int, int]:
+    """Microseconds of 32 bits made to run on where they wrap; how often they have by then, and the last of them.
+
+    `turns` and `before` are those of the block that came before, 0 at the start.
+    """
+    t = t.astype(np.int64)
+    wrapped = np.cumsum(np.diff(t, prepend=before) < -WRAP_US // 2)
+    return t + (turns + wrapped) * WRAP_US, turns + int(wrapped[-1]), int(t[-1])
 
 
 def sensor_size(path: Path, choices: Choices, height: int | None = None, width: int | None = None) -> tuple[int, int]:

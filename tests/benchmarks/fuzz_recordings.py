@@ -25,7 +25,7 @@ from typing import Any
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
-from polarnet.measure import machine_record, uncommitted, write_section
+from polarnet.measure import machine_record, read_results, uncommitted, write_section
 from polarnet.recordings.formats import isolated
 from polarnet.recordings.recording import FORMATS
 
@@ -115,9 +115,7 @@ def main() -> None:
     found = {form: fuzz(form, arguments.cases, f"{record['commit']} {changed}") for form in arguments.readers}
     print(f"{min(one['cases'] for one in found.values())} cases a reader passed, of {len(found)} readers")
     if arguments.write:
-        results = ROOT / "docs" / "results" / "recordings.json"
-        known = json.loads(results.read_text()) if results.exists() else {}
-        readers = known.get("fuzz", {}).get("readers", {}) | {
+        readers = read_results(ROOT, "recordings").get("fuzz", {}).get("readers", {}) | {
             form: {key: one[key] for key in ("cases", "endings", "seconds")} | {"commit": record["commit"]}
             for form, one in found.items()
         }

@@ -1,20 +1,22 @@
-"""How fast recordings are read, and in how much memory: python tests/benchmarks/recordings.py [--write] [--events N]
+"""How fast recordings are read, and in how much memory: python tests/benchmarks/recordings.py [--write] [--full]
 
-For each size, a file of random events of a 1280 x 720 sensor (CeleX-5: 1280 x 800), 1 M a second, is written to a
-temporary folder, part by part, and read in chunks, in a process of its own whose kernels are compiled. Seconds are the
-shortest of the repeats, from opening to the last chunk; the file is in the disk cache. Memory is the most that process
-held, less what it held when it had read a small file. Libraries that are installed read the same files whole or in
-packets, as they do.
+For each format and size, a file of random events of a 1280 x 720 sensor (CeleX-5: 1280 x 800, AEDAT-2: 346 x 260), 1 M
+a second, is written to a temporary folder and read by polarnet in chunks, and by each library that is installed (faery;
+`pip install eventcv expelliarmus aedat dv-processing`) whole or in packets, as it does. Every reader is a process of
+its own, whose kernels are compiled. Seconds are the shortest of the repeats, from opening to the last chunk; the file
+is in the disk cache. Memory is the most that the process and those it started held, added up, less what they held when
+they had read a small file (Linux: high-water marks of resident memory).
 
-The default, 1 M events, takes a minute; `--events 1000000 100000000` measures the memory of both, with 3 GB of disk.
-`--write` puts the figures into docs/results/recordings.json: `readers.NAME.mevents_per_s` of the smallest size, and
-`readers.NAME.peak_mib` of each.
+Sizes are 1 M and 10 M events, with --full 100 M too (3 GB of disk; a store is written whole, so 8 GB of memory). Speed
+is that of the smallest. `--write` puts `readers.NAME.mevents_per_s` and `readers.NAME.peak_mib` of each size into
+docs/results/recordings.json; formats left out of this run keep their figures, with the commit they were measured at.
 """
 
 import argparse
+import importlib.metadata
 import importlib.util
 import json
-import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -24,19 +26,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import torch
 
 from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
-from polarnet.measure import machine_record, uncommitted, write_section
+from polarnet.measure import machine_record, read_results, uncommitted, write_section
 from polarnet.recordings.formats.celex5_bin_writer import write_celex5_bin
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.recording import open_recording
 
 ROOT = Path(__file__).resolve().parents[2]
 PART = 1_000_000  # events that are written at a time, and microseconds that they take
+SIZES, LARGEST = (1_000_000, 10_000_000), 100_000_000  # events
 SMALL = 20_000  # events: enough to compile every kernel
 HEIGHT, WIDTH = 720, 1280
+POLARITY_BY_CHANGE = ("celex5_bin",)  # random polarities need some events more, repeated parts lose some
 
 
 def parts(count: int) -> Iterator[np.ndarray]:
@@ -57,7 +62,6 @@ def write_csv(path: Path, count: int) -> None:
 
 def write_lines(path: Path, count: int) -> None:
     with path.open("wb") as file:
-        file.write(f"{WIDTH} {HEIGHT}\n".encode())
         for part in parts(count):
             file.write(lines_of(part.T, " "))
 
@@ -81,7 +85,8 @@ def write_dsec(path: Path, count: int) -> None:
 
     with h5py.File(path, "w") as file:
         types = {"t": "u4", "x": "u2", "y": "u2", "p": "u1"}
-        columns = [file.create_dataset(f"events/{n}", (count,), t, chunks=(2**16,)) for n, t in types.items()]
+        chunk = (min(count, 2**16),)
+        columns = [file.create_dataset(f"events/{n}", (count,), t, chunks=chunk) for n, t in types.items()]
         for k, part in enumerate(parts(count)):
             for column, values in zip(columns, part, strict=True):
                 column[k * PART : k * PART + len(values)] = values
@@ -122,6 +127,13 @@ def write_dat(path: Path, count: int) -> None:
             file.write(np.stack([t, x | y << 14 | p << 28], axis=1).astype("<u4").tobytes())
 
 
+def write_aedat2(path: Path, count: int) -> None:
+    with path.open("wb") as file:
+        file.write(b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis346blue\r\n")
+        for t, x, y, p in parts(count):
+            file.write(np.stack([(y % 260) << 22 | (x % 346) << 12 | p << 11, t], axis=1).astype(">u4").tobytes())
+
+
 def write_store(path: Path, count: int) -> None:
     t, x, y, p = np.concatenate(list(parts(count)), axis=1)
     types = (np.int64, np.int16, np.int16, np.int8)
@@ -133,15 +145,33 @@ def write_store(path: Path, count: int) -> None:
     store.finish()
 
 
+def write_by_faery(ending: str) -> Callable[[Path, int], None]:
+    def write(path: Path, count: int) -> None:
+        import faery
+
+        rows = np.empty(count, faery.EVENTS_DTYPE)
+        for name, column in zip(("t", "x", "y", "on"), np.concatenate(list(parts(count)), axis=1), strict=True):
+            rows[name] = column
+        written = path.with_suffix(ending)  # it goes by the name
+        faery.events_stream_from_array(rows, (WIDTH, HEIGHT)).to_file(written)
+        written.rename(path)
+
+    return write
+
+
 def read_own(path: Path) -> int:
-    return sum(len(events) for events in open_recording(path, part="0", assume_polarity=1))
+    height, width = (HEIGHT, WIDTH) if path.suffix == ".text" else (None, None)
+    reader = open_recording(path, height=height, width=width, part="0", assume_polarity=1)
+    return sum(map(len, reader))
 
 
 def read_faery(path: Path) -> int:
     import faery
 
-    version = {".evt2": "evt2", ".evt3": "evt3", ".dat": "dat2"}[path.suffix]
-    kind = "dat" if path.suffix == ".dat" else "evt"
+    kind, version = {
+        ".evt2": ("evt", "evt2"), ".evt3": ("evt", "evt3"), ".dat": ("dat", "dat2"), ".aedat4": ("aedat", None),
+        ".event_stream": ("es", None),
+    }[path.suffix]  # fmt: skip
     return sum(map(len, faery.events_stream_from_file(path, file_type=kind, version_fallback=version)))
 
 
@@ -149,22 +179,43 @@ def read_expelliarmus(path: Path) -> int:
     import expelliarmus
 
     wizard = expelliarmus.Wizard(encoding=path.suffix[1:])
-    wizard.set_file(path)
+    wizard.set_file(named(path))
     return len(wizard.read())
 
 
 def read_eventcv(path: Path) -> int:
     import eventcv
 
-    suffix = {".evt2": ".raw", ".evt3": ".raw", ".dat": ".dat", ".text": ".txt"}[path.suffix]  # it goes by the name
-    link = path.with_name(f"for_eventcv_{path.stem}{suffix}")
-    link.unlink(missing_ok=True)
-    link.symlink_to(path)
-    return len(eventcv.load(str(link), sensor_size=(WIDTH, HEIGHT)).numpy())
+    return len(eventcv.load(str(named(path)), sensor_size=(WIDTH, HEIGHT)).numpy())
+
+
+def named(path: Path) -> Path:
+    """The same file under the ending that libraries expect, which go by the name."""
+    link = path.with_suffix(
+        {".evt2": ".raw", ".evt3": ".raw", ".text": ".txt", ".aedat2": ".aedat"}.get(path.suffix, path.suffix)
+    )
+    if not link.exists():
+        link.hardlink_to(path)  # some look where a symbolic one leads
+    return link
+
+
+def read_aedat(path: Path) -> int:
+    import aedat
+
+    return sum(len(packet["events"]) for packet in aedat.Decoder(str(path)) if "events" in packet)
+
+
+def read_dv_processing(path: Path) -> int:
+    import dv_processing
+
+    recording, count = dv_processing.io.MonoCameraRecording(str(path)), 0
+    while (packet := recording.getNextEventBatch()) is not None:
+        count += len(packet.numpy())
+    return count
 
 
 def read_numpy(path: Path) -> int:
-    return len(np.loadtxt(path, skiprows=1))
+    return len(np.loadtxt(path))
 
 
 FILES: dict[str, Callable[[Path, int], None]] = {
@@ -178,13 +229,19 @@ FILES: dict[str, Callable[[Path, int], None]] = {
     "evt2": write_evt2,
     "evt3": write_evt3,
     "dat": write_dat,
+    "aedat2": write_aedat2,
+    "aedat4": write_by_faery(".aedat4"),
+    "event_stream": write_by_faery(".es"),
 }
 LIBRARIES: dict[str, tuple[Callable[[Path], int], tuple[str, ...]]] = {
-    "faery": (read_faery, ("evt2", "evt3", "dat")),
+    "faery": (read_faery, ("evt2", "evt3", "dat", "aedat4", "event_stream")),
     "expelliarmus": (read_expelliarmus, ("evt2", "evt3", "dat")),
-    "eventcv": (read_eventcv, ("text", "evt2", "evt3", "dat")),
+    "eventcv": (read_eventcv, ("text", "evt2", "evt3", "dat", "aedat2", "aedat4")),
+    "aedat": (read_aedat, ("aedat4",)),
+    "dv_processing": (read_dv_processing, ("aedat4",)),
     "numpy": (read_numpy, ("text",)),
 }
+"""What reads the formats it knows."""
 
 
 def measure_one(reader: str, path: Path, small: Path, repeats: int) -> dict[str, float]:
@@ -202,7 +259,9 @@ def measure_one(reader: str, path: Path, small: Path, repeats: int) -> dict[str,
 
 def peak_mib() -> float:
     """Of this process and of those it started."""
-    return max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 1024
+    own = psutil.Process()
+    marks = [Path(f"/proc/{process.pid}/status").read_text() for process in (own, *own.children(recursive=True))]
+    return sum(int(line.split()[1]) for mark in marks for line in mark.splitlines() if line.startswith("VmHWM")) / 1024
 
 
 def in_own_process(reader: str, path: Path, small: Path, repeats: int) -> dict[str, float]:
@@ -213,45 +272,37 @@ def in_own_process(reader: str, path: Path, small: Path, repeats: int) -> dict[s
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def measure(sizes: list[int], names: list[str], repeats: int) -> dict[str, dict[str, Any]]:
-    """All figures, printed as they come."""
+def measure(name: str, sizes: list[int], repeats: int) -> dict[str, dict[str, Any]]:
+    """Figures of all readers of a format, printed as they come."""
     figures: dict[str, dict[str, Any]] = {}
+    libraries = [lib for lib, (_, formats) in LIBRARIES.items() if name in formats and importlib.util.find_spec(lib)]
     with tempfile.TemporaryDirectory() as folder:
-        for name in names:
-            for size in sizes:
-                path, small = Path(folder) / f"large.{name}", Path(folder) / f"small.{name}"
-                FILES[name](path, size)
-                FILES[name](small, SMALL)
-                installed = [lib for lib in LIBRARIES if importlib.util.find_spec(lib)]
-                libraries = [lib for lib in installed if name in LIBRARIES[lib][1] and size == sizes[0]]
-                for reader in ["own", *libraries]:
-                    key = name if reader == "own" else f"{reader}_{name}"
-                    one = in_own_process(reader, path, small, repeats if size == sizes[0] else 1)
-                    figure = figures.setdefault(key, {"peak_mib": {}})
-                    speed = one["events"] / one["seconds"] / 1e6
-                    figure.setdefault("mevents_per_s", round(speed, 2))
-                    figure["peak_mib"][f"{size / 1e6:g}M"] = round(one["mib"])
-                    print(f"{key:24s} {one['events']:11,.0f} events {speed:8.2f} M/s {one['mib']:7.0f} MiB", flush=True)
-                remove(path)
-                remove(small)
+        for size in sizes:
+            path, small = Path(folder) / f"large.{name}", Path(folder) / f"small.{name}"
+            FILES[name](path, size)
+            FILES[name](small, SMALL)
+            held = size
+            for reader in ["own", *(libraries if size == sizes[0] else [])]:
+                one = in_own_process(reader, path, small, repeats if size == sizes[0] else 1)
+                held = one["events"] if reader == "own" else held
+                if one["events"] != held or (held != size and name not in POLARITY_BY_CHANGE):
+                    raise RuntimeError(f"{reader} found {one['events']} of {size} events in {path.name}, own {held}")
+                figure = figures.setdefault(name if reader == "own" else f"{reader}_{name}", {"peak_mib": {}})
+                speed = one["events"] / one["seconds"] / 1e6
+                figure.setdefault("mevents_per_s", round(speed, 2))
+                figure["peak_mib"][f"{size / 1e6:g}M"] = round(one["mib"])
+                print(f"{name:20s} {reader:14s} {one['events']:11,d} events {speed:7.2f} M/s {one['mib']:6.0f} MiB")
+            for left in Path(folder).iterdir():
+                shutil.rmtree(left) if left.is_dir() else left.unlink()
     return figures
-
-
-def remove(path: Path) -> None:
-    if path.is_dir():
-        for file in sorted(path.rglob("*"), reverse=True):
-            file.rmdir() if file.is_dir() else file.unlink()
-        path.rmdir()
-    else:
-        path.unlink()
 
 
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
-    parser.add_argument("--events", type=int, nargs="*", default=[PART], help="of each file, smallest first")
-    parser.add_argument("--readers", nargs="*", choices=list(FILES), default=list(FILES))
+    parser.add_argument("--full", action="store_true", help="100 M events too")
+    parser.add_argument("--formats", nargs="*", choices=list(FILES), default=list(FILES))
     parser.add_argument("--repeats", type=int, default=5, help="runs of which the fastest counts")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -261,11 +312,17 @@ def main() -> None:
         return
     if arguments.write and (changed := uncommitted(ROOT)):
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
-    record = machine_record(ROOT)
-    figures = measure(sorted(arguments.events), arguments.readers, arguments.repeats)
-    if arguments.write:
-        path = write_section(ROOT, "recordings", "readers", figures, record)
-        print(f"written to {path.relative_to(ROOT)}")
+    for name in arguments.formats:
+        record = machine_record(ROOT)
+        record["versions"] |= {
+            lib: importlib.metadata.version(lib) for lib in LIBRARIES if importlib.util.find_spec(lib)
+        }
+        figures = measure(name, [*SIZES, *([LARGEST] if arguments.full else [])], arguments.repeats)
+        if arguments.write:
+            known = read_results(ROOT, "recordings").get("readers", {})
+            found = {reader: figure | {"commit": record["commit"]} for reader, figure in figures.items()}
+            path = write_section(ROOT, "recordings", "readers", known | found, record)
+            print(f"written to {path.relative_to(ROOT)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ train_e2v.
 
 The sensor is a quarter of a CeleX-5 in each direction (200 x 320, pictures of 30 x 45), with --full all of it (800 x
 1280, pictures of 120 x 180). `--write` merges the figures into docs/results/recordings.json as section `rig`, or
-`rig_full`.
+`rig_full`. `--docs` draws the pictures of docs/recordings.md and docs/recordings-dot.md instead.
 """
 
 import argparse
@@ -31,12 +31,17 @@ from polarnet.config import Config, load
 from polarnet.evaluation.benchmark import run_benchmark
 from polarnet.evaluation.methods import available
 from polarnet.evaluation.score import summary
+from polarnet.events.exchange import write_hdf5
 from polarnet.events.frames import FrameStore
 from polarnet.measure import BENCHMARK_KEYS, machine_record, uncommitted, write_section
-from polarnet.recordings.dot import RecordingsConfig
+from polarnet.recordings.dot import EVENT_CAPTURES, RecordingsConfig, read_event_capture
 from polarnet.recordings.imported import import_targets
+from polarnet.recordings.inspection import findings, inspect_recording
+from polarnet.recordings.recording import open_recording
+from polarnet.recordings.registration import event_image, register, warped
 from polarnet.recordings.targets import Calibrated, calibrate_targets, spread_us
-from polarnet.reports.calibration import draw_calibration
+from polarnet.reports.calibration import draw_calibration, draw_hot_pixels, draw_registration
+from polarnet.reports.recordings import recording_picture
 from polarnet.reports.tables import as_plain, score_table
 from polarnet.rig import RigConfig, RigTruth, true_dolp, write_rig
 from polarnet.runtime import generator_for
@@ -57,6 +62,8 @@ RIG = RigConfig(
     hot_pixels=5,
     file_type="bin",
 )
+SECOND_CAMERA = np.array([[1.01, 0.02, 5.0], [-0.015, 0.99, -4.0], [2e-5, -1e-5, 1.0]])
+"""Homography from the first camera's pixels to those of the one that the pages lay on it."""
 FULL_RIG = replace(RIG, speed_px_s=240.0, picture_rate_hz=100.0)
 
 
@@ -128,11 +135,38 @@ def benchmarked(folder: Path, names: list[str], config: Config) -> dict[str, dic
         one = run_benchmark(made_set(name, folder / name), context, benchmark, None, folder / "cache")
         rows += one.rows
         costs = {method: asdict(cost) for method, cost in one.costs.items()}
-    scores = summary(rows, benchmark.bootstrap_samples, config.seed)
-    print(as_plain(score_table({m: {**s, **costs[m]} for m, s in scores.items()}, "not loaded here")))
+    scores = {m: {**s, **costs[m]} for m, s in summary(rows, benchmark.bootstrap_samples, config.seed).items()}
+    print(as_plain(score_table(scores, "not loaded here")))
     for method, reason in absent.items():
         print(f"{method} is left out: {reason}")
     return {method: {key: scores[method].get(key) for key in BENCHMARK_KEYS} for method in scores}
+
+
+def draw_documentation(
+    scratch: Path, rig: RigConfig, recordings: RecordingsConfig, emulator: EmulatorConfig
+) -> list[Path]:
+    """The pictures of the pages on recordings and what `polarnet inspect` says, of one target; where they are."""
+    name, pictures = "coffee", ROOT / "docs" / "pictures"
+    truth = write_rig(scratch / "raw" / name, scene_of(0), rig, recordings, emulator, seed=1, threads=2)
+    import_targets(scratch / "raw", scratch / "imported", recordings)
+    (found,) = calibrate_targets(scratch / "imported", scratch / "calibrated", recordings, {})
+    draw_calibration(found, recordings, pictures / "recordings_calibration.png")
+
+    one, other = (read_event_capture(scratch / "raw" / name / f"{c}.bin", recordings) for c in EVENT_CAPTURES[:2])
+    capture = scratch / "events_0.h5"
+    write_hdf5(capture, one, int(one.t[-1]))
+    assert recordings.hot_pixel_factor is not None
+    inspection = inspect_recording(open_recording(capture), recordings.hot_pixel_factor)
+    (pictures / "recordings_inspect.png").write_bytes(recording_picture(inspection))
+    draw_hot_pixels(inspection.counts, inspection.hot, pictures / "recordings_hot_pixels.png")
+    assert int(inspection.hot.sum()) == len(truth.hot)
+    lines = [f"$ polarnet inspect {capture.name}", *findings(inspection), f"picture     {capture.name}.png"]
+    (ROOT / "docs" / "results" / "inspection.json").write_text(json.dumps({"lines": lines}, indent=2) + "\n")
+
+    reference, moving = event_image(one), warped(event_image(other), SECOND_CAMERA)
+    homography = register(reference, moving).homography
+    draw_registration(reference, moving, warped(moving, homography), pictures / "recordings_registration.png")
+    return sorted(pictures.glob("recordings_*.png"))
 
 
 def main() -> None:
@@ -144,6 +178,7 @@ def main() -> None:
     parser.add_argument("--cutoff-hz", type=float, default=3000.0, help="of the photoreceptor; a slow one adds a delay")
     parser.add_argument("--data", type=Path, default=ROOT / "data", help="where trained networks are looked for")
     parser.add_argument("--pictures", type=Path, default=ROOT / "outputs" / "rig", help="where diagnoses are drawn")
+    parser.add_argument("--docs", action="store_true", help="only draw the pictures of the pages on recordings")
     arguments = parser.parse_args()
     if arguments.write and (changed := uncommitted(ROOT)):
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
@@ -151,6 +186,11 @@ def main() -> None:
     recordings = replace(config.recordings, enabled=True, **({} if arguments.full else QUARTER))
     rig = FULL_RIG if arguments.full else RIG
     emulator = replace(config.emulate, model="exact", cutoff_hz=arguments.cutoff_hz)
+    if arguments.docs:
+        with tempfile.TemporaryDirectory() as scratch:
+            for path in draw_documentation(Path(scratch), rig, recordings, emulator):
+                print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1024:.0f} kB")
+        return
     arguments.pictures.mkdir(parents=True, exist_ok=True)
     record: dict[str, Any] = machine_record(ROOT)
     with tempfile.TemporaryDirectory() as scratch:

@@ -19,7 +19,7 @@ import pytest
 import zarr.storage._local
 from zarr.core.sync import sync
 
-from polarnet.events.table import Column, Table, create_table, open_table
+from polarnet.events.table import Column, Table, create_table, open_group, open_table
 
 ROWS = [f"row{i}" for i in range(4)]
 LENGTH = 3000
@@ -317,3 +317,11 @@ def test_attributes_that_json_cannot_hold_are_refused(tmp_path):
         table_at(tmp_path / "store.zarr", threshold=float("nan"))
     with pytest.raises(ValueError, match="finite, plain JSON"):
         table_at(tmp_path / "store.zarr", root=tmp_path)
+
+
+@pytest.mark.parametrize("content", ["6", "[]", "{"])
+def test_a_damaged_header_is_unreadable_by_name(tmp_path, content):
+    (tmp_path / "store.zarr").mkdir()
+    (tmp_path / "store.zarr" / "zarr.json").write_text(content)
+    with pytest.raises(ValueError, match=r"store\.zarr is unreadable"):
+        open_group(tmp_path / "store.zarr")

@@ -106,6 +106,10 @@ def write_sample(form: str, path: Path, events: Events) -> None:
         words = np.stack([events.t, events.x.long() | events.y.long() << 14 | (events.p > 0).long() << 28], axis=1)
         header = f"% Version 2\n% Height {events.height}\n% Width {events.width}\n".encode()
         path.write_bytes(header + b"\x0c\x08" + words.astype("<u4").tobytes())
+    elif form == "aedat2":
+        address = (events.height - 1 - events.y.long()) << 22 | events.x.long() << 12 | (events.p > 0).long() << 11
+        header = b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis346blue\r\n"
+        path.write_bytes(header + np.stack([address, events.t], axis=1).astype(">u4").tobytes())
     elif form == "celex5_csv":
         write_celex5_csv(path, events)
     elif form == "text":

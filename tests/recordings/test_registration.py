@@ -1,12 +1,15 @@
 """Cameras laid on each other by their event images."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from polarnet.cli import main
 from polarnet.events.stream import Events
-from polarnet.recordings.registration import event_image, register, warp_events
+from polarnet.recordings.registration import event_image, register, warp_events, warped
 from polarnet.recordings.source import RecordingError
 from polarnet.reports.calibration import draw_hot_pixels, draw_registration
 
@@ -38,10 +41,21 @@ def test_the_homography_between_two_cameras_is_found_to_a_fraction_of_a_pixel(im
     assert corners_apart(np.eye(3)) > 2
     assert corners_apart(found.homography) < 0.2
     assert found.correlation > 0.95
-    after = cv2.warpPerspective(moving, found.homography, (WIDTH, HEIGHT))
+    after = warped(moving, found.homography)
     draw_registration(reference, moving, after, tmp_path / "registration.png")
     draw_hot_pixels(np.ones((5, 5)), np.eye(5, dtype=bool), tmp_path / "hot.png")
     assert all((tmp_path / name).stat().st_size > 5000 for name in ("registration.png", "hot.png"))
+
+
+def test_register_prints_the_homography_of_two_recordings_and_draws_both(images, tmp_path, capsys):
+    for name, image in zip(("a.txt", "b.txt"), images, strict=True):
+        y, x = (np.repeat(axis.ravel(), np.rint(60 * image).astype(int).ravel()) for axis in np.indices(image.shape))
+        lines = "".join(f"{t} {column} {row} 1\n" for t, (row, column) in enumerate(zip(y, x, strict=True)))
+        (tmp_path / name).write_text(f"{WIDTH} {HEIGHT}\n{lines}")
+    command = ["register", str(tmp_path / "a.txt"), str(tmp_path / "b.txt"), "--picture", str(tmp_path / "both.png")]
+    assert main(command) == 0
+    assert corners_apart(np.array(json.loads(capsys.readouterr().out)["homography"])) < 0.5
+    assert (tmp_path / "both.png").stat().st_size > 5000
 
 
 def test_events_are_moved_to_the_reference_camera_and_those_it_does_not_see_left_out():

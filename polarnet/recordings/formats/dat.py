@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, sensor_size
+from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, running_on, sensor_size
 
 MOST_HEADER_BYTES = 2**16
 EVENT_BYTES = 8
 CHANGE_DETECTION = (0, 12)  # event types: 2D of the first sensors, CD of the later ones
-WRAP_US = 2**32
 
 
 class Header(NamedTuple):
@@ -45,11 +44,7 @@ def open_dat(path: Path, choices: Choices) -> Source:
                 words = np.frombuffer(data[: len(data) // EVENT_BYTES * EVENT_BYTES], "<u4").reshape(-1, 2)
                 if not len(words):
                     continue
-                t = words[:, 0].astype(np.int64)
-                wrapped = np.cumsum(np.diff(t, prepend=before) < -WRAP_US // 2)
-                before = int(t[-1])
-                t += (turns + wrapped) * WRAP_US
-                turns += int(wrapped[-1])
+                t, turns, before = running_on(words[:, 0], turns, before)
                 address = words[:, 1]
                 if header.version == 1:
                     yield Block(t, address & 0x1FF, address >> 9 & 0xFF, address >> 17 & 1)

@@ -1,0 +1,60 @@
+"""AEDAT-2 files of jAER, of a DAVIS (the PDAVIS is one): a header of # lines, then 8 bytes an event, big endian.
+
+The first four are an address: y from the bottom in bits 22 to 30, x in bits 12 to 21, the polarity in bit 11. Where bit
+31 (a picture's sample) or bit 10 (of the IMU, or from outside) is set, it is no event of a pixel. The others are
+microseconds.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, running_on, sensor_size
+
+MAGIC = b"#!AER-DAT2"
+LAST_LINE = b"#End Of ASCII Header"  # of newer files; an event can begin with # too
+MOST_HEADER_BYTES = 2**20  # jAER writes its settings there
+EVENT_BYTES = 8
+NO_EVENT = 1 << 31 | 1 << 10
+SENSORS = {b"346": (260, 346), b"240": (180, 240), b"128": None}
+"""Height and width by the number in the name of the camera's class in the header; the DVS128 has other addresses."""
+
+
+def matches(path: Path, head: bytes) -> bool:
+    """By its first bytes."""
+    return head.startswith(MAGIC)
+
+
+def open_aedat2(path: Path, choices: Choices) -> Source:
+    """The events of a DAVIS; times that wrap after 71 minutes are made to run on."""
+    with path.open("rb") as file:
+        data = file.read(MOST_HEADER_BYTES)
+    start, ended = 0, False
+    while not ended and data[start : start + 1] == b"#" and (end := data.find(b"\n", start)) >= 0:
+        ended = data[start:end].strip() == LAST_LINE
+        start = end + 1
+    if not data.startswith(MAGIC) or (not ended and data[start : start + 1] == b"#"):
+        raise RecordingError(f"{path.name}: expected AEDAT-2's header of # lines, and events after it")
+    chip = re.search(rb"# AEChip: [\w.]*?(346|240|128)", data[:start])
+    size = SENSORS[chip[1]] if chip else (None, None)
+    if size is None:
+        raise RecordingError(f"{path.name}: expected the recording of a DAVIS, got one of a DVS128")
+    height, width = sensor_size(path, choices, *size)
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        turns, before = 0, 0
+        with path.open("rb") as file:
+            file.seek(start)
+            while data := file.read(BLOCK_EVENTS * EVENT_BYTES):
+                counts["cut_tail"] += len(data) % EVENT_BYTES != 0
+                words = np.frombuffer(data[: len(data) // EVENT_BYTES * EVENT_BYTES], ">u4").reshape(-1, 2)
+                words = words[words[:, 0] & NO_EVENT == 0]
+                if len(words):
+                    t, turns, before = running_on(words[:, 1], turns, before)
+                    address = words[:, 0].astype(np.int64)
+                    yield Block(t, address >> 12 & 0x3FF, height - 1 - (address >> 22 & 0x1FF), address >> 11 & 1)
+
+    return Source(height, width, blocks)
