@@ -47,18 +47,15 @@ def trained(network: str, epochs: int, arguments: argparse.Namespace) -> Path:
     return folder
 
 
-def figures(tables: dict[str, dict[str, dict[str, Any]]], minutes: dict[str, float]) -> dict[str, Any]:
-    """What the tables say of the two networks, and the tables."""
+def headlines(tables: dict[str, dict[str, dict[str, Any]]]) -> dict[str, Any]:
+    """What the tables say of the two networks."""
     simulated, measured = tables["simulated"], tables["measured"]
     return {
         "gain_over_paper_db": simulated["ours"]["psnr"] - simulated["paper"]["psnr"],
         "mse_over_paper": simulated["ours"]["mse"] / simulated["paper"]["mse"],
         "mse_over_oracle_mean": simulated["ours"]["mse"] / simulated["oracle_mean"]["mse"],
-        "measured_mse_over_best_baseline": measured["ours"]["mse"] / min(measured[row]["mse"] for row in INTENSITY),
-        "minutes_trained": minutes,
-        **{
-            name: {method: {key: scores.get(key) for key in BENCHMARK_KEYS} for method, scores in table.items()}
-            for name, table in tables.items()
+        "measured": {
+            "mse_over_best_baseline": measured["ours"]["mse"] / min(measured[row]["mse"] for row in INTENSITY)
         },
     }
 
@@ -91,17 +88,17 @@ def main() -> None:
     weights = f"baselines.weights.paper={paper / 'best.safetensors'}"
     stage("benchmark", arguments, *sets, methods, weights, f"paths.train={ours}")
     folder = arguments.work / "data" / "benchmark"
-    tables = {
-        name: json.loads((path / "metrics.json").read_text())
-        for name, path in (("simulated", folder), ("measured", folder / "sets" / "measured"))
-    }
-    minutes = {
-        name: json.loads((path / "minutes.json").read_text()) for name, path in (("ours", ours), ("paper", paper))
-    }
-    found = figures(tables, minutes)
-    print(json.dumps({key: value for key, value in found.items() if key not in tables}, indent=2))
+    tables, about = {}, {}
+    for name, path in (("simulated", folder), ("measured", folder / "sets" / "measured")):
+        rows, details = (json.loads((path / f"{file}.json").read_text()) for file in ("metrics", "details"))
+        tables[name] = {row: {key: scores.get(key) for key in BENCHMARK_KEYS} for row, scores in rows.items()}
+        about[name] = {"scenes": len(details["scenes"]), "frames": details["frames"], "paired": details["paired"]}
+    minutes = {row: json.loads((path / "minutes.json").read_text()) for row, path in (("ours", ours), ("paper", paper))}
+    print(json.dumps({"minutes_trained": minutes} | headlines(tables), indent=2))
     if arguments.write:
-        print(write_section(ROOT, "network", f"photographs_seed_{arguments.seed}", found, record))
+        section = "study" if arguments.seed == 1 else f"study_seed_{arguments.seed}"
+        found = {"minutes_trained": minutes, "threads": arguments.threads, "about": about, **tables}
+        print(write_section(ROOT, "network", section, found, record, headlines(tables)))
 
 
 if __name__ == "__main__":
