@@ -1,6 +1,7 @@
 """The network polarnet against the paper's, both trained on the same photographs for about as long, and the baselines.
 
-python tests/benchmarks/network.py --photographs FOLDER --measured FOLDER --work FOLDER [--write]
+python tests/benchmarks/network.py --photographs FOLDER --measured FOLDER --work FOLDER
+    [--firenet FILE] [--write]
 
 Runs the pipeline's stages with experiment=photographs in the folder --work, where a killed run goes on, and prints the
 tables of held-out photographs and of measured scenes, on which nothing was trained. --write puts them into
@@ -18,8 +19,8 @@ from typing import Any
 from polarnet.measure import BENCHMARK_KEYS, machine_record, uncommitted, write_section
 
 ROOT = Path(__file__).resolve().parents[2]
-METHODS = ["zeros", "train_mean", "oracle_mean", "cf", "highpass", "cf+gain", "highpass+gain", "paper", "ours"]
-INTENSITY = ("cf", "highpass", "cf+gain", "highpass+gain")  # baselines that reconstruct intensities
+INTENSITY = [f"{row}{gain}" for row in ("cf", "highpass", "firenet_published") for gain in ("", "+gain")]
+METHODS = ["zeros", "train_mean", "oracle_mean", *INTENSITY, "paper", "ours"]
 
 
 def stage(name: str, arguments: argparse.Namespace, *overrides: str) -> None:
@@ -50,6 +51,7 @@ def trained(network: str, epochs: int, arguments: argparse.Namespace) -> Path:
 def headlines(tables: dict[str, dict[str, dict[str, Any]]]) -> dict[str, Any]:
     """What the tables say of the two networks."""
     simulated, measured = tables["simulated"], tables["measured"]
+    best = min(scores["mse"] for row, scores in measured.items() if row in INTENSITY)
     return {
         "gain_over_paper_db": simulated["ours"]["psnr"] - simulated["paper"]["psnr"],
         "mse_over_paper": simulated["ours"]["mse"] / simulated["paper"]["mse"],
@@ -65,6 +67,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photographs", type=Path, required=True)
     parser.add_argument("--measured", type=Path, required=True, help="scenes as ingest.source=polarization takes them")
+    parser.add_argument("--firenet", type=Path, help="FireNet's published weights; without them its rows are left out")
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--epochs", type=int, default=3)
     parser.add_argument("--paper-epochs", type=int, default=4)
@@ -85,8 +88,10 @@ def main() -> None:
     sets = ("benchmark.sets=[simulated,measured]", f"sets.measured_root={arguments.measured}")
     stage("sets", arguments, *sets)
     methods = f"benchmark.methods=[{','.join(METHODS)}]"
-    weights = f"baselines.weights.paper={paper / 'best.safetensors'}"
-    stage("benchmark", arguments, *sets, methods, weights, f"paths.train={ours}")
+    weights = [f"paths.train={ours}", f"baselines.weights.paper={paper / 'best.safetensors'}"]
+    if arguments.firenet:
+        weights.append(f"baselines.weights.firenet_published={arguments.firenet.resolve()}")
+    stage("benchmark", arguments, *sets, methods, *weights)
     folder = arguments.work / "data" / "benchmark"
     tables, about = {}, {}
     for name, path in (("simulated", folder), ("measured", folder / "sets" / "measured")):
