@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from polarnet.reports.recording_tables import recordings_block
 from polarnet.reports.tables import COLUMNS, COSTS, SET_TITLES, as_markdown, paired_lines, score_table, standing
 
 MARKER = re.compile(r"<!-- (?P<end>/?)results:(?P<name>[\w-]+) -->")
@@ -106,6 +107,11 @@ def emulation_block(results: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def inspection_block(results: Mapping[str, Any]) -> str:
+    """What `polarnet inspect` says of a capture of the simulated rig."""
+    return "\n".join(["```", *results["lines"], "```"])
+
+
 GOLDEN_CASES = 23  # 15 of v2e, 8 of ESIM
 EMULATION_COLUMNS = (
     ("seconds_1_thread", "seconds, 1 thread", 3),
@@ -122,10 +128,15 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "pipeline": pipeline_block,
     "benchmark": benchmark_block,
     "emulation": emulation_block,
+    "recordings": recordings_block,
+    "inspection": inspection_block,
 }
 """What writes the block of each name."""
 
-UNMEASURED = {"emulation": "Not measured yet: `python tests/benchmarks/emulation.py --write` does it."}
+UNMEASURED = {
+    "emulation": "Not measured yet: `python tests/benchmarks/emulation.py --write` does it.",
+    "recordings": "Not measured yet: `tests/benchmarks/{recordings,fuzz_recordings,rig}.py --write` do it.",
+}
 """Blocks that may stand in a document before their results do, and what they say until then."""
 
 
