@@ -2,18 +2,21 @@
 
 import argparse
 import contextlib
+import functools
 import json
 import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from polarnet import __version__
 
 if TYPE_CHECKING:
     from polarnet.config import Config
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,7 +44,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"polarnet {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_pipeline(commands)
+    _add_stores(commands)
+    _add_inspect(commands)
+    _add_recover(commands)
+    _add_benchmark(commands)
+    return parser
 
+
+def _add_pipeline(commands: Commands) -> None:
     doctor = commands.add_parser("doctor", help="what this machine offers: versions, device, bf16, weights, free disk")
     doctor.set_defaults(run=_doctor)
 
@@ -56,6 +67,8 @@ def _parser() -> argparse.ArgumentParser:
     stages = commands.add_parser("stages", help="the names of the stages, in order")
     stages.set_defaults(run=_stages)
 
+
+def _add_stores(commands: Commands) -> None:
     verify = commands.add_parser("verify", help="check every byte of a store of events, frames or scenes")
     verify.add_argument("store", help="folder, zip or fsspec URL")
     verify.set_defaults(run=_verify)
@@ -71,6 +84,8 @@ def _parser() -> argparse.ArgumentParser:
     import_.add_argument("store", type=Path, help="written anew")
     import_.set_defaults(run=_import)
 
+
+def _add_inspect(commands: Commands) -> None:
     inspect = commands.add_parser("inspect", help="what is in a camera's file, and a picture of its busiest moment")
     inspect.add_argument("file", type=Path)
     inspect.add_argument("--format", help="where the content does not show it: text, celex5_csv, celex5_bin, dat, ...")
@@ -92,6 +107,59 @@ def _parser() -> argparse.ArgumentParser:
     register.add_argument("--picture", type=Path, help="where to write a PNG of both event images, before and after")
     register.set_defaults(run=_register)
 
+
+def _add_recover(commands: Commands) -> None:
+    recover = commands.add_parser(
+        "recover",
+        help="DoLP and AoLP of recordings, or of a camera that runs: frames, pictures, a video and a page",
+        description="INPUT is four files, one a polarizer, with --angles; one file of a camera with polarizers on its "
+        "pixels, with --mosaic; an event store; a folder of division-of-time captures; or, with --live, lines "
+        "`t x y p angle` of a file that grows or of standard input (-).",
+    )
+    recover.add_argument("input", nargs="+", metavar="INPUT")
+    recover.add_argument("--angles", nargs=4, type=int, metavar="DEG", help="polarizers of the four files, in order")
+    recover.add_argument(
+        "--mosaic", metavar="'A B / C D'", help="polarizers of 2x2 pixels: even row / odd row, degrees"
+    )
+    recover.add_argument("--sequence", metavar="NAME", help="of an event store with several")
+    recover.add_argument("--live", action="store_true", help="recover while events come, and show the latency")
+    recover.add_argument(
+        "--idle", type=float, default=5.0, metavar="S", help="a live file that stops growing has ended"
+    )
+    recover.add_argument(
+        "--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce files to so many pixels"
+    )
+    recover.add_argument(
+        "--window", default="33.333ms",
+        help="a time (33.3ms) or a number of events of all polarizers (20000ev); networks are trained on 1/30 s",
+    )  # fmt: skip
+    recover.add_argument("--step", help="time between the ends of overlapping windows, from 0.1ms; default: no overlap")
+    recover.add_argument(
+        "--weights", type=Path, metavar="FILE", help="of the network; default: shipped, or trained here"
+    )
+    recover.add_argument("--method", help="instead of the network: cf, highpass, cf+gain, e2v, ... of the benchmark")
+    recover.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N")
+    recover.add_argument("--precision", choices=("fp32", "bf16"), default="fp32", help="of the networks")
+    recover.add_argument("--out", type=Path, metavar="FOLDER", help="default: outputs/recover/NAME")
+    recover.add_argument("--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), help="default: zarr png mp4")
+    recover.add_argument("--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video")
+    recover.add_argument("--format", help="of files, where the content does not show it; like the next for inspect")
+    recover.add_argument("--height", type=int, help="of the sensor, where the files do not say it")
+    recover.add_argument("--width", type=int)
+    recover.add_argument("--clock-mhz", type=float)
+    recover.add_argument("--assume-polarity", type=int, choices=(1, -1))
+    recover.set_defaults(run=_recover)
+
+    replay = commands.add_parser(
+        "replay", help="a stored sequence as live lines, at its own pace: polarnet recover --live"
+    )
+    replay.add_argument("store", help="folder, zip or fsspec URL")
+    replay.add_argument("sequence")
+    replay.add_argument("--speed", type=float, default=1.0, help="times as fast as recorded")
+    replay.set_defaults(run=_replay)
+
+
+def _add_benchmark(commands: Commands) -> None:
     docs = commands.add_parser("docs", help="write docs/results/*.json into the tables of README.md and docs/")
     docs.add_argument("--check", action="store_true", help="change nothing; fail where a table is out of date")
     docs.set_defaults(run=_docs)
@@ -107,7 +175,9 @@ def _parser() -> argparse.ArgumentParser:
     asked.add_argument("--scenes", type=Path, metavar="FOLDER", help="photographs or measurements, in all subfolders")
     asked.add_argument("--event-budget", action="store_true", help="quality against events per pixel (paper, Fig. 11)")
     asked.add_argument("--sensitivity", action="store_true", help="quality against mismatch, noise, speed, channels")
-    benchmark.add_argument("--weights", type=Path, metavar="FILE", help="of the DoLP network; default: trained here")
+    benchmark.add_argument(
+        "--weights", type=Path, metavar="FILE", help="of the network; default: trained here, or shipped"
+    )
     benchmark.add_argument(
         "--kind", choices=("auto", "photographs", "polarization"), default="auto",
         help="what lies in FOLDER; auto takes .npz files and NAME_0, NAME_45, ... for measured polarization",
@@ -124,7 +194,6 @@ def _parser() -> argparse.ArgumentParser:
         help="pipeline: time the README's two commands in a fresh clone of HEAD; benchmark: what data/benchmark holds",
     )  # fmt: skip
     measure.set_defaults(run=_measure)
-    return parser
 
 
 def _doctor(options: argparse.Namespace) -> int:
@@ -235,6 +304,58 @@ def _register(options: argparse.Namespace) -> int:
     print(json.dumps({"homography": found.homography.tolist(), "correlation": found.correlation}, indent=2))
     if options.picture:
         draw_registration(reference, moving, warped(moving, found.homography), options.picture)
+    return 0
+
+
+def _recover(options: argparse.Namespace) -> int:
+    from polarnet.config import load
+    from polarnet.events.streaming import WindowRule, parse_window
+    from polarnet.recordings.recording import read_recording
+    from polarnet.recover import Arrangement, facts_of, open_files, open_live, open_stream, recover
+    from polarnet.reports.recovery import RecoveryWriter
+    from polarnet.stokes import parse_mosaic
+
+    config = functools.cache(lambda: load(project_root()))
+    length_us, events = parse_window(options.window)
+    step_us, step_events = parse_window(options.step) if options.step else (None, None)
+    if step_events is not None:
+        raise ValueError(f"--step: expected a time such as 0.1ms, got {options.step}")
+    rule = WindowRule(length_us, events, step_us)
+    stream, words = open_stream(options.method, options.weights, options.device, options.precision, config)
+    name = "live" if options.live else Path(options.input[0]).stem
+    out = options.out or Path("outputs") / "recover" / name
+    mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
+    lines = None
+    if options.live:
+        if len(options.input) != 1 or options.size or options.angles:
+            raise ValueError("--live: expected one file or - and, where it has one, a --mosaic; nothing else of files")
+        source, lines = open_live(options.input[0], mosaic, options.idle)
+    else:
+        sides = ("format", "height", "width", "clock_mhz", "assume_polarity")
+        read = functools.partial(read_recording, **{side: getattr(options, side) for side in sides})
+        arrangement = Arrangement(options.angles, mosaic, options.sequence)
+        size = (options.size[0], options.size[1]) if options.size else None
+        source = open_files([Path(path) for path in options.input], arrangement, read, size, out / "work", config)
+    writer = RecoveryWriter(out, options.write or ("zarr", "png", "mp4"), options.video_rate)
+    summary = recover(source, rule, stream, writer)
+    facts = facts_of(source, rule, words, summary)
+    for key, value in facts.items():
+        print(f"{key:11s} {value}")
+    left_out = {kind: count for kind, count in lines.counts.items() if count} if lines else {}
+    notes = [f"Lines that were left out: {left_out}."] if left_out else []
+    print(*notes, f"the page: {writer.write_page(source.name, facts, notes)}", sep="\n")
+    return 0
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from polarnet.events.store import EventStore
+    from polarnet.recover import replay
+
+    def write(data: bytes) -> None:
+        sys.stdout.buffer.write(data)
+        sys.stdout.buffer.flush()
+
+    replay(EventStore.open(options.store), options.sequence, options.speed, write)
     return 0
 
 

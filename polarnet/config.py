@@ -22,6 +22,8 @@ from polarnet.evaluation.score import BenchmarkConfig
 from polarnet.experiments import BASE
 from polarnet.lpips import LpipsConfig, lpips_problem
 from polarnet.networks.dolp_unet import DolpUNetConfig
+from polarnet.networks.registry import NetworkConfig
+from polarnet.networks.stokes_unet import StokesUNetConfig
 from polarnet.ranges import check_ranges
 from polarnet.recordings.dot import RecordingsConfig
 from polarnet.runtime import RuntimeConfig, configure
@@ -29,6 +31,7 @@ from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import MotionConfig
 from polarnet.simulation.pictures.ingest import IngestConfig
 from polarnet.simulation.sets import SetsConfig
+from polarnet.simulation.variation import VariationConfig
 from polarnet.training.e2p import E2pConfig
 from polarnet.training.e2v import E2vConfig
 from polarnet.training.loop import TrainConfig
@@ -45,6 +48,7 @@ class NetworksConfig:
     """Section `networks` of params.yaml: one entry a network; `network` names the one in use."""
 
     paper: DolpUNetConfig
+    polarnet: StokesUNetConfig
 
 
 @dataclass(frozen=True)
@@ -98,6 +102,7 @@ class Config:
     seed: int
     ingest: IngestConfig
     synthesize: MotionConfig
+    variation: VariationConfig
     emulate: EmulatorConfig
     network: str
     networks: NetworksConfig
@@ -128,7 +133,7 @@ class Config:
                 raise ValueError(f"{key}: expected at most the window of section synthesize, {window}, got {crop}")
 
     @property
-    def network_config(self) -> DolpUNetConfig:
+    def network_config(self) -> NetworkConfig:
         """The section of `networks` that `network` names."""
         return getattr(self.networks, self.network)
 

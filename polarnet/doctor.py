@@ -9,7 +9,7 @@ import psutil
 import torch
 
 from polarnet.lpips import BACKBONES, LpipsConfig, lpips_problem
-from polarnet.runtime import usable_cores
+from polarnet.runtime import bf16_units, usable_cores
 
 PACKAGES = ("torch", "numpy", "numba", "zarr", "OpenImageIO", "opencv-contrib-python-headless", "scikit-image",
             "dvc", "hydra-core")  # fmt: skip
@@ -45,10 +45,5 @@ def _device() -> str:
 
 
 def _bf16() -> str:
-    if torch.cuda.is_available():
-        return "CUDA, fast" if torch.cuda.is_bf16_supported() else "not on this GPU: set train.precision=fp32"
-    if not torch.backends.mkldnn.is_available():
-        return "no oneDNN in this torch: set train.precision=fp32"
-    amx, avx512 = torch.cpu._is_amx_tile_supported(), torch.cpu._is_avx512_bf16_supported()
-    found = [name for name, there in (("AMX", amx), ("AVX512-BF16", avx512)) if there]
-    return ", ".join(found) if found else "emulated on this processor, slow: set train.precision=fp32"
+    found = bf16_units(torch.device("cuda" if torch.cuda.is_available() else "cpu"))
+    return ", ".join(found) if found else "emulated here, slower than fp32, which train.precision=auto therefore takes"

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedSeq
 
 BASE = {"experiment": "demo", "sensor": "default"}
 """Of each group (a folder of conf/), the preset that names every value which another of it changes: none can leak."""
@@ -56,12 +57,19 @@ def write_preset(root: Path, name: str) -> list[str]:
             raise ValueError(f"{group} {name!r} sets {key}, which params.yaml does not have")
         if node[last] != value:
             changed.append(f"{key}: {node[last]} -> {value}")
-            node[last] = value
+            node[last] = _in_a_line(value) if isinstance(value, list) else value
     temporary = path.with_suffix(".yaml.tmp")
     with temporary.open("w") as file:
         yaml.dump(params, file)
     temporary.replace(path)
     return changed
+
+
+def _in_a_line(values: list[Any]) -> CommentedSeq:
+    """A list that is written like [1, 2], as all of params.yaml's are."""
+    line = CommentedSeq(values)
+    line.fa.set_flow_style()
+    return line
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -15,6 +15,7 @@ from polarnet.reports.set_page import write_set_page
 from polarnet.runtime import threads_of
 from polarnet.similarity import Lpips
 from polarnet.simulation.sets import Recipe, make_folder_set
+from polarnet.weights import shipped_weights
 
 
 def benchmark_folder(
@@ -25,7 +26,7 @@ def benchmark_folder(
     `out` gets metrics.json, details.json, frames.csv, panels and index.html, and in `out`/work what they were made
     from, so that a run that was stopped goes on and a second one with other weights makes only what is new. Methods
     whose weights are not there are left out, and `notes` says so. `weights` is a checkpoint of the DoLP network; None:
-    the one that the pipeline trained. ValueError where nothing in the folder can be used.
+    the one that the pipeline trained, or else the shipped one. ValueError where nothing in the folder can be used.
     """
     if weights is not None and not weights.is_file():
         raise ValueError(
@@ -39,8 +40,10 @@ def benchmark_folder(
         raise ValueError(f"--scenes {root}: nothing to test on. {error}") from error
     notes: list[str] = []
     train_mean = _train_mean(config)
-    context = context_of(config, train_mean or 0.0, weights)
     wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
+    context = context_of(config, train_mean or 0.0, weights)
+    if why_absent("ours", context):
+        context = context_of(config, train_mean or 0.0, shipped_weights())
     methods = [method for method in wanted if _runs(method, context, train_mean, notes)]
     lpips, record = _lpips_if_there(config)
     settings = dataclasses.replace(config.benchmark, methods=methods)
@@ -61,8 +64,7 @@ def _train_mean(config: Config) -> float | None:
 def _runs(method: str, context: Context, train_mean: float | None, notes: list[str]) -> bool:
     """Whether all is there that a method needs; adds to `notes` what is not."""
     if reason := why_absent(method, context):
-        remedy = "give --weights FILE or run `dvc repro`" if method == "ours" else "run `dvc repro` for what it trains"
-        notes.append(f"{method} was left out: {reason}; {remedy}.")
+        notes.append(f"{method} was left out: {reason}; run `dvc repro` for what it trains.")
         return False
     if train_mean is None and "train_mean" in reach(METHODS[method], type(context)).fields:  # type: ignore[arg-type]
         notes.append(f"{method} was left out: the training split is not there; run `dvc repro synthesize`.")

@@ -1,7 +1,9 @@
 """Device, determinism and named random generators."""
 
+import ctypes
 import hashlib
 import os
+import platform
 from dataclasses import dataclass, field
 
 import numba
@@ -9,6 +11,9 @@ import numpy as np
 import torch
 
 from polarnet.ranges import allowed, check_ranges
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
+LARGEST_KEPT = 2**30  # bytes
 
 
 @dataclass(frozen=True)
@@ -63,10 +68,40 @@ def device_of(config: RuntimeConfig) -> torch.device:
     return device
 
 
+def bf16_units(device: torch.device) -> list[str]:
+    """What of this device computes in bfloat16; nothing where torch would only emulate it, slower than float32."""
+    if device.type == "cuda":
+        return ["CUDA"] if torch.cuda.is_bf16_supported(including_emulation=False) else []
+    if device.type != "cpu" or not torch.backends.mkldnn.is_available():
+        return []
+    units = {"AMX": torch.cpu._is_amx_tile_supported(), "AVX512-BF16": torch.cpu._is_avx512_bf16_supported()}
+    return [name for name, there in units.items() if there]
+
+
+def precision_on(device: torch.device, precision: str) -> str:
+    """fp32 or bf16: `precision` itself, or where it is auto, bf16 if the device has units for it."""
+    if precision == "auto":
+        return "bf16" if bf16_units(device) else "fp32"
+    return precision
+
+
+def keep_freed_memory() -> None:
+    """Have glibc keep the memory of large tensors for the next ones; other systems are left as they are.
+
+    It would hand each back to the system, and get the next one page by page, zeroed.
+    """
+    if platform.libc_ver()[0] == "glibc":
+        libc = ctypes.CDLL(None)
+        libc.mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT)
+        libc.mallopt(M_TRIM_THRESHOLD, LARGEST_KEPT)
+
+
 def configure(config: RuntimeConfig, seed: int) -> torch.device:
-    """Set threads, seed torch, ask torch for deterministic kernels; the device to run on."""
+    """Set threads, seed torch, keep freed memory, ask torch for deterministic kernels; the device to run on."""
     limit_threads(config.threads or usable_cores())
+    keep_freed_memory()
     torch.manual_seed(seed)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     torch.use_deterministic_algorithms(True, warn_only=True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]  # a debugging aid
     return device_of(config)

@@ -13,7 +13,7 @@ def main(config: Config) -> None:
     """Make a scene of every picture and let windows move over it."""
     mapper = functools.partial(pmap, workers=config.runtime.workers, label="synthesize", address=config.cluster.address)
     images, scenes, frames = (Path(path) for path in (config.paths.images, config.paths.scenes, config.paths.frames))
-    count = synthesize(images, scenes, frames, config.synthesize, config.seed, mapper)
+    count = synthesize(images, scenes, frames, config.synthesize, config.seed, mapper, config.variation)
     print(f"{count} sequences")
 
 

@@ -15,12 +15,12 @@ def main(config: Config) -> None:
     """Train `network` on the training split; a killed run of the same training goes on where it stopped."""
     lpips = lpips_of(Path(config.paths.weights), config.loss.lpips)
     task = dolp_task(config.network, config.network_config, config.train, config.loss, lpips, config.seed)
-    paths, threads = config.paths, threads_of(config.runtime)
+    paths, threads, device = config.paths, threads_of(config.runtime), device_of(config.runtime)
     events = open_events(config.train.data, paths.events, paths.scenes, config.emulate, config.seed, threads)
     split = open_split(events, paths.frames, task.encode)
-    metadata = describe(task, split, config.train, Path(paths.weights), config.seed)
+    metadata = describe(task, split, config.train, Path(paths.weights), config.seed, device)
     recorder = Recorder(Path(paths.train), Path(paths.resume), metadata)
-    train(task, split, config.train, recorder, config.seed, device_of(config.runtime), config.runtime.workers)
+    train(task, split, config.train, recorder, config.seed, device, config.runtime.workers)
 
 
 if __name__ == "__main__":

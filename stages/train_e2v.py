@@ -16,12 +16,12 @@ def main(config: Config) -> None:
     e2v = config.baselines.e2v
     lpips = lpips_of(Path(config.paths.weights), e2v.lpips)
     task = e2v_task(e2v, lpips, config.seed)
-    paths, threads = config.paths, threads_of(config.runtime)
+    paths, threads, device = config.paths, threads_of(config.runtime), device_of(config.runtime)
     events = open_events(e2v.data, paths.events, paths.scenes, config.emulate, config.seed, threads)
     split = open_split(events, paths.frames, task.encode)
-    metadata = describe(task, split, e2v, Path(paths.weights), config.seed)
+    metadata = describe(task, split, e2v, Path(paths.weights), config.seed, device)
     recorder = Recorder(Path(paths.train_e2v), Path(paths.resume), metadata)
-    train(task, split, e2v, recorder, config.seed, device_of(config.runtime), config.runtime.workers)
+    train(task, split, e2v, recorder, config.seed, device, config.runtime.workers)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,20 @@
-import pytest
+import platform
+import resource
 
-from polarnet.runtime import RuntimeConfig, device_of, generator_for, seed_for
+import numpy as np
+import pytest
+import torch
+
+from polarnet import runtime
+from polarnet.runtime import (
+    RuntimeConfig,
+    bf16_units,
+    device_of,
+    generator_for,
+    keep_freed_memory,
+    precision_on,
+    seed_for,
+)
 
 
 def test_a_seed_depends_on_each_of_its_three_parts_and_on_nothing_else():
@@ -26,3 +40,24 @@ def test_a_missing_gpu_is_refused_with_the_way_out():
 def test_zero_workers_are_refused():
     with pytest.raises(ValueError, match="workers: expected >= 1, got 0"):
         RuntimeConfig(device="cpu", threads=1, workers=0)
+
+
+@pytest.mark.parametrize(("units", "precision"), [([], "fp32"), (["AMX"], "bf16")])
+def test_automatic_precision_is_bf16_only_where_the_device_has_units_for_it(monkeypatch, units, precision):
+    monkeypatch.setattr(runtime, "bf16_units", lambda device: units)
+    cpu = torch.device("cpu")
+    assert [precision_on(cpu, asked) for asked in ("auto", "fp32", "bf16")] == [precision, "fp32", "bf16"]
+
+
+def test_a_device_that_is_neither_a_processor_nor_cuda_has_no_bf16_units_that_we_know_of():
+    assert bf16_units(torch.device("meta")) == []
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators are left as they are")
+def test_a_large_array_takes_the_memory_of_the_one_before():
+    keep_freed_memory()
+    bytes_each = 2**26
+    np.ones(bytes_each, np.uint8)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    np.ones(bytes_each, np.uint8)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before < bytes_each / resource.getpagesize() / 4

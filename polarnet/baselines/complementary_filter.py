@@ -5,7 +5,7 @@ the complementary filter without frames, and the high-pass filter of their event
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, no_type_check
 
@@ -23,6 +23,8 @@ ROBUST = (0.0025, 0.9975)  # quantiles that the package takes for an image's dar
 FOLLOWED_S = 2.0  # after this long ...
 FOLLOWED = 0.95  # ... its automatic range has followed so much of a change
 RANGE_RULES = ("fixed", "common", "per_polarizer")
+
+Step = Callable[..., tuple[Tensor, "FilterState"]]
 
 
 @dataclass(frozen=True)
@@ -100,59 +102,103 @@ def log_intensity_at(state: LeakyIntegrator, t_us: int, decay: Decay) -> Float64
     return state.log_intensity * np.exp(-decay.rate_per_us * (t_us - state.updated_us))
 
 
+class FilterState(NamedTuple):
+    """What a filter carries from one image to the next."""
+
+    pixels: Sequence[LeakyIntegrator]
+    """Behind each polarizer."""
+    t_us: int
+    """Of the last image."""
+    shown: Float64[np.ndarray, "2 c"]
+    """Intensities shown as 0 and 1, for each polarizer."""
+
+
+def filter_at_rest(
+    channels: int, height: int, width: int, config: ComplementaryFilterConfig | HighPassConfig
+) -> FilterState:
+    """The state at time 0, when nothing is known."""
+    shown = np.array(config.intensity_range)[:, None] + np.zeros(channels)
+    return FilterState([at_rest(height, width)] * channels, 0, shown)
+
+
+def step_cf(
+    state: FilterState, channels: Sequence[Events], t_us: int, config: ComplementaryFilterConfig
+) -> tuple[Float64[Tensor, "c h w"], FilterState]:
+    """Intensity at a time from the events since the last image: I = exp(L) - 1, brought to [0, 1].
+
+    Each of the c channels, the polarizers of a recording, is filtered by itself. What `config.range_rule` says is
+    shown as 0 and 1, and what lies outside is clipped.
+    """
+    decay = Decay(_rate_per_us(config.cutoff_hz), 0.0, config.contrast_on, config.contrast_off)
+    logs, pixels = _log_intensities(state, channels, t_us, decay)
+    return _shown(np.expm1(logs), state._replace(pixels=pixels), t_us, config.range_rule)
+
+
+def step_highpass(
+    state: FilterState, channels: Sequence[Events], t_us: int, config: HighPassConfig
+) -> tuple[Float64[Tensor, "c h w"], FilterState]:
+    """Like `step_cf`, with a decay per event and I = 1.5 exp(L) - 1."""
+    decay = Decay(_rate_per_us(config.cutoff_hz), config.decay_per_event, config.contrast_on, config.contrast_off)
+    logs, pixels = _log_intensities(state, channels, t_us, decay)
+    return _shown(HIGHPASS_GAIN * np.exp(logs) - 1, state._replace(pixels=pixels), t_us, config.range_rule)
+
+
 def reconstruct_cf(
     channels: Sequence[Events], t_us: Int64[Tensor, " t"], config: ComplementaryFilterConfig
 ) -> Float64[Tensor, "t c h w"]:
-    """Intensity at rising times from the events up to each (inclusive): I = exp(L) - 1, brought to [0, 1].
+    """`step_cf` at rising times, each from the events up to it (inclusive).
 
-    Each of the c channels, the polarizers of a recording, is filtered by itself. What `config.range_rule` says is
-    shown as 0 and 1, and what lies outside is clipped. Times count from the start of the recording, when nothing is
-    known.
+    Times count from the start of the recording, when nothing is known.
     """
-    decay = Decay(_rate_per_us(config.cutoff_hz), 0.0, config.contrast_on, config.contrast_off)
-    return _shown(np.expm1(_log_intensities(channels, t_us, decay)), t_us, config.intensity_range, config.range_rule)
+    return _reconstructed(step_cf, channels, t_us, config)
 
 
 def reconstruct_highpass(
     channels: Sequence[Events], t_us: Int64[Tensor, " t"], config: HighPassConfig
 ) -> Float64[Tensor, "t c h w"]:
-    """Like `reconstruct_cf`, with a decay per event and I = 1.5 exp(L) - 1."""
-    decay = Decay(_rate_per_us(config.cutoff_hz), config.decay_per_event, config.contrast_on, config.contrast_off)
-    intensity = HIGHPASS_GAIN * np.exp(_log_intensities(channels, t_us, decay)) - 1
-    return _shown(intensity, t_us, config.intensity_range, config.range_rule)
+    """`step_highpass` at rising times, like `reconstruct_cf`."""
+    return _reconstructed(step_highpass, channels, t_us, config)
 
 
-def following_ranges(
-    darkest: Float64[np.ndarray, "t c"],
-    brightest: Float64[np.ndarray, "t c"],
-    t_us: Int64[Tensor, " t"],
-    start: Sequence[float],
-) -> Float64[np.ndarray, "2 t c"]:
-    """Ranges that begin as `start` at time 0 and follow the images' own as a low-pass filter: 95 % in 2 s."""
-    ranges = np.empty((2, *darkest.shape))
-    current, before = np.array(start)[:, None] + np.zeros(darkest.shape[1]), 0
-    for i, t in enumerate(t_us.tolist()):
-        kept = (1 - FOLLOWED) ** ((t - before) * 1e-6 / FOLLOWED_S)
-        current, before = kept * current + (1 - kept) * np.stack([darkest[i], brightest[i]]), t
-        ranges[:, i] = current
-    return ranges
+def followed_range(
+    shown: Float64[np.ndarray, "2 c"], image: Float64[np.ndarray, "2 c"], elapsed_us: int
+) -> Float64[np.ndarray, "2 c"]:
+    """The range shown, which follows that of the images (darkest, brightest) as a low-pass filter: 95 % in 2 s."""
+    kept = (1 - FOLLOWED) ** (elapsed_us * 1e-6 / FOLLOWED_S)
+    return kept * shown + (1 - kept) * image
+
+
+def _reconstructed(step: Step, channels: Sequence[Events], t_us: Int64[Tensor, " t"], config) -> Tensor:
+    state = filter_at_rest(len(channels), channels[0].height, channels[0].width, config)
+    stops = [torch.searchsorted(events.t, t_us, right=True).tolist() for events in channels]
+    images, starts = [], [0] * len(channels)
+    for k, t in enumerate(t_us.tolist()):
+        since = [slice_count(e, start, stop[k]) for e, start, stop in zip(channels, starts, stops, strict=True)]
+        image, state = step(state, since, t, config)
+        images.append(image)
+        starts = [stop[k] for stop in stops]
+    return torch.stack(images)
 
 
 def _log_intensities(
-    channels: Sequence[Events], t_us: Int64[Tensor, " t"], decay: Decay
-) -> Float64[np.ndarray, "t c h w"]:
-    return np.stack([_log_intensity_frames(events, t_us, decay) for events in channels], axis=1)
+    state: FilterState, channels: Sequence[Events], t_us: int, decay: Decay
+) -> tuple[Float64[np.ndarray, "c h w"], list[LeakyIntegrator]]:
+    pixels = [integrate(before, events, decay) for before, events in zip(state.pixels, channels, strict=True)]
+    return np.stack([log_intensity_at(after, t_us, decay) for after in pixels]), pixels
 
 
-def _log_intensity_frames(events: Events, t_us: Int64[Tensor, " t"], decay: Decay) -> Float64[np.ndarray, "t h w"]:
-    frames = np.empty((len(t_us), events.height, events.width))
-    state, start = at_rest(events.height, events.width), 0
-    for frame, t, stop in zip(
-        frames, t_us.tolist(), torch.searchsorted(events.t, t_us, right=True).tolist(), strict=True
-    ):
-        state, start = integrate(state, slice_count(events, start, stop), decay), stop
-        frame[:] = log_intensity_at(state, t, decay)
-    return frames
+def _shown(
+    intensity: Float64[np.ndarray, "c h w"], state: FilterState, t_us: int, rule: str
+) -> tuple[Float64[Tensor, "c h w"], FilterState]:
+    shown = state.shown
+    if rule != "fixed":
+        over = (-3, -2, -1) if rule == "common" else (-2, -1)
+        image = np.quantile(intensity, ROBUST, axis=over).reshape(2, -1)
+        shown = followed_range(shown, np.broadcast_to(image, shown.shape), t_us - state.t_us)
+    low, high = shown[..., None, None]
+    span = np.maximum(high - low, np.finfo(np.float64).tiny)  # an image of one value has none in the end
+    unit = torch.from_numpy(((intensity - low) / span).clip(0, 1))
+    return unit, state._replace(t_us=t_us, shown=shown)
 
 
 @numba.njit(nogil=True, cache=True)
@@ -172,19 +218,6 @@ def _integrate(log_intensity, updated_us, t, x, y, p, rate_per_us, per_event, co
 
 def _rate_per_us(cutoff_hz: float) -> float:
     return 2 * math.pi * cutoff_hz * 1e-6
-
-
-def _shown(
-    intensity: Float64[np.ndarray, "t c h w"], t_us: Int64[Tensor, " t"], intensity_range: Sequence[float], rule: str
-) -> Float64[Tensor, "t c h w"]:
-    low, high = np.array(intensity_range)[:, None, None] + np.zeros(intensity.shape[:2])
-    if rule != "fixed":
-        over = (-3, -2, -1) if rule == "common" else (-2, -1)
-        darkest, brightest = np.quantile(intensity, ROBUST, axis=over).reshape(2, len(t_us), -1)
-        low, high = following_ranges(darkest, brightest, t_us, intensity_range)
-    span = np.maximum(high - low, np.finfo(np.float64).tiny)  # an image of one value has none in the end
-    shown = (intensity - low[..., None, None]) / span[..., None, None]
-    return torch.from_numpy(shown.clip(0, 1))
 
 
 def _check_intensity_range(intensity_range: Sequence[float]) -> None:

@@ -45,12 +45,17 @@ def consistent(intensities: Float[Tensor, "n 4 h w"], config: GainConfig) -> Flo
 
 def gains(intensities: Float[Tensor, "n 4 h w"], config: GainConfig) -> Float[Tensor, "n 4"]:
     """Of each frame, from it and those before it alone; their geometric mean is 1."""
+    starts = [max(0, last + 1 - config.window_frames) for last in range(len(intensities))]
+    return torch.stack([last_gains(intensities[start : last + 1], config) for last, start in enumerate(starts)])
+
+
+def last_gains(intensities: Float[Tensor, "n 4 h w"], config: GainConfig) -> Float[Tensor, "4"]:
+    """Of the last frame, from all that are given."""
     frames, _, height, width = intensities.shape
-    step = max(1, -(-height * width * min(config.window_frames, frames) // config.pixels))
-    residuals = (intensities.double() * intensities.new_tensor(SIGNS)[:, None, None]).flatten(2).transpose(1, 2)
-    starts = [max(0, last + 1 - config.window_frames) for last in range(frames)]
-    windows = (residuals[start : last + 1].flatten(0, 1)[::step] for last, start in enumerate(starts))
-    return torch.stack([solved(window, config) for window in windows])
+    size = height * width
+    looked_at = torch.arange(0, frames * size, max(1, -(-frames * size // config.pixels)), device=intensities.device)
+    pixels = intensities.flatten(2)[looked_at // size, :, looked_at % size].double()
+    return solved(pixels * pixels.new_tensor(SIGNS), config)
 
 
 def solved(residuals: Float[Tensor, "n 4"], config: GainConfig) -> Float[Tensor, "4"]:

@@ -17,14 +17,16 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
-from torch import Tensor, nn
+from torch import Tensor
 from tqdm import tqdm
 
-from polarnet.evaluation.methods import Context, Polarization, Recording, recover
+from polarnet.evaluation.methods import Context, Polarization, Recording, degree, recover
 from polarnet.evaluation.resimulate import recording_at
 from polarnet.evaluation.score import FrameScore, scene_means, score_sequence
+from polarnet.events.representations import REPRESENTATIONS, event_tensor
 from polarnet.events.store import EventStore
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, slice_count
+from polarnet.events.streaming import SlidingEventTensor
 from polarnet.similarity import correlation, mse, psnr
 from polarnet.simulation.scenes import SceneStore
 
@@ -116,76 +118,53 @@ def _means(rows: Sequence[FrameScore]) -> dict[str, Any]:
     return {"frames": len(rows), "scenes": len({row.scene for row in rows}), **scores}
 
 
-class SlidingEventTensor:
-    """The event tensor (paper Eq. 5) of the last `count` events of one polarizer, updated by what comes and goes.
+def move_to_last(sliding: SlidingEventTensor, events: Events, count: int, t_us: int) -> Float[Tensor, "h w"]:
+    """The event tensor of the last `count` of the events before `t_us`; time only goes forward.
 
-    Two integers a pixel are kept, the sum of polarities and of polarity times time, to which an event that comes is
-    added and from which one that leaves is taken: the work of a step is in proportion to the events of the step, not
-    of the window, and as integers do not round, the tensor is that of a window cut out anew.
+    The window ends with its last event; 0 everywhere while fewer than two events have come.
     """
-
-    def __init__(self, events: Events, count: int):
-        if count < 2:
-            raise ValueError(f"count: expected at least 2 events, got {count}")
-        self.events = events
-        self.count = count
-        self.first = self.stop = 0
-        pixels = events.height * events.width
-        self._polarity = torch.zeros(pixels, dtype=torch.int64)
-        self._moment = torch.zeros(pixels, dtype=torch.int64)
-
-    def advance(self, t_us: int) -> None:
-        """Let the events before `t_us` come, and the oldest go, so that `count` stay; time only goes forward."""
-        stop = int(torch.searchsorted(self.events.t, t_us))
-        if stop < self.stop:
-            raise ValueError(f"time only goes forward: {t_us} us is before what was seen already")
-        first = max(self.first, stop - self.count)
-        self._add(max(self.stop, first), stop, 1)
-        self._add(self.first, min(first, self.stop), -1)
-        self.first, self.stop = first, stop
-
-    def tensor(self) -> Float[Tensor, "h w"]:
-        """Polarities summed per pixel, each weighted by its time since the window's first event, in window lengths.
-
-        The window ends with its last event; 0 everywhere while fewer than two events have come.
-        """
-        height, width = self.events.height, self.events.width
-        if self.stop - self.first < 2:
-            return torch.zeros(height, width)
-        start = self.events.t[self.first]
-        length = (self.events.t[self.stop - 1] - start).clamp(min=1)
-        weighted = (self._moment - start * self._polarity).double() / length
-        return weighted.float().view(height, width)
-
-    def _add(self, first: int, stop: int, sign: int) -> None:
-        if first >= stop:
-            return
-        events = self.events
-        pixel = events.y[first:stop].long() * events.width + events.x[first:stop].long()
-        polarity = sign * events.p[first:stop].long()
-        self._polarity.index_add_(0, pixel, polarity)
-        self._moment.index_add_(0, pixel, polarity * events.t[first:stop])
+    stop = int(torch.searchsorted(events.t, t_us))
+    first = max(0, stop - count)
+    sliding.move_to(first, slice_count(events, first, stop))
+    times = sliding.window.t
+    return sliding.tensor(max(1, int(times[-1] - times[0])) if len(times) else 1)
 
 
 @torch.no_grad()
 def sliding_recovery(
-    recording: Recording, network: nn.Module, count: int, t_us: Sequence[int], carry: bool, context: Context
+    recording: Recording, count: int, t_us: Sequence[int], carry: bool, context: Context
 ) -> Float[Tensor, "n h w"]:
-    """DoLP at times `t_us` from the last `count` events of each polarizer, by a network that takes event tensors.
+    """DoLP at times `t_us` from the last `count` events of each polarizer, by the network `ours`.
 
-    `carry`: whether the network's state goes from one overlapping window to the next, or each stands alone.
+    Event tensors are updated as the window moves, other input is encoded anew. `carry`: whether the network's state
+    goes from one overlapping window to the next, or each stands alone.
     """
-    windows = [SlidingEventTensor(events, count) for events in recording.events]
+    network, metadata = context.ours
+    encode = REPRESENTATIONS[metadata["representation"]]
+    windows = [SlidingEventTensor(events.height, events.width) for events in recording.events]
     state, frames = None, []
     for t in t_us:
-        for window in windows:
-            window.advance(t)
-        inputs = torch.stack([window.tensor() for window in windows])[None].to(context.device)
+        if encode is event_tensor:
+            images = [move_to_last(w, events, count, t) for w, events in zip(windows, recording.events, strict=True)]
+        else:
+            images = [encode(last, max(1, _length_us(last))) for last in _last(recording.events, count, t)]
+        inputs = torch.cat([image.view(-1, *image.shape[-2:]) for image in images])[None].to(context.device)
         with context.autocast():
             prediction, after = network(inputs, state)
         state = after if carry else None
-        frames.append(prediction.dolp[0].float().clamp(0, 1).cpu())
+        frames.append(degree(prediction.dolp[0]).cpu())
     return torch.stack(frames)
+
+
+def _last(channels: Sequence[Events], count: int, t_us: int) -> list[Events]:
+    """The last `count` events of each channel before a time."""
+    stops = [int(torch.searchsorted(events.t, t_us)) for events in channels]
+    return [slice_count(events, max(0, stop - count), stop) for events, stop in zip(channels, stops, strict=True)]
+
+
+def _length_us(events: Events) -> int:
+    """From the first event to the last; 0 where there are none."""
+    return int(events.t[-1] - events.t[0]) if len(events) else 0
 
 
 def by_sliding_window(
@@ -199,13 +178,8 @@ def by_sliding_window(
     """For each of `EVENTS_PER_PIXEL`, with the state carried on and without: mean scores of a frame every `spacing_us`.
 
     `change` is the mean absolute difference of consecutive frames, which of a steady recovery is small, beside that
-    of the truth. ValueError where the network takes something else than event tensors.
+    of the truth.
     """
-    network, metadata = context.ours
-    if metadata["representation"] != "event_tensor":
-        raise ValueError(
-            f"overlapping windows are updated as event tensors; the network takes {metadata['representation']}"
-        )
     times = list(range(span_us[0], span_us[1] + 1, spacing_us))
     table = []
     recordings = [
@@ -214,20 +188,20 @@ def by_sliding_window(
     ]
     for per_pixel in tqdm(EVENTS_PER_PIXEL, "overlapping windows", unit="size"):
         for carry in (False, True):
-            found = [_sliding_scores(one, network, per_pixel, times, carry, context) for one in recordings]
+            found = [_sliding_scores(one, per_pixel, times, carry, context) for one in recordings]
             means = {name: float(np.mean([scores[name] for scores in found])) for name in found[0]}
             table.append({"events_per_pixel": per_pixel, "carry": carry, "spacing_us": spacing_us, **means})
     return table
 
 
 def _sliding_scores(
-    recording: Recording, network: nn.Module, per_pixel: float, times: Sequence[int], carry: bool, context: Context
+    recording: Recording, per_pixel: float, times: Sequence[int], carry: bool, context: Context
 ) -> Mapping[str, float]:
     first = recording.events[0]
     count = max(2, round(per_pixel * first.height * first.width))
-    frames = sliding_recovery(recording, network, count, times, carry, context)
+    frames = sliding_recovery(recording, count, times, carry, context)
     truth, valid = recording.dolp, recording.valid
-    spans = [_span_us(events, count, times[len(times) // 2]) for events in recording.events]
+    spans = [_length_us(last) for last in _last(recording.events, count, times[len(times) // 2])]
     scores = {
         "mse": mse(frames, truth, valid),
         "psnr": psnr(frames, truth, valid),
@@ -239,10 +213,3 @@ def _sliding_scores(
         "true_change": float(truth.diff(dim=0).abs().mean()),
         "window_ms": float(np.mean(spans)) / 1000,
     }
-
-
-def _span_us(events: Events, count: int, t_us: int) -> int:
-    """How long the last `count` events before a time took to come."""
-    stop = int(torch.searchsorted(events.t, t_us))
-    window = events.t[max(0, stop - count) : stop]
-    return int(window[-1] - window[0]) if len(window) else 0

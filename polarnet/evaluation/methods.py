@@ -219,7 +219,7 @@ def baseline(build: type[Network], kind: str, path: Path | None) -> Network:
 def dolp_checkpoint(path: Path | None, device: torch.device) -> tuple[nn.Module, dict[str, Any]]:
     """A network that turns events into DoLP, and its checkpoint's metadata."""
     network, metadata = load_network(_present(path))
-    return network.to(device), metadata
+    return network.to(device, memory_format=torch.channels_last), metadata  # type: ignore[call-overload]
 
 
 def _present(path: Path | None) -> Path:
@@ -272,9 +272,14 @@ def recover(method: str, recording: Recording, context: Context) -> Recovered:
     """Run one of `METHODS`, clamp its DoLP, and take the time: from events in memory to frames in memory."""
     start = time.perf_counter()
     found = METHODS[method](recording, context)
-    recovered = found.dolp.float().clamp(0, 1).cpu()
+    recovered = degree(found.dolp).cpu()
     seconds = time.perf_counter() - start
     return Recovered(recovered, None if found.aolp is None else found.aolp.float().cpu(), seconds)
+
+
+def degree(dolp: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
+    """What a method says, as a degree of polarization: in [0, 1], float32."""
+    return dolp.float().clamp(0, 1)
 
 
 def zeros(recording: Recording, context: Context) -> Polarization:

@@ -72,6 +72,15 @@ def time_surface(events: Events, window_us: int) -> Float[Tensor, "h w"]:
     return surface.view(events.height, events.width)
 
 
+def event_counts(events: Events, window_us: int) -> Float[Tensor, "2 h w"]:
+    """Per pixel the sum of polarities, that is, the change of log intensity in contrast thresholds; and the events."""
+    pixel = _pixel(events)
+    images = torch.zeros(2, events.height * events.width, device=events.t.device)
+    images[0].index_add_(0, pixel, events.p.float())
+    images[1].index_add_(0, pixel, torch.ones_like(pixel, dtype=images.dtype))
+    return images.view(2, events.height, events.width)
+
+
 def voxel_grid_of_window(events: Events, window_us: int) -> Float[Tensor, "bins h w"]:
     """`voxel_grid` in E2VID's 5 bins, which stretch over the events whatever the window's length."""
     return voxel_grid(events, VOXEL_BINS)
@@ -79,6 +88,7 @@ def voxel_grid_of_window(events: Events, window_us: int) -> Float[Tensor, "bins 
 
 REPRESENTATIONS: dict[str, Encode] = {
     "event_tensor": event_tensor,
+    "event_counts": event_counts,
     "voxel_grid": voxel_grid_of_window,
     "time_surface": time_surface,
 }

@@ -17,7 +17,27 @@ class Prediction(NamedTuple):
 
     dolp: Float[Tensor, "*b h w"]
     aolp: Float[Tensor, "*b h w"] | None = None
+    """Radians in [0, pi)."""
     log_variance: Float[Tensor, "*b h w"] | None = None
+    """Logarithm of the expected squared error of DoLP."""
+    stokes: Float[Tensor, "*b 2 h w"] | None = None
+    """s1, s2 = S1 / S0, S2 / S0, of which `aolp` is the angle."""
+
+
+def contrasts(events: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b c h w"]:
+    """(e0 + e45 + e90 + e135) / 2, e0 - e90, e45 - e135 and (e0 + e90) - (e45 + e135) of the polarizers' tensors.
+
+    Unpolarized light drives the four alike, and far more than polarization sets them apart: given them as they are, a
+    network first has to find the differences. The last one is no copy of the others:
+    events tell of log intensities, for which I0 + I90 = I45 + I135 does not hold as it stands.
+    """
+    e0, e45, e90, e135 = events.unflatten(-3, (4, -1)).unbind(-4)
+    return torch.cat([(e0 + e45 + e90 + e135) / 2, e0 - e90, e45 - e135, (e0 + e90) - (e45 + e135)], dim=-3)
+
+
+def compressed(x: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
+    """sign(x) log(1 + |x|): a pixel with many events reaches tens, while most of what matters is below one."""
+    return torch.sign(x) * torch.log1p(x.abs())
 
 
 def conv3x3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:

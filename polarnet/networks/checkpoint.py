@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from polarnet.networks.dolp_unet import NETWORKS
+from polarnet.networks.registry import NETWORKS
 
 FORMAT = "polarnet-checkpoint-1"
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.blocks import ConvGRU, Prediction, ResidualBlock, UpBlock, conv3x3
+from polarnet.networks.blocks import ConvGRU, Prediction, ResidualBlock, UpBlock, compressed, contrasts, conv3x3
 from polarnet.networks.swin import SwinStage
 from polarnet.ranges import allowed, check_ranges
 
@@ -48,6 +48,9 @@ class DolpUNet(nn.Module):
     C1 sees the four tensors, mixed as `input_mixing` says and `compressed`. The output is linear, so that no pixel's
     gradient vanishes near 0 or 1: it can leave [0, 1], and whoever scores or shows it clamps it.
     """
+
+    representation = "event_tensor"
+    predicts_stokes = False
 
     def __init__(self, config: DolpUNetConfig, in_channels: int = 4):
         super().__init__()
@@ -104,24 +107,4 @@ class DolpUNet(nn.Module):
         ]
 
 
-NETWORKS: dict[str, tuple[type[DolpUNet], type[DolpUNetConfig]]] = {"paper": (DolpUNet, DolpUNetConfig)}
-"""Each network by its name in params.yaml, and the class of its section there."""
-
-
-def contrasts(events: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b c h w"]:
-    """(e0 + e45 + e90 + e135) / 2, e0 - e90, e45 - e135 and (e0 + e90) - (e45 + e135) of the polarizers' tensors.
-
-    Unpolarized light drives the four alike, and far more than polarization sets them apart: given them as they are, a
-    network first has to find the differences. The last one is no copy of the others:
-    events tell of log intensities, for which I0 + I90 = I45 + I135 does not hold as it stands.
-    """
-    e0, e45, e90, e135 = events.unflatten(-3, (4, -1)).unbind(-4)
-    return torch.cat([(e0 + e45 + e90 + e135) / 2, e0 - e90, e45 - e135, (e0 + e90) - (e45 + e135)], dim=-3)
-
-
 INPUT_MIXINGS: dict[str, Callable[[Tensor], Tensor]] = {"polarizers": lambda events: events, "contrasts": contrasts}
-
-
-def compressed(x: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
-    """sign(x) log(1 + |x|): a pixel with many events reaches tens, while most of what matters is below one."""
-    return torch.sign(x) * torch.log1p(x.abs())

@@ -5,7 +5,7 @@ polarizers on its pixels (division of focal plane). Division-of-time captures: `
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from jaxtyping import Float64
 
 from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
-from polarnet.recordings.recording import read_recording
+from polarnet.recordings.recording import Recording, read_recording
 from polarnet.recordings.registration import warp_events
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
@@ -24,12 +24,14 @@ def read_four(
     files: Mapping[int, Path],
     start_us: Mapping[int, int] | None = None,
     homographies: Mapping[int, Float64[np.ndarray, "3 3"]] | None = None,
+    read: Callable[[Path], Recording] = read_recording,
 ) -> list[Events]:
     """The four channels, in the order 0, 45, 90, 135 degrees, of files by polarizer angle (degrees, of any half turn).
 
     `start_us` says when the common clock starts, by each file's own clock (none given: the clocks are one, and start
     with the first event of all); what comes earlier is left out. `homographies` lay cameras on the reference
-    (`polarnet.recordings.registration`). RecordingError where an angle is missing, there twice, or of another sensor.
+    (`polarnet.recordings.registration`). `read` reads a file, for what `read_recording` has to be told. RecordingError
+    where an angle is missing, there twice, or of another sensor.
     """
     by_angle = {angle % 180: angle for angle in files}
     if sorted(by_angle) != list(POLARIZER_ANGLES_DEG) or len(by_angle) != len(files):
@@ -39,7 +41,7 @@ def read_four(
     channels = []
     for angle in POLARIZER_ANGLES_DEG:
         key = by_angle[angle]
-        events = read_recording(files[key]).events
+        events = read(files[key]).events
         if homographies is not None and key in homographies:
             events = warp_events(events, homographies[key])
         channels.append(events)
@@ -74,9 +76,9 @@ def split_mosaic(events: Events, mosaic: Mosaic) -> list[Events]:
     return channels
 
 
-def read_mosaic(path: Path, mosaic: Mosaic) -> list[Events]:
+def read_mosaic(path: Path, mosaic: Mosaic, read: Callable[[Path], Recording] = read_recording) -> list[Events]:
     """The four channels of one file of a camera with a mosaic; time starts with its first event."""
-    channels = split_mosaic(read_recording(path).events, mosaic)
+    channels = split_mosaic(read(path).events, mosaic)
     first = first_time_us(channels)
     return [since(channel, first) for channel in channels]
 

@@ -1,6 +1,7 @@
 """Blocks of README.md and docs/*.md that are written from docs/results/NAME.json, so that no measured number is typed.
 
-A block lies between `<!-- results:NAME -->` and `<!-- /results:NAME -->`.
+A block lies between `<!-- results:NAME -->` and `<!-- /results:NAME -->`; NAME-SECTION needs
+that section of NAME.json alone.
 """
 
 import json
@@ -112,6 +113,73 @@ def inspection_block(results: Mapping[str, Any]) -> str:
     return "\n".join(["```", *results["lines"], "```"])
 
 
+def study_block(results: Mapping[str, Any]) -> str:
+    """The networks and the baselines on held-out photographs and on measured scenes, by tests/benchmarks/network.py."""
+    study, record = results["study"], results["records"]["study"]
+    lines = []
+    for name in ("simulated", "measured"):
+        about = study["about"][name]
+        lines += [f"**{SET_TITLES[name]}**: {about['scenes']} scenes, {about['frames']} frames", ""]
+        lines += [as_markdown(score_table(study[name], None, {**COLUMNS, **COSTS})), ""]
+        lines += [f"- {line}" for line in paired_lines(about["paired"])] + [""]
+    minutes, versions = study["minutes_trained"], ", ".join(f"{k} {v}" for k, v in record["versions"].items())
+    lines += [
+        f"MSE of ours over the oracle mean's: {results['mse_over_oracle_mean']:.2f}; PSNR over the paper's network: "
+        f"{results['gain_over_paper_db']:+.2f} dB; on measured scenes, MSE over that of the best intensity "
+        f"reconstruction: {results['measured']['mse_over_best_baseline']:.2f}.",
+        "",
+        f"Trained {minutes['ours']:.0f} (ours) and {minutes['paper']:.0f} minutes (paper) on "
+        f"{study['threads'] or record['cores']} of {record['cores']} cores ({record['machine']}, load "
+        f"{record['load']:.1f} before the start; {versions}; commit `{record['commit'][:10]}`).",
+    ]
+    return "\n".join(lines)
+
+
+def throughput_block(results: Mapping[str, Any]) -> str:
+    """How fast each network trains and runs under each setting, and where torch spends the time.
+
+    `results` is docs/results/network.json as tests/benchmarks/training.py writes it.
+    """
+    throughput, record = results["throughput"], results["records"]["throughput"]
+    lines = [
+        "| network | setting | precision | training, frames/s | inference, windows/s | GFLOP a window | "
+        "share of the peak in training | in inference |",
+        "|---" * 8 + "|",
+    ]
+    profiles = []
+    for name, settings in throughput["networks"].items():
+        for setting, row in settings.items():
+            if setting == "shipped_over_naive":
+                continue
+            train, infer, gflop = row["train_frames_per_s"], row["infer_windows_per_s"], row["gflop_per_window"]
+            peak = row["peak_gflop_per_s"]
+            lines.append(
+                f"| `{name}` | {setting} | {row['precision']} | {train:.2f} | {infer:.2f} | {gflop:.2f} | "
+                f"{100 * TRAINING_FLOPS * train * gflop / peak:.0f} % | {100 * infer * gflop / peak:.0f} % |"
+            )
+            profiles += [
+                f"| `{name}`, {setting}, {work} | " + ", ".join(f"{op} {share:.0f}" for op, share in shares) + " |"
+                for work in ("train", "infer")
+                if (shares := [(op, share) for op, share in row[f"{work}_profile"].items() if share >= 1])
+            ]
+    faster = [
+        f"Shipped over naive, `{name}`: training {ratio['train_frames_per_s']:.2f}x, "
+        f"inference {ratio['infer_windows_per_s']:.2f}x."
+        for name, settings in throughput["networks"].items()
+        if (ratio := settings["shipped_over_naive"])
+    ]
+    versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
+    return "\n".join([
+        *lines, "", *faster, "",
+        "Percent of the time in torch's operations, of those with at least 1 %:", "",
+        "| run | operations |", "|---|---|", *profiles, "",
+        f"{throughput['threads']} thread(s) on {record['cores']} cores ({record['machine']}, {throughput['device']}, "
+        f"load {record['load']:.1f} before the start; {versions}; commit `{record['commit'][:10]}`).",
+    ])  # fmt: skip
+
+
+TRAINING_FLOPS = 3  # of a forward pass: backward multiplies once for the inputs and once for the weights
+
 GOLDEN_CASES = 23  # 15 of v2e, 8 of ESIM
 EMULATION_COLUMNS = (
     ("seconds_1_thread", "seconds, 1 thread", 3),
@@ -130,12 +198,16 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "emulation": emulation_block,
     "recordings": recordings_block,
     "inspection": inspection_block,
+    "network-study": study_block,
+    "network-throughput": throughput_block,
 }
 """What writes the block of each name."""
 
 UNMEASURED = {
     "emulation": "Not measured yet: `python tests/benchmarks/emulation.py --write` does it.",
     "recordings": "Not measured yet: `tests/benchmarks/{recordings,fuzz_recordings,rig}.py --write` do it.",
+    "network-study": "Not measured yet: `python tests/benchmarks/network.py --write` does it.",
+    "network-throughput": "Not measured yet: `python tests/benchmarks/training.py --write` does it.",
 }
 """Blocks that may stand in a document before their results do, and what they say until then."""
 
@@ -159,9 +231,11 @@ def _with_blocks(text: str, path: Path, results: Path) -> str:
 def _rendered(name: str, path: Path, results: Path) -> str:
     if name not in RENDERERS:
         raise ValueError(f"{path}: no renderer for results:{name}; there are {', '.join(RENDERERS)}")
-    file = results / f"{name}.json"
-    if not file.exists() and name in UNMEASURED:
-        return UNMEASURED[name]
-    if not file.exists():
-        raise FileNotFoundError(f"{path} shows results:{name}, but {file} is missing; run `polarnet measure`")
-    return RENDERERS[name](json.loads(file.read_text(encoding="utf-8"))).strip()
+    stem, _, section = name.partition("-")
+    file = results / f"{stem}.json"
+    known = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    if not known or (section and section not in known):
+        if name in UNMEASURED:
+            return UNMEASURED[name]
+        raise FileNotFoundError(f"{path} shows results:{name}, but {file} does not have it; run `polarnet measure`")
+    return RENDERERS[name](known).strip()

@@ -26,6 +26,7 @@ from polarnet.simulation.scene import (
     scene_from_polarization,
 )
 from polarnet.simulation.scenes import SceneStore
+from polarnet.simulation.variation import VariationConfig, varied
 
 
 def frames_of(
@@ -51,20 +52,37 @@ def valid_frames(
     return seen[:, 0] == 0
 
 
+VARIANT = "-variant"  # in the name of a scene made from the picture whose name comes before
+
+
 def synthesize(
-    images: Path, scenes: Path, frames: Path, config: MotionConfig, seed: int, mapper: Callable[..., Iterable[Any]]
+    images: Path,
+    scenes: Path,
+    frames: Path,
+    config: MotionConfig,
+    seed: int,
+    mapper: Callable[..., Iterable[Any]],
+    variation: VariationConfig | None = None,
 ) -> int:
-    """Fill both stores with `sequences_per_picture` sequences of every picture of `images`; how many there are.
+    """Fill both stores with `sequences_per_picture` sequences of every scene; how many there are.
+
+    A scene is a picture of `images`, or a variant of one of the training split (`variation` None: there are none).
 
     `mapper` is `polarnet.cluster.pmap` with its workers bound, or the built-in `map`. Every trajectory depends on
     the seed and the sequence's name alone. An interrupted run goes on where it stopped.
     """
     manifest = read_manifest(images)
-    scene_store, frame_store = _create(manifest, images, scenes, frames, config, seed)
+    scene_store, frame_store = _create(manifest, images, scenes, frames, config, variation, seed)
     missing = {*scene_store.missing(), *frame_store.missing()}
     pictures = {scene_store.picture_of[sequence] for sequence in missing} | set(scene_store.missing_pictures())
     task = functools.partial(
-        _synthesize_picture, images=images, scenes=scene_store, frames=frame_store, config=config, seed=seed
+        _synthesize_scene,
+        images=images,
+        scenes=scene_store,
+        frames=frame_store,
+        config=config,
+        variation=variation,
+        seed=seed,
     )
     for _ in mapper(task, sorted(pictures)):
         pass
@@ -74,15 +92,28 @@ def synthesize(
 
 
 def _create(
-    manifest: Manifest, images: Path, scenes: Path, frames: Path, config: MotionConfig, seed: int
+    manifest: Manifest,
+    images: Path,
+    scenes: Path,
+    frames: Path,
+    config: MotionConfig,
+    variation: VariationConfig | None,
+    seed: int,
 ) -> tuple[SceneStore, FrameStore]:
     """Two unfinished stores; their attributes say what they are made from, so that only the same is resumed."""
     picture_of, splits = {}, {}
     for entry in manifest.pictures:
-        for number in range(config.sequences_per_picture):
-            sequence = f"{entry.name}-{number:02d}"
-            picture_of[sequence], splits[sequence] = entry.name, entry.split
-    attributes = {"synthesize": asdict(config), "seed": seed, "images_sha256": _digest(manifest, images)}
+        variants = variation.scenes_per_picture if variation and entry.split == "train" else 0
+        for scene in [entry.name, *(f"{entry.name}{VARIANT}{k:02d}" for k in range(1, variants + 1))]:
+            for number in range(config.sequences_per_picture):
+                sequence = f"{scene}-{number:02d}"
+                picture_of[sequence], splits[sequence] = scene, entry.split
+    attributes = {
+        "synthesize": asdict(config),
+        "variation": asdict(variation) if variation else None,
+        "seed": seed,
+        "images_sha256": _digest(manifest, images),
+    }
     window = config.window_height, config.window_width
     largest = max(entry.height for entry in manifest.pictures), max(entry.width for entry in manifest.pictures)
     names = Trajectory.vector_names()
@@ -103,11 +134,21 @@ def _create(
     return scene_store, frame_store
 
 
-def _synthesize_picture(
-    picture: str, images: Path, scenes: SceneStore, frames: FrameStore, config: MotionConfig, seed: int
+def _synthesize_scene(
+    picture: str,
+    images: Path,
+    scenes: SceneStore,
+    frames: FrameStore,
+    config: MotionConfig,
+    variation: VariationConfig | None,
+    seed: int,
 ) -> None:
-    """Write one picture and all its sequences."""
-    (s0, dolp, aolp), valid = _read_polarization(images, picture)
+    """Write one picture, or a variant of it, and all its sequences."""
+    source, variant, _ = picture.partition(VARIANT)
+    polarization, valid = _read_polarization(images, source)
+    if variation and variant:
+        polarization = varied(polarization, variation, generator_for(seed, picture, "variation"))
+    s0, dolp, aolp = polarization
     scenes.write_picture(picture, s0, dolp, aolp, valid if scenes.masked else None)
     height, width = s0.shape
     t_us = frame_times_us(config)

@@ -1,41 +1,58 @@
-"""How the DoLP network is trained: four channels of events in, DoLP out."""
+"""How a network that recovers polarization is trained: four channels of events in, DoLP out, and AoLP if it can."""
 
 from dataclasses import asdict
-from typing import Any
 
+import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from polarnet.events.representations import REPRESENTATIONS, channels_of
-from polarnet.networks.dolp_unet import NETWORKS
+from polarnet.networks.registry import NETWORKS, NetworkConfig
 from polarnet.similarity import Lpips
 from polarnet.training.loop import TrainConfig
-from polarnet.training.losses import LossConfig, polarization_loss
+from polarnet.training.losses import LossConfig, PolarizationLoss
+from polarnet.training.sequences import Batch
 from polarnet.training.task import State, Task, initialised
 
 
 def dolp_task(
-    name: str, network_config: Any, config: TrainConfig, loss: LossConfig, lpips: Lpips | None, seed: int
+    name: str, network_config: NetworkConfig, config: TrainConfig, loss: LossConfig, lpips: Lpips | None, seed: int
 ) -> Task:
-    """Train the network called `name` (a key of NETWORKS), new and initialised from the seed."""
+    """Train the network called `name` (a key of NETWORKS), new and initialised from the seed.
+
+    Its answer and the truth are stacked: DoLP, s1 and s2, and of the answer the log variance; DoLP alone where the
+    network says no more.
+    """
     build, _ = NETWORKS[name]
-    encode = REPRESENTATIONS[config.representation]
+    representation = config.representation or build.representation
+    encode = REPRESENTATIONS[representation]
     in_channels = 4 * channels_of(encode)
     network = initialised(lambda: build(network_config, in_channels), seed)
 
-    def unroll(inputs: Tensor, state: State) -> tuple[Tensor, State]:
+    def unroll(inputs: Tensor, state: State) -> tuple[Float[Tensor, "t b k h w"], State]:
         prediction, state = network.unroll(inputs, state)
-        return prediction.dolp, state
+        maps = prediction.dolp[:, :, None]
+        if prediction.stokes is not None and prediction.log_variance is not None:
+            maps = torch.cat([maps, prediction.stokes, prediction.log_variance[:, :, None]], dim=2)
+        return maps, state
 
     return Task(
         network=network,
         encode=encode,
-        streams=lambda batch: (batch.inputs, batch.dolp, batch.valid),
+        streams=lambda batch: (batch.inputs, normalised_stokes(batch), batch.valid),
         unroll=unroll,
-        loss=polarization_loss(loss, lpips),
+        loss=PolarizationLoss(loss, lpips, dolp_only=not build.predicts_stokes),
         description={
             "network": name,
             "config": asdict(network_config),
             "in_channels": in_channels,
-            "representation": config.representation,
+            "representation": representation,
         },
+        scored=lambda maps: maps[:, :, 0],
     )
+
+
+def normalised_stokes(batch: Batch) -> Float[Tensor, "t b 3 h w"]:
+    """DoLP, S1 / S0 and S2 / S0."""
+    angle = 2 * batch.aolp
+    return torch.stack([batch.dolp, batch.dolp * torch.cos(angle), batch.dolp * torch.sin(angle)], dim=2)

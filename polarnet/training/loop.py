@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from polarnet.events.representations import REPRESENTATIONS
 from polarnet.events.windows import WindowDataset
 from polarnet.ranges import allowed
+from polarnet.runtime import precision_on
 from polarnet.similarity import correlation, mse, psnr
 from polarnet.training.losses import known_frames
 from polarnet.training.recorder import Recorder
@@ -39,15 +40,16 @@ class LoopConfig(ViewConfig):
     """The fraction of the training over which the rate rises from 0."""
     gradient_norm: float | None = field(metadata=allowed(above=0))
     """Gradients that are longer together are shortened to this; null: never."""
-    precision: str = field(metadata=allowed(choices=("fp32", "bf16")))
-    """Of autocast; weights and Adam are float32 either way."""
+    precision: str = field(metadata=allowed(choices=("auto", "fp32", "bf16")))
+    """Of autocast; weights and Adam are float32 either way. auto: bf16 where the device has units for it."""
 
 
 @dataclass(frozen=True)
 class TrainConfig(LoopConfig):
     """Section `train` of params.yaml."""
 
-    representation: str = field(metadata=allowed(choices=tuple(REPRESENTATIONS)))
+    representation: str | None = field(metadata=allowed(choices=tuple(REPRESENTATIONS)))
+    """Of the events in a window; null: the one that the network was made for."""
 
 
 def train(
@@ -145,5 +147,5 @@ def set_learning_rate(optimizer: torch.optim.Optimizer, config: LoopConfig, done
 
 
 def autocast(precision: str, device: torch.device) -> torch.autocast:
-    """Convolutions and matrix products in bfloat16 where `precision` is bf16."""
-    return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16")
+    """Convolutions and matrix products in bfloat16 where `precision` on this device is bf16."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision_on(device, precision) == "bf16")

@@ -17,7 +17,7 @@ from polarnet.events.frames import FrameStore
 from polarnet.events.representations import Encode
 from polarnet.events.store import EventStore
 from polarnet.events.windows import EventSource, WindowDataset
-from polarnet.runtime import seed_for
+from polarnet.runtime import precision_on, seed_for
 from polarnet.similarity import Lpips
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.fly import EmulatedEvents
@@ -100,15 +100,18 @@ def lpips_of(folder: Path, weight: float) -> Lpips | None:
     return lpips
 
 
-def describe(task: Task, split: Split, config: Any, weights: Path, seed: int) -> dict[str, Any]:
-    """All that decides the weights: what the JSON of a checkpoint says, and what the running checkpoint is keyed by."""
+def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, device: torch.device) -> dict[str, Any]:
+    """All that decides the weights: what the JSON of a checkpoint says, and what the running checkpoint is keyed by.
+
+    `training.precision` is the one that is used on `device`.
+    """
     events, frames = split.train.events, split.train.frames
     lpips = (
         json.loads((weights / "lpips.json").read_text()) if any("lpips" in term for term in task.loss.weights) else {}
     )
     return {
         **task.description,
-        "training": {"seed": seed, **asdict(config)},
+        "training": {"seed": seed, **asdict(config), "precision": precision_on(device, config.precision)},
         "loss": dict(task.loss.weights),
         "lpips": {key: lpips.get(key) for key in ("backbone", "sha256")},
         "data": {

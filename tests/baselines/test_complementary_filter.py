@@ -9,7 +9,7 @@ from polarnet.baselines.complementary_filter import (
     Decay,
     HighPassConfig,
     at_rest,
-    following_ranges,
+    followed_range,
     integrate,
     log_intensity_at,
     reconstruct_cf,
@@ -90,10 +90,11 @@ def test_intensities_outside_the_range_are_clipped():
 
 
 def test_a_range_has_followed_19_twentieths_of_a_change_after_2_s():
-    darkest, brightest = np.full((3, 1), 1.0), np.full((3, 1), 3.0)
-    low, high = following_ranges(darkest, brightest, times(0, 2_000_000, 4_000_000), [0.0, 2.0])
-    np.testing.assert_allclose(low[:, 0], [0, 0.95, 0.9975], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(high[:, 0], [2, 2.95, 2.9975], rtol=0, atol=1e-12)
+    shown, image = np.array([[0.0], [2.0]]), np.array([[1.0], [3.0]])
+    np.testing.assert_array_equal(followed_range(shown, image, 0), shown)
+    once = followed_range(shown, image, 2_000_000)
+    np.testing.assert_allclose(once, [[0.95], [2.95]], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(followed_range(once, image, 2_000_000), [[0.9975], [2.9975]], rtol=0, atol=1e-12)
 
 
 def ramp(events_a_column):

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from polarnet.events.representations import (
     REPRESENTATIONS,
     channels_of,
+    event_counts,
     event_tensor,
     normalise_nonzero,
     time_surface,
@@ -28,6 +29,11 @@ def test_event_tensor_does_not_depend_on_when_the_window_opened(make_events):
     early = make_events([(100, 0, 0, 1), (110, 0, 0, 1)], 1, 1)
     late = make_events([(1100, 0, 0, 1), (1110, 0, 0, 1)], 1, 1)
     assert torch.equal(event_tensor(early, 50), event_tensor(late, 50))
+
+
+def test_event_counts_are_the_net_and_the_total_number_of_events(make_events):
+    events = make_events([(1, 0, 0, 1), (2, 0, 0, 1), (3, 0, 0, -1), (4, 2, 1, -1)], 2, 3)
+    assert event_counts(events, 50).tolist() == [[[1, 0, 0], [0, 0, -1]], [[3, 0, 0], [0, 0, 1]]]
 
 
 def test_voxel_grid_has_the_first_event_in_the_first_bin_and_the_last_in_the_last(make_events):
@@ -95,7 +101,7 @@ def test_every_representation_of_no_events_is_zero_and_has_its_number_of_channel
     assert image.dtype == torch.float32
     assert image.abs().max() == 0
     assert image.shape == ((channels_of(encode), 4, 6) if image.ndim == 3 else (4, 6))
-    assert channels_of(encode) == {"event_tensor": 1, "voxel_grid": 5, "time_surface": 1}[name]
+    assert channels_of(encode) == {"event_tensor": 1, "event_counts": 2, "voxel_grid": 5, "time_surface": 1}[name]
 
 
 @pytest.mark.parametrize("name", REPRESENTATIONS)

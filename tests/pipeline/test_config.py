@@ -147,7 +147,7 @@ def test_a_preset_keeps_comments_and_unrelated_values_and_the_base_undoes_it(pro
 
 
 def test_an_unknown_preset_lists_the_ones_there_are(project):
-    with pytest.raises(ValueError, match="no preset 'papper'; there are experiments demo, paper, smoke; sensors clean"):
+    with pytest.raises(ValueError, match="no preset 'papper'; there are experiments demo, paper, photographs, smoke;"):
         write_preset(project, "papper")
 
 

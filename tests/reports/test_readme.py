@@ -148,3 +148,21 @@ def test_the_rig_is_shown_with_its_errors_and_its_benchmark():
     assert "64 captures of a sensor of 320 x 200 px" in block
     assert "within 0.96 pictures of the camera, refined ones within 0.59 ms of each other" in block
     assert "| CF | **0.0500** |" in block
+
+
+def test_a_section_of_a_results_file_has_a_block_of_its_own(project):
+    row = {"precision": "fp32", "gflop_per_window": 10.0, "peak_gflop_per_s": 100.0, "infer_windows_per_s": 5.0}
+    setting = row | {"train_frames_per_s": 2.0, "train_profile": {"aten::mm": 60.4, "x": 0.2}, "infer_profile": {}}
+    ratio = {"train_frames_per_s": 1.0, "infer_windows_per_s": 1.0}
+    network = {"naive": setting, "shipped": setting, "shipped_over_naive": ratio}
+    throughput = {"threads": 1, "device": "cpu", "networks": {"paper": network}}
+    file = project / "docs" / "results" / "network.json"
+    (project / "docs" / "training.md").write_text(BEFORE.replace("pipeline", "network-throughput"))
+    file.write_text(json.dumps({"other": 1}))
+    update_results_blocks(project, check=False)
+    assert "Not measured yet" in (project / "docs" / "training.md").read_text()
+    file.write_text(json.dumps({"throughput": throughput, "records": {"throughput": RESULTS}}))
+    update_results_blocks(project, check=False)
+    text = (project / "docs" / "training.md").read_text()
+    assert "| `paper` | shipped | fp32 | 2.00 | 5.00 | 10.00 | 60 % | 50 % |" in text
+    assert "| `paper`, naive, train | aten::mm 60 |" in text

@@ -40,7 +40,7 @@ E2P = E2pConfig(**LOOP, bins=5, intensity_lpips=3.0, lpips=0.0, mse=50.0, ssim=1
 def test_a_training_of_e2p_leaves_a_checkpoint_of_the_published_size(stores, tmp_path):
     task = e2p_task(E2P, None, SEED)
     split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
-    recorder = Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, E2P, tmp_path, SEED))
+    recorder = Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, E2P, tmp_path, SEED, CPU))
     train(task, split, E2P, recorder, SEED, CPU, workers=0)
     tensors, metadata = load_checkpoint(tmp_path / "out" / "best.safetensors")
     assert metadata["network"] == "e2p"

@@ -13,6 +13,7 @@ from polarnet.baselines.e2vid import E2vid
 from polarnet.events.store import EventStore
 from polarnet.networks.checkpoint import load_checkpoint, load_network
 from polarnet.networks.dolp_unet import DolpUNetConfig
+from polarnet.runtime import precision_on
 from polarnet.training.dolp import dolp_task
 from polarnet.training.e2v import E2vConfig, e2v_task
 from polarnet.training.loop import TrainConfig, set_learning_rate, train, validate
@@ -43,7 +44,7 @@ E2V = E2vConfig(**LOOP, arch="firenet", bins=5, ssim=1.0, lpips=0.0)
 NETWORK = DolpUNetConfig(
     channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1, input_mixing="contrasts"
 )
-LOSS = LossConfig(mse=1.0, ssim=1.0, lpips=0.0)
+LOSS = LossConfig(mse=1.0, ssim=1.0, lpips=0.0, stokes=0.0, uncertainty=0.0)
 
 
 class Killed(Exception):
@@ -57,7 +58,7 @@ def small_task() -> Task:
 def run(task: Task, stores: tuple[Path, Path], folder: Path, config: TrainConfig | E2vConfig = TRAIN) -> Path:
     """A whole training that keeps a running checkpoint after every batch; the folder of its outputs."""
     split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
-    metadata = describe(task, split, config, folder, SEED)
+    metadata = describe(task, split, config, folder, SEED, CPU)
     recorder = Recorder(folder / "out", folder / "resume", metadata, keep_every_s=0.0)
     train(task, split, config, recorder, SEED, CPU, workers=0)
     return folder / "out"
@@ -115,7 +116,7 @@ def test_a_changed_setting_starts_anew(stores, tmp_path):
     task = small_task()
     split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
     places = {
-        Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, config, tmp_path, SEED)).running
+        Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, config, tmp_path, SEED, CPU)).running
         for config in (TRAIN, dataclasses.replace(TRAIN, learning_rate=2e-3), dataclasses.replace(TRAIN, epochs=3))
     }
     assert len(places) == 3
@@ -124,7 +125,7 @@ def test_a_changed_setting_starts_anew(stores, tmp_path):
 def test_worker_processes_change_nothing(stores, tmp_path, undisturbed):
     task = small_task()
     split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
-    recorder = Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, TRAIN, tmp_path, SEED))
+    recorder = Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, TRAIN, tmp_path, SEED, CPU))
     train(task, split, TRAIN, recorder, SEED, CPU, workers=2)
     assert bytes_of(tmp_path / "out") == undisturbed
 
@@ -133,7 +134,7 @@ def test_one_sequence_can_be_learnt_by_heart(stores, tmp_path):
     config = dataclasses.replace(
         TRAIN, epochs=20, batch_size=1, bptt_windows=2, learning_rate=1e-2, windows=None, crop=None, symmetries=False
     )
-    loss = LossConfig(mse=1.0, ssim=0.0, lpips=0.0)
+    loss = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=0.0, uncertainty=0.0)
     task = dolp_task("paper", NETWORK, config, loss, None, SEED)
     split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
     split.train.sequences[1:] = []
@@ -181,6 +182,11 @@ def test_bf16_trains_as_well(stores, tmp_path):
     after = task.network.state_dict()
     assert all(tensor.dtype == torch.float32 and tensor.isfinite().all() for tensor in after.values())
     assert any(not torch.equal(after[name], before[name]) for name in before)
+
+
+def test_the_checkpoint_names_the_precision_that_auto_became(stores, tmp_path):
+    out = run(small_task(), stores, tmp_path, dataclasses.replace(TRAIN, epochs=1, visits=1, precision="auto"))
+    assert load_checkpoint(out / "last.safetensors")[1]["training"]["precision"] == precision_on(CPU, "auto")
 
 
 def test_a_loss_that_is_not_a_number_stops_the_training(stores, tmp_path):

@@ -1,9 +1,11 @@
+import math
+
 import pytest
 import torch
 
 from polarnet.lpips import Lpips
 from polarnet.similarity import ssim
-from polarnet.training.losses import FrameLoss, LossConfig, polarization_loss
+from polarnet.training.losses import FrameLoss, LossConfig, PolarizationLoss
 
 
 def frames(value: float) -> torch.Tensor:
@@ -25,9 +27,14 @@ def test_constant_frames_half_apart():
     assert terms["ssim_loss"].item() == pytest.approx(1 - luminance, rel=1e-5)
 
 
+def of_dolp(mse: float, ssim: float, lpips: float, network: Lpips | None = None) -> PolarizationLoss:
+    config = LossConfig(mse=mse, ssim=ssim, lpips=lpips, stokes=1.0, uncertainty=1.0)
+    return PolarizationLoss(config, network, dolp_only=True)
+
+
 def test_the_total_is_equation_9():
-    predicted, truth = torch.rand(2, 1, 2, 12, 12).unbind()
-    loss = polarization_loss(LossConfig(mse=2.0, ssim=3.0, lpips=0.0), None)
+    predicted, truth = torch.rand(2, 1, 2, 1, 12, 12).unbind()
+    loss = of_dolp(mse=2.0, ssim=3.0, lpips=0.0)
     terms = loss(predicted, truth)
     expected = 2 * (predicted - truth).square().mean() + 3 * (1 - ssim(predicted, truth)).mean()
     torch.testing.assert_close(loss.total(terms), expected)
@@ -36,17 +43,53 @@ def test_the_total_is_equation_9():
 def test_lpips_is_weighed_with_the_rest_where_there_is_a_network():
     torch.manual_seed(0)
     lpips = Lpips("squeeze")
-    loss = polarization_loss(LossConfig(mse=1.0, ssim=0.0, lpips=10.0), lpips)
-    predicted, truth = torch.rand(1, 2, 32, 32), torch.rand(1, 2, 32, 32)
+    loss = of_dolp(1.0, 0.0, 10.0, lpips)
+    predicted, truth = torch.rand(1, 2, 1, 32, 32), torch.rand(1, 2, 1, 32, 32)
     terms = loss(predicted, truth)
-    torch.testing.assert_close(terms["lpips"], lpips(predicted[0], truth[0]).mean())
+    torch.testing.assert_close(terms["lpips"], lpips(predicted[0, :, 0], truth[0, :, 0]).mean())
     torch.testing.assert_close(loss.total(terms), terms["mse"] + 10 * terms["lpips"])
 
 
 def test_without_a_network_lpips_is_left_out_and_not_made_up():
-    loss = polarization_loss(LossConfig(mse=1.0, ssim=1.0, lpips=10.0), None)
+    loss = of_dolp(1.0, 1.0, 10.0)
     assert loss.weights == {"mse": 1.0, "ssim_loss": 1.0}
-    assert list(loss(frames(0.1), frames(0.2))) == ["mse", "ssim_loss"]
+    assert list(loss(frames(0.1)[:, :, None], frames(0.2)[:, :, None])) == ["mse", "ssim_loss"]
+
+
+def of_everything(dolp: float, s1: float, s2: float, log_variance: float) -> torch.Tensor:
+    return torch.tensor([dolp, s1, s2, log_variance])[None, None, :, None, None].expand(2, 3, 4, 12, 12)
+
+
+def test_angles_and_uncertainty_are_judged_where_a_network_predicts_them():
+    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=2.0, uncertainty=3.0)
+    loss = PolarizationLoss(config, None, dolp_only=False)
+    terms = loss(of_everything(0.5, 0.3, 0.4, math.log(0.02)), of_everything(0.4, 0.1, 0.4, 0)[:, :, :3])
+    assert {name: round(term.item(), 5) for name, term in terms.items()} == {
+        "mse": 0.01,
+        "stokes": 0.04,
+        "uncertainty": round((0.01 / 0.02 + math.log(0.02)) / 2, 5),
+    }
+    assert loss.total(terms).item() == pytest.approx(0.01 + 2 * 0.04 + 3 * terms["uncertainty"].item())
+
+
+def test_the_uncertainty_learns_from_the_error_and_the_error_not_from_the_uncertainty():
+    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=0.0, uncertainty=1.0)
+    predicted = of_everything(0.5, 0.3, 0.4, 0.0).clone().requires_grad_()
+    PolarizationLoss(config, None, dolp_only=False)(predicted, torch.zeros(2, 3, 3, 12, 12))["uncertainty"].backward()
+    assert predicted.grad is not None
+    assert not predicted.grad[:, :, :3].any()
+    assert (predicted.grad[:, :, 3] > 0).all()  # the variance of 1 is too much for an error of 0.5
+
+
+def test_masked_pixels_count_neither_for_angles_nor_for_uncertainty():
+    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=1.0)
+    valid = torch.zeros(2, 3, 12, 12, dtype=torch.bool)
+    valid[..., :6] = True
+    predicted = of_everything(0.5, 0.5, 0.0, 0.0).clone()
+    truth = predicted[:, :, :3].clone()
+    truth[..., 6:] = 0.9
+    terms = PolarizationLoss(config, None, dolp_only=False)(predicted, truth, valid)
+    assert [term.item() for term in terms.values()] == [0, 0, 0]
 
 
 def test_a_weight_of_zero_is_not_even_computed():
@@ -55,7 +98,7 @@ def test_a_weight_of_zero_is_not_even_computed():
 
 def test_a_loss_of_nothing_is_refused():
     with pytest.raises(ValueError, match="mse, ssim, lpips: expected at least one weight > 0"):
-        LossConfig(mse=0.0, ssim=0.0, lpips=0.0)
+        LossConfig(mse=0.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=1.0)
 
 
 def test_masked_pixels_and_frames_count_in_no_term_and_get_no_gradient():

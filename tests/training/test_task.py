@@ -37,10 +37,11 @@ NETWORK = DolpUNetConfig(
 )
 TRAIN = TrainConfig(**LOOP, representation="event_tensor")
 E2V = E2vConfig(**LOOP, arch="firenet", bins=3, ssim=1.0, lpips=0.0)
+LOSS = LossConfig(mse=1.0, ssim=1.0, lpips=0.0, stokes=0.0, uncertainty=0.0)
 
 
 def dolp() -> Task:
-    return dolp_task("paper", NETWORK, TRAIN, LossConfig(mse=1.0, ssim=1.0, lpips=0.0), None, SEED)
+    return dolp_task("paper", NETWORK, TRAIN, LOSS, None, SEED)
 
 
 def e2v() -> Task:
@@ -95,7 +96,7 @@ def test_a_checkpoint_tells_what_its_events_were_made_from(simulated, tmp_path):
     described = {}
     for data in ("store", "fly"):
         config = dataclasses.replace(TRAIN, data=data)
-        described[data] = describe(task, split_of(simulated, data, task), config, tmp_path, SEED)
+        described[data] = describe(task, split_of(simulated, data, task), config, tmp_path, SEED, torch.device("cpu"))
         assert described[data]["training"]["data"] == data
         assert described[data]["data"]["events_from"]["emulate"] == dataclasses.asdict(simulated.emulate)
     assert described["store"]["data"]["events_sha256"] != described["fly"]["data"]["events_sha256"]
@@ -126,7 +127,7 @@ def test_training_and_validation_leave_masked_pixels_out(masked, simulated):
     assert val.valid.float().mean() == pytest.approx(4 / 6 * 2 / 3)
     with torch.no_grad():
         predicted, _ = task.unroll(val.inputs[:, None], None)
-    expected = (predicted[2:, 0, :, 8:] - val.dolp[2:, :, 8:]).square().mean().item()
+    expected = (predicted[2:, 0, 0, :, 8:] - val.dolp[2:, :, 8:]).square().mean().item()
     config = dataclasses.replace(TRAIN, bptt_windows=6)
     assert validate(task, split.val, config, cpu, workers=0)["mse"] == pytest.approx(expected, rel=1e-4)
     plain = validate(task, split_of(simulated, "store", task).val, config, cpu, workers=0)["mse"]
@@ -141,7 +142,7 @@ def test_what_the_truth_says_at_masked_pixels_does_not_change_the_weights(masked
         if of_e2v:
             task = e2v_task(dataclasses.replace(E2V, ssim=0.0), None, SEED)
         else:  # SSIM looks at neighbours, and so at the truth of masked pixels
-            task = dolp_task("paper", NETWORK, TRAIN, LossConfig(mse=1.0, ssim=0.0, lpips=0.0), None, SEED)
+            task = dolp_task("paper", NETWORK, TRAIN, dataclasses.replace(LOSS, ssim=0.0), None, SEED)
         visits = Visits(split_of(masked, "store", task).train, config, SEED, epoch=0)
         batch = next(batches_of(visits, [0, 1], config.batch_size, workers=0))
         assert not batch.valid.all()

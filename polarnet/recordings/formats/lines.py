@@ -44,8 +44,8 @@ def number_blocks(
                 raise RecordingError(
                     f"{path.name}: expected lines of numbers, got {len(rest)} bytes without the end of a line"
                 )
-            yield from _rows(data[:end], shift, counts, "unreadable_lines")
-        yield from _rows(rest, shift, counts, "cut_tail")
+            yield from rows_of(data[:end], shift, counts, "unreadable_lines")
+        yield from rows_of(rest, shift, counts, "cut_tail")
 
 
 class Line(NamedTuple):
@@ -72,7 +72,10 @@ def numbers_of(head: bytes) -> list[Line]:
     return found if len(found) >= others else []
 
 
-def _rows(data: bytes, shift: np.ndarray, counts: Counter[str], damage: str) -> Iterator[np.ndarray]:
+def rows_of(
+    data: bytes, shift: Int64[np.ndarray, " columns"], counts: Counter[str], damage: str
+) -> Iterator[Int64[np.ndarray, "n columns"]]:
+    """Whole lines as rows of numbers, as `number_blocks` has them; what is not such a line is counted as `damage`."""
     buffer = np.frombuffer(data, np.uint8)
     start = 0
     while start < len(buffer):

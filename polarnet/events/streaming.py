@@ -1,0 +1,187 @@
+"""A stream of events cut into windows as it comes: by time or by number of events, one after the other or overlapping.
+
+Whoever has events, all at once or little by little, hands them to a `WindowCutter`; a `SlidingEventTensor` keeps the
+input of a window that moves up to date.
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from polarnet.events.stream import Events, concatenate, slice_count
+
+SHORTEST_STEP_US = 100
+
+
+class EventWindow(NamedTuple):
+    """What the four polarizers (0, 45, 90, 135 degrees) reported with start_us <= t < stop_us."""
+
+    channels: Sequence[Events]
+    start_us: int
+    stop_us: int
+    first: Sequence[int]
+    """How many events of each channel came before the window, so that consecutive windows can be told apart."""
+
+    @property
+    def length_us(self) -> int:
+        """Never 0."""
+        return max(1, self.stop_us - self.start_us)
+
+
+@dataclass(frozen=True)
+class WindowRule:
+    """How long windows are, and how far apart they end. Exactly one of `length_us` and `events` is given."""
+
+    length_us: int | None
+    events: int | None
+    """Of the four polarizers together."""
+    step_us: int | None
+    """From one window's end to the next; None: each begins where the one before it ended."""
+
+    def __post_init__(self):
+        if (self.length_us is None) == (self.events is None):
+            raise ValueError(f"expected windows of a time or of a number of events, got {self}")
+        if self.length_us is not None and self.length_us < SHORTEST_STEP_US:
+            raise ValueError(f"expected windows of at least {SHORTEST_STEP_US} us, got {self.length_us}")
+        if self.events is not None and self.events < 2:
+            raise ValueError(f"expected windows of at least 2 events, got {self.events}")
+        if self.step_us is not None:
+            if self.step_us < SHORTEST_STEP_US:
+                raise ValueError(f"expected a step of at least {SHORTEST_STEP_US / 1000} ms, got {self.step_us} us")
+            if self.length_us is not None and self.step_us > self.length_us:
+                raise ValueError(
+                    f"expected a step no longer than the windows of {self.length_us} us, got {self.step_us} us: "
+                    f"events between windows would be lost"
+                )
+
+
+def parse_window(text: str) -> tuple[int | None, int | None]:
+    """(microseconds, None) of "33.3ms", (None, number) of "20000ev"; ValueError for anything else."""
+    match = re.fullmatch(r"(?P<number>\d+(\.\d*)?|\.\d+)\s*(?P<unit>us|ms|s|ev|events)", text.strip())
+    if match is None or (match["unit"] in ("ev", "events") and not match["number"].isdigit()):
+        raise ValueError(f"expected a time such as 33.3ms or a number of events such as 20000ev, got {text!r}")
+    if match["unit"] in ("ev", "events"):
+        return None, int(match["number"])
+    return round(float(match["number"]) * {"us": 1, "ms": 1_000, "s": 1_000_000}[match["unit"]]), None
+
+
+class WindowCutter:
+    """Cuts a stream that comes in pieces into windows, each as soon as all of its events are known.
+
+    Windows by time end at multiples of the step (or of their length), the first after one whole length. Windows by
+    number end with their last event; with a step, they are the last so many events before each multiple of it. A
+    window's time starts where the window that many events or microseconds before it ended. What no later window needs
+    is forgotten. Times count from 0.
+    """
+
+    def __init__(self, rule: WindowRule, height: int, width: int):
+        self.rule = rule
+        self._held = [Events.empty(height, width) for _ in range(4)]
+        self._forgotten = [0, 0, 0, 0]
+        self._next_us = rule.length_us if rule.length_us is not None else rule.step_us
+        self._start_us = 0
+
+    def add(self, channels: Sequence[Events], until_us: int) -> Iterator[EventWindow]:
+        """The windows that are complete once every event before `until_us` has come; `channels` are the new ones."""
+        self._held = [concatenate([held, new]) for held, new in zip(self._held, channels, strict=True)]
+        if self.rule.length_us is not None:
+            return self._by_time(self.rule.length_us, until_us)
+        assert self.rule.events is not None
+        if self.rule.step_us is not None:
+            return self._last_events(self.rule.events, self.rule.step_us, until_us)
+        return self._by_number(self.rule.events, until_us)
+
+    def _by_time(self, length_us: int, until_us: int) -> Iterator[EventWindow]:
+        assert self._next_us is not None
+        while self._next_us <= until_us:
+            start_us = self._next_us - length_us
+            self._forget(self._places(start_us))
+            yield self._window(start_us, self._next_us, self._places(self._next_us))
+            self._next_us += self.rule.step_us or length_us
+
+    def _by_number(self, count: int, until_us: int) -> Iterator[EventWindow]:
+        known = self._places(until_us)
+        times = torch.cat([held.t[:n] for held, n in zip(self._held, known, strict=True)]).sort().values
+        used = 0
+        while used + count <= len(times):
+            stop_us = int(times[used + count - 1]) + 1  # events of the same time all belong to it
+            stops = self._places(stop_us)
+            window = self._window(self._start_us, stop_us, stops)
+            used += sum(stops)
+            self._forget(stops)
+            self._start_us = stop_us
+            yield window
+
+    def _last_events(self, count: int, step_us: int, until_us: int) -> Iterator[EventWindow]:
+        assert self._next_us is not None
+        while self._next_us <= until_us:
+            stops = self._places(self._next_us)
+            times = torch.cat([held.t[:n] for held, n in zip(self._held, stops, strict=True)])
+            surplus = len(times) - count
+            if surplus >= 0:
+                start_us = int(times.kthvalue(surplus + 1).values)
+                self._forget(self._places(start_us))
+                yield self._window(start_us, self._next_us, self._places(self._next_us))
+            self._next_us += step_us
+
+    def _places(self, t_us: int) -> list[int]:
+        return [int(torch.searchsorted(held.t, t_us)) for held in self._held]
+
+    def _window(self, start_us: int, stop_us: int, stops: Sequence[int]) -> EventWindow:
+        channels = [slice_count(held, 0, stop) for held, stop in zip(self._held, stops, strict=True)]
+        return EventWindow(channels, start_us, stop_us, list(self._forgotten))
+
+    def _forget(self, places: Sequence[int]) -> None:
+        self._held = [slice_count(held, place, len(held)) for held, place in zip(self._held, places, strict=True)]
+        self._forgotten = [before + place for before, place in zip(self._forgotten, places, strict=True)]
+
+
+class SlidingEventTensor:
+    """The event tensor (paper Eq. 5) of one polarizer in a window that moves, updated by what comes and goes.
+
+    Two integers a pixel are kept, the sum of polarities and of polarity times time, to which an event that comes is
+    added and from which one that leaves is taken: the work of a step is in proportion to the events of the step, not
+    of the window, and as integers do not round, the tensor is that of a window cut out anew.
+    """
+
+    def __init__(self, height: int, width: int):
+        self.window = Events.empty(height, width)
+        self.first = 0
+        self._polarity = torch.zeros(height * width, dtype=torch.int64)
+        self._moment = torch.zeros(height * width, dtype=torch.int64)
+
+    def move_to(self, first: int, window: Events) -> None:
+        """Show `window`, which begins with event number `first` of the stream; neither end goes back."""
+        gone, stop = first - self.first, self.first + len(self.window)
+        if gone < 0 or first + len(window) < stop:
+            raise ValueError(
+                f"a window only goes forward: from events {self.first} to {stop}, it cannot move to "
+                f"{first} to {first + len(window)}"
+            )
+        if gone < len(self.window):
+            self._add(slice_count(self.window, 0, gone), -1)
+            self._add(slice_count(window, stop - first, len(window)), 1)
+        else:
+            self._polarity.zero_()
+            self._moment.zero_()
+            self._add(window, 1)
+        self.first, self.window = first, window
+
+    def tensor(self, window_us: int) -> Float[Tensor, "h w"]:
+        """Polarities summed per pixel, each weighted by its time since the window's first event, in window lengths."""
+        height, width = self.window.height, self.window.width
+        if len(self.window) == 0:
+            return torch.zeros(height, width)
+        weighted = (self._moment - self.window.t[0] * self._polarity).double() / window_us
+        return weighted.float().view(height, width)
+
+    def _add(self, events: Events, sign: int) -> None:
+        pixel = events.y.long() * events.width + events.x.long()
+        polarity = sign * events.p.long()
+        self._polarity.index_add_(0, pixel, polarity)
+        self._moment.index_add_(0, pixel, polarity * events.t)

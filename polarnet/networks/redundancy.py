@@ -1,0 +1,101 @@
+"""What the redundancy of four polarizers says about polarization from events alone, without any training.
+
+I0 + I90 = I45 + I135. In logarithms, with s1 = S1 / S0 and s2 = S2 / S0: log I0 + log I90 = 2 log(S0 / 2) +
+log(1 - s1^2) and likewise for 45, 135 and s2; also log I0 - log I90 = 2 atanh(s1). So where e_k is how much log I_k has
+changed, and changes are small,
+
+    (e0 + e90) - (e45 + e135) = -s1 (e0 - e90) + s2 (e45 - e135):
+
+C = -s1 A + s2 B, one linear equation a pixel, in which S0 and the unknown constants of the logarithms do not occur.
+Least squares over neighbours and past windows gives s1 and s2. Events are e_k up to noise: the pixels' thresholds
+differ and changes come in whole steps, which biases the second moments that least squares needs ("errors in
+variables"). `SecondMoments` takes the expected bias out again; what it takes, and how pixels are weighed, is learnt.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+MOMENTS = 6  # AA, AB, BB, AC, BC and the weighted number of steps
+LEAST_EVIDENCE = 1e-2  # of a moment, in squared events: keeps the solution finite, and 0, where nothing happened
+MOST_CORRELATED = 0.95  # A and B; corrected moments can exceed what those of any A and B could be
+
+
+def faded(x: Float[Tensor, "t *b"], keep: float, state: Float[Tensor, " *b"]) -> Float[Tensor, "t *b"]:
+    """Running sums: after each of t windows, what came before counts `keep` times as much as a window earlier."""
+    sums = []
+    for now in x:
+        state = torch.add(now, state, alpha=keep)
+        sums.append(state)
+    return torch.stack(sums)
+
+
+class SecondMoments(nn.Module):
+    """Products of A, B and C at each pixel, free of the bias that noise of the events leaves in them.
+
+    For each of `memories` sums of events three numbers are learnt: how strongly a pixel's weight falls with its
+    activity, the variance of the relative mismatch of thresholds, and that of a step.
+    """
+
+    def __init__(self, memories: int):
+        super().__init__()
+        self.log_activity = nn.Parameter(torch.full((memories,), -1.0))
+        self.log_mismatch = nn.Parameter(torch.full((memories,), -3.5))
+        self.log_step = nn.Parameter(torch.full((memories,), -2.0))
+
+    def forward(self, events: Float[Tensor, "n m 4 h w"]) -> Float[Tensor, "n m 6 h w"]:
+        """`MOMENTS` of the sums of events of the four polarizers."""
+        activity, mismatch, step = (
+            p.exp().view(-1, 1, 1, 1) for p in (self.log_activity, self.log_mismatch, self.log_step)
+        )
+        squared, steps = events.square(), events.abs()
+        weight = 1 / (1 + activity * squared.sum(2, keepdim=True))
+        v0, v45, v90, v135 = (mismatch * squared + step * steps).unbind(2)
+        e0, e45, e90, e135 = events.unbind(2)
+        a, b, c = e0 - e90, e45 - e135, (e0 + e90) - (e45 + e135)
+        moments = [a * a - v0 - v90, a * b, b * b - v45 - v135, a * c - v0 + v90, b * c + v45 - v135, steps.sum(2)]
+        return weight * torch.stack(moments, dim=2)
+
+
+class LeastSquares(nn.Module):
+    """s1, s2 that fit C = -s1 A + s2 B best, for summed moments of each memory, decay and scale.
+
+    A ridge for each, learnt, pulls towards 0 where there is little evidence.
+    """
+
+    def __init__(self, memories: int, decays: int, scales: int):
+        super().__init__()
+        self.log_ridge = nn.Parameter(torch.full((memories, decays, scales), -2.5))
+
+    def forward(
+        self, moments: Float[Tensor, "n m d k 6 h w"]
+    ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "n c h w"], Float[Tensor, "n c h w"]]:
+        """s1, s2 with hypot(s1, s2) <= 1, and the weighted number of steps they rest on; c = m * d * k."""
+        aa, ab, bb, ac, bc, steps = moments.unbind(4)
+        ridge = self.log_ridge.exp()[..., None, None] * steps + LEAST_EVIDENCE
+        aa, bb = F.relu(aa) + ridge, F.relu(bb) + ridge
+        limit = MOST_CORRELATED * (aa * bb).sqrt()
+        ab = torch.maximum(torch.minimum(ab, limit), -limit)
+        determinant = aa * bb - ab * ab
+        s1, s2 = (bc * ab - ac * bb) / determinant, (bc * aa - ac * ab) / determinant
+        inside = 1 / length(s1, s2).clamp(min=1)
+        return tuple(field.flatten(1, 3) for field in (s1 * inside, s2 * inside, steps))  # type: ignore[return-value]
+
+
+def length(s1: Float[Tensor, "*b"], s2: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """hypot(s1, s2), with a gradient at 0."""
+    return torch.sqrt(s1 * s1 + s2 * s2 + 1e-12)
+
+
+def neighbourhoods(x: Float[Tensor, "n c h w"], scales: Sequence[int]) -> Iterable[Float[Tensor, "n c h w"]]:
+    """Means over boxes of so many pixels around each one, an odd number; 0: over the whole image."""
+    for scale in scales:
+        if scale == 0:
+            yield x.mean((-1, -2), keepdim=True).expand_as(x)
+        elif scale == 1:
+            yield x
+        else:
+            yield F.avg_pool2d(x, scale, stride=1, padding=scale // 2, count_include_pad=False)

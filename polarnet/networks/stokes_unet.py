@@ -1,0 +1,197 @@
+"""polarnet's own network: the redundancy of four polarizers solved at many scales, then refined by a small U-Net."""
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from polarnet.networks.blocks import ConvGRU, Prediction, ResidualBlock, UpBlock, compressed, contrasts, conv3x3
+from polarnet.networks.redundancy import MOMENTS, LeastSquares, SecondMoments, faded, length, neighbourhoods
+from polarnet.ranges import allowed, check_ranges
+
+STRIDE = 8  # three stages that halve the size
+IMAGES = 2  # of a polarizer's events: the sum of polarities and their number (representation `event_counts`)
+MIDDLE_DOLP = 0.3  # of the constant that is one more candidate, at the start
+SURROUNDINGS = (1, 3, 9)  # width in pixels of the neighbourhoods whose events tell fine structure
+MOST_POLARIZED = 0.98  # of 1: keeps atanh finite
+LOG_VARIANCE = -4.0  # at the start: an error of 0.14
+
+
+@dataclass(frozen=True)
+class StokesUNetConfig:
+    """Section `networks.polarnet` of params.yaml."""
+
+    channels: list[int] = field(metadata=allowed(low=1))
+    """At a half, a quarter and an eighth of the size."""
+    memories: list[float] = field(metadata=allowed(low=0, high=0.999))
+    """Of each sum of events that the redundancy is solved for: the weight of an event one window later."""
+    decays: list[float] = field(metadata=allowed(low=0, high=0.999))
+    """Of each sum of second moments: their weight one window later."""
+    scales: list[int] = field(metadata=allowed(low=0))
+    """Of the neighbourhoods that are solved together, in pixels of a quarter of the size, odd; 0: the whole image."""
+
+    def __post_init__(self):
+        check_ranges(self)
+        if len(self.channels) != 3 or not (self.memories and self.decays and self.scales):
+            raise ValueError(f"channels, memories, decays, scales: expected 3 numbers and at least 1 each, got {self}")
+        if any(scale and scale % 2 == 0 for scale in self.scales):
+            raise ValueError(f"scales: expected odd numbers, or 0 for the whole image, got {self.scales}")
+
+
+class Candidates(NamedTuple):
+    """What least squares makes of each memory, decay and scale, at a quarter of the size."""
+
+    s1: Float[Tensor, "n c h w"]
+    s2: Float[Tensor, "n c h w"]
+    dolp: Float[Tensor, "n c h w"]
+    evidence: Float[Tensor, "n c h w"]
+    """Weighted number of events they rest on."""
+
+
+class StokesUNet(nn.Module):
+    """Events of the four polarizers to DoLP, AoLP and DoLP's expected squared error, with a recurrent state.
+
+    The redundancy's candidates for (s1, s2) are mixed by weights that the U-Net chooses at each place, together with a
+    constant: coarse, but on the true scale. Fine structure comes from the events themselves, because e0 - e90 counts
+    how 2 atanh(s1) has changed at a pixel: (s1, s2) are moved by their sums, times gains that the U-Net chooses too.
+    What it adds last, when it has seen the result, is free. DoLP is not the length of (s1, s2): where these are
+    uncertain their mean is short, as is a mean over angles. The outputs are linear, as those of the paper's network.
+    """
+
+    representation = "event_counts"
+    predicts_stokes = True
+
+    def __init__(self, config: StokesUNetConfig, in_channels: int = 4 * IMAGES):
+        super().__init__()
+        if in_channels != 4 * IMAGES:
+            raise ValueError(
+                f"network=polarnet takes {4 * IMAGES} images (representation event_counts), got {in_channels}"
+            )
+        self.memories, self.decays, self.scales = config.memories, config.decays, config.scales
+        memories, solved = len(config.memories), len(config.memories) * len(config.decays) * len(config.scales)
+        half, quarter, eighth = config.channels
+        self.moments = SecondMoments(memories)
+        self.solve = LeastSquares(memories, len(config.decays), len(config.scales))
+        self.stem = conv3x3(4 * (4 * memories + 1), half)
+        self.to_quarter = nn.Conv2d(half, quarter, kernel_size=2, stride=2)
+        self.from_candidates = nn.Conv2d(len(Candidates._fields) * solved, quarter, kernel_size=1)
+        self.join = conv3x3(quarter, quarter)
+        self.gru_quarter = ConvGRU(quarter)
+        self.to_eighth = nn.Conv2d(quarter, eighth, kernel_size=2, stride=2)
+        self.before = ResidualBlock(eighth)
+        self.gru_eighth = ConvGRU(eighth)
+        self.after = ResidualBlock(eighth)
+        self.up_quarter = UpBlock(eighth, quarter)
+        self.at_quarter = ResidualBlock(quarter)
+        self.choose = nn.Conv2d(quarter, solved + 1, kernel_size=1)
+        self.up_half = UpBlock(quarter, half)
+        self.at_half = ResidualBlock(half)
+        self.gains = nn.Conv2d(half, 4 * len(SURROUNDINGS) * memories, kernel_size=1)
+        self.look = conv3x3(half + 4 * 3, half)
+        self.refine = ResidualBlock(half)
+        self.add = nn.Conv2d(half, 4 * 4, kernel_size=1)
+        self.constant = nn.Parameter(torch.tensor(MIDDLE_DOLP))
+        for last in (self.choose, self.gains, self.add):
+            assert last.bias is not None
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+
+    def forward(
+        self, inputs: Float[Tensor, "b 8 h w"], state: list[Tensor] | None = None
+    ) -> tuple[Prediction, list[Tensor]]:
+        """One window of b streams. `state` is what the window before handed back, None at the start."""
+        prediction, state = self.unroll(inputs[None], state)
+        return Prediction(*(field[0] for field in prediction if field is not None)), state
+
+    def unroll(
+        self, inputs: Float[Tensor, "t b 8 h w"], state: list[Tensor] | None = None
+    ) -> tuple[Prediction, list[Tensor]]:
+        """t windows of b streams at once: the same numbers as `forward` window by window, in fewer operations."""
+        t, b, _, height, width = inputs.shape
+        inputs = F.pad(inputs, (0, -width % STRIDE, 0, -height % STRIDE))  # no events there
+        polarity, count = inputs.unflatten(2, (4, IMAGES)).unbind(3)
+        state = state or self.initial_state(inputs[0])
+        memories, decays = len(self.memories), len(self.decays)
+
+        summed = [faded(polarity, keep, before) for keep, before in zip(self.memories, state[:memories], strict=True)]
+        events = torch.stack(summed, dim=2).flatten(0, 1)  # t * b, memory, polarizer
+        candidates, moments = self._candidates(events, b, state[memories : memories + decays])
+
+        x2 = F.relu(self.stem(_images(events, count.flatten(0, 1))))
+        solved = torch.cat([candidates.s1, candidates.s2, candidates.dolp, torch.log1p(candidates.evidence)], dim=1)
+        solved = solved.contiguous(memory_format=torch.channels_last)
+        x4 = F.relu(self.join(F.relu(self.to_quarter(x2) + self.from_candidates(solved))))
+        g4, state4 = self.gru_quarter(x4, state[-2])
+        x8 = self.before(F.relu(self.to_eighth(g4)))
+        g8, state8 = self.gru_eighth(x8, state[-1])
+        y4 = self.at_quarter(self.up_quarter(self.after(g8), skip=g4))
+        mixed = self._mixed(candidates, self.choose(y4).float().softmax(1))
+        y2 = self.at_half(self.up_half(y4, skip=x2))
+        gains = F.pixel_shuffle(self.gains(y2), 2).float()
+        coarse = F.interpolate(mixed, scale_factor=4, mode="bilinear")
+        moved = _moved(coarse[:, :2], events, gains)
+        dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
+        fine = torch.cat([moved, dolp], dim=1)
+        seen = torch.cat([y2, F.pixel_unshuffle(fine, 2).to(y2.dtype)], dim=1)
+        added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(seen)))), 2).float()
+
+        s1, s2, dolp = (fine + added[:, :3]).unbind(1)
+        aolp = torch.remainder(torch.atan2(s2, s1) / 2, math.pi)
+        maps = [dolp, aolp, LOG_VARIANCE + added[:, 3], torch.stack([s1, s2], dim=1)]
+        prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
+        return prediction, [*(images[-1] for images in summed), *moments, state4, state8]
+
+    def _candidates(
+        self, events: Float[Tensor, "n m 4 h w"], streams: int, state: list[Tensor]
+    ) -> tuple[Candidates, list[Tensor]]:
+        """Also the sums of moments to carry on from. In float32: the equations are solved by differences."""
+        with torch.autocast(events.device.type, enabled=False):
+            moments = F.avg_pool2d(self.moments(events).flatten(1, 2), 4).unflatten(0, (-1, streams))
+            sums = [faded(moments, keep, before) for keep, before in zip(self.decays, state, strict=True)]
+            shape = (len(self.decays), len(self.memories), MOMENTS)
+            near = neighbourhoods(torch.stack(sums, dim=2).flatten(0, 1).flatten(1, 2), self.scales)
+            stacked = torch.stack([mean.unflatten(1, shape).transpose(1, 2) for mean in near], dim=3)
+            s1, s2, evidence = self.solve(stacked)
+            return Candidates(s1, s2, length(s1, s2), evidence), [images[-1] for images in sums]
+
+    def _mixed(self, candidates: Candidates, weights: Float[Tensor, "n c1 h w"]) -> Float[Tensor, "n 3 h w"]:
+        """s1, s2 and DoLP; the last weight is that of the constant, which has no angle."""
+        of_solved, of_constant = weights[:, :-1], weights[:, -1:]
+        mixed = [(of_solved * field).sum(1, keepdim=True) for field in candidates[:3]]
+        mixed[2] = mixed[2] + of_constant * self.constant
+        return torch.cat(mixed, dim=1)
+
+    def initial_state(self, inputs: Float[Tensor, "b c h w"]) -> list[Tensor]:
+        """Nothing seen yet: sums of events and of moments, and what the two recurrent layers hold; all zeros.
+
+        Height and width divide by 8.
+        """
+        b, _, height, width = inputs.shape
+        quarter, eighth = (
+            inputs.new_zeros(b, height // scale, width // scale, layer.channels).permute(0, 3, 1, 2)
+            for scale, layer in ((4, self.gru_quarter), (8, self.gru_eighth))
+        )
+        events = [inputs.new_zeros(b, 4, height, width) for _ in self.memories]
+        moments = [inputs.new_zeros(b, len(self.memories) * MOMENTS, height // 4, width // 4) for _ in self.decays]
+        return [*events, *moments, quarter, eighth]
+
+
+def _moved(
+    stokes: Float[Tensor, "n 2 h w"], events: Float[Tensor, "n m 4 h w"], gains: Float[Tensor, "n g h w"]
+) -> Float[Tensor, "n 2 h w"]:
+    """(s1, s2) after atanh(s1) and atanh(s2) changed by gains times sums of events, in each of its `SURROUNDINGS`."""
+    e0, e45, e90, e135 = events.unbind(2)
+    sums = neighbourhoods(torch.cat([e0 - e90, e45 - e135], dim=1), SURROUNDINGS)
+    of_a, of_b = (torch.cat(parts, dim=1) for parts in zip(*(near.chunk(2, dim=1) for near in sums), strict=True))
+    change = torch.stack([(gains * of_a).sum(1), (gains * of_b).sum(1)], dim=1)
+    return torch.tanh(torch.atanh(MOST_POLARIZED * stokes) + change)
+
+
+def _images(events: Float[Tensor, "n m 4 h w"], count: Float[Tensor, "n 4 h w"]) -> Float[Tensor, "n c h2 w2"]:
+    """What the U-Net sees, at half the size: contrasts of every sum of events, and how many there were."""
+    seen = torch.cat([contrasts(events).flatten(1, 2), count.sum(1, keepdim=True) / 2], dim=1)
+    return F.pixel_unshuffle(compressed(seen), 2).contiguous(memory_format=torch.channels_last)

@@ -1,0 +1,163 @@
+"""Events as a camera gives them: lines of text from standard input or from a file that grows.
+
+The first line is `width height` of the sensor. Each other line is an event: `t x y p angle`, separated by blanks or
+commas; t in whole microseconds, p 1 or 0 (or -1), angle the polarizer's, 0, 45, 90 or 135. A camera with a mosaic of
+polarizers gives `t x y p`. # starts a comment.
+"""
+
+import os
+import stat
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Int64
+
+from polarnet.events.stream import LARGEST_SIDE, Events
+from polarnet.recordings.arrangements import split_mosaic
+from polarnet.recordings.formats.lines import lines_of, numbers_of, rows_of
+from polarnet.recordings.repair import TOLERATED_COUNT, TOLERATED_SHARE
+from polarnet.recordings.source import RecordingError
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
+
+READ_BYTES = 2**20
+POLL_S = 0.001
+DAMAGE = {
+    "unreadable_lines": "lines that are not {columns}",
+    "bad_polarity": "events of a polarity that is not 1, 0 or -1",
+    "bad_angle": "events of an angle that is not 0, 45, 90 or 135",
+    "out_of_range": "events that are not on the sensor",
+    "late": "events earlier than others that were used already",
+}
+
+
+class Piece(NamedTuple):
+    """What came since the piece before."""
+
+    channels: Sequence[Events]
+    """Of the four polarizers; times count from the first event of the stream."""
+    until_us: int
+    """No event before it will come any more."""
+    read_at: float
+    """By `time.perf_counter`."""
+
+
+class LiveLines:
+    """Lines as they come, in pieces; iterating ends with the input, or after `idle_s` in which a file did not grow.
+
+    Lines that cannot be used are left out and counted in `counts`; late ones are those behind an event that came in a
+    piece before. RecordingError where more than 1 % (and 8) are of one kind, or the first line is no size.
+    """
+
+    def __init__(self, source: BinaryIO, name: str, mosaic: Mosaic | None, idle_s: float):
+        self.name, self.mosaic = name, mosaic
+        self.counts: Counter[str] = Counter()
+        self.seen = 0
+        self._source, self._idle_s = source, idle_s
+        self._grows = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
+        self._rest = b""
+        self._sensor = self._first_line()
+        self.height, self.width = (side // 2 if mosaic else side for side in self._sensor)
+
+    def __iter__(self) -> Iterator[Piece]:
+        columns = "t x y p" if self.mosaic else "t x y p angle"
+        shift = np.zeros(len(columns.split()), np.int64)
+        origin_us, until_us = None, 0
+        for data in self._whole_lines():
+            read_at = time.perf_counter()
+            rows = [*rows_of(data, shift, self.counts, "unreadable_lines")]
+            table = self._usable(np.concatenate(rows)) if rows else np.empty((0, len(shift)), np.int64)
+            self.seen += data.count(b"\n")
+            self._refuse_damage(columns)
+            if len(table) == 0:
+                continue
+            table = table[np.argsort(table[:, 0], kind="stable")]
+            if origin_us is None:
+                origin_us = int(table[0, 0])
+            table[:, 0] -= origin_us
+            late = int(np.searchsorted(table[:, 0], until_us))
+            self.counts["late"] += late
+            if late == len(table):
+                continue
+            table, until_us = table[late:], int(table[-1, 0])
+            yield Piece(self._channels(table), until_us, read_at)
+
+    def _first_line(self) -> tuple[int, int]:
+        for data in self._whole_lines():
+            line, _, rest = data.partition(b"\n")
+            words = [word for one in numbers_of(line) for word in one.words]
+            if len(words) != 2 or not all(w.isdigit() and 0 < int(w) <= LARGEST_SIDE for w in words):
+                break
+            self._rest = rest + self._rest
+            return int(words[1]), int(words[0])
+        raise RecordingError(f"{self.name}: expected a first line `width height` of the sensor, such as `346 260`")
+
+    def _whole_lines(self) -> Iterator[bytes]:
+        """What has come up to the last line end, as soon as it has come; at the end of the input, what is left."""
+        quiet_since = time.monotonic()
+        while True:
+            data, self._rest = self._rest, b""
+            end = data.rfind(b"\n") + 1
+            self._rest = data[end:]
+            if end:
+                yield data[:end]
+                quiet_since = time.monotonic()
+            new = os.read(self._source.fileno(), READ_BYTES)  # what has come, without waiting for more
+            self._rest += new
+            if new:
+                continue
+            if not self._grows or time.monotonic() - quiet_since > self._idle_s:
+                if self._rest.strip():
+                    data, self._rest = self._rest + b"\n", b""
+                    yield data
+                return
+            time.sleep(POLL_S)
+
+    def _usable(self, table: Int64[np.ndarray, "n columns"]) -> Int64[np.ndarray, "m columns"]:
+        height, width = self._sensor
+        checks = {
+            "out_of_range": (table[:, 1] >= 0) & (table[:, 1] < width) & (table[:, 2] >= 0) & (table[:, 2] < height),
+            "bad_polarity": np.abs(table[:, 3]) <= 1,
+            "bad_angle": np.isin(table[:, 4], POLARIZER_ANGLES_DEG) if not self.mosaic else np.ones(len(table), bool),
+        }
+        usable = np.ones(len(table), bool)
+        for kind, good in checks.items():
+            self.counts[kind] += int(np.count_nonzero(~good))
+            usable &= good
+        return table[usable]
+
+    def _refuse_damage(self, columns: str) -> None:
+        for kind, words in DAMAGE.items():
+            if kind != "late" and self.counts[kind] > max(TOLERATED_COUNT, TOLERATED_SHARE * self.seen):
+                raise RecordingError(
+                    f"{self.name}: {self.counts[kind]} of the first {self.seen} lines are "
+                    f"{words.format(columns=f'`{columns}`')}; is the format right, and the size in the first line?"
+                )
+
+    def _channels(self, table: Int64[np.ndarray, "n columns"]) -> list[Events]:
+        if self.mosaic:
+            return split_mosaic(_events(table, *self._sensor), self.mosaic)
+        return [_events(table[table[:, 4] == angle], *self._sensor) for angle in POLARIZER_ANGLES_DEG]
+
+
+def live_lines(channels: Sequence[Events]) -> tuple[bytes, Int64[np.ndarray, " n"], bytes]:
+    """Four channels as `LiveLines` reads them: the first line; the events' times, and their lines in that order."""
+    tables = [
+        np.stack([*(getattr(events, name).numpy().astype(np.int64) for name in "txyp"), np.full(len(events), angle)], 1)
+        for events, angle in zip(channels, POLARIZER_ANGLES_DEG, strict=True)
+    ]
+    table = np.concatenate(tables)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    head = f"{channels[0].width} {channels[0].height}\n".encode()
+    return head, table[:, 0], lines_of(table, " ")
+
+
+def _events(table: Int64[np.ndarray, "n columns"], height: int, width: int) -> Events:
+    t, x, y, p = table[:, :4].T
+    sign = np.where(p > 0, 1, -1)
+    x16, y16, p8 = x.astype(np.int16), y.astype(np.int16), sign.astype(np.int8)
+    tensors = [torch.from_numpy(column) for column in (t.copy(), x16, y16, p8)]
+    return Events(tensors[0], tensors[1], tensors[2], tensors[3], height, width)

@@ -1,0 +1,288 @@
+"""`polarnet recover`: files of event cameras, or a camera that runs, to frames of DoLP and AoLP."""
+
+import dataclasses
+import itertools
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from torch import Tensor
+from tqdm import tqdm
+
+from polarnet.benchmarking import context_of
+from polarnet.config import Config
+from polarnet.evaluation.methods import dolp_checkpoint, why_absent
+from polarnet.evaluation.recoverer import Recoverer, Stream, WindowRecoverer, each_map, stream_of
+from polarnet.events.store import EventStore
+from polarnet.events.stream import Events, downscale
+from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
+from polarnet.networks.blocks import Prediction
+from polarnet.recordings.arrangements import read_four, read_mosaic
+from polarnet.recordings.dot import EVENT_CAPTURES
+from polarnet.recordings.imported import import_targets
+from polarnet.recordings.live import LiveLines, Piece, live_lines
+from polarnet.recordings.recording import Recording, detect_format
+from polarnet.recordings.targets import calibrate_targets
+from polarnet.reports.recovery import RecoveryWriter
+from polarnet.runtime import RuntimeConfig, device_of
+from polarnet.stokes import Mosaic
+from polarnet.weights import shipped_weights
+
+STANDARD_INPUT = "-"
+BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}{postfix}]"
+LIVE_BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """How polarizers stand before the sensor, as far as the user says it."""
+
+    angles: Sequence[int] | None
+    """Degrees, of four files, in their order."""
+    mosaic: Mosaic | None
+    sequence: str | None
+    """Of an event store with several."""
+
+
+class Input(NamedTuple):
+    """Four channels of one size, all at once or piece by piece."""
+
+    name: str
+    height: int
+    width: int
+    pieces: Iterable[Piece]
+    duration_us: int | None
+    """None: not known before the end."""
+
+
+class Frame(NamedTuple):
+    """What was recovered from a window, on the CPU, and how long it took."""
+
+    window: EventWindow
+    found: Prediction
+    step_s: float
+    """From the window's events in memory to the frame in memory."""
+    latency_s: float
+    """From the arrival of the last of the window's events to the frame in memory."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Of a run."""
+
+    frames: int
+    stream_s: float
+    """Up to the end of the last window."""
+    run_s: float
+    step_ms: float
+    """Median."""
+    latency_ms: float | None
+    """Median; None where all events were there from the start."""
+    latency_ms_95: float | None
+    """95 % of the frames came faster."""
+
+    @property
+    def realtime_factor(self) -> float:
+        """Seconds of the recording in a second of work."""
+        return self.stream_s / self.run_s
+
+
+def open_files(
+    paths: Sequence[Path],
+    arrangement: Arrangement,
+    read: Callable[[Path], Recording],
+    size: tuple[int, int] | None,
+    work: Path,
+    config: Callable[[], Config],
+) -> Input:
+    """What the files hold, as four channels from time 0 on, reduced to `size` (height, width) if given.
+
+    Four files are one for each of `arrangement.angles`, read by `read`; one file is a camera with a mosaic, an event
+    store, or a folder of division-of-time captures, which is calibrated as `config` says, in `work`. ValueError or
+    FileNotFoundError that says what is missing.
+    """
+    missing = [str(path) for path in paths if not path.exists()]
+    if missing:
+        raise FileNotFoundError(f"{', '.join(missing)}: there is no such file")
+    name = paths[0].name if len(paths) == 1 else ", ".join(path.name for path in paths)
+    channels = _channels(paths, arrangement, read, work, config)
+    duration_us = max((int(events.t[-1]) + 1 for events in channels if len(events)), default=0)
+    if size is not None:
+        channels = [downscale(events, *size, keep_rate=True) for events in channels]
+    pieces = [Piece(channels, duration_us, time.perf_counter())]
+    return Input(name, channels[0].height, channels[0].width, pieces, duration_us)
+
+
+def _channels(
+    paths: Sequence[Path],
+    arrangement: Arrangement,
+    read: Callable[[Path], Recording],
+    work: Path,
+    config: Callable[[], Config],
+) -> Sequence[Events]:
+    if len(paths) == 4:
+        if arrangement.angles is None:
+            raise ValueError("four files: say the polarizer of each, in their order, such as --angles 0 45 90 135")
+        if len(set(arrangement.angles)) < 4:
+            raise ValueError(f"four files: expected four different angles, got {list(arrangement.angles)}")
+        return read_four(dict(zip(arrangement.angles, paths, strict=True)), read=read)
+    if len(paths) != 1:
+        raise ValueError(f"expected one file or folder, or four files with --angles, got {len(paths)}")
+    (path,) = paths
+    if arrangement.mosaic is not None:
+        return read_mosaic(path, arrangement.mosaic, read)
+    if path.is_dir() and any(path.glob(f"{EVENT_CAPTURES[0]}.*")):
+        return _captures(path, work, config())
+    if detect_format(path) == "store":
+        return _sequence(EventStore.open(path), path, arrangement.sequence)
+    raise ValueError(
+        f"{path.name} is one file of events: say where the polarizers of its pixels are, such as --mosaic "
+        f"'90 45 / 135 0', or give four files with --angles, an event store, or a folder of {EVENT_CAPTURES[0]}.*, ..."
+    )
+
+
+def _sequence(store: EventStore, path: Path, sequence: str | None) -> Sequence[Events]:
+    if sequence is None and len(store.sequences) == 1:
+        (sequence,) = store.sequences
+    if sequence not in store.sequences:
+        names = ", ".join(store.sequences[:8]) + (", ..." if len(store.sequences) > 8 else "")
+        raise ValueError(f"{path.name}: say --sequence, one of {names}; got {sequence!r}")
+    return store.read(sequence)
+
+
+def _captures(folder: Path, work: Path, config: Config) -> Sequence[Events]:
+    root = work / "targets"
+    root.mkdir(parents=True, exist_ok=True)
+    target = root / folder.resolve().name
+    if not target.exists():
+        target.symlink_to(folder.resolve(), target_is_directory=True)
+    import_targets(root, work / "imported", config.recordings)
+    calibrate_targets(work / "imported", work / "calibrated", config.recordings, {})
+    return EventStore.open(work / "calibrated" / "events.zarr").read(target.name)
+
+
+def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> tuple[Input, LiveLines]:
+    """Lines as they come: from standard input (-), or from a file that grows, until it has not for `idle_s`."""
+    if path != STANDARD_INPUT and not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: there is no such file; - reads standard input")
+    source = sys.stdin.buffer if path == STANDARD_INPUT else open(path, "rb")  # noqa: SIM115 - read until the end
+    name = "standard input" if path == STANDARD_INPUT else Path(path).name
+    lines = LiveLines(source, name, mosaic, idle_s)
+    return Input(name, lines.height, lines.width, lines, None), lines
+
+
+def open_stream(
+    method: str | None, weights: Path | None, device: str, precision: str, config: Callable[[], Config]
+) -> tuple[Stream, str]:
+    """The method that recovers, and words for it.
+
+    A network: of `weights`, else the shipped one, else what the pipeline trained. Another `method` of the benchmark:
+    as `config` says. ValueError or FileNotFoundError that says what is missing.
+    """
+    place = device_of(RuntimeConfig(device, threads=0, workers=1))
+    if method in (None, "ours"):
+        file = weights or _default_weights(config)
+        if not file.is_file():
+            raise FileNotFoundError(f"--weights {file}: expected a checkpoint (NAME.safetensors), there is none")
+        network, metadata = dolp_checkpoint(file, place)
+        return Recoverer((network, metadata), place, precision), f"network {metadata['network']}, {file}"
+    assert method is not None
+    if weights is not None:
+        raise ValueError(f"--weights is for the DoLP network; set baselines.weights.{method} for {method}")
+    context = dataclasses.replace(context_of(config(), 0.0), device=place, precision=precision)
+    if reason := why_absent(method, context):
+        raise ValueError(f"--method {method}: {reason}")
+    return stream_of(method, context), method
+
+
+def _default_weights(config: Callable[[], Config]) -> Path:
+    try:
+        return shipped_weights()
+    except FileNotFoundError as absent:
+        try:
+            trained = Path(config().paths.train) / "best.safetensors"
+        except FileNotFoundError:
+            raise absent from None
+        if trained.is_file():
+            return trained
+        raise
+
+
+def frames_of(source: Input, rule: WindowRule, stream: Stream) -> Iterator[Frame]:
+    """A frame for each window, as soon as the window's last event has come."""
+    if isinstance(stream, WindowRecoverer):
+        stream.prepare(source.height, source.width)
+    cutter = WindowCutter(rule, source.height, source.width)
+    for piece in source.pieces:
+        for window in cutter.add(piece.channels, piece.until_us):
+            start = time.perf_counter()
+            found = each_map(stream.step(window), Tensor.cpu)
+            done = time.perf_counter()
+            yield Frame(window, found, done - start, done - piece.read_at)
+
+
+def recover(source: Input, rule: WindowRule, stream: Stream, writer: RecoveryWriter) -> Summary:
+    """Recover and write every frame, behind a progress bar; ValueError where there is not one window."""
+    live = source.duration_us is None
+    steps: list[float] = []
+    latencies: list[float] = []
+    last_us, started = 0, time.perf_counter()
+    with (
+        writer,
+        tqdm(total=source.duration_us, desc="recover", unit_scale=1e-6, bar_format=LIVE_BAR if live else BAR) as bar,
+    ):
+        for frame in frames_of(source, rule, stream):
+            writer.add(frame.window, frame.found)
+            steps.append(frame.step_s)
+            latencies.append(frame.latency_s)
+            bar.update(frame.window.stop_us - last_us)
+            last_us = frame.window.stop_us
+            shown = {"latency": f"{1000 * frame.latency_s:.1f} ms"} if live else {}
+            bar.set_postfix(frames=len(steps), step=f"{1000 * frame.step_s:.1f} ms", refresh=False, **shown)
+    if not steps:
+        raise ValueError(f"{source.name}: its events do not fill one window; give a shorter --window")
+    return Summary(
+        len(steps),
+        last_us * 1e-6,
+        time.perf_counter() - started,
+        1000 * statistics.median(steps),
+        1000 * statistics.median(latencies) if live else None,
+        1000 * sorted(latencies)[int(0.95 * (len(latencies) - 1))] if live else None,
+    )
+
+
+def facts_of(source: Input, rule: WindowRule, words: str, summary: Summary) -> dict[str, str]:
+    """What the page and the terminal say about a run."""
+    length = f"{rule.length_us / 1000:g} ms" if rule.length_us is not None else f"{rule.events:,} events"
+    step = "one after the other" if rule.step_us is None else f"one every {rule.step_us / 1000:g} ms"
+    facts = {
+        "input": source.name,
+        "size": f"{source.height} x {source.width} px",
+        "method": words,
+        "windows": f"of {length}, {step}",
+        "frames": f"{summary.frames:,} of {summary.stream_s:.3f} s",
+        "step": f"{summary.step_ms:.2f} ms (median)",
+    }
+    if summary.latency_ms is None:
+        return facts | {"time": f"{summary.run_s:.2f} s, {summary.realtime_factor:.2f} times as fast as real time"}
+    return facts | {"latency": f"{summary.latency_ms:.1f} ms (median), 95 % within {summary.latency_ms_95:.1f} ms"}
+
+
+def replay(store: EventStore, sequence: str, speed: float, write: Callable[[bytes], object]) -> None:
+    """Write a sequence as `LiveLines` reads it, at the pace at which it was recorded, times `speed`."""
+    head, times, lines = live_lines(store.read(sequence))
+    write(head)
+    ends = [0, *itertools.accumulate(map(len, lines.splitlines(keepends=True)))]
+    started, sent = time.perf_counter(), 0
+    while sent < len(times):
+        due_us = int((time.perf_counter() - started) * 1e6 * speed)
+        come = int(times.searchsorted(due_us, side="right"))
+        if come > sent:
+            write(lines[ends[sent] : ends[come]])
+            sent = come
+        else:
+            time.sleep(0.001)

@@ -1,0 +1,14 @@
+"""The weights that come with the package, and where they are."""
+
+from pathlib import Path
+
+
+def shipped_weights() -> Path:
+    """The checkpoint of the network `polarnet`; FileNotFoundError, which says what to do, where there is none."""
+    path = Path(__file__).parent / "polarnet.safetensors"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path} is not there: this version ships no weights. Give --weights FILE, the best.safetensors of a "
+            f"training (`dvc repro train` leaves one in data/train), or --method highpass, which needs none"
+        )
+    return path

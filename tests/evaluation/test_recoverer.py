@@ -1,0 +1,105 @@
+import pytest
+import torch
+
+from polarnet.evaluation.methods import METHODS, recover
+from polarnet.evaluation.recoverer import STREAMED, Recoverer, StateHistory, stream_of
+from polarnet.events.stream import slice_time
+from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
+from polarnet.networks.blocks import Prediction
+from polarnet.networks.checkpoint import load_network
+
+WINDOW_US = 1000
+CONSECUTIVE = WindowRule(WINDOW_US, None, None)
+
+
+def windows_of(recording, rule=CONSECUTIVE):
+    first = recording.events[0]
+    cutter = WindowCutter(rule, first.height, first.width)
+    return list(cutter.add(recording.events, int(recording.t_us[-1])))
+
+
+@pytest.fixture
+def tie_free(recording):
+    """Without events at the very times of the frames, which belong to the window after for one, before for another."""
+    for events in recording.events:
+        events.t[events.t % WINDOW_US == 0] += 1
+    return recording
+
+
+def test_all_methods_but_the_constants_are_streams():
+    assert set(STREAMED) == set(METHODS) - {"zeros", "train_mean", "oracle_mean"}
+
+
+@pytest.mark.parametrize("method", STREAMED)
+def test_a_stream_gives_what_the_method_gives_for_the_whole_recording(method, tie_free, context):
+    stream = stream_of(method, context)
+    expected = recover(method, tie_free, context)
+    found = [stream.step(window) for window in windows_of(tie_free)]
+    assert stream.windows == len(found) == 4
+    torch.testing.assert_close(torch.stack([one.dolp for one in found]), expected.dolp, atol=2e-5, rtol=1e-4)
+    if expected.aolp is None:
+        assert found[0].aolp is None
+    else:
+        angle = torch.stack([one.aolp for one in found]) - expected.aolp
+        assert (torch.sin(angle).abs() * expected.dolp).max() < 1e-3  # of period pi, and undefined without polarization
+    stream.reset()
+    torch.testing.assert_close(stream.step(windows_of(tie_free)[0]).dolp, found[0].dolp)
+
+
+def test_many_streams_at_once_give_what_each_gives_alone(make_recording, checkpoints):
+    network = load_network(checkpoints["ours_checkpoint"])
+    recordings = [windows_of(make_recording(seed=seed)) for seed in range(3)]
+    together, alone = Recoverer(network), Recoverer(network)
+    together.prepare(18, 20, streams=3)
+    batches = [together.step_many(windows).dolp for windows in zip(*recordings, strict=True)]
+    for k, windows in enumerate(recordings):
+        alone.reset()
+        for window, batch in zip(windows, batches, strict=True):
+            torch.testing.assert_close(alone.step(window).dolp, batch[k], atol=1e-5, rtol=1e-4)
+    with pytest.raises(ValueError, match=r"until reset\(\), of 3 streams, got 2"):
+        together.step_many([recordings[0][0]] * 2)
+    with pytest.raises(ValueError, match="expected windows of one time"):
+        alone.step_many(recordings[0][:2])
+
+
+def test_overlapping_windows_continue_those_that_ended_where_they_begin(recording, context):
+    """Every quarter of a window: the fourth part of the frames is what windows one after the other give."""
+    overlapping = stream_of("ours", context)
+    frames = {w.stop_us: overlapping.step(w).dolp for w in windows_of(recording, WindowRule(WINDOW_US, None, 250))}
+    for shift_us in (0, 250, 500, 750):
+        events = [slice_time(one, shift_us, 10**6) for one in recording.events]
+        alone = stream_of("ours", context)
+        for stop_us in range(shift_us + WINDOW_US, 4001, WINDOW_US):
+            channels = [slice_time(one, stop_us - WINDOW_US, stop_us) for one in events]
+            first = [int((one.t < stop_us - WINDOW_US).sum()) for one in events]
+            expected = alone.step(EventWindow(channels, stop_us - WINDOW_US, stop_us, first)).dolp
+            torch.testing.assert_close(frames[stop_us], expected, atol=1e-5, rtol=1e-4)
+
+
+def test_a_bounded_number_of_states_is_kept_however_fine_the_steps():
+    history, length = StateHistory(), 33_300
+    for stop in range(length, 20 * length, 100):
+        window = EventWindow([], stop - length, stop, [])
+        state = history.before(window)
+        assert (state is None) == (stop < 2 * length)
+        if state is not None:
+            assert 0 <= window.start_us - state < length / 64 + 100
+        history.after(window, stop)
+    assert len(history._left) <= 66
+
+
+def test_more_than_dolp_is_handed_on_where_the_network_says_more(recording):
+    class Sure(torch.nn.Module):
+        def forward(self, inputs, state):
+            maps = inputs[:, 0]
+            return Prediction(3 + maps, 0.5 + 0 * maps, maps), [maps]
+
+    found = Recoverer((Sure(), {"representation": "voxel_grid"})).step(windows_of(recording)[0])
+    assert found.dolp.max() <= 1
+    assert found.aolp.unique().tolist() == [0.5]
+    assert found.log_variance.shape == (18, 20)
+
+
+def test_a_constant_is_no_stream(context):
+    with pytest.raises(ValueError, match="expected a method of cf, "):
+        stream_of("oracle_mean", context)

@@ -1,0 +1,131 @@
+import itertools
+
+import pytest
+import torch
+
+from polarnet.events.representations import event_tensor
+from polarnet.events.stream import Events, slice_count, slice_time
+from polarnet.events.streaming import SlidingEventTensor, WindowCutter, WindowRule, parse_window
+
+HEIGHT, WIDTH, DURATION_US = 6, 8, 20_000
+
+
+def random_events(seed, count=300):
+    generator = torch.Generator().manual_seed(seed)
+    t = torch.randint(DURATION_US, (count,), generator=generator).sort().values
+    x = torch.randint(WIDTH, (count,), generator=generator).short()
+    y = torch.randint(HEIGHT, (count,), generator=generator).short()
+    p = (2 * torch.randint(2, (count,), generator=generator) - 1).to(torch.int8)
+    return Events(t, x, y, p, HEIGHT, WIDTH)
+
+
+CHANNELS = [random_events(seed) for seed in range(4)]
+
+
+def windows(rule, pieces=1):
+    """What the cutter gives where the stream comes in so many pieces."""
+    cutter = WindowCutter(rule, HEIGHT, WIDTH)
+    edges = [DURATION_US * k // pieces for k in range(pieces + 1)]
+    return [
+        window
+        for start, stop in itertools.pairwise(edges)
+        for window in cutter.add([slice_time(events, start, stop) for events in CHANNELS], stop)
+    ]
+
+
+@pytest.mark.parametrize("rule", [
+    WindowRule(3000, None, None), WindowRule(3000, None, 500), WindowRule(None, 100, None), WindowRule(None, 100, 700),
+])  # fmt: skip
+@pytest.mark.parametrize("pieces", [1, 7, 501])
+def test_windows_do_not_depend_on_the_pieces_in_which_a_stream_comes(rule, pieces):
+    whole, cut = windows(rule), windows(rule, pieces)
+    assert [(w.start_us, w.stop_us, w.first) for w in whole] == [(w.start_us, w.stop_us, w.first) for w in cut]
+    for a, b in zip(whole, cut, strict=True):
+        for ours, theirs, all_of_them in zip(a.channels, b.channels, CHANNELS, strict=True):
+            assert torch.equal(ours.t, theirs.t)
+            assert torch.equal(ours.x, slice_time(all_of_them, a.start_us, a.stop_us).x)
+
+
+def test_consecutive_windows_of_a_time_hold_every_event_once():
+    found = windows(WindowRule(4000, None, None))
+    assert [(w.start_us, w.stop_us) for w in found] == [(0, 4000), (4000, 8000), (8000, 12000), (12000, 16000),
+                                                        (16000, 20000)]  # fmt: skip
+    assert sum(len(events) for w in found for events in w.channels) == 4 * 300
+
+
+def test_overlapping_windows_are_whole_ones_that_end_at_every_step():
+    found = windows(WindowRule(5000, None, 100))
+    assert [w.stop_us for w in found] == list(range(5000, 20001, 100))
+    assert {w.stop_us - w.start_us for w in found} == {5000}
+
+
+def test_windows_of_a_number_follow_each_other_and_hold_it():
+    found = windows(WindowRule(None, 90, None))
+    assert all(90 <= sum(map(len, w.channels)) < 95 for w in found)  # events of one time stay together
+    assert all(after.start_us == before.stop_us for before, after in itertools.pairwise(found))
+    last = windows(WindowRule(None, 90, 1000))
+    assert [w.stop_us for w in last] == list(range(last[0].stop_us, 20001, 1000))
+    assert all(90 <= sum(map(len, w.channels)) < 95 for w in last)
+
+
+@pytest.mark.parametrize(("text", "rule"), [
+    ("33.3ms", (33_300, None)), ("100 us", (100, None)), ("1s", (1_000_000, None)), ("20000ev", (None, 20_000)),
+    ("500events", (None, 500)),
+])  # fmt: skip
+def test_a_window_is_a_time_or_a_number_of_events(text, rule):
+    assert parse_window(text) == rule
+
+
+@pytest.mark.parametrize("text", ["33", "ms", "1.5ev", "-3ms", "20 000ev"])
+def test_a_window_without_a_unit_is_refused(text):
+    with pytest.raises(ValueError, match=r"such as 33\.3ms or a number of events"):
+        parse_window(text)
+
+
+@pytest.mark.parametrize(("rule", "reason"), [
+    ((None, None, None), "a time or of a number"), ((50, None, None), "at least 100 us"),
+    ((None, 1, None), "at least 2 events"), ((1000, None, 50), r"at least 0\.1 ms"),
+    ((1000, None, 2000), "events between windows would be lost"),
+])  # fmt: skip
+def test_rules_that_make_no_windows_are_refused(rule, reason):
+    with pytest.raises(ValueError, match=reason):
+        WindowRule(*rule)
+
+
+@pytest.mark.parametrize("rule", [
+    WindowRule(3000, None, 100), WindowRule(3000, None, 2900), WindowRule(3000, None, None), WindowRule(None, 50, 300),
+])  # fmt: skip
+def test_the_tensor_kept_up_to_date_is_that_of_the_window_cut_out_anew(rule):
+    sliding = SlidingEventTensor(HEIGHT, WIDTH)
+    for window in windows(rule):
+        sliding.move_to(window.first[1], window.channels[1])
+        expected = event_tensor(window.channels[1], window.length_us)
+        torch.testing.assert_close(sliding.tensor(window.length_us), expected, atol=1e-5, rtol=1e-5)
+
+
+def test_an_event_that_comes_and_goes_leaves_nothing():
+    events, sliding, anew = CHANNELS[0], SlidingEventTensor(HEIGHT, WIDTH), SlidingEventTensor(HEIGHT, WIDTH)
+    for first in range(296):
+        sliding.move_to(first, slice_count(events, first, first + 5))
+    anew.move_to(295, slice_count(events, 295, 300))
+    assert torch.equal(sliding.tensor(1000), anew.tensor(1000))
+
+
+def test_a_step_touches_the_events_of_the_step_alone(monkeypatch):
+    events, sliding, touched = CHANNELS[0], SlidingEventTensor(HEIGHT, WIDTH), []
+    sliding.move_to(0, slice_count(events, 0, 100))
+    add = sliding._add
+    monkeypatch.setattr(sliding, "_add", lambda part, sign: touched.append(len(part)) or add(part, sign))
+    sliding.move_to(7, slice_count(events, 7, 104))
+    assert touched == [7, 4]
+
+
+def test_a_window_only_goes_forward():
+    sliding = SlidingEventTensor(HEIGHT, WIDTH)
+    sliding.move_to(10, slice_count(CHANNELS[0], 10, 20))
+    with pytest.raises(ValueError, match="a window only goes forward"):
+        sliding.move_to(9, slice_count(CHANNELS[0], 9, 30))
+
+
+def test_before_any_event_there_is_nothing_to_see():
+    assert not SlidingEventTensor(HEIGHT, WIDTH).tensor(1000).any()

@@ -1,0 +1,97 @@
+import math
+
+import pytest
+import torch
+
+from polarnet.networks.redundancy import MOMENTS, LeastSquares, SecondMoments, faded, neighbourhoods
+from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
+
+
+def changes(dolp: float, aolp: float, count: int, size: float) -> torch.Tensor:
+    """How much the four log intensities of `count` pixels change where light and polarization vary by about `size`."""
+    torch.manual_seed(0)
+    s0, degree, angle = torch.tensor([0.5, dolp, aolp]).double().view(3, 1, 1) + size * torch.randn(3, 2, count)
+    before, after = intensities_from_stokes(stokes_from_polarization(s0, degree, angle)).log().unbind(1)
+    return (after - before).float()
+
+
+def noiseless(memories: int = 1) -> SecondMoments:
+    moments = SecondMoments(memories)
+    with torch.no_grad():
+        for parameter in moments.parameters():
+            parameter.fill_(-torch.inf)
+    return moments
+
+
+@pytest.mark.parametrize(("dolp", "aolp"), [(0.6, 0.3), (0.3, 2.0), (0.8, 1.2), (0.05, 0.0)])
+@torch.no_grad()
+def test_polarization_follows_from_small_changes_of_the_logarithms_alone(dolp, aolp):
+    moments = noiseless()(1e4 * changes(dolp, aolp, 400, 1e-3).view(1, 1, 4, 1, 400))
+    solve = LeastSquares(1, 1, 1)
+    solve.log_ridge.fill_(-torch.inf)
+    s1, s2, _ = solve(moments.mean((-1, -2), keepdim=True)[:, :, None, None])
+    assert s1.item() == pytest.approx(dolp * math.cos(2 * aolp), abs=0.02)
+    assert s2.item() == pytest.approx(dolp * math.sin(2 * aolp), abs=0.02)
+
+
+@torch.no_grad()
+def test_moments_by_hand():
+    e0, e45, e90, e135 = 3.0, 1.0, -1.0, 2.0  # A = 4, B = -1, C = -1
+    events = torch.tensor([e0, e45, e90, e135]).view(1, 1, 4, 1, 1)
+    assert noiseless()(events).flatten().tolist() == [16, -4, 1, -4, 1, 7]
+    noisy = SecondMoments(1)
+    noisy.log_activity.fill_(math.log(0.2))
+    noisy.log_mismatch.fill_(math.log(0.1))
+    noisy.log_step.fill_(math.log(0.5))
+    variance = [0.1 * e * e + 0.5 * abs(e) for e in (e0, e45, e90, e135)]  # 2.4, 0.6, 0.6, 1.4
+    expected = [16 - 2.4 - 0.6, -4, 1 - 0.6 - 1.4, -4 - 2.4 + 0.6, 1 + 0.6 - 1.4, 7]
+    assert variance == pytest.approx([2.4, 0.6, 0.6, 1.4])
+    torch.testing.assert_close(noisy(events).flatten(), torch.tensor(expected) / (1 + 0.2 * 15))
+
+
+@torch.no_grad()
+def test_noise_of_thresholds_and_steps_leaves_no_bias():
+    torch.manual_seed(0)
+    true = torch.tensor([30.0, -20.0, 10.0, 25.0]).view(1, 1, 4, 1, 1)
+    noisy = true * (1 + 0.15 * torch.randn(1, 1, 4, 500, 500))
+    corrected = SecondMoments(1)
+    corrected.log_activity.fill_(-torch.inf)
+    corrected.log_step.fill_(-torch.inf)
+    corrected.log_mismatch.fill_(math.log(0.15**2 / (1 + 0.15**2)))  # of what is seen, which holds the noise too
+    found, plain, truth = (
+        moments(events).mean((-1, -2)).flatten()[: MOMENTS - 1]
+        for moments, events in ((corrected, noisy), (noiseless(), noisy), (noiseless(), true))
+    )
+    torch.testing.assert_close(found, truth, atol=3.0, rtol=0)
+    assert (plain - truth).abs().max() > 15
+
+
+@torch.no_grad()
+def test_without_events_nothing_is_polarized_and_nothing_is_infinite():
+    s1, s2, steps = LeastSquares(1, 1, 1)(SecondMoments(1)(torch.zeros(1, 1, 4, 2, 2))[:, :, None, None])
+    assert not s1.any()
+    assert not s2.any()
+    assert not steps.any()
+
+
+@torch.no_grad()
+def test_solutions_stay_physical_whatever_the_moments():
+    torch.manual_seed(0)
+    moments = 100 * torch.randn(5, 2, 3, 2, MOMENTS, 4, 4)
+    moments[:, :, :, :, -1].abs_()  # a number of steps
+    s1, s2, _ = LeastSquares(2, 3, 2)(moments)
+    assert s1.shape == (5, 12, 4, 4)
+    assert torch.hypot(s1, s2).max() <= 1 + 1e-5
+
+
+def test_running_sums_fade():
+    sums = faded(torch.tensor([[1.0], [1.0], [2.0]]), 0.5, torch.tensor([4.0]))
+    assert sums.flatten().tolist() == [3.0, 2.5, 3.25]
+
+
+def test_neighbourhoods_are_means_of_what_lies_inside_the_image():
+    x = torch.arange(9.0).view(1, 1, 3, 3)
+    one, three, everything = neighbourhoods(x, [1, 3, 0])
+    assert torch.equal(one, x)
+    assert three[0, 0, 0].tolist() == [2.0, 2.5, 3.0]
+    assert everything.unique().tolist() == [4.0]

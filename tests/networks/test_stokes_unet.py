@@ -1,0 +1,106 @@
+import math
+
+import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.networks.stokes_unet import StokesUNet, StokesUNetConfig
+
+CONFIG = StokesUNetConfig(channels=[8, 8, 8], memories=[0.0, 0.5], decays=[0.7, 0.9], scales=[1, 3, 0])
+
+
+def network() -> StokesUNet:
+    torch.manual_seed(0)
+    built = StokesUNet(CONFIG)
+    for last in (built.choose, built.add):  # which begin with zeros
+        torch.nn.init.normal_(last.weight, std=0.1)
+    return built.eval()
+
+
+def events(*shape: int) -> torch.Tensor:
+    torch.manual_seed(1)
+    return torch.randint(-3, 4, shape).float()
+
+
+@torch.no_grad()
+def test_any_height_and_width_come_back_with_everything_predicted():
+    for height, width in ((16, 24), (17, 22), (120, 180)):
+        prediction, state = network()(events(2, 8, height, width))
+        assert prediction.aolp is not None
+        assert prediction.log_variance is not None
+        assert prediction.stokes is not None
+        assert {field.shape for field in (prediction.dolp, prediction.aolp, prediction.log_variance)} == {
+            (2, height, width)
+        }
+        assert prediction.stokes.shape == (2, 2, height, width)
+        assert prediction.aolp.min() >= 0
+        assert prediction.aolp.max() < math.pi
+        assert len(state) == 2 + 2 + 2
+
+
+@torch.no_grad()
+def test_windows_at_once_are_windows_one_by_one_with_the_state_carried():
+    built, windows = network(), events(5, 2, 8, 18, 20)
+    together, last = built.unroll(windows)
+    state = None
+    for number, window in enumerate(windows):
+        prediction, state = built(window, state)
+        for field, expected in zip(prediction, together, strict=True):
+            torch.testing.assert_close(field, expected[number], atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(state, last, atol=1e-4, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_streams_of_a_batch_do_not_mix():
+    built, windows = network(), events(2, 3, 8, 16, 24)
+    together, _ = built.unroll(windows)
+    alone, _ = built.unroll(windows[:, 1:2])
+    torch.testing.assert_close(together.dolp[:, 1:2], alone.dolp, atol=1e-4, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_before_training_it_says_the_mean_of_the_candidates_and_of_the_constant():
+    torch.manual_seed(0)
+    prediction, _ = StokesUNet(CONFIG)(torch.zeros(1, 8, 16, 16))
+    torch.testing.assert_close(prediction.dolp, torch.full((1, 16, 16), 0.3 / 13), atol=1e-5, rtol=0)
+
+
+def test_every_parameter_has_a_gradient_from_two_windows():
+    built = network()
+    prediction, _ = built.unroll(events(2, 1, 8, 16, 16))
+    assert prediction.stokes is not None
+    assert prediction.log_variance is not None
+    (prediction.dolp.sum() + prediction.stokes.square().sum() + prediction.log_variance.sum()).backward()
+    assert [name for name, p in built.named_parameters() if p.grad is None or not p.grad.any()] == []
+
+
+@torch.no_grad()
+def test_it_costs_at_most_three_times_what_the_papers_network_costs():
+    def flops(built: torch.nn.Module, channels: int) -> int:
+        with FlopCounterMode(display=False) as counter:
+            built(torch.zeros(1, channels, 120, 180))
+        return counter.get_total_flops()
+
+    shipped = StokesUNetConfig(
+        channels=[32, 64, 96], memories=[0.0, 0.6, 0.85, 0.97], decays=[0.8, 0.98], scales=[1, 3, 9, 0]
+    )
+    paper = DolpUNetConfig(
+        channels=[32, 64, 128],
+        swin_depth=2,
+        swin_window=5,
+        swin_heads=[2, 4],
+        residual_blocks=2,
+        input_mixing="polarizers",
+    )
+    assert flops(StokesUNet(shipped), 8) < 3 * flops(DolpUNet(paper), 4)
+
+
+def test_other_input_than_counts_of_events_is_refused():
+    with pytest.raises(ValueError, match=r"takes 8 images \(representation event_counts\), got 4"):
+        StokesUNet(CONFIG, 4)
+
+
+def test_a_neighbourhood_needs_a_middle():
+    with pytest.raises(ValueError, match="scales: expected odd numbers"):
+        StokesUNetConfig(channels=[8, 8, 8], memories=[0.0], decays=[0.9], scales=[2])

@@ -1,0 +1,178 @@
+import io
+import re
+
+import numpy as np
+import pytest
+import torch
+import zarr
+
+from polarnet.cli import main
+from polarnet.config import load
+from polarnet.evaluation.recoverer import Recoverer
+from polarnet.events.store import EventStore
+from polarnet.events.stream import Events
+from polarnet.events.streaming import WindowRule
+from polarnet.networks.checkpoint import load_network, save_checkpoint
+from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.recordings.formats.lines import lines_of
+from polarnet.recordings.live import live_lines
+from polarnet.recordings.recording import read_recording
+from polarnet.recover import Arrangement, frames_of, open_files, replay
+from polarnet.weights import shipped_weights
+
+HEIGHT, WIDTH, DURATION_US, ANGLES = 16, 20, 100_000, (0, 45, 90, 135)
+NETWORK = {
+    "channels": [4, 8, 8], "swin_depth": 2, "swin_window": 4, "swin_heads": [2, 2], "residual_blocks": 1,
+    "input_mixing": "contrasts",
+}  # fmt: skip
+
+
+def random_events(seed, height=HEIGHT, width=WIDTH, count=2000):
+    generator = np.random.default_rng(seed)
+    t = np.sort(generator.integers(0, DURATION_US, count))
+    t[0], t[-1] = 0, DURATION_US - 1
+    x, y = generator.integers(0, width, count), generator.integers(0, height, count)
+    p = generator.choice([-1, 1], count)
+    columns = (t, x.astype(np.int16), y.astype(np.int16), p.astype(np.int8))
+    return Events(*map(torch.from_numpy, columns), height, width)
+
+
+@pytest.fixture(scope="module")
+def channels():
+    return [random_events(seed) for seed in range(4)]
+
+
+@pytest.fixture(scope="module")
+def store(channels, tmp_path_factory):
+    path = tmp_path_factory.mktemp("store") / "events.zarr"
+    writer = EventStore.create(path, ["lake", "road"], HEIGHT, WIDTH, {})
+    for name in writer.sequences:
+        writer.write(name, channels, DURATION_US)
+    writer.finish()
+    return path
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "mine.safetensors"
+    metadata = {"network": "paper", "config": NETWORK, "in_channels": 4, "representation": "event_tensor"}
+    save_checkpoint(path, DolpUNet(DolpUNetConfig(**NETWORK)).state_dict(), metadata)
+    return path
+
+
+@pytest.fixture
+def at_root(project_root, monkeypatch):
+    monkeypatch.chdir(project_root)
+
+
+def write_lines(path, events):
+    table = np.stack([getattr(events, name).numpy().astype(np.int64) for name in "txyp"], axis=1)
+    path.write_bytes(f"{events.width} {events.height}\n".encode() + lines_of(table, " "))
+    return path
+
+
+def opened(store, size=None):
+    """A sequence of a store, for which neither settings nor a folder are needed."""
+    unused = store / "unused"
+    return open_files([store], Arrangement(None, None, "lake"), read_recording, size, unused, lambda: load(unused))
+
+
+def recovered(out):
+    group = zarr.open_group(out / "recovered.zarr", mode="r")
+    return {name: group[name][:] for name in ("t_us", "dolp")}
+
+
+def run(*arguments, out):
+    return main(["recover", *map(str, arguments), "--out", str(out), "--write", "zarr"])
+
+
+def test_a_store_four_files_and_lines_that_come_give_the_same(store, channels, weights, tmp_path, monkeypatch, capsys):
+    options = ("--weights", weights, "--window", "20ms", "--device", "cpu")
+    assert run(store, "--sequence", "road", *options, out=tmp_path / "a") == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"frames +5 of 0\.100 s", printed)
+    assert "times as fast as real time" in printed
+    files = [write_lines(tmp_path / f"{angle}.txt", channels[angle // 45]) for angle in (90, 0, 135, 45)]
+    assert run(*files, "--angles", 90, 0, 135, 45, *options, out=tmp_path / "b") == 0
+    head, _, lines = live_lines(channels)
+    live = tmp_path / "live.txt"
+    live.write_bytes(head + lines + f"{DURATION_US} 0 0 1 0\n".encode())
+    assert run(live, "--live", "--idle", 0, *options, out=tmp_path / "c") == 0
+    assert re.search(r"latency +[\d.]+ ms \(median\)", capsys.readouterr().out)
+    expected = recovered(tmp_path / "a")
+    assert expected["t_us"].tolist() == [20_000, 40_000, 60_000, 80_000, 100_000]
+    for other in "bc":
+        found = recovered(tmp_path / other)
+        assert found["t_us"].tolist() == expected["t_us"].tolist()
+        np.testing.assert_allclose(found["dolp"].astype(float), expected["dolp"], atol=3)
+
+
+def test_a_mosaic_is_one_file_with_channels_of_half_its_size(tmp_path, at_root):
+    whole = write_lines(tmp_path / "camera.txt", random_events(1, 2 * HEIGHT, 2 * WIDTH))
+    options = ("--mosaic", "90 45 / 135 0", "--method", "cf+gain", "--window", "500ev", "--step", "5ms")
+    assert run(whole, *options, out=tmp_path / "out") == 0
+    assert recovered(tmp_path / "out")["dolp"].shape[1:] == (HEIGHT, WIDTH)
+
+
+def test_windows_that_overlap_give_a_frame_every_tenth_of_a_millisecond(store, weights):
+    source = opened(store)
+    frames = list(frames_of(source, WindowRule(33_333, None, 100), Recoverer(load_network(weights))))
+    ends = [frame.window.stop_us for frame in frames]
+    assert ends == list(range(33_333, DURATION_US + 1, 100))
+    change = torch.stack([frame.found.dolp for frame in frames]).diff(dim=0).abs().mean(dim=(1, 2))
+    assert change.max() < 0.05
+
+
+def test_files_are_reduced_to_the_size_that_is_asked_for(store):
+    source = opened(store, (8, 10))
+    assert (source.height, source.width) == (8, 10)
+    assert source.duration_us == DURATION_US
+
+
+def test_a_sequence_is_replayed_as_lines_at_its_own_pace(store, channels):
+    head, _, lines = live_lines(channels)
+    out = io.BytesIO()
+    replay(EventStore.open(store), "lake", 1000.0, out.write)
+    assert out.getvalue() == head + lines
+
+
+@pytest.mark.parametrize(("arguments", "reason"), [
+    ((), "say --sequence, one of lake, road; got None"),
+    (("--sequence", "lake", "--method", "oracle_mean"), "expected a method of cf"),
+    (("--sequence", "lake", "--method", "e2p"), "is not there"),
+    (("--sequence", "lake", "--method", "cf", "--window", "1s"), "do not fill one window"),
+    (("--sequence", "lake", "--method", "cf", "--step", "9ev"), "expected a time such as 0.1ms"),
+    (("--sequence", "lake", "--method", "cf", "--step", "1s"), "events between windows would be lost"),
+    (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
+    (("--sequence", "lake", "--weights", "nothing.safetensors"), "expected a checkpoint"),
+    (("--live", "--method", "cf", "--size", 8, 10), "--live: expected one file"),
+])  # fmt: skip
+def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, capsys):
+    if "cuda:9" in arguments and torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    method = () if {"--method", "--weights"} & set(arguments) else ("--method", "cf")
+    assert run(store, *arguments, *method, out=tmp_path / "out") == 1
+    assert reason in capsys.readouterr().err
+
+
+def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):
+    one = write_lines(tmp_path / "camera.txt", random_events(1))
+    for files, reason in (
+        ([one], "say where the polarizers of its pixels are"),
+        ([one, one], "four files with --angles, got 2"),
+        ([one] * 4, "say the polarizer of each"),
+        ([one] * 4 + ["--angles", 0, 45, 90, 90], "four different angles"),
+        ([tmp_path / "none.csv"], "there is no such file"),
+    ):
+        assert run(*files, "--method", "cf", out=tmp_path / "out") == 1
+        assert reason in capsys.readouterr().err
+
+
+def test_shipped_weights_are_a_checkpoint_or_say_what_to_do():
+    try:
+        network, _ = load_network(shipped_weights())
+    except FileNotFoundError as absent:
+        assert "--weights FILE" in str(absent)  # noqa: PT017 - a version may ship weights or not
+    else:
+        assert isinstance(network, torch.nn.Module)
