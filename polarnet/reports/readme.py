@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from polarnet.reports.recording_tables import recordings_block
 from polarnet.reports.tables import COLUMNS, COSTS, SET_TITLES, as_markdown, paired_lines, score_table, standing
 
 MARKER = re.compile(r"<!-- (?P<end>/?)results:(?P<name>[\w-]+) -->")
@@ -107,6 +108,11 @@ def emulation_block(results: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def inspection_block(results: Mapping[str, Any]) -> str:
+    """What `polarnet inspect` says of a capture of the simulated rig."""
+    return "\n".join(["```", *results["lines"], "```"])
+
+
 def study_block(results: Mapping[str, Any]) -> str:
     """The networks and the baselines on held-out photographs and on measured scenes, by tests/benchmarks/network.py."""
     study, record = results["study"], results["records"]["study"]
@@ -190,6 +196,8 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "pipeline": pipeline_block,
     "benchmark": benchmark_block,
     "emulation": emulation_block,
+    "recordings": recordings_block,
+    "inspection": inspection_block,
     "network-study": study_block,
     "network-throughput": throughput_block,
 }
@@ -197,6 +205,7 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
 
 UNMEASURED = {
     "emulation": "Not measured yet: `python tests/benchmarks/emulation.py --write` does it.",
+    "recordings": "Not measured yet: `tests/benchmarks/{recordings,fuzz_recordings,rig}.py --write` do it.",
     "network-study": "Not measured yet: `python tests/benchmarks/network.py --write` does it.",
     "network-throughput": "Not measured yet: `python tests/benchmarks/training.py --write` does it.",
 }

@@ -249,7 +249,7 @@ def _photo() -> Path:
     return next(photo.path for photo in BUILTIN_PHOTOS if photo.file == PHOTO)
 
 
-def _few_colours(content: bytes) -> bytes:
+def few_colours(content: bytes) -> bytes:
     """The same picture with a palette: a third of the bytes, and no difference that an eye finds."""
     buffer = io.BytesIO()
     picture = Image.open(io.BytesIO(content)).convert("RGB")
@@ -273,7 +273,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in FIGURES.items():
         path = folder / f"{name}.png"
-        path.write_bytes(_few_colours(png(figure())))
+        path.write_bytes(few_colours(png(figure())))
         print(f"{path}: {path.stat().st_size / 1024:.0f} kB")
 
 

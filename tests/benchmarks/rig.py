@@ -33,15 +33,17 @@ from polarnet.evaluation.methods import available
 from polarnet.evaluation.score import summary
 from polarnet.events.exchange import write_hdf5
 from polarnet.events.frames import FrameStore
+from polarnet.events.stream import Events, slice_time
 from polarnet.measure import BENCHMARK_KEYS, machine_record, uncommitted, write_section
 from polarnet.recordings.dot import EVENT_CAPTURES, RecordingsConfig, read_event_capture
-from polarnet.recordings.imported import import_targets
+from polarnet.recordings.imported import import_targets, shifted
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.registration import event_image, register, warped
 from polarnet.recordings.targets import Calibrated, calibrate_targets, spread_us
 from polarnet.reports.calibration import draw_calibration, draw_hot_pixels, draw_registration
 from polarnet.reports.recordings import recording_picture
+from polarnet.reports.simulation_pictures import few_colours
 from polarnet.reports.tables import as_plain, score_table
 from polarnet.rig import RigConfig, RigTruth, true_dolp, write_rig
 from polarnet.runtime import generator_for
@@ -152,9 +154,12 @@ def draw_documentation(
     (found,) = calibrate_targets(scratch / "imported", scratch / "calibrated", recordings, {})
     draw_calibration(found, recordings, pictures / "recordings_calibration.png")
 
-    one, other = (read_event_capture(scratch / "raw" / name / f"{c}.bin", recordings) for c in EVENT_CAPTURES[:2])
+    one, other = (
+        since_landmark(read_event_capture(scratch / "raw" / name / f"{capture}.bin", recordings), capture, found)
+        for capture in EVENT_CAPTURES[:2]
+    )
     capture = scratch / "events_0.h5"
-    write_hdf5(capture, one, int(one.t[-1]))
+    write_hdf5(capture, one, found.duration_us)
     assert recordings.hot_pixel_factor is not None
     inspection = inspect_recording(open_recording(capture), recordings.hot_pixel_factor)
     (pictures / "recordings_inspect.png").write_bytes(recording_picture(inspection))
@@ -166,7 +171,16 @@ def draw_documentation(
     reference, moving = event_image(one), warped(event_image(other), SECOND_CAMERA)
     homography = register(reference, moving).homography
     draw_registration(reference, moving, warped(moving, homography), pictures / "recordings_registration.png")
-    return sorted(pictures.glob("recordings_*.png"))
+    drawn = sorted(pictures.glob("recordings_*.png"))
+    for path in drawn:
+        path.write_bytes(few_colours(path.read_bytes()))
+    return drawn
+
+
+def since_landmark(events: Events, capture: str, found: Calibrated) -> Events:
+    """The events of a capture by the common clock, as long as all captures last."""
+    start_us = found.start_us[capture]
+    return shifted(slice_time(events, start_us, start_us + found.duration_us), start_us)
 
 
 def main() -> None:

@@ -3,6 +3,7 @@ import json
 import pytest
 
 from polarnet.reports.readme import update_results_blocks
+from polarnet.reports.recording_tables import recordings_block
 
 RESULTS = {
     "setup_minutes": 1.5,
@@ -116,6 +117,37 @@ def test_the_emulation_block_says_how_to_measure_while_nobody_has(project):
         "Not measured yet: `python tests/benchmarks/emulation.py --write`" in (project / "docs/scaling.md").read_text()
     )
     assert update_results_blocks(project, check=True) == []
+
+
+MACHINE = {"machine": "a processor", "cores": 2, "load": 1.0, "versions": {"python": "3.11"}, "commit": "abc1234"}
+
+
+def test_recordings_are_shown_reader_by_reader_with_libraries_beside_them():
+    readers = {
+        "evt2": {"mevents_per_s": 60.25, "peak_mib": {"1M": 12, "10M": 13}},
+        "faery_evt2": {"mevents_per_s": 80.0, "peak_mib": {"1M": 1}},
+        "celex5_csv": {"mevents_per_s": 4.0, "peak_mib": {"1M": 20}},
+    }
+    fuzz = {"cases_per_reader": 10000, "readers": {"evt": {"cases": 10000, "endings": {"read": 1999, "refused": 8001}}}}
+    block = recordings_block({"readers": readers, "fuzz": fuzz, "measured": {"readers": MACHINE, "fuzz": MACHINE}})
+    assert "| format | polarnet | faery | MiB at 1M | MiB at 10M |" in block
+    assert "| `evt2` | 60.2 | 80.0 | 12 | 13 |" in block
+    assert "| `celex5_csv` | 4.0 | - | 20 | - |" in block
+    assert "at least 10,000 for each reader" in block
+    assert "| `evt` | 10,000 | 1,999 | 0 | 8,001 |" in block
+    assert block.count("On 2 cores (a processor, load 1.0 before the start; python 3.11; commit `abc1234`).") == 2
+
+
+def test_the_rig_is_shown_with_its_errors_and_its_benchmark():
+    rig = {
+        "captures": 64, "sensor": [200, 320], "start_error_frames_max": 0.957, "refined_error_ms_max": 0.593,
+        "clock_zero_ms_max": 11.6, "dolp_rms": 0.005, "dolp_rms_max": 0.00685,
+        "benchmark": {"zeros": {"mse": 0.1}, "cf": {"mse": 0.05}},
+    }  # fmt: skip
+    block = recordings_block({"rig": rig, "measured": {"rig": MACHINE}})
+    assert "64 captures of a sensor of 320 x 200 px" in block
+    assert "within 0.96 pictures of the camera, refined ones within 0.59 ms of each other" in block
+    assert "| CF | **0.0500** |" in block
 
 
 def test_a_section_of_a_results_file_has_a_block_of_its_own(project):

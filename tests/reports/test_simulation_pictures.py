@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from polarnet.reports.figures import png
-from polarnet.reports.simulation_pictures import FIGURES, QUIET, _few_colours, light_of_one_pixel, pixel_events
+from polarnet.reports.simulation_pictures import FIGURES, QUIET, few_colours, light_of_one_pixel, pixel_events
 from polarnet.reports.simulation_pictures import parameters_figure as draw
 
 
@@ -23,7 +23,7 @@ def test_half_the_threshold_gives_about_twice_the_events():
 
 
 def test_the_same_picture_is_drawn_each_time_and_lies_beside_the_page(project_root):
-    assert _few_colours(png(draw())) == _few_colours(png(draw()))
+    assert few_colours(png(draw())) == few_colours(png(draw()))
     page = (project_root / "docs" / "simulation.md").read_text()
     for name in FIGURES:
         assert f"pictures/{name}.png" in page
