@@ -16,7 +16,7 @@ def recordings_block(results: Figures) -> str:
     lines: list[str] = []
     for name, lines_of in sections.items():
         if name in results:
-            lines += [*lines_of(results[name]), "", origin(results["measured"][name]), ""]
+            lines += [*lines_of(results[name]), "", origin(results["records"][name]), ""]
     return "\n".join(lines)
 
 

@@ -129,7 +129,7 @@ def test_recordings_are_shown_reader_by_reader_with_libraries_beside_them():
         "celex5_csv": {"mevents_per_s": 4.0, "peak_mib": {"1M": 20}},
     }
     fuzz = {"cases_per_reader": 10000, "readers": {"evt": {"cases": 10000, "endings": {"read": 1999, "refused": 8001}}}}
-    block = recordings_block({"readers": readers, "fuzz": fuzz, "measured": {"readers": MACHINE, "fuzz": MACHINE}})
+    block = recordings_block({"readers": readers, "fuzz": fuzz, "records": {"readers": MACHINE, "fuzz": MACHINE}})
     assert "| format | polarnet | faery | MiB at 1M | MiB at 10M |" in block
     assert "| `evt2` | 60.2 | 80.0 | 12 | 13 |" in block
     assert "| `celex5_csv` | 4.0 | - | 20 | - |" in block
@@ -144,7 +144,7 @@ def test_the_rig_is_shown_with_its_errors_and_its_benchmark():
         "clock_zero_ms_max": 11.6, "dolp_rms": 0.005, "dolp_rms_max": 0.00685,
         "benchmark": {"zeros": {"mse": 0.1}, "cf": {"mse": 0.05}},
     }  # fmt: skip
-    block = recordings_block({"rig": rig, "measured": {"rig": MACHINE}})
+    block = recordings_block({"rig": rig, "records": {"rig": MACHINE}})
     assert "64 captures of a sensor of 320 x 200 px" in block
     assert "within 0.96 pictures of the camera, refined ones within 0.59 ms of each other" in block
     assert "| CF | **0.0500** |" in block
