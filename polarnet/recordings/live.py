@@ -45,7 +45,7 @@ class Piece(NamedTuple):
     until_us: int
     """No event before it will come any more."""
     read_at: float
-    """By `time.perf_counter`."""
+    """When the first of it came, by `time.perf_counter`."""
 
 
 class LiveLines:
@@ -106,6 +106,11 @@ class LiveLines:
             yield data, self._read_at
         while (come := self._queue.get()) is not None:
             data, self._read_at = come
+            while len(data) < READ_BYTES and not self._queue.empty():  # what waits already is one piece
+                if (more := self._queue.get()) is None:
+                    self._queue.put(None)
+                    break
+                data += more[0]
             data = self._rest + data
             end = data.rfind(b"\n") + 1
             self._rest = data[end:]
