@@ -10,6 +10,8 @@ import stat
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from queue import Queue
+from threading import Thread
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
@@ -24,6 +26,7 @@ from polarnet.recordings.source import RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 
 READ_BYTES = 2**20
+MOST_READ_AHEAD = 64  # times READ_BYTES, of a file; a camera does not wait
 POLL_S = 0.001
 DAMAGE = {
     "unreadable_lines": "lines that are not {columns}",
@@ -42,7 +45,7 @@ class Piece(NamedTuple):
     until_us: int
     """No event before it will come any more."""
     read_at: float
-    """By `time.perf_counter`."""
+    """When the first of it came, by `time.perf_counter`."""
 
 
 class LiveLines:
@@ -58,7 +61,9 @@ class LiveLines:
         self.seen = 0
         self._source, self._idle_s = source, idle_s
         self._grows = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
-        self._rest = b""
+        self._rest, self._started_with, self._read_at = b"", b"", 0.0
+        self._queue: Queue[tuple[bytes, float] | None] = Queue(MOST_READ_AHEAD if self._grows else 0)
+        Thread(target=self._read, daemon=True).start()
         self._sensor = self._first_line()
         self.height, self.width = (side // 2 if mosaic else side for side in self._sensor)
 
@@ -66,8 +71,7 @@ class LiveLines:
         columns = "t x y p" if self.mosaic else "t x y p angle"
         shift = np.zeros(len(columns.split()), np.int64)
         origin_us, until_us = None, 0
-        for data in self._whole_lines():
-            read_at = time.perf_counter()
+        for data, read_at in self._whole_lines():
             rows = [*rows_of(data, shift, self.counts, "unreadable_lines")]
             table = self._usable(np.concatenate(rows)) if rows else np.empty((0, len(shift)), np.int64)
             self.seen += data.count(b"\n")
@@ -86,35 +90,54 @@ class LiveLines:
             yield Piece(self._channels(table), until_us, read_at)
 
     def _first_line(self) -> tuple[int, int]:
-        for data in self._whole_lines():
+        for data, _ in self._whole_lines():
             line, _, rest = data.partition(b"\n")
             words = [word for one in numbers_of(line) for word in one.words]
             if len(words) != 2 or not all(w.isdigit() and 0 < int(w) <= LARGEST_SIDE for w in words):
                 break
-            self._rest = rest + self._rest
+            self._started_with = rest
             return int(words[1]), int(words[0])
         raise RecordingError(f"{self.name}: expected a first line `width height` of the sensor, such as `346 260`")
 
-    def _whole_lines(self) -> Iterator[bytes]:
-        """What has come up to the last line end, as soon as it has come; at the end of the input, what is left."""
-        quiet_since = time.monotonic()
-        while True:
-            data, self._rest = self._rest, b""
+    def _whole_lines(self) -> Iterator[tuple[bytes, float]]:
+        """What has come up to a line end, and when it came; at the end of the input, what is left."""
+        if self._started_with:
+            data, self._started_with = self._started_with, b""
+            yield data, self._read_at
+        while (come := self._queue.get()) is not None:
+            data, self._read_at = come
+            while len(data) < READ_BYTES and not self._queue.empty():  # what waits already is one piece
+                if (more := self._queue.get()) is None:
+                    self._queue.put(None)
+                    break
+                data += more[0]
+            data = self._rest + data
             end = data.rfind(b"\n") + 1
             self._rest = data[end:]
             if end:
-                yield data[:end]
-                quiet_since = time.monotonic()
-            new = os.read(self._source.fileno(), READ_BYTES)  # what has come, without waiting for more
-            self._rest += new
-            if new:
-                continue
-            if not self._grows or time.monotonic() - quiet_since > self._idle_s:
-                if self._rest.strip():
-                    data, self._rest = self._rest + b"\n", b""
-                    yield data
-                return
-            time.sleep(POLL_S)
+                yield data[:end], self._read_at
+        self._queue.put(None)  # for whoever asks again
+        if self._rest.strip():
+            data, self._rest = self._rest + b"\n", b""
+            yield data, self._read_at
+
+    def _read(self) -> None:
+        """What comes into the queue with its time, in a thread of its own: whoever recovers may be busy as it comes."""
+        quiet_since = time.monotonic()
+        try:
+            while True:
+                data = os.read(self._source.fileno(), READ_BYTES)  # what is there, without waiting for more
+                if data:
+                    self._queue.put((data, time.perf_counter()))
+                    quiet_since = time.monotonic()
+                elif not self._grows or time.monotonic() - quiet_since > self._idle_s:
+                    return
+                else:
+                    time.sleep(POLL_S)
+        except (OSError, ValueError):  # closed by whoever opened it
+            return
+        finally:
+            self._queue.put(None)
 
     def _usable(self, table: Int64[np.ndarray, "n columns"]) -> Int64[np.ndarray, "m columns"]:
         height, width = self._sensor

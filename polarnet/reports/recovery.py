@@ -56,7 +56,7 @@ class Film(NamedTuple):
     """Pictures below each other as one, which the page's style moves through."""
 
     source: str
-    pictures: int
+    frames: int
     height: int
     width: int
 

@@ -9,7 +9,7 @@ costs the same); the high-pass filter, with and without solved gains. Live, the 
 pace from another process; its latency is that from the arrival of an event to the frame that it completes.
 
 `--write` merges the figures into docs/results/recordings.json under `recover`. `--picture` copies the pictures that
-the high-pass filter with solved gains, or the network of --weights, made of the stream.
+the network made of the stream, the high-pass filter if nobody trained the network.
 """
 
 import argparse
@@ -49,6 +49,7 @@ RESULTS = ROOT / "docs" / "results" / "recordings.json"
 RATE = 1_000_000  # events a second of the four polarizers together
 WINDOWS = WindowRule(33_333, None, None)
 WRITTEN = ("zarr", "png", "mp4")
+UNTRAINED = ", untrained"
 FILTERS = ("highpass", "highpass+gain")
 
 
@@ -71,7 +72,7 @@ def network_of(config: Config, weights: Path | None) -> tuple[Stream, str]:
         representation = config.train.representation
         torch.manual_seed(config.seed)
         module = build(config.network_config, 4 * channels_of(REPRESENTATIONS[representation]))
-        return Recoverer((module, {"representation": representation})), f"{config.network}, untrained"
+        return Recoverer((module, {"representation": representation})), config.network + UNTRAINED
     network, metadata = load_network(weights)
     return Recoverer((network, metadata)), metadata["network"]
 
@@ -134,7 +135,7 @@ def main() -> None:
             figures["methods"][method]["live_latency_ms"] = round(summary.latency_ms or 0.0, 1)
             print(f"{method}, live", asdict(summary), flush=True)
         if arguments.picture:
-            shutil.copy(pictures["network" if arguments.weights else "highpass+gain"], arguments.picture)
+            shutil.copy(pictures["highpass" if name.endswith(UNTRAINED) else "network"], arguments.picture)
     figures |= figures["methods"]["network"]
     print(json.dumps(figures, indent=2))
     if arguments.write:

@@ -97,10 +97,31 @@ def test_late_events_and_single_bad_lines_are_left_out_and_counted(tmp_path):
 
 
 @pytest.mark.parametrize(("text", "reason"), [
-    ("", "expected a first line `width height`"), ("0 0 0 1 0\n", "expected a first line `width height`"),
+    ("", "expected a first line `width height`"), ("hello", "expected a first line"),
+    ("0 0 0 1 0\n", "expected a first line `width height`"),
     ("4 3\n" + "1 2 3\n" * 20, "20 of the first 20 lines are lines that are not `t x y p angle`"),
     ("4 3\n" + "1 7 2 1 0\n" * 20, "not on the sensor"),
 ])  # fmt: skip
 def test_what_is_no_such_stream_is_refused(tmp_path, text, reason):
     with pytest.raises(RecordingError, match=reason):
         read(tmp_path, text)
+
+
+def test_a_size_and_nothing_else_is_a_stream_without_events(tmp_path):
+    for text in ("4 3", "4 3\n"):
+        live, pieces = read(tmp_path, text)
+        assert (live.height, live.width, pieces) == (3, 4, [])
+
+
+def test_lines_keep_the_time_at_which_they_came_while_nobody_reads():
+    reader, writer = os.pipe()
+    with os.fdopen(reader, "rb") as source, os.fdopen(writer, "wb", buffering=0) as camera:
+        camera.write(b"4 3\n")
+        live = LiveLines(source, "pipe", None, idle_s=0.0)
+        before = time.perf_counter()
+        camera.write(b"0 0 0 1 0\n10 0 0 1 0\n")
+        camera.close()
+        while live._queue.qsize() < 2:
+            time.sleep(0.001)
+        after = time.perf_counter()
+        assert all(before <= piece.read_at <= after for piece in live)
