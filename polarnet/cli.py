@@ -9,12 +9,14 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from polarnet import __version__
 
 if TYPE_CHECKING:
     from polarnet.config import Config
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -42,7 +44,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"polarnet {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_pipeline(commands)
+    _add_stores(commands)
+    _add_inspect(commands)
+    _add_recover(commands)
+    _add_benchmark(commands)
+    return parser
 
+
+def _add_pipeline(commands: Commands) -> None:
     doctor = commands.add_parser("doctor", help="what this machine offers: versions, device, bf16, weights, free disk")
     doctor.set_defaults(run=_doctor)
 
@@ -57,6 +67,8 @@ def _parser() -> argparse.ArgumentParser:
     stages = commands.add_parser("stages", help="the names of the stages, in order")
     stages.set_defaults(run=_stages)
 
+
+def _add_stores(commands: Commands) -> None:
     verify = commands.add_parser("verify", help="check every byte of a store of events, frames or scenes")
     verify.add_argument("store", help="folder, zip or fsspec URL")
     verify.set_defaults(run=_verify)
@@ -72,6 +84,8 @@ def _parser() -> argparse.ArgumentParser:
     import_.add_argument("store", type=Path, help="written anew")
     import_.set_defaults(run=_import)
 
+
+def _add_inspect(commands: Commands) -> None:
     inspect = commands.add_parser("inspect", help="what is in a camera's file, and a picture of its busiest moment")
     inspect.add_argument("file", type=Path)
     inspect.add_argument("--format", help="where the content does not show it: text, celex5_csv, celex5_bin, dat, ...")
@@ -87,6 +101,14 @@ def _parser() -> argparse.ArgumentParser:
     inspect.add_argument("--hot-pixels", type=Path, metavar="PNG", help="where to draw how often each pixel fired")
     inspect.set_defaults(run=_inspect)
 
+    register = commands.add_parser("register", help="lay one camera's recording on another's: the homography")
+    register.add_argument("reference", type=Path)
+    register.add_argument("file", type=Path)
+    register.add_argument("--picture", type=Path, help="where to write a PNG of both event images, before and after")
+    register.set_defaults(run=_register)
+
+
+def _add_recover(commands: Commands) -> None:
     recover = commands.add_parser(
         "recover",
         help="DoLP and AoLP of recordings, or of a camera that runs: frames, pictures, a video and a page",
@@ -136,12 +158,8 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument("--speed", type=float, default=1.0, help="times as fast as recorded")
     replay.set_defaults(run=_replay)
 
-    register = commands.add_parser("register", help="lay one camera's recording on another's: the homography")
-    register.add_argument("reference", type=Path)
-    register.add_argument("file", type=Path)
-    register.add_argument("--picture", type=Path, help="where to write a PNG of both event images, before and after")
-    register.set_defaults(run=_register)
 
+def _add_benchmark(commands: Commands) -> None:
     docs = commands.add_parser("docs", help="write docs/results/*.json into the tables of README.md and docs/")
     docs.add_argument("--check", action="store_true", help="change nothing; fail where a table is out of date")
     docs.set_defaults(run=_docs)
@@ -157,7 +175,9 @@ def _parser() -> argparse.ArgumentParser:
     asked.add_argument("--scenes", type=Path, metavar="FOLDER", help="photographs or measurements, in all subfolders")
     asked.add_argument("--event-budget", action="store_true", help="quality against events per pixel (paper, Fig. 11)")
     asked.add_argument("--sensitivity", action="store_true", help="quality against mismatch, noise, speed, channels")
-    benchmark.add_argument("--weights", type=Path, metavar="FILE", help="of the DoLP network; default: trained here, else shipped")
+    benchmark.add_argument(
+        "--weights", type=Path, metavar="FILE", help="of the network; default: trained here, or shipped"
+    )
     benchmark.add_argument(
         "--kind", choices=("auto", "photographs", "polarization"), default="auto",
         help="what lies in FOLDER; auto takes .npz files and NAME_0, NAME_45, ... for measured polarization",
@@ -174,7 +194,6 @@ def _parser() -> argparse.ArgumentParser:
         help="pipeline: time the README's two commands in a fresh clone of HEAD; benchmark: what data/benchmark holds",
     )  # fmt: skip
     measure.set_defaults(run=_measure)
-    return parser
 
 
 def _doctor(options: argparse.Namespace) -> int:

@@ -43,14 +43,24 @@ def read_results(root: Path, name: str) -> dict[str, Any]:
     return json.loads(path.read_text()) if path.exists() else {}
 
 
-def write_section(root: Path, name: str, section: str, figures: Mapping[str, Any], record: Mapping[str, Any]) -> Path:
+def write_section(
+    root: Path,
+    name: str,
+    section: str,
+    figures: Mapping[str, Any],
+    record: Mapping[str, Any],
+    headlines: Mapping[str, Any] | None = None,
+) -> Path:
     """Write `figures` as one section of docs/results/NAME.json and the machine's record beside it; the rest stays.
 
-    The record (`machine_record`, taken before measuring) becomes `measured.SECTION`: sections may be of different days.
+    The record (`machine_record`, taken before measuring) becomes `records.SECTION`: sections may be of different days.
+    `headlines` are figures that stand above the sections; one that is a mapping joins what is there.
     """
     path, known = root / "docs" / "results" / f"{name}.json", read_results(root, name)
-    known["measured"] = dict(sorted({**known.get("measured", {}), section: dict(record)}.items()))
+    known["records"] = dict(sorted({**known.get("records", {}), section: dict(record)}.items()))
     known[section] = dict(figures)
+    for key, value in (headlines or {}).items():
+        known[key] = {**known.get(key, {}), **value} if isinstance(value, Mapping) else value
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(dict(sorted(known.items())), indent=2, allow_nan=False) + "\n")
     return path

@@ -36,9 +36,17 @@ def test_a_section_of_the_results_is_replaced_and_the_others_stay(tmp_path):
     assert path == tmp_path / "docs" / "results" / "recordings.json"
     assert json.loads(path.read_text()) == {
         "fuzz": {"cases_per_reader": 10},
-        "measured": {"fuzz": {"commit": "b"}, "rig": {"commit": "c"}},
+        "records": {"fuzz": {"commit": "b"}, "rig": {"commit": "c"}},
         "rig": {"captures": 32},
     }
+
+
+def test_headlines_stand_above_the_sections_and_join_what_is_there(tmp_path):
+    write_section(tmp_path, "network", "speed", {"a": 1}, {}, {"speedup": 2.0, "ours": {"per_s": 10}})
+    path = write_section(tmp_path, "network", "study", {"b": 1}, {}, {"ours": {"mse": 0.1}})
+    found = json.loads(path.read_text())
+    assert found["speedup"] == 2.0
+    assert found["ours"] == {"mse": 0.1, "per_s": 10}
 
 
 def test_a_tree_with_changes_is_not_measured(tmp_path):

@@ -20,7 +20,9 @@ from polarnet.recordings.dot import (
     read_intensity_capture,
 )
 from polarnet.recordings.imported import import_targets
+from polarnet.recordings.recording import read_recording
 from polarnet.recordings.targets import calibrate_targets, spread_us
+from polarnet.recover import Arrangement, open_files
 from polarnet.reports.calibration import draw_calibration
 from polarnet.rig import RigConfig, true_dolp, write_rig
 from polarnet.simulation.pictures.dead_leaves import dead_leaves
@@ -69,6 +71,16 @@ def calibrated(rig, config, tmp_path_factory):
     import_targets(root, folder / "imported", config)
     (found,) = calibrate_targets(folder / "imported", folder / "out", config, {})
     return folder / "out", found, truth
+
+
+def test_a_folder_of_captures_goes_into_recover_calibrated(rig, config, project_root, tmp_path):
+    root, _ = rig
+    settings = replace(load(project_root), recordings=config)
+    source = open_files([root / "one"], Arrangement(None, None, None), read_recording, None, tmp_path, lambda: settings)
+    (piece,) = source.pieces
+    assert (source.height, source.width) == tuple(config.size)
+    assert min(map(len, piece.channels)) > 0
+    assert 0 <= min(int(events.t[0]) for events in piece.channels) <= source.duration_us == piece.until_us
 
 
 def test_the_rig_writes_eight_captures_and_says_what_is_true_of_them(rig):

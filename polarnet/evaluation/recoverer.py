@@ -154,7 +154,8 @@ class Recoverer(WindowRecoverer):
     ):
         module, metadata = network
         place = torch.device(device)
-        super().__init__(module.to(place).eval(), REPRESENTATIONS[metadata["representation"]], place, precision)
+        ready = module.to(place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+        super().__init__(ready, REPRESENTATIONS[metadata["representation"]], place, precision)
 
 
 class FilterRecoverer:

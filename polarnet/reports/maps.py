@@ -53,9 +53,9 @@ def polarization_hsv(
 
     The inverse of how the simulation reads a photograph, so that a simulated scene comes out as its photograph.
     """
-    hue = (aolp / math.pi).remainder(1.0)
-    hsv = np.stack([hue.numpy(force=True), *(x.clamp(0, 1).numpy(force=True) for x in (dolp, s0))], axis=-1)
-    return _bytes(hsv_to_rgb(hsv.astype(np.float64)))
+    hue_deg = 360 * (aolp / math.pi).remainder(1.0)
+    hsv = np.stack([hue_deg.numpy(force=True), *(x.clamp(0, 1).numpy(force=True) for x in (dolp, s0))], axis=-1)
+    return _bytes(cv2.cvtColor(hsv.astype(np.float32), cv2.COLOR_HSV2RGB))
 
 
 def hue_wheel(size: int) -> UInt8[np.ndarray, "size size 4"]:

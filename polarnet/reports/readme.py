@@ -107,12 +107,34 @@ def emulation_block(results: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def study_block(results: Mapping[str, Any]) -> str:
+    """The networks and the baselines on held-out photographs and on measured scenes, by tests/benchmarks/network.py."""
+    study, record = results["study"], results["records"]["study"]
+    lines = []
+    for name in ("simulated", "measured"):
+        about = study["about"][name]
+        lines += [f"**{SET_TITLES[name]}**: {about['scenes']} scenes, {about['frames']} frames", ""]
+        lines += [as_markdown(score_table(study[name], None, {**COLUMNS, **COSTS})), ""]
+        lines += [f"- {line}" for line in paired_lines(about["paired"])] + [""]
+    minutes, versions = study["minutes_trained"], ", ".join(f"{k} {v}" for k, v in record["versions"].items())
+    lines += [
+        f"MSE of ours over the oracle mean's: {results['mse_over_oracle_mean']:.2f}; PSNR over the paper's network: "
+        f"{results['gain_over_paper_db']:+.2f} dB; on measured scenes, MSE over that of the best intensity "
+        f"reconstruction: {results['measured']['mse_over_best_baseline']:.2f}.",
+        "",
+        f"Trained {minutes['ours']:.0f} (ours) and {minutes['paper']:.0f} minutes (paper) on "
+        f"{study['threads'] or record['cores']} of {record['cores']} cores ({record['machine']}, load "
+        f"{record['load']:.1f} before the start; {versions}; commit `{record['commit'][:10]}`).",
+    ]
+    return "\n".join(lines)
+
+
 def throughput_block(results: Mapping[str, Any]) -> str:
     """How fast each network trains and runs under each setting, and where torch spends the time.
 
     `results` is docs/results/network.json as tests/benchmarks/training.py writes it.
     """
-    throughput, record = results["throughput"], results["measured"]["throughput"]
+    throughput, record = results["throughput"], results["records"]["throughput"]
     lines = [
         "| network | setting | precision | training, frames/s | inference, windows/s | GFLOP a window | "
         "share of the peak in training | in inference |",
@@ -168,12 +190,14 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "pipeline": pipeline_block,
     "benchmark": benchmark_block,
     "emulation": emulation_block,
+    "network-study": study_block,
     "network-throughput": throughput_block,
 }
 """What writes the block of each name."""
 
 UNMEASURED = {
     "emulation": "Not measured yet: `python tests/benchmarks/emulation.py --write` does it.",
+    "network-study": "Not measured yet: `python tests/benchmarks/network.py --write` does it.",
     "network-throughput": "Not measured yet: `python tests/benchmarks/training.py --write` does it.",
 }
 """Blocks that may stand in a document before their results do, and what they say until then."""

@@ -25,6 +25,7 @@ from polarnet.networks.blocks import Prediction
 from polarnet.reports.figures import dolp_bar
 from polarnet.reports.maps import (
     dolp_image,
+    encode_jpeg,
     encode_png,
     event_full_scale,
     event_image,
@@ -34,8 +35,10 @@ from polarnet.reports.maps import (
 from polarnet.reports.tiles import chart, data_uri
 
 OUTPUTS = ("zarr", "png", "exr", "mp4")
-CODECS = {"recovered.mp4": "mp4v", "recovered.webm": "VP80"}
-"""What OpenCV's wheels can encode: MPEG-4 for players and editors, VP8 for the page, as browsers do not show MPEG-4."""
+VIDEO, CODEC = "recovered.mp4", "mp4v"  # MPEG-4, which players show and browsers do not; VP8 takes 20 times as long
+FILM_FRAMES = 24
+"""At least so many pictures, evenly spread, run on the page."""
+NO_FILTER = 8  # libpng's PNG_FILTER_NONE: half the time, and hardly larger
 FRAMES_PER_CHUNK = 16
 MOST_WAITING = 64  # frames that are not written yet
 SHOWN_ON_PAGE = 6
@@ -47,6 +50,15 @@ ZARR_CONVENTIONS = {
     "aolp": "angle of linear polarization in radians in [0, pi), divided by 65536 and times pi",
     "log_variance": "natural logarithm of the variance that the network expects of its own DoLP",
 }
+
+
+class Film(NamedTuple):
+    """Pictures below each other as one, which the page's style moves through."""
+
+    source: str
+    pictures: int
+    height: int
+    width: int
 
 
 class Shown(NamedTuple):
@@ -66,16 +78,16 @@ class _Kept:
     def offer(self, number: int, shown: Shown) -> None:
         if number % self.every == 0:
             self.pictures.append(shown)
-        if len(self.pictures) > 2 * SHOWN_ON_PAGE:
+        if len(self.pictures) > 2 * FILM_FRAMES:
             self.pictures, self.every = self.pictures[::2], 2 * self.every
 
 
 class RecoveryWriter:
     """Writes frames into a folder as they come; use it in a `with`, which waits for the last and closes the files.
 
-    `outputs` are some of OUTPUTS. The folder gets recovered.zarr, png/*.png, exr/*.exr, recovered.mp4 and
-    recovered.webm (`video_rate_hz` frames a second, whatever the time between them), and with `write_page` index.html
-    and recovered.png.
+    `outputs` are some of OUTPUTS. The folder gets recovered.zarr, png/*.png, exr/*.exr and recovered.mp4
+    (`video_rate_hz` frames a second, whatever the time between them), and with `write_page` index.html and
+    recovered.png.
     """
 
     def __init__(self, folder: Path, outputs: Collection[str], video_rate_hz: float):
@@ -85,7 +97,7 @@ class RecoveryWriter:
         self._scale: float | None = None
         self._group: zarr.Group | None = None
         self._buffer: dict[str, list[np.ndarray]] = {}
-        self._videos: list[cv2.VideoWriter] = []
+        self._video: cv2.VideoWriter | None = None
         self._thread = ThreadPoolExecutor(1)
         self._waiting: deque[Future] = deque()
         folder.mkdir(parents=True, exist_ok=True)
@@ -102,8 +114,8 @@ class RecoveryWriter:
             self._flush()
         finally:
             self._thread.shutdown(cancel_futures=True)
-            for video in self._videos:
-                video.release()
+            if self._video is not None:
+                self._video.release()
 
     def add(self, window: EventWindow, found: Prediction) -> None:
         """A frame, on the CPU; returns before it is written, unless many wait already."""
@@ -124,7 +136,8 @@ class RecoveryWriter:
             title=title,
             facts=facts,
             notes=notes,
-            videos=[name for name in reversed(CODECS) if (self.folder / name).exists()],
+            video=VIDEO if self._video is not None else None,
+            film=_film([shown.picture for shown in self._kept.pictures]),
             pictures=[(shown.t_us / 1000, data_uri(encode_png(shown.picture), "png")) for shown in some],
             dolp_bar=chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
             wheel=data_uri(encode_png(hue_wheel(192)), "png"),
@@ -150,8 +163,9 @@ class RecoveryWriter:
         if "png" in self.outputs:
             _write_png(self.folder / "png" / f"{number:06d}.png", picture)
         if "mp4" in self.outputs:
-            for video in self._videos or self._open_videos(*picture.shape[:2]):
-                video.write(np.ascontiguousarray(picture[..., ::-1]))
+            if self._video is None:
+                self._video = _open_video(self.folder / VIDEO, self.video_rate_hz, *picture.shape[:2])
+            self._video.write(np.ascontiguousarray(picture[..., ::-1]))
 
     def _picture(self, window: EventWindow, found: Prediction) -> UInt8[np.ndarray, "h w 3"]:
         events = signed_events(window)
@@ -165,15 +179,6 @@ class RecoveryWriter:
         side_by_side = np.concatenate([part for one in maps for part in (one, gap)][:-1], axis=1)
         height, width = side_by_side.shape[:2]
         return np.pad(side_by_side, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")  # codecs want even sides
-
-    def _open_videos(self, height: int, width: int) -> list[cv2.VideoWriter]:
-        for name, codec in CODECS.items():
-            code = cv2.VideoWriter.fourcc(*codec)
-            video = cv2.VideoWriter(str(self.folder / name), code, self.video_rate_hz, (width, height))
-            if not video.isOpened():
-                raise RuntimeError(f"OpenCV cannot write {name} ({codec}); leave mp4 out of --write")
-            self._videos.append(video)
-        return self._videos
 
     def _add_to_zarr(self, window: EventWindow, found: Prediction) -> None:
         frame = {"t_us": np.array(window.stop_us, np.int64), "dolp": _quantised(found.dolp * 65535, 65535)}
@@ -220,6 +225,20 @@ def _spread(items: Sequence[Shown], count: int) -> list[Shown]:
     return [items[k] for k in places]
 
 
+def _film(pictures: Sequence[np.ndarray]) -> Film | None:
+    if not pictures:
+        return None
+    height, width = pictures[0].shape[:2]
+    return Film(data_uri(encode_jpeg(np.concatenate(pictures)), "jpeg"), len(pictures), height, width)
+
+
+def _open_video(path: Path, rate_hz: float, height: int, width: int) -> cv2.VideoWriter:
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), rate_hz, (width, height))
+    if not video.isOpened():
+        raise RuntimeError(f"{path}: OpenCV cannot write it ({CODEC}); leave mp4 out of --write")
+    return video
+
+
 def _with_margin(picture: np.ndarray) -> np.ndarray:
     return np.pad(picture, ((GAP, GAP), (GAP, GAP), (0, 0)), constant_values=255)
 
@@ -227,6 +246,7 @@ def _with_margin(picture: np.ndarray) -> np.ndarray:
 def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
     spec = oiio.ImageSpec(picture.shape[1], picture.shape[0], 3, oiio.UINT8)
     spec["png:compressionLevel"] = 1  # thousands of them are written while a camera runs
+    spec["png:filter"] = NO_FILTER
     _write_picture(path, spec, picture)
 
 

@@ -168,7 +168,7 @@ def validate(
                 sums.update({name: value.item() * len(a) for name, value in scores.items()})
                 count += len(a)
     task.network.train()
-    together = torch.tensor([*sums.values(), count], dtype=torch.float64)
+    together = torch.tensor([*sums.values(), count], dtype=torch.float64, device=device)
     add_up([together])
     *totals, count = together.tolist()
     if not count:

@@ -1,6 +1,7 @@
 """The network polarnet against the paper's, both trained on the same photographs for about as long, and the baselines.
 
-python tests/benchmarks/network.py --photographs FOLDER --measured FOLDER --work FOLDER [--write]
+python tests/benchmarks/network.py --photographs FOLDER --measured FOLDER --work FOLDER
+    [--firenet FILE] [--write]
 
 Runs the pipeline's stages with experiment=photographs in the folder --work, where a killed run goes on, and prints the
 tables of held-out photographs and of measured scenes, on which nothing was trained. --write puts them into
@@ -18,8 +19,8 @@ from typing import Any
 from polarnet.measure import BENCHMARK_KEYS, machine_record, uncommitted, write_section
 
 ROOT = Path(__file__).resolve().parents[2]
-METHODS = ["zeros", "train_mean", "oracle_mean", "cf", "highpass", "cf+gain", "highpass+gain", "paper", "ours"]
-INTENSITY = ("cf", "highpass", "cf+gain", "highpass+gain")  # baselines that reconstruct intensities
+INTENSITY = [f"{row}{gain}" for row in ("cf", "highpass", "firenet_published") for gain in ("", "+gain")]
+METHODS = ["zeros", "train_mean", "oracle_mean", *INTENSITY, "paper", "ours"]
 
 
 def stage(name: str, arguments: argparse.Namespace, *overrides: str) -> None:
@@ -47,19 +48,15 @@ def trained(network: str, epochs: int, arguments: argparse.Namespace) -> Path:
     return folder
 
 
-def figures(tables: dict[str, dict[str, dict[str, Any]]], minutes: dict[str, float]) -> dict[str, Any]:
-    """What the tables say of the two networks, and the tables."""
+def headlines(tables: dict[str, dict[str, dict[str, Any]]]) -> dict[str, Any]:
+    """What the tables say of the two networks."""
     simulated, measured = tables["simulated"], tables["measured"]
+    best = min(scores["mse"] for row, scores in measured.items() if row in INTENSITY)
     return {
         "gain_over_paper_db": simulated["ours"]["psnr"] - simulated["paper"]["psnr"],
         "mse_over_paper": simulated["ours"]["mse"] / simulated["paper"]["mse"],
         "mse_over_oracle_mean": simulated["ours"]["mse"] / simulated["oracle_mean"]["mse"],
-        "measured_mse_over_best_baseline": measured["ours"]["mse"] / min(measured[row]["mse"] for row in INTENSITY),
-        "minutes_trained": minutes,
-        **{
-            name: {method: {key: scores.get(key) for key in BENCHMARK_KEYS} for method, scores in table.items()}
-            for name, table in tables.items()
-        },
+        "measured": {"mse_over_best_baseline": measured["ours"]["mse"] / best},
     }
 
 
@@ -68,6 +65,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photographs", type=Path, required=True)
     parser.add_argument("--measured", type=Path, required=True, help="scenes as ingest.source=polarization takes them")
+    parser.add_argument("--firenet", type=Path, help="FireNet's published weights; without them its rows are left out")
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--epochs", type=int, default=3)
     parser.add_argument("--paper-epochs", type=int, default=4)
@@ -88,20 +86,22 @@ def main() -> None:
     sets = ("benchmark.sets=[simulated,measured]", f"sets.measured_root={arguments.measured}")
     stage("sets", arguments, *sets)
     methods = f"benchmark.methods=[{','.join(METHODS)}]"
-    weights = f"baselines.weights.paper={paper / 'best.safetensors'}"
-    stage("benchmark", arguments, *sets, methods, weights, f"paths.train={ours}")
+    weights = [f"paths.train={ours}", f"baselines.weights.paper={paper / 'best.safetensors'}"]
+    if arguments.firenet:
+        weights.append(f"baselines.weights.firenet_published={arguments.firenet.resolve()}")
+    stage("benchmark", arguments, *sets, methods, *weights)
     folder = arguments.work / "data" / "benchmark"
-    tables = {
-        name: json.loads((path / "metrics.json").read_text())
-        for name, path in (("simulated", folder), ("measured", folder / "sets" / "measured"))
-    }
-    minutes = {
-        name: json.loads((path / "minutes.json").read_text()) for name, path in (("ours", ours), ("paper", paper))
-    }
-    found = figures(tables, minutes)
-    print(json.dumps({key: value for key, value in found.items() if key not in tables}, indent=2))
+    tables, about = {}, {}
+    for name, path in (("simulated", folder), ("measured", folder / "sets" / "measured")):
+        rows, details = (json.loads((path / f"{file}.json").read_text()) for file in ("metrics", "details"))
+        tables[name] = {row: {key: scores.get(key) for key in BENCHMARK_KEYS} for row, scores in rows.items()}
+        about[name] = {"scenes": len(details["scenes"]), "frames": details["frames"], "paired": details["paired"]}
+    minutes = {row: json.loads((path / "minutes.json").read_text()) for row, path in (("ours", ours), ("paper", paper))}
+    print(json.dumps({"minutes_trained": minutes} | headlines(tables), indent=2))
     if arguments.write:
-        print(write_section(ROOT, "network", f"photographs_seed_{arguments.seed}", found, record))
+        section = "study" if arguments.seed == 1 else f"study_seed_{arguments.seed}"
+        found = {"minutes_trained": minutes, "threads": arguments.threads, "about": about, **tables}
+        print(write_section(ROOT, "network", section, found, record, headlines(tables)))
 
 
 if __name__ == "__main__":

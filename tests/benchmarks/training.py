@@ -202,11 +202,7 @@ def main() -> None:
     settings = list(SETTINGS if arguments.compile else SETTINGS[:2])
     figures = measure(arguments.networks, settings, arguments.rounds, arguments.threads, arguments.device)
     if arguments.write:
-        path = write_section(ROOT, "network", "throughput", figures, record)
-        known = json.loads(path.read_text())
-        for key, value in headlines(figures["networks"]).items():
-            known[key] = known.get(key, {}) | value if isinstance(value, dict) else value
-        path.write_text(json.dumps(dict(sorted(known.items())), indent=2) + "\n")
+        path = write_section(ROOT, "network", "throughput", figures, record, headlines(figures["networks"]))
         print(f"written to {path.relative_to(ROOT)}")
 
 

@@ -1,0 +1,148 @@
+"""How fast `polarnet recover` is: python tests/benchmarks/recover.py [--write] [--weights FILE] [--picture FILE]
+
+A window moves over a photograph of scikit-image; the events of its 120 x 180 pixels behind four polarizers, on a clock
+stretched so that 1 M of them come in a second, are recovered as the command does it: windows of 1/30 s, frames written
+as Zarr, PNG and video. `realtime_factor` is seconds of the stream in a second of work, writing included, and more than
+1 is faster than real time; `latency_ms` is the median of a step, from the window's events in memory to DoLP and AoLP
+in memory. Methods: the network of --weights, else the shipped one, else one of params.yaml that nobody trained (which
+costs the same); the high-pass filter, with and without solved gains. Live, the stream comes through a pipe at its own
+pace from another process; its latency is that from the arrival of an event to the frame that it completes.
+
+`--write` merges the figures into docs/results/recordings.json under `recover`. `--picture` copies the pictures that
+the high-pass filter with solved gains, or the network of --weights, made of the stream.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from skimage import data
+
+from polarnet.benchmarking import context_of
+from polarnet.config import Config, load
+from polarnet.evaluation.recoverer import Recoverer, Stream, stream_of
+from polarnet.events.representations import REPRESENTATIONS, channels_of
+from polarnet.events.stream import Events
+from polarnet.events.streaming import WindowRule
+from polarnet.measure import machine_record
+from polarnet.networks.checkpoint import load_network
+from polarnet.networks.dolp_unet import NETWORKS
+from polarnet.recordings.arrangements import write_store
+from polarnet.recordings.live import LiveLines, Piece
+from polarnet.recover import Input, Summary, recover
+from polarnet.reports.provenance import git
+from polarnet.reports.recovery import RecoveryWriter
+from polarnet.simulation import simulate
+from polarnet.weights import shipped_weights
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "docs" / "results" / "recordings.json"
+RATE = 1_000_000  # events a second of the four polarizers together
+WINDOWS = WindowRule(33_333, None, None)
+WRITTEN = ("zarr", "png", "mp4")
+FILTERS = ("highpass", "highpass+gain")
+
+
+def stream_of_events(config: Config, seconds: float) -> list[Events]:
+    """Four channels of 120 x 180 pixels, `seconds` long, at `RATE`."""
+    picture = torch.from_numpy(data.coffee()).permute(2, 0, 1).float() / 255
+    motion = replace(config.synthesize, duration_s=seconds, window_height=120, window_width=180)
+    channels = simulate(picture, motion, config.emulate, seed=1).events
+    stretch = sum(map(len, channels)) / (RATE * seconds)
+    stretched = [replace(events, t=(events.t * stretch).long()) for events in channels]
+    return [replace(e, **{c: getattr(e, c)[e.t < seconds * 1e6] for c in "txyp"}) for e in stretched]
+
+
+def network_of(config: Config, weights: Path | None) -> tuple[Stream, str]:
+    """The network to measure, and what it is."""
+    try:
+        weights = weights or shipped_weights()
+    except FileNotFoundError:
+        build, _ = NETWORKS[config.network]
+        representation = config.train.representation
+        torch.manual_seed(config.seed)
+        module = build(config.network_config, 4 * channels_of(REPRESENTATIONS[representation]))
+        return Recoverer((module, {"representation": representation})), f"{config.network}, untrained"
+    network, metadata = load_network(weights)
+    return Recoverer((network, metadata)), metadata["network"]
+
+
+def measured(channels: Sequence[Events], stream: Stream, out: Path) -> tuple[Summary, Path]:
+    """A run of the command's own loop over events in memory, and the pictures it left."""
+    until_us = max(int(events.t[-1]) for events in channels) + 1
+    piece = Piece(channels, until_us, time.perf_counter())
+    source = Input("stream", channels[0].height, channels[0].width, [piece], until_us)
+    writer = RecoveryWriter(out, WRITTEN, 30.0)
+    summary = recover(source, WINDOWS, stream, writer)
+    writer.write_page("stream", {}, [])
+    return summary, out / "recovered.png"
+
+
+def measured_live(store: Path, stream: Stream, out: Path) -> Summary:
+    """The same, as lines come through a pipe from another process at their own pace."""
+    command = [sys.executable, "-m", "polarnet.cli", "replay", str(store), "stream"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as camera:
+        assert camera.stdout is not None
+        lines = LiveLines(camera.stdout, "pipe", None, idle_s=0.0)
+        source = Input("pipe", lines.height, lines.width, lines, None)
+        return recover(source, WINDOWS, stream, RecoveryWriter(out, ("zarr", "mp4"), 30.0))
+
+
+def figures_of(summary: Summary) -> dict[str, float]:
+    """What is reported of a run."""
+    return {"realtime_factor": round(summary.realtime_factor, 3), "latency_ms": round(summary.step_ms, 2)}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
+    parser.add_argument("--weights", type=Path, help="of the network")
+    parser.add_argument("--seconds", type=float, default=4.0, help="of the stream")
+    parser.add_argument("--picture", type=Path, help="where to copy the pictures of a run")
+    arguments = parser.parse_args()
+    changed = git(ROOT, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
+    if arguments.write and changed:
+        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    config = load(ROOT)
+    figures: dict[str, Any] = machine_record(ROOT)
+    channels = stream_of_events(config, arguments.seconds)
+    network, name = network_of(config, arguments.weights)
+    context = replace(context_of(config, 0.0), device=torch.device("cpu"))
+    figures |= {"network": name, "events": sum(map(len, channels)), "seconds": arguments.seconds, "methods": {}}
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        pictures = {}
+        for method in ("network", *FILTERS):
+            stream = network if method == "network" else stream_of(method, context)
+            summary, pictures[method] = measured(channels, stream, folder / method)
+            figures["methods"][method] = figures_of(summary)
+            print(method, asdict(summary), flush=True)
+        write_store(folder / "events.zarr", {"stream": channels})
+        for method, stream in (("network", network), ("highpass", stream_of("highpass", context))):
+            stream.reset()
+            summary = measured_live(folder / "events.zarr", stream, folder / f"{method}_live")
+            figures["methods"][method]["live_latency_ms"] = round(summary.latency_ms or 0.0, 1)
+            print(f"{method}, live", asdict(summary), flush=True)
+        if arguments.picture:
+            shutil.copy(pictures["network" if arguments.weights else "highpass+gain"], arguments.picture)
+    figures |= figures["methods"]["network"]
+    print(json.dumps(figures, indent=2))
+    if arguments.write:
+        known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+        RESULTS.parent.mkdir(parents=True, exist_ok=True)
+        RESULTS.write_text(json.dumps(known | {"recover": figures}, indent=2) + "\n")
+        print(f"written to {RESULTS.relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    main()
