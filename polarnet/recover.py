@@ -183,7 +183,7 @@ def open_stream(
     A network: of `weights`, else the shipped one, else what the pipeline trained. Another `method` of the benchmark:
     as `config` says. ValueError or FileNotFoundError that says what is missing.
     """
-    place = device_of(RuntimeConfig(device, threads=0, workers=1))
+    place = device_of(RuntimeConfig(device, threads=0, workers=1, devices=1, nodes=1, rendezvous=""))
     if method in (None, "ours"):
         file = weights or _default_weights(config)
         if not file.is_file():

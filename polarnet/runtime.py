@@ -26,6 +26,12 @@ class RuntimeConfig:
     """Of torch and numba in each process; 0: as many as there are cores."""
     workers: int = field(metadata=allowed(low=1))
     """Processes that share out sequences."""
+    devices: int = field(metadata=allowed(low=1))
+    """Processes on this machine that share a training, each on a GPU of its own, or all on the processor."""
+    nodes: int = field(metadata=allowed(low=1))
+    """Machines that share a training; the same command starts on each."""
+    rendezvous: str
+    """Where they meet: host:port of one of them."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -60,9 +66,10 @@ def threads_of(config: RuntimeConfig) -> int:
 
 def device_of(config: RuntimeConfig) -> torch.device:
     """The torch device that `config.device` names; ValueError where it asks for a GPU that is not there."""
+    own_gpu = f"cuda:{os.environ.get('LOCAL_RANK', 0)}"  # torchrun's number of this process
     if config.device == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    device = torch.device(config.device)
+        return torch.device(own_gpu if torch.cuda.is_available() else "cpu")
+    device = torch.device(own_gpu if config.device == "cuda" else config.device)
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"runtime.device={config.device}: torch {torch.__version__} sees no GPU; use device=cpu")
     return device
@@ -99,7 +106,7 @@ def keep_freed_memory() -> None:
 def configure(config: RuntimeConfig, seed: int) -> torch.device:
     """Set threads, seed torch, keep freed memory, ask torch for deterministic kernels; the device to run on."""
     torch.set_flush_denormal(True)  # tiny gradients made convolutions several times slower; threads inherit it
-    limit_threads(config.threads or usable_cores())
+    limit_threads(config.threads or max(1, usable_cores() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))))
     keep_freed_memory()
     torch.manual_seed(seed)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")

@@ -6,6 +6,7 @@ from polarnet.config import Config, hydra_stage
 from polarnet.runtime import device_of, threads_of
 from polarnet.training.dolp import dolp_task
 from polarnet.training.loop import train
+from polarnet.training.parallel import join, launched
 from polarnet.training.recorder import Recorder
 from polarnet.training.task import describe, lpips_of, open_events, open_split
 
@@ -13,9 +14,13 @@ from polarnet.training.task import describe, lpips_of, open_events, open_split
 @hydra_stage
 def main(config: Config) -> None:
     """Train `network` on the training split; a killed run of the same training goes on where it stopped."""
+    if launched("stages.train", config.runtime):
+        return
+    device = device_of(config.runtime)
+    join(device)
     lpips = lpips_of(Path(config.paths.weights), config.loss.lpips)
     task = dolp_task(config.network, config.network_config, config.train, config.loss, lpips, config.seed)
-    paths, threads, device = config.paths, threads_of(config.runtime), device_of(config.runtime)
+    paths, threads = config.paths, threads_of(config.runtime)
     events = open_events(config.train.data, paths.events, paths.scenes, config.emulate, config.seed, threads)
     split = open_split(events, paths.frames, task.encode)
     metadata = describe(task, split, config.train, Path(paths.weights), config.seed, device)

@@ -6,6 +6,7 @@ from polarnet.config import Config, hydra_stage
 from polarnet.runtime import device_of, threads_of
 from polarnet.training.e2v import e2v_task
 from polarnet.training.loop import train
+from polarnet.training.parallel import join, launched
 from polarnet.training.recorder import Recorder
 from polarnet.training.task import describe, lpips_of, open_events, open_split
 
@@ -13,10 +14,14 @@ from polarnet.training.task import describe, lpips_of, open_events, open_split
 @hydra_stage
 def main(config: Config) -> None:
     """Train `baselines.e2v.arch` on the training split; a killed run of the same training goes on where it stopped."""
+    if launched("stages.train_e2v", config.runtime):
+        return
+    device = device_of(config.runtime)
+    join(device)
     e2v = config.baselines.e2v
     lpips = lpips_of(Path(config.paths.weights), e2v.lpips)
     task = e2v_task(e2v, lpips, config.seed)
-    paths, threads, device = config.paths, threads_of(config.runtime), device_of(config.runtime)
+    paths, threads = config.paths, threads_of(config.runtime)
     events = open_events(e2v.data, paths.events, paths.scenes, config.emulate, config.seed, threads)
     split = open_split(events, paths.frames, task.encode)
     metadata = describe(task, split, e2v, Path(paths.weights), config.seed, device)

@@ -1,3 +1,4 @@
+import dataclasses
 import platform
 import resource
 
@@ -15,6 +16,8 @@ from polarnet.runtime import (
     precision_on,
     seed_for,
 )
+
+RUNTIME = RuntimeConfig(device="cpu", threads=1, workers=1, devices=1, nodes=1, rendezvous="localhost:29500")
 
 
 def test_a_seed_depends_on_each_of_its_three_parts_and_on_nothing_else():
@@ -34,12 +37,12 @@ def test_the_generator_of_a_name_is_pinned_for_ever():
 
 def test_a_missing_gpu_is_refused_with_the_way_out():
     with pytest.raises(ValueError, match="use device=cpu"):
-        device_of(RuntimeConfig(device="cuda:99", threads=1, workers=1))
+        device_of(dataclasses.replace(RUNTIME, device="cuda:99"))
 
 
 def test_zero_workers_are_refused():
     with pytest.raises(ValueError, match="workers: expected >= 1, got 0"):
-        RuntimeConfig(device="cpu", threads=1, workers=0)
+        dataclasses.replace(RUNTIME, workers=0)
 
 
 @pytest.mark.parametrize(("units", "precision"), [([], "fp32"), (["AMX"], "bf16")])

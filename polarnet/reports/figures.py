@@ -165,6 +165,30 @@ def score_distribution(per_scene: Mapping[str, Mapping[str, Sequence[float]]], t
     return figure
 
 
+def reliability_figure(curves: Mapping[str, Sequence[tuple[float, float, int]]], theme: Theme) -> Figure:
+    """Measured against predicted squared error of DoLP, a line a method; on the diagonal its uncertainty is right.
+
+    `curves` are those of `polarnet.evaluation.reliability`: predicted, measured, pixels. Dots grow with the pixels.
+    """
+    figure = _figure((3.4, 3.2), theme)
+    with matplotlib.rc_context(chart_style(theme)):
+        axes = figure.add_subplot()
+        values = [
+            value for curve in curves.values() for predicted, measured, _ in curve for value in (predicted, measured)
+        ]
+        positive = [value for value in values if value > 0]
+        axes.plot([min(positive), max(positive)], [min(positive), max(positive)], color=theme.quiet, linewidth=0.8)
+        for method, curve in curves.items():
+            predicted, measured, pixels = (np.array(column) for column in zip(*curve, strict=True))
+            colour = METHOD_COLOURS.get(method, OTHER_COLOUR)
+            axes.plot(predicted, measured, color=colour, label=METHODS.get(method, method))
+            axes.scatter(predicted, measured, s=4 + 60 * pixels / pixels.sum(), color=colour, linewidths=0, zorder=3)
+        axes.set(xscale="log", yscale="log", xlabel="predicted squared error", ylabel="measured squared error")
+        axes.legend(frameon=False)
+    figure.tight_layout()
+    return figure
+
+
 def score_line(recovered: Float[Tensor, "h w"], truth: Float[Tensor, "h w"]) -> str:
     """MSE and PSNR of one frame, for below its picture."""
     error, ratio = (float(score(recovered[None], truth[None])) for score in (mse, psnr))

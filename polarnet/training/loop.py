@@ -14,9 +14,10 @@ from polarnet.ranges import allowed
 from polarnet.runtime import precision_on
 from polarnet.similarity import correlation, mse, psnr
 from polarnet.training.losses import known_frames
+from polarnet.training.parallel import add_up, place, wait_for_all
 from polarnet.training.recorder import Recorder
-from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, kept_in_memory, shuffled
-from polarnet.training.task import Split, Task
+from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, kept_in_memory, parts_of, shuffled
+from polarnet.training.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
 
@@ -30,6 +31,8 @@ class LoopConfig(ViewConfig):
     epochs: int = field(metadata=allowed(low=1))
     batch_size: int = field(metadata=allowed(low=1))
     """Visits to sequences."""
+    accumulate: int = field(metadata=allowed(low=1))
+    """Parts in which a batch goes through the network, to need less memory: the same steps up to rounding."""
     bptt_windows: int = field(metadata=allowed(low=1))
     """Windows of one step: gradients are not carried further back, the recurrent state is."""
     learning_rate: float = field(metadata=allowed(above=0))
@@ -58,11 +61,13 @@ def train(
     """Train the task's network; where the recorder holds a killed run of the same training, go on with that.
 
     All that is random derives from the seed, the epoch and a sequence's name, so a run that was killed and resumed ends
-    with the weights of one that was not. Workers (processes that read ahead) do not change them either.
+    with the weights of one that was not. Workers (processes that read ahead) do not change them either. Processes that
+    share a training (polarnet.training.parallel) all call this; they change the weights by rounding alone.
     """
     network = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
     progress = recorder.resume(network, optimizer)
+    wait_for_all()  # before one of them writes again
     sequences, workers = kept_in_memory(split.train, workers)
     for epoch in range(progress.epoch, config.epochs):
         visits = Visits(sequences, config, seed, epoch)
@@ -81,21 +86,52 @@ def train(
 def train_batch(
     task: Task, optimizer: torch.optim.Optimizer, batch: Batch, config: LoopConfig, device: torch.device
 ) -> list[dict[str, float]]:
-    """One step for each run of `bptt_windows` windows; the loss and its terms at each."""
-    state, losses = None, []
-    for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
-        with autocast(config.precision, device):
-            predicted, state = task.unroll(windows, state)
-            terms = task.loss(predicted, frames, valid)
-            total = task.loss.total(terms)
+    """One step for each run of `bptt_windows` windows; the loss and its terms at each.
+
+    The batch goes through the network in parts, this process's own one after the other. Each part's loss is a mean over
+    its frames, so it counts by its share of the frames that any process knows something of.
+    """
+    rank, processes = place()
+    parts = parts_of(batch, processes * config.accumulate)[rank::processes]
+    runs = [list(runs_of(task, part, config.bptt_windows, device)) for part in parts]
+    states: list[State] = [None] * len(parts)
+    losses = []
+    for number in range(math.ceil(len(batch.inputs) / config.bptt_windows)):
         optimizer.zero_grad()
-        total.backward()
+        sums = torch.zeros(1 + len(task.loss.weights), device=device)
+        counts = [frames_known(frames, valid) for _, frames, valid in (run[number] for run in runs)]
+        known = torch.tensor(float(sum(counts)), device=device)
+        add_up([known])
+        for part, count in enumerate(counts):
+            windows, frames, valid = runs[part][number]
+            with autocast(config.precision, device):
+                predicted, state = task.unroll(windows, states[part])
+                terms = task.loss(predicted, frames, valid)
+                total = task.loss.total(terms)
+            share = count / max(1.0, known.item())
+            (share * total).backward()
+            states[part] = [tensor.detach() for tensor in state or []]
+            sums += share * torch.stack([total, *terms.values()]).detach()
+        add_up([*gradients_of(task.network, processes), sums])
         if config.gradient_norm is not None:
             nn.utils.clip_grad_norm_(task.network.parameters(), config.gradient_norm)
         optimizer.step()
-        state = [tensor.detach() for tensor in state or []]
-        losses.append({name: term.item() for name, term in {"total": total, **terms}.items()})
+        losses.append(dict(zip(("total", *task.loss.weights), sums.tolist(), strict=True)))
     return losses
+
+
+def frames_known(frames: Tensor, valid: Tensor | None) -> int:
+    """How many of t x b frames have a pixel whose truth is known."""
+    return frames.shape[0] * frames.shape[1] if valid is None else int(valid.flatten(2).any(-1).sum())
+
+
+def gradients_of(network: nn.Module, processes: int) -> list[Tensor]:
+    """The gradients to be added up over processes: zeros where this one has none but another may."""
+    if processes == 1:
+        return []
+    for parameter in network.parameters():
+        parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+    return [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
 
 
 def runs_of(
@@ -117,8 +153,9 @@ def validate(
     Of the valid pixels alone, and without frames that have none. ValueError where no frame has any.
     """
     task.network.eval()
-    sums, count = Counter[str](), 0
-    for batch in batches_of(dataset, range(len(dataset)), 1, workers):
+    sums, count = Counter[str](dict.fromkeys(("total", *task.loss.weights, *SCORES), 0.0)), 0
+    rank, processes = place()
+    for batch in batches_of(dataset, range(rank, len(dataset), processes), 1, workers):
         state = None
         for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
             with autocast(config.precision, device):
@@ -131,11 +168,14 @@ def validate(
                 sums.update({name: value.item() * len(a) for name, value in scores.items()})
                 count += len(a)
     task.network.train()
+    together = torch.tensor([*sums.values(), count], dtype=torch.float64, device=device)
+    add_up([together])
+    *totals, count = together.tolist()
     if not count:
         raise ValueError(
             f"{dataset.frames.path}: no frame of the validation split has a valid pixel; use other pictures"
         )
-    return {name: value / count for name, value in sums.items()}
+    return {name: value / count for name, value in zip(sums, totals, strict=True)}
 
 
 def set_learning_rate(optimizer: torch.optim.Optimizer, config: LoopConfig, done: float) -> None:

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from polarnet.networks.checkpoint import save_checkpoint
+from polarnet.training.parallel import place
 from polarnet.training.sequences import Batch
 
 logger = logging.getLogger(__name__)
@@ -71,7 +72,8 @@ class Recorder:
     """Writes a training into the folder `out`, and its running checkpoint below `resume`, until `finish` deletes it.
 
     `metadata` says all that decides the weights: it goes into the JSON of both checkpoints, and the running checkpoint
-    is found again by its hash. Anything left in `out` from before is removed.
+    is found again by its hash. Anything left in `out` from before is removed. Of several processes that share a
+    training, only the first writes.
     """
 
     def __init__(self, out: Path, resume: Path, metadata: Mapping[str, Any], keep_every_s: float = KEEP_EVERY_S):
@@ -79,8 +81,10 @@ class Recorder:
         key = hashlib.sha256(json.dumps(self.metadata, sort_keys=True).encode()).hexdigest()
         self.running = resume / key[:16]
         self.kept_at = time.monotonic()
-        shutil.rmtree(out, ignore_errors=True)
-        out.mkdir(parents=True)
+        self.writes = place()[0] == 0
+        if self.writes:
+            shutil.rmtree(out, ignore_errors=True)
+            out.mkdir(parents=True)
 
     def resume(self, network: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
         """Put network and optimizer where the running checkpoint left them, if there is one; how far that is."""
@@ -92,7 +96,7 @@ class Recorder:
         optimizer.load_state_dict(content["optimizer"])
         progress = Progress(**content["progress"])
         tqdm.write(f"resuming in epoch {progress.epoch + 1}, from {file}")
-        if progress.history and not progress.visits:
+        if self.writes and progress.history and not progress.visits:
             self._write(progress, network)  # what the epoch before had written is gone
         return progress
 
@@ -100,7 +104,7 @@ class Recorder:
         self, progress: Progress, network: nn.Module, optimizer: torch.optim.Optimizer, at_once: bool = False
     ) -> None:
         """Write the running checkpoint if the last one is old enough."""
-        if not at_once and time.monotonic() - self.kept_at < self.keep_every_s:
+        if not self.writes or (not at_once and time.monotonic() - self.kept_at < self.keep_every_s):
             return
         self.running.mkdir(parents=True, exist_ok=True)
         content = {
@@ -115,8 +119,9 @@ class Recorder:
     def show(self, batches: Iterable[Batch], progress: Progress, visits: int, epochs: int) -> Iterator[Batch]:
         """The batches, behind a progress bar that counts visits to sequences."""
         with tqdm(
-            total=visits, initial=progress.visits, desc=f"epoch {progress.epoch + 1}/{epochs}", unit="visit"
-        ) as bar:
+            total=visits, initial=progress.visits, desc=f"epoch {progress.epoch + 1}/{epochs}", unit="visit",
+            disable=not self.writes,
+        ) as bar:  # fmt: skip
             for batch in batches:
                 yield batch
                 bar.update(len(batch.names))
@@ -125,12 +130,15 @@ class Recorder:
     def end_epoch(self, progress: Progress, network: nn.Module, scores: Mapping[str, float]) -> None:
         """Close the epoch in `progress` and write checkpoints, history and curves."""
         progress.end_epoch(network.state_dict(), scores)
+        if not self.writes:
+            return
         tqdm.write("  validation: " + "  ".join(f"{name} {value:.4f}" for name, value in scores.items()))
         self._write(progress, network)
 
     def finish(self) -> None:
         """The training is complete: nothing is left to resume."""
-        shutil.rmtree(self.running, ignore_errors=True)
+        if self.writes:
+            shutil.rmtree(self.running, ignore_errors=True)
 
     def _write(self, progress: Progress, network: nn.Module) -> None:
         last = progress.history[-1]

@@ -140,6 +140,18 @@ def stack(sequences: Sequence[WindowSequence]) -> Batch:
     return Batch(list(names), inputs, dolp, aolp, intensity, valid)
 
 
+def parts_of(batch: Batch, parts: int) -> list[Batch]:
+    """A batch cut into as many parts of nearly equal size, or into single visits where it has fewer."""
+    numbers = [part.tolist() for part in torch.arange(len(batch.names)).tensor_split(parts) if len(part)]
+    return [_visits_of(batch, part[0], part[-1] + 1) for part in numbers]
+
+
+def _visits_of(batch: Batch, start: int, stop: int) -> Batch:
+    inputs, dolp, aolp, intensity = (tensor[:, start:stop] for tensor in batch[1:5])
+    valid = None if batch.valid is None else batch.valid[:, start:stop]
+    return Batch(batch.names[start:stop], inputs, dolp, aolp, intensity, valid)
+
+
 def shuffled(count: int, seed: int, epoch: int) -> list[int]:
     """The order of an epoch."""
     return generator_for(seed, "all sequences", f"order of epoch {epoch}").permutation(count).tolist()

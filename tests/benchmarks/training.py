@@ -23,6 +23,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,8 @@ from polarnet.config import load
 from polarnet.events.representations import REPRESENTATIONS, channels_of
 from polarnet.measure import machine_record, uncommitted, write_section
 from polarnet.networks.blocks import Prediction
-from polarnet.networks.dolp_unet import NETWORKS
-from polarnet.runtime import RuntimeConfig, configure, device_of, limit_threads, precision_on, usable_cores
+from polarnet.networks.registry import NETWORKS
+from polarnet.runtime import configure, device_of, limit_threads, precision_on, usable_cores
 from polarnet.training.loop import autocast
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -52,9 +53,10 @@ MEASURED = ("train_frames_per_s", "infer_windows_per_s")
 def network_of(name: str, setting: str, device: torch.device) -> tuple[nn.Module, int]:
     """The network with random weights under a setting, and its input channels."""
     config = load(ROOT)
-    channels = 4 * channels_of(REPRESENTATIONS[config.train.representation])
+    build, _ = NETWORKS[name]
+    channels = 4 * channels_of(REPRESENTATIONS[build.representation])
     torch.manual_seed(0)
-    network = NETWORKS[name][0](getattr(config.networks, name), channels).to(device)
+    network = build(getattr(config.networks, name), channels).to(device)
     if setting == "naive":
         for module in network.modules():
             if isinstance(module, nn.Conv2d):
@@ -71,7 +73,7 @@ def loss_of(prediction: Prediction) -> Tensor:
 
 def measure_one(name: str, setting: str, threads: int, device_name: str) -> dict[str, Any]:
     """Figures of one network under one setting, in this process."""
-    runtime = RuntimeConfig(device=device_name, threads=threads, workers=1)
+    runtime = replace(load(ROOT).runtime, device=device_name, threads=threads)
     device = device_of(runtime)
     limit_threads(threads)
     if setting != "naive":

@@ -11,6 +11,7 @@ from polarnet.reports.figures import (
     comparison_panel,
     dolp_bar,
     png,
+    reliability_figure,
     score_distribution,
     score_line,
     training_curves,
@@ -31,6 +32,7 @@ def scene(*methods):
         lambda: training_curves([CURVE], [CURVE], "validation", LIGHT),
         lambda: score_distribution(SCORES, DARK),
         lambda: dolp_bar(LIGHT),
+        lambda: reliability_figure({"ours": [(0.01, 0.02, 100), (0.1, 0.1, 300)]}, DARK),
     ],
 )
 def test_the_same_figure_gives_the_same_bytes_without_date_or_software(draw):

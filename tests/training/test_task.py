@@ -24,6 +24,7 @@ LOOP: dict[str, Any] = {
     "crop": [16, 20],
     "symmetries": True,
     "epochs": 1,
+    "accumulate": 1,
     "batch_size": 2,
     "bptt_windows": 2,
     "learning_rate": 1e-3,
