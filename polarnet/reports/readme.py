@@ -122,15 +122,17 @@ def study_block(results: Mapping[str, Any]) -> str:
         lines += [f"**{SET_TITLES[name]}**: {about['scenes']} scenes, {about['frames']} frames", ""]
         lines += [as_markdown(score_table(study[name], None, {**COLUMNS, **COSTS})), ""]
         lines += [f"- {line}" for line in paired_lines(about["paired"])] + [""]
-    minutes, versions = study["minutes_trained"], ", ".join(f"{k} {v}" for k, v in record["versions"].items())
+    versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
+    minutes = ", ".join(f"{row} {value:.0f} minutes" for row, value in study["minutes_trained"].items())
+    over_paper = ""
+    if "gain_over_paper_db" in results:
+        over_paper = f"PSNR over the paper's network: {results['gain_over_paper_db']:+.2f} dB. "
     lines += [
-        f"MSE of ours over the oracle mean's: {results['mse_over_oracle_mean']:.2f}; PSNR over the paper's network: "
-        f"{results['gain_over_paper_db']:+.2f} dB; on measured scenes, MSE over that of the best intensity "
-        f"reconstruction: {results['measured']['mse_over_best_baseline']:.2f}.",
+        f"MSE of ours over the oracle mean's: {results['mse_over_oracle_mean']:.2f}. {over_paper}On measured scenes, "
+        f"MSE over that of the best intensity reconstruction: {results['measured']['mse_over_best_baseline']:.2f}.",
         "",
-        f"Trained {minutes['ours']:.0f} (ours) and {minutes['paper']:.0f} minutes (paper) on "
-        f"{study['threads'] or record['cores']} of {record['cores']} cores ({record['machine']}, load "
-        f"{record['load']:.1f} before the start; {versions}; commit `{record['commit'][:10]}`).",
+        f"Trained: {minutes}, on {study['threads'] or record['cores']} of {record['cores']} cores "
+        f"({record['machine']}, load {record['load']:.1f} before the start; {versions}; commit `{record['commit'][:10]}`).",
     ]
     return "\n".join(lines)
 

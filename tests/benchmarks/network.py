@@ -52,9 +52,13 @@ def headlines(tables: dict[str, dict[str, dict[str, Any]]]) -> dict[str, Any]:
     """What the tables say of the two networks."""
     simulated, measured = tables["simulated"], tables["measured"]
     best = min(scores["mse"] for row, scores in measured.items() if row in INTENSITY)
-    return {
-        "gain_over_paper_db": simulated["ours"]["psnr"] - simulated["paper"]["psnr"],
-        "mse_over_paper": simulated["ours"]["mse"] / simulated["paper"]["mse"],
+    over_paper = {}
+    if "paper" in simulated:
+        over_paper = {
+            "gain_over_paper_db": simulated["ours"]["psnr"] - simulated["paper"]["psnr"],
+            "mse_over_paper": simulated["ours"]["mse"] / simulated["paper"]["mse"],
+        }
+    return over_paper | {
         "mse_over_oracle_mean": simulated["ours"]["mse"] / simulated["oracle_mean"]["mse"],
         "measured": {"mse_over_best_baseline": measured["ours"]["mse"] / best},
     }
@@ -68,7 +72,7 @@ def main() -> None:
     parser.add_argument("--firenet", type=Path, help="FireNet's published weights; without them its rows are left out")
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--epochs", type=int, default=3)
-    parser.add_argument("--paper-epochs", type=int, default=4)
+    parser.add_argument("--paper-epochs", type=int, default=1, help="0: leave the paper's network out")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     parser.add_argument("--write", action="store_true", help="write docs/results/network.json")
@@ -82,11 +86,15 @@ def main() -> None:
     if not (arguments.work / "data" / "events.zarr").exists():
         for name in ("ingest", "synthesize", "emulate", "weights"):
             stage(name, arguments)
-    ours, paper = trained("polarnet", arguments.epochs, arguments), trained("paper", arguments.paper_epochs, arguments)
+    folders = {"ours": trained("polarnet", arguments.epochs, arguments)}
+    if arguments.paper_epochs:
+        folders["paper"] = trained("paper", arguments.paper_epochs, arguments)
     sets = ("benchmark.sets=[simulated,measured]", f"sets.measured_root={arguments.measured}")
     stage("sets", arguments, *sets)
     methods = f"benchmark.methods=[{','.join(METHODS)}]"
-    weights = [f"paths.train={ours}", f"baselines.weights.paper={paper / 'best.safetensors'}"]
+    weights = [f"paths.train={folders['ours']}"]
+    if "paper" in folders:
+        weights.append(f"baselines.weights.paper={folders['paper'] / 'best.safetensors'}")
     if arguments.firenet:
         weights.append(f"baselines.weights.firenet_published={arguments.firenet.resolve()}")
     stage("benchmark", arguments, *sets, methods, *weights)
@@ -96,7 +104,7 @@ def main() -> None:
         rows, details = (json.loads((path / f"{file}.json").read_text()) for file in ("metrics", "details"))
         tables[name] = {row: {key: scores.get(key) for key in BENCHMARK_KEYS} for row, scores in rows.items()}
         about[name] = {"scenes": len(details["scenes"]), "frames": details["frames"], "paired": details["paired"]}
-    minutes = {row: json.loads((path / "minutes.json").read_text()) for row, path in (("ours", ours), ("paper", paper))}
+    minutes = {row: json.loads((path / "minutes.json").read_text()) for row, path in folders.items()}
     print(json.dumps({"minutes_trained": minutes} | headlines(tables), indent=2))
     if arguments.write:
         section = "study" if arguments.seed == 1 else f"study_seed_{arguments.seed}"

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from polarnet.reports.readme import update_results_blocks
+from polarnet.reports.readme import study_block, update_results_blocks
 from polarnet.reports.recording_tables import recordings_block
 
 RESULTS = {
@@ -120,6 +120,30 @@ def test_the_emulation_block_says_how_to_measure_while_nobody_has(project):
 
 
 MACHINE = {"machine": "a processor", "cores": 2, "load": 1.0, "versions": {"python": "3.11"}, "commit": "abc1234"}
+
+
+def test_the_study_of_the_networks_shows_both_sets_and_says_what_was_trained():
+    table = {"zeros": {"mse": 0.1, "psnr": 10.0}, "ours": {"mse": 0.02, "psnr": 17.0}}
+    about = {"scenes": 30, "frames": 750, "paired": {}}
+    study = {
+        "simulated": table,
+        "measured": {"ours": {"mse": 0.01, "psnr": 20.0}},
+        "about": {"simulated": about, "measured": about | {"scenes": 4}},
+        "minutes_trained": {"ours": 36.2},
+        "threads": 1,
+    }
+    results = {
+        "study": study,
+        "records": {"study": MACHINE},
+        "mse_over_oracle_mean": 0.6,
+        "measured": {"mse_over_best_baseline": 0.4},
+    }
+    block = study_block(results)
+    assert "**Simulated**: 30 scenes, 750 frames" in block
+    assert "**Measured polarization**: 4 scenes" in block
+    assert "oracle mean's: 0.60. On measured scenes, MSE over that of the best intensity reconstruction: 0.40." in block
+    assert "Trained: ours 36 minutes, on 1 of 2 cores (a processor" in block
+    assert "PSNR over the paper's network: +2.00 dB." in study_block(results | {"gain_over_paper_db": 2.0})
 
 
 def test_recordings_are_shown_reader_by_reader_with_libraries_beside_them():
