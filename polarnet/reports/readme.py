@@ -132,7 +132,8 @@ def study_block(results: Mapping[str, Any]) -> str:
         f"MSE over that of the best intensity reconstruction: {results['measured']['mse_over_best_baseline']:.2f}.",
         "",
         f"Trained: {minutes}, on {study['threads'] or record['cores']} of {record['cores']} cores "
-        f"({record['machine']}, load {record['load']:.1f} before the start; {versions}; commit `{record['commit'][:10]}`).",
+        f"({record['machine']}, load {record['load']:.1f} before the start; {versions}; "
+        f"commit `{record['commit'][:10]}`).",
     ]
     return "\n".join(lines)
 
