@@ -282,7 +282,9 @@ def replay(store: EventStore, sequence: str, speed: float, write: Callable[[byte
         due_us = int((time.perf_counter() - started) * 1e6 * speed)
         come = int(times.searchsorted(due_us, side="right"))
         if come > sent:
+            asked = time.perf_counter()
             write(lines[ends[sent] : ends[come]])
+            started += time.perf_counter() - asked  # the clock stands while nobody takes the lines
             sent = come
         else:
             time.sleep(0.001)
