@@ -63,7 +63,8 @@ class LiveLines:
         self._grows = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
         self._rest, self._started_with, self._read_at = b"", b"", 0.0
         self._queue: Queue[tuple[bytes, float] | None] = Queue(MOST_READ_AHEAD if self._grows else 0)
-        Thread(target=self._read, daemon=True).start()
+        own = os.dup(source.fileno())  # whose number no file that is opened later can get
+        Thread(target=self._read, args=[own], daemon=True).start()
         self._sensor = self._first_line()
         self.height, self.width = (side // 2 if mosaic else side for side in self._sensor)
 
@@ -121,12 +122,12 @@ class LiveLines:
             data, self._rest = self._rest + b"\n", b""
             yield data, self._read_at
 
-    def _read(self) -> None:
+    def _read(self, descriptor: int) -> None:
         """What comes into the queue with its time, in a thread of its own: whoever recovers may be busy as it comes."""
         quiet_since = time.monotonic()
         try:
-            while True:
-                data = os.read(self._source.fileno(), READ_BYTES)  # what is there, without waiting for more
+            while not self._source.closed:
+                data = os.read(descriptor, READ_BYTES)  # what is there, without waiting for more
                 if data:
                     self._queue.put((data, time.perf_counter()))
                     quiet_since = time.monotonic()
@@ -134,9 +135,10 @@ class LiveLines:
                     return
                 else:
                     time.sleep(POLL_S)
-        except (OSError, ValueError):  # closed by whoever opened it
+        except OSError:  # the other end is gone
             return
         finally:
+            os.close(descriptor)
             self._queue.put(None)
 
     def _usable(self, table: Int64[np.ndarray, "n columns"]) -> Int64[np.ndarray, "m columns"]:
