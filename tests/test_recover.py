@@ -140,7 +140,7 @@ def test_a_sequence_is_replayed_as_lines_at_its_own_pace(store, channels):
 @pytest.mark.parametrize(("arguments", "reason"), [
     ((), "say --sequence, one of lake, road; got None"),
     (("--sequence", "lake", "--method", "oracle_mean"), "expected a method of cf"),
-    (("--sequence", "lake", "--method", "e2p"), "is not there"),
+    (("--sequence", "lake", "--method", "e2vid_published"), "no weights are given"),
     (("--sequence", "lake", "--method", "cf", "--window", "1s"), "do not fill one window"),
     (("--sequence", "lake", "--method", "cf", "--step", "9ev"), "expected a time such as 0.1ms"),
     (("--sequence", "lake", "--method", "cf", "--step", "1s"), "events between windows would be lost"),
