@@ -97,3 +97,24 @@ def test_a_set_that_was_not_run_is_asked_for(tmp_path, measured_project):
     (measured_project / "data" / "benchmark" / "sets" / "measured" / "metrics.json").unlink()
     with pytest.raises(RuntimeError, match=r"no results of measured; run `dvc repro` with benchmark.sets"):
         measure_benchmark(measured_project, measured_project / "data" / "benchmark")
+
+
+def test_figures_are_kept_where_the_tests_fail(tmp_path):
+    """A project of which `make repro` leaves what the record takes, and whose tests fail."""
+    root = tmp_path / "project"
+    for folder in ("data/benchmark", "data/weights", "data/report", "docs/results", "docs/pictures"):
+        (root / folder).mkdir(parents=True)
+        (root / folder / ".keep").write_text("")
+    (root / "data" / "benchmark" / "metrics.json").write_text('{"ours": {"mse": 0.1}}')
+    (root / "data" / "weights" / "lpips.json").write_text('{"reason": "none here"}')
+    (root / "data" / "report" / "overview.png").write_bytes(b"picture")
+    (root / "Makefile").write_text("setup:\n\t@true\nrepro:\n\t@true\ntest:\n\t@false\n")
+    git(root, "init", "--quiet")
+    git(root, "add", ".")
+    git(root, "-c", "user.name=a", "-c", "user.email=a@b", "commit", "--quiet", "-m", "all")
+    with pytest.raises(RuntimeError, match="make test failed"):
+        measure_pipeline(root)
+    record = json.loads((root / "docs" / "results" / "pipeline.json").read_text())
+    assert record["metrics"] == {"ours": {"mse": 0.1}}
+    assert "test_minutes" not in record
+    assert (root / "docs" / "pictures" / "overview.png").read_bytes() == b"picture"

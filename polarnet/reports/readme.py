@@ -46,10 +46,11 @@ def pipeline_block(results: Mapping[str, Any]) -> str:
         lines += ["Means over the test scenes; below them the 95 % bootstrap interval over scenes.", ""]
     lines += [f"- {line}" for line in standing(metrics)]
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
+    tests = f", `make test` {results['test_minutes']:.1f}" if "test_minutes" in results else ""
     lines += [
         "",
-        f"`make repro` took {results['repro_minutes']:.1f} minutes after a set-up of {results['setup_minutes']:.1f}, "
-        f"`make test` {results['test_minutes']:.1f}, on {results['cores']} cores ({results['machine']}, "
+        f"`make repro` took {results['repro_minutes']:.1f} minutes after a set-up of {results['setup_minutes']:.1f}"
+        f"{tests}, on {results['cores']} cores ({results['machine']}, "
         f"load {results['load']:.1f} before the start; {versions}; commit `{results['commit'][:10]}`).",
     ]
     if stages := results.get("stage_minutes"):

@@ -38,6 +38,13 @@ def test_the_block_shows_the_committed_results_and_nothing_else_changes(project)
     assert "Minutes by stage: ingest 0.2, train 8.0." in text
 
 
+def test_a_run_whose_tests_failed_is_shown_without_their_minutes(project):
+    results = {key: value for key, value in RESULTS.items() if key != "test_minutes"}
+    (project / "docs" / "results" / "pipeline.json").write_text(json.dumps(results))
+    update_results_blocks(project, check=False)
+    assert "after a set-up of 1.5, on 2 cores (a processor" in (project / "README.md").read_text()
+
+
 def test_a_second_update_changes_nothing(project):
     update_results_blocks(project, check=False)
     assert update_results_blocks(project, check=False) == []
