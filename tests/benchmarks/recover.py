@@ -35,7 +35,7 @@ from polarnet.events.stream import Events
 from polarnet.events.streaming import WindowRule
 from polarnet.measure import machine_record
 from polarnet.networks.checkpoint import load_network
-from polarnet.networks.dolp_unet import NETWORKS
+from polarnet.networks.registry import NETWORKS
 from polarnet.recordings.arrangements import write_store
 from polarnet.recordings.live import LiveLines, Piece
 from polarnet.recover import Input, Summary, recover
@@ -69,7 +69,7 @@ def network_of(config: Config, weights: Path | None) -> tuple[Stream, str]:
         weights = weights or shipped_weights()
     except FileNotFoundError:
         build, _ = NETWORKS[config.network]
-        representation = config.train.representation
+        representation = config.train.representation or build.representation
         torch.manual_seed(config.seed)
         module = build(config.network_config, 4 * channels_of(REPRESENTATIONS[representation]))
         return Recoverer((module, {"representation": representation})), config.network + UNTRAINED
