@@ -105,7 +105,7 @@ def keep_freed_memory() -> None:
 
 def configure(config: RuntimeConfig, seed: int) -> torch.device:
     """Set threads, seed torch, keep freed memory, ask torch for deterministic kernels; the device to run on."""
-    torch.set_flush_denormal(True)  # tiny gradients made convolutions several times slower; threads inherit it
+    torch.set_flush_denormal(True)  # processors compute slowly with tiny gradients; threads inherit it
     limit_threads(config.threads or max(1, usable_cores() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))))
     keep_freed_memory()
     torch.manual_seed(seed)

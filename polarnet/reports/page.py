@@ -5,8 +5,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, SetResults, read_artefacts
 from polarnet.reports.figures import (
     PanelScene,
@@ -45,6 +43,7 @@ from polarnet.reports.tiles import (
     event_tiles,
     panel_tiles,
     polarization_tiles,
+    template,
 )
 from polarnet.simulation.pictures.manifest import SPLITS
 
@@ -91,10 +90,7 @@ def write_report(paths: ReportPaths, run: Run, folder: Path) -> Path:
     if artefacts.panels:
         rows = [PanelScene(panel.sequence, panel.events, panel.truth_dolp, panel.dolp) for panel in artefacts.panels]
         comparison_panel(rows, folder / "comparison.png")
-    environment = Environment(
-        loader=PackageLoader("polarnet.reports", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
-    page = environment.get_template("page.html.jinja").render(_context(artefacts, run, overview))
+    page = template("page.html.jinja").render(_context(artefacts, run, overview))
     path = folder / "index.html"
     path.write_text(page, encoding="utf-8")
     return path

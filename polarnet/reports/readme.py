@@ -124,7 +124,8 @@ def study_block(results: Mapping[str, Any]) -> str:
         lines += [as_markdown(score_table(study[name], None, {**COLUMNS, **COSTS})), ""]
         lines += [f"- {line}" for line in paired_lines(about["paired"])] + [""]
     versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
-    minutes = ", ".join(f"{row} {value:.0f} minutes" for row, value in study["minutes_trained"].items())
+    timed = {row: value for row, value in study["minutes_trained"].items() if value is not None}
+    minutes = "Trained: " + ", ".join(f"{row} {value:.0f} minutes" for row, value in timed.items()) if timed else "Run"
     over_paper = ""
     if "gain_over_paper_db" in results:
         over_paper = f"PSNR over the paper's network: {results['gain_over_paper_db']:+.2f} dB. "
@@ -132,7 +133,7 @@ def study_block(results: Mapping[str, Any]) -> str:
         f"MSE of ours over the oracle mean's: {results['mse_over_oracle_mean']:.2f}. {over_paper}On measured scenes, "
         f"MSE over that of the best intensity reconstruction: {results['measured']['mse_over_best_baseline']:.2f}.",
         "",
-        f"Trained: {minutes}, on {study['threads'] or record['cores']} of {record['cores']} cores "
+        f"{minutes} on {study['threads'] or record['cores']} of {record['cores']} cores "
         f"({record['machine']}, load {record['load']:.1f} before the start; {versions}; "
         f"commit `{record['commit'][:10]}`).",
     ]

@@ -17,7 +17,6 @@ import OpenImageIO as oiio
 import torch
 import zarr
 from jaxtyping import Float, UInt8
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from torch import Tensor
 
 from polarnet.events.streaming import EventWindow
@@ -32,10 +31,10 @@ from polarnet.reports.maps import (
     hue_wheel,
     polarization_hsv,
 )
-from polarnet.reports.tiles import chart, data_uri
+from polarnet.reports.tiles import chart, data_uri, template
 
 OUTPUTS = ("zarr", "png", "exr", "mp4")
-VIDEO, CODEC = "recovered.mp4", "mp4v"  # MPEG-4, which players show and browsers do not; VP8 takes 20 times as long
+VIDEO, CODEC = "recovered.mp4", "mp4v"  # MPEG-4, which players show and browsers do not
 FILM_FRAMES = 24
 """At least so many pictures, evenly spread, run on the page."""
 NO_FILTER = 8  # libpng's PNG_FILTER_NONE: half the time, and hardly larger
@@ -129,10 +128,7 @@ class RecoveryWriter:
         if some:
             sheet = np.concatenate([_with_margin(shown.picture) for shown in some[1::2] or some])
             (self.folder / "recovered.png").write_bytes(encode_png(sheet))
-        environment = Environment(
-            loader=PackageLoader("polarnet.reports", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-        )
-        page = environment.get_template("recovery.html.jinja").render(
+        page = template("recovery.html.jinja").render(
             title=title,
             facts=facts,
             notes=notes,

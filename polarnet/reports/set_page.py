@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from polarnet.reports.artefacts import read_set
 from polarnet.reports.figures import PanelScene, comparison_panel, dolp_bar
 from polarnet.reports.maps import encode_png, hue_wheel
@@ -18,7 +16,7 @@ from polarnet.reports.tables import (
     score_table,
     standing,
 )
-from polarnet.reports.tiles import TileRow, chart, data_uri, distribution, panel_tiles, polarization_tiles
+from polarnet.reports.tiles import TileRow, chart, data_uri, distribution, panel_tiles, polarization_tiles, template
 
 
 def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str]) -> Path:
@@ -31,10 +29,7 @@ def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str])
     if results.panels:
         rows = [PanelScene(panel.sequence, panel.events, panel.truth_dolp, panel.dolp) for panel in results.panels]
         comparison_panel(rows, folder / "comparison.png")
-    environment = Environment(
-        loader=PackageLoader("polarnet.reports", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
-    page = environment.get_template("set.html.jinja").render(
+    page = template("set.html.jinja").render(
         title=title,
         command=command,
         notes=notes,

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
 
 from polarnet.reports.artefacts import Panel
@@ -116,3 +117,11 @@ def tile(picture: UInt8[np.ndarray, "h w 3"], label: str, detail: str = "") -> T
 def data_uri(content: bytes, kind: str) -> str:
     """A picture file's content as an address."""
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def template(name: str) -> Template:
+    """A page's template of this package: every value escaped, and one that is missing an error."""
+    environment = Environment(
+        loader=PackageLoader("polarnet.reports", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    return environment.get_template(name)

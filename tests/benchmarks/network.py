@@ -39,12 +39,13 @@ def stage(name: str, arguments: argparse.Namespace, *overrides: str) -> None:
 
 
 def trained(network: str, epochs: int, arguments: argparse.Namespace) -> Path:
-    """The folder of a network's training, and in its minutes.json how long that took; done once."""
+    """The folder of a network's training, and in its minutes.json how long that took; null: a killed one went on."""
     folder = arguments.work / f"train_{network}_{epochs}"
     if not (folder / "minutes.json").exists():
-        started = time.monotonic()
+        whole, started = not any((arguments.work / "resume").glob("*/running.pt")), time.monotonic()
         stage("train", arguments, f"network={network}", f"train.epochs={epochs}", f"paths.train={folder}")
-        (folder / "minutes.json").write_text(json.dumps(round((time.monotonic() - started) / 60, 1)))
+        minutes = round((time.monotonic() - started) / 60, 1) if whole else None
+        (folder / "minutes.json").write_text(json.dumps(minutes))
     return folder
 
 

@@ -149,7 +149,7 @@ def test_the_study_of_the_networks_shows_both_sets_and_says_what_was_trained():
     assert "**Simulated**: 30 scenes, 750 frames" in block
     assert "**Measured polarization**: 4 scenes" in block
     assert "oracle mean's: 0.60. On measured scenes, MSE over that of the best intensity reconstruction: 0.40." in block
-    assert "Trained: ours 36 minutes, on 1 of 2 cores (a processor" in block
+    assert "Trained: ours 36 minutes on 1 of 2 cores (a processor" in block
     assert "PSNR over the paper's network: +2.00 dB." in study_block(results | {"gain_over_paper_db": 2.0})
 
 
