@@ -102,14 +102,17 @@ BENCHMARK_KEYS = (
 """Of each method in docs/results/benchmark.json; intervals stay in metrics.json."""
 
 
-def measure_benchmark(root: Path, benchmark: Path) -> Path:
+def measure_benchmark(root: Path, benchmark: Path, record: Mapping[str, Any] | None = None) -> Path:
     """Write docs/results/benchmark.json from what the benchmark left in the folder `benchmark`.
+
+    `record` is the machine's from before the run, where the caller started it; None: as it is now.
 
     Its keys are the test sets, then the methods, then `BENCHMARK_KEYS`, beside the machine's record and each set's
     pairs of `ours` with the others. Raises RuntimeError where the simulated or the measured set was not run, and when
     the tree has uncommitted changes.
     """
-    if git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!dvc.lock", ":!data", ":!params.yaml"):
+    pipeline = (":!dvc.lock", ":!data", ":!params.yaml", ":!docs/results")
+    if git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", *pipeline):
         raise RuntimeError("the tree has uncommitted changes; commit them first, the figures name a commit")
     folders = {"simulated": benchmark} | {path.name: path for path in sorted(benchmark.glob("sets/*")) if path.is_dir()}
     missing = [name for name in ("simulated", "measured") if not (folders.get(name, root) / "metrics.json").exists()]
@@ -118,19 +121,18 @@ def measure_benchmark(root: Path, benchmark: Path) -> Path:
             f"{benchmark} has no results of {' and '.join(missing)}; run `dvc repro` with "
             f"benchmark.sets=[simulated,measured] and sets.measured_root=FOLDER first"
         )
-    record = machine_record(root)
-    record["paired"], record["about"] = {}, {}
+    found: dict[str, Any] = {**(record or machine_record(root)), "paired": {}, "about": {}}
     for name, folder in folders.items():
         metrics, details = (json.loads((folder / f"{file}.json").read_text()) for file in ("metrics", "details"))
-        record[name] = {method: {key: scores.get(key) for key in BENCHMARK_KEYS} for method, scores in metrics.items()}
-        record["paired"][name] = details["paired"]
-        record["about"][name] = {key: details[key] for key in ("frames", "warmup_windows", "precision")} | {
+        found[name] = {method: {key: scores.get(key) for key in BENCHMARK_KEYS} for method, scores in metrics.items()}
+        found["paired"][name] = details["paired"]
+        found["about"][name] = {key: details[key] for key in ("frames", "warmup_windows", "precision")} | {
             "scenes": len(details["scenes"]),
             "lpips_reason": details["lpips"]["reason"],
         }
     path = root / "docs" / "results" / "benchmark.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(record, indent=2, allow_nan=False) + "\n")
+    path.write_text(json.dumps(found, indent=2, allow_nan=False) + "\n")
     return path
 
 

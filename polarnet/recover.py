@@ -28,7 +28,7 @@ from polarnet.recordings.live import LiveLines, Piece, live_lines
 from polarnet.recordings.recording import Recording, detect_format
 from polarnet.recordings.targets import calibrate_targets
 from polarnet.reports.recovery import RecoveryWriter
-from polarnet.runtime import RuntimeConfig, device_of
+from polarnet.runtime import RuntimeConfig, device_of, tune
 from polarnet.stokes import Mosaic
 from polarnet.weights import shipped_weights
 
@@ -183,6 +183,7 @@ def open_stream(
     A network: of `weights`, else the shipped one, else what the pipeline trained. Another `method` of the benchmark:
     as `config` says. ValueError or FileNotFoundError that says what is missing.
     """
+    tune()
     place = device_of(RuntimeConfig(device, threads=0, workers=1, devices=1, nodes=1, rendezvous=""))
     if method in (None, "ours"):
         file = weights or _default_weights(config)

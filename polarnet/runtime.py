@@ -103,11 +103,16 @@ def keep_freed_memory() -> None:
         libc.mallopt(M_TRIM_THRESHOLD, LARGEST_KEPT)
 
 
+def tune() -> None:
+    """Settings that only speed up; what `configure` does for stages, for whatever else runs networks."""
+    torch.set_flush_denormal(True)  # processors compute slowly with tiny numbers; threads inherit it
+    keep_freed_memory()
+
+
 def configure(config: RuntimeConfig, seed: int) -> torch.device:
     """Set threads, seed torch, keep freed memory, ask torch for deterministic kernels; the device to run on."""
-    torch.set_flush_denormal(True)  # processors compute slowly with tiny gradients; threads inherit it
     limit_threads(config.threads or max(1, usable_cores() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))))
-    keep_freed_memory()
+    tune()
     torch.manual_seed(seed)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     torch.use_deterministic_algorithms(True, warn_only=True)

@@ -6,7 +6,7 @@ import json
 import platform
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from polarnet.evaluation.cache import FORMAT, Cache, sequence_digest
 from polarnet.evaluation.cost import Cost, cost_of
 from polarnet.evaluation.methods import METHODS, Context, Polarization, Recording, recover
 from polarnet.evaluation.paired import paired_comparisons
+from polarnet.evaluation.reliability import Reliability, reliability
 from polarnet.evaluation.score import (
     METRICS,
     BenchmarkConfig,
@@ -63,6 +64,8 @@ class Benchmark:
     rows: Sequence[FrameScore]
     costs: Mapping[str, Cost]
     panels: Sequence[Panel]
+    reliability: Mapping[str, Reliability] = field(default_factory=dict)
+    """Of the methods that say how large their error is to be expected."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,7 @@ def run_benchmark(
     shown = _spread(names, config.panel_scenes, {name: test_set.scene_of(name) for name in names})
     panels = [_panel(test_set.recording(name), digests, kept, config.warmup_windows) for name in names if name in shown]
     kept.forget([*names])
-    return Benchmark(rows, costs, panels)
+    return Benchmark(rows, costs, panels, _reliability(test_set, digests, kept, config.warmup_windows))
 
 
 def _recover_and_score(
@@ -160,7 +163,7 @@ def _recover_and_score(
         if (known := cache.scores(method, sequence, score_key)) is None:
             if (found := cache.prediction(method, sequence, key)) is None:
                 recovered = recover(method, recording, context)
-                found = cache.write_prediction(method, sequence, key, Polarization(recovered.dolp, recovered.aolp))
+                found = cache.write_prediction(method, sequence, key, recovered.polarization)
             known = score_sequence(recording, {method: found}, config.warmup_windows, lpips, context.device)
             cache.write_scores(method, sequence, score_key, known)
         rows += known
@@ -213,6 +216,10 @@ def write_benchmark(
         "bootstrap_samples": config.bootstrap_samples,
         "scene_means": {metric: of_methods for metric, of_methods in means.items() if of_methods},
         "paired": paired_comparisons(benchmark.rows, "ours"),
+        "reliability": {
+            method: {"curve": sums.curve(), "log_error": sums.log_error()}
+            for method, sums in benchmark.reliability.items()
+        },
     }
     for name, content in (("metrics", metrics), ("details", details)):
         (folder / f"{name}.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
@@ -227,6 +234,25 @@ def _spread(names: Sequence[str], count: int, scenes: Mapping[str, str]) -> set[
     first = list({scenes.get(name, name): name for name in reversed(names)}.values())[::-1]
     count = min(count, len(first))
     return {first[round(i * (len(first) - 1) / max(count - 1, 1))] for i in range(count)}
+
+
+def _reliability(
+    test_set: BenchmarkSet, digests: Mapping[str, str], cache: Cache, warmup_windows: int
+) -> dict[str, Reliability]:
+    """Over the scored windows of all sequences, of each method that expects an error."""
+    sums: dict[str, Reliability] = {}
+    speaking = dict(digests)  # all that may say something of it, until the first sequence tells
+    for recording in test_set.recordings():
+        windows = slice(scored_windows(recording, warmup_windows).start, None)
+        valid = None if recording.valid is None else recording.valid[windows]
+        for method, key in _prediction_keys(recording, speaking).items():
+            found = cache.prediction(method, recording.name, key)
+            if found is None or found.log_variance is None:
+                del speaking[method]
+                continue
+            here = reliability(found.log_variance[windows], found.dolp[windows], recording.dolp[windows], valid)
+            sums[method] = sums[method] + here if method in sums else here
+    return sums
 
 
 def _panel(recording: Recording, digests: Mapping[str, str], cache: Cache, warmup_windows: int) -> Panel:

@@ -8,7 +8,7 @@ import dataclasses
 import json
 import os
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,12 @@ from torch import Tensor
 
 from polarnet.evaluation.cost import Cost
 from polarnet.evaluation.methods import Polarization, Recording
+from polarnet.evaluation.reliability import HIGHEST, LOWEST
 from polarnet.evaluation.score import FrameScore
 from polarnet.events.frames import dequantise_angle, dequantise_fraction, quantise_angle, quantise_fraction
 from polarnet.fingerprint import digest
 
-FORMAT = "1"  # part of every hash: raise it when what is stored, or `methods.recover`, changes
+FORMAT = "2"  # part of every hash: raise it when what is stored, or `methods.recover`, changes
 
 
 def sequence_digest(recording: Recording) -> str:
@@ -38,8 +39,8 @@ def sequence_digest(recording: Recording) -> str:
 class Cache:
     """The entries of one test set under `folder`, which may not exist yet.
 
-    Predictions are kept in the steps of the stored truth (DoLP in 1/65535, AoLP in pi/65536), and scored as kept, so
-    that a run that finds them and one that makes them give the same scores.
+    Predictions are kept in the steps of the stored truth (DoLP in 1/65535, AoLP in pi/65536; the expected error as
+    float16), and scored as kept, so that a run that finds them and one that makes them give the same scores.
     """
 
     def __init__(self, folder: Path):
@@ -52,8 +53,7 @@ class Cache:
             with np.load(path, allow_pickle=False) as arrays:
                 if str(arrays["key"]) != key:
                     return None
-                aolp = dequantise_angle(arrays["aolp"]) if "aolp" in arrays.files else None
-                return Polarization(dequantise_fraction(arrays["dolp"]), aolp)
+                return _kept(arrays)
         except (FileNotFoundError, KeyError, ValueError, EOFError, zipfile.BadZipFile):  # absent, or cut short
             return None
 
@@ -79,14 +79,15 @@ class Cache:
         arrays = {"dolp": quantise_fraction(found.dolp)}
         if found.aolp is not None:
             arrays["aolp"] = quantise_angle(_wrapped(found.aolp))
+        if found.log_variance is not None:
+            arrays["log_variance"] = found.log_variance.clamp(LOWEST, HIGHEST).numpy().astype(np.float16)
         path = self._path(method, sequence, "npz")
         temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:
             np.savez_compressed(file, key=np.array(key), **arrays)  # type: ignore[arg-type]
         temporary.replace(path)
-        aolp = dequantise_angle(arrays["aolp"]) if "aolp" in arrays else None
-        return Polarization(dequantise_fraction(arrays["dolp"]), aolp)
+        return _kept(arrays)
 
     def scores(self, method: str, sequence: str, key: str) -> list[FrameScore] | None:
         """The rows that `write_scores` was given under this key."""
@@ -128,6 +129,13 @@ class Cache:
         temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
         temporary.write_text(json.dumps({"key": key, "value": value}))
         temporary.replace(path)
+
+
+def _kept(arrays: Mapping[str, np.ndarray]) -> Polarization:
+    """What an entry holds, in its steps."""
+    aolp = dequantise_angle(arrays["aolp"]) if "aolp" in arrays else None
+    log_variance = torch.from_numpy(arrays["log_variance"].astype(np.float32)) if "log_variance" in arrays else None
+    return Polarization(dequantise_fraction(arrays["dolp"]), aolp, log_variance)
 
 
 def _wrapped(aolp: Tensor) -> Tensor:

@@ -108,8 +108,7 @@ def by_window_length(
 
 
 def _answer(method: str, recording: Recording, context: Context) -> Polarization:
-    found = recover(method, recording, context)
-    return Polarization(found.dolp, found.aolp)
+    return recover(method, recording, context).polarization
 
 
 def _means(rows: Sequence[FrameScore]) -> dict[str, Any]:

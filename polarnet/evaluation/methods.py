@@ -104,6 +104,8 @@ class Polarization(NamedTuple):
 
     dolp: Float[Tensor, "n h w"]
     aolp: Float[Tensor, "n h w"] | None = None
+    log_variance: Float[Tensor, "n h w"] | None = None
+    """Natural logarithm of the squared error of DoLP that the method expects; None where it says nothing of it."""
 
 
 class Recovered(NamedTuple):
@@ -111,7 +113,13 @@ class Recovered(NamedTuple):
 
     dolp: Float[Tensor, "n h w"]
     aolp: Float[Tensor, "n h w"] | None
+    log_variance: Float[Tensor, "n h w"] | None
     seconds: float
+
+    @property
+    def polarization(self) -> Polarization:
+        """Without the time."""
+        return Polarization(self.dolp, self.aolp, self.log_variance)
 
 
 @dataclass(frozen=True)
@@ -274,7 +282,8 @@ def recover(method: str, recording: Recording, context: Context) -> Recovered:
     found = METHODS[method](recording, context)
     recovered = degree(found.dolp).cpu()
     seconds = time.perf_counter() - start
-    return Recovered(recovered, None if found.aolp is None else found.aolp.float().cpu(), seconds)
+    aolp, log_variance = (None if maps is None else maps.float().cpu() for maps in (found.aolp, found.log_variance))
+    return Recovered(recovered, aolp, log_variance, seconds)
 
 
 def degree(dolp: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
@@ -377,7 +386,9 @@ def dolp_network(network_of: Callable[[Context], tuple[nn.Module, dict[str, Any]
                 prediction, state = network(window[None].to(context.device), state)
             frames.append(prediction)
         angles = [frame.aolp for frame in frames if frame.aolp is not None]
-        return Polarization(torch.cat([frame.dolp for frame in frames]), torch.cat(angles) if angles else None)
+        variances = [frame.log_variance for frame in frames if frame.log_variance is not None]
+        more = (torch.cat(maps) if maps else None for maps in (angles, variances))
+        return Polarization(torch.cat([frame.dolp for frame in frames]), *more)
 
     return polarization
 

@@ -137,7 +137,7 @@ def score_sequence(
     shown = {method: with_truth_outside(found.dolp, truth, valid) for method, found in counted.items()}
     distances = _lpips_of(shown, truth, lpips)
     rows = []
-    for method, (dolp, aolp) in counted.items():
+    for method, (dolp, aolp, _) in counted.items():
         per_frame: dict[str, Tensor | None] = {
             "mse": mse(dolp, truth, valid),
             "psnr": psnr(dolp, truth, valid),

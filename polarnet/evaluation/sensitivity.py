@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from polarnet.evaluation.methods import Context, Polarization, recover
+from polarnet.evaluation.methods import Context, recover
 from polarnet.evaluation.resimulate import resimulated
 from polarnet.evaluation.score import FrameScore, scene_means, score_sequence
 from polarnet.simulation.emulator import EmulatorConfig
@@ -84,10 +84,7 @@ def sensitivity(
                     raise
                 left_out.append(f"{sequence}: {error}")
                 continue
-            answers = {}
-            for method in methods:
-                found = recover(method, recording, context)
-                answers[method] = Polarization(found.dolp, found.aolp)
+            answers = {method: recover(method, recording, context).polarization for method in methods}
             rows += score_sequence(recording, answers, warmup_windows, None, context.device)
             pixels = recording.events[0].height * recording.events[0].width
             seconds = (int(recording.t_us[-1]) - int(recording.t_us[0])) / 1e6

@@ -98,4 +98,24 @@ def neighbourhoods(x: Float[Tensor, "n c h w"], scales: Sequence[int]) -> Iterab
         elif scale == 1:
             yield x
         else:
-            yield F.avg_pool2d(x, scale, stride=1, padding=scale // 2, count_include_pad=False)
+            yield box_means(x, scale)
+
+
+def box_means(x: Float[Tensor, "n c h w"], width: int) -> Float[Tensor, "n c h w"]:
+    """Means over boxes of `width` pixels around each one, without what lies outside the image.
+
+    One axis after the other, as depthwise convolutions of channels_last images: many times as fast on a CPU as pooling.
+    """
+    channels, rows, columns = x.shape[-3:]
+    ones = x.new_ones(channels, 1, 1, width)
+    with torch.autocast(x.device.type, enabled=False):
+        sums = x.float().contiguous(memory_format=torch.channels_last)
+        sums = F.conv2d(sums, ones, padding=(0, width // 2), groups=channels)
+        sums = F.conv2d(sums, ones.transpose(2, 3), padding=(width // 2, 0), groups=channels)
+    return sums / (inside(rows, width, x)[:, None] * inside(columns, width, x))
+
+
+def inside(pixels: int, width: int, like: Tensor) -> Float[Tensor, " pixels"]:
+    """How many of `width` pixels around each of a row lie in it."""
+    middle = torch.arange(pixels, device=like.device)
+    return ((middle + width // 2).clamp(max=pixels - 1) - (middle - width // 2).clamp(min=0) + 1).float()

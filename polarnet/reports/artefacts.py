@@ -35,6 +35,7 @@ class ReportPaths:
     events: Path
     train: Path
     train_e2v: Path
+    train_e2p: Path
     benchmark: Path
 
     def check(self) -> None:
@@ -46,6 +47,7 @@ class ReportPaths:
             self.events: "emulate",
             self.train / "history.json": "train",
             self.train_e2v / "history.json": "train_e2v",
+            self.train_e2p / "history.json": "train_e2p",
             self.benchmark / "metrics.json": "benchmark",
             self.benchmark / "details.json": "benchmark",
         }
@@ -117,6 +119,7 @@ class Artefacts:
     """Test sets beyond the simulated one."""
     ours: History
     e2v: History
+    e2p: History
     rates: Sequence[EventRate]
     overview: Overview | None
     """None where the benchmark kept no panel of the network."""
@@ -151,6 +154,7 @@ def read_artefacts(paths: ReportPaths) -> Artefacts:
         sets=[read_set(folder) for folder in sorted(paths.benchmark.glob("sets/*")) if folder.is_dir()],
         ours=read_history(paths.train / "history.json"),
         e2v=read_history(paths.train_e2v / "history.json"),
+        e2p=read_history(paths.train_e2p / "history.json"),
         rates=event_rates(events, frames),
         overview=next((overview_of(panel, scenes, frames, events) for panel in _telling(panels)), None),
         thumbnails={

@@ -6,7 +6,7 @@ import cv2
 import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.colors import LinearSegmentedColormap, hsv_to_rgb
+from matplotlib.colors import Colormap, LinearSegmentedColormap, hsv_to_rgb
 from torch import Tensor
 
 DOLP_COLOURS = "viridis"  # perceptually uniform, and still monotonic in grey
@@ -33,12 +33,12 @@ def event_full_scale(events: Float[Tensor, "*b h w"]) -> float:
 def event_image(events: Float[Tensor, "h w"], full_scale: float) -> UInt8[np.ndarray, "h w 3"]:
     """Signed event counts or an event tensor (paper Eq. 5): ON red, OFF blue, nothing white; +-full_scale saturate."""
     unit = (events.numpy(force=True) / full_scale).clip(-1, 1)
-    return _bytes(EVENT_COLOURS((unit + 1) / 2)[..., :3])
+    return _coloured((unit + 1) / 2, EVENT_TABLE)
 
 
 def dolp_image(dolp: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """DoLP from 0 (dark violet) to 1 (yellow); values outside are clamped."""
-    return _bytes(matplotlib.colormaps[DOLP_COLOURS](dolp.numpy(force=True).clip(0, 1))[..., :3])
+    return _coloured(dolp.numpy(force=True).clip(0, 1), DOLP_TABLE)
 
 
 def intensity_image(intensity: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -90,3 +90,16 @@ def encode_jpeg(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
 
 def _bytes(unit: np.ndarray) -> np.ndarray:
     return np.rint(unit * 255).astype(np.uint8)
+
+
+def _table(colours: Colormap) -> UInt8[np.ndarray, "n 3"]:
+    """The steps of a colour map."""
+    return _bytes(colours(np.arange(colours.N))[:, :3])
+
+
+def _coloured(unit: np.ndarray, table: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """What matplotlib shows for numbers in [0, 1], in a fraction of its time."""
+    return table[np.minimum((unit * len(table)).astype(np.intp), len(table) - 1)]
+
+
+DOLP_TABLE, EVENT_TABLE = _table(matplotlib.colormaps[DOLP_COLOURS]), _table(EVENT_COLOURS)

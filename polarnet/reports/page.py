@@ -43,6 +43,7 @@ from polarnet.reports.tiles import (
     event_tiles,
     panel_tiles,
     polarization_tiles,
+    reliability_chart,
     template,
 )
 from polarnet.simulation.pictures.manifest import SPLITS
@@ -115,6 +116,7 @@ def _context(artefacts: Artefacts, run: Run, overview: bytes | None) -> dict[str
         "comparability": PAPER_COMPARABILITY,
         "standing": standing(metrics),
         "distribution": distribution(details["scene_means"]),
+        "reliability": reliability_chart(details),
         "dolp_bar": chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
         "wheel": data_uri(encode_png(hue_wheel(192)), "png"),
         "panels": [TileRow(panel.sequence, panel_tiles(panel)) for panel in artefacts.panels]
@@ -129,6 +131,7 @@ def _context(artefacts: Artefacts, run: Run, overview: bytes | None) -> dict[str
         "training": {
             "The DoLP network": _training(artefacts.ours),
             "E2V, events to intensity": _training(artefacts.e2v),
+            "E2P, events to polarization": _training(artefacts.e2p),
         },
         "ours_has_aolp": any("ours" in panel.aolp for panel in artefacts.panels),
         "manifest": manifest,

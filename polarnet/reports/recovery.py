@@ -97,7 +97,8 @@ class RecoveryWriter:
         self._group: zarr.Group | None = None
         self._buffer: dict[str, list[np.ndarray]] = {}
         self._video: cv2.VideoWriter | None = None
-        self._thread = ThreadPoolExecutor(1)
+        # A second thread that computes on several cores would put those of the network to sleep between operations.
+        self._thread = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,))
         self._waiting: deque[Future] = deque()
         folder.mkdir(parents=True, exist_ok=True)
         for kind in ("png", "exr"):

@@ -16,7 +16,16 @@ from polarnet.reports.tables import (
     score_table,
     standing,
 )
-from polarnet.reports.tiles import TileRow, chart, data_uri, distribution, panel_tiles, polarization_tiles, template
+from polarnet.reports.tiles import (
+    TileRow,
+    chart,
+    data_uri,
+    distribution,
+    panel_tiles,
+    polarization_tiles,
+    reliability_chart,
+    template,
+)
 
 
 def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str]) -> Path:
@@ -44,6 +53,7 @@ def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str])
         paper_source=PAPER_SOURCE,
         comparability=PAPER_COMPARABILITY,
         distribution=distribution(results.details["scene_means"]),
+        reliability=reliability_chart(results.details),
         dolp_bar=chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
         wheel=data_uri(encode_png(hue_wheel(192)), "png"),
         panels=[TileRow(panel.sequence, panel_tiles(panel)) for panel in results.panels],

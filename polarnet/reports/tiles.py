@@ -2,7 +2,7 @@
 
 import base64
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
 
 from polarnet.reports.artefacts import Panel
-from polarnet.reports.figures import DARK, LIGHT, Theme, png, score_distribution, score_line
+from polarnet.reports.figures import DARK, LIGHT, Theme, png, reliability_figure, score_distribution, score_line
 from polarnet.reports.maps import (
     dolp_image,
     encode_png,
@@ -91,6 +91,14 @@ def event_tiles(panel: Panel) -> list[Tile]:
         tile(event_image(events, full_scale), f"{angle}°")
         for events, angle in zip(panel.events, POLARIZER_ANGLES_DEG, strict=True)
     ]
+
+
+def reliability_chart(details: Mapping[str, Any]) -> Chart | None:
+    """Of the methods in details.json that expect an error; None where there is none."""
+    curves = {method: found["curve"] for method, found in details.get("reliability", {}).items()}
+    if not curves:
+        return None
+    return chart(lambda theme: reliability_figure(curves, theme), "measured against predicted squared error of DoLP")
 
 
 def distribution(scene_means: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Chart:

@@ -41,6 +41,7 @@ from polarnet.recordings.live import LiveLines, Piece
 from polarnet.recover import Input, Summary, recover
 from polarnet.reports.provenance import git
 from polarnet.reports.recovery import RecoveryWriter
+from polarnet.runtime import tune
 from polarnet.simulation import simulate
 from polarnet.weights import shipped_weights
 
@@ -115,6 +116,7 @@ def main() -> None:
     if arguments.write and changed:
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
     config = load(ROOT)
+    tune()
     figures: dict[str, Any] = machine_record(ROOT)
     channels = stream_of_events(config, arguments.seconds)
     network, name = network_of(config, arguments.weights)

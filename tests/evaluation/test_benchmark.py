@@ -1,6 +1,7 @@
 import dataclasses
 import functools
 import json
+import math
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from polarnet.cluster import pmap
 from polarnet.evaluation.benchmark import BenchmarkSet, run_benchmark, train_mean_dolp, write_benchmark
-from polarnet.evaluation.methods import METHODS, recover
+from polarnet.evaluation.methods import METHODS, Polarization, recover
 from polarnet.evaluation.score import BenchmarkConfig
 from polarnet.events.frames import FrameStore
 from polarnet.events.store import EventStore
@@ -89,6 +90,28 @@ def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
     assert details["paired"]["cf"]["mse"]["scenes"] == 3
     assert set(details["paired"]) == set(METHODS) - {"ours"}
     assert set(details["scene_means"]["ssim"]["cf"]) == {"lake", "town", "wood"}
+
+
+def test_expected_errors_are_held_against_measured_ones_in_the_scored_windows(
+    five_scenes, context, tmp_path, monkeypatch
+):
+    def sure(recording, context):
+        """Off by 0.1 everywhere and knows it, but in the warm-up."""
+        log_variance = torch.full_like(recording.dolp, math.log(0.01))
+        log_variance[0] = 0.0
+        off = torch.where(recording.dolp < 0.5, 0.1, -0.1)
+        return Polarization(recording.dolp + off, None, log_variance)
+
+    monkeypatch.setitem(METHODS, "highpass", sure)
+    for _ in range(2):  # made, and from the cache
+        found = run_benchmark(five_scenes, context, config(methods=["zeros", "highpass"]), None, tmp_path / "cache")
+        assert set(found.reliability) == {"highpass"}
+        assert found.reliability["highpass"].pixels.sum() == 4 * 3 * 18 * 20
+        assert found.reliability["highpass"].log_error() < 0.01
+    write_benchmark(tmp_path / "out", found, config(methods=["zeros", "highpass"]), 1, {})
+    written = json.loads((tmp_path / "out" / "details.json").read_text())["reliability"]["highpass"]
+    ((predicted, measured, pixels),) = written["curve"]
+    assert (predicted, measured, pixels) == (pytest.approx(0.01, rel=0.01), pytest.approx(0.01, rel=0.01), 4320)
 
 
 def test_panels_show_one_window_of_different_scenes_and_every_method(five_scenes, context, tmp_path):

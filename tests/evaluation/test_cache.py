@@ -16,11 +16,13 @@ def cache(tmp_path):
 
 
 def test_a_prediction_comes_back_in_the_steps_of_the_truth(cache, recording):
-    found = Polarization(recording.dolp, recording.aolp)
+    found = Polarization(recording.dolp, recording.aolp, 3 * recording.dolp - 4)
     kept = cache.write_prediction("m", "a", "key", found)
     again = cache.prediction("m", "a", "key")
     assert torch.equal(again.dolp, kept.dolp)
     assert torch.equal(again.aolp, kept.aolp)
+    assert torch.equal(again.log_variance, kept.log_variance)
+    torch.testing.assert_close(again.log_variance, found.log_variance, atol=0.002, rtol=0)
     torch.testing.assert_close(again.dolp, found.dolp, atol=0.51 / 65535, rtol=0)
     assert cache.has_prediction("m", "a", "key")
 

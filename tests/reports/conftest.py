@@ -107,7 +107,7 @@ def paths(tmp_path_factory):
     data = tmp_path_factory.mktemp("data")
     paths = ReportPaths(
         data / "images", data / "scenes.zarr", data / "frames.zarr", data / "events.zarr", data / "train",
-        data / "train_e2v", data / "benchmark",
+        data / "train_e2v", data / "train_e2p", data / "benchmark",
     )  # fmt: skip
     write_images(paths.images)
     motion = MotionConfig(
@@ -118,7 +118,7 @@ def paths(tmp_path_factory):
     frames = FrameStore.open(paths.frames)
     write_events(paths.events, frames)
     run_methods(EventStore.open(paths.events), frames, paths.benchmark)
-    for folder in (paths.train, paths.train_e2v):
+    for folder in (paths.train, paths.train_e2v, paths.train_e2p):
         folder.mkdir()
         (folder / "history.json").write_text(json.dumps(HISTORY))
     return paths

@@ -129,28 +129,38 @@ def test_the_emulation_block_says_how_to_measure_while_nobody_has(project):
 MACHINE = {"machine": "a processor", "cores": 2, "load": 1.0, "versions": {"python": "3.11"}, "commit": "abc1234"}
 
 
-def test_the_study_of_the_networks_shows_both_sets_and_says_what_was_trained():
-    table = {"zeros": {"mse": 0.1, "psnr": 10.0}, "ours": {"mse": 0.02, "psnr": 17.0}}
-    about = {"scenes": 30, "frames": 750, "paired": {}}
-    study = {
-        "simulated": table,
-        "measured": {"ours": {"mse": 0.01, "psnr": 20.0}},
-        "about": {"simulated": about, "measured": about | {"scenes": 4}},
-        "minutes_trained": {"ours": 36.2},
-        "threads": 1,
-    }
+def test_the_study_of_the_networks_shows_every_seed_beside_what_must_be_beaten():
+    def scores(mse):
+        rest = dict.fromkeys(("pattern_mse", "psnr", "ssim", "corr"), 0.0)
+        return {"mse": mse, "level_mse": mse / 2, **rest, "aolp_deg": None}
+
+    def seed(mse, minutes):
+        rows = {"zeros": 0.2, "oracle_mean": 0.03, "cf": 0.1, "firenet+gain": 0.05, "paper": 0.04, "ours": mse}
+        table = {row: scores(value) for row, value in rows.items()}
+        return {
+            "rows": {"simulated": table, "measured": table},
+            "minutes_trained": {"paper": minutes, "ours": None},
+            "threads": 1,
+            "gain_over_paper_db": 1.5,
+            "mse_over_paper": mse / 0.04,
+            "mse_over_oracle_mean": mse / 0.03,
+            "measured": {"mse_over_best_baseline": mse / 0.05},
+        }
+
     results = {
-        "study": study,
-        "records": {"study": MACHINE},
-        "mse_over_oracle_mean": 0.6,
-        "measured": {"mse_over_best_baseline": 0.4},
+        "seed_1": seed(0.02, 36.2),
+        "seed_2": seed(0.025, 30.0),
+        "records": {"seed_1": MACHINE, "seed_2": MACHINE},
+        "throughput": {},
     }
-    block = study_block(results)
-    assert "**Simulated**: 30 scenes, 750 frames" in block
-    assert "**Measured polarization**: 4 scenes" in block
-    assert "oracle mean's: 0.60. On measured scenes, MSE over that of the best intensity reconstruction: 0.40." in block
-    assert "Trained: ours 36 minutes on 1 of 2 cores (a processor" in block
-    assert "PSNR over the paper's network: +2.00 dB." in study_block(results | {"gain_over_paper_db": 2.0})
+    lines = study_block(results).splitlines()
+    shown = [line.split(" | ")[0].removeprefix("| ") for line in lines if line.startswith("| ") and "↓" not in line]
+    ours = ["the paper's network, seed 1", "the paper's network, seed 2", "ours, seed 1", "ours, seed 2"]
+    assert shown == ["oracle mean", "FireNet, gains solved", *ours] * 2
+    assert "| ours, seed 2 | 0.0250 | 0.0125 |" in "\n".join(lines)
+    said = "\n".join(lines)
+    assert "Seed 1: PSNR over the paper's network +1.50 dB, MSE over its 0.50; over the oracle mean's 0.67;" in said
+    assert "Minutes of training: paper 36, each on 1 of 2 cores (a processor" in said
 
 
 def test_recordings_are_shown_reader_by_reader_with_libraries_beside_them():

@@ -1,0 +1,177 @@
+"""Every network trained on the same photographs, then every method on held-out photographs and on measured scenes.
+
+python tests/benchmarks/study.py --photographs FOLDER --measured FOLDER --work FOLDER
+    [--ours FILE] [--firenet FILE] [--lpips FILE] [--override ROW:KEY=VALUE ...] [--only ROW] [--write]
+
+Runs the pipeline's stages with experiment=photographs in the folder --work, where a killed run goes on and nothing is
+trained twice. Networks are trained one after the other, or side by side: start the command once for each with --only
+ROW, then without. Choose `--override paper:train.epochs=N` so that both DoLP networks take about as long; the minutes
+are printed. --write puts the tables into docs/results/benchmark.json, what they say of the two networks into
+network.json, and the event budget into event_budget.json and docs/pictures. Nothing is trained on measured scenes or
+on the test split; the split is by source picture.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from polarnet.measure import machine_record, measure_benchmark, uncommitted, write_section
+
+ROOT = Path(__file__).resolve().parents[2]
+TRAININGS = {
+    "ours": ("train", "network=polarnet"),
+    "paper": ("train", "network=paper"),
+    "firenet": ("train_e2v", "baselines.e2v.arch=firenet"),
+    "e2vid": ("train_e2v", "baselines.e2v.arch=e2vid"),
+    "e2p": ("train_e2p", "baselines.e2p.bins=5"),
+}
+"""Row of the table: the stage that trains its network, and what makes the stage train this one."""
+SOLVED = [f"{row}{gain}" for row in ("cf", "highpass", "firenet_published", "firenet") for gain in ("", "+gain")]
+INTENSITY = [*SOLVED, "e2vid"]
+METHODS = ["zeros", "train_mean", "oracle_mean", *INTENSITY, "e2p", "paper", "ours"]
+KEPT = ("mse", "level_mse", "pattern_mse", "psnr", "ssim", "corr", "aolp_deg")
+"""Of the rows in network.json; all figures are in benchmark.json."""
+BUDGET_SEQUENCES = 12
+BUDGET_METHODS = ("oracle_mean", "highpass+gain", "ours")
+
+
+def common(arguments: argparse.Namespace) -> list[str]:
+    """Overrides that every command of this study gets: its data and its threads."""
+    return [
+        "experiment=photographs",
+        f"ingest.root={arguments.photographs}",
+        f"paths.data={arguments.work / 'data'}",
+        f"paths.cache={arguments.work / 'cache'}",
+        f"runtime.threads={arguments.threads}",
+        *([f"lpips.path={arguments.lpips}"] if arguments.lpips else []),
+    ]
+
+
+def stage(name: str, arguments: argparse.Namespace, *overrides: str) -> None:
+    """Run one stage of the pipeline on the data of this study."""
+    subprocess.run([sys.executable, "-m", f"stages.{name}", *common(arguments), *overrides], cwd=ROOT, check=True)
+
+
+def trained(row: str, arguments: argparse.Namespace) -> Path:
+    """The folder of a row's training, and in its minutes.json how long that took; null: a killed one went on."""
+    folder = arguments.work / f"train_{row}_{arguments.seed}"
+    if not (folder / "minutes.json").exists():
+        name, choice = TRAININGS[row]
+        chosen = [pair for of_row, _, pair in (one.partition(":") for one in arguments.override) if of_row == row]
+        resume = arguments.work / "resume" / folder.name
+        whole, started = not any(resume.glob("*/running.pt")), time.monotonic()
+        paths = (f"paths.{name}={folder}", f"paths.resume={resume}")
+        stage(name, arguments, choice, f"seed={arguments.seed}", *paths, *chosen)
+        minutes = round((time.monotonic() - started) / 60, 1) if whole else None
+        (folder / "minutes.json").write_text(json.dumps(minutes))
+    return folder
+
+
+def stand_in(arguments: argparse.Namespace) -> Path:
+    """Given weights of `ours`, where a training would have left them."""
+    best = arguments.work / f"given_ours_{arguments.seed}" / "best.safetensors"
+    best.parent.mkdir(exist_ok=True)
+    for suffix in (".safetensors", ".json"):
+        shutil.copy(arguments.ours.with_suffix(suffix), best.with_suffix(suffix))
+    return best
+
+
+def headlines(tables: dict[str, dict[str, dict[str, Any]]]) -> dict[str, Any]:
+    """What the tables say of the two DoLP networks."""
+    simulated, measured = tables["simulated"], tables["measured"]
+    best = min(scores["mse"] for row, scores in measured.items() if row in INTENSITY)
+    return {
+        "gain_over_paper_db": simulated["ours"]["psnr"] - simulated["paper"]["psnr"],
+        "mse_over_paper": simulated["ours"]["mse"] / simulated["paper"]["mse"],
+        "mse_over_oracle_mean": simulated["ours"]["mse"] / simulated["oracle_mean"]["mse"],
+        "measured": {"mse_over_best_baseline": measured["ours"]["mse"] / best},
+    }
+
+
+def parsed() -> argparse.Namespace:
+    """The command line, with paths as every working directory understands them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--photographs", type=Path, required=True)
+    parser.add_argument("--measured", type=Path, required=True, help="scenes as ingest.source=polarization takes them")
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--ours", type=Path, help="weights of `ours`, such as the shipped ones, instead of training it")
+    parser.add_argument("--firenet", type=Path, help="FireNet's published weights; without them its rows are left out")
+    parser.add_argument("--lpips", type=Path, help="of SqueezeNet, for the column and for the baselines' losses")
+    parser.add_argument("--override", action="append", default=[], metavar="ROW:KEY=VALUE", help="of a row's training")
+    parser.add_argument("--only", choices=tuple(TRAININGS), help="train this one and stop")
+    parser.add_argument("--seed", type=int, default=1, help="of the trainings; the data are the same for all")
+    parser.add_argument("--threads", type=int, default=0, help="0: all cores")
+    parser.add_argument("--write", action="store_true", help="write docs/results")
+    arguments = parser.parse_args()
+    if arguments.write and uncommitted(ROOT):
+        parser.error("the tree has uncommitted changes; commit them first, the figures name a commit")
+    for name in ("photographs", "measured", "work", "ours", "firenet", "lpips"):
+        if path := getattr(arguments, name):
+            setattr(arguments, name, path.resolve())
+    return arguments
+
+
+def main() -> None:
+    """Train, benchmark, print and perhaps write."""
+    arguments = parsed()
+    record = machine_record(ROOT)
+    if not (arguments.work / "data" / "weights" / "lpips.json").exists():
+        for name in ("ingest", "synthesize", "emulate", "weights"):
+            stage(name, arguments)
+    if arguments.only:
+        trained(arguments.only, arguments)
+        return
+    folders = {row: trained(row, arguments) for row in TRAININGS if row != "ours" or not arguments.ours}
+    sets = ("benchmark.sets=[simulated,measured]", f"sets.measured_root={arguments.measured}")
+    stage("sets", arguments, *sets)
+    results = arguments.work / f"benchmark_{arguments.seed}"
+    best = {row: folder / "best.safetensors" for row, folder in folders.items()}
+    if arguments.ours:
+        best["ours"] = stand_in(arguments)
+    weights = [f"baselines.weights.{row}={file}" for row, file in best.items() if row != "ours"]
+    if arguments.firenet:
+        weights.append(f"baselines.weights.firenet_published={arguments.firenet}")
+    methods = f"benchmark.methods=[{','.join(METHODS)}]"
+    paths = (f"paths.train={best['ours'].parent}", f"paths.benchmark={results}")
+    stage("benchmark", arguments, *sets, methods, *weights, *paths)
+    tables = {
+        name: json.loads((path / "metrics.json").read_text())
+        for name, path in (("simulated", results), ("measured", results / "sets" / "measured"))
+    }
+    found: dict[str, Any] = {
+        "minutes_trained": {row: json.loads((path / "minutes.json").read_text()) for row, path in folders.items()},
+        "threads": arguments.threads,
+        "overrides": arguments.override,
+        **headlines(tables),
+        "rows": {
+            name: {row: {key: scores.get(key) for key in KEPT} for row, scores in table.items()}
+            for name, table in tables.items()
+        },
+    }
+    print(json.dumps({key: value for key, value in found.items() if key != "rows"}, indent=2))
+    if not arguments.write:
+        return
+    print(write_section(ROOT, "network", f"seed_{arguments.seed}", found, record, headlines(tables)))
+    if arguments.seed == 1:
+        print(measure_benchmark(ROOT, results, record))
+        print(event_budget(arguments, best["ours"], record))
+
+
+def event_budget(arguments: argparse.Namespace, weights: Path, record: dict[str, Any]) -> Path:
+    """Write docs/results/event_budget.json and its figure."""
+    out = arguments.work / "event_budget"
+    asked = ["--event-budget", "--weights", weights, "--methods", ",".join(BUDGET_METHODS), "--out", out]
+    polarnet = Path(sys.executable).with_name("polarnet")
+    command = [polarnet, "benchmark", *asked, "--limit", str(BUDGET_SEQUENCES)]
+    subprocess.run([*command, *common(arguments)], cwd=ROOT, check=True)
+    shutil.copy(out / "event_budget.png", ROOT / "docs" / "pictures" / "event_budget.png")
+    return write_section(ROOT, "event_budget", "budget", json.loads((out / "event_budget.json").read_text()), record)
+
+
+if __name__ == "__main__":
+    main()
