@@ -18,6 +18,7 @@ from polarnet.runtime import generator_for
 
 Sequences = WindowDataset | list[WindowSequence]
 
+KEPT = 0.7  # of the memory that is free when a training begins, for its sequences
 EIGHTH_TURN = math.pi / 4  # between neighbouring polarizers
 
 
@@ -119,12 +120,12 @@ class Visits(Dataset[WindowSequence]):
 
 
 def kept_in_memory(dataset: WindowDataset, workers: int) -> tuple[Sequences, int]:
-    """The sequences of a dataset, read and encoded beforehand if that takes at most half of the free memory.
+    """The sequences of a dataset, read and encoded beforehand if that takes at most `KEPT` of the free memory.
 
     Also how many worker processes should read them: none when they are in memory.
     """
     bytes_each = sum(tensor.nbytes for tensor in dataset[0][1:] if tensor is not None)
-    if bytes_each * len(dataset) > psutil.virtual_memory().available / 2:
+    if bytes_each * len(dataset) > KEPT * psutil.virtual_memory().available:
         return dataset, workers
     return [dataset[number] for number in range(len(dataset))], 0
 
