@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.reports.recording_tables import recordings_block
+from polarnet.reports.study_tables import event_budget_block, study_block
 from polarnet.reports.tables import (
     COLUMNS,
     COSTS,
@@ -76,7 +77,14 @@ def benchmark_block(results: Mapping[str, Any]) -> str:
         about = results["about"][name]
         lines += [f"**{title}**: {about['scenes']} scenes, {about['frames']} frames", ""]
         lines += [as_markdown(score_table(results[name], about["lpips_reason"], {**COLUMNS, **COSTS})), ""]
-        lines += [f"- {line}" for line in paired_lines(results["paired"][name])] + [""]
+        lines += [f"- {line}" for line in paired_lines(results["paired"][name])]
+        gains = [
+            f"{METHODS[row]} {results[name][f'{row}+gain']['psnr'] - scores['psnr']:+.2f} dB"
+            for row, scores in results[name].items()
+            if f"{row}+gain" in results[name]
+        ]
+        lines += [f"- PSNR that solved gains bring: {', '.join(gains)}."] if gains else []
+        lines.append("")
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     lines.append(f"On {results['cores']} cores ({results['machine']}; {versions}; commit `{results['commit'][:10]}`).")
     return "\n".join(lines)
@@ -121,57 +129,6 @@ def emulation_block(results: Mapping[str, Any]) -> str:
 def inspection_block(results: Mapping[str, Any]) -> str:
     """What `polarnet inspect` says of a capture of the simulated rig."""
     return "\n".join(["```", *results["lines"], "```"])
-
-
-def study_block(results: Mapping[str, Any]) -> str:
-    """The two DoLP networks, seed by seed, beside the rows that they must beat, by tests/benchmarks/study.py.
-
-    `results` is docs/results/network.json; every method is in the tables of benchmark.json.
-    """
-    seeds = {name.removeprefix("seed_"): found for name, found in results.items() if name.startswith("seed_")}
-    first = next(iter(seeds.values()))
-    lines = []
-    for name in ("simulated", "measured"):
-        rows = {METHODS[row]: first["rows"][name][row] for row in ("oracle_mean", _best(first["rows"][name]))}
-        for row in ("paper", "ours"):
-            rows |= {f"{METHODS[row]}, seed {seed}": found["rows"][name][row] for seed, found in seeds.items()}
-        lines += [f"**{SET_TITLES[name]}**", "", "| | " + " | ".join(label for _, label, _ in STUDY_COLUMNS) + " |"]
-        lines.append("|---" + "|---:" * len(STUDY_COLUMNS) + "|")
-        for label, scores in rows.items():
-            cells = ("-" if scores[key] is None else f"{scores[key]:.{n}f}" for key, _, n in STUDY_COLUMNS)
-            lines.append(f"| {label} | " + " | ".join(cells) + " |")
-        lines.append("")
-    for seed, found in seeds.items():
-        record, minutes = results["records"][f"seed_{seed}"], found["minutes_trained"]
-        trained = ", ".join(f"{row} {value:.0f}" for row, value in minutes.items() if value is not None)
-        versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
-        lines += [
-            f"Seed {seed}: PSNR over the paper's network {found['gain_over_paper_db']:+.2f} dB, MSE over its "
-            f"{found['mse_over_paper']:.2f}; over the oracle mean's {found['mse_over_oracle_mean']:.2f}; on measured "
-            f"scenes over that of the best intensity reconstruction {found['measured']['mse_over_best_baseline']:.2f}. "
-            f"Minutes of training: {trained}, each on {found['threads'] or record['cores']} of {record['cores']} cores "
-            f"({record['machine']}; {versions}; commit `{record['commit'][:10]}`).",
-            "",
-        ]
-    return "\n".join(lines)
-
-
-def _best(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """The intensity reconstruction with the smallest MSE."""
-    others = {"zeros", "train_mean", "oracle_mean", "e2p", "paper", "ours"}
-    return min((row for row in rows if row not in others), key=lambda row: rows[row]["mse"])
-
-
-STUDY_COLUMNS = (
-    ("mse", "MSE ↓", 4),
-    ("level_mse", "level ↓", 4),
-    ("pattern_mse", "pattern ↓", 4),
-    ("psnr", "PSNR ↑", 2),
-    ("ssim", "SSIM ↑", 3),
-    ("corr", "corr. ↑", 3),
-    ("aolp_deg", "AoLP err. ↓", 1),
-)
-"""Key in network.json, heading, decimals."""
 
 
 def throughput_block(results: Mapping[str, Any]) -> str:
@@ -238,13 +195,16 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "recordings": recordings_block,
     "inspection": inspection_block,
     "network-seed_1": study_block,
+    "event_budget-budget": event_budget_block,
     "network-throughput": throughput_block,
 }
 """What writes the block of each name."""
 
 UNMEASURED = {
+    "benchmark": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "emulation": "Not measured yet: `python tests/benchmarks/emulation.py --write` does it.",
     "recordings": "Not measured yet: `tests/benchmarks/{recordings,fuzz_recordings,rig}.py --write` do it.",
+    "event_budget-budget": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "network-seed_1": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "network-throughput": "Not measured yet: `python tests/benchmarks/training.py --write` does it.",
 }

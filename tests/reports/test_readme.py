@@ -2,8 +2,10 @@ import json
 
 import pytest
 
-from polarnet.reports.readme import study_block, update_results_blocks
+from polarnet.measure import BENCHMARK_KEYS
+from polarnet.reports.readme import benchmark_block, update_results_blocks
 from polarnet.reports.recording_tables import recordings_block
+from polarnet.reports.study_tables import event_budget_block, study_block
 
 RESULTS = {
     "setup_minutes": 1.5,
@@ -161,6 +163,32 @@ def test_the_study_of_the_networks_shows_every_seed_beside_what_must_be_beaten()
     said = "\n".join(lines)
     assert "Seed 1: PSNR over the paper's network +1.50 dB, MSE over its 0.50; over the oracle mean's 0.67;" in said
     assert "Minutes of training: paper 36, each on 1 of 2 cores (a processor" in said
+
+
+def test_the_benchmark_says_what_solved_gains_bring():
+    rows = {"zeros": 9.0, "cf": 8.0, "cf+gain": 9.25, "highpass": 12.0, "highpass+gain": 11.5, "ours": 17.0}
+    scores = {row: dict.fromkeys(BENCHMARK_KEYS, 0.1) | {"psnr": psnr} for row, psnr in rows.items()}
+    about = {"scenes": 30, "frames": 750, "lpips_reason": None}
+    results = MACHINE | {"simulated": scores, "about": {"simulated": about}, "paired": {"simulated": {}}}
+    block = benchmark_block(results)
+    assert "**Simulated**: 30 scenes, 750 frames" in block
+    assert "- PSNR that solved gains bring: CF +1.25 dB, high-pass -0.50 dB." in block
+
+
+def test_the_event_budget_is_held_against_the_papers_claim():
+    def entries(psnr):
+        bins = ((0.0, 0.75, 0.5), (0.75, 1.5, 1.1), (1.5, None, 4.0))
+        return [
+            {"from": low, "to": high, "events_per_pixel": at, "scenes": 3, "psnr": psnr + k, "corr": 0.1 * k}
+            for k, (low, high, at) in enumerate(bins)
+        ]
+
+    budget = {"since_start": {"ours": entries(14.0), "oracle_mean": entries(18.0)}, "sequences": ["a", "b", "c"]}
+    block = event_budget_block({"budget": budget, "records": {"budget": MACHINE}})
+    assert "| events per pixel | scenes | oracle mean: PSNR | corr. | ours: PSNR | corr. |" in block
+    assert "| 1.10 | 3 | 19.00 | 0.100 | 15.00 | 0.100 |" in block
+    assert "At 1.10 events per pixel, the bin of the paper's 1.04, ours has 15.00 dB" in block
+    assert "the highest correlation, 0.200 with 16.00 dB, comes at 4.0." in block
 
 
 def test_recordings_are_shown_reader_by_reader_with_libraries_beside_them():

@@ -1,0 +1,87 @@
+"""Tables of what tests/benchmarks/study.py measures: the two DoLP networks, and how many events a frame takes."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from polarnet.reports.studies import PAPER_EVENTS_PER_PIXEL
+from polarnet.reports.tables import METHODS, SET_TITLES, in_order
+
+
+def study_block(results: Mapping[str, Any]) -> str:
+    """The two DoLP networks, seed by seed, beside the rows that they must beat, by tests/benchmarks/study.py.
+
+    `results` is docs/results/network.json; every method is in the tables of benchmark.json.
+    """
+    seeds = {name.removeprefix("seed_"): found for name, found in results.items() if name.startswith("seed_")}
+    first = next(iter(seeds.values()))
+    lines = []
+    for name in ("simulated", "measured"):
+        rows = {METHODS[row]: first["rows"][name][row] for row in ("oracle_mean", _best(first["rows"][name]))}
+        for row in ("paper", "ours"):
+            rows |= {f"{METHODS[row]}, seed {seed}": found["rows"][name][row] for seed, found in seeds.items()}
+        lines += [f"**{SET_TITLES[name]}**", "", "| | " + " | ".join(label for _, label, _ in STUDY_COLUMNS) + " |"]
+        lines.append("|---" + "|---:" * len(STUDY_COLUMNS) + "|")
+        for label, scores in rows.items():
+            cells = ("-" if scores[key] is None else f"{scores[key]:.{n}f}" for key, _, n in STUDY_COLUMNS)
+            lines.append(f"| {label} | " + " | ".join(cells) + " |")
+        lines.append("")
+    for seed, found in seeds.items():
+        record, minutes = results["records"][f"seed_{seed}"], found["minutes_trained"]
+        trained = ", ".join(f"{row} {value:.0f}" for row, value in minutes.items() if value is not None)
+        versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
+        lines += [
+            f"Seed {seed}: PSNR over the paper's network {found['gain_over_paper_db']:+.2f} dB, MSE over its "
+            f"{found['mse_over_paper']:.2f}; over the oracle mean's {found['mse_over_oracle_mean']:.2f}; on measured "
+            f"scenes over that of the best intensity reconstruction {found['measured']['mse_over_best_baseline']:.2f}. "
+            f"Minutes of training: {trained}, each on {found['threads'] or record['cores']} of {record['cores']} cores "
+            f"({record['machine']}; {versions}; commit `{record['commit'][:10]}`).",
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def _best(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    """The intensity reconstruction with the smallest MSE."""
+    others = {"zeros", "train_mean", "oracle_mean", "e2p", "paper", "ours"}
+    return min((row for row in rows if row not in others), key=lambda row: rows[row]["mse"])
+
+
+STUDY_COLUMNS = (
+    ("mse", "MSE ↓", 4),
+    ("level_mse", "level ↓", 4),
+    ("pattern_mse", "pattern ↓", 4),
+    ("psnr", "PSNR ↑", 2),
+    ("ssim", "SSIM ↑", 3),
+    ("corr", "corr. ↑", 3),
+    ("aolp_deg", "AoLP err. ↓", 1),
+)
+"""Key in network.json, heading, decimals."""
+
+
+def event_budget_block(results: Mapping[str, Any]) -> str:
+    """Ours and its rivals by events per pixel since the start, and what that says of the paper's claim.
+
+    `results` is docs/results/event_budget.json.
+    """
+    budget, record = results["budget"], results["records"]["budget"]
+    rows = budget["since_start"]
+    methods = in_order(rows)
+    lines = [
+        "| events per pixel | scenes | " + " | ".join(f"{METHODS[m]}: PSNR | corr." for m in methods) + " |",
+        "|---" + "|---:" * (1 + 2 * len(methods)) + "|",
+    ]
+    for entries in zip(*(rows[method] for method in methods), strict=True):
+        scores = " | ".join(f"{entry['psnr']:.2f} | {entry['corr']:.3f}" for entry in entries)
+        lines.append(f"| {entries[0]['events_per_pixel']:.2f} | {entries[0]['scenes']} | {scores} |")
+    ours = rows["ours"]
+    claimed = next(e for e in ours if e["to"] is None or e["to"] > PAPER_EVENTS_PER_PIXEL)
+    best = max(ours, key=lambda entry: entry["corr"])
+    lines += [
+        "",
+        f"At {claimed['events_per_pixel']:.2f} events per pixel, the bin of the paper's {PAPER_EVENTS_PER_PIXEL}, ours "
+        f"has {claimed['psnr']:.2f} dB and a correlation of {claimed['corr']:.3f}; the highest correlation, "
+        f"{best['corr']:.3f} with {best['psnr']:.2f} dB, comes at {best['events_per_pixel']:.1f}.",
+        "",
+        f"{len(budget['sequences'])} sequences (commit `{record['commit'][:10]}`).",
+    ]
+    return "\n".join(lines)
