@@ -106,6 +106,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--only", choices=tuple(TRAININGS), help="train this one and stop")
     parser.add_argument("--seed", type=int, default=1, help="of the trainings; the data are the same for all")
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
+    parser.add_argument("--workers", type=int, default=1, help="processes that share the benchmark's sequences")
     parser.add_argument("--write", action="store_true", help="write docs/results")
     arguments = parser.parse_args()
     if arguments.write and uncommitted(ROOT):
@@ -138,7 +139,7 @@ def main() -> None:
         weights.append(f"baselines.weights.firenet_published={arguments.firenet}")
     methods = f"benchmark.methods=[{','.join(METHODS)}]"
     paths = (f"paths.train={best['ours'].parent}", f"paths.benchmark={results}")
-    stage("benchmark", arguments, *sets, methods, *weights, *paths)
+    stage("benchmark", arguments, *sets, methods, *weights, *paths, f"runtime.workers={arguments.workers}")
     tables = {
         name: json.loads((path / "metrics.json").read_text())
         for name, path in (("simulated", results), ("measured", results / "sets" / "measured"))
