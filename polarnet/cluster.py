@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-from polarnet.runtime import limit_threads, usable_cores
+from polarnet.runtime import limit_threads, tune, usable_cores
 
 ATTEMPTS = 4  # as many as Dask gives a task whose workers die (allowed-failures 3)
 
@@ -65,13 +65,18 @@ def _over_processes(
     return [results[i] for i in range(len(items))]
 
 
+def _start_worker(threads: int) -> None:
+    limit_threads(threads)
+    tune()
+
+
 def _collect(
     function: Callable[[Item], Result], items: Sequence[Item], workers: int, results: dict[int, Result], bar: tqdm
 ) -> None:
     """Fill `results` with what is missing of it, until all is there or the pool breaks."""
     spawn = multiprocessing.get_context("spawn")  # a fork of a process with running OpenMP threads can hang
     threads = max(1, usable_cores() // workers)
-    with ProcessPoolExecutor(workers, spawn, initializer=limit_threads, initargs=(threads,)) as pool:
+    with ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(threads,)) as pool:
         futures = {pool.submit(function, items[i]): i for i in range(len(items)) if i not in results}
         try:
             for future in as_completed(futures):
