@@ -36,7 +36,7 @@ INTENSITY = [*SOLVED, "e2vid"]
 METHODS = ["zeros", "train_mean", "oracle_mean", *INTENSITY, "e2p", "paper", "ours"]
 KEPT = ("mse", "level_mse", "pattern_mse", "psnr", "ssim", "corr", "aolp_deg")
 """Of the rows in network.json; all figures are in benchmark.json."""
-BUDGET_SEQUENCES = 12
+BUDGET_SEQUENCES = 6
 BUDGET_METHODS = ("oracle_mean", "highpass+gain", "ours")
 
 
