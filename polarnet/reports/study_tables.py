@@ -33,7 +33,7 @@ def study_block(results: Mapping[str, Any]) -> str:
             f"Seed {seed}: PSNR over the paper's network {found['gain_over_paper_db']:+.2f} dB, MSE over its "
             f"{found['mse_over_paper']:.2f}; over the oracle mean's {found['mse_over_oracle_mean']:.2f}; on measured "
             f"scenes over that of the best intensity reconstruction {found['measured']['mse_over_best_baseline']:.2f}. "
-            f"Minutes of training: {trained}, each on {found['threads'] or record['cores']} of {record['cores']} cores "
+            f"Minutes of training: {trained}. Scored on {found['threads'] or record['cores']} core(s) "
             f"({record['machine']}; {versions}; commit `{record['commit'][:10]}`).",
             "",
         ]
