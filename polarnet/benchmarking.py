@@ -16,6 +16,8 @@ from polarnet.events.store import EventStore
 from polarnet.runtime import device_of
 from polarnet.similarity import Lpips
 
+RECORDINGS = "recordings"  # the set of real targets
+
 
 def context_of(config: Config, train_mean: float, weights: Path | None = None) -> Context:
     """What methods get; `weights` replaces those of `ours` that the pipeline trained."""
@@ -61,11 +63,15 @@ def set_folder(config: Config, name: str) -> Path:
 
 
 def run_pipeline_benchmark(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
-    """Run all of `benchmark.sets` and write what each gave; set, then method: the metrics."""
+    """Run all of `benchmark.sets` and write what each gave; set, then method: the metrics.
+
+    Real targets are one more set, `RECORDINGS`, while `recordings.enabled` is true.
+    """
     (Path(config.paths.benchmark) / "sets").mkdir(parents=True, exist_ok=True)
-    return {
-        name: run_on(config, pipeline_set(config, name), set_folder(config, name)) for name in config.benchmark.sets
-    }
+    tests = {name: pipeline_set(config, name) for name in config.benchmark.sets}
+    if config.recordings.enabled:
+        tests[RECORDINGS] = made_set(RECORDINGS, Path(config.paths.calibrated))
+    return {name: run_on(config, test_set, set_folder(config, name)) for name, test_set in tests.items()}
 
 
 def run_on(config: Config, test_set: BenchmarkSet, folder: Path) -> dict[str, dict[str, Any]]:

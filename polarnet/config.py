@@ -90,7 +90,6 @@ class Paths:
     report: str
     imported: str
     calibrated: str
-    benchmark_recordings: str
     resume: str
     cache: str
 

@@ -85,7 +85,12 @@ METHODS = {
 TRIVIAL = ("zeros", "train_mean", "oracle_mean")
 """Methods whose answer is one value everywhere."""
 
-SET_TITLES = {"simulated": "Simulated", "complex_motion": "Complex motion", "measured": "Measured polarization"}
+SET_TITLES = {
+    "simulated": "Simulated",
+    "complex_motion": "Complex motion",
+    "measured": "Measured polarization",
+    "recordings": "Real targets",
+}
 """Test sets, in the order of every page."""
 
 PAPER_SOURCE = "Yan et al., Photonics 2024, 11(5), 481, Table 2"

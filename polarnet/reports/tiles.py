@@ -95,7 +95,10 @@ def event_tiles(panel: Panel) -> list[Tile]:
 
 def reliability_chart(details: Mapping[str, Any]) -> Chart | None:
     """Of the methods in details.json that expect an error; None where there is none."""
-    curves = {method: found["curve"] for method, found in details.get("reliability", {}).items()}
+    curves = {
+        method: [(predicted, measured, pixels) for predicted, measured, pixels in found["curve"]]
+        for method, found in details.get("reliability", {}).items()
+    }
     if not curves:
         return None
     return chart(lambda theme: reliability_figure(curves, theme), "measured against predicted squared error of DoLP")
