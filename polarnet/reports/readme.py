@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from polarnet.reports.provenance import cores, measured_with, origin
 from polarnet.reports.recording_tables import recordings_block
 from polarnet.reports.study_tables import event_budget_block, study_block
 from polarnet.reports.tables import (
@@ -55,13 +56,11 @@ def pipeline_block(results: Mapping[str, Any]) -> str:
     if any(key.endswith("_ci") for scores in metrics.values() for key in scores):
         lines += ["Means over the test scenes; below them the 95 % bootstrap interval over scenes.", ""]
     lines += [f"- {line}" for line in standing(metrics)]
-    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     tests = f", `make test` {results['test_minutes']:.1f}" if "test_minutes" in results else ""
     lines += [
         "",
         f"`make repro` took {results['repro_minutes']:.1f} minutes after a set-up of {results['setup_minutes']:.1f}"
-        f"{tests}, on {results['cores']} cores ({results['machine']}, "
-        f"load {results['load']:.1f} before the start; {versions}; commit `{results['commit'][:10]}`).",
+        f"{tests}, on {cores(results)} ({measured_with(results)}).",
     ]
     if stages := results.get("stage_minutes"):
         lines += ["", "Minutes by stage: " + ", ".join(f"{name} {value:.1f}" for name, value in stages.items()) + "."]
@@ -85,8 +84,7 @@ def benchmark_block(results: Mapping[str, Any]) -> str:
         ]
         lines += [f"- PSNR that solved gains bring: {', '.join(gains)}."] if gains else []
         lines.append("")
-    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
-    lines.append(f"On {results['cores']} cores ({results['machine']}; {versions}; commit `{results['commit'][:10]}`).")
+    lines.append(origin(results))
     return "\n".join(lines)
 
 
@@ -118,11 +116,7 @@ def emulation_block(results: Mapping[str, Any]) -> str:
         if stages := paper.get("stage_minutes"):
             text += " (" + ", ".join(f"{name} {minutes:.1f}" for name, minutes in stages.items()) + ")"
         lines += [f"{text}.", ""]
-    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
-    lines.append(
-        f"On {results['cores']} cores ({results['machine']}, load {results['load']:.1f} before the start; {versions}; "
-        f"commit `{results['commit'][:10]}`)."
-    )
+    lines.append(origin(results))
     return "\n".join(lines)
 
 
@@ -164,13 +158,11 @@ def throughput_block(results: Mapping[str, Any]) -> str:
         for name, settings in throughput["networks"].items()
         if (ratio := settings["shipped_over_naive"])
     ]
-    versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
     return "\n".join([
         *lines, "", *faster, "",
         "Percent of the time in torch's operations, of those with at least 1 %:", "",
         "| run | operations |", "|---|---|", *profiles, "",
-        f"{throughput['threads']} thread(s) on {record['cores']} cores ({record['machine']}, {throughput['device']}, "
-        f"load {record['load']:.1f} before the start; {versions}; commit `{record['commit'][:10]}`).",
+        f"{throughput['threads']} thread(s) on {cores(record)} ({throughput['device']}; {measured_with(record)}).",
     ])  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from polarnet.reports.provenance import origin
 from polarnet.reports.tables import as_markdown, score_table
 
 Figures = Mapping[str, Any]
@@ -73,20 +74,6 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[st
     yield "|---|" + "---:|" * (len(headings) - 1)
     for row in rows:
         yield f"| {' | '.join(row)} |"
-
-
-def origin(record: Figures) -> str:
-    """Where and with what a section was measured."""
-    versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
-    return (
-        f"On {cores(record)} ({record['machine']}, load {record['load']:.1f} before the start; {versions}; "
-        f"commit `{record['commit'][:10]}`)."
-    )
-
-
-def cores(record: Figures) -> str:
-    """How many were used, in words."""
-    return "one core" if record["cores"] == 1 else f"{record['cores']} cores"
 
 
 def _speed(figures: Figures | None) -> str:

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+from polarnet.evaluation.methods import GAIN, INTENSITY_METHODS
+from polarnet.reports.provenance import measured_with, origin
 from polarnet.reports.studies import PAPER_EVENTS_PER_PIXEL
 from polarnet.reports.tables import METHODS, SET_TITLES, in_order
 
@@ -16,7 +18,9 @@ def study_block(results: Mapping[str, Any]) -> str:
     first = next(iter(seeds.values()))
     lines = []
     for name in ("simulated", "measured"):
-        rows = {METHODS[row]: first["rows"][name][row] for row in ("oracle_mean", _best(first["rows"][name]))}
+        rows = {
+            METHODS[row]: first["rows"][name][row] for row in ("oracle_mean", best_reconstruction(first["rows"][name]))
+        }
         for row in ("paper", "ours"):
             rows |= {f"{METHODS[row]}, seed {seed}": found["rows"][name][row] for seed, found in seeds.items()}
         lines += [f"**{SET_TITLES[name]}**", "", "| | " + " | ".join(label for _, label, _ in STUDY_COLUMNS) + " |"]
@@ -28,22 +32,21 @@ def study_block(results: Mapping[str, Any]) -> str:
     for seed, found in seeds.items():
         record, minutes = results["records"][f"seed_{seed}"], found["minutes_trained"]
         trained = ", ".join(f"{row} {value:.0f}" for row, value in minutes.items() if value is not None)
-        versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
         lines += [
             f"Seed {seed}: PSNR over the paper's network {found['gain_over_paper_db']:+.2f} dB, MSE over its "
             f"{found['mse_over_paper']:.2f}; over the oracle mean's {found['mse_over_oracle_mean']:.2f}; on measured "
             f"scenes over that of the best intensity reconstruction {found['measured']['mse_over_best_baseline']:.2f}. "
             f"Minutes of training: {trained}. Scored on {found['threads'] or record['cores']} core(s) "
-            f"({record['machine']}; {versions}; commit `{record['commit'][:10]}`).",
+            f"({measured_with(record)}).",
             "",
         ]
     return "\n".join(lines)
 
 
-def _best(rows: Mapping[str, Mapping[str, Any]]) -> str:
+def best_reconstruction(rows: Mapping[str, Mapping[str, Any]]) -> str:
     """The intensity reconstruction with the smallest MSE."""
-    others = {"zeros", "train_mean", "oracle_mean", "e2p", "paper", "ours"}
-    return min((row for row in rows if row not in others), key=lambda row: rows[row]["mse"])
+    intensity = [row for row in rows if row.removesuffix(GAIN) in INTENSITY_METHODS]
+    return min(intensity, key=lambda row: rows[row]["mse"])
 
 
 STUDY_COLUMNS = (
@@ -82,6 +85,6 @@ def event_budget_block(results: Mapping[str, Any]) -> str:
         f"has {claimed['psnr']:.2f} dB and a correlation of {claimed['corr']:.3f}; the highest correlation, "
         f"{best['corr']:.3f} with {best['psnr']:.2f} dB, comes at {best['events_per_pixel']:.1f}.",
         "",
-        f"{len(budget['sequences'])} sequences (commit `{record['commit'][:10]}`).",
+        f"{len(budget['sequences'])} sequences. {origin(record)}",
     ]
     return "\n".join(lines)

@@ -21,19 +21,19 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.measure import machine_record, measure_benchmark, uncommitted, write_section
+from polarnet.reports.study_tables import best_reconstruction
 
 ROOT = Path(__file__).resolve().parents[2]
-TRAININGS = {
+TRAININGS: dict[str, tuple[str, ...]] = {
     "ours": ("train", "network=polarnet"),
     "paper": ("train", "network=paper"),
     "firenet": ("train_e2v", "baselines.e2v.arch=firenet"),
     "e2vid": ("train_e2v", "baselines.e2v.arch=e2vid"),
-    "e2p": ("train_e2p", "baselines.e2p.bins=5"),
+    "e2p": ("train_e2p",),
 }
 """Row of the table: the stage that trains its network, and what makes the stage train this one."""
 SOLVED = [f"{row}{gain}" for row in ("cf", "highpass", "firenet_published", "firenet") for gain in ("", "+gain")]
-INTENSITY = [*SOLVED, "e2vid"]
-METHODS = ["zeros", "train_mean", "oracle_mean", *INTENSITY, "e2p", "paper", "ours"]
+METHODS = ["zeros", "train_mean", "oracle_mean", *SOLVED, "e2vid", "e2p", "paper", "ours"]
 KEPT = ("mse", "level_mse", "pattern_mse", "psnr", "ssim", "corr", "aolp_deg")
 """Of the rows in network.json; all figures are in benchmark.json."""
 BUDGET_SEQUENCES = 6
@@ -61,12 +61,12 @@ def trained(row: str, arguments: argparse.Namespace) -> Path:
     """The folder of a row's training, and in its minutes.json how long that took; null: a killed one went on."""
     folder = arguments.work / f"train_{row}_{arguments.seed}"
     if not (folder / "minutes.json").exists():
-        name, choice = TRAININGS[row]
+        name, *choice = TRAININGS[row]
         chosen = [pair for of_row, _, pair in (one.partition(":") for one in arguments.override) if of_row == row]
         resume = arguments.work / "resume" / folder.name
         whole, started = not any(resume.glob("*/running.pt")), time.monotonic()
         paths = (f"paths.{name}={folder}", f"paths.resume={resume}")
-        stage(name, arguments, choice, f"seed={arguments.seed}", *paths, *chosen)
+        stage(name, arguments, *choice, f"seed={arguments.seed}", *paths, *chosen)
         minutes = round((time.monotonic() - started) / 60, 1) if whole else None
         (folder / "minutes.json").write_text(json.dumps(minutes))
     return folder
@@ -84,7 +84,7 @@ def stand_in(arguments: argparse.Namespace) -> Path:
 def headlines(tables: dict[str, dict[str, dict[str, Any]]]) -> dict[str, Any]:
     """What the tables say of the two DoLP networks."""
     simulated, measured = tables["simulated"], tables["measured"]
-    best = min(scores["mse"] for row, scores in measured.items() if row in INTENSITY)
+    best = measured[best_reconstruction(measured)]["mse"]
     return {
         "gain_over_paper_db": simulated["ours"]["psnr"] - simulated["paper"]["psnr"],
         "mse_over_paper": simulated["ours"]["mse"] / simulated["paper"]["mse"],
