@@ -15,6 +15,7 @@ from polarnet.ranges import allowed, check_ranges
 
 STRIDE = 8  # three stages that halve the size
 IMAGES = 2  # of a polarizer's events: the sum of polarities and their number (representation `event_counts`)
+PARTS = ("redundancy", "sums", "recurrence")
 MIDDLE_DOLP = 0.3  # of the constant that is one more candidate, at the start
 SURROUNDINGS = (1, 3, 9)  # width in pixels of the neighbourhoods whose events tell fine structure
 MOST_POLARIZED = 0.98  # of 1: keeps atanh finite
@@ -33,6 +34,9 @@ class StokesUNetConfig:
     """Of each sum of second moments: their weight one window later."""
     scales: list[int] = field(metadata=allowed(low=0))
     """Of the neighbourhoods that are solved together, in pixels of a quarter of the size, odd; 0: the whole image."""
+    without: list[str]
+    """Some of PARTS, to see what they bring: what the redundancy says (candidates are 0), the movement of (s1, s2) by
+    sums of events (their gains are 0), what the recurrent layers hold (they begin anew in each window)."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -40,6 +44,8 @@ class StokesUNetConfig:
             raise ValueError(f"channels, memories, decays, scales: expected 3 numbers and at least 1 each, got {self}")
         if any(scale and scale % 2 == 0 for scale in self.scales):
             raise ValueError(f"scales: expected odd numbers, or 0 for the whole image, got {self.scales}")
+        if unknown := set(self.without) - set(PARTS):
+            raise ValueError(f"without: expected some of {', '.join(PARTS)}, got {', '.join(sorted(unknown))}")
 
 
 class Candidates(NamedTuple):
@@ -72,6 +78,7 @@ class StokesUNet(nn.Module):
                 f"network=polarnet takes {4 * IMAGES} images (representation event_counts), got {in_channels}"
             )
         self.memories, self.decays, self.scales = config.memories, config.decays, config.scales
+        self.without = frozenset(config.without)
         memories, solved = len(config.memories), len(config.memories) * len(config.decays) * len(config.scales)
         half, quarter, eighth = config.channels
         self.moments = SecondMoments(memories)
@@ -125,13 +132,13 @@ class StokesUNet(nn.Module):
         solved = torch.cat([candidates.s1, candidates.s2, candidates.dolp, torch.log1p(candidates.evidence)], dim=1)
         solved = solved.contiguous(memory_format=torch.channels_last)
         x4 = F.relu(self.join(F.relu(self.to_quarter(x2) + self.from_candidates(solved))))
-        g4, state4 = self.gru_quarter(x4, state[-2])
+        g4, state4 = self._carried(self.gru_quarter, x4, state[-2])
         x8 = self.before(F.relu(self.to_eighth(g4)))
-        g8, state8 = self.gru_eighth(x8, state[-1])
+        g8, state8 = self._carried(self.gru_eighth, x8, state[-1])
         y4 = self.at_quarter(self.up_quarter(self.after(g8), skip=g4))
         mixed = self._mixed(candidates, self.choose(y4).float().softmax(1))
         y2 = self.at_half(self.up_half(y4, skip=x2))
-        gains = F.pixel_shuffle(self.gains(y2), 2).float()
+        gains = self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float())
         coarse = F.interpolate(mixed, scale_factor=4, mode="bilinear")
         moved = _moved(coarse[:, :2], events, gains)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
@@ -150,7 +157,8 @@ class StokesUNet(nn.Module):
     ) -> tuple[Candidates, list[Tensor]]:
         """Also the sums of moments to carry on from. In float32: the equations are solved by differences."""
         with torch.autocast(events.device.type, enabled=False):
-            moments = F.avg_pool2d(self.moments(events).flatten(1, 2), 4).unflatten(0, (-1, streams))
+            moments = self.moments(self._unless("redundancy", events))
+            moments = F.avg_pool2d(moments.flatten(1, 2), 4).unflatten(0, (-1, streams))
             sums = [faded(moments, keep, before) for keep, before in zip(self.decays, state, strict=True)]
             shape = (len(self.decays), len(self.memories), MOMENTS)
             near = neighbourhoods(torch.stack(sums, dim=2).flatten(0, 1).flatten(1, 2), self.scales)
@@ -164,6 +172,17 @@ class StokesUNet(nn.Module):
         mixed = [(of_solved * field).sum(1, keepdim=True) for field in candidates[:3]]
         mixed[2] = mixed[2] + of_constant * self.constant
         return torch.cat(mixed, dim=1)
+
+    def _unless(self, part: str, x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """`x`, or zeros that it still depends on where this part is left out."""
+        return 0 * x if part in self.without else x
+
+    def _carried(
+        self, layer: ConvGRU, x: Float[Tensor, "n c h w"], state: Float[Tensor, "b c h w"]
+    ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "b c h w"]]:
+        if "recurrence" in self.without:
+            return layer(x, torch.zeros_like(x))[0], state
+        return layer(x, state)
 
     def initial_state(self, inputs: Float[Tensor, "b c h w"]) -> list[Tensor]:
         """Nothing seen yet: sums of events and of moments, and what the two recurrent layers hold; all zeros.

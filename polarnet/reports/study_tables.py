@@ -1,6 +1,7 @@
 """Tables of what tests/benchmarks/study.py measures: the two DoLP networks, and how many events a frame takes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from statistics import fmean, stdev
 from typing import Any
 
 from polarnet.evaluation.methods import GAIN, INTENSITY_METHODS
@@ -9,38 +10,63 @@ from polarnet.reports.studies import PAPER_EVENTS_PER_PIXEL
 from polarnet.reports.tables import METHODS, SET_TITLES, in_order
 
 
+def seeds_of(results: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """What docs/results/network.json holds of each seed of the trainings, by its number."""
+    return {name.removeprefix("seed_"): found for name, found in results.items() if name.startswith("seed_")}
+
+
+def over_seeds(seeds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The means of what the seeds say of the two DoLP networks."""
+    means = {key: fmean(found[key] for found in seeds) for key in _OF_NETWORKS}
+    measured = fmean(found["measured"]["mse_over_best_baseline"] for found in seeds)
+    return means | {"measured": {"mse_over_best_baseline": measured}}
+
+
 def study_block(results: Mapping[str, Any]) -> str:
-    """The two DoLP networks, seed by seed, beside the rows that they must beat, by tests/benchmarks/study.py.
+    """The two DoLP networks over all seeds, beside the rows that they must beat, by tests/benchmarks/study.py.
 
     `results` is docs/results/network.json; every method is in the tables of benchmark.json.
     """
-    seeds = {name.removeprefix("seed_"): found for name, found in results.items() if name.startswith("seed_")}
+    seeds = seeds_of(results)
     first = next(iter(seeds.values()))
     lines = []
     for name in ("simulated", "measured"):
-        rows = {
-            METHODS[row]: first["rows"][name][row] for row in ("oracle_mean", best_reconstruction(first["rows"][name]))
-        }
-        for row in ("paper", "ours"):
-            rows |= {f"{METHODS[row]}, seed {seed}": found["rows"][name][row] for seed, found in seeds.items()}
         lines += [f"**{SET_TITLES[name]}**", "", "| | " + " | ".join(label for _, label, _ in STUDY_COLUMNS) + " |"]
         lines.append("|---" + "|---:" * len(STUDY_COLUMNS) + "|")
-        for label, scores in rows.items():
-            cells = ("-" if scores[key] is None else f"{scores[key]:.{n}f}" for key, _, n in STUDY_COLUMNS)
-            lines.append(f"| {label} | " + " | ".join(cells) + " |")
+        for row in ("oracle_mean", best_reconstruction(first["rows"][name])):
+            lines.append(_row(METHODS[row], [first["rows"][name][row]]))
+        for row in ("paper", "ours"):
+            lines += [_row(f"{METHODS[row]}, seed {n}", [found["rows"][name][row]]) for n, found in seeds.items()]
+            if len(seeds) > 1:
+                label = f"{METHODS[row]}, mean of {len(seeds)} seeds ± standard deviation"
+                lines.append(_row(label, [found["rows"][name][row] for found in seeds.values()]))
         lines.append("")
+    means = over_seeds([*seeds.values()])
+    lines += [
+        f"Mean of {len(seeds)} seed(s): PSNR over the paper's network {means['gain_over_paper_db']:+.2f} dB, MSE over "
+        f"its {means['mse_over_paper']:.2f}; over the oracle mean's {means['mse_over_oracle_mean']:.2f}; on measured "
+        f"scenes over that of the best intensity reconstruction {means['measured']['mse_over_best_baseline']:.2f}.",
+        "",
+    ]
     for seed, found in seeds.items():
         record, minutes = results["records"][f"seed_{seed}"], found["minutes_trained"]
         trained = ", ".join(f"{row} {value:.0f}" for row, value in minutes.items() if value is not None)
         lines += [
-            f"Seed {seed}: PSNR over the paper's network {found['gain_over_paper_db']:+.2f} dB, MSE over its "
-            f"{found['mse_over_paper']:.2f}; over the oracle mean's {found['mse_over_oracle_mean']:.2f}; on measured "
-            f"scenes over that of the best intensity reconstruction {found['measured']['mse_over_best_baseline']:.2f}. "
-            f"Minutes of training: {trained}. Scored on {found['threads'] or record['cores']} core(s) "
-            f"({measured_with(record)}).",
+            f"Seed {seed}: minutes of training: {trained}; trained and scored on "
+            f"{found['threads'] or record['cores']} core(s) ({measured_with(record)}).",
             "",
         ]
     return "\n".join(lines)
+
+
+def _row(label: str, scores: Sequence[Mapping[str, float | None]]) -> str:
+    """One line of a table; of several seeds the mean and what they scatter by."""
+    cells = []
+    for key, _, decimals in STUDY_COLUMNS:
+        values = [value for one in scores if (value := one[key]) is not None]
+        spread = f" ± {stdev(values):.{decimals}f}" if len(values) > 1 else ""
+        cells.append(f"{fmean(values):.{decimals}f}{spread}" if values else "-")
+    return f"| {label} | " + " | ".join(cells) + " |"
 
 
 def best_reconstruction(rows: Mapping[str, Mapping[str, Any]]) -> str:
@@ -59,6 +85,7 @@ STUDY_COLUMNS = (
     ("aolp_deg", "AoLP err. ↓", 1),
 )
 """Key in network.json, heading, decimals."""
+_OF_NETWORKS = ("gain_over_paper_db", "mse_over_paper", "mse_over_oracle_mean")
 
 
 def event_budget_block(results: Mapping[str, Any]) -> str:

@@ -1,14 +1,16 @@
 """Every network trained on the same photographs, then every method on held-out photographs and on measured scenes.
 
 python tests/benchmarks/study.py --photographs FOLDER --measured FOLDER --work FOLDER
-    [--ours FILE] [--firenet FILE] [--lpips FILE] [--override ROW:KEY=VALUE ...] [--only ROW] [--write]
+    [--ours FILE] [--firenet FILE] [--lpips FILE] [--override ROW:KEY=VALUE ...] [--only ROW]
+    [--seed N] [--rows ROW ...] [--write]
 
 Runs the pipeline's stages with experiment=photographs in the folder --work, where a killed run goes on and nothing is
 trained twice. Networks are trained one after the other, or side by side: start the command once for each with --only
 ROW, then without. Choose `--override paper:train.epochs=N` so that both DoLP networks take about as long; the minutes
 are printed. --write puts the tables into docs/results/benchmark.json, what they say of the two networks into
-network.json, and the event budget into event_budget.json and docs/pictures. Nothing is trained on measured scenes or
-on the test split; the split is by source picture.
+network.json, and the event budget into event_budget.json and docs/pictures. With another --seed, only network.json
+gets a section more and the means over seeds anew; --rows ours paper is enough for that. Nothing is trained on measured
+scenes or on the test split; the split is by source picture.
 """
 
 import argparse
@@ -20,8 +22,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from polarnet.measure import machine_record, measure_benchmark, uncommitted, write_section
-from polarnet.reports.study_tables import best_reconstruction
+from polarnet.measure import machine_record, measure_benchmark, read_results, uncommitted, write_section
+from polarnet.reports.study_tables import best_reconstruction, over_seeds, seeds_of
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAININGS: dict[str, tuple[str, ...]] = {
@@ -104,6 +106,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--lpips", type=Path, help="of SqueezeNet, for the column and for the baselines' losses")
     parser.add_argument("--override", action="append", default=[], metavar="ROW:KEY=VALUE", help="of a row's training")
     parser.add_argument("--only", choices=tuple(TRAININGS), help="train this one and stop")
+    parser.add_argument("--rows", nargs="+", choices=tuple(TRAININGS), default=[*TRAININGS], help="to train and score")
     parser.add_argument("--seed", type=int, default=1, help="of the trainings; the data are the same for all")
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     parser.add_argument("--workers", type=int, default=1, help="processes that share the benchmark's sequences")
@@ -127,7 +130,7 @@ def main() -> None:
     if arguments.only:
         trained(arguments.only, arguments)
         return
-    folders = {row: trained(row, arguments) for row in TRAININGS if row != "ours" or not arguments.ours}
+    folders = {row: trained(row, arguments) for row in arguments.rows if row != "ours" or not arguments.ours}
     sets = ("benchmark.sets=[simulated,measured]", f"sets.measured_root={arguments.measured}")
     stage("sets", arguments, *sets)
     results = arguments.work / f"benchmark_{arguments.seed}"
@@ -137,7 +140,8 @@ def main() -> None:
     weights = [f"baselines.weights.{row}={file}" for row, file in best.items() if row != "ours"]
     if arguments.firenet:
         weights.append(f"baselines.weights.firenet_published={arguments.firenet}")
-    methods = f"benchmark.methods=[{','.join(METHODS)}]"
+    scored = [row for row in METHODS if row.removesuffix("+gain") not in set(TRAININGS) - set(arguments.rows)]
+    methods = f"benchmark.methods=[{','.join(scored)}]"
     paths = (f"paths.train={best['ours'].parent}", f"paths.benchmark={results}")
     stage("benchmark", arguments, *sets, methods, *weights, *paths, f"runtime.workers={arguments.workers}")
     tables = {
@@ -157,7 +161,9 @@ def main() -> None:
     print(json.dumps({key: value for key, value in found.items() if key != "rows"}, indent=2))
     if not arguments.write:
         return
-    print(write_section(ROOT, "network", f"seed_{arguments.seed}", found, record, headlines(tables)))
+    others = {n: one for n, one in seeds_of(read_results(ROOT, "network")).items() if n != str(arguments.seed)}
+    means = over_seeds([found, *others.values()])
+    print(write_section(ROOT, "network", f"seed_{arguments.seed}", found, record, means))
     if arguments.seed == 1:
         print(measure_benchmark(ROOT, results, record))
         print(event_budget(arguments, best["ours"], record))

@@ -1,19 +1,21 @@
 import math
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
-from polarnet.networks.stokes_unet import StokesUNet, StokesUNetConfig
+from polarnet.networks.stokes_unet import PARTS, StokesUNet, StokesUNetConfig
 
-CONFIG = StokesUNetConfig(channels=[8, 8, 8], memories=[0.0, 0.5], decays=[0.7, 0.9], scales=[1, 3, 0])
+CONFIG = StokesUNetConfig(channels=[8, 8, 8], memories=[0.0, 0.5], decays=[0.7, 0.9], scales=[1, 3, 0], without=[])
 
 
-def network() -> StokesUNet:
+def network(**changes: Any) -> StokesUNet:
     torch.manual_seed(0)
-    built = StokesUNet(CONFIG)
-    for last in (built.choose, built.add):  # which begin with zeros
+    built = StokesUNet(replace(CONFIG, **changes))
+    for last in (built.choose, built.gains, built.add):  # which begin with zeros
         torch.nn.init.normal_(last.weight, std=0.1)
     return built.eval()
 
@@ -83,7 +85,7 @@ def test_it_costs_at_most_three_times_what_the_papers_network_costs():
         return counter.get_total_flops()
 
     shipped = StokesUNetConfig(
-        channels=[32, 64, 96], memories=[0.0, 0.6, 0.85, 0.97], decays=[0.8, 0.98], scales=[1, 3, 9, 0]
+        channels=[32, 48, 64], memories=[0.0, 0.6, 0.85, 0.97], decays=[0.8, 0.98], scales=[1, 3, 9, 0], without=[]
     )
     paper = DolpUNetConfig(
         channels=[32, 64, 128],
@@ -96,6 +98,27 @@ def test_it_costs_at_most_three_times_what_the_papers_network_costs():
     assert flops(StokesUNet(shipped), 8) < 3 * flops(DolpUNet(paper), 4)
 
 
+@torch.no_grad()
+def test_each_part_can_be_left_out_and_then_does_nothing():
+    windows = events(3, 1, 8, 16, 24)
+    whole, _ = network().unroll(windows)
+    without = {part: network(without=[part]) for part in PARTS}
+    found = {part: built.unroll(windows)[0] for part, built in without.items()}
+    assert all((one.dolp - whole.dolp).abs().max() > 1e-3 for one in found.values())
+    without["redundancy"].moments.log_mismatch.add_(1)
+    without["sums"].gains.weight.add_(1)
+    for part in ("redundancy", "sums"):
+        torch.testing.assert_close(without[part].unroll(windows)[0].dolp, found[part].dolp)
+    state = [images.clone() for images in network().unroll(windows)[1]]
+    _, after = without["recurrence"](windows[0], state)
+    torch.testing.assert_close(after[-2:], state[-2:])
+
+
+def test_a_part_that_there_is_not_is_named():
+    with pytest.raises(ValueError, match="without: expected some of redundancy, sums, recurrence, got attention"):
+        network(without=["attention"])
+
+
 def test_other_input_than_counts_of_events_is_refused():
     with pytest.raises(ValueError, match=r"takes 8 images \(representation event_counts\), got 4"):
         StokesUNet(CONFIG, 4)
@@ -103,4 +126,4 @@ def test_other_input_than_counts_of_events_is_refused():
 
 def test_a_neighbourhood_needs_a_middle():
     with pytest.raises(ValueError, match="scales: expected odd numbers"):
-        StokesUNetConfig(channels=[8, 8, 8], memories=[0.0], decays=[0.9], scales=[2])
+        StokesUNetConfig(channels=[8, 8, 8], memories=[0.0], decays=[0.9], scales=[2], without=[])

@@ -157,12 +157,14 @@ def test_the_study_of_the_networks_shows_every_seed_beside_what_must_be_beaten()
     }
     lines = study_block(results).splitlines()
     shown = [line.split(" | ")[0].removeprefix("| ") for line in lines if line.startswith("| ") and "↓" not in line]
-    ours = ["the paper's network, seed 1", "the paper's network, seed 2", "ours, seed 1", "ours, seed 2"]
-    assert shown == ["oracle mean", "FireNet, gains solved", *ours] * 2
-    assert "| ours, seed 2 | 0.0250 | 0.0125 |" in "\n".join(lines)
+    kinds = ("seed 1", "seed 2", "mean of 2 seeds ± standard deviation")
+    networks = [f"{network}, {kind}" for network in ("the paper's network", "ours") for kind in kinds]
+    assert shown == ["oracle mean", "FireNet, gains solved", *networks] * 2
     said = "\n".join(lines)
-    assert "Seed 1: PSNR over the paper's network +1.50 dB, MSE over its 0.50; over the oracle mean's 0.67;" in said
-    assert "Minutes of training: paper 36. Scored on 1 core(s) (a processor" in said
+    assert "| ours, seed 2 | 0.0250 | 0.0125 |" in said
+    assert "| ours, mean of 2 seeds ± standard deviation | 0.0225 ± 0.0035 |" in said
+    assert "PSNR over the paper's network +1.50 dB, MSE over its 0.56; over the oracle mean's 0.75; on measured" in said
+    assert "Seed 1: minutes of training: paper 36; trained and scored on 1 core(s) (a processor" in said
 
 
 def test_the_benchmark_says_what_solved_gains_bring():
