@@ -99,7 +99,7 @@ def _table(colours: Colormap) -> UInt8[np.ndarray, "n 3"]:
 
 def _coloured(unit: np.ndarray, table: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """What matplotlib shows for numbers in [0, 1]: no copies, no checks for what is outside or missing."""
-    return table[np.minimum((unit * len(table)).astype(np.intp), len(table) - 1)]
+    return table.take(np.minimum((unit * len(table)).astype(np.intp), len(table) - 1), axis=0)
 
 
 DOLP_TABLE, EVENT_TABLE = _table(matplotlib.colormaps[DOLP_COLOURS]), _table(EVENT_COLOURS)
