@@ -1,0 +1,263 @@
+"""A DoLP network as an ONNX file: one window of one stream, with the state as named inputs and outputs.
+
+The file says in its own metadata, as JSON, what it takes and gives, so whoever has ONNX Runtime needs no polarnet.
+"""
+
+import contextlib
+import inspect
+import json
+import logging
+import math
+import os
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from polarnet.events.representations import REPRESENTATIONS, channels_of
+from polarnet.events.stream import Events
+from polarnet.events.windows import encode_windows
+from polarnet.networks.blocks import Prediction
+from polarnet.stokes import POLARIZER_ANGLES_DEG
+
+FORMAT = "polarnet-onnx-1"
+KEY = "polarnet"  # of the JSON among the file's metadata_props
+OPSET = 20  # the first with GELU as one operator
+TOLERANCE = 1e-4
+"""Of `largest_differences`. Sums of float32 in another order leave a few 1e-6 in both networks; an operator that means
+something else leaves far more: images enlarged by another rule (align_corners) 6e-2 in the shipped network."""
+CHECKED_WINDOWS = 5  # with events; one without any follows
+CHECKED_WINDOW_US = 33_333  # where the checkpoint does not say how long its windows are
+MOST_EVENTS = 10  # a pixel and polarizer in all checked windows together
+SEED = 0
+MEANINGS = {
+    "dolp": "degree of linear polarization, not clamped to [0, 1]",
+    "aolp": "angle of linear polarization, radians in [0, pi)",
+    "log_variance": "logarithm of the expected squared error of dolp",
+    "stokes": "S1 / S0 and S2 / S0, of which aolp is the angle",
+}
+"""What the file says of the fields of `Prediction`."""
+
+
+class OneWindow(nn.Module):
+    """A network whose state comes and goes tensor by tensor, as in a graph."""
+
+    def __init__(self, network: nn.Module):
+        super().__init__()
+        self.network = network
+
+    def forward(self, events: Float[Tensor, "1 c h w"], *state: Tensor) -> tuple[Tensor, ...]:
+        """The values of `outputs_by_name`."""
+        return tuple(outputs_by_name(*self.network(events, list(state))).values())
+
+
+def outputs_by_name(prediction: Prediction, state: Sequence[Tensor]) -> dict[str, Tensor]:
+    """What is predicted, under its name, then the new state: new_state_0, new_state_1, ..."""
+    predicted = {name: field for name, field in prediction._asdict().items() if field is not None}
+    return predicted | {f"new_state_{number}": tensor for number, tensor in enumerate(state)}
+
+
+def export_network(
+    network: nn.Module, metadata: Mapping[str, Any], path: Path, height: int, width: int
+) -> dict[str, float]:
+    """Write what `load_network` gave to `path` (.onnx), for images of one size; its `largest_differences` from torch.
+
+    The weights are in the file, and the same network gives the same bytes. ValueError or FileNotFoundError where `path`
+    cannot be written; RuntimeError where packages are missing, or where an output of ONNX Runtime differs by more than
+    `TOLERANCE`: then there is no file, or still the one that was there before.
+    """
+    onnx, _ = _packages()
+    _check_path(path)
+    if min(height, width) < 1:
+        raise ValueError(f"expected a height and a width of at least 1 pixel, got {height}x{width}")
+    windows = random_windows(metadata, height, width)
+    model, description = _traced(network, metadata, windows[0])
+    onnx.helper.set_model_props(model, {KEY: json.dumps(description)})
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        temporary.write_bytes(model.SerializeToString(deterministic=True))
+        found = largest_differences(temporary, network, windows)
+        _check_differences(found, path)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return found
+
+
+@torch.no_grad()
+def largest_differences(path: Path, network: nn.Module, windows: Float[Tensor, "t 1 c h w"]) -> dict[str, float]:
+    """How far each output of the file is from torch's, at any pixel of consecutive windows.
+
+    Both sides carry their own state, and begin with none. Where a map exceeds 1, relative to its largest value. Of the
+    angle, the circular difference times the length of (s1, s2): light that is not polarized has no angle. RuntimeError
+    for a file that ONNX Runtime does not take.
+    """
+    session = _session(path)
+    states = json.loads(session.get_modelmeta().custom_metadata_map[KEY])["state"]
+    names = [output.name for output in session.get_outputs()]
+    carried = {entry["input"]: torch.zeros(entry["shape"]).numpy() for entry in states}
+    state, differences = None, []
+    for events in windows:
+        given = dict(zip(names, session.run(names, {"events": events.numpy(), **carried}), strict=True))
+        carried = {entry["input"]: given[entry["output"]] for entry in states}
+        prediction, state = network(events, state)
+        expected = outputs_by_name(prediction, state)
+        differences.append([_difference(name, torch.from_numpy(given[name]), expected) for name in names])
+    return dict(zip(names, torch.tensor(differences).amax(0).tolist(), strict=True))
+
+
+def random_windows(metadata: Mapping[str, Any], height: int, width: int) -> Float[Tensor, "t 1 c h w"]:
+    """Consecutive windows in the representation of a checkpoint: always the same random events, at last none at all.
+
+    Their number differs from polarizer to polarizer and falls from window to window.
+    """
+    generator = torch.Generator().manual_seed(SEED)
+    window_us = _window_us(metadata) or CHECKED_WINDOW_US
+    channels = [_random_events(height, width, CHECKED_WINDOWS * window_us, generator) for _ in POLARIZER_ANGLES_DEG]
+    t_us = window_us * torch.arange(CHECKED_WINDOWS + 2)
+    return encode_windows(channels, t_us, REPRESENTATIONS[metadata["representation"]])[:, None]
+
+
+def _random_events(height: int, width: int, duration_us: int, generator: torch.Generator) -> Events:
+    count = int(torch.randint(1, MOST_EVENTS * height * width + 1, (), generator=generator))
+    early = torch.rand(count, generator=generator, dtype=torch.float64).square()
+    t = (early * duration_us).long().sort().values
+    x, y, positive = (torch.randint(n, (count,), generator=generator) for n in (width, height, 2))
+    return Events(t, x.short(), y.short(), (2 * positive - 1).to(torch.int8), height, width)
+
+
+def _traced(
+    network: nn.Module, metadata: Mapping[str, Any], events: Float[Tensor, "1 c h w"]
+) -> tuple[Any, dict[str, Any]]:
+    """The model, without what tracing notes about it (such as this machine's paths), and what is to be said of it."""
+    with torch.no_grad():
+        # Before it is traced the network must have run at this size: it keeps masks, and would keep those of tracing,
+        # which hold no numbers.
+        prediction, state = network(events)
+    shapes = [list(tensor.shape) for tensor in state]
+    description = _description(metadata, prediction, list(events.shape), shapes)
+    with _quiet():
+        program = torch.onnx.export(
+            OneWindow(network).eval(),
+            (events, *(torch.zeros(shape) for shape in shapes)),
+            dynamo=True,
+            input_names=["events", *(entry["input"] for entry in description["state"])],
+            output_names=list(outputs_by_name(prediction, state)),
+            opset_version=OPSET,
+            custom_translation_table={torch.ops.aten.copysign.Tensor: _copysign},
+            verbose=False,
+        )
+    assert program is not None
+    model = program.model_proto
+    graph = model.graph
+    for part in (graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        part.ClearField("metadata_props")
+    return model, description
+
+
+def _copysign(size: Any, signed: Any) -> Any:
+    """torch.copysign as ONNX operators, among which it is none; -0 counts as positive."""
+    import onnxscript
+
+    op: Any = onnxscript.opset20
+    positive = op.Abs(size)
+    return op.Where(op.Less(signed, op.CastLike(0.0, signed)), op.Neg(positive), positive)
+
+
+def _description(
+    metadata: Mapping[str, Any], prediction: Prediction, shape: list[int], states: list[list[int]]
+) -> dict[str, Any]:
+    """What somebody without polarnet has to know of the file."""
+    encode = REPRESENTATIONS[metadata["representation"]]
+    return {
+        "format": FORMAT,
+        "network": metadata["network"],
+        "representation": metadata["representation"],
+        "window_us": _window_us(metadata),
+        "events": {
+            "shape": shape,
+            "polarizers_deg": POLARIZER_ANGLES_DEG,
+            "images_of_each": channels_of(encode),
+            "channel": "images_of_each * polarizer + image",
+            "images": inspect.getdoc(encode),
+        },
+        "outputs": {name: MEANINGS[name] for name in outputs_by_name(prediction, [])},
+        "state": [
+            {"input": f"state_{number}", "output": f"new_state_{number}", "shape": shape, "start": 0.0}
+            for number, shape in enumerate(states)
+        ],
+        "checkpoint": dict(metadata),
+    }
+
+
+def _window_us(metadata: Mapping[str, Any]) -> int | None:
+    """How long the windows of the training were, where their events were simulated; else None."""
+    made_with = metadata.get("data", {}).get("events_from", {}).get("scenes", {}).get("synthesize")
+    return round(1e6 / made_with["frame_rate_hz"]) if made_with else None
+
+
+def _session(path: Path) -> Any:
+    _, onnxruntime = _packages()
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    try:
+        return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its own errors have no other class in common
+        raise RuntimeError(f"ONNX Runtime {onnxruntime.__version__} does not take {path.name}: {error}") from None
+
+
+def _difference(name: str, given: Tensor, expected: Mapping[str, Tensor]) -> float:
+    wanted = expected[name]
+    assert given.shape == wanted.shape, f"{name}: {given.shape}, not {wanted.shape}"
+    if name == "aolp":
+        turned = torch.remainder(given - wanted + math.pi / 2, math.pi) - math.pi / 2
+        return float((turned * expected["stokes"].norm(dim=1)).abs().max())
+    return float((given - wanted).abs().max() / wanted.abs().max().clamp(min=1))
+
+
+def _check_differences(found: Mapping[str, float], path: Path) -> None:
+    wrong = {name: difference for name, difference in found.items() if not difference <= TOLERANCE}  # NaN is wrong too
+    if wrong:
+        raise RuntimeError(
+            f"{path} is not written: ONNX Runtime differs from torch by more than {TOLERANCE:g} in "
+            f"{', '.join(f'{name} ({difference:.2g})' for name, difference in wrong.items())}; "
+            f"take the versions of torch, onnxscript and onnxruntime that constraints.txt names"
+        )
+
+
+def _check_path(path: Path) -> None:
+    if path.suffix != ".onnx":
+        raise ValueError(f"expected a file NAME.onnx to write, got {path}")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path.parent} is no folder; make it first, or write {path.name} somewhere else")
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise ValueError(f"{path} cannot be written: it is a folder, or {path.parent} is read-only for you")
+
+
+def _packages() -> tuple[Any, Any]:
+    """The modules onnx and onnxruntime, once onnxscript is known to be there too."""
+    try:
+        import onnx
+        import onnxruntime
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise RuntimeError(f"ONNX files need {error.name}: pip install 'polarnet[export]'") from None
+    return onnx, onnxruntime
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without torch's warnings that torchvision, which polarnet does not use, is missing, and of its own old names."""
+    logger = logging.getLogger("torch.onnx._internal.exporter._registration")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)
+            yield
+    finally:
+        logger.setLevel(before)
