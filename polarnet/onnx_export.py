@@ -148,7 +148,6 @@ def _traced(
             input_names=["events", *(entry["input"] for entry in description["state"])],
             output_names=list(outputs_by_name(prediction, state)),
             opset_version=OPSET,
-            custom_translation_table={torch.ops.aten.copysign.Tensor: _copysign},
             verbose=False,
         )
     assert program is not None
@@ -157,15 +156,6 @@ def _traced(
     for part in (graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
         part.ClearField("metadata_props")
     return model, description
-
-
-def _copysign(size: Any, signed: Any) -> Any:
-    """torch.copysign as ONNX operators, among which it is none; -0 counts as positive."""
-    import onnxscript
-
-    op: Any = onnxscript.opset20
-    positive = op.Abs(size)
-    return op.Where(op.Less(signed, op.CastLike(0.0, signed)), op.Neg(positive), positive)
 
 
 def _description(

@@ -17,11 +17,10 @@ from polarnet import onnx_export
 from polarnet.cli import main
 from polarnet.events.representations import event_counts
 from polarnet.events.stream import Events
-from polarnet.networks.blocks import Prediction
 from polarnet.networks.checkpoint import load_network, save_checkpoint
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
 from polarnet.networks.stokes_unet import StokesUNet, StokesUNetConfig
-from polarnet.onnx_export import export_network, largest_differences, random_windows
+from polarnet.onnx_export import largest_differences, random_windows
 
 HEIGHT, WIDTH = 30, 44  # neither divides by 8
 CONFIGS = {
@@ -123,19 +122,6 @@ def test_the_check_sees_one_weight_that_is_off(written):
     with torch.no_grad():
         last.bias[0] += 0.001
     assert max(largest_differences(written.path, network, random_windows(metadata, HEIGHT, WIDTH)).values()) > 4e-4
-
-
-class Signed(torch.nn.Module):
-    """Takes a number from one polarizer's image, and the sign from the next one's."""
-
-    def forward(self, events, state=None):
-        before = state[0] if state else torch.zeros_like(events)
-        return Prediction(torch.copysign(events[:, 0] - 0.5, events[:, 1]) + before[:, 2]), [events]
-
-
-def test_a_sign_that_is_copied_is_the_same_in_onnx(tmp_path):
-    metadata = {"network": "signed", "representation": "time_surface"}
-    assert set(export_network(Signed(), metadata, tmp_path / "n.onnx", 6, 8).values()) == {0.0}
 
 
 def test_a_file_that_onnx_runtime_does_not_take_is_an_error_that_says_so(tmp_path):
