@@ -205,9 +205,11 @@ def _add_benchmark(commands: Commands) -> None:
 
     measure = commands.add_parser("measure", help="write the figures that README and docs show")
     measure.add_argument(
-        "what", nargs="?", choices=("pipeline", "benchmark"), default="pipeline",
-        help="pipeline: time the README's two commands in a fresh clone of HEAD; benchmark: what data/benchmark holds",
+        "what", nargs="?", choices=("pipeline", "benchmark", "ablation"), default="pipeline",
+        help="pipeline: time the README's two commands in a fresh clone of HEAD; benchmark: what data/benchmark holds; "
+        "ablation: what a sweep over conf/ablation has left",
     )  # fmt: skip
+    measure.add_argument("--sweep", type=Path, metavar="FOLDER", help="of ablation: below outputs/sweeps")
     measure.set_defaults(run=_measure)
 
 
@@ -439,12 +441,17 @@ def _study(options: argparse.Namespace, config: "Config", out: Path, weights: Pa
 
 
 def _measure(options: argparse.Namespace) -> int:
-    from polarnet.measure import measure_benchmark, measure_pipeline
+    from polarnet.measure import measure_ablation, measure_benchmark, measure_pipeline
 
     root = project_root()
-    path = (
-        measure_pipeline(root) if options.what == "pipeline" else measure_benchmark(root, root / "data" / "benchmark")
-    )
+    if options.what == "ablation":
+        if options.sweep is None:
+            raise ValueError("measure ablation: say --sweep FOLDER, the one that the sweep named at its end")
+        path = measure_ablation(root, options.sweep)
+    elif options.what == "benchmark":
+        path = measure_benchmark(root, root / "data" / "benchmark")
+    else:
+        path = measure_pipeline(root)
     print(f"wrote {path}; `polarnet docs` brings it into the README")
     return 0
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from polarnet.reports.provenance import git, processor
 from polarnet.runtime import usable_cores
+from polarnet.sweep import sweep_points
 
 VERSIONS_OF = ("torch", "numpy", "numba", "zarr", "dvc", "hydra-core")
 STAGE_STARTS = re.compile(r"Running stage '([\w@]+)'")  # what dvc repro prints
@@ -134,6 +135,33 @@ def measure_benchmark(root: Path, benchmark: Path, record: Mapping[str, Any] | N
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(found, indent=2, allow_nan=False) + "\n")
     return path
+
+
+ABLATION_KEYS = ("mse", "level_mse", "pattern_mse", "psnr", "ssim", "corr", "aolp_deg")
+"""Of each ablation in docs/results/network.json."""
+
+
+def measure_ablation(root: Path, sweep: Path) -> Path:
+    """Write section `ablation` of docs/results/network.json from a sweep's folder: jobs that name conf/ablation/NAME.
+
+    What each leaves out is the comment of its file. RuntimeError where a job has no `ablation=NAME`, where there is
+    none with `ablation=nothing` to compare with, or where the tree has uncommitted changes.
+    """
+    if uncommitted(root):
+        raise RuntimeError("the tree has uncommitted changes; commit them first, the figures name a commit")
+    rows, overrides = {}, set()
+    for point in sweep_points(sweep):
+        given = dict(one.lstrip("+").split("=", 1) for one in point["overrides"])
+        if "ablation" not in given:
+            raise RuntimeError(f"{sweep / point['job']}: expected ablation=NAME among its overrides, got {given}")
+        name = given.pop("ablation")
+        about = (root / "conf" / "ablation" / f"{name}.yaml").read_text().splitlines()[1].removeprefix("# ")
+        rows[name] = {"about": about} | {key: point["scores"].get(key) for key in ABLATION_KEYS}
+        overrides |= {f"{key}={value}" for key, value in given.items() if not key.startswith(("paths.", "ingest.root"))}
+    if "nothing" not in rows:
+        raise RuntimeError(f"{sweep}: expected a finished job with ablation=nothing, got {', '.join(rows) or 'no job'}")
+    found = {"overrides": sorted(overrides), "rows": rows}
+    return write_section(root, "network", "ablation", found, machine_record(root))
 
 
 def _timed(target: str, folder: Path) -> tuple[float, dict[str, float]]:

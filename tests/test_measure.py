@@ -3,7 +3,15 @@ import subprocess
 
 import pytest
 
-from polarnet.measure import BENCHMARK_KEYS, _timed, machine_record, measure_benchmark, measure_pipeline, write_section
+from polarnet.measure import (
+    BENCHMARK_KEYS,
+    _timed,
+    machine_record,
+    measure_ablation,
+    measure_benchmark,
+    measure_pipeline,
+    write_section,
+)
 from polarnet.reports.provenance import git
 from polarnet.reports.readme import benchmark_block
 
@@ -55,6 +63,36 @@ def test_a_tree_with_changes_is_not_measured(tmp_path):
     git(tmp_path, "add", "file")
     with pytest.raises(RuntimeError, match="uncommitted changes"):
         measure_pipeline(tmp_path)
+
+
+def swept(root, **mse):
+    (root / "conf" / "ablation").mkdir(parents=True)
+    for number, (name, value) in enumerate(mse.items()):
+        job = root / "sweep" / str(number)
+        (job / ".hydra").mkdir(parents=True)
+        (job / "benchmark").mkdir()
+        (job / ".hydra" / "overrides.yaml").write_text(f"- ablation={name}\n- train.epochs=1\n- paths.data=x\n")
+        (job / "benchmark" / "metrics.json").write_text(json.dumps({"ours": {"mse": value, "psnr": 15.0}}))
+        (root / "conf" / "ablation" / f"{name}.yaml").write_text(f"# @package _global_\n# Without {name}.\n")
+    (root / "conf" / "file").write_text("")
+    git(root, "init", "--quiet")
+    git(root, "add", "conf")
+    git(root, "-c", "user.name=a", "-c", "user.email=a@b.c", "commit", "--quiet", "-m", "one")
+    return root / "sweep"
+
+
+def test_an_ablation_is_what_a_sweep_found_with_what_each_job_leaves_out(tmp_path):
+    sweep = swept(tmp_path, nothing=0.03, sums=0.05)
+    found = json.loads(measure_ablation(tmp_path, sweep).read_text())
+    assert found["ablation"]["overrides"] == ["train.epochs=1"]
+    assert found["ablation"]["rows"]["sums"]["about"] == "Without sums."
+    assert {name: row["mse"] for name, row in found["ablation"]["rows"].items()} == {"nothing": 0.03, "sums": 0.05}
+    assert found["records"]["ablation"]["commit"] == git(tmp_path, "rev-parse", "HEAD")
+
+
+def test_an_ablation_needs_the_whole_to_compare_with(tmp_path):
+    with pytest.raises(RuntimeError, match="expected a finished job with ablation=nothing, got sums"):
+        measure_ablation(tmp_path, swept(tmp_path, sums=0.05))
 
 
 def write_results(folder):

@@ -12,7 +12,7 @@ from typing import Any
 
 from polarnet.reports.provenance import cores, measured_with, origin
 from polarnet.reports.recording_tables import recordings_block
-from polarnet.reports.study_tables import event_budget_block, study_block
+from polarnet.reports.study_tables import ablation_block, event_budget_block, study_block
 from polarnet.reports.tables import (
     COLUMNS,
     COSTS,
@@ -187,6 +187,7 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "recordings": recordings_block,
     "inspection": inspection_block,
     "network-seed_1": study_block,
+    "network-ablation": ablation_block,
     "event_budget-budget": event_budget_block,
     "network-throughput": throughput_block,
 }
@@ -198,6 +199,7 @@ UNMEASURED = {
     "recordings": "Not measured yet: `tests/benchmarks/{recordings,fuzz_recordings,rig}.py --write` do it.",
     "event_budget-budget": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "network-seed_1": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
+    "network-ablation": "Not measured yet: the sweep above and `polarnet measure ablation --sweep FOLDER` do it.",
     "network-throughput": "Not measured yet: `python tests/benchmarks/training.py --write` does it.",
 }
 """Blocks that may stand in a document before their results do, and what they say until then."""

@@ -88,6 +88,20 @@ STUDY_COLUMNS = (
 _OF_NETWORKS = ("gain_over_paper_db", "mse_over_paper", "mse_over_oracle_mean")
 
 
+def ablation_block(results: Mapping[str, Any]) -> str:
+    """What each part of the network and its training brings: the worst loss first, below the whole.
+
+    `results` is docs/results/network.json; `polarnet measure ablation` writes the section.
+    """
+    found, record = results["ablation"], results["records"]["ablation"]
+    rows = sorted(found["rows"].items(), key=lambda row: (row[0] != "nothing", -row[1]["mse"]))
+    lines = ["| `ablation=` | | " + " | ".join(label for _, label, _ in STUDY_COLUMNS) + " |"]
+    lines.append("|---|---" + "|---:" * len(STUDY_COLUMNS) + "|")
+    lines += [_row(f"`{name}` | {scores['about']}", [scores]) for name, scores in rows]
+    overrides = " ".join(f"`{override}`" for override in found["overrides"])
+    return "\n".join([*lines, "", f"One training each, {overrides or 'without further overrides'}. {origin(record)}"])
+
+
 def event_budget_block(results: Mapping[str, Any]) -> str:
     """Ours and its rivals by events per pixel since the start, and what that says of the paper's claim.
 

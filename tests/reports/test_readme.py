@@ -5,7 +5,7 @@ import pytest
 from polarnet.measure import BENCHMARK_KEYS
 from polarnet.reports.readme import benchmark_block, update_results_blocks
 from polarnet.reports.recording_tables import recordings_block
-from polarnet.reports.study_tables import event_budget_block, study_block
+from polarnet.reports.study_tables import ablation_block, event_budget_block, study_block
 
 RESULTS = {
     "setup_minutes": 1.5,
@@ -165,6 +165,20 @@ def test_the_study_of_the_networks_shows_every_seed_beside_what_must_be_beaten()
     assert "| ours, mean of 2 seeds ± standard deviation | 0.0225 ± 0.0035 |" in said
     assert "PSNR over the paper's network +1.50 dB, MSE over its 0.56; over the oracle mean's 0.75; on measured" in said
     assert "Seed 1: minutes of training: paper 36; trained and scored on 1 core(s) (a processor" in said
+
+
+def test_an_ablation_shows_the_whole_first_and_then_what_is_missed_most():
+    def scores(mse, about):
+        return dict.fromkeys(("level_mse", "pattern_mse", "psnr", "ssim", "corr"), 0.0) | {
+            "mse": mse, "aolp_deg": None, "about": about,
+        }  # fmt: skip
+
+    rows = {"sums": scores(0.04, "No sums."), "scales": scores(0.05, "One."), "nothing": scores(0.045, "All.")}
+    found = {"ablation": {"rows": rows, "overrides": ["train.epochs=1"]}, "records": {"ablation": MACHINE}}
+    lines = ablation_block(found).splitlines()
+    assert [line.split(" | ")[0] for line in lines[2:5]] == ["| `nothing`", "| `scales`", "| `sums`"]
+    assert lines[3].startswith("| `scales` | One. | 0.0500 | 0.0000 |")
+    assert "One training each, `train.epochs=1`." in lines[-1]
 
 
 def test_the_benchmark_says_what_solved_gains_bring():
