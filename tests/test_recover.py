@@ -1,4 +1,5 @@
 import io
+import itertools
 import re
 
 import numpy as np
@@ -122,6 +123,18 @@ def test_windows_that_overlap_give_a_frame_every_tenth_of_a_millisecond(store, w
     assert ends == list(range(33_333, DURATION_US + 1, 100))
     change = torch.stack([frame.found.dolp for frame in frames]).diff(dim=0).abs().mean(dim=(1, 2))
     assert change.max() < 0.05
+
+
+def test_a_file_goes_through_the_network_several_windows_at_once_and_gives_the_same(store, weights):
+    rule, source = WindowRule(20_000, None, None), opened(store)
+    by_one, by_two = (
+        list(frames_of(source, rule, Recoverer(load_network(weights)), pixels_at_once=n * HEIGHT * WIDTH))
+        for n in (1, 2)
+    )
+    assert [frame.window.stop_us for frame in by_two] == [20_000, 40_000, 60_000, 80_000, 100_000]
+    assert [frame.step_s == after.step_s for frame, after in itertools.pairwise(by_two)] == [True, False, True, False]
+    for one, other in zip(by_one, by_two, strict=True):
+        torch.testing.assert_close(one.found.dolp, other.found.dolp, atol=1e-5, rtol=1e-4)
 
 
 def test_files_are_reduced_to_the_size_that_is_asked_for(store):

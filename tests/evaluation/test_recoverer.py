@@ -46,6 +46,23 @@ def test_a_stream_gives_what_the_method_gives_for_the_whole_recording(method, ti
     torch.testing.assert_close(stream.step(windows_of(tie_free)[0]).dolp, found[0].dolp)
 
 
+@pytest.mark.parametrize("network", ["ours_checkpoint", "paper_checkpoint"])
+def test_windows_at_once_give_what_they_give_one_by_one(network, tie_free, checkpoints):
+    windows = windows_of(tie_free)
+    one_by_one, together = Recoverer(load_network(checkpoints[network])), Recoverer(load_network(checkpoints[network]))
+    expected = [one_by_one.step(window) for window in windows]
+    found = [*together.step_on(windows[:3]), together.step(windows[3])]
+    assert together.windows == 4
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one.dolp, other.dolp, atol=1e-5, rtol=1e-4)
+
+
+def test_windows_at_once_must_follow_each_other(tie_free, checkpoints):
+    windows = windows_of(tie_free)
+    with pytest.raises(ValueError, match=r"follow each other, got \[\(0, 1000\), \(2000, 3000\)\] us"):
+        Recoverer(load_network(checkpoints["ours_checkpoint"])).step_on([windows[0], windows[2]])
+
+
 def test_many_streams_at_once_give_what_each_gives_alone(make_recording, checkpoints):
     network = load_network(checkpoints["ours_checkpoint"])
     recordings = [windows_of(make_recording(seed=seed)) for seed in range(3)]
