@@ -40,14 +40,12 @@ def study_block(results: Mapping[str, Any]) -> str:
             if len(seeds) > 1:
                 label = f"{METHODS[row]}, mean of {len(seeds)} seeds ± standard deviation"
                 lines.append(_row(label, [found["rows"][name][row] for found in seeds.values()]))
+        if "shipped" in results:
+            lines.append(_row("ours, shipped weights", [results["shipped"]["rows"][name]["ours"]]))
         lines.append("")
-    means = over_seeds([*seeds.values()])
-    lines += [
-        f"Mean of {len(seeds)} seed(s): PSNR over the paper's network {means['gain_over_paper_db']:+.2f} dB, MSE over "
-        f"its {means['mse_over_paper']:.2f}; over the oracle mean's {means['mse_over_oracle_mean']:.2f}; on measured "
-        f"scenes over that of the best intensity reconstruction {means['measured']['mse_over_best_baseline']:.2f}.",
-        "",
-    ]
+    lines += [f"Mean of {len(seeds)} seed(s): {_said(over_seeds([*seeds.values()]))}", ""]
+    if "shipped" in results:
+        lines += [f"Shipped weights: {_said(results['shipped'])}", ""]
     for seed, found in seeds.items():
         record, minutes = results["records"][f"seed_{seed}"], found["minutes_trained"]
         trained = ", ".join(f"{row} {value:.0f}" for row, value in minutes.items() if value is not None)
@@ -57,6 +55,14 @@ def study_block(results: Mapping[str, Any]) -> str:
             "",
         ]
     return "\n".join(lines)
+
+
+def _said(found: Mapping[str, Any]) -> str:
+    return (
+        f"PSNR over the paper's network {found['gain_over_paper_db']:+.2f} dB, MSE over its "
+        f"{found['mse_over_paper']:.2f}; over the oracle mean's {found['mse_over_oracle_mean']:.2f}; on measured "
+        f"scenes over that of the best intensity reconstruction {found['measured']['mse_over_best_baseline']:.2f}."
+    )
 
 
 def _row(label: str, scores: Sequence[Mapping[str, float | None]]) -> str:

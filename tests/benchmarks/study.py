@@ -7,10 +7,11 @@ python tests/benchmarks/study.py --photographs FOLDER --measured FOLDER --work F
 Runs the pipeline's stages with experiment=photographs in the folder --work, where a killed run goes on and nothing is
 trained twice. Networks are trained one after the other, or side by side: start the command once for each with --only
 ROW, then without. Choose `--override paper:train.epochs=N` so that both DoLP networks take about as long; the minutes
-are printed. --write puts the tables into docs/results/benchmark.json, what they say of the two networks into
-network.json, and the event budget into event_budget.json and docs/pictures. With another --seed, only network.json
-gets a section more and the means over seeds anew; --rows ours paper is enough for that. Nothing is trained on measured
-scenes or on the test split; the split is by source picture.
+are printed. --write puts what the tables say of the two networks into docs/results/network.json, as the section of the
+seed and in the means over seeds, and if every row was scored also the tables into benchmark.json and the event budget
+into event_budget.json and docs/pictures. With --ours the section is `shipped`, and no part of the means. For further
+seeds `--rows ours paper` is enough. Nothing is trained on measured scenes or on the test split; the split is by source
+picture.
 """
 
 import argparse
@@ -76,7 +77,7 @@ def trained(row: str, arguments: argparse.Namespace) -> Path:
 
 def stand_in(arguments: argparse.Namespace) -> Path:
     """Given weights of `ours`, where a training would have left them."""
-    best = arguments.work / f"given_ours_{arguments.seed}" / "best.safetensors"
+    best = arguments.work / "given_ours" / "best.safetensors"
     best.parent.mkdir(exist_ok=True)
     for suffix in (".safetensors", ".json"):
         shutil.copy(arguments.ours.with_suffix(suffix), best.with_suffix(suffix))
@@ -133,7 +134,8 @@ def main() -> None:
     folders = {row: trained(row, arguments) for row in arguments.rows if row != "ours" or not arguments.ours}
     sets = ("benchmark.sets=[simulated,measured]", f"sets.measured_root={arguments.measured}")
     stage("sets", arguments, *sets)
-    results = arguments.work / f"benchmark_{arguments.seed}"
+    section = "shipped" if arguments.ours else f"seed_{arguments.seed}"
+    results = arguments.work / f"benchmark_{section}"
     best = {row: folder / "best.safetensors" for row, folder in folders.items()}
     if arguments.ours:
         best["ours"] = stand_in(arguments)
@@ -161,10 +163,9 @@ def main() -> None:
     print(json.dumps({key: value for key, value in found.items() if key != "rows"}, indent=2))
     if not arguments.write:
         return
-    others = {n: one for n, one in seeds_of(read_results(ROOT, "network")).items() if n != str(arguments.seed)}
-    means = over_seeds([found, *others.values()])
-    print(write_section(ROOT, "network", f"seed_{arguments.seed}", found, record, means))
-    if arguments.seed == 1:
+    seeds = seeds_of(read_results(ROOT, "network") | {section: found})
+    print(write_section(ROOT, "network", section, found, record, over_seeds([*seeds.values()]) if seeds else None))
+    if set(arguments.rows) == set(TRAININGS):
         print(measure_benchmark(ROOT, results, record))
         print(event_budget(arguments, best["ours"], record))
 
