@@ -33,7 +33,7 @@ from polarnet.stokes import Mosaic
 from polarnet.weights import shipped_weights
 
 STANDARD_INPUT = "-"
-PIXELS_AT_ONCE = 8 * 120 * 180  # of windows that go through a network together: more saves no time, but takes memory
+PIXELS_AT_ONCE = 4 * 120 * 180  # of windows that go through a network together: more saves no time, but takes memory
 BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}{postfix}]"
 LIVE_BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
 

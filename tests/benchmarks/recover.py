@@ -122,7 +122,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
     parser.add_argument("--weights", type=Path, help="of the network")
-    parser.add_argument("--seconds", type=float, default=4.0, help="of the stream")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of the stream")
     parser.add_argument("--picture", type=Path, help="where to copy the pictures of a run")
     arguments = parser.parse_args()
     changed = git(ROOT, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
