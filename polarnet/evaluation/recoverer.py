@@ -166,7 +166,7 @@ class Recoverer(WindowRecoverer):
         place = torch.device(device)
         ready = module.to(place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
         super().__init__(ready, REPRESENTATIONS[metadata["representation"]], place, precision)
-        self._unroll: Forward = ready.unroll  # type: ignore[assignment]
+        self._network = ready
 
     @torch.inference_mode()
     def step_on(self, windows: Sequence[EventWindow]) -> list[Prediction]:
@@ -179,7 +179,8 @@ class Recoverer(WindowRecoverer):
             raise ValueError(f"expected windows that follow each other, got {spans} us")
         self._begin(windows[:1])
         inputs = torch.stack([self._inputs(window, self._sliding[0]) for window in windows])[:, None]
-        found = self._run(self._unroll, inputs, self._history.before(windows[0]), windows[-1])
+        unroll: Any = self._network.unroll
+        found = self._run(unroll, inputs, self._history.before(windows[0]), windows[-1])
         self.windows += len(windows)
         return [each_map(found, operator.itemgetter((k, 0))) for k in range(len(windows))]
 
