@@ -19,7 +19,6 @@ from polarnet.baselines.postprocessing import PostprocessingConfig
 from polarnet.baselines.stokes_gain import GainConfig
 from polarnet.evaluation.methods import WeightsConfig
 from polarnet.evaluation.score import BenchmarkConfig
-from polarnet.experiments import BASE
 from polarnet.lpips import LpipsConfig, lpips_problem
 from polarnet.networks.dolp_unet import DolpUNetConfig
 from polarnet.networks.registry import NetworkConfig
@@ -164,9 +163,10 @@ def check_keys(root: Path, overrides: list[str]) -> None:
     params = OmegaConf.to_container(OmegaConf.load(root / "params.yaml"))
     for key in _leaves(params):
         _check_key(key, "params.yaml")
+    groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
     for override in overrides:
         key = override.split("=", 1)[0].lstrip("+~").split("@")[0]
-        if key not in BASE and not key.startswith(("hydra.", "hydra/", "paths.data")):
+        if key not in groups and not key.startswith(("hydra.", "hydra/", "paths.data")):
             _check_key(key, "command line")
 
 

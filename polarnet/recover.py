@@ -33,7 +33,7 @@ from polarnet.stokes import Mosaic
 from polarnet.weights import shipped_weights
 
 STANDARD_INPUT = "-"
-PIXELS_AT_ONCE = 4 * 120 * 180  # of windows that go through a network together: more saves no time, but takes memory
+PIXELS_AT_ONCE = 4 * 120 * 180  # of windows that go through a network together; bounds its memory
 BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}{postfix}]"
 LIVE_BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
 
@@ -245,13 +245,8 @@ def _runs(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWindo
         yield run
 
 
-def recover(
-    source: Input, rule: WindowRule, stream: Stream, writer: RecoveryWriter, pixels_at_once: int = PIXELS_AT_ONCE
-) -> Summary:
-    """Recover and write every frame, behind a progress bar; ValueError where there is not one window.
-
-    `pixels_at_once` is that of `frames_of`.
-    """
+def recover(source: Input, rule: WindowRule, stream: Stream, writer: RecoveryWriter) -> Summary:
+    """Recover and write every frame, behind a progress bar; ValueError where there is not one window."""
     live = source.duration_us is None
     steps: list[float] = []
     latencies: list[float] = []
@@ -260,7 +255,7 @@ def recover(
         writer,
         tqdm(total=source.duration_us, desc="recover", unit_scale=1e-6, bar_format=LIVE_BAR if live else BAR) as bar,
     ):
-        for frame in frames_of(source, rule, stream, pixels_at_once):
+        for frame in frames_of(source, rule, stream):
             writer.add(frame.window, frame.found)
             steps.append(frame.step_s)
             latencies.append(frame.latency_s)
