@@ -45,6 +45,13 @@ def conv3x3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
     return nn.Conv2d(inputs, outputs, kernel_size=3, padding=1, bias=bias)
 
 
+def on_blocks(layer: nn.Conv2d, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n d h/2 w/2"]:
+    """layer(pixel_unshuffle(x, 2)) of a `conv3x3`, as one 6x6 convolution: the shuffled copy would cost more."""
+    weight = layer.weight.unflatten(1, (-1, 2, 2))  # d, c, row and column in a block, row and column of the block
+    weight = weight.permute(0, 1, 4, 2, 5, 3).flatten(4, 5).flatten(2, 3)
+    return F.conv2d(x, weight.contiguous(memory_format=torch.channels_last), layer.bias, stride=2, padding=2)
+
+
 class ConvGRU(nn.Module):
     """Convolutional gated recurrent unit (Ballas et al., ICLR 2016), all its convolutions 3x3.
 

@@ -24,11 +24,14 @@ LEAST_EVIDENCE = 1e-2  # of a moment, in squared events: keeps the solution fini
 MOST_CORRELATED = 0.95  # A and B; corrected moments can exceed what those of any A and B could be
 
 
-def faded(x: Float[Tensor, "t *b"], keep: float, state: Float[Tensor, " *b"]) -> Float[Tensor, "t *b"]:
-    """Running sums: after each of t windows, what came before counts `keep` times as much as a window earlier."""
+def faded(x: Float[Tensor, "t *b"], keep: Float[Tensor, "*k"], state: Float[Tensor, "*s"]) -> Float[Tensor, "t *s"]:
+    """Running sums: after each of t windows, what came before counts `keep` times as much as a window earlier.
+
+    `x` and `keep` are broadcast to the shape of `state`.
+    """
     sums = []
     for now in x:
-        state = torch.add(now, state, alpha=keep)
+        state = torch.addcmul(now, state, keep)
         sums.append(state)
     return torch.stack(sums)
 
@@ -46,18 +49,25 @@ class SecondMoments(nn.Module):
         self.log_mismatch = nn.Parameter(torch.full((memories,), -3.5))
         self.log_step = nn.Parameter(torch.full((memories,), -2.0))
 
-    def forward(self, events: Float[Tensor, "n m 4 h w"]) -> Float[Tensor, "n m 6 h w"]:
-        """`MOMENTS` of the sums of events of the four polarizers."""
+    def forward(self, events: Float[Tensor, "n m 4 h w"], pooled: int) -> Float[Tensor, "n m 6 h/{pooled} w/{pooled}"]:
+        """`MOMENTS` of the sums of events of the four polarizers, means over blocks of `pooled` x `pooled` pixels.
+
+        What is linear is left for after the pooling, when the images are small: most of the work is memory traffic.
+        """
         activity, mismatch, step = (
             p.exp().view(-1, 1, 1, 1) for p in (self.log_activity, self.log_mismatch, self.log_step)
         )
-        squared, steps = events.square(), events.abs()
-        weight = 1 / (1 + activity * squared.sum(2, keepdim=True))
-        v0, v45, v90, v135 = (mismatch * squared + step * steps).unbind(2)
+        steps = events.abs()
+        weight = 1 / (1 + activity * events.square().sum(2, keepdim=True))
+        weighted = weight * steps
+        mean_steps, mean_squares = block_means(weighted, pooled), block_means(weighted * steps, pooled)
+        v0, v45, v90, v135 = (mismatch * mean_squares + step * mean_steps).unbind(2)
         e0, e45, e90, e135 = events.unbind(2)
         a, b, c = e0 - e90, e45 - e135, (e0 + e90) - (e45 + e135)
-        moments = [a * a - v0 - v90, a * b, b * b - v45 - v135, a * c - v0 + v90, b * c + v45 - v135, steps.sum(2)]
-        return weight * torch.stack(moments, dim=2)
+        wa, wb = weight[:, :, 0] * a, weight[:, :, 0] * b
+        aa, ab, bb, ac, bc = (block_means(product, pooled) for product in (wa * a, wa * b, wb * b, wa * c, wb * c))
+        moments = [aa - v0 - v90, ab, bb - v45 - v135, ac - v0 + v90, bc + v45 - v135, mean_steps.sum(2)]
+        return torch.stack(moments, dim=2)
 
 
 class LeastSquares(nn.Module):
@@ -99,6 +109,15 @@ def neighbourhoods(x: Float[Tensor, "n c h w"], scales: Sequence[int]) -> Iterab
             yield x
         else:
             yield box_means(x, scale)
+
+
+def block_means(x: Float[Tensor, "*b h w"], size: int) -> Float[Tensor, "*b h/{size} w/{size}"]:
+    """Means over blocks of `size` x `size` pixels, which height and width divide into.
+
+    Rows first, whole lines at a time: avg_pool2d goes pixel by pixel.
+    """
+    rows = x.unflatten(-2, (-1, size)).sum(-2)
+    return rows.unflatten(-1, (-1, size)).sum(-1) / size**2
 
 
 def box_means(x: Float[Tensor, "n c h w"], width: int) -> Float[Tensor, "n c h w"]:

@@ -1,8 +1,9 @@
 import math
 
 import torch
+from torch.nn import functional as F
 
-from polarnet.networks.blocks import ConvGRU, ResidualBlock, UpBlock
+from polarnet.networks.blocks import ConvGRU, ResidualBlock, UpBlock, conv3x3, on_blocks
 
 
 def only_centres(gru: ConvGRU, from_input: list[float], from_state: list[float], from_reset_state: float) -> None:
@@ -58,3 +59,10 @@ def test_a_residual_block_has_two_3x3_convolutions_with_biases():
 
 def test_an_up_block_doubles_the_size_and_takes_the_channels_of_its_skip():
     assert UpBlock(8, 4)(torch.randn(3, 8, 5, 6), skip=torch.randn(3, 4, 10, 12)).shape == (3, 4, 10, 12)
+
+
+@torch.no_grad()
+def test_a_convolution_on_blocks_is_that_of_the_unshuffled_image():
+    torch.manual_seed(0)
+    layer, image = conv3x3(4 * 3, 5), torch.randn(2, 3, 8, 10)
+    torch.testing.assert_close(on_blocks(layer, image), layer(F.pixel_unshuffle(image, 2)))

@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from torch.nn import functional as F
 
 from polarnet.networks.redundancy import MOMENTS, LeastSquares, SecondMoments, faded, neighbourhoods
 from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
@@ -26,7 +27,7 @@ def noiseless(memories: int = 1) -> SecondMoments:
 @pytest.mark.parametrize(("dolp", "aolp"), [(0.6, 0.3), (0.3, 2.0), (0.8, 1.2), (0.05, 0.0)])
 @torch.no_grad()
 def test_polarization_follows_from_small_changes_of_the_logarithms_alone(dolp, aolp):
-    moments = noiseless()(1e4 * changes(dolp, aolp, 400, 1e-3).view(1, 1, 4, 1, 400))
+    moments = noiseless()(1e4 * changes(dolp, aolp, 400, 1e-3).view(1, 1, 4, 1, 400), pooled=1)
     solve = LeastSquares(1, 1, 1)
     solve.log_ridge.fill_(-torch.inf)
     s1, s2, _ = solve(moments.mean((-1, -2), keepdim=True)[:, :, None, None])
@@ -38,7 +39,7 @@ def test_polarization_follows_from_small_changes_of_the_logarithms_alone(dolp, a
 def test_moments_by_hand():
     e0, e45, e90, e135 = 3.0, 1.0, -1.0, 2.0  # A = 4, B = -1, C = -1
     events = torch.tensor([e0, e45, e90, e135]).view(1, 1, 4, 1, 1)
-    assert noiseless()(events).flatten().tolist() == [16, -4, 1, -4, 1, 7]
+    assert noiseless()(events, pooled=1).flatten().tolist() == [16, -4, 1, -4, 1, 7]
     noisy = SecondMoments(1)
     noisy.log_activity.fill_(math.log(0.2))
     noisy.log_mismatch.fill_(math.log(0.1))
@@ -46,7 +47,15 @@ def test_moments_by_hand():
     variance = [0.1 * e * e + 0.5 * abs(e) for e in (e0, e45, e90, e135)]  # 2.4, 0.6, 0.6, 1.4
     expected = [16 - 2.4 - 0.6, -4, 1 - 0.6 - 1.4, -4 - 2.4 + 0.6, 1 + 0.6 - 1.4, 7]
     assert variance == pytest.approx([2.4, 0.6, 0.6, 1.4])
-    torch.testing.assert_close(noisy(events).flatten(), torch.tensor(expected) / (1 + 0.2 * 15))
+    torch.testing.assert_close(noisy(events, pooled=1).flatten(), torch.tensor(expected) / (1 + 0.2 * 15))
+
+
+@torch.no_grad()
+def test_pooled_moments_are_means_over_blocks():
+    torch.manual_seed(0)
+    events, moments = 3 * torch.randn(2, 3, 4, 8, 12), SecondMoments(3)
+    each = moments(events, pooled=1)
+    torch.testing.assert_close(moments(events, pooled=4).flatten(1, 2), F.avg_pool2d(each.flatten(1, 2), 4))
 
 
 @torch.no_grad()
@@ -59,7 +68,7 @@ def test_noise_of_thresholds_and_steps_leaves_no_bias():
     corrected.log_step.fill_(-torch.inf)
     corrected.log_mismatch.fill_(math.log(0.15**2 / (1 + 0.15**2)))  # of what is seen, which holds the noise too
     found, plain, truth = (
-        moments(events).mean((-1, -2)).flatten()[: MOMENTS - 1]
+        moments(events, pooled=1).mean((-1, -2)).flatten()[: MOMENTS - 1]
         for moments, events in ((corrected, noisy), (noiseless(), noisy), (noiseless(), true))
     )
     torch.testing.assert_close(found, truth, atol=3.0, rtol=0)
@@ -68,7 +77,7 @@ def test_noise_of_thresholds_and_steps_leaves_no_bias():
 
 @torch.no_grad()
 def test_without_events_nothing_is_polarized_and_nothing_is_infinite():
-    s1, s2, steps = LeastSquares(1, 1, 1)(SecondMoments(1)(torch.zeros(1, 1, 4, 2, 2))[:, :, None, None])
+    s1, s2, steps = LeastSquares(1, 1, 1)(SecondMoments(1)(torch.zeros(1, 1, 4, 2, 2), pooled=1)[:, :, None, None])
     assert not s1.any()
     assert not s2.any()
     assert not steps.any()
@@ -85,8 +94,8 @@ def test_solutions_stay_physical_whatever_the_moments():
 
 
 def test_running_sums_fade():
-    sums = faded(torch.tensor([[1.0], [1.0], [2.0]]), 0.5, torch.tensor([4.0]))
-    assert sums.flatten().tolist() == [3.0, 2.5, 3.25]
+    sums = faded(torch.tensor([[1.0], [1.0], [2.0]]), torch.tensor([0.5, 0.0]), torch.tensor([4.0, 4.0]))
+    assert sums.tolist() == [[3.0, 1.0], [2.5, 1.0], [3.25, 2.0]]
 
 
 def test_neighbourhoods_are_means_of_what_lies_inside_the_image():
