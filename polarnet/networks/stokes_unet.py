@@ -1,6 +1,5 @@
 """polarnet's own network: the redundancy of four polarizers solved at many scales, then refined by a small U-Net."""
 
-import functools
 import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -218,9 +217,10 @@ def _moved(
     e0, e45, e90, e135 = events.unbind(2)
     sums = neighbourhoods(torch.cat([e0 - e90, e45 - e135], dim=1), SURROUNDINGS)
     each = zip(gains.contiguous().chunk(len(SURROUNDINGS), dim=1), sums, strict=True)  # of one layout: much faster
-    moves = (gain[:, None] * near.contiguous().unflatten(1, (2, -1)) for gain, near in each)
-    change = functools.reduce(torch.add, moves).sum(2)
-    return torch.tanh(torch.atanh(MOST_POLARIZED * stokes) + change)
+    moves = events.new_zeros(())
+    for gain, near in each:
+        moves = torch.addcmul(moves, gain[:, None], near.contiguous().unflatten(1, (2, -1)))
+    return torch.tanh(torch.atanh(MOST_POLARIZED * stokes) + moves.sum(2))
 
 
 def _images(events: Float[Tensor, "n m 4 h w"], count: Float[Tensor, "n 4 h w"]) -> Float[Tensor, "n c h w"]:

@@ -33,15 +33,17 @@ from polarnet.reports.maps import (
     polarization_hsv,
 )
 from polarnet.reports.tiles import chart, data_uri, template
+from polarnet.runtime import usable_cores
 
 OUTPUTS = ("zarr", "png", "exr", "mp4")
 VIDEO, CODEC = "recovered.mp4", "mp4v"  # MPEG-4, which players show and browsers do not
 FILM_FRAMES = 24
 """At least so many pictures, evenly spread, run on the page."""
-PNG_STORED = 0  # not compressed: twice the bytes, in a sixth of the time
+PNG_STORED, NO_FILTER = 0, 8  # not compressed, libpng's PNG_FILTER_NONE: twice the bytes, in a sixth of the time
 FRAMES_PER_CHUNK = 32
 ZARR_CODEC = BloscCodec(cname="lz4", shuffle="shuffle")  # faster than Zarr's default, and smaller
 MOST_WAITING = 64  # frames that are not written yet
+FEW_CORES = 2  # all are the network's: a thread that writes meanwhile holds up the others at every operation
 SHOWN_ON_PAGE = 6
 GAP = 4  # pixels between the maps of a picture
 SCALE_KEPT = 0.9  # of the events' full scale, from one picture to the next: it must not flicker
@@ -96,7 +98,7 @@ class RecoveryWriter:
         self.frames = 0
         self._kept = _Kept([])
         self._scale: float | None = None
-        self._group: zarr.Group | None = None
+        self._arrays: dict[str, zarr.Array] = {}
         self._buffer: dict[str, list[np.ndarray]] = {}
         self._video: cv2.VideoWriter | None = None
         # A second thread that computes on several cores would put those of the network to sleep between operations.
@@ -121,8 +123,8 @@ class RecoveryWriter:
 
     def add(self, window: EventWindow, found: Prediction) -> None:
         """A frame, on the CPU; returns before it is written, unless many wait already."""
-        self._wait(MOST_WAITING)
         self._waiting.append(self._thread.submit(self._write, self.frames, window, found))
+        self._wait(MOST_WAITING if usable_cores() > FEW_CORES else 0)
         self.frames += 1
 
     def write_page(self, title: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:
@@ -193,18 +195,16 @@ class RecoveryWriter:
     def _flush(self) -> None:
         if not self._buffer:
             return
-        if self._group is None:
-            self._group = zarr.open_group(self.folder / "recovered.zarr", mode="w")
-            self._group.attrs["conventions"] = {name: ZARR_CONVENTIONS[name] for name in self._buffer}
+        if not self._arrays:
+            group = zarr.open_group(self.folder / "recovered.zarr", mode="w")
+            group.attrs["conventions"] = {name: ZARR_CONVENTIONS[name] for name in self._buffer}
             for name, (first, *_) in self._buffer.items():
                 chunks = (FRAMES_PER_CHUNK, *first.shape)
-                self._group.create_array(
+                self._arrays[name] = group.create_array(
                     name, shape=(0, *first.shape), chunks=chunks, dtype=first.dtype, compressors=ZARR_CODEC
                 )
         for name, values in self._buffer.items():
-            array = self._group[name]
-            assert isinstance(array, zarr.Array)
-            array.append(np.stack(values))
+            self._arrays[name].append(np.stack(values))
         self._buffer.clear()
 
 
@@ -247,6 +247,7 @@ def _with_margin(picture: np.ndarray) -> np.ndarray:
 def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
     spec = oiio.ImageSpec(picture.shape[1], picture.shape[0], 3, oiio.UINT8)
     spec["png:compressionLevel"] = PNG_STORED  # thousands of them are written while a camera runs
+    spec["png:filter"] = NO_FILTER
     _write_picture(path, spec, picture)
 
 
