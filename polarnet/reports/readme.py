@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.reports.provenance import cores, measured_with, origin
-from polarnet.reports.recording_tables import recordings_block
+from polarnet.reports.recording_tables import recordings_block, recover_block
 from polarnet.reports.study_tables import ablation_block, event_budget_block, study_block
 from polarnet.reports.tables import (
     COLUMNS,
@@ -185,6 +185,7 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "benchmark": benchmark_block,
     "emulation": emulation_block,
     "recordings": recordings_block,
+    "recordings-recover": recover_block,
     "inspection": inspection_block,
     "network-seed_1": study_block,
     "network-ablation": ablation_block,
@@ -197,6 +198,7 @@ UNMEASURED = {
     "benchmark": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "emulation": "Not measured yet: `python tests/benchmarks/emulation.py --write` does it.",
     "recordings": "Not measured yet: `tests/benchmarks/{recordings,fuzz_recordings,rig}.py --write` do it.",
+    "recordings-recover": "Not measured yet: `python tests/benchmarks/recover.py --write` does it.",
     "event_budget-budget": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "network-seed_1": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "network-ablation": "Not measured yet: the sweep above and `polarnet measure ablation --sweep FOLDER` do it.",

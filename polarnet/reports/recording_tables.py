@@ -1,4 +1,4 @@
-"""The block of docs/recordings.md that shows what docs/results/recordings.json holds; what it lacks is left out."""
+"""The blocks of the docs that show what docs/results/recordings.json holds; what it lacks is left out."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -66,6 +66,24 @@ def rig_lines(rig: Figures) -> Iterator[str]:
     )
     yield ""
     yield as_markdown(score_table(rig["benchmark"]))
+
+
+def recover_block(results: Figures) -> str:
+    """How fast `polarnet recover` is with each method, from a file and live."""
+    found = results["recover"]
+    names = {"network": f"network `{found['network']}`"}
+    rows = (
+        [
+            names.get(name, f"`{name}`"),
+            f"{one['realtime_factor']:.2f}",
+            f"{one['latency_ms']:.1f}",
+            f"{one['live_latency_ms']:.0f}" if "live_latency_ms" in one else "-",
+        ]
+        for name, one in found["methods"].items()
+    )
+    headings = ["method", "times real time", "a step, ms", "live, from event to frame, ms"]
+    stream = f"{found['events']:,} events in {found['seconds']:g} s"
+    return "\n".join([f"{stream}; Zarr, PNG and video written:", "", *table(headings, rows), "", origin(found)])
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:

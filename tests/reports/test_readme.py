@@ -4,7 +4,7 @@ import pytest
 
 from polarnet.measure import BENCHMARK_KEYS
 from polarnet.reports.readme import benchmark_block, update_results_blocks
-from polarnet.reports.recording_tables import recordings_block
+from polarnet.reports.recording_tables import recordings_block, recover_block
 from polarnet.reports.study_tables import ablation_block, event_budget_block, study_block
 
 RESULTS = {
@@ -226,6 +226,16 @@ def test_recordings_are_shown_reader_by_reader_with_libraries_beside_them():
     assert "at least 10,000 for each reader" in block
     assert "| `evt` | 10,000 | 1,999 | 0 | 8,001 |" in block
     assert block.count("On 2 cores (a processor, load 1.0 before the start; python 3.11; commit `abc1234`).") == 2
+
+
+def test_the_speed_of_recover_is_shown_method_by_method():
+    network = {"realtime_factor": 1.234, "latency_ms": 21.84, "live_latency_ms": 40.2}
+    methods = {"network": network, "highpass+gain": {"realtime_factor": 2.0, "latency_ms": 9.0}}
+    block = recover_block({"recover": MACHINE | {"network": "x", "events": 2500, "seconds": 10.0, "methods": methods}})
+    assert block.startswith("2,500 events in 10 s")
+    assert "| network `x` | 1.23 | 21.8 | 40 |" in block
+    assert "| `highpass+gain` | 2.00 | 9.0 | - |" in block
+    assert "On 2 cores (a processor" in block
 
 
 def test_the_rig_is_shown_with_its_errors_and_its_benchmark():
