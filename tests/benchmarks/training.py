@@ -1,12 +1,12 @@
 """How fast the networks train and run: python tests/benchmarks/training.py [--write] [--rounds N] [--device cuda]
 
 Frames (four polarizers, 120 x 180 pixels) a second. Training: forward and backward through batches of sequences, the
-squares of the outputs as loss, without optimizer and data loading. Inference: one stream, window by window, the state
-carried on. Weights and inputs are random. Every network of `params.yaml` that there is a class for is measured, with
+squares of the outputs as loss, without optimizer and data loading. Inference: one stream, the state carried on. Weights
+and inputs are random. Every network of `params.yaml` that there is a class for is measured, with
 
 - `naive`: float32, images as torch makes them (contiguous NCHW), a window at a time, torch as it starts;
-- `shipped`: what stages and benchmark do: channels_last, a run of windows at once, `train.precision`'s `auto`, and the
-  runtime's settings of `polarnet.runtime.configure`;
+- `shipped`: channels_last, a run of windows at once, `train.precision`'s `auto`; in training with the settings of
+  `polarnet.runtime.configure`, as in stages; in inference as many windows as `polarnet recover` takes from a file;
 - `compiled` (with --compile): `shipped` through torch.compile, which needs a C++ compiler.
 
 Each is measured in a process of its own, in turns; figures are medians over the turns. `peak_gflop_per_s` is what the
@@ -36,6 +36,7 @@ from polarnet.events.representations import REPRESENTATIONS, channels_of
 from polarnet.measure import machine_record, uncommitted, write_section
 from polarnet.networks.blocks import Prediction
 from polarnet.networks.registry import NETWORKS
+from polarnet.recover import PIXELS_AT_ONCE
 from polarnet.runtime import configure, device_of, limit_threads, precision_on, usable_cores
 from polarnet.training.loop import autocast
 
@@ -82,7 +83,7 @@ def measure_one(name: str, setting: str, threads: int, device_name: str) -> dict
     network, channels = network_of(name, setting, device)
     windows = torch.randn(RUN, BATCH, channels, HEIGHT, WIDTH, device=device)
     stream = torch.randn(STREAMED, 1, channels, HEIGHT, WIDTH, device=device)
-    unroll, step = (network.unroll, network) if setting != "compiled" else map(torch.compile, (network.unroll, network))
+    unroll = torch.compile(network.unroll) if setting == "compiled" else network.unroll
 
     def train() -> None:
         network.zero_grad()
@@ -93,12 +94,14 @@ def measure_one(name: str, setting: str, threads: int, device_name: str) -> dict
                 loss = loss + loss_of(prediction)
         loss.backward()
 
-    @torch.no_grad()
+    at_once = 1 if setting == "naive" else PIXELS_AT_ONCE // (HEIGHT * WIDTH)
+
+    @torch.inference_mode()
     def infer() -> None:
         state = None
-        for window in stream:
+        for run in stream.split(at_once):
             with autocast(precision, device):
-                _, state = step(window, state)
+                _, state = unroll(run, state)
 
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         network(stream[0])
@@ -107,6 +110,7 @@ def measure_one(name: str, setting: str, threads: int, device_name: str) -> dict
     figures["train_frames_per_s"] = RUN * BATCH / seconds_of(train, device)
     figures["train_profile"] = profile_of(train)
     network.eval()
+    torch.use_deterministic_algorithms(False)  # which `configure` asks for, and `recover` does not
     figures["infer_windows_per_s"] = STREAMED / seconds_of(infer, device)
     figures["infer_profile"] = profile_of(infer)
     figures["peak_gflop_per_s"] = peak_gflop_per_s(device)
