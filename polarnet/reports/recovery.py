@@ -1,7 +1,7 @@
 """What `polarnet recover` leaves behind: numbers (Zarr, EXR), pictures (PNG), a video, and a page to look at.
 
-A picture shows DoLP, AoLP and the events of the window side by side. All is written by a thread of its own as frames
-come, in memory that does not grow with their number.
+A picture shows DoLP, AoLP and the events of the window side by side. All is written as frames come, in memory that does
+not grow with their number.
 """
 
 from collections import deque
@@ -39,9 +39,9 @@ OUTPUTS = ("zarr", "png", "exr", "mp4")
 VIDEO, CODEC = "recovered.mp4", "mp4v"  # MPEG-4, which players show and browsers do not
 FILM_FRAMES = 24
 """At least so many pictures, evenly spread, run on the page."""
-PNG_STORED, NO_FILTER = 0, 8  # not compressed, libpng's PNG_FILTER_NONE: twice the bytes, in a sixth of the time
+PNG_STORED, NO_FILTER = 0, 8  # not compressed, libpng's PNG_FILTER_NONE: larger, but quick to write
 FRAMES_PER_CHUNK = 32
-ZARR_CODEC = BloscCodec(cname="lz4", shuffle="shuffle")  # faster than Zarr's default, and smaller
+ZARR_CODEC = BloscCodec(cname="lz4", shuffle="shuffle")
 MOST_WAITING = 64  # frames that are not written yet
 FEW_CORES = 2  # all are the network's: a thread that writes meanwhile holds up the others at every operation
 SHOWN_ON_PAGE = 6
@@ -122,7 +122,7 @@ class RecoveryWriter:
                 self._video.release()
 
     def add(self, window: EventWindow, found: Prediction) -> None:
-        """A frame, on the CPU; returns before it is written, unless many wait already."""
+        """A frame, on the CPU; returns before it is written, unless many wait already or cores are few."""
         self._waiting.append(self._thread.submit(self._write, self.frames, window, found))
         self._wait(MOST_WAITING if usable_cores() > FEW_CORES else 0)
         self.frames += 1
