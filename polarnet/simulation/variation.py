@@ -1,7 +1,10 @@
-"""Other scenes from the same pictures, to train on: their polarization turned and rescaled, their light regraded.
+"""Other scenes from the same pictures, to train on: their polarization turned, rescaled or evened out, their light
+regraded.
 
 Photographs are highly polarized by the rule that saturation is DoLP, measured scenes hardly: what is trained on
-scenes in between, whose angles are any, does not learn one world's averages.
+scenes in between, whose angles are any, does not learn one world's averages. A scene of about one hue is polarized
+alike everywhere. Then the four polarizers' logarithms change alike, whatever DoLP is, and only how a pixel responds to
+dim and to bright light tells; such scenes are rare among photographs, and `uniform_share` makes more.
 """
 
 import math
@@ -31,10 +34,14 @@ class VariationConfig:
     """... after it was raised to a power whose logarithm is normal with this standard deviation."""
     s0_factor: list[float] = field(metadata=allowed(above=0, high=1))
     s0_exponent_spread: float = field(metadata=allowed(low=0))
+    uniform_share: float = field(metadata=allowed(low=0, high=1))
+    """Of them whose polarization is drawn towards one of any degree and angle, the same everywhere ..."""
+    uniform_weight: list[float] = field(metadata=allowed(low=0, high=1))
+    """... by a weight between these two; 1: DoLP and AoLP are constant."""
 
     def __post_init__(self):
         check_ranges(self)
-        for name in ("dolp_factor", "s0_factor"):
+        for name in ("dolp_factor", "s0_factor", "uniform_weight"):
             values = getattr(self, name)
             if len(values) != 2 or values[0] > values[1]:
                 raise ValueError(f"{name}: expected a smaller and a greater number, got {values}")
@@ -52,7 +59,22 @@ def varied(
         dolp = _graded(dolp, config.dolp_factor, config.dolp_exponent_spread, generator).clamp(max=GREATEST_DOLP)
     if generator.random() < config.share:
         s0 = _graded(s0, config.s0_factor, config.s0_exponent_spread, generator)
+    if generator.random() < config.uniform_share:
+        dolp, aolp = _evened(dolp, aolp, config.uniform_weight, generator)
     return torch.stack([s0, dolp, aolp])
+
+
+def _evened(
+    dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"], weight: list[float], generator: np.random.Generator
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """DoLP and AoLP of a mean of the scene's own S1 / S0, S2 / S0 and a constant."""
+    lightest, heaviest = weight
+    share = generator.uniform(lightest, heaviest)
+    degree, angle = generator.uniform(0, GREATEST_DOLP), generator.uniform(0, math.pi)
+    s1 = (1 - share) * dolp * torch.cos(2 * aolp) + share * degree * math.cos(2 * angle)
+    s2 = (1 - share) * dolp * torch.sin(2 * aolp) + share * degree * math.sin(2 * angle)
+    aolp = torch.remainder(torch.atan2(s2, s1) / 2, math.pi)
+    return torch.hypot(s1, s2).clamp(max=GREATEST_DOLP), torch.where(aolp >= math.pi, 0.0, aolp)
 
 
 def _graded(values: Tensor, factor: list[float], spread: float, generator: np.random.Generator) -> Tensor:

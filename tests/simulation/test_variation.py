@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ CONFIG = VariationConfig(
     dolp_exponent_spread=0.4,
     s0_factor=[0.5, 1.0],
     s0_exponent_spread=0.35,
+    uniform_share=0.0,
+    uniform_weight=[0.5, 1.0],
 )
 
 
@@ -41,7 +44,7 @@ def test_shapes_stay_brighter_stays_brighter_and_more_polarized_more_polarized()
 
 
 def test_with_no_share_only_angles_turn_and_all_alike():
-    config = VariationConfig(1, 0.0, [0.1, 1.3], 0.4, [0.5, 1.0], 0.35)
+    config = replace(CONFIG, share=0.0)
     s0, dolp, aolp = varied(scene(), config, np.random.default_rng(1))
     assert torch.equal(s0, scene()[0])
     assert torch.equal(dolp, scene()[1])
@@ -49,6 +52,32 @@ def test_with_no_share_only_angles_turn_and_all_alike():
     assert min((turn - turn[0, 0]).abs().max().item() for turn in turns) < 1e-5
 
 
+def test_an_even_variant_has_one_polarization_everywhere():
+    config = replace(CONFIG, uniform_share=1.0, uniform_weight=[1.0, 1.0])
+    seen = []
+    for seed in range(20):
+        s0, dolp, aolp = varied(scene(), config, np.random.default_rng(seed))
+        assert s0.std() > 0.05
+        assert dolp.std() < 1e-5
+        assert torch.exp(2j * (aolp - aolp[0, 0])).real.min() > 0.9999
+        seen.append((dolp.mean().item(), aolp[0, 0].item()))
+    degrees, angles = zip(*seen, strict=True)
+    assert min(degrees) < 0.3
+    assert max(degrees) > 0.7
+    assert max(angles) - min(angles) > 1
+
+
+def test_half_evened_is_half_as_varied():
+    plain = replace(CONFIG, share=0.0)
+    even = replace(plain, uniform_share=1.0, uniform_weight=[0.5, 0.5])
+
+    def stokes(config: VariationConfig) -> torch.Tensor:
+        _, dolp, aolp = varied(scene(), config, np.random.default_rng(2))
+        return dolp * torch.exp(2j * aolp)
+
+    torch.testing.assert_close(stokes(even) - stokes(even).mean(), (stokes(plain) - stokes(plain).mean()) / 2)
+
+
 def test_a_range_upside_down_is_refused():
     with pytest.raises(ValueError, match="dolp_factor: expected a smaller and a greater number"):
-        VariationConfig(1, 0.5, [1.3, 0.1], 0.4, [0.5, 1.0], 0.35)
+        replace(CONFIG, dolp_factor=[1.3, 0.1])
