@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from polarnet import stokes
 from polarnet.ranges import allowed, check_ranges
 
 GREATEST_DOLP = 0.99
@@ -71,10 +72,10 @@ def _evened(
     lightest, heaviest = weight
     share = generator.uniform(lightest, heaviest)
     degree, angle = generator.uniform(0, GREATEST_DOLP), generator.uniform(0, math.pi)
-    s1 = (1 - share) * dolp * torch.cos(2 * aolp) + share * degree * math.cos(2 * angle)
-    s2 = (1 - share) * dolp * torch.sin(2 * aolp) + share * degree * math.sin(2 * angle)
-    aolp = torch.remainder(torch.atan2(s2, s1) / 2, math.pi)
-    return torch.hypot(s1, s2).clamp(max=GREATEST_DOLP), torch.where(aolp >= math.pi, 0.0, aolp)
+    mean = stokes.stokes_from_polarization(torch.ones_like(dolp), (1 - share) * dolp, aolp)
+    mean[1] += share * degree * math.cos(2 * angle)
+    mean[2] += share * degree * math.sin(2 * angle)
+    return stokes.dolp(mean).clamp(max=GREATEST_DOLP), stokes.aolp(mean)
 
 
 def _graded(values: Tensor, factor: list[float], spread: float, generator: np.random.Generator) -> Tensor:
