@@ -27,7 +27,21 @@ CONFIGS = {
     "paper": DolpUNetConfig(
         channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1, input_mixing="contrasts"
     ),
-    "polarnet": StokesUNetConfig(channels=[8, 8, 8], memories=[0.0, 0.5], decays=[0.9], scales=[1, 3, 0], without=[]),
+    "polarnet": StokesUNetConfig(
+        channels=[8, 8, 8],
+        memories=[0.0, 0.5],
+        decays=[0.9],
+        scales=[1, 3, 0],
+        reach=5,
+        mosaic_margin=16,
+        mosaic_keep=0.7,
+        mosaic_ridge=0.02,
+        mosaic_fade=0.95,
+        mosaic_step=0.2,
+        mosaic_scale=5,
+        mosaic_share=0.6,
+        without=[],
+    ),
 }
 REPRESENTATIONS = {"paper": "event_tensor", "polarnet": "event_counts"}
 

@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,13 @@ def load_network(path: Path) -> tuple[nn.Module, dict[str, Any]]:
             f"{path} holds a {metadata['network']!r}; expected a DoLP network, one of {', '.join(NETWORKS)}"
         )
     build, config_class = NETWORKS[metadata["network"]]
+    needed, given = {entry.name for entry in fields(config_class)}, set(metadata["config"])
+    if needed != given:
+        raise ValueError(
+            f"{path.with_suffix('.json')}: expected a config with the keys of networks.{metadata['network']} in "
+            f"params.yaml, got one that lacks {_listed(needed - given)} and has besides {_listed(given - needed)}; "
+            "edit the JSON, or train again"
+        )
     network = build(config_class(**metadata["config"]), metadata["in_channels"])
     load_tensors(network, tensors, path)
     return network.eval(), metadata
@@ -76,6 +84,10 @@ def load_tensors(network: nn.Module, tensors: Mapping[str, Tensor], path: Path) 
             f"is {found.get(wrong[0], 'absent')} ({len(wrong)} tensors differ)"
         )
     network.load_state_dict(tensors)
+
+
+def _listed(keys: set[str]) -> str:
+    return ", ".join(sorted(keys)) or "nothing"
 
 
 def _check_suffix(path: Path) -> None:

@@ -19,12 +19,22 @@ from polarnet.networks.blocks import (
     conv3x3,
     on_blocks,
 )
-from polarnet.networks.redundancy import MOMENTS, LeastSquares, SecondMoments, faded, length, neighbourhoods
+from polarnet.networks.mosaic import Memory, Motion, Picture, displacements, follow, nothing_seen
+from polarnet.networks.redundancy import (
+    MOMENTS,
+    LeastSquares,
+    SecondMoments,
+    block_means,
+    box_means,
+    faded,
+    length,
+    neighbourhoods,
+)
 from polarnet.ranges import allowed, check_ranges
 
 STRIDE = 8  # three stages that halve the size
 IMAGES = 2  # of a polarizer's events: the sum of polarities and their number (representation `event_counts`)
-PARTS = ("redundancy", "sums", "recurrence")
+PARTS = ("redundancy", "sums", "recurrence", "mosaic")
 MIDDLE_DOLP = 0.3  # of the constant that is one more candidate, at the start
 SURROUNDINGS = (1, 3, 9)  # width in pixels of the neighbourhoods whose events tell fine structure
 MOST_POLARIZED = 0.98  # of 1: keeps atanh finite
@@ -43,9 +53,24 @@ class StokesUNetConfig:
     """Of each sum of second moments: their weight one window later."""
     scales: list[int] = field(metadata=allowed(low=0))
     """Of the neighbourhoods that are solved together, in pixels of a quarter of the size, odd; 0: the whole image."""
+    reach: int = field(metadata=allowed(low=1))
+    """Pixels along each axis within which the scene's motion from window to window is looked for."""
+    mosaic_margin: int = field(metadata=allowed(low=1))
+    """Of the mosaic beyond the image, in pixels of half the size."""
+    mosaic_keep: float = field(metadata=allowed(low=0, high=1))
+    """These three: `polarnet.networks.mosaic.Memory`."""
+    mosaic_ridge: float = field(metadata=allowed(above=0))
+    mosaic_fade: float = field(metadata=allowed(low=0, high=1))
+    mosaic_step: float = field(metadata=allowed(above=0))
+    """Natural-log intensity of an event."""
+    mosaic_scale: int = field(metadata=allowed(low=1))
+    """Width of the neighbourhood, in pixels of a quarter of the size, odd, whose mean is the network's and not the
+    mosaic's."""
+    mosaic_share: float = field(metadata=allowed(low=0, high=1))
+    """What the mosaic weighs in the answer where it is certain."""
     without: list[str]
     """Some of PARTS, to see what they bring: what the redundancy says (candidates are 0), the movement of (s1, s2) by
-    sums of events (their gains are 0), what the recurrent layers hold (they begin anew in each window)."""
+    sums of events (their gains are 0), what the recurrent layers hold (they begin anew in each window), the mosaic."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -53,6 +78,8 @@ class StokesUNetConfig:
             raise ValueError(f"channels, memories, decays, scales: expected 3 numbers and at least 1 each, got {self}")
         if any(scale and scale % 2 == 0 for scale in self.scales):
             raise ValueError(f"scales: expected odd numbers, or 0 for the whole image, got {self.scales}")
+        if self.mosaic_scale % 2 == 0:
+            raise ValueError(f"mosaic_scale: expected an odd number, got {self.mosaic_scale}")
         if unknown := set(self.without) - set(PARTS):
             raise ValueError(f"without: expected some of {', '.join(PARTS)}, got {', '.join(sorted(unknown))}")
 
@@ -75,6 +102,10 @@ class StokesUNet(nn.Module):
     how 2 atanh(s1) has changed at a pixel: (s1, s2) are moved by their sums, times gains that the U-Net chooses too.
     What it adds last, when it has seen the result, is free. DoLP is not the length of (s1, s2): where these are
     uncertain their mean is short, as is a mean over angles. The outputs are linear, as those of the paper's network.
+
+    Once trained (`eval`), it averages what it says with what the mosaic shows (`polarnet.networks.mosaic`), whose
+    unknown constants are chosen to suit what it says around each place. Nothing of that is learnt, and training is
+    without it.
     """
 
     representation = "event_counts"
@@ -88,6 +119,9 @@ class StokesUNet(nn.Module):
             )
         self.memories, self.decays, self.scales = config.memories, config.decays, config.scales
         self.without = frozenset(config.without)
+        self.reach, self.margin = config.reach, config.mosaic_margin
+        self.memory = Memory(config.mosaic_keep, config.mosaic_ridge, config.mosaic_fade)
+        self.step, self.around, self.share = config.mosaic_step, config.mosaic_scale, config.mosaic_share
         memories, solved = len(config.memories), len(config.memories) * len(config.decays) * len(config.scales)
         half, quarter, eighth = config.channels
         self.moments = SecondMoments(memories)
@@ -156,11 +190,16 @@ class StokesUNet(nn.Module):
         seen = torch.cat([y2, F.pixel_unshuffle(fine, 2).to(y2.dtype)], dim=1)
         added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(seen)))), 2).float()
 
-        s1, s2, dolp = (fine + added[:, :3]).unbind(1)
-        aolp = torch.remainder(torch.atan2(s2, s1) / 2, math.pi)
-        maps = [dolp, aolp, LOG_VARIANCE + added[:, 3], torch.stack([s1, s2], dim=1)]
+        stokes, dolp = (fine + added[:, :3]).split([2, 1], dim=1)
+        carried = state[memories + decays : memories + decays + 3]
+        if not self.training and "mosaic" not in self.without:
+            levels, certainties, carried = self._mosaic(polarity, (height, width), *carried)
+            share = self.share * (certainties / (certainties + 1)).mean((-1, -2), keepdim=True)
+            stokes, dolp = averaged(stokes, dolp, self.step * levels, share, self.around)
+        aolp = torch.remainder(torch.atan2(stokes[:, 1], stokes[:, 0]) / 2, math.pi)
+        maps = [dolp[:, 0], aolp, LOG_VARIANCE + added[:, 3], stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
-        return prediction, [*summed[-1].unbind(1), *moments, state4, state8]
+        return prediction, [*summed[-1].unbind(1), *moments, *carried, state4, state8]
 
     def _candidates(
         self, events: Float[Tensor, "n m 4 h w"], streams: int, state: list[Tensor]
@@ -176,6 +215,28 @@ class StokesUNet(nn.Module):
             stacked = torch.stack([mean.unflatten(1, shape).transpose(1, 2) for mean in near], dim=3)
             s1, s2, evidence = self.solve(stacked)
             return Candidates(s1, s2, length(s1, s2), evidence), [*sums[-1].unbind(1)]
+
+    def _mosaic(
+        self,
+        polarity: Float[Tensor, "t b 4 h w"],
+        seen: tuple[int, int],
+        before: Float[Tensor, "b h w"],
+        level: Float[Tensor, "b 4 H W"],
+        certainty: Float[Tensor, "b 1 H F"],
+    ) -> tuple[Float[Tensor, "n 4 h/2 w/2"], Float[Tensor, "n 1 H F"], list[Tensor]]:
+        """The mosaic after each window, at half the size, and how certain it is; and what to carry on from.
+
+        The sensor has the first `seen` rows and columns; `before` is the window before the first, of all polarizers.
+        """
+        images = torch.cat([before[None], polarity.sum(2)])
+        motion = displacements(images, self.reach)
+        changes = block_means(polarity, 2)[..., : seen[0] // 2, : seen[1] // 2]
+        pictures = [Picture(level, certainty)]
+        for change, displacement, found in zip(changes, motion.displacement / 2, motion.found, strict=True):
+            pictures.append(follow(change, Motion(displacement, found), pictures[-1], self.memory))
+        levels, certainties = (torch.cat(images) for images in zip(*pictures[1:], strict=True))
+        height, width = (size // 2 for size in polarity.shape[-2:])
+        return levels[..., :height, :width], certainties, [images[-1], *pictures[-1]]
 
     def _mixed(self, candidates: Candidates, weights: Float[Tensor, "n c1 h w"]) -> Float[Tensor, "n 3 h w"]:
         """s1, s2 and DoLP; the last weight is that of the constant, which has no angle."""
@@ -196,7 +257,8 @@ class StokesUNet(nn.Module):
         return layer(x, state)
 
     def initial_state(self, inputs: Float[Tensor, "b c h w"]) -> list[Tensor]:
-        """Nothing seen yet: sums of events and of moments, and what the two recurrent layers hold; all zeros.
+        """Nothing seen yet: sums of events and of moments, the last window's polarities, the mosaic, and what the two
+        recurrent layers hold; all zeros.
 
         Height and width divide by 8.
         """
@@ -207,7 +269,8 @@ class StokesUNet(nn.Module):
         )
         events = [inputs.new_zeros(b, 4, height, width) for _ in self.memories]
         moments = [inputs.new_zeros(b, len(self.memories) * MOMENTS, height // 4, width // 4) for _ in self.decays]
-        return [*events, *moments, quarter, eighth]
+        mosaic = nothing_seen(inputs[..., ::2, ::2], self.margin)
+        return [*events, *moments, inputs.new_zeros(b, height, width), *mosaic, quarter, eighth]
 
 
 def _moved(
@@ -221,6 +284,27 @@ def _moved(
     for gain, near in each:
         moves = torch.addcmul(moves, gain[:, None], near.contiguous().unflatten(1, (2, -1)))
     return torch.tanh(torch.atanh(MOST_POLARIZED * stokes) + moves.sum(2))
+
+
+def averaged(
+    stokes: Float[Tensor, "n 2 h w"],
+    dolp: Float[Tensor, "n 1 h w"],
+    level: Float[Tensor, "n 4 h/2 w/2"],
+    share: Float[Tensor, "n 1 1 1"],
+    around: int,
+) -> tuple[Float[Tensor, "n 2 h w"], Float[Tensor, "n 1 h w"]]:
+    """(s1, s2) and DoLP, drawn by `share` towards a mosaic of natural-log intensities with unknown constants.
+
+    2 atanh(s1) = log I0 - log I90 and likewise for s2, 45 and 135. The mosaic has the differences but for constants:
+    those that make them, averaged over `around` pixels of a quarter of the size, what (s1, s2) are there.
+    """
+    short = length(*stokes.unbind(1))[:, None]
+    own = torch.atanh(stokes / short * torch.maximum(short, dolp).clamp(max=MOST_POLARIZED))
+    shown = (level[:, :2] - level[:, 2:]) / 2
+    constants = box_means(block_means(own, 4) - block_means(shown, 2), around)
+    shown = shown + F.interpolate(constants, scale_factor=2, mode="bilinear")
+    mosaic = torch.tanh(F.interpolate(shown, scale_factor=2, mode="bilinear"))
+    return torch.lerp(stokes, mosaic, share), torch.lerp(dolp, length(*mosaic.unbind(1))[:, None], share)
 
 
 def _images(events: Float[Tensor, "n m 4 h w"], count: Float[Tensor, "n 4 h w"]) -> Float[Tensor, "n c h w"]:

@@ -77,6 +77,14 @@ def test_a_checkpoint_of_another_kind_of_network_is_refused(saved):
         load_network(path)
 
 
+def test_a_config_of_another_version_says_which_keys_differ(saved):
+    path, _ = saved
+    config = {key: value for key, value in asdict(CONFIG).items() if key != "swin_depth"}
+    rewrite(path, config=config | {"layers": 3})
+    with pytest.raises(ValueError, match=r"networks\.paper .* lacks swin_depth and has besides layers"):
+        load_network(path)
+
+
 def test_tensors_of_another_shape_are_named(saved):
     path, _ = saved
     rewrite(path, in_channels=4)

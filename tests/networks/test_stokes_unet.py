@@ -4,12 +4,28 @@ from typing import Any
 
 import pytest
 import torch
+from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
-from polarnet.networks.stokes_unet import PARTS, StokesUNet, StokesUNetConfig
+from polarnet.networks.stokes_unet import PARTS, StokesUNet, StokesUNetConfig, averaged
+from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
 
-CONFIG = StokesUNetConfig(channels=[8, 8, 8], memories=[0.0, 0.5], decays=[0.7, 0.9], scales=[1, 3, 0], without=[])
+CONFIG = StokesUNetConfig(
+    channels=[8, 8, 8],
+    memories=[0.0, 0.5],
+    decays=[0.7, 0.9],
+    scales=[1, 3, 0],
+    reach=5,
+    mosaic_margin=16,
+    mosaic_keep=0.7,
+    mosaic_ridge=0.02,
+    mosaic_fade=0.95,
+    mosaic_step=0.2,
+    mosaic_scale=5,
+    mosaic_share=0.6,
+    without=[],
+)
 
 
 def network(**changes: Any) -> StokesUNet:
@@ -25,6 +41,16 @@ def events(*shape: int) -> torch.Tensor:
     return torch.randint(-3, 4, shape).float()
 
 
+def moving_events(windows: int, height: int, width: int) -> torch.Tensor:
+    """Counts of a random picture that moves left by three pixels a window: [windows, 1, 8, h, w]."""
+    torch.manual_seed(1)
+    picture = torch.randn(1, 4, height // 4, width // 4 + windows)
+    picture = 3 * F.interpolate(picture, scale_factor=4, mode="bilinear")[0]
+    seen = torch.stack([picture[..., 3 * k : 3 * k + width] for k in range(windows + 1)])
+    polarity = seen.diff(dim=0).round()
+    return torch.stack([polarity, polarity.abs()], dim=2).flatten(1, 2)[:, None]
+
+
 @torch.no_grad()
 def test_any_height_and_width_come_back_with_everything_predicted():
     for height, width in ((16, 24), (17, 22), (120, 180)):
@@ -38,7 +64,7 @@ def test_any_height_and_width_come_back_with_everything_predicted():
         assert prediction.stokes.shape == (2, 2, height, width)
         assert prediction.aolp.min() >= 0
         assert prediction.aolp.max() < math.pi
-        assert len(state) == 2 + 2 + 2
+        assert len(state) == 2 + 2 + 3 + 2
 
 
 @torch.no_grad()
@@ -84,8 +110,13 @@ def test_it_costs_at_most_three_times_what_the_papers_network_costs():
             built(torch.zeros(1, channels, 120, 180))
         return counter.get_total_flops()
 
-    shipped = StokesUNetConfig(
-        channels=[32, 48, 64], memories=[0.0, 0.6, 0.85, 0.97], decays=[0.8, 0.98], scales=[1, 3, 9, 0], without=[]
+    shipped = replace(
+        CONFIG,
+        channels=[32, 48, 64],
+        memories=[0.0, 0.6, 0.85, 0.97],
+        decays=[0.8, 0.98],
+        scales=[1, 3, 9, 0],
+        mosaic_scale=25,
     )
     paper = DolpUNetConfig(
         channels=[32, 64, 128],
@@ -95,12 +126,12 @@ def test_it_costs_at_most_three_times_what_the_papers_network_costs():
         residual_blocks=2,
         input_mixing="polarizers",
     )
-    assert flops(StokesUNet(shipped), 8) < 3 * flops(DolpUNet(paper), 4)
+    assert flops(StokesUNet(shipped).eval(), 8) < 3 * flops(DolpUNet(paper), 4)
 
 
 @torch.no_grad()
 def test_each_part_can_be_left_out_and_then_does_nothing():
-    windows = events(3, 1, 8, 16, 24)
+    windows = moving_events(4, 48, 64)
     whole, _ = network().unroll(windows)
     without = {part: network(without=[part]) for part in PARTS}
     found = {part: built.unroll(windows)[0] for part, built in without.items()}
@@ -114,8 +145,36 @@ def test_each_part_can_be_left_out_and_then_does_nothing():
     torch.testing.assert_close(after[-2:], state[-2:])
 
 
+@torch.no_grad()
+def test_the_mosaic_is_for_trained_networks_and_scenes_that_move():
+    moving, blinking = moving_events(4, 48, 64), events(4, 1, 8, 48, 64)
+    for windows, changes in ((moving, True), (blinking, False)):
+        built, plain = network(), network(without=["mosaic"])
+        expected, _ = plain.unroll(windows)
+        assert ((built.unroll(windows)[0].dolp - expected.dolp).abs().max() > 1e-3) == changes
+        torch.testing.assert_close(built.train().unroll(windows)[0].dolp, expected.dolp)
+
+
+def test_the_mosaic_gives_the_pattern_and_the_network_the_level():
+    torch.manual_seed(0)
+    coarse = torch.randn(3, 1, 1, 6, 9)
+    s0, dolp, aolp = (F.interpolate(image, size=(48, 72), mode="bicubic")[0] for image in coarse)
+    truth = stokes_from_polarization(torch.exp(s0)[0], (0.3 + 0.2 * torch.tanh(dolp))[0], (1 + 0.5 * aolp)[0])
+    level = F.avg_pool2d(intensities_from_stokes(truth).log(), 2)[None] + torch.tensor([1, -2, 0.5, 3]).view(1, 4, 1, 1)
+    truth = truth[None, 1:] / truth[:1]
+    told = truth.mean((-1, -2), keepdim=True).expand_as(truth)
+    length = truth.norm(dim=1, keepdim=True)
+    stokes, found = averaged(told, told.norm(dim=1, keepdim=True), level, torch.ones(1, 1, 1, 1), around=23)
+    assert (stokes - truth).square().mean() < 0.1 * (told - truth).square().mean()
+    assert (found - length).square().mean() < 0.1 * length.var()
+    half, _ = averaged(told, told.norm(dim=1, keepdim=True), level, torch.full((1, 1, 1, 1), 0.5), around=23)
+    torch.testing.assert_close(half, (told + stokes) / 2)
+
+
 def test_a_part_that_there_is_not_is_named():
-    with pytest.raises(ValueError, match="without: expected some of redundancy, sums, recurrence, got attention"):
+    with pytest.raises(
+        ValueError, match="without: expected some of redundancy, sums, recurrence, mosaic, got attention"
+    ):
         network(without=["attention"])
 
 
@@ -126,4 +185,6 @@ def test_other_input_than_counts_of_events_is_refused():
 
 def test_a_neighbourhood_needs_a_middle():
     with pytest.raises(ValueError, match="scales: expected odd numbers"):
-        StokesUNetConfig(channels=[8, 8, 8], memories=[0.0], decays=[0.9], scales=[2], without=[])
+        replace(CONFIG, scales=[2])
+    with pytest.raises(ValueError, match="mosaic_scale: expected an odd number, got 4"):
+        replace(CONFIG, mosaic_scale=4)

@@ -1,0 +1,122 @@
+import math
+
+import pytest
+import torch
+
+from polarnet.networks.mosaic import Memory, Motion, Picture, displacements, follow, nothing_seen
+
+MEMORY = Memory(keep=0.7, ridge=0.02, fade=0.95)
+HEIGHT, WIDTH, MARGIN = 44, 60, 16
+
+
+def scene(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Random log intensities behind four polarizers, in steps, at any place of an endless plane."""
+    generator = torch.Generator().manual_seed(0)
+    across, down = (torch.randn(4, 40, 1, 1, generator=generator) * 0.5 for _ in range(2))
+    phase = torch.rand(4, 40, 1, 1, generator=generator) * 2 * math.pi
+    return torch.sin(across * x + down * y + phase).sum(1) / 2
+
+
+def views(places: list[tuple[float, float]]) -> torch.Tensor:
+    """What a sensor sees whose first pixel lies at these (x, y): [n, 4, h, w]."""
+    rows, columns = torch.arange(HEIGHT).view(-1, 1), torch.arange(WIDTH)
+    return torch.stack([scene(columns + x, rows + y) for x, y in places])
+
+
+def path(count: int) -> list[tuple[float, float]]:
+    """Places along a circle: motion in all directions, 2.8 pixels a window."""
+    return [(9 * math.cos(0.31 * k), 9 * math.sin(0.31 * k)) for k in range(count)]
+
+
+def motion_between(places: list[tuple[float, float]], k: int) -> Motion:
+    (x0, y0), (x1, y1) = places[k : k + 2]
+    return Motion(torch.tensor([[x1 - x0, y1 - y0]]), torch.tensor([True]))
+
+
+def followed(places: list[tuple[float, float]], noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The picture after the last window, sums of events, and what the sensor then sees; each [4, h, w], means 0."""
+    changes = views(places).diff(dim=0)
+    changes = changes + noise * torch.randn(changes.shape, generator=torch.Generator().manual_seed(1))
+    picture = nothing_seen(changes[:1], MARGIN)
+    for k, change in enumerate(changes):
+        picture = follow(change[None], motion_between(places, k), picture, MEMORY)
+    level, truth = picture.level[0, :, :HEIGHT, :WIDTH], views(places[-1:])[0]
+    return tuple(image - image.mean((-1, -2), keepdim=True) for image in (level, changes.sum(0), truth))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("speed", [(3.0, 0.0), (0.0, 2.0), (5.0, 4.0), (-2.4, 1.3), (0.5, -6.7)])
+def test_the_motion_is_found_in_the_events_of_two_windows(speed):
+    seen = views([(k * speed[0], k * speed[1]) for k in range(4)])
+    motion = displacements(seen.diff(dim=0).sum(1, keepdim=True).round(), reach=8)
+    assert motion.found.all()
+    torch.testing.assert_close(motion.displacement, torch.tensor(speed).expand(2, 1, 2), atol=0.25, rtol=0)
+
+
+def test_windows_that_show_different_things_or_nothing_have_no_motion():
+    one, other = torch.randn(2, 1, 120, 180, generator=torch.Generator().manual_seed(0))
+    nothing = torch.zeros_like(one)
+    assert not displacements(torch.stack([nothing, one, other, nothing, nothing]), reach=6).found.any()
+
+
+def test_one_pixel_that_always_fires_does_not_hide_the_motion():
+    changes = views([(4.0 * k, 1.0 * k) for k in range(3)]).diff(dim=0).sum(1, keepdim=True).round()
+    changes[:, :, 20, 30] = 500.0
+    motion = displacements(changes, reach=8)
+    torch.testing.assert_close(motion.displacement, torch.tensor([[[4.0, 1.0]]]), atol=0.3, rtol=0)
+
+
+def test_streams_are_searched_one_by_one():
+    images = torch.cat([views([(s * k, 0.0) for k in range(4)]).diff(dim=0).sum(1, keepdim=True) for s in (2, 5)], 1)
+    together = displacements(images, reach=8)
+    for stream in range(2):
+        alone = displacements(images[:, stream : stream + 1], reach=8)
+        torch.testing.assert_close(together.displacement[:, stream], alone.displacement[:, 0])
+
+
+def test_following_the_motion_shows_the_scene_where_sums_show_changes():
+    level, sums, truth = followed(path(31), noise=0.0)
+    variance = truth.square().mean()
+    assert (level - truth).square().mean() < 0.15 * variance
+    assert (sums - truth).square().mean() > 0.5 * variance
+
+
+def test_noise_of_the_events_averages_out_where_sums_gather_it():
+    noiseless, _, _ = followed(path(31), noise=0.0)
+    level, _, _ = followed(path(31), noise=0.5)
+    assert (level - noiseless).square().mean() < 0.3 * 30 * 0.5**2
+
+
+def test_without_motion_the_picture_stays_as_it_is():
+    places = path(5)
+    changes = views(places).diff(dim=0)
+    picture = nothing_seen(changes[:1], MARGIN)
+    for k, change in enumerate(changes):
+        picture = follow(change[None], motion_between(places, k), picture, MEMORY)
+    lost = Motion(torch.tensor([[2.0, 1.0]]), torch.tensor([False]))
+    after = follow(changes[:1], lost, picture, MEMORY)
+    seen = (..., slice(HEIGHT), slice(WIDTH))
+    torch.testing.assert_close(after.level[seen], picture.level[seen], atol=1e-4, rtol=0)
+    torch.testing.assert_close(after.certainty, MEMORY.keep * picture.certainty)
+
+
+def test_one_window_by_hand():
+    change = torch.zeros(1, 4, 16, 16)
+    change[:, :, 4, 5], change[:, :, 4, 6] = -1.0, 1.0  # what was bright at column 6 came to column 5 ...
+    motion = Motion(torch.tensor([[1.0, 0.0]]), torch.tensor([True]))
+    picture = follow(change, motion, nothing_seen(change, 16), Memory(keep=0.7, ridge=1.0, fade=0.5))
+    f = torch.fft.rfftfreq(32) * 2 * math.pi
+    expected = 2 - 2 * torch.cos(f)  # |exp(i f) - 1|^2
+    torch.testing.assert_close(picture.certainty, expected.expand(1, 1, 32, 17), atol=1e-5, rtol=0)
+    # (1 - exp(i f)) r / (|exp(i f) - 1|^2 + 1), r = -exp(-5 i f) + exp(-6 i f)
+    spectrum = (1 - torch.exp(1j * f)) * (torch.exp(-6j * f) - torch.exp(-5j * f)) / (expected + 1)
+    row = torch.fft.irfft(spectrum, n=32)
+    torch.testing.assert_close(picture.level[0, 0, 4, :16], row[:16], atol=1e-5, rtol=0)
+    torch.testing.assert_close(picture.level[0, 0, 4, 16:], 0.5 * row[16:], atol=1e-5, rtol=0)  # out of sight
+    assert picture.level[0, 0, 5:].abs().max() < 1e-5
+
+
+def test_the_margin_is_at_least_what_was_asked_for():
+    picture = nothing_seen(torch.zeros(2, 8, 60, 92), 16)
+    assert isinstance(picture, Picture)
+    assert picture.level.shape == (2, 4, 80, 112)
+    assert picture.certainty.shape == (2, 1, 80, 57)
