@@ -81,7 +81,8 @@ def displacements(images: Float[Tensor, "t1 b h w"], reach: int) -> Motion:
     """
     height, width = images.shape[-2:]
     images = images.clamp(-MOST_EVENTS, MOST_EVENTS)
-    size = (_round(height + reach + 1), _round(width + reach + 1))  # nothing wraps around
+    # nothing wraps around, and all of the places looked at are there
+    size = (_round(max(height, reach + 2) + reach + 1), _round(max(width, reach + 2) + reach + 1))
     spectrum = torch.fft.rfft2(images, s=size)
     correlation = torch.fft.irfft2(spectrum[:-1] * spectrum[1:].conj(), s=size)
     correlation = torch.roll(correlation, (reach + 1, reach + 1), (-2, -1))
