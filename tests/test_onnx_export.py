@@ -3,7 +3,7 @@ import io
 import json
 import re
 from contextlib import redirect_stdout
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,11 +15,12 @@ import torch
 
 from polarnet import onnx_export
 from polarnet.cli import main
+from polarnet.config import load
 from polarnet.events.representations import event_counts
 from polarnet.events.stream import Events
 from polarnet.networks.checkpoint import load_network, save_checkpoint
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
-from polarnet.networks.stokes_unet import StokesUNet, StokesUNetConfig
+from polarnet.networks.stokes_unet import StokesUNet
 from polarnet.onnx_export import largest_differences, random_windows
 
 HEIGHT, WIDTH = 30, 44  # neither divides by 8
@@ -27,20 +28,13 @@ CONFIGS = {
     "paper": DolpUNetConfig(
         channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1, input_mixing="contrasts"
     ),
-    "polarnet": StokesUNetConfig(
+    "polarnet": replace(
+        load(Path(__file__).resolve().parents[1]).networks.polarnet,
         channels=[8, 8, 8],
         memories=[0.0, 0.5],
         decays=[0.9],
         scales=[1, 3, 0],
-        reach=5,
-        mosaic_margin=16,
-        mosaic_keep=0.7,
-        mosaic_ridge=0.02,
-        mosaic_fade=0.95,
-        mosaic_step=0.2,
         mosaic_scale=5,
-        mosaic_share=0.6,
-        without=[],
     ),
 }
 REPRESENTATIONS = {"paper": "event_tensor", "polarnet": "event_counts"}

@@ -11,7 +11,7 @@ Each window is such a measurement of L, blind to what varies only across its own
 that. `follow` solves them together by recursive least squares, which is a division for each frequency: of what the
 picture so far does not explain of a window's events, exp(i f d) - 1 says where in L it belongs, and the sum of
 |exp(i f d) - 1|^2 over past windows how much of it to believe. Mosaicing with event cameras (Kim et al., BMVC 2014)
-does this pixel by pixel; by frequency, errors that vary slowly over the image are undone as fast as others.
+does this pixel by pixel.
 
 The motion is one displacement a window, where the events of two windows in a row correlate best (`displacements`).
 Lengths are pixels of the images given; log intensities count in steps, the contrast threshold of an event.
@@ -109,7 +109,7 @@ def _vertex(left: Float[Tensor, "*n"], middle: Float[Tensor, "*n"], right: Float
 
 
 def follow(changes: Float[Tensor, "b 4 h w"], motion: Motion, picture: Picture, memory: Memory) -> Picture:
-    """The picture one window later. Where no motion was found it stays as it is.
+    """The picture one window later. Where no motion was found it stays as it is, and is less certain.
 
     With m = exp(i f d), L moves to m L, r is what the events differ from m L - L in sight, c <- keep c + |m - 1|^2,
     and m L gains (1 - m) r / (c + ridge).

@@ -4,7 +4,7 @@ regraded.
 Photographs are highly polarized by the rule that saturation is DoLP, measured scenes hardly: what is trained on
 scenes in between, whose angles are any, does not learn one world's averages. A scene of about one hue is polarized
 alike everywhere. Then the four polarizers' logarithms change alike, whatever DoLP is, and only how a pixel responds to
-dim and to bright light tells; such scenes are rare among photographs, and `uniform_share` makes more.
+dim and to bright light tells; `uniform_share` makes more such scenes.
 """
 
 import math

@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -7,24 +8,19 @@ import torch
 from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
+from polarnet.config import load
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
-from polarnet.networks.stokes_unet import PARTS, StokesUNet, StokesUNetConfig, averaged
+from polarnet.networks.stokes_unet import PARTS, StokesUNet, averaged
 from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
 
-CONFIG = StokesUNetConfig(
+CONFIG = replace(
+    load(Path(__file__).resolve().parents[2]).networks.polarnet,
     channels=[8, 8, 8],
     memories=[0.0, 0.5],
     decays=[0.7, 0.9],
     scales=[1, 3, 0],
     reach=5,
-    mosaic_margin=16,
-    mosaic_keep=0.7,
-    mosaic_ridge=0.02,
-    mosaic_fade=0.95,
-    mosaic_step=0.2,
     mosaic_scale=5,
-    mosaic_share=0.6,
-    without=[],
 )
 
 
