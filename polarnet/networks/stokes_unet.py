@@ -19,7 +19,7 @@ from polarnet.networks.blocks import (
     conv3x3,
     on_blocks,
 )
-from polarnet.networks.mosaic import Memory, Motion, Picture, displacements, follow, nothing_seen
+from polarnet.networks.mosaic import Memory, Motion, Picture, certainty, displacements, follow, nothing_seen
 from polarnet.networks.redundancy import (
     MOMENTS,
     LeastSquares,
@@ -57,9 +57,11 @@ class StokesUNetConfig:
     """Pixels along each axis within which the scene's motion from window to window is looked for."""
     mosaic_margin: int = field(metadata=allowed(low=1))
     """Of the mosaic beyond the image, in pixels of half the size."""
-    mosaic_keep: float = field(metadata=allowed(low=0, high=1))
-    """These three: `polarnet.networks.mosaic.Memory`."""
-    mosaic_ridge: float = field(metadata=allowed(above=0))
+    mosaic_prior: float = field(metadata=allowed(above=0))
+    """These five: `polarnet.networks.mosaic.Memory`."""
+    mosaic_noise: float = field(metadata=allowed(above=0))
+    mosaic_drift: float = field(metadata=allowed(low=0))
+    mosaic_renewal: float = field(metadata=allowed(low=0, high=1))
     mosaic_fade: float = field(metadata=allowed(low=0, high=1))
     mosaic_step: float = field(metadata=allowed(above=0))
     """Natural-log intensity of an event."""
@@ -120,7 +122,9 @@ class StokesUNet(nn.Module):
         self.memories, self.decays, self.scales = config.memories, config.decays, config.scales
         self.without = frozenset(config.without)
         self.reach, self.margin = config.reach, config.mosaic_margin
-        self.memory = Memory(config.mosaic_keep, config.mosaic_ridge, config.mosaic_fade)
+        self.memory = Memory(
+            config.mosaic_prior, config.mosaic_noise, config.mosaic_drift, config.mosaic_renewal, config.mosaic_fade
+        )
         self.step, self.around, self.share = config.mosaic_step, config.mosaic_scale, config.mosaic_share
         memories, solved = len(config.memories), len(config.memories) * len(config.decays) * len(config.scales)
         half, quarter, eighth = config.channels
@@ -191,11 +195,10 @@ class StokesUNet(nn.Module):
         added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(seen)))), 2).float()
 
         stokes, dolp = (fine + added[:, :3]).split([2, 1], dim=1)
-        carried = state[memories + decays : memories + decays + 3]
+        carried = state[memories + decays : -2]
         if not self.training and "mosaic" not in self.without:
-            levels, certainties, carried = self._mosaic(polarity, (height, width), *carried)
-            share = self.share * (certainties / (certainties + 1)).mean((-1, -2), keepdim=True)
-            stokes, dolp = averaged(stokes, dolp, self.step * levels, share, self.around)
+            shown, certain, carried = self._mosaic(polarity, (height, width), *carried)
+            stokes, dolp = averaged(stokes, dolp, self.step * shown, self.share * certain, self.around)
         aolp = torch.remainder(torch.atan2(stokes[:, 1], stokes[:, 0]) / 2, math.pi)
         maps = [dolp[:, 0], aolp, LOG_VARIANCE + added[:, 3], stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
@@ -221,22 +224,27 @@ class StokesUNet(nn.Module):
         polarity: Float[Tensor, "t b 4 h w"],
         seen: tuple[int, int],
         before: Float[Tensor, "b h w"],
-        level: Float[Tensor, "b 4 H W"],
-        certainty: Float[Tensor, "b 1 H F"],
-    ) -> tuple[Float[Tensor, "n 4 h/2 w/2"], Float[Tensor, "n 1 H F"], list[Tensor]]:
-        """The mosaic after each window, at half the size, and how certain it is; and what to carry on from.
+        level: Float[Tensor, "b 2 H W"],
+        own: Float[Tensor, "b 2 h/2 w/2"],
+        explained: Float[Tensor, "b 4 H F"],
+    ) -> tuple[Float[Tensor, "n 2 h/2 w/2"], Float[Tensor, "n 1 1 1"], list[Tensor]]:
+        """What atanh(s1) and atanh(s2) are after each window but for two constants, in steps and at half the size; how
+        certain that is; and what to carry on from.
 
         The sensor has the first `seen` rows and columns; `before` is the window before the first, of all polarizers.
         """
         images = torch.cat([before[None], polarity.sum(2)])
         motion = displacements(images, self.reach)
-        changes = block_means(polarity, 2)[..., : seen[0] // 2, : seen[1] // 2]
-        pictures = [Picture(level, certainty)]
+        height, width = (size // 2 for size in seen)
+        changes = block_means((polarity[:, :, :2] - polarity[:, :, 2:]) / 2, 2)[..., :height, :width]
+        picture, pictures = Picture(level, own[..., :height, :width], explained), []
         for change, displacement, found in zip(changes, motion.displacement / 2, motion.found, strict=True):
-            pictures.append(follow(change, Motion(displacement, found), pictures[-1], self.memory))
-        levels, certainties = (torch.cat(images) for images in zip(*pictures[1:], strict=True))
-        height, width = (size // 2 for size in polarity.shape[-2:])
-        return levels[..., :height, :width], certainties, [images[-1], *pictures[-1]]
+            picture = follow(change, Motion(displacement, found), picture, self.memory)
+            pictures.append(picture)
+        shown = torch.cat([one.level[..., : own.shape[-2], : own.shape[-1]] for one in pictures])
+        certain = torch.cat([certainty(one, self.memory) for one in pictures])
+        own = F.pad(picture.own, (0, own.shape[-1] - width, 0, own.shape[-2] - height))
+        return shown, certain, [images[-1], picture.level, own, picture.explained]
 
     def _mixed(self, candidates: Candidates, weights: Float[Tensor, "n c1 h w"]) -> Float[Tensor, "n 3 h w"]:
         """s1, s2 and DoLP; the last weight is that of the constant, which has no angle."""
@@ -269,7 +277,7 @@ class StokesUNet(nn.Module):
         )
         events = [inputs.new_zeros(b, 4, height, width) for _ in self.memories]
         moments = [inputs.new_zeros(b, len(self.memories) * MOMENTS, height // 4, width // 4) for _ in self.decays]
-        mosaic = nothing_seen(inputs[..., ::2, ::2], self.margin)
+        mosaic = nothing_seen(inputs[:, :2, ::2, ::2], self.margin)
         return [*events, *moments, inputs.new_zeros(b, height, width), *mosaic, quarter, eighth]
 
 
@@ -289,18 +297,17 @@ def _moved(
 def averaged(
     stokes: Float[Tensor, "n 2 h w"],
     dolp: Float[Tensor, "n 1 h w"],
-    level: Float[Tensor, "n 4 h/2 w/2"],
+    shown: Float[Tensor, "n 2 h/2 w/2"],
     share: Float[Tensor, "n 1 1 1"],
     around: int,
 ) -> tuple[Float[Tensor, "n 2 h w"], Float[Tensor, "n 1 h w"]]:
-    """(s1, s2) and DoLP, drawn by `share` towards a mosaic of natural-log intensities with unknown constants.
+    """(s1, s2) and DoLP, drawn by `share` towards what a mosaic shows: atanh(s1) and atanh(s2) but for constants.
 
-    2 atanh(s1) = log I0 - log I90 and likewise for s2, 45 and 135. The mosaic has the differences but for constants:
-    those that make them, averaged over `around` pixels of a quarter of the size, what (s1, s2) are there.
+    The constants are those that make it, averaged over `around` pixels of a quarter of the size, what (s1, s2) are
+    there.
     """
     short = length(*stokes.unbind(1))[:, None]
     own = torch.atanh(stokes / short * torch.maximum(short, dolp).clamp(max=MOST_POLARIZED))
-    shown = (level[:, :2] - level[:, 2:]) / 2
     constants = box_means(block_means(own, 4) - block_means(shown, 2), around)
     shown = shown + F.interpolate(constants, scale_factor=2, mode="bilinear")
     mosaic = torch.tanh(F.interpolate(shown, scale_factor=2, mode="bilinear"))

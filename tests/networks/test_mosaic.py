@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.mosaic import Memory, Motion, Picture, displacements, follow, nothing_seen
+from polarnet.networks.mosaic import Memory, Motion, certainty, displacements, follow, nothing_seen
 
-MEMORY = Memory(keep=0.7, ridge=0.02, fade=0.95)
+MEMORY = Memory(prior=1.0, noise=0.01, drift=0.01, renewal=0.15, fade=0.95)
 HEIGHT, WIDTH, MARGIN = 44, 60, 16
 
 
@@ -34,12 +34,16 @@ def motion_between(places: list[tuple[float, float]], k: int) -> Motion:
 
 
 def followed(places: list[tuple[float, float]], noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The picture after the last window, sums of events, and what the sensor then sees; each [4, h, w], means 0."""
+    """The picture after the last window, sums of events, and what the sensor then sees; each [4, h, w], means 0.
+
+    The events have errors of this standard deviation, which the filter is told.
+    """
+    memory = MEMORY._replace(drift=max(MEMORY.drift, noise**2))
     changes = views(places).diff(dim=0)
     changes = changes + noise * torch.randn(changes.shape, generator=torch.Generator().manual_seed(1))
     picture = nothing_seen(changes[:1], MARGIN)
     for k, change in enumerate(changes):
-        picture = follow(change[None], motion_between(places, k), picture, MEMORY)
+        picture = follow(change[None], motion_between(places, k), picture, memory)
     level, truth = picture.level[0, :, :HEIGHT, :WIDTH], views(places[-1:])[0]
     return tuple(image - image.mean((-1, -2), keepdim=True) for image in (level, changes.sum(0), truth))  # type: ignore[return-value]
 
@@ -92,37 +96,68 @@ def test_noise_of_the_events_averages_out_where_sums_gather_it():
     assert (level - noiseless).square().mean() < 0.01 * 30 * 0.5**2  # of the sums
 
 
-def test_without_motion_the_picture_stays_as_it_is():
-    places = path(5)
+def test_what_is_known_grows_with_the_motion_and_fades_without():
+    places = path(9)
     changes = views(places).diff(dim=0)
-    picture = nothing_seen(changes[:1], MARGIN)
+    picture, known = nothing_seen(changes[:1], MARGIN), []
     for k, change in enumerate(changes):
         picture = follow(change[None], motion_between(places, k), picture, MEMORY)
+        known.append(certainty(picture, MEMORY).item())
+    assert known[:4] == sorted(known[:4])
+    assert 0.5 < known[-1] < 1
+    for _ in range(60):
+        picture = follow(changes[:1], Motion(torch.zeros(1, 2), torch.tensor([False])), picture, MEMORY)
+    assert certainty(picture, MEMORY) < 0.1
+
+
+def test_without_motion_the_picture_changes_as_the_pixels_do():
+    places = path(6)
+    changes = views(places).diff(dim=0)
+    picture = nothing_seen(changes[:1], MARGIN)
+    for k, change in enumerate(changes[:-1]):
+        picture = follow(change[None], motion_between(places, k), picture, MEMORY)
     lost = Motion(torch.tensor([[2.0, 1.0]]), torch.tensor([False]))
-    after = follow(changes[:1], lost, picture, MEMORY)
-    seen = (..., slice(HEIGHT), slice(WIDTH))
-    torch.testing.assert_close(after.level[seen], picture.level[seen], atol=1e-4, rtol=0)
-    torch.testing.assert_close(after.certainty, MEMORY.keep * picture.certainty)
+    after = follow(changes[-1:], lost, picture, MEMORY)
+    torch.testing.assert_close(after.own, picture.own + changes[-1:])
+    torch.testing.assert_close(after.level[..., :HEIGHT, :WIDTH], after.own, atol=1e-4, rtol=0)
 
 
 def test_one_window_by_hand():
-    change = torch.zeros(1, 4, 16, 16)
+    change = torch.zeros(1, 2, 16, 16)
     change[:, :, 4, 5], change[:, :, 4, 6] = -1.0, 1.0  # what was bright at column 6 came to column 5 ...
     motion = Motion(torch.tensor([[1.0, 0.0]]), torch.tensor([True]))
-    picture = follow(change, motion, nothing_seen(change, 16), Memory(keep=0.7, ridge=1.0, fade=0.5))
-    f = torch.fft.rfftfreq(32) * 2 * math.pi
-    expected = 2 - 2 * torch.cos(f)  # |exp(i f) - 1|^2
-    torch.testing.assert_close(picture.certainty, expected.expand(1, 1, 32, 17), atol=1e-5, rtol=0)
-    # (1 - exp(i f)) r / (|exp(i f) - 1|^2 + 1), r = -exp(-5 i f) + exp(-6 i f)
-    spectrum = (1 - torch.exp(1j * f)) * (torch.exp(-6j * f) - torch.exp(-5j * f)) / (expected + 1)
-    row = torch.fft.irfft(spectrum, n=32)
-    torch.testing.assert_close(picture.level[0, 0, 4, :16], row[:16], atol=1e-5, rtol=0)
-    torch.testing.assert_close(picture.level[0, 0, 4, 16:], 0.5 * row[16:], atol=1e-5, rtol=0)  # out of sight
-    assert picture.level[0, 0, 5:].abs().max() < 1e-5
+    memory = Memory(prior=2.0, noise=0.3, drift=0.2, renewal=0.0, fade=0.5)
+    picture = follow(change, motion, nothing_seen(change, 16), memory)
+    down, across = (torch.fft.fftfreq(32) * 2 * math.pi)[:, None], torch.fft.rfftfreq(32) * 2 * math.pi
+    before = 2 / (down.square() + across.square()).clamp(min=(2 * math.pi / 32) ** 2)  # variance of either error
+    step = 2 - 2 * torch.cos(across)  # |exp(i f) - 1|^2
+    spread = before * step + 0.2 + 0.3
+    # both errors were minus the picture; that of the level has moved: (1 - exp(i f)) of it shows in the difference
+    seen = torch.exp(-4j * down) * (torch.exp(-6j * across) - torch.exp(-5j * across))
+    level = torch.fft.irfft2(before * (1 - torch.exp(1j * across)) / spread * seen, s=(32, 32))
+    own = torch.fft.irfft2((before * (1 - torch.exp(-1j * across)) + 0.2) / spread * seen, s=(32, 32))
+    for channel in range(2):
+        torch.testing.assert_close(picture.level[0, channel], level, atol=1e-5, rtol=0)
+        torch.testing.assert_close(picture.own[0, channel], (change[0, channel] - own[:16, :16]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(picture.explained[0, 0], before.square() * step / spread, atol=1e-4, rtol=1e-5)
+    own_alone = (before * (1 - torch.exp(-1j * across)) + 0.2).abs().square()
+    torch.testing.assert_close(picture.explained[0, 1], own_alone / spread - 0.2, atol=1e-4, rtol=1e-5)
+    later = follow(torch.zeros_like(change), motion, picture, memory)
+    assert later.level[..., 16:].abs().mean() < 0.6 * picture.level[..., 16:].abs().mean()  # out of sight it fades
+
+
+def test_every_stream_is_followed_by_itself():
+    places = path(5)
+    changes = views(places).diff(dim=0)
+    here, there = motion_between(places, 0), Motion(torch.tensor([[0.0, -3.0]]), torch.tensor([False]))
+    both = Motion(*(torch.cat(pair) for pair in zip(here, there, strict=True)))
+    together = follow(changes[:2], both, nothing_seen(changes[:2], MARGIN), MEMORY)
+    for stream, motion in enumerate((here, there)):
+        alone = follow(changes[stream : stream + 1], motion, nothing_seen(changes[:1], MARGIN), MEMORY)
+        for image, expected in zip(together, alone, strict=True):
+            torch.testing.assert_close(image[stream : stream + 1], expected, atol=1e-5, rtol=1e-5)
 
 
 def test_the_margin_is_at_least_what_was_asked_for():
-    picture = nothing_seen(torch.zeros(2, 8, 60, 92), 16)
-    assert isinstance(picture, Picture)
-    assert picture.level.shape == (2, 4, 80, 112)
-    assert picture.certainty.shape == (2, 1, 80, 57)
+    picture = nothing_seen(torch.zeros(2, 3, 60, 92), 16)
+    assert [tuple(image.shape) for image in picture] == [(2, 3, 80, 112), (2, 3, 60, 92), (2, 4, 80, 57)]

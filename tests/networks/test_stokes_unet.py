@@ -60,7 +60,7 @@ def test_any_height_and_width_come_back_with_everything_predicted():
         assert prediction.stokes.shape == (2, 2, height, width)
         assert prediction.aolp.min() >= 0
         assert prediction.aolp.max() < math.pi
-        assert len(state) == 2 + 2 + 3 + 2
+        assert len(state) == 2 + 2 + 4 + 2
 
 
 @torch.no_grad()
@@ -156,14 +156,15 @@ def test_the_mosaic_gives_the_pattern_and_the_network_the_level():
     coarse = torch.randn(3, 1, 1, 6, 9)
     s0, dolp, aolp = (F.interpolate(image, size=(48, 72), mode="bicubic")[0] for image in coarse)
     truth = stokes_from_polarization(torch.exp(s0)[0], (0.3 + 0.2 * torch.tanh(dolp))[0], (1 + 0.5 * aolp)[0])
-    level = F.avg_pool2d(intensities_from_stokes(truth).log(), 2)[None] + torch.tensor([1, -2, 0.5, 3]).view(1, 4, 1, 1)
+    level = F.avg_pool2d(intensities_from_stokes(truth).log(), 2)[None]
+    shown = (level[:, :2] - level[:, 2:]) / 2 + torch.tensor([0.3, -2]).view(1, 2, 1, 1)
     truth = truth[None, 1:] / truth[:1]
     told = truth.mean((-1, -2), keepdim=True).expand_as(truth)
     length = truth.norm(dim=1, keepdim=True)
-    stokes, found = averaged(told, told.norm(dim=1, keepdim=True), level, torch.ones(1, 1, 1, 1), around=23)
+    stokes, found = averaged(told, told.norm(dim=1, keepdim=True), shown, torch.ones(1, 1, 1, 1), around=23)
     assert (stokes - truth).square().mean() < 0.1 * (told - truth).square().mean()
     assert (found - length).square().mean() < 0.1 * length.var()
-    half, _ = averaged(told, told.norm(dim=1, keepdim=True), level, torch.full((1, 1, 1, 1), 0.5), around=23)
+    half, _ = averaged(told, told.norm(dim=1, keepdim=True), shown, torch.full((1, 1, 1, 1), 0.5), around=23)
     torch.testing.assert_close(half, (told + stokes) / 2)
 
 
