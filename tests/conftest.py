@@ -12,6 +12,11 @@ import torch
 torch.set_num_threads(1)  # tests run side by side; threads that wait for each other would only slow them down
 
 
+def pytest_runtest_setup() -> None:
+    """Undo what `polarnet.runtime.tune`, called by an earlier test, leaves on: hypothesis wants numbers below 1e-38."""
+    torch.set_flush_denormal(False)
+
+
 @pytest.fixture(scope="session")
 def project_root() -> Path:
     return Path(__file__).resolve().parent.parent
