@@ -2,7 +2,9 @@
 
 import math
 import re
+from typing import TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -27,13 +29,21 @@ def stokes_from_polarization(
     return torch.stack([s0, polarized * torch.cos(2 * aolp), polarized * torch.sin(2 * aolp)], dim=-3)
 
 
-def intensity_behind_polarizer(stokes: Float[Tensor, "*b 3 h w"], angle: float) -> Float[Tensor, "*b h w"]:
+Plane = TypeVar("Plane", Tensor, np.ndarray)
+
+
+def behind_polarizer(s0: Plane, s1: Plane, s2: Plane, angle: float) -> Plane:
     """Intensity behind an ideal linear polarizer at `angle` radians (paper Eq. 4, written in Stokes parameters).
 
     S0 (1 - DoLP) / 2 + S0 DoLP cos^2(angle - AoLP) = (S0 + S1 cos(2 angle) + S2 sin(2 angle)) / 2.
     """
-    s0, s1, s2 = stokes.unbind(-3)
     return (s0 + s1 * math.cos(2 * angle) + s2 * math.sin(2 * angle)) / 2
+
+
+def intensity_behind_polarizer(stokes: Float[Tensor, "*b 3 h w"], angle: float) -> Float[Tensor, "*b h w"]:
+    """As `behind_polarizer`, of Stokes vectors."""
+    s0, s1, s2 = stokes.unbind(-3)
+    return behind_polarizer(s0, s1, s2, angle)
 
 
 def intensities_from_stokes(stokes: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 4 h w"]:

@@ -14,7 +14,7 @@ from polarnet.simulation.motion import Pose, Trajectory, bilinear, window_to_sce
 from polarnet.simulation.pixels.columns import Columns
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames, light_of_scene
 from polarnet.simulation.scene import PolarizationScene
-from polarnet.stokes import intensities_from_stokes
+from polarnet.stokes import POLARIZER_ANGLES_DEG, behind_polarizer
 
 POLARIZERS = (0, 1, 2, 3)
 SLOWEST_RATE_HZ = 30.0  # of an adaptive rate, for a window that stands still
@@ -164,9 +164,14 @@ def _lights_of_drift(scene: PolarizationScene, pose: Pose, height: int, width: i
     """What falls on the four planes of a window that only drifts, over the part of the scene that it comes to see."""
     left, top = pose.x - (width - 1) / 2, pose.y - (height - 1) / 2
     rows, columns = _seen(top, height, scene.height), _seen(left, width, scene.width)
-    intensities = intensities_from_stokes(scene.stokes[:, rows, columns]).clamp(min=0) * FULL_SCALE
-    planes = np.pad(intensities.numpy(), ((0, 0), (0, 1), (0, 1)), mode="edge")
-    return [light_of_scene(plane, top - rows.start, left - columns.start) for plane in planes]
+    # numpy: torch's threads would wait for more work on the cores that the planes' threads are about to use
+    s0, s1, s2 = scene.stokes[:, rows, columns].numpy()
+    lights = []
+    for angle in POLARIZER_ANGLES_DEG:
+        plane = np.maximum(behind_polarizer(s0, s1, s2, math.radians(angle)), 0) * FULL_SCALE
+        plane = np.pad(plane, (0, 1), mode="edge")
+        lights.append(light_of_scene(plane, top - rows.start, left - columns.start))
+    return lights
 
 
 def _seen(first: Float64[np.ndarray, " n"], size: int, limit: int) -> slice:

@@ -1,9 +1,10 @@
-"""How fast and how true the emulator is: python tests/benchmarks/emulation.py [--write] [--repeats N] [--paper-set N]
+"""How fast and how true the emulator is: python tests/benchmarks/emulation.py [--write] [--rounds N] [--paper-set N]
 
 The clip is that of the shared reference figures: scikit-image's coffee photograph mapped to polarization, a window of
 120 x 180 pixels drifting over it at 110 px/s, 300 steps a second, four polarizers, one second; from rendering to
-columns in memory. Seconds are medians of wall-clock time, of a process whose kernels are compiled. Every model and
-number of threads runs in a process of its own, which also gives its peak memory.
+columns in memory. Seconds are medians of wall-clock time, of processes whose kernels are compiled. Every model and
+number of threads runs in processes of its own, one after the other in each of several rounds, so that what a shared
+machine does to one hour it does to all of them; a process also gives its peak memory.
 
 Timing errors are those of noiseless pixels with equal thresholds, against `exact` at 4800 steps a second, over the
 pixels whose polarities agree from the first event to the last. `exact` places its steps where pixels meet; its figure
@@ -67,7 +68,7 @@ MODELS = {
 }
 PAPER_SEQUENCES, PAPER_SEQUENCES_A_PICTURE, PAPER_WORKERS = 1000, 5, 2
 MEMORY_SAMPLES_A_SECOND = 2
-THREADS = {"seconds_1_thread": 1, "seconds_2_threads": 2}
+THREADS = (1, 2)
 
 
 class Drift(Trajectory):
@@ -86,8 +87,8 @@ def benchmark_scene() -> tuple[PolarizationScene, Drift]:
     return scene, Drift(x, y, (STILL,) * HARMONICS, (STILL,) * HARMONICS, STILL, STILL, SPEED_PX_S)
 
 
-def measure_one(name: str, threads: int, repeats: int) -> dict[str, float]:
-    """Figures of one model in this process."""
+def measure_one(name: str, threads: int, repeats: int) -> dict[str, Any]:
+    """Seconds of each run, events and peak memory of one model in this process."""
     torch.set_num_threads(threads)
     scene, path = benchmark_scene()
     seconds = []
@@ -95,22 +96,33 @@ def measure_one(name: str, threads: int, repeats: int) -> dict[str, float]:
         start = time.perf_counter()
         events = synthesize_sequence(scene, path, DURATION_US, HEIGHT, WIDTH, MODELS[name], 1, threads)
         seconds.append(time.perf_counter() - start)
-    median, steps = float(np.median(seconds[1:])), DURATION_US * 1e-6 * float(MODELS[name].render_rate_hz or 0)
     return {
-        "seconds": round(median, 4),
-        "mpixel_updates_per_s": round(4 * HEIGHT * WIDTH * steps / median * 1e-6, 1),
-        "mevents_per_s": round(sum(map(len, events)) / median * 1e-6, 2),
+        "seconds": seconds[1:],
         "events": sum(map(len, events)),
         "peak_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
     }
 
 
-def in_own_process(name: str, threads: int, repeats: int) -> dict[str, float]:
+def in_own_process(name: str, threads: int, repeats: int) -> dict[str, Any]:
     """`measure_one` in a new process of this script."""
     command = [sys.executable, __file__, "--one", name, "--threads", str(threads), "--repeats", str(repeats)]
     environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout)
+
+
+def figures_of(name: str, processes: dict[int, list[dict[str, Any]]]) -> dict[str, Any]:
+    """What goes into the results of one model, from all its processes by their number of threads."""
+    medians = {t: float(np.median(np.concatenate([one["seconds"] for one in ones]))) for t, ones in processes.items()}
+    one, steps = processes[1][0], DURATION_US * 1e-6 * float(MODELS[name].render_rate_hz or 0)
+    return {
+        "seconds_1_thread": round(medians[1], 4),
+        "seconds_2_threads": round(medians[2], 4),
+        "mpixel_updates_per_s": round(4 * HEIGHT * WIDTH * steps / medians[1] * 1e-6, 1),
+        "mevents_per_s": round(one["events"] / medians[1] * 1e-6, 2),
+        "events": one["events"],
+        "peak_mib": one["peak_mib"],
+    }
 
 
 def timing_error_ms(events: list[Events], reference: list[Events]) -> tuple[float, float]:
@@ -231,15 +243,18 @@ def _held_bytes(pid: int) -> int:
     return total
 
 
-def measure(repeats: int) -> dict[str, Any]:
+def measure(rounds: int, repeats: int) -> dict[str, Any]:
     """All figures of the models, printed as they come."""
-    figures: dict[str, Any] = {}
+    processes: dict[str, dict[int, list[dict[str, Any]]]] = {name: {t: [] for t in THREADS} for name in MODELS}
+    for _ in range(rounds):
+        for threads in THREADS:
+            for name in MODELS:
+                one = in_own_process(name, threads, repeats)
+                processes[name][threads].append(one)
+                print(f"{name:14s} {threads} thread(s): {np.median(one['seconds']):.4f} s")
+    figures: dict[str, Any] = {name: figures_of(name, processes[name]) for name in MODELS}
     for name in MODELS:
-        figures[name] = {}
-        for key, threads in THREADS.items():
-            one = in_own_process(name, threads, repeats)
-            figures[name] |= {key: one.pop("seconds")} | (one if threads == 1 else {})
-            print(f"{name:14s} {threads} thread(s): {figures[name][key]:.4f} s  {one}")
+        print(name, figures[name])
     for name, errors in measure_timing().items():
         figures[name] |= errors
         print(name, errors)
@@ -255,7 +270,8 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/emulation.json")
-    parser.add_argument("--repeats", type=int, default=9, help="runs of which the median counts")
+    parser.add_argument("--rounds", type=int, default=3, help="processes of each model and number of threads")
+    parser.add_argument("--repeats", type=int, default=9, help="runs of each process; the median of all counts")
     parser.add_argument(
         "--paper-set", type=int, default=PAPER_SEQUENCES, metavar="N", help="sequences of the paper's set to make"
     )
@@ -271,7 +287,7 @@ def main() -> None:
     figures: dict[str, Any] = machine_record(ROOT)
     print(f"{figures['machine']}, {figures['cores']} cores, load {figures['load']}")
     if not arguments.only_paper_set:
-        figures |= measure(arguments.repeats)
+        figures |= measure(arguments.rounds, arguments.repeats)
     if arguments.paper_set:
         figures["paper_set"] = measure_paper_set(arguments.paper_set)
         print("paper_set", figures["paper_set"])

@@ -14,6 +14,7 @@ import numpy as np
 from polarnet.simulation.compilation import compiled, inlined
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL
+from polarnet.simulation.pixels.course import empty_course, keep, put, take
 from polarnet.simulation.pixels.light import intensity_rows, linlog
 from polarnet.simulation.pixels.pending import event_of, pending_events, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normal, uniform
@@ -30,8 +31,10 @@ from polarnet.simulation.pixels.v2e import (
 SHOT_NOISE_IN_THE_DARK = 1 - SHOT_NOISE_SLOPE * DARK_OFFSET / SATURATION
 SMALLEST_LAG = np.float32(1e-12)  # below, it is 0: processors are slow with the tiny numbers that decay leads to
 LONG_AGO_US = -1e18
+ENOUGH = 2000  # pixels on the course that make it worth following them
 LOG2_E = np.float32(1 / math.log(2))
-# 2^f - 1 on [-1/2, 1/2]: f times a polynomial (Taylor's to f^6, whose error is below 1e-7)
+# 2^f - 1 on [-1/2, 1/2]: f times a polynomial (Taylor's to f^6, whose error is below 1e-7), in pairs (Estrin's scheme)
+# because processors wait less for short chains
 EXP2 = tuple(np.float32(math.log(2) ** k / math.factorial(k)) for k in range(1, 8))
 
 
@@ -56,21 +59,6 @@ class Pixels(NamedTuple):
     events: np.ndarray
     """int32, fired so far: numbers the draws of the leak's jitter"""
     next_shot_us: np.ndarray
-
-
-class Course(NamedTuple):
-    """Pixels of a strip that are being followed through a step."""
-
-    pixel: np.ndarray
-    """int32, number in the strip"""
-    groups: np.ndarray
-    """int32, scratch"""
-    place: np.ndarray
-    """int64, see `pending`"""
-    change: np.ndarray
-    """float64, at time `now`"""
-    now: np.ndarray
-    """float64, microseconds since the start of the step"""
 
 
 def initial(h: int, w: int, physics: Physics, key: np.uint64, plane: int) -> Pixels:
@@ -119,16 +107,15 @@ def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, co
     """Run steps times_us[k] .. times_us[k + 1] under light[offset + k]; the columns and how many events they hold."""
     rows = rows_of_strip(h, w)
     strip = np.empty((4, rows * w), np.float32)
-    m = rows * w + SPARE
     words = flag_words(rows * w)
-    course = Course(np.empty(m, np.int32), np.empty(m, np.int32), np.empty(m, np.int64), np.empty(m), np.empty(m))
+    course = empty_course(ENOUGH + rows * w + SPARE)
     keys = key_for(key, randomness.LEAK_JITTER, plane), key_for(key, randomness.SHOT_NOISE, plane)
     pending = pending_events(h * w, columns.exact_us.size > 0)
     soonest_us = np.array([pixels.next_shot_us[y * w : (y + rows) * w].min() for y in range(0, h, rows)])
     used = 0
     for k in range(times_us.size - 1):
         start_us, stop_us = times_us[k], times_us[k + 1]
-        n = 0
+        n, active, shooting = 0, 0, soonest_us.min() < stop_us
         for y in range(0, h, rows):
             first, stop = y * w, min(y + rows, h) * w
             dn, response = strip[0, : stop - first], strip[1, : stop - first]
@@ -141,20 +128,21 @@ def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, co
                     dn, response, pixels.dn[first:stop], pixels.linlog[first:stop], pixels.lag[first:stop], rate, rise
                 )
             else:
-                _difference(response, pixels.linlog[first:stop], rise)
+                _difference(dn, response, pixels.dn[first:stop], pixels.linlog[first:stop], rise)
             change, leak = pixels.change[first:stop], pixels.leak[first:stop]
             threshold_on, threshold_off = pixels.threshold_on[first:stop], pixels.threshold_off[first:stop]
             fires = flags_of(words, stop - first)
             _move(change, leak, rise, np.float32(stop_us - start_us), before, threshold_on, threshold_off, fires)
-            shooting = soonest_us[y // rows] < stop_us
-            if shooting:
+            if soonest_us[y // rows] < stop_us:
                 _flag_shots(pixels.next_shot_us[first:stop], stop_us, fires)
-            active = _line_up(words, y, w, before, course)
-            pending, n = _fire(
-                pixels, physics, keys, course, active, rise, dn, first, shooting, start_us, stop_us, pending, n
-            )
-            if shooting:
-                soonest_us[y // rows] = pixels.next_shot_us[first:stop].min()
+            active = _line_up(words, first, before, rise, pixels, start_us, stop_us, course, active)
+            if active >= ENOUGH or y + rows >= h:
+                pending, n = _fire(pixels, physics, keys, course, active, shooting, w, start_us, stop_us, pending, n)
+                active = 0
+        if shooting:
+            for y in range(0, h, rows):
+                if soonest_us[y // rows] < stop_us:
+                    soonest_us[y // rows] = pixels.next_shot_us[y * w : (y + rows) * w].min()
         base_us = math.floor(start_us)
         columns, used = write_in_order(
             pending, n, np.int64(base_us), np.int64(math.ceil(stop_us) - base_us), columns, used
@@ -162,14 +150,14 @@ def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, co
     return columns, used
 
 
-@compiled
-def _difference(response, response_before, rise):
+@inlined
+def _difference(dn, response, dn_before, response_before, rise):
     for j in range(rise.size):
         rise[j] = response[j] - response_before[j]
-        response_before[j] = response[j]
+        dn_before[j], response_before[j] = dn[j], response[j]
 
 
-@compiled
+@inlined
 def _filter(dn, response, dn_before, response_before, lag, rate, rise):
     """First-order low-pass of a response that is linear in time, with the bandwidth at the mean light of the step.
 
@@ -177,21 +165,25 @@ def _filter(dn, response, dn_before, response_before, lag, rate, rise):
     lag <- lag exp(-a) - (change of response) (1 - exp(-a)) / a.
     """
     c1, c2, c3, c4, c5, c6, c7 = EXP2
+    half_rate = np.float32(0.5) * rate
     for j in range(dn.size):
-        a = min(rate * (np.float32(0.5) * (dn[j] + dn_before[j]) + np.float32(DARK_OFFSET)), np.float32(80))
+        a = min(half_rate * ((dn[j] + dn_before[j]) + np.float32(2 * DARK_OFFSET)), np.float32(80))
+        per_a = np.float32(1) / a
         whole = np.rint(-a * LOG2_E)
         f = -a * LOG2_E - whole
         scale = np.float32(np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32))
-        above_one = f * (c1 + f * (c2 + f * (c3 + f * (c4 + f * (c5 + f * (c6 + f * c7))))))
+        square = f * f
+        low, high = (c1 + c2 * f) + (c3 + c4 * f) * square, (c5 + c6 * f) + c7 * square
+        above_one = f * (low + high * (square * square))
         decayed = (np.float32(1) - scale) - scale * above_one  # 1 - exp(-a), accurate for small a as well
         step = response[j] - response_before[j]
-        lag_after = lag[j] - lag[j] * decayed - step * (decayed / a)
+        lag_after = (lag[j] - lag[j] * decayed) - step * (decayed * per_a)
         lag_after = lag_after if abs(lag_after) > SMALLEST_LAG else np.float32(0)
         rise[j] = step + (lag_after - lag[j])
         lag[j], dn_before[j], response_before[j] = lag_after, dn[j], response[j]
 
 
-@compiled
+@inlined
 def _move(change, leak, rise, dt_us, before, threshold_on, threshold_off, fires):
     """Advance each change by its rise and leak as if nothing fired; flag pixels beyond a threshold at either end."""
     for j in range(rise.size):
@@ -201,82 +193,144 @@ def _move(change, leak, rise, dt_us, before, threshold_on, threshold_off, fires)
         before[j], change[j] = start, stop
 
 
-@compiled
+@inlined
 def _flag_shots(next_shot_us, stop_us, fires):
     for j in range(fires.size):
         fires[j] |= next_shot_us[j] < stop_us
 
 
-@compiled
-def _line_up(words, y, w, before, course):
-    """Put the flagged pixels of a strip that begins at row y on the course; how many they are."""
-    active, row_start = flagged(words, before.size, course.pixel, course.groups), 0
-    for a in range(active):
-        j = course.pixel[a]
-        while j >= row_start + w:
-            y, row_start = y + 1, row_start + w
-        course.place[a], course.change[a], course.now[a] = place_of(y, j - row_start), before[np.uint64(j)], 0.0
-    return active
+@inlined
+def _line_up(words, first, before, rise, pixels, start_us, stop_us, course, active):
+    """Append the flagged pixels of a strip that begins at pixel `first` to the course; how many are on it then."""
+    pixel, index = course.pixel[active:], course.index[active:]
+    stop = active + flagged(words, before.size, index, pixel)
+    pixel, index = course.pixel[active:stop], course.index[active:stop]
+    for a in range(stop - active):
+        pixel[a] = first + index[a]
+    take(before, index, course.change[active:stop])
+    take(rise, index, course.drift[active:stop])
+    take(pixels.threshold_on, pixel, course.threshold_on[active:stop])
+    take(pixels.threshold_off, pixel, course.threshold_off[active:stop])
+    take(pixels.leak, pixel, course.leak[active:stop])
+    take(pixels.leak_nominal, pixel, course.leak_nominal[active:stop])
+    take(pixels.events, pixel, course.events[active:stop])
+    take(pixels.last_event_us, pixel, course.last_event[active:stop])
+    per_us = 1 / (stop_us - start_us)
+    for a in range(active, stop):
+        course.drift[a] *= per_us
+        course.last_event[a] -= start_us
+        course.now[a] = 0.0
+    return stop
 
 
-@compiled
-def _fire(pixels, physics, keys, course, active, rise, dn, first, shooting, start_us, stop_us, pending, n):
+@inlined
+def _fire(pixels, physics, keys, course, active, shooting, w, start_us, stop_us, pending, n):
     """Follow the pixels on `course` through a step, in rounds: in each, a pixel fires once at most.
 
     Rounds instead of pixels, and choices instead of branches, because what a pixel does next is not to be guessed.
-    Times are in microseconds since the start of the step. Returns the pending events and their number.
+    Returns the pending events and their number.
     """
-    base_us, dt, shot = math.floor(start_us), stop_us - start_us, np.inf
-    refractory_us, per_us = physics.refractory_s * 1e6, 1 / dt
+    dt = stop_us - start_us
     jitter = physics.leak_jitter if physics.leak_rate_hz > 0 else 0.0
     while active > 0:
         while n + active > pending.events.size:
             pending = roomier(pending)
-        remaining = 0
-        for a in range(active):
-            j, place, change, now = course.pixel[a], course.place[a], course.change[a], course.now[a]
-            i, at = np.uint64(first + j), np.uint64(n)  # unsigned: numba checks other indices for being negative
-            j = np.uint64(j)
-            last, leak = pixels.last_event_us[i] - start_us, np.float64(pixels.leak[i])
-            number, next_leak = pixels.events[i], leak
-            if jitter > 0:  # drawn before it is known whether there is an event: the two need not wait for each other
-                next_leak = np.float64(jittered_leak(pixels.leak_nominal[i], jitter, keys[0], i, number + 1))
-            threshold_on, threshold_off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
-            slope = rise[j] * per_us + leak
-            ready = max(now, last + refractory_us)
-            at_ready = change + slope * (ready - now)
-            on = (at_ready >= threshold_on) | ((at_ready > -threshold_off) & (slope > 0))
-            excess = at_ready - threshold_on if on else -threshold_off - at_ready
-            event = ready + (0.0 if excess >= 0 else abs(excess / slope))
-            fires, again = event < dt, False
-            label = LEAK if on & (leak * (event - last) > 0.5 * threshold_on) else SIGNAL
-            if shooting:
-                shot = pixels.next_shot_us[i] - start_us
-                if shot < min(event, dt):
-                    happens, on = _shot(physics, keys[1], i, start_us + shot, threshold_on, threshold_off, dn[j])
-                    wait = _until_next_shot(physics, keys[1], i, start_us + shot, threshold_on, threshold_off)
-                    pixels.next_shot_us[i] += wait
-                    event, label, excess = shot, SHOT, 0.0
-                    fires = happens & (event >= last + refractory_us)
-                again = pixels.next_shot_us[i] < stop_us
-            pending.events[at] = event_of(np.int64(start_us - base_us + event), place, on, label)
-            if pending.exact_us.size:
-                pending.exact_us[at] = start_us + event
-            n += fires
-            # a crossing leaves nothing of the change; after waiting, what exceeded the threshold remains
-            rest = max(excess, 0.0) if on else -max(excess, 0.0)
-            change, now, last = (rest, event, event) if fires else (change, now, last)
-            pixels.events[i] = number + fires
-            leak = next_leak if fires else leak
-            at_end = change + (rise[j] * per_us + leak) * (dt - now)
-            pixels.change[i], pixels.leak[i], pixels.last_event_us[i] = at_end, leak, start_us + last
-            kept = np.uint64(remaining)
-            course.pixel[kept], course.place[kept] = j, place
-            course.change[kept], course.now[kept] = change, now
-            beyond = (max(change, at_end) >= threshold_on) | (min(change, at_end) <= -threshold_off)
-            remaining += again | (fires & beyond)
-        active = remaining
+        _cross(course, active, physics.refractory_s * 1e6, dt)
+        course.again[:active] = 0
+        if shooting:
+            _shoot(pixels, physics, keys[1], course, active, start_us, stop_us)
+        _settle(course, active, jitter, keys[0], dt)
+        n = _collect(course, active, w, start_us, pending, n)
+        _hand_back(pixels, course, active, start_us)
+        active = keep(course, active)
     return pending, n
+
+
+@inlined
+def _cross(course, active, refractory_us, dt):
+    """When each pixel next meets a threshold, and what of its change is left then."""
+    for a in range(active):
+        threshold_on, threshold_off = np.float64(course.threshold_on[a]), np.float64(course.threshold_off[a])
+        leak, change, now, last = np.float64(course.leak[a]), course.change[a], course.now[a], course.last_event[a]
+        slope = course.drift[a] + leak
+        ready = max(now, last + refractory_us)
+        at_ready = change + slope * (ready - now)
+        on = (at_ready >= threshold_on) | ((at_ready > -threshold_off) & (slope > 0))
+        over, under = at_ready - threshold_on, -threshold_off - at_ready
+        excess = over if on else under
+        wait = abs(excess / slope)
+        event = ready + (0.0 if excess >= 0 else wait)
+        left = max(excess, 0.0)  # a crossing leaves nothing of the change; after waiting, the excess remains
+        left = left if on else -left
+        leaked = on & (leak * (event - last) > 0.5 * threshold_on)
+        fires = event < dt
+        course.kind[a] = event_of(0, 0, on, LEAK if leaked else SIGNAL)
+        course.fires[a], course.after[a], course.since[a] = fires, left if fires else change, event if fires else now
+
+
+@compiled
+def _shoot(pixels, physics, key, course, active, start_us, stop_us):
+    """Put the shot noise that comes before a pixel's next crossing in its place."""
+    dt = stop_us - start_us
+    for a in range(active):
+        i = course.pixel[a]
+        shot = pixels.next_shot_us[i] - start_us
+        if shot < (course.since[a] if course.fires[a] else dt):
+            on, off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
+            happens, is_on = _shot(physics, key, i, start_us + shot, on, off, pixels.dn[i])
+            pixels.next_shot_us[i] += _until_next_shot(physics, key, i, start_us + shot, on, off)
+            fires = happens & (shot >= course.last_event[a] + physics.refractory_s * 1e6)
+            course.kind[a], course.fires[a] = event_of(0, 0, is_on, SHOT), fires
+            course.after[a], course.since[a] = (0.0, shot) if fires else (course.change[a], course.now[a])
+        course.again[a] = pixels.next_shot_us[i] < stop_us
+
+
+@inlined
+def _settle(course, active, jitter, key, dt):
+    """Where pixels are after their events, and whether they are to be followed further."""
+    pixel, events, leak_nominal = course.pixel[:active], course.events[:active], course.leak_nominal[:active]
+    leak, last_event, fires = course.leak[:active], course.last_event[:active], course.fires[:active]
+    for a in range(active):
+        events[a] += fires[a]
+        if jitter > 0:
+            drawn = jittered_leak(leak_nominal[a], jitter, key, pixel[a], events[a])
+            leak[a] = drawn if fires[a] else leak[a]
+    for a in range(active):
+        after, since = course.after[a], course.since[a]
+        last_event[a] = since if fires[a] else last_event[a]
+        end = after + (course.drift[a] + leak[a]) * (dt - since)
+        beyond = (max(after, end) >= course.threshold_on[a]) | (min(after, end) <= -course.threshold_off[a])
+        course.at_end[a] = end
+        course.again[a] |= fires[a] & beyond
+
+
+@inlined
+def _collect(course, active, w, start_us, pending, n):
+    """Append the events of a round to the pending ones; how many those are then."""
+    since_whole_us, per_row = start_us - math.floor(start_us), 1 / w
+    for a in range(active):
+        y = np.int64((course.pixel[a] + 0.5) * per_row)
+        place = place_of(y, course.pixel[a] - y * w)
+        course.kind[a] |= event_of(since_whole_us + course.since[a], place, 0, 0)
+    for a in range(active):
+        at = np.uint64(n)  # what does not fire is overwritten by the next
+        pending.events[at] = course.kind[a]
+        if pending.exact_us.size:
+            pending.exact_us[at] = start_us + course.since[a]
+        n += course.fires[a]
+    return n
+
+
+@inlined
+def _hand_back(pixels, course, active, start_us):
+    """What has become of the pixels, for the next step."""
+    pixel = course.pixel[:active]
+    for a in range(active):
+        course.now[a] = start_us + course.last_event[a]
+    put(course.at_end, pixel, pixels.change)
+    put(course.leak, pixel, pixels.leak)
+    put(course.events, pixel, pixels.events)
+    put(course.now, pixel, pixels.last_event_us)
 
 
 @inlined

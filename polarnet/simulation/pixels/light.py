@@ -95,7 +95,8 @@ def linlog_as_v2e(dn, linlog):
         linlog[j] = np.float32(np.rint(response * 1e8) / 1e8)
 
 
-# ln(1 + x) = x - x^2 / 2 + x^3 P(x) for 1 + x in [sqrt(1/2), sqrt(2)], and ln 2 in two parts (Cephes' logf)
+# ln(1 + x) = x - x^2 / 2 + x^3 P(x) for 1 + x in [sqrt(1/2), sqrt(2)], and ln 2 in two parts (Cephes' logf); P is
+# evaluated in pairs (Estrin's scheme)
 LOG_POLYNOMIAL = tuple(
     np.float32(c)
     for c in (
@@ -123,7 +124,9 @@ def ln(x):
     exponent = np.int32(np.int32(bits - SQRT_HALF_BITS) >> MANTISSA_BITS)
     f = np.float32(np.int32(bits - np.int32(exponent << MANTISSA_BITS)).view(np.float32)) - np.float32(1)
     e, square = np.float32(exponent), f * f
-    cubic = ((((((((p0 * f + p1) * f + p2) * f + p3) * f + p4) * f + p5) * f + p6) * f + p7) * f + p8) * f * square
+    fourth = square * square
+    low = ((p7 * f + p8) + (p5 * f + p6) * square) + ((p3 * f + p4) + (p1 * f + p2) * square) * fourth
+    cubic = (low + p0 * (fourth * fourth)) * (f * square)
     return (f + ((cubic + e * LN2_LOW) - np.float32(0.5) * square)) + e * LN2_HIGH
 
 
