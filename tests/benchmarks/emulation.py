@@ -41,6 +41,7 @@ from skimage import data
 from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
 from polarnet.measure import machine_record, uncommitted
+from polarnet.runtime import tune
 from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory
 from polarnet.simulation.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.simulation.presets import SENSORS
@@ -88,8 +89,9 @@ def benchmark_scene() -> tuple[PolarizationScene, Drift]:
 
 
 def measure_one(name: str, threads: int, repeats: int) -> dict[str, Any]:
-    """Seconds of each run, events and peak memory of one model in this process."""
+    """Seconds of each run, events and peak memory of one model in this process, which is set up as stages are."""
     torch.set_num_threads(threads)
+    tune()
     scene, path = benchmark_scene()
     seconds = []
     for _ in range(repeats + 1):  # the first compiles
