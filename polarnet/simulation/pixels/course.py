@@ -12,7 +12,7 @@ class Course(NamedTuple):
 
     pixel: np.ndarray
     """int32, number in the plane"""
-    index: np.ndarray
+    entry: np.ndarray
     """int32, scratch"""
     change: np.ndarray
     """float64, log intensity since the last event at time `now`"""
@@ -72,7 +72,7 @@ def put(source, index, to):
 @inlined
 def keep(course, active):
     """Keep those of the first `active` pixels that may fire again, with what the next round needs; how many."""
-    index, remaining = course.index[:active], 0
+    index, remaining = course.entry[:active], 0
     for a in range(active):
         index[np.uint64(remaining)] = a
         remaining += course.again[a]

@@ -202,9 +202,9 @@ def _flag_shots(next_shot_us, stop_us, fires):
 @inlined
 def _line_up(words, first, before, rise, pixels, start_us, stop_us, course, active):
     """Append the flagged pixels of a strip that begins at pixel `first` to the course; how many are on it then."""
-    pixel, index = course.pixel[active:], course.index[active:]
+    pixel, index = course.pixel[active:], course.entry[active:]
     stop = active + flagged(words, before.size, index, pixel)
-    pixel, index = course.pixel[active:stop], course.index[active:stop]
+    pixel, index = course.pixel[active:stop], course.entry[active:stop]
     for a in range(stop - active):
         pixel[a] = first + index[a]
     take(before, index, course.change[active:stop])
