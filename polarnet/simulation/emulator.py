@@ -217,6 +217,9 @@ def run(
     times, steps = (t_us, 0) if state is None else (np.concatenate([[state.t_us], t_us]), state.steps)
     room = 1 + int(min(LARGEST_FIRST_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
 
+    # made here: what other threads allocate, glibc hands back to the system as soon as they end
+    empty = [empty_columns(room, labels, exact) for _ in planes]
+
     def one_plane(i: int) -> tuple[Columns, Any]:
         if state is None:
             first, pixels = 1, model.initial(height, width, physics, seed, planes[i])
@@ -224,9 +227,8 @@ def run(
         else:
             first, pixels = 0, type(state.pixels[i])(*(array.copy() for array in state.pixels[i]))
         columns, used = model.advance(
-            lights[i], first, pixels, physics, height, width, times, steps, seed, planes[i],
-            empty_columns(room, labels, exact),
-        )  # fmt: skip
+            lights[i], first, pixels, physics, height, width, times, steps, seed, planes[i], empty[i]
+        )
         return trimmed(columns, used), pixels
 
     if threads > 1 and len(planes) > 1:
