@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -14,8 +13,9 @@ from torch import Tensor
 from polarnet.events.stream import Events
 from polarnet.ranges import allowed, check_ranges
 from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
-from polarnet.simulation.pixels.columns import Columns, empty_columns, trimmed
+from polarnet.simulation.pixels.columns import Columns, empty_columns
 from polarnet.simulation.pixels.light import Light, light_of_frames
+from polarnet.simulation.sharing import PlaneRun, run_planes
 
 EVENTS_PER_PIXEL_AND_STEP = 0.5  # room to begin with, far more than usual: what is not written costs no memory
 LARGEST_FIRST_ROOM = 1 << 22  # events; columns grow where a scene is busier
@@ -217,28 +217,31 @@ def run(
     times, steps = (t_us, 0) if state is None else (np.concatenate([[state.t_us], t_us]), state.steps)
     room = 1 + int(min(LARGEST_FIRST_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
 
-    # made here: what other threads allocate, glibc hands back to the system as soon as they end
-    empty = [empty_columns(room, labels, exact) for _ in planes]
+    def begin(i: int) -> Any:
+        if state is not None:
+            return type(state.pixels[i])(*(array.copy() for array in state.pixels[i]))
+        new = model.initial(height, width, physics, seed, planes[i])
+        model.start(lights[i], new, physics, height, width, times[0], seed, planes[i])
+        return new
 
-    def one_plane(i: int) -> tuple[Columns, Any]:
-        if state is None:
-            first, pixels = 1, model.initial(height, width, physics, seed, planes[i])
-            model.start(lights[i], pixels, physics, height, width, times[0], seed, planes[i])
-        else:
-            first, pixels = 0, type(state.pixels[i])(*(array.copy() for array in state.pixels[i]))
-        columns, used = model.advance(
-            lights[i], first, pixels, physics, height, width, times, steps, seed, planes[i], empty[i]
-        )
-        return trimmed(columns, used), pixels
+    def plane_run(i: int) -> PlaneRun:
+        def advance(start: int, stop: int, columns: Columns) -> tuple[Columns, int]:
+            if start == 0:
+                pixels[i] = begin(i)
+            offset = start + (1 if state is None else 0)  # without a state, the first of the lights is that of `begin`
+            return model.advance(
+                lights[i], offset, pixels[i], physics, height, width, times[start : stop + 1], steps + start,
+                seed, planes[i], columns,
+            )  # fmt: skip
 
-    if threads > 1 and len(planes) > 1:
-        with ThreadPoolExecutor(min(threads, len(planes))) as pool:
-            results = list(pool.map(one_plane, range(len(planes))))
-    else:
-        results = [one_plane(i) for i in range(len(planes))]
-    columns, pixels = zip(*results, strict=True)
-    after = SensorState(config.model, height, width, planes, pixels, float(times[-1]), steps + len(times) - 1)
-    return list(columns), after
+        # room made here: what other threads allocate, glibc hands back to the system as soon as they end
+        return PlaneRun(advance, empty_columns(room, labels, exact))
+
+    pixels: list[Any] = [None] * len(planes)
+    runs = [plane_run(i) for i in range(len(planes))]
+    run_planes(runs, times, threads)
+    after = SensorState(config.model, height, width, planes, tuple(pixels), float(times[-1]), steps + len(times) - 1)
+    return [plane.events for plane in runs], after
 
 
 def events_of(columns: Columns, height: int, width: int) -> Events:
