@@ -53,7 +53,7 @@ def run_planes(planes: Sequence[PlaneRun], times_us: Float64[np.ndarray, " n"], 
         while True:
             with lock:
                 waiting = [plane for plane in planes if plane.done < last and not plane.busy]
-                if not waiting:  # each plane that is not done has a thread, which stays with it
+                if not waiting:  # the planes that are left have their threads
                     return
                 plane = min(waiting, key=lambda plane: plane.done)
                 plane.busy = True
