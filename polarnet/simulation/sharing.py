@@ -41,7 +41,7 @@ class PlaneRun:
 def run_planes(planes: Sequence[PlaneRun], times_us: Float64[np.ndarray, " n"], threads: int) -> None:
     """Emulate each plane from the first of the times to the last."""
     last = len(times_us) - 1
-    if threads == 1 or len(planes) == 1 or last < PIECES:
+    if threads <= 1 or len(planes) == 1 or last < PIECES:
         for plane in planes:
             plane.go_on(last)
         return
