@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int8, Int64
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -49,8 +49,9 @@ class WindowSequence(NamedTuple):
     """All windows of a sequence, with the truth at the end of each."""
 
     name: str
-    inputs: Float[Tensor, "t c h w"]
-    """Polarizer by polarizer (0, 45, 90, 135 degrees); c is 4 times the channels of the representation."""
+    inputs: Float[Tensor, "t c h w"] | Int8[Tensor, "t c h w"]
+    """Polarizer by polarizer (0, 45, 90, 135 degrees); c is 4 times the channels of the representation. Bytes only
+    while a training keeps them in memory."""
     dolp: Float[Tensor, "t h w"]
     aolp: Float[Tensor, "t h w"]
     intensity: Float[Tensor, "t 4 h w"]

@@ -62,7 +62,7 @@ def seen(sequence: WindowSequence, view: View) -> WindowSequence:
         return frames[view.start : stop, ..., view.top : bottom, view.left : right].flip(mirrored).contiguous()
 
     polarizers = [(view.turn + view.direction * j) % 4 for j in range(4)]
-    inputs = look(sequence.inputs).unflatten(1, (4, -1))[:, polarizers].flatten(1, 2)
+    inputs = look(sequence.inputs).unflatten(1, (4, -1))[:, polarizers].flatten(1, 2).float()
     aolp = view.direction * (look(sequence.aolp) - view.turn * EIGHTH_TURN)
     intensity = look(sequence.intensity)[:, polarizers]
     valid = None if sequence.valid is None else look(sequence.valid)
@@ -124,10 +124,16 @@ def kept_in_memory(dataset: WindowDataset, workers: int) -> tuple[Sequences, int
 
     Also how many worker processes should read them: none when they are in memory.
     """
-    bytes_each = sum(tensor.nbytes for tensor in dataset[0][1:] if tensor is not None)
+    bytes_each = sum(tensor.nbytes for tensor in packed(dataset[0])[1:] if tensor is not None)
     if bytes_each * len(dataset) > KEPT * psutil.virtual_memory().available:
         return dataset, workers
-    return [dataset[number] for number in range(len(dataset))], 0
+    return [packed(dataset[number]) for number in range(len(dataset))], 0
+
+
+def packed(sequence: WindowSequence) -> WindowSequence:
+    """The sequence with its inputs as bytes where those hold them exactly: counts of events nearly always."""
+    small = sequence.inputs.to(torch.int8)
+    return sequence._replace(inputs=small) if torch.equal(small.float(), sequence.inputs) else sequence
 
 
 def stack(sequences: Sequence[WindowSequence]) -> Batch:

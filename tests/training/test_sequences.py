@@ -16,6 +16,7 @@ from polarnet.training.sequences import (
     Visits,
     batches_of,
     kept_in_memory,
+    packed,
     random_view,
     seen,
     shuffled,
@@ -119,6 +120,20 @@ def test_a_dataset_in_memory_is_read_once(stores):
     assert workers == 0
     assert kept[1] is kept[1]
     assert torch.equal(kept[1].inputs, dataset[1].inputs)
+
+
+def test_counts_of_events_are_kept_as_bytes_and_seen_as_they_were():
+    counts = sequence()._replace(inputs=torch.randint(-128, 128, (3, 8, 6, 8)).float())
+    kept = packed(counts)
+    assert kept.inputs.dtype == torch.int8
+    assert torch.equal(seen(kept, WHOLE).inputs, counts.inputs)
+    assert seen(kept, WHOLE).inputs.dtype == torch.float32
+
+
+@pytest.mark.parametrize("value", [0.5, 128.0, -129.0, 1e9])
+def test_what_bytes_do_not_hold_is_kept_as_it_is(value):
+    before = sequence()._replace(inputs=torch.full((3, 8, 6, 8), value))
+    assert packed(before) is before
 
 
 def test_a_crop_larger_than_the_image_is_refused():
