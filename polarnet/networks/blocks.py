@@ -4,6 +4,7 @@ Recurrent layers take a whole run of windows at once: "n" counts images, time-ma
 everything but the recurrence itself is one large operation.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -105,7 +106,44 @@ class UpBlock(nn.Module):
         self.narrow = nn.Conv2d(inputs, outputs, kernel_size=1)
         self.smooth = conv3x3(outputs, outputs)
 
-    def forward(self, x: Float[Tensor, "n c h w"], skip: Float[Tensor, "n d 2*h 2*w"]) -> Float[Tensor, "n d 2*h 2*w"]:
-        """`skip` has the channels and the size of the result."""
+    def forward(self, x: Float[Tensor, "n c h2 w2"], skip: Float[Tensor, "n d h w"]) -> Float[Tensor, "n d h w"]:
+        """`skip` has the channels and the size of the result: twice that of x, or a row or column less."""
+        height, width = skip.shape[-2:]
         enlarged = F.interpolate(self.narrow(x), scale_factor=2, mode="bilinear")
-        return F.relu(self.smooth(enlarged + skip))
+        return F.relu(self.smooth(enlarged[..., :height, :width] + skip))
+
+
+class Level(nn.Module):
+    """A recurrent U-Net from one of its sizes down: what an image gets from itself seen at half the size, and smaller.
+
+    `channels` are those at a half of the size, a quarter, and so on, one recurrent layer each. Each level sees twice as
+    far as the one above it, at a quarter of its cost.
+    """
+
+    def __init__(self, above: int, channels: Sequence[int]):
+        super().__init__()
+        own, *smaller = channels
+        self.down = nn.Conv2d(above, own, kernel_size=2, stride=2)
+        self.before = ResidualBlock(own)
+        self.gru = ConvGRU(own)
+        self.smaller = Level(own, smaller) if smaller else None
+        self.after = ResidualBlock(own)
+        self.up = UpBlock(own, above)
+
+    def forward(
+        self, x: Float[Tensor, "n c h w"], states: Sequence[Tensor]
+    ) -> tuple[Float[Tensor, "n c h w"], list[Tensor]]:
+        """n windows of the streams whose recurrent layers hold `states`, and the states after the last window."""
+        height, width = x.shape[-2:]
+        halved = self.down(F.pad(x, (0, width % 2, 0, height % 2), mode="replicate"))
+        y, state = self.gru(self.before(F.relu(halved)), states[0])
+        others: list[Tensor] = []
+        if self.smaller is not None:
+            y, others = self.smaller(y, states[1:])
+        return self.up(self.after(y), skip=x), [state, *others]
+
+    def initial_states(self, x: Float[Tensor, "n c h w"]) -> list[Tensor]:
+        """Zeros, for images of the size of `x`."""
+        height, width = (-(-size // 2) for size in x.shape[-2:])
+        own = x.new_zeros(len(x), height, width, self.gru.channels).permute(0, 3, 1, 2)
+        return [own, *(self.smaller.initial_states(own) if self.smaller is not None else [])]

@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from polarnet.networks.blocks import (
     ConvGRU,
+    Level,
     Prediction,
     ResidualBlock,
     UpBlock,
@@ -32,7 +33,7 @@ from polarnet.networks.redundancy import (
 )
 from polarnet.ranges import allowed, check_ranges
 
-STRIDE = 8  # three stages that halve the size
+STRIDE = 4  # of the largest image with a recurrent layer
 IMAGES = 2  # of a polarizer's events: the sum of polarities and their number (representation `event_counts`)
 PARTS = ("redundancy", "sums", "recurrence", "mosaic")
 MIDDLE_DOLP = 0.3  # of the constant that is one more candidate, at the start
@@ -46,7 +47,7 @@ class StokesUNetConfig:
     """Section `networks.polarnet` of params.yaml."""
 
     channels: list[int] = field(metadata=allowed(low=1))
-    """At a half, a quarter and an eighth of the size."""
+    """At a half, a quarter and an eighth of the size, and so on: at least three."""
     memories: list[float] = field(metadata=allowed(low=0, high=0.999))
     """Of each sum of events that the redundancy is solved for: the weight of an event one window later."""
     decays: list[float] = field(metadata=allowed(low=0, high=0.999))
@@ -76,8 +77,8 @@ class StokesUNetConfig:
 
     def __post_init__(self):
         check_ranges(self)
-        if len(self.channels) != 3 or not (self.memories and self.decays and self.scales):
-            raise ValueError(f"channels, memories, decays, scales: expected 3 numbers and at least 1 each, got {self}")
+        if len(self.channels) < 3 or not (self.memories and self.decays and self.scales):
+            raise ValueError(f"channels, memories, decays, scales: expected at least 3, 1, 1, 1 numbers, got {self}")
         if any(scale and scale % 2 == 0 for scale in self.scales):
             raise ValueError(f"scales: expected odd numbers, or 0 for the whole image, got {self.scales}")
         if self.mosaic_scale % 2 == 0:
@@ -127,7 +128,7 @@ class StokesUNet(nn.Module):
         )
         self.step, self.around, self.share = config.mosaic_step, config.mosaic_scale, config.mosaic_share
         memories, solved = len(config.memories), len(config.memories) * len(config.decays) * len(config.scales)
-        half, quarter, eighth = config.channels
+        half, quarter, *smaller = config.channels
         self.moments = SecondMoments(memories)
         self.solve = LeastSquares(memories, len(config.decays), len(config.scales))
         self.stem = conv3x3(4 * (4 * memories + 1), half)
@@ -135,11 +136,8 @@ class StokesUNet(nn.Module):
         self.from_candidates = nn.Conv2d(len(Candidates._fields) * solved, quarter, kernel_size=1)
         self.join = conv3x3(quarter, quarter)
         self.gru_quarter = ConvGRU(quarter)
-        self.to_eighth = nn.Conv2d(quarter, eighth, kernel_size=2, stride=2)
-        self.before = ResidualBlock(eighth)
-        self.gru_eighth = ConvGRU(eighth)
-        self.after = ResidualBlock(eighth)
-        self.up_quarter = UpBlock(eighth, quarter)
+        self.smaller = Level(quarter, smaller)
+        self.recurrent = 1 + len(smaller)
         self.at_quarter = ResidualBlock(quarter)
         self.choose = nn.Conv2d(quarter, solved + 1, kernel_size=1)
         self.up_half = UpBlock(quarter, half)
@@ -180,10 +178,12 @@ class StokesUNet(nn.Module):
         solved = torch.cat([candidates.s1, candidates.s2, candidates.dolp, torch.log1p(candidates.evidence)], dim=1)
         solved = solved.contiguous(memory_format=torch.channels_last)
         x4 = F.relu(self.join(F.relu(self.to_quarter(x2) + self.from_candidates(solved))))
-        g4, state4 = self._carried(self.gru_quarter, x4, state[-2])
-        x8 = self.before(F.relu(self.to_eighth(g4)))
-        g8, state8 = self._carried(self.gru_eighth, x8, state[-1])
-        y4 = self.at_quarter(self.up_quarter(self.after(g8), skip=g4))
+        recurrent = state[-self.recurrent :]
+        began = self._nothing_held(x4) if "recurrence" in self.without else recurrent
+        g4, held = self.gru_quarter(x4, began[0])
+        y4, others = self.smaller(g4, began[1:])
+        recurrent = recurrent if "recurrence" in self.without else [held, *others]
+        y4 = self.at_quarter(y4)
         mixed = self._mixed(candidates, self.choose(y4).float().softmax(1))
         y2 = self.at_half(self.up_half(y4, skip=x2))
         gains = self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float())
@@ -195,14 +195,14 @@ class StokesUNet(nn.Module):
         added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(seen)))), 2).float()
 
         stokes, dolp = (fine + added[:, :3]).split([2, 1], dim=1)
-        carried = state[memories + decays : -2]
+        carried = state[memories + decays : -self.recurrent]
         if not self.training and "mosaic" not in self.without:
             shown, certain, carried = self._mosaic(polarity, (height, width), *carried)
             stokes, dolp = averaged(stokes, dolp, self.step * shown, self.share * certain, self.around)
         aolp = torch.remainder(torch.atan2(stokes[:, 1], stokes[:, 0]) / 2, math.pi)
         maps = [dolp[:, 0], aolp, LOG_VARIANCE + added[:, 3], stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
-        return prediction, [*summed[-1].unbind(1), *moments, *carried, state4, state8]
+        return prediction, [*summed[-1].unbind(1), *moments, *carried, *recurrent]
 
     def _candidates(
         self, events: Float[Tensor, "n m 4 h w"], streams: int, state: list[Tensor]
@@ -257,28 +257,22 @@ class StokesUNet(nn.Module):
         """`x`, or zeros that it still depends on where this part is left out."""
         return 0 * x if part in self.without else x
 
-    def _carried(
-        self, layer: ConvGRU, x: Float[Tensor, "n c h w"], state: Float[Tensor, "b c h w"]
-    ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "b c h w"]]:
-        if "recurrence" in self.without:
-            return layer(x, torch.zeros_like(x))[0], state
-        return layer(x, state)
+    def _nothing_held(self, x4: Float[Tensor, "n c h w"]) -> list[Tensor]:
+        """What the recurrent layers hold at the start: zeros."""
+        return [torch.zeros_like(x4), *self.smaller.initial_states(x4)]
 
     def initial_state(self, inputs: Float[Tensor, "b c h w"]) -> list[Tensor]:
-        """Nothing seen yet: sums of events and of moments, the last window's polarities, the mosaic, and what the two
+        """Nothing seen yet: sums of events and of moments, the last window's polarities, the mosaic, and what the
         recurrent layers hold; all zeros.
 
-        Height and width divide by 8.
+        Height and width divide by 4.
         """
         b, _, height, width = inputs.shape
-        quarter, eighth = (
-            inputs.new_zeros(b, height // scale, width // scale, layer.channels).permute(0, 3, 1, 2)
-            for scale, layer in ((4, self.gru_quarter), (8, self.gru_eighth))
-        )
+        quarter = inputs.new_zeros(b, height // 4, width // 4, self.gru_quarter.channels).permute(0, 3, 1, 2)
         events = [inputs.new_zeros(b, 4, height, width) for _ in self.memories]
         moments = [inputs.new_zeros(b, len(self.memories) * MOMENTS, height // 4, width // 4) for _ in self.decays]
         mosaic = nothing_seen(inputs[:, :2, ::2, ::2], self.margin)
-        return [*events, *moments, inputs.new_zeros(b, height, width), *mosaic, quarter, eighth]
+        return [*events, *moments, inputs.new_zeros(b, height, width), *mosaic, *self._nothing_held(quarter)]
 
 
 def _moved(

@@ -1,9 +1,10 @@
 import math
 
+import pytest
 import torch
 from torch.nn import functional as F
 
-from polarnet.networks.blocks import ConvGRU, ResidualBlock, UpBlock, conv3x3, on_blocks
+from polarnet.networks.blocks import ConvGRU, Level, ResidualBlock, UpBlock, conv3x3, on_blocks
 
 
 def only_centres(gru: ConvGRU, from_input: list[float], from_state: list[float], from_reset_state: float) -> None:
@@ -59,6 +60,33 @@ def test_a_residual_block_has_two_3x3_convolutions_with_biases():
 
 def test_an_up_block_doubles_the_size_and_takes_the_channels_of_its_skip():
     assert UpBlock(8, 4)(torch.randn(3, 8, 5, 6), skip=torch.randn(3, 4, 10, 12)).shape == (3, 4, 10, 12)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("height", "width"), [(8, 8), (15, 23), (1, 1)])
+def test_levels_over_windows_at_once_are_the_same_as_window_by_window(height, width):
+    torch.manual_seed(0)
+    level, x = Level(3, [4, 5, 6]), torch.randn(6, 3, height, width)
+    start = level.initial_states(x[:2])
+    together, last = level(x, start)
+    assert together.shape == x.shape
+    states = start
+    for window, expected in zip(x.split(2), together.split(2), strict=True):
+        found, states = level(window, states)
+        torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(states, last)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("levels", "reached"), [(1, False), (3, True)])
+def test_each_level_sees_further(levels, reached):
+    torch.manual_seed(0)
+    level, x = Level(4, [4] * levels), torch.randn(1, 4, 1, 64)
+    start = level.initial_states(x)
+    changed = x.clone()
+    changed[..., 63] += 10
+    far = (level(x, start)[0] - level(changed, start)[0])[..., :40]
+    assert bool(far.any()) == reached
 
 
 @torch.no_grad()
