@@ -69,8 +69,8 @@ class StokesUNetConfig:
     mosaic_scale: int = field(metadata=allowed(low=1))
     """Width of the neighbourhood, in pixels of a quarter of the size, odd, whose mean is the network's and not the
     mosaic's."""
-    mosaic_share: float = field(metadata=allowed(low=0, high=1))
-    """What the mosaic weighs in the answer where it is certain."""
+    mosaic_share: float = field(metadata=allowed(low=0.01, high=0.99))
+    """What the mosaic weighs where it is certain, at the start of the training: the U-Net learns it for each place."""
     without: list[str]
     """Some of PARTS, to see what they bring: what the redundancy says (candidates are 0), the movement of (s1, s2) by
     sums of events (their gains are 0), what the recurrent layers hold (they begin anew in each window), the mosaic."""
@@ -106,9 +106,9 @@ class StokesUNet(nn.Module):
     What it adds last, when it has seen the result, is free. DoLP is not the length of (s1, s2): where these are
     uncertain their mean is short, as is a mean over angles. The outputs are linear, as those of the paper's network.
 
-    Once trained (`eval`), it averages what it says with what the mosaic shows (`polarnet.networks.mosaic`), whose
-    unknown constants are chosen to suit what it says around each place. Nothing of that is learnt, and training is
-    without it.
+    Before that last addition the result is averaged with what the mosaic shows (`polarnet.networks.mosaic`), whose
+    unknown constants are chosen to suit the result around each place. The mosaic itself has nothing to learn; the U-Net
+    sees it and chooses at each place what it weighs.
     """
 
     representation = "event_counts"
@@ -126,12 +126,13 @@ class StokesUNet(nn.Module):
         self.memory = Memory(
             config.mosaic_prior, config.mosaic_noise, config.mosaic_drift, config.mosaic_renewal, config.mosaic_fade
         )
-        self.step, self.around, self.share = config.mosaic_step, config.mosaic_scale, config.mosaic_share
+        self.step, self.around = config.mosaic_step, config.mosaic_scale
         memories, solved = len(config.memories), len(config.memories) * len(config.decays) * len(config.scales)
         half, quarter, *smaller = config.channels
         self.moments = SecondMoments(memories)
         self.solve = LeastSquares(memories, len(config.decays), len(config.scales))
         self.stem = conv3x3(4 * (4 * memories + 1), half)
+        self.from_mosaic = nn.Conv2d(3, half, kernel_size=3, padding=1, bias=False)
         self.to_quarter = nn.Conv2d(half, quarter, kernel_size=2, stride=2)
         self.from_candidates = nn.Conv2d(len(Candidates._fields) * solved, quarter, kernel_size=1)
         self.join = conv3x3(quarter, quarter)
@@ -143,14 +144,17 @@ class StokesUNet(nn.Module):
         self.up_half = UpBlock(quarter, half)
         self.at_half = ResidualBlock(half)
         self.gains = nn.Conv2d(half, 4 * len(SURROUNDINGS) * memories, kernel_size=1)
+        self.trust = nn.Conv2d(half, 1, kernel_size=1)
         self.look = conv3x3(half + 4 * 3, half)
         self.refine = ResidualBlock(half)
         self.add = nn.Conv2d(half, 4 * 4, kernel_size=1)
         self.constant = nn.Parameter(torch.tensor(MIDDLE_DOLP))
-        for last in (self.choose, self.gains, self.add):
+        for last in (self.choose, self.gains, self.add, self.trust):
             assert last.bias is not None
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
+        assert self.trust.bias is not None
+        nn.init.constant_(self.trust.bias, math.log(config.mosaic_share / (1 - config.mosaic_share)))
 
     def forward(
         self, inputs: Float[Tensor, "b 8 h w"], state: list[Tensor] | None = None
@@ -174,7 +178,9 @@ class StokesUNet(nn.Module):
         events = summed.flatten(0, 1)
         candidates, moments = self._candidates(events, b, state[memories : memories + decays])
 
-        x2 = F.relu(on_blocks(self.stem, _images(events, count.flatten(0, 1))))
+        shown, certain, carried = self._mosaic(polarity, (height, width), state[memories + decays : -self.recurrent])
+        x2 = on_blocks(self.stem, _images(events, count.flatten(0, 1)))
+        x2 = F.relu(x2 + self.from_mosaic(_pattern(shown, certain)))
         solved = torch.cat([candidates.s1, candidates.s2, candidates.dolp, torch.log1p(candidates.evidence)], dim=1)
         solved = solved.contiguous(memory_format=torch.channels_last)
         x4 = F.relu(self.join(F.relu(self.to_quarter(x2) + self.from_candidates(solved))))
@@ -190,15 +196,12 @@ class StokesUNet(nn.Module):
         coarse = F.interpolate(mixed, scale_factor=4, mode="bilinear")
         moved = _moved(coarse[:, :2], events, gains)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
-        fine = torch.cat([moved, dolp], dim=1)
+        trusted = F.interpolate(torch.sigmoid(self.trust(y2).float()), scale_factor=2, mode="bilinear")
+        fine = torch.cat(averaged(moved, dolp, shown, certain * trusted, self.around), dim=1)
         seen = torch.cat([y2, F.pixel_unshuffle(fine, 2).to(y2.dtype)], dim=1)
         added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(seen)))), 2).float()
 
         stokes, dolp = (fine + added[:, :3]).split([2, 1], dim=1)
-        carried = state[memories + decays : -self.recurrent]
-        if not self.training and "mosaic" not in self.without:
-            shown, certain, carried = self._mosaic(polarity, (height, width), *carried)
-            stokes, dolp = averaged(stokes, dolp, self.step * shown, self.share * certain, self.around)
         aolp = torch.remainder(torch.atan2(stokes[:, 1], stokes[:, 0]) / 2, math.pi)
         maps = [dolp[:, 0], aolp, LOG_VARIANCE + added[:, 3], stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
@@ -219,32 +222,33 @@ class StokesUNet(nn.Module):
             s1, s2, evidence = self.solve(stacked)
             return Candidates(s1, s2, length(s1, s2), evidence), [*sums[-1].unbind(1)]
 
+    @torch.no_grad()
     def _mosaic(
-        self,
-        polarity: Float[Tensor, "t b 4 h w"],
-        seen: tuple[int, int],
-        before: Float[Tensor, "b h w"],
-        level: Float[Tensor, "b 2 H W"],
-        own: Float[Tensor, "b 2 h/2 w/2"],
-        explained: Float[Tensor, "b 4 H F"],
+        self, polarity: Float[Tensor, "t b 4 h w"], seen: tuple[int, int], state: list[Tensor]
     ) -> tuple[Float[Tensor, "n 2 h/2 w/2"], Float[Tensor, "n 1 1 1"], list[Tensor]]:
-        """What atanh(s1) and atanh(s2) are after each window but for two constants, in steps and at half the size; how
-        certain that is; and what to carry on from.
+        """What atanh(s1) and atanh(s2) are after each window but for two constants, at half the size; how certain that
+        is, from 0 to 1; and what to carry on from.
 
-        The sensor has the first `seen` rows and columns; `before` is the window before the first, of all polarizers.
+        The sensor has the first `seen` rows and columns. `state` is the window before the first, of all polarizers,
+        and a `Picture`. Where the mosaic is left out it shows nothing and is not certain at all.
         """
-        images = torch.cat([before[None], polarity.sum(2)])
-        motion = displacements(images, self.reach)
-        height, width = (size // 2 for size in seen)
-        changes = block_means((polarity[:, :, :2] - polarity[:, :, 2:]) / 2, 2)[..., :height, :width]
-        picture, pictures = Picture(level, own[..., :height, :width], explained), []
-        for change, displacement, found in zip(changes, motion.displacement / 2, motion.found, strict=True):
-            picture = follow(change, Motion(displacement, found), picture, self.memory)
-            pictures.append(picture)
-        shown = torch.cat([one.level[..., : own.shape[-2], : own.shape[-1]] for one in pictures])
-        certain = torch.cat([certainty(one, self.memory) for one in pictures])
-        own = F.pad(picture.own, (0, own.shape[-1] - width, 0, own.shape[-2] - height))
-        return shown, certain, [images[-1], picture.level, own, picture.explained]
+        before, level, own, explained = state
+        if "mosaic" in self.without:
+            shown = own.new_zeros(len(polarity) * len(own), *own.shape[1:])
+            return shown, shown.new_zeros(len(shown), 1, 1, 1), state
+        with torch.autocast(polarity.device.type, enabled=False):
+            images = torch.cat([before[None], polarity.sum(2)])
+            motion = displacements(images, self.reach)
+            height, width = (size // 2 for size in seen)
+            changes = block_means((polarity[:, :, :2] - polarity[:, :, 2:]) / 2, 2)[..., :height, :width]
+            picture, pictures = Picture(level, own[..., :height, :width], explained), []
+            for change, displacement, found in zip(changes, motion.displacement / 2, motion.found, strict=True):
+                picture = follow(change, Motion(displacement, found), picture, self.memory)
+                pictures.append(picture)
+            shown = torch.cat([one.level[..., : own.shape[-2], : own.shape[-1]] for one in pictures])
+            certain = torch.cat([certainty(one, self.memory) for one in pictures])
+            own = F.pad(picture.own, (0, own.shape[-1] - width, 0, own.shape[-2] - height))
+            return self.step * shown, certain, [images[-1], picture.level, own, picture.explained]
 
     def _mixed(self, candidates: Candidates, weights: Float[Tensor, "n c1 h w"]) -> Float[Tensor, "n 3 h w"]:
         """s1, s2 and DoLP; the last weight is that of the constant, which has no angle."""
@@ -292,7 +296,7 @@ def averaged(
     stokes: Float[Tensor, "n 2 h w"],
     dolp: Float[Tensor, "n 1 h w"],
     shown: Float[Tensor, "n 2 h/2 w/2"],
-    share: Float[Tensor, "n 1 1 1"],
+    share: Float[Tensor, "n 1 #h #w"],
     around: int,
 ) -> tuple[Float[Tensor, "n 2 h w"], Float[Tensor, "n 1 h w"]]:
     """(s1, s2) and DoLP, drawn by `share` towards what a mosaic shows: atanh(s1) and atanh(s2) but for constants.
@@ -306,6 +310,12 @@ def averaged(
     shown = shown + F.interpolate(constants, scale_factor=2, mode="bilinear")
     mosaic = torch.tanh(F.interpolate(shown, scale_factor=2, mode="bilinear"))
     return torch.lerp(stokes, mosaic, share), torch.lerp(dolp, length(*mosaic.unbind(1))[:, None], share)
+
+
+def _pattern(shown: Float[Tensor, "n 2 h w"], certain: Float[Tensor, "n 1 1 1"]) -> Float[Tensor, "n 3 h w"]:
+    """What the U-Net sees of the mosaic: without its constants, and how certain it is."""
+    images = [shown - shown.mean((-1, -2), keepdim=True), certain.expand_as(shown[:, :1])]
+    return torch.cat(images, dim=1).contiguous(memory_format=torch.channels_last)
 
 
 def _images(events: Float[Tensor, "n m 4 h w"], count: Float[Tensor, "n 4 h w"]) -> Float[Tensor, "n c h w"]:

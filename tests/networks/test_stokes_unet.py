@@ -28,7 +28,7 @@ CONFIG = replace(
 def network(**changes: Any) -> StokesUNet:
     torch.manual_seed(0)
     built = StokesUNet(replace(CONFIG, **changes))
-    for last in (built.choose, built.gains, built.add):  # which begin with zeros
+    for last in (built.choose, built.gains, built.add, built.trust):  # which begin with zeros
         torch.nn.init.normal_(last.weight, std=0.1)
     return built.eval()
 
@@ -91,9 +91,9 @@ def test_before_training_it_says_the_mean_of_the_candidates_and_of_the_constant(
     torch.testing.assert_close(prediction.dolp, torch.full((1, 16, 16), 0.3 / 13), atol=1e-5, rtol=0)
 
 
-def test_every_parameter_has_a_gradient_from_two_windows():
+def test_every_parameter_has_a_gradient_from_a_few_windows():
     built = network()
-    prediction, _ = built.unroll(events(2, 1, 8, 16, 16))
+    prediction, _ = built.unroll(moving_events(3, 48, 64))
     assert prediction.stokes is not None
     assert prediction.log_variance is not None
     (prediction.dolp.sum() + prediction.stokes.square().sum() + prediction.log_variance.sum()).backward()
@@ -135,13 +135,13 @@ def test_each_part_can_be_left_out_and_then_does_nothing():
 
 
 @torch.no_grad()
-def test_the_mosaic_is_for_trained_networks_and_scenes_that_move():
+def test_the_mosaic_is_averaged_in_where_the_scene_moves():
     moving, blinking = moving_events(4, 48, 64), events(4, 1, 8, 48, 64)
     for windows, changes in ((moving, True), (blinking, False)):
-        built, plain = network(), network(without=["mosaic"])
-        expected, _ = plain.unroll(windows)
-        assert ((built.unroll(windows)[0].dolp - expected.dolp).abs().max() > 1e-3) == changes
-        torch.testing.assert_close(built.train().unroll(windows)[0].dolp, expected.dolp)
+        built = network()
+        before, _ = built.unroll(windows)
+        built.trust.bias.add_(2)
+        assert ((built.unroll(windows)[0].dolp - before.dolp).abs().max() > 1e-3) == changes
 
 
 def test_the_mosaic_gives_the_pattern_and_the_network_the_level():
