@@ -132,7 +132,7 @@ class StokesUNet(nn.Module):
         self.moments = SecondMoments(memories)
         self.solve = LeastSquares(memories, len(config.decays), len(config.scales))
         self.stem = conv3x3(4 * (4 * memories + 1), half)
-        self.from_mosaic = nn.Conv2d(3, half, kernel_size=3, padding=1, bias=False)
+        self.from_mosaic = nn.Conv2d(5, half, kernel_size=3, padding=1, bias=False)
         self.to_quarter = nn.Conv2d(half, quarter, kernel_size=2, stride=2)
         self.from_candidates = nn.Conv2d(len(Candidates._fields) * solved, quarter, kernel_size=1)
         self.join = conv3x3(quarter, quarter)
@@ -197,7 +197,7 @@ class StokesUNet(nn.Module):
         moved = _moved(coarse[:, :2], events, gains)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
         trusted = F.interpolate(torch.sigmoid(self.trust(y2).float()), scale_factor=2, mode="bilinear")
-        fine = torch.cat(averaged(moved, dolp, shown, certain * trusted, self.around), dim=1)
+        fine = torch.cat(averaged(moved, dolp, shown[:, 1:3], certain * trusted, self.around), dim=1)
         seen = torch.cat([y2, F.pixel_unshuffle(fine, 2).to(y2.dtype)], dim=1)
         added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(seen)))), 2).float()
 
@@ -225,9 +225,10 @@ class StokesUNet(nn.Module):
     @torch.no_grad()
     def _mosaic(
         self, polarity: Float[Tensor, "t b 4 h w"], seen: tuple[int, int], state: list[Tensor]
-    ) -> tuple[Float[Tensor, "n 2 h/2 w/2"], Float[Tensor, "n 1 1 1"], list[Tensor]]:
-        """What atanh(s1) and atanh(s2) are after each window but for two constants, at half the size; how certain that
-        is, from 0 to 1; and what to carry on from.
+    ) -> tuple[Float[Tensor, "n 4 h/2 w/2"], Float[Tensor, "n 1 1 1"], list[Tensor]]:
+        """The mean of the four log intensities, atanh(s1), atanh(s2) and half of (log I0 + log I90) - (log I45 + log
+        I135) after each window but for four constants, at half the size; how certain that is, from 0 to 1; and what to
+        carry on from.
 
         The sensor has the first `seen` rows and columns. `state` is the window before the first, of all polarizers,
         and a `Picture`. Where the mosaic is left out it shows nothing and is not certain at all.
@@ -240,7 +241,7 @@ class StokesUNet(nn.Module):
             images = torch.cat([before[None], polarity.sum(2)])
             motion = displacements(images, self.reach)
             height, width = (size // 2 for size in seen)
-            changes = block_means((polarity[:, :, :2] - polarity[:, :, 2:]) / 2, 2)[..., :height, :width]
+            changes = block_means(contrasts(polarity) / 2, 2)[..., :height, :width]
             picture, pictures = Picture(level, own[..., :height, :width], explained), []
             for change, displacement, found in zip(changes, motion.displacement / 2, motion.found, strict=True):
                 picture = follow(change, Motion(displacement, found), picture, self.memory)
@@ -275,7 +276,7 @@ class StokesUNet(nn.Module):
         quarter = inputs.new_zeros(b, height // 4, width // 4, self.gru_quarter.channels).permute(0, 3, 1, 2)
         events = [inputs.new_zeros(b, 4, height, width) for _ in self.memories]
         moments = [inputs.new_zeros(b, len(self.memories) * MOMENTS, height // 4, width // 4) for _ in self.decays]
-        mosaic = nothing_seen(inputs[:, :2, ::2, ::2], self.margin)
+        mosaic = nothing_seen(inputs[:, :4, ::2, ::2], self.margin)
         return [*events, *moments, inputs.new_zeros(b, height, width), *mosaic, *self._nothing_held(quarter)]
 
 
@@ -312,7 +313,7 @@ def averaged(
     return torch.lerp(stokes, mosaic, share), torch.lerp(dolp, length(*mosaic.unbind(1))[:, None], share)
 
 
-def _pattern(shown: Float[Tensor, "n 2 h w"], certain: Float[Tensor, "n 1 1 1"]) -> Float[Tensor, "n 3 h w"]:
+def _pattern(shown: Float[Tensor, "n 4 h w"], certain: Float[Tensor, "n 1 1 1"]) -> Float[Tensor, "n 5 h w"]:
     """What the U-Net sees of the mosaic: without its constants, and how certain it is."""
     images = [shown - shown.mean((-1, -2), keepdim=True), certain.expand_as(shown[:, :1])]
     return torch.cat(images, dim=1).contiguous(memory_format=torch.channels_last)
