@@ -1,4 +1,4 @@
-"""Pictures of what the polarizers differ by, gathered along the motion of the scene, without training.
+"""Pictures of what the polarizers see and differ by, gathered along the motion of the scene, without training.
 
 A pixel's own sum of events tells how much its log intensity has changed since the start: without the start itself, and
 with errors that grow event by event, because thresholds differ between pixels. A scene that moves past the sensor
