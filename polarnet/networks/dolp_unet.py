@@ -51,6 +51,8 @@ class DolpUNet(nn.Module):
 
     representation = "event_tensor"
     predicts_stokes = False
+    optimizer = "adam"
+    outputs = ("p1",)
 
     def __init__(self, config: DolpUNetConfig, in_channels: int = 4):
         super().__init__()

@@ -113,6 +113,8 @@ class StokesUNet(nn.Module):
 
     representation = "event_counts"
     predicts_stokes = True
+    optimizer = "muon"
+    outputs = ("choose", "gains", "trust", "add")
 
     def __init__(self, config: StokesUNetConfig, in_channels: int = 4 * IMAGES):
         super().__init__()

@@ -14,6 +14,7 @@ from polarnet.ranges import allowed
 from polarnet.runtime import precision_on
 from polarnet.similarity import correlation, mse, psnr
 from polarnet.training.losses import known_frames
+from polarnet.training.optimizers import OPTIMIZERS, Stepper
 from polarnet.training.parallel import add_up, place, wait_for_all
 from polarnet.training.recorder import Recorder
 from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, kept_in_memory, parts_of, shuffled
@@ -36,7 +37,7 @@ class LoopConfig(ViewConfig):
     bptt_windows: int = field(metadata=allowed(low=1))
     """Windows of one step: gradients are not carried further back, the recurrent state is."""
     learning_rate: float = field(metadata=allowed(above=0))
-    """Of Adam, at its highest."""
+    """At its highest."""
     schedule: str = field(metadata=allowed(choices=("constant", "cosine")))
     """cosine: from the highest rate to 0 over the training."""
     warmup: float = field(metadata=allowed(low=0, high=1))
@@ -44,7 +45,8 @@ class LoopConfig(ViewConfig):
     gradient_norm: float | None = field(metadata=allowed(above=0))
     """Gradients that are longer together are shortened to this; null: never."""
     precision: str = field(metadata=allowed(choices=("auto", "fp32", "bf16")))
-    """Of autocast; weights and Adam are float32 either way. auto: bf16 where the device has units for it."""
+    """Of autocast; weights and an optimizer's memories are float32 either way. auto: bf16 where the device has units
+    for it."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class TrainConfig(LoopConfig):
 
     representation: str | None = field(metadata=allowed(choices=tuple(REPRESENTATIONS)))
     """Of the events in a window; null: the one that the network was made for."""
+    optimizer: str | None = field(metadata=allowed(choices=tuple(OPTIMIZERS)))
+    """null: the one that the network was made for."""
 
 
 def train(
@@ -65,7 +69,7 @@ def train(
     share a training (polarnet.training.parallel) all call this; they change the weights by rounding alone.
     """
     network = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
+    optimizer = OPTIMIZERS[task.optimizer](network, config.learning_rate)
     progress = recorder.resume(network, optimizer)
     wait_for_all()  # before one of them writes again
     sequences, workers = kept_in_memory(split.train, workers)
@@ -84,7 +88,7 @@ def train(
 
 
 def train_batch(
-    task: Task, optimizer: torch.optim.Optimizer, batch: Batch, config: LoopConfig, device: torch.device
+    task: Task, optimizer: Stepper, batch: Batch, config: LoopConfig, device: torch.device
 ) -> list[dict[str, float]]:
     """One step for each run of `bptt_windows` windows; the loss and its terms at each.
 
@@ -178,7 +182,7 @@ def validate(
     return {name: value / count for name, value in zip(sums, totals, strict=True)}
 
 
-def set_learning_rate(optimizer: torch.optim.Optimizer, config: LoopConfig, done: float) -> None:
+def set_learning_rate(optimizer: Stepper, config: LoopConfig, done: float) -> None:
     """The rate once this fraction of the training is done: the warm-up's rise, times the schedule's fall."""
     rise = min(1.0, done / config.warmup) if config.warmup else 1.0
     fall = (1 + math.cos(math.pi * done)) / 2 if config.schedule == "cosine" else 1.0

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from polarnet.networks.checkpoint import save_checkpoint
+from polarnet.training.optimizers import Stepper
 from polarnet.training.parallel import place
 from polarnet.training.sequences import Batch
 
@@ -86,7 +87,7 @@ class Recorder:
             shutil.rmtree(out, ignore_errors=True)
             out.mkdir(parents=True)
 
-    def resume(self, network: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
+    def resume(self, network: nn.Module, optimizer: Stepper) -> Progress:
         """Put network and optimizer where the running checkpoint left them, if there is one; how far that is."""
         file = self.running / "running.pt"
         if not file.exists():
@@ -100,9 +101,7 @@ class Recorder:
             self._write(progress, network)  # what the epoch before had written is gone
         return progress
 
-    def keep(
-        self, progress: Progress, network: nn.Module, optimizer: torch.optim.Optimizer, at_once: bool = False
-    ) -> None:
+    def keep(self, progress: Progress, network: nn.Module, optimizer: Stepper, at_once: bool = False) -> None:
         """Write the running checkpoint if the last one is old enough."""
         if not self.writes or (not at_once and time.monotonic() - self.kept_at < self.keep_every_s):
             return

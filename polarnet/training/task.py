@@ -49,6 +49,8 @@ class Task:
     loss: FrameLoss
     description: Mapping[str, Any]
     """What a checkpoint says of the network and its input: at least "network", "config" and "in_channels"."""
+    optimizer: str = "adam"
+    """A key of OPTIMIZERS."""
     scored: Callable[[Tensor], Float[Tensor, "t b h w"]] = lambda frames: frames
     """Of what it says and should say, the frames that validation scores, and by which the best epoch is chosen."""
 
@@ -103,7 +105,7 @@ def lpips_of(folder: Path, weight: float) -> Lpips | None:
 def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, device: torch.device) -> dict[str, Any]:
     """All that decides the weights: what the JSON of a checkpoint says, and what the running checkpoint is keyed by.
 
-    `training.precision` is the one that is used on `device`.
+    `training.precision` is the one that is used on `device`, `training.optimizer` the one that the network gets.
     """
     events, frames = split.train.events, split.train.frames
     lpips = (
@@ -111,7 +113,12 @@ def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, de
     )
     return {
         **task.description,
-        "training": {"seed": seed, **asdict(config), "precision": precision_on(device, config.precision)},
+        "training": {
+            "seed": seed,
+            **asdict(config),
+            "optimizer": task.optimizer,
+            "precision": precision_on(device, config.precision),
+        },
         "loss": dict(task.loss.weights),
         "lpips": {key: lpips.get(key) for key in ("backbone", "sha256")},
         "data": {

@@ -40,7 +40,7 @@ LOOP: dict[str, Any] = {
     "gradient_norm": 1.0,
     "precision": "fp32",
 }
-TRAIN = TrainConfig(**LOOP, representation="event_tensor")
+TRAIN = TrainConfig(**LOOP, representation="event_tensor", optimizer=None)
 E2V = E2vConfig(**LOOP, arch="firenet", bins=5, ssim=1.0, lpips=0.0)
 NETWORK = DolpUNetConfig(
     channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1, input_mixing="contrasts"
@@ -90,22 +90,38 @@ def test_equal_trainings_leave_equal_bytes(stores, tmp_path):
     assert first == second
 
 
-@pytest.mark.parametrize("killed_at", range(1, 17))
-def test_a_training_killed_at_any_step_and_resumed_ends_as_if_nothing_had_happened(
-    stores, tmp_path, undisturbed, killed_at
-):
-    task, calls = small_task(), 0
+def killed(task: Task, at: int, stores: tuple[Path, Path], folder: Path) -> None:
+    """A training that is killed when it is about to see windows for the `at`-th time."""
+    calls = 0
 
     def unroll(*arguments: Any) -> Any:
         nonlocal calls
         calls += 1
-        if calls == killed_at:
+        if calls == at:
             raise Killed
         return task.unroll(*arguments)
 
     with pytest.raises(Killed):
-        run(dataclasses.replace(task, unroll=unroll), stores, tmp_path)
+        run(dataclasses.replace(task, unroll=unroll), stores, folder)
+
+
+@pytest.mark.parametrize("killed_at", range(1, 17))
+def test_a_training_killed_at_any_step_and_resumed_ends_as_if_nothing_had_happened(
+    stores, tmp_path, undisturbed, killed_at
+):
+    killed(small_task(), killed_at, stores, tmp_path)
     assert bytes_of(run(small_task(), stores, tmp_path)) == undisturbed
+
+
+@pytest.mark.parametrize("killed_at", [4, 9])
+def test_so_does_one_that_muon_trains(stores, tmp_path, killed_at):
+    def task() -> Task:
+        return dataclasses.replace(small_task(), optimizer="muon")
+
+    killed(task(), killed_at, stores, tmp_path / "killed")
+    resumed = bytes_of(run(task(), stores, tmp_path / "killed"))
+    assert resumed == bytes_of(run(task(), stores, tmp_path / "whole"))
+    assert json.loads(resumed["best.json"])["training"]["optimizer"] == "muon"
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,71 @@
+"""What changes a network's weights by their gradients, by its name in params.yaml."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+
+class Muon:
+    """Muon for the weights of hidden layers, Adam for all else, as Muon's author says (Jordan et al., 2024).
+
+    Muon steps along the gradient's momentum made orthogonal: all directions of a layer's matrix move alike, where
+    Adam's steps have a few strong ones. `torch.optim.Muon` takes matrices alone; a convolution's weight is one of
+    outputs by everything else. Its steps are as long as Adam's (`match_rms_adamw`), so that they share one rate. What
+    a network calls its `outputs` are the layers whose results are read as numbers; those are Adam's.
+    """
+
+    def __init__(self, network: nn.Module, learning_rate: float):
+        outputs = tuple(f"{name}." for name in getattr(network, "outputs", ()))
+        named = list(network.named_parameters())
+        hidden = {name for name, weight in named if weight.ndim > 1 and not name.startswith(outputs)}
+        self._all = [weight for _, weight in named]
+        self._weights = [weight for name, weight in named if name in hidden]
+        self._matrices = [nn.Parameter(weight.detach().flatten(1).clone()) for weight in self._weights]
+        others = [weight for name, weight in named if name not in hidden]
+        self._muon = torch.optim.Muon(
+            self._matrices, lr=learning_rate, weight_decay=0.0, adjust_lr_fn="match_rms_adamw"
+        )
+        self._adam = torch.optim.Adam(others, lr=learning_rate, fused=True)
+        self.param_groups = [*self._muon.param_groups, *self._adam.param_groups]
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        for weight in self._all:
+            weight.grad = None
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Change the weights that have gradients."""
+        for matrix, weight in self._pairs():
+            matrix.copy_(weight.flatten(1))
+            matrix.grad = None if weight.grad is None else weight.grad.flatten(1)
+        self._muon.step()
+        self._adam.step()
+        for matrix, weight in self._pairs():
+            weight.copy_(matrix.view(weight.shape))
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that it remembers."""
+        return {"muon": self._muon.state_dict(), "adam": self._adam.state_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Remember that again."""
+        self._muon.load_state_dict(state_dict["muon"])
+        self._adam.load_state_dict(state_dict["adam"])
+        self.param_groups = [*self._muon.param_groups, *self._adam.param_groups]
+
+    def _pairs(self) -> Iterator[tuple[Tensor, Tensor]]:
+        return zip(self._matrices, self._weights, strict=True)
+
+
+Stepper = torch.optim.Optimizer | Muon
+
+
+def _adam(network: nn.Module, learning_rate: float) -> Stepper:
+    return torch.optim.Adam(network.parameters(), lr=learning_rate, fused=True)
+
+
+OPTIMIZERS: dict[str, Callable[[nn.Module, float], Stepper]] = {"adam": _adam, "muon": Muon}
+"""Of a network's weights at a learning rate."""
