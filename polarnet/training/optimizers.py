@@ -12,7 +12,7 @@ class Muon:
 
     Muon steps along the gradient's momentum made orthogonal: all directions of a layer's matrix move alike, where
     Adam's steps have a few strong ones. `torch.optim.Muon` takes matrices alone; a convolution's weight is one of
-    outputs by everything else. Its steps are as long as Adam's (`match_rms_adamw`), so that they share one rate. What
+    outputs by everything else. Its steps are about as long as Adam's (`match_rms_adamw`), so that they share one rate. What
     a network calls its `outputs` are the layers whose results are read as numbers; those are Adam's.
     """
 
