@@ -12,15 +12,14 @@ class Muon:
 
     Muon steps along the gradient's momentum made orthogonal: all directions of a layer's matrix move alike, where
     Adam's steps have a few strong ones. `torch.optim.Muon` takes matrices alone; a convolution's weight is one of
-    outputs by everything else. Its steps are about as long as Adam's (`match_rms_adamw`), so that they share one rate. What
-    a network calls its `outputs` are the layers whose results are read as numbers; those are Adam's.
+    outputs by everything else. Its steps are about as long as Adam's (`match_rms_adamw`), so that they share one rate.
+    What a network calls its `outputs` are the layers whose results are read as numbers; those are Adam's.
     """
 
     def __init__(self, network: nn.Module, learning_rate: float):
         outputs = tuple(f"{name}." for name in getattr(network, "outputs", ()))
         named = list(network.named_parameters())
         hidden = {name for name, weight in named if weight.ndim > 1 and not name.startswith(outputs)}
-        self._all = [weight for _, weight in named]
         self._weights = [weight for name, weight in named if name in hidden]
         self._matrices = [nn.Parameter(weight.detach().flatten(1).clone()) for weight in self._weights]
         others = [weight for name, weight in named if name not in hidden]
@@ -28,12 +27,12 @@ class Muon:
             self._matrices, lr=learning_rate, weight_decay=0.0, adjust_lr_fn="match_rms_adamw"
         )
         self._adam = torch.optim.Adam(others, lr=learning_rate, fused=True)
-        self.param_groups = [*self._muon.param_groups, *self._adam.param_groups]
+        self.zero_grad = network.zero_grad
 
-    def zero_grad(self) -> None:
-        """Forget the gradients."""
-        for weight in self._all:
-            weight.grad = None
+    @property
+    def param_groups(self) -> list[dict[str, Any]]:
+        """Of both; the loop sets their learning rate `lr`."""
+        return [*self._muon.param_groups, *self._adam.param_groups]
 
     @torch.no_grad()
     def step(self) -> None:
@@ -54,7 +53,6 @@ class Muon:
         """Remember that again."""
         self._muon.load_state_dict(state_dict["muon"])
         self._adam.load_state_dict(state_dict["adam"])
-        self.param_groups = [*self._muon.param_groups, *self._adam.param_groups]
 
     def _pairs(self) -> Iterator[tuple[Tensor, Tensor]]:
         return zip(self._matrices, self._weights, strict=True)
