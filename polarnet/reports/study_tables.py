@@ -1,4 +1,4 @@
-"""Tables of what tests/benchmarks/study.py measures: the two DoLP networks, and how many events a frame takes."""
+"""Tables of what tests/benchmarks/study.py and scenes.py measure: networks, their scenes, events that a frame takes."""
 
 from collections.abc import Mapping, Sequence
 from statistics import fmean, stdev
@@ -106,6 +106,20 @@ def ablation_block(results: Mapping[str, Any]) -> str:
     lines += [_row(f"`{name}` | {scores['about']}", [scores]) for name, scores in rows]
     overrides = " ".join(f"`{override}`" for override in found["overrides"])
     return "\n".join([*lines, "", f"One training each, {overrides or 'without further overrides'}. {origin(record)}"])
+
+
+def choices_block(results: Mapping[str, Any]) -> str:
+    """Which scenes were trained on, scored inside the training split, by tests/benchmarks/scenes.py.
+
+    `results` is docs/results/scenes.json.
+    """
+    rows, record = results["choices"]["rows"], results["records"]["choices"]
+    lines = ["| | trainings | " + " | ".join(label for _, label, _ in STUDY_COLUMNS) + " |"]
+    lines.append("|---|---:" + "|---:" * len(STUDY_COLUMNS) + "|")
+    for name, row in rows.items():
+        trainings = "-" if name == "oracle_mean" else len(row["seeds"])
+        lines.append(_row(f"{row['about']} | {trainings}", row["seeds"]))
+    return "\n".join([*lines, "", f"Mean ± standard deviation over the trainings. {origin(record)}"])
 
 
 def event_budget_block(results: Mapping[str, Any]) -> str:

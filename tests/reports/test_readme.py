@@ -5,7 +5,7 @@ import pytest
 from polarnet.measure import BENCHMARK_KEYS
 from polarnet.reports.readme import benchmark_block, update_results_blocks
 from polarnet.reports.recording_tables import recordings_block, recover_block
-from polarnet.reports.study_tables import ablation_block, event_budget_block, study_block
+from polarnet.reports.study_tables import ablation_block, choices_block, event_budget_block, study_block
 
 RESULTS = {
     "setup_minutes": 1.5,
@@ -184,6 +184,21 @@ def test_an_ablation_shows_the_whole_first_and_then_what_is_missed_most():
     assert [line.split(" | ")[0] for line in lines[2:5]] == ["| `nothing`", "| `scales`", "| `sums`"]
     assert lines[3].startswith("| `scales` | One. | 0.0500 | 0.0000 |")
     assert "One training each, `train.epochs=1`." in lines[-1]
+
+
+def test_choices_of_scenes_are_means_over_their_trainings():
+    def scores(mse, aolp):
+        return dict.fromkeys(("level_mse", "pattern_mse", "psnr", "ssim", "corr"), 0.5) | {"mse": mse, "aolp_deg": aolp}
+
+    rows = {
+        "shipped": {"about": "As shipped.", "seeds": [scores(0.02, 10.0), scores(0.03, 12.0)]},
+        "oracle_mean": {"about": "Each frame's own mean.", "seeds": [scores(0.04, None)]},
+    }
+    lines = choices_block({"choices": {"rows": rows}, "records": {"choices": MACHINE}}).splitlines()
+    assert lines[2].startswith("| As shipped. | 2 | 0.0250 ± 0.0071 |")
+    assert lines[2].endswith("| 11.0 ± 1.4 |")
+    assert lines[3].startswith("| Each frame's own mean. | - | 0.0400 | 0.5000 |")
+    assert lines[3].endswith("| - |")
 
 
 def test_the_benchmark_says_what_solved_gains_bring():
