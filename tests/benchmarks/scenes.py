@@ -64,9 +64,9 @@ def without_test_split(arguments: argparse.Namespace) -> Path:
     folder = arguments.work / "photographs"
     folder.mkdir(exist_ok=True)
     for entry in read_manifest(data / "images").pictures:
-        link = folder / entry.source.replace("/", "_")
+        link = folder / entry.origin.replace("/", "_")
         if entry.split != "test" and not link.exists():
-            link.symlink_to(arguments.photographs / entry.source)
+            link.symlink_to(arguments.photographs / entry.origin)
     return folder
 
 
