@@ -23,11 +23,10 @@ HELD_OUT = 1 / 3  # of the photographs that are left
 
 
 class Choice(NamedTuple):
-    """What is compared: how the scenes are made, and how often the network sees each."""
+    """What is compared: how the scenes are made."""
 
     about: str
     synthesis: tuple[str, ...] = ()
-    training: tuple[str, ...] = ()
 
 
 SHORT = ("train.windows=6",)
@@ -35,11 +34,6 @@ SHORT = ("train.windows=6",)
 CHOICES = {
     "shipped": Choice("`experiment=photographs`: three further scenes of each photograph, a third of them evened."),
     "none_evened": Choice("Three further scenes, none evened.", ("variation.uniform_share=0",)),
-    "plain": Choice(
-        "The photographs as they are, each visited as often as its four scenes together.",
-        ("variation.scenes_per_picture=0",),
-        ("train.epochs=8",),
-    ),
 }
 
 
@@ -76,7 +70,7 @@ def scored(name: str, seed: int, photographs: Path, arguments: argparse.Namespac
     if not (results / "metrics.json").exists():
         paths = (f"paths.train={trained}", f"paths.benchmark={results}")
         resume = f"paths.resume={arguments.work / 'resume' / run}"
-        stage("train", arguments, data, f"seed={seed}", *SHORT, *choice.training, *paths, resume)
+        stage("train", arguments, data, f"seed={seed}", *SHORT, *paths, resume)
         stage("benchmark", arguments, data, "benchmark.methods=[oracle_mean,ours]", *paths)
     metrics = json.loads((results / "metrics.json").read_text())
     return {row: {key: scores.get(key) for key in ABLATION_KEYS} for row, scores in metrics.items()}
