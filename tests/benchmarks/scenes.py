@@ -105,7 +105,7 @@ def main() -> None:
             found["oracle_mean"] = {"about": "Each frame's own mean.", "seeds": [scores["oracle_mean"]]}
             print(name, seed, json.dumps(scores["ours"]), flush=True)
     if arguments.write:
-        print(write_section(ROOT, "scenes", "choices", {"rows": found}, record))
+        print(write_section(ROOT, "scenes", "choices", {"overrides": SHORT, "rows": found}, record))
 
 
 if __name__ == "__main__":
