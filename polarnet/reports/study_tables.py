@@ -109,7 +109,7 @@ def ablation_block(results: Mapping[str, Any]) -> str:
 
 
 def choices_block(results: Mapping[str, Any]) -> str:
-    """Which scenes were trained on, scored inside the training split, by tests/benchmarks/scenes.py.
+    """Scenes to train on, compared without the test split by tests/benchmarks/scenes.py.
 
     `results` is docs/results/scenes.json.
     """

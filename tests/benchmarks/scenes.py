@@ -1,4 +1,4 @@
-"""Which scenes to train on: trainings held against each other on photographs of the training split alone.
+"""Which scenes to train on: trainings held against each other without the test split.
 
 python tests/benchmarks/scenes.py --photographs FOLDER --work FOLDER [--seeds N] [--threads N] [--write]
 
