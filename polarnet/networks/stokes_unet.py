@@ -323,5 +323,5 @@ def _pattern(shown: Float[Tensor, "n 4 h w"], certain: Float[Tensor, "n 1 1 1"])
 
 def _images(events: Float[Tensor, "n m 4 h w"], count: Float[Tensor, "n 4 h w"]) -> Float[Tensor, "n c h w"]:
     """What the U-Net sees: contrasts of every sum of events, and how many there were."""
-    seen = [*(contrasts(of_memory) for of_memory in events.unbind(1)), count.sum(1, keepdim=True) / 2]
-    return torch.cat([compressed(image) for image in seen], dim=1).contiguous(memory_format=torch.channels_last)
+    seen = torch.cat([contrasts(events).flatten(1, 2), count.sum(1, keepdim=True) / 2], dim=1)
+    return compressed(seen).contiguous(memory_format=torch.channels_last)
