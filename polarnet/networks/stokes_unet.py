@@ -179,14 +179,14 @@ class StokesUNet(nn.Module):
         nn.init.constant_(self.trust.bias, math.log(config.mosaic_share / (1 - config.mosaic_share)))
 
     def forward(
-        self, inputs: Float[Tensor, "b 8 h w"], state: list[Tensor] | None = None
+        self, inputs: Float[Tensor, "b 16 h w"], state: list[Tensor] | None = None
     ) -> tuple[Prediction, list[Tensor]]:
         """One window of b streams. `state` is what the window before handed back, None at the start."""
         prediction, state = self.unroll(inputs[None], state)
         return Prediction(*(field[0] for field in prediction if field is not None)), state
 
     def unroll(
-        self, inputs: Float[Tensor, "t b 8 h w"], state: list[Tensor] | None = None
+        self, inputs: Float[Tensor, "t b 16 h w"], state: list[Tensor] | None = None
     ) -> tuple[Prediction, list[Tensor]]:
         """t windows of b streams at once: the same numbers as `forward` window by window, in fewer operations."""
         t, b, _, height, width = inputs.shape
@@ -236,7 +236,7 @@ class StokesUNet(nn.Module):
 
     def _candidates(
         self, events: Float[Tensor, "n m 4 h w"], streams: int, state: list[Tensor]
-    ) -> tuple[Candidates, Float[Tensor, "n m d k 6 h w"], list[Tensor]]:
+    ) -> tuple[Candidates, Float[Tensor, "n m d k 6 h4 w4"], list[Tensor]]:
         """Also the moments that they are solved from, and the sums of moments to carry on from.
 
         In float32: the equations are solved by differences.
