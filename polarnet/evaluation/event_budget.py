@@ -23,7 +23,7 @@ from tqdm import tqdm
 from polarnet.evaluation.methods import Context, Polarization, Recording, degree, recover
 from polarnet.evaluation.resimulate import recording_at
 from polarnet.evaluation.score import FrameScore, scene_means, score_sequence
-from polarnet.events.representations import REPRESENTATIONS, event_tensor
+from polarnet.events.representations import REPRESENTATIONS, Encode, event_tensor
 from polarnet.events.store import EventStore
 from polarnet.events.stream import Events, since, slice_count
 from polarnet.events.streaming import SlidingEventTensor
