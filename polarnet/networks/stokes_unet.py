@@ -1,6 +1,7 @@
 """polarnet's own network: the redundancy of four polarizers solved at many scales, then refined by a small U-Net."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -38,7 +39,7 @@ STRIDE = 4  # of the largest image with a recurrent layer
 IMAGES = 4  # of a polarizer's events: sums of polarities in the quarters of a window (representation `event_stack`)
 PARTS = ("redundancy", "delays", "sums", "recurrence", "mosaic")
 MIDDLE_DOLP = 0.3  # of the constant that is one more candidate, at the start
-SURROUNDINGS = (1, 3, 9)  # width in pixels of the neighbourhoods whose events tell fine structure
+WIDE = (3, 9)  # pixels, of the neighbourhoods that tell fine structure beside a pixel by itself
 MOST_POLARIZED = 0.98  # of 1: keeps atanh finite
 LOG_VARIANCE = -4.0  # at the start: an error of 0.14
 
@@ -165,7 +166,7 @@ class StokesUNet(nn.Module):
         self.believe = nn.Conv2d(quarter, delays, kernel_size=1)
         self.up_half = UpBlock(quarter, half)
         self.at_half = ResidualBlock(half)
-        self.gains = nn.Conv2d(half, 4 * len(SURROUNDINGS) * memories, kernel_size=1)
+        self.gains = nn.Conv2d(half, 4 * (1 + len(WIDE)) * memories, kernel_size=1)
         self.trust = nn.Conv2d(half, 1, kernel_size=1)
         self.look = conv3x3(half + 4 * 3, half)
         self.refine = ResidualBlock(half)
@@ -200,8 +201,10 @@ class StokesUNet(nn.Module):
         summed = faded(polarity.unsqueeze(2), keep, torch.stack(state[:memories], dim=1))  # t, b, memory, polarizer
         events = summed.flatten(0, 1)
         candidates, solved_from, moments = self._candidates(events, b, state[memories : memories + decays])
-        mosaic = memories + 2 * decays + 1  # where its state begins
-        delayed, later = self._delayed(parts, solved_from, state[memories + decays : mosaic])
+        wide = memories + 2 * decays + 1  # where its state begins
+        delayed, later = self._delayed(parts, solved_from, state[memories + decays : wide])
+        mosaic = wide + len(WIDE)
+        around = _around(polarity, state[wide:mosaic], keep)
 
         shown, certain, carried = self._mosaic(polarity, (height, width), state[mosaic : -self.recurrent])
         x2 = on_blocks(self.stem, _images(events, count.flatten(0, 1)))
@@ -221,7 +224,7 @@ class StokesUNet(nn.Module):
         y2 = self.at_half(self.up_half(y4, skip=x2))
         gains = self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float())
         coarse = F.interpolate(mixed, scale_factor=4, mode="bilinear")
-        moved = _moved(coarse[:, :2], events, gains)
+        moved = _moved(coarse[:, :2], [_differences(summed), *around], gains)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
         trusted = F.interpolate(torch.sigmoid(self.trust(y2).float()), scale_factor=2, mode="bilinear")
         fine = torch.cat(averaged(moved, dolp, shown[:, 1:3], certain * trusted, self.around), dim=1)
@@ -232,6 +235,7 @@ class StokesUNet(nn.Module):
         aolp = torch.remainder(torch.atan2(stokes[:, 1], stokes[:, 0]) / 2, math.pi)
         maps = [dolp[:, 0], aolp, LOG_VARIANCE + added[:, 3], stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
+        carried = [*(sums[-1] for sums in around), *carried]
         return prediction, [*summed[-1].unbind(1), *moments, *later, *carried, *recurrent]
 
     def _candidates(
@@ -257,16 +261,17 @@ class StokesUNet(nn.Module):
     ) -> tuple[Delayed, list[Tensor]]:
         """What delays say, and the last part of the last window and the sums of products to carry on from."""
         with torch.autocast(parts.device.type, enabled=False):
-            in_order = torch.cat([state[0][None], parts.movedim(3, 1).flatten(0, 1)])
-            runs = in_order.unfold(0, IMAGES + 1, IMAGES).movedim(-1, 1)  # each with the part before it
-            products = torch.stack([delay_products(run, pooled=4) for run in runs])
-            keep = products.new_tensor(self.decays).view(-1, 1, 1, 1)
-            sums = faded(products.unsqueeze(2), keep, torch.stack(state[1:], dim=1))
+            last, products = state[0][None], []
+            for window in parts.movedim(3, 1):  # one by one they fit into a core's cache
+                products.append(delay_products(torch.cat([last, window]), pooled=4))
+                last = window[-1:]
+            keep = parts.new_tensor(self.decays).view(-1, 1, 1, 1)
+            sums = faded(torch.stack(products).unsqueeze(2), keep, torch.stack(state[1:], dim=1))
             near = neighbourhoods(sums.flatten(0, 1).flatten(1, 2), self.delay_scales)
             stacked = torch.stack([mean.unflatten(1, (-1, DELAYS)) for mean in near], dim=2)
             of_scales = [self.scales.index(scale) for scale in self.delay_scales]
             delayed = Delayed(*self.delays(stacked, solved_from[:, :, :, of_scales]))
-            return delayed, [in_order[-1], *sums[-1].unbind(1)]
+            return delayed, [last[0], *sums[-1].unbind(1)]
 
     def _believed(self, delayed: Delayed, y4: Float[Tensor, "n c h w"]) -> Float[Tensor, "n d h w"]:
         """What each of the delays' (s1, s2) moves the mixture by."""
@@ -317,8 +322,8 @@ class StokesUNet(nn.Module):
         return [torch.zeros_like(x4), *self.smaller.initial_states(x4)]
 
     def initial_state(self, inputs: Float[Tensor, "b c h w"]) -> list[Tensor]:
-        """Nothing seen yet: sums of events and of moments, the last quarter window, sums of delays' products, the last
-        window's polarities, the mosaic, and what the recurrent layers hold; all zeros.
+        """Nothing seen yet: sums of events and of moments, the last quarter window, sums of delays' products, means of
+        sums, the last window's polarities, the mosaic, and what the recurrent layers hold; all zeros.
 
         Height and width divide by 4.
         """
@@ -328,9 +333,10 @@ class StokesUNet(nn.Module):
         moments = [inputs.new_zeros(b, len(self.memories) * MOMENTS, height // 4, width // 4) for _ in self.decays]
         delays = [inputs.new_zeros(b, DELAYS, height // 4, width // 4) for _ in self.decays]
         late = [inputs.new_zeros(b, 4, height, width), *delays]
+        wide = [inputs.new_zeros(b, len(self.memories), 2, height, width) for _ in WIDE]
         mosaic = nothing_seen(inputs[:, :4, ::2, ::2], self.margin)
         before = inputs.new_zeros(b, height, width)
-        return [*events, *moments, *late, before, *mosaic, *self._nothing_held(quarter)]
+        return [*events, *moments, *late, *wide, before, *mosaic, *self._nothing_held(quarter)]
 
 
 def _moved_together(
@@ -344,17 +350,31 @@ def _moved_together(
     return torch.cat([after / long.clamp(min=1), dolp + longer], dim=1)
 
 
+def _around(
+    polarity: Float[Tensor, "t b 4 h w"], before: Sequence[Tensor], keep: Float[Tensor, "m 1 1 1"]
+) -> list[Float[Tensor, "t b m 2 h w"]]:
+    """Sums of e0 - e90 and e45 - e135 with each of the memories, means over each of `WIDE`, on from those `before`.
+
+    Sums of means are means of sums: a window is averaged once, not each of the sums.
+    """
+    now = _differences(polarity)
+    near = (box_means(now.flatten(0, 1), width).contiguous().unflatten(0, now.shape[:2]) for width in WIDE)
+    return [faded(means.unsqueeze(2), keep, state) for means, state in zip(near, before, strict=True)]
+
+
+def _differences(events: Float[Tensor, "*b 4 h w"]) -> Float[Tensor, "*b 2 h w"]:
+    """e0 - e90 and e45 - e135."""
+    return events[..., :2, :, :] - events[..., 2:, :, :]
+
+
 def _moved(
-    stokes: Float[Tensor, "n 2 h w"], events: Float[Tensor, "n m 4 h w"], gains: Float[Tensor, "n g h w"]
+    stokes: Float[Tensor, "n 2 h w"], sums: Sequence[Float[Tensor, "t b m 2 h w"]], gains: Float[Tensor, "n g h w"]
 ) -> Float[Tensor, "n 2 h w"]:
-    """(s1, s2) after atanh(s1) and atanh(s2) changed by gains times sums of events, in each of its `SURROUNDINGS`."""
-    e0, e45, e90, e135 = events.unbind(2)
-    sums = neighbourhoods(torch.cat([e0 - e90, e45 - e135], dim=1), SURROUNDINGS)
-    each = zip(gains.contiguous().chunk(len(SURROUNDINGS), dim=1), sums, strict=True)  # of one layout: much faster
-    moves = events.new_zeros(())
-    for gain, near in each:
-        moves = torch.addcmul(moves, gain[:, None], near.contiguous().unflatten(1, (2, -1)))
-    return torch.tanh(torch.atanh(MOST_POLARIZED * stokes) + moves.sum(2))
+    """(s1, s2) after atanh(s1) and atanh(s2) changed by gains times each of the sums of their events."""
+    moves = stokes.new_zeros(())
+    for gain, near in zip(gains.contiguous().chunk(len(sums), dim=1), sums, strict=True):
+        moves = torch.addcmul(moves, gain.unflatten(1, (-1, 1)), near.flatten(0, 1))
+    return torch.tanh(torch.atanh(MOST_POLARIZED * stokes) + moves.sum(1))
 
 
 def averaged(
@@ -385,5 +405,6 @@ def _pattern(shown: Float[Tensor, "n 4 h w"], certain: Float[Tensor, "n 1 1 1"])
 
 def _images(events: Float[Tensor, "n m 4 h w"], count: Float[Tensor, "n 4 h w"]) -> Float[Tensor, "n c h w"]:
     """What the U-Net sees: contrasts of every sum of events, and how many there were."""
-    seen = torch.cat([contrasts(events).flatten(1, 2), count.sum(1, keepdim=True) / 2], dim=1)
-    return compressed(seen).contiguous(memory_format=torch.channels_last)
+    windows = zip(events.split(1), count.split(1), strict=True)  # one by one they fit into a core's cache
+    seen = (torch.cat([contrasts(sums).flatten(1, 2), each.sum(1, keepdim=True) / 2], dim=1) for sums, each in windows)
+    return torch.cat([compressed(images).contiguous(memory_format=torch.channels_last) for images in seen])

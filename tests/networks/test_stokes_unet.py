@@ -61,7 +61,7 @@ def test_any_height_and_width_come_back_with_everything_predicted():
         assert prediction.stokes.shape == (2, 2, height, width)
         assert prediction.aolp.min() >= 0
         assert prediction.aolp.max() < math.pi
-        assert len(state) == 2 + 2 + 3 + 4 + 3
+        assert len(state) == 2 + 2 + 3 + 2 + 4 + 3
 
 
 @torch.no_grad()
