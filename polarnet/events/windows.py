@@ -55,6 +55,7 @@ class WindowSequence(NamedTuple):
     dolp: Float[Tensor, "t h w"]
     aolp: Float[Tensor, "t h w"]
     intensity: Float[Tensor, "t 4 h w"]
+    """Of no window while a training that does not want it keeps sequences in memory."""
     valid: Bool[Tensor, "t h w"] | None = None
     """Where the truth is known; None: everywhere."""
 

@@ -48,6 +48,7 @@ def dolp_task(
             "in_channels": in_channels,
             "representation": representation,
         },
+        wants_intensity=False,
         optimizer=config.optimizer or build.optimizer,
         scored=lambda maps: maps[:, :, 0],
     )

@@ -72,7 +72,7 @@ def train(
     optimizer = OPTIMIZERS[task.optimizer](network, config.learning_rate)
     progress = recorder.resume(network, optimizer)
     wait_for_all()  # before one of them writes again
-    sequences, workers = kept_in_memory(split.train, workers)
+    sequences, workers = kept_in_memory(split.train, workers, task.wants_intensity)
     for epoch in range(progress.epoch, config.epochs):
         visits = Visits(sequences, config, seed, epoch)
         order = shuffled(len(visits), seed, epoch)

@@ -119,19 +119,24 @@ class Visits(Dataset[WindowSequence]):
         return seen(sequence, random_view(count, height, width, self.config, generator))
 
 
-def kept_in_memory(dataset: WindowDataset, workers: int) -> tuple[Sequences, int]:
+def kept_in_memory(dataset: WindowDataset, workers: int, intensity: bool) -> tuple[Sequences, int]:
     """The sequences of a dataset, read and encoded beforehand if that takes at most `KEPT` of the free memory.
 
-    Also how many worker processes should read them: none when they are in memory.
+    Also how many worker processes should read them: none when they are in memory. `intensity`: whether it is wanted.
     """
-    bytes_each = sum(tensor.nbytes for tensor in packed(dataset[0])[1:] if tensor is not None)
+    bytes_each = sum(tensor.nbytes for tensor in packed(dataset[0], intensity)[1:] if tensor is not None)
     if bytes_each * len(dataset) > KEPT * psutil.virtual_memory().available:
         return dataset, workers
-    return [packed(dataset[number]) for number in range(len(dataset))], 0
+    return [packed(dataset[number], intensity) for number in range(len(dataset))], 0
 
 
-def packed(sequence: WindowSequence) -> WindowSequence:
-    """The sequence with its inputs as bytes where those hold them exactly: counts of events nearly always."""
+def packed(sequence: WindowSequence, intensity: bool) -> WindowSequence:
+    """The sequence with its inputs as bytes where those hold them exactly: counts of events nearly always.
+
+    Without its intensity, the largest part, where that is not wanted.
+    """
+    if not intensity:
+        sequence = sequence._replace(intensity=sequence.intensity[:0].clone())
     small = sequence.inputs.to(torch.int8)
     return sequence._replace(inputs=small) if torch.equal(small.float(), sequence.inputs) else sequence
 

@@ -49,6 +49,8 @@ class Task:
     loss: FrameLoss
     description: Mapping[str, Any]
     """What a checkpoint says of the network and its input: at least "network", "config" and "in_channels"."""
+    wants_intensity: bool = True
+    """Whether `streams` looks at the intensity; where it does not, sequences in memory are without."""
     optimizer: str = "adam"
     """A key of OPTIMIZERS."""
     scored: Callable[[Tensor], Float[Tensor, "t b h w"]] = lambda frames: frames

@@ -116,7 +116,7 @@ def test_an_epoch_visits_each_sequence_as_often_as_it_should_under_other_views()
 
 def test_a_dataset_in_memory_is_read_once(stores):
     dataset = WindowDataset(EventStore.open(stores[0]), FrameStore.open(stores[1]), ["a", "b"], event_tensor)
-    kept, workers = kept_in_memory(dataset, workers=3)
+    kept, workers = kept_in_memory(dataset, workers=3, intensity=True)
     assert workers == 0
     assert kept[1] is kept[1]
     assert torch.equal(kept[1].inputs, dataset[1].inputs)
@@ -124,7 +124,7 @@ def test_a_dataset_in_memory_is_read_once(stores):
 
 def test_counts_of_events_are_kept_as_bytes_and_seen_as_they_were():
     counts = sequence()._replace(inputs=torch.randint(-128, 128, (3, 8, 6, 8)).float())
-    kept = packed(counts)
+    kept = packed(counts, intensity=True)
     assert kept.inputs.dtype == torch.int8
     assert torch.equal(seen(kept, WHOLE).inputs, counts.inputs)
     assert seen(kept, WHOLE).inputs.dtype == torch.float32
@@ -133,7 +133,7 @@ def test_counts_of_events_are_kept_as_bytes_and_seen_as_they_were():
 @pytest.mark.parametrize("value", [0.5, 128.0, -129.0, 1e9])
 def test_what_bytes_do_not_hold_is_kept_as_it_is(value):
     before = sequence()._replace(inputs=torch.full((3, 8, 6, 8), value))
-    assert packed(before) is before
+    assert packed(before, intensity=True) is before
 
 
 def test_a_crop_larger_than_the_image_is_refused():
