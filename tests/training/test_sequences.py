@@ -136,6 +136,14 @@ def test_what_bytes_do_not_hold_is_kept_as_it_is(value):
     assert packed(before, intensity=True) is before
 
 
+def test_a_sequence_without_its_intensity_is_seen_as_before_otherwise():
+    whole, kept = sequence(), packed(sequence(), intensity=False)
+    batch = stack([seen(kept, WHOLE)] * 2)
+    assert batch.intensity.numel() == 0
+    assert torch.equal(batch.dolp[:, 1], whole.dolp)
+    assert torch.equal(batch.inputs[:, 1], whole.inputs)
+
+
 def test_a_crop_larger_than_the_image_is_refused():
     config = ViewConfig(visits=1, windows=None, crop=[16, 16], symmetries=True)
     with pytest.raises(ValueError, match="at most the 3 windows of 6x8 pixels of the sequences, got 3 of 16x16"):
