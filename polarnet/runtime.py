@@ -4,6 +4,8 @@ import ctypes
 import hashlib
 import os
 import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numba
@@ -14,6 +16,7 @@ from polarnet.ranges import allowed, check_ranges
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
 LARGEST_KEPT = 2**30  # bytes
+LARGEST_MIXED = 2**20  # bytes; larger tensors get memory of their own while others are to stay
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,18 @@ def keep_freed_memory() -> None:
         libc = ctypes.CDLL(None)
         libc.mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT)
         libc.mallopt(M_TRIM_THRESHOLD, LARGEST_KEPT)
+
+
+@contextmanager
+def memory_handed_back() -> Iterator[None]:
+    """Within, glibc hands the memory of large tensors back at once; afterwards it keeps it (`keep_freed_memory`).
+
+    For filling memory with tensors that stay: else they come to lie between holes that nothing fits into.
+    """
+    if platform.libc_ver()[0] == "glibc":
+        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGEST_MIXED)
+    yield
+    keep_freed_memory()
 
 
 def tune() -> None:

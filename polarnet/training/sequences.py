@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from polarnet.events.windows import WindowDataset, WindowSequence
 from polarnet.ranges import allowed, check_ranges
-from polarnet.runtime import generator_for
+from polarnet.runtime import generator_for, memory_handed_back
 
 Sequences = WindowDataset | list[WindowSequence]
 
@@ -127,7 +127,8 @@ def kept_in_memory(dataset: WindowDataset, workers: int, intensity: bool) -> tup
     bytes_each = sum(tensor.nbytes for tensor in packed(dataset[0], intensity)[1:] if tensor is not None)
     if bytes_each * len(dataset) > KEPT * psutil.virtual_memory().available:
         return dataset, workers
-    return [packed(dataset[number], intensity) for number in range(len(dataset))], 0
+    with memory_handed_back():
+        return [packed(dataset[number], intensity) for number in range(len(dataset))], 0
 
 
 def packed(sequence: WindowSequence, intensity: bool) -> WindowSequence:
