@@ -30,8 +30,8 @@ class Choice(NamedTuple):
 
 
 CHOICES = {
-    "shipped": Choice("`experiment=photographs`: two further scenes of each photograph, none evened."),
-    "evened": Choice("Two further scenes, a third of them evened.", ("variation.uniform_share=0.35",)),
+    "shipped": Choice("`experiment=photographs`: three further scenes of each photograph, a third of them evened."),
+    "none_evened": Choice("Three further scenes, none evened.", ("variation.uniform_share=0",)),
 }
 
 
