@@ -16,7 +16,7 @@ import torch
 from polarnet import onnx_export
 from polarnet.cli import main
 from polarnet.config import load
-from polarnet.events.representations import event_stack
+from polarnet.events.representations import event_counts
 from polarnet.events.stream import Events
 from polarnet.networks.checkpoint import load_network, save_checkpoint
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
@@ -34,11 +34,10 @@ CONFIGS = {
         memories=[0.0, 0.5],
         decays=[0.9],
         scales=[1, 3, 0],
-        delay_scales=[0],
         mosaic_scale=5,
     ),
 }
-REPRESENTATIONS = {"paper": "event_tensor", "polarnet": "event_stack"}
+REPRESENTATIONS = {"paper": "event_tensor", "polarnet": "event_counts"}
 
 
 def save_small(name: str, folder: Path) -> Path:
@@ -50,7 +49,7 @@ def save_small(name: str, folder: Path) -> Path:
     metadata = {
         "network": name,
         "config": asdict(config),
-        "in_channels": 4 if name == "paper" else 16,
+        "in_channels": 4 if name == "paper" else 8,
         "representation": REPRESENTATIONS[name],
         "data": {"events_from": {"scenes": {"synthesize": {"frame_rate_hz": 50.0}}}},
     }
@@ -223,9 +222,9 @@ def test_the_lines_on_the_page_run_as_they_stand(of_each, monkeypatch, project_r
     assert len(printed.getvalue().split()) == 2
     assert names["found"]["dolp"].shape == (1, HEIGHT, WIDTH)
 
-    columns = {"t": torch.int64, "x": torch.int16, "y": torch.int16, "polarity": torch.int8}
-    t, x, y, p = (torch.from_numpy(names[name]).to(dtype) for name, dtype in columns.items())
+    columns = zip(("x", "y", "polarity"), (torch.int16, torch.int16, torch.int8), strict=True)
+    x, y, p = (torch.from_numpy(names[name]).to(dtype) for name, dtype in columns)
     of = [torch.from_numpy(names["polarizer"] == number) for number in range(4)]
-    window_us = names["about"]["window_us"]
-    images = [event_stack(Events(t[k], x[k], y[k], p[k], HEIGHT, WIDTH), window_us) for k in of]
+    t = torch.arange(len(x))
+    images = [event_counts(Events(t[k], x[k], y[k], p[k], HEIGHT, WIDTH), 33_333) for k in of]
     assert torch.equal(torch.cat(images), torch.from_numpy(names["events"][0]))

@@ -23,9 +23,9 @@ from tqdm import tqdm
 from polarnet.evaluation.methods import Context, Polarization, Recording, degree, recover
 from polarnet.evaluation.resimulate import recording_at
 from polarnet.evaluation.score import FrameScore, scene_means, score_sequence
-from polarnet.events.representations import REPRESENTATIONS, Encode, event_tensor
+from polarnet.events.representations import REPRESENTATIONS, event_tensor
 from polarnet.events.store import EventStore
-from polarnet.events.stream import Events, since, slice_count
+from polarnet.events.stream import Events, slice_count
 from polarnet.events.streaming import SlidingEventTensor
 from polarnet.similarity import correlation, mse, psnr
 from polarnet.simulation.scenes import SceneStore
@@ -146,7 +146,7 @@ def sliding_recovery(
         if encode is event_tensor:
             images = [move_to_last(w, events, count, t) for w, events in zip(windows, recording.events, strict=True)]
         else:
-            images = _encoded(_last(recording.events, count, t), encode)
+            images = [encode(last, max(1, _length_us(last))) for last in _last(recording.events, count, t)]
         inputs = torch.cat([image.view(-1, *image.shape[-2:]) for image in images])[None].to(context.device)
         with context.autocast():
             prediction, after = network(inputs, state)
@@ -161,11 +161,9 @@ def _last(channels: Sequence[Events], count: int, t_us: int) -> list[Events]:
     return [slice_count(events, max(0, stop - count), stop) for events, stop in zip(channels, stops, strict=True)]
 
 
-def _encoded(channels: Sequence[Events], encode: Encode) -> list[Tensor]:
-    """The channels' events in one window, from the first event of any to the last."""
-    times = torch.cat([events.t[:: max(1, len(events) - 1)] for events in channels])
-    start, stop = (int(times.min()), int(times.max())) if len(times) else (0, 0)
-    return [encode(since(events, start), max(1, stop - start)) for events in channels]
+def _length_us(events: Events) -> int:
+    """From the first event to the last; 0 where there are none."""
+    return int(events.t[-1] - events.t[0]) if len(events) else 0
 
 
 def by_sliding_window(

@@ -36,7 +36,7 @@ from polarnet.events.representations import (
     normalise_nonzero,
     voxel_grid,
 )
-from polarnet.events.stream import Events, since, slice_time
+from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow, SlidingEventTensor
 from polarnet.networks.blocks import Prediction
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
@@ -145,7 +145,7 @@ class WindowRecoverer:
             for tensor, events, first in zip(sliding, window.channels, window.first, strict=True):
                 tensor.move_to(first, events)
             return torch.stack([tensor.tensor(window.length_us) for tensor in sliding])
-        images = [self._encode(since(events, window.start_us), window.length_us) for events in window.channels]
+        images = [self._encode(events, window.length_us) for events in window.channels]
         return torch.cat([image.view(-1, *image.shape[-2:]) for image in images])
 
 

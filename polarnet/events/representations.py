@@ -8,7 +8,6 @@ from torch import Tensor
 
 from polarnet.events.stream import Events
 
-STACKED = 4  # equal parts of a window in `event_stack`
 VOXEL_BINS = 5  # of E2VID (Rebecq et al. 2019) and FireNet
 
 Encode = Callable[[Events, int], Tensor]
@@ -82,18 +81,6 @@ def event_counts(events: Events, window_us: int) -> Float[Tensor, "2 h w"]:
     return images.view(2, events.height, events.width)
 
 
-def event_stack(events: Events, window_us: int) -> Float[Tensor, "4 h w"]:
-    """Per pixel the sum of polarities in each quarter of the window ("stacking based on time", Wang et al. 2019).
-
-    That is the change of log intensity in contrast thresholds, and when it came.
-    """
-    size = events.height * events.width
-    part = (events.t * STACKED // max(1, window_us)).clamp(0, STACKED - 1)
-    images = torch.zeros(STACKED * size, device=events.t.device)
-    images.index_add_(0, part * size + _pixel(events), events.p.float())
-    return images.view(STACKED, events.height, events.width)
-
-
 def voxel_grid_of_window(events: Events, window_us: int) -> Float[Tensor, "bins h w"]:
     """`voxel_grid` in E2VID's 5 bins, which stretch over the events whatever the window's length."""
     return voxel_grid(events, VOXEL_BINS)
@@ -102,14 +89,10 @@ def voxel_grid_of_window(events: Events, window_us: int) -> Float[Tensor, "bins 
 REPRESENTATIONS: dict[str, Encode] = {
     "event_tensor": event_tensor,
     "event_counts": event_counts,
-    "event_stack": event_stack,
     "voxel_grid": voxel_grid_of_window,
     "time_surface": time_surface,
 }
-"""Events of one polarizer in a window of so many microseconds -> an image, or a stack of them.
-
-Their times count from the beginning of the window (`polarnet.events.stream.since`).
-"""
+"""Events of one polarizer in a window of so many microseconds -> an image, or a stack of them."""
 
 
 def channels_of(encode: Encode) -> int:

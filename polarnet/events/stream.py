@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import no_type_check
 
 import numba
@@ -101,11 +101,6 @@ def slice_count(events: Events, start: int, stop: int) -> Events:
         events.height,
         events.width,
     )
-
-
-def since(events: Events, start_us: int) -> Events:
-    """The same events, their times counted from `start_us`."""
-    return replace(events, t=events.t - start_us)
 
 
 def crop(events: Events, top: int, left: int, height: int, width: int) -> Events:

@@ -11,7 +11,7 @@ from torch.utils.data import Dataset
 
 from polarnet.events.frames import FrameStore
 from polarnet.events.representations import Encode
-from polarnet.events.stream import Events, since, slice_count
+from polarnet.events.stream import Events, slice_count
 
 
 @runtime_checkable
@@ -79,15 +79,13 @@ def encode_windows(channels: Sequence[Events], t_us: Int64[Tensor, " n"], encode
     """
     if len(t_us) < 2:
         raise ValueError(f"expected at least two frame times to have a window, got {t_us.tolist()}")
-    spans = windows_of(t_us)
-
-    def encoded(events: Events) -> Tensor:
-        windows = zip(cut_windows(events, t_us), spans, strict=True)
-        return torch.stack([encode(since(window, start), stop - start) for window, (start, stop) in windows])
-
-    per_channel = [encoded(events) for events in channels]
+    lengths = [stop - start for start, stop in windows_of(t_us)]
+    per_channel = [
+        torch.stack([encode(window, length) for window, length in zip(cut_windows(events, t_us), lengths, strict=True)])
+        for events in channels
+    ]
     height, width = per_channel[0].shape[-2:]
-    return torch.cat([images.view(len(spans), -1, height, width) for images in per_channel], dim=1)
+    return torch.cat([images.view(len(lengths), -1, height, width) for images in per_channel], dim=1)
 
 
 class WindowDataset(Dataset[WindowSequence]):

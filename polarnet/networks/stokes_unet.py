@@ -21,7 +21,6 @@ from polarnet.networks.blocks import (
     conv3x3,
     on_blocks,
 )
-from polarnet.networks.delays import DELAYS, Delays, delay_products
 from polarnet.networks.mosaic import Memory, Motion, Picture, certainty, displacements, follow, nothing_seen
 from polarnet.networks.redundancy import (
     MOMENTS,
@@ -36,8 +35,8 @@ from polarnet.networks.redundancy import (
 from polarnet.ranges import allowed, check_ranges
 
 STRIDE = 4  # of the largest image with a recurrent layer
-IMAGES = 4  # of a polarizer's events: sums of polarities in the quarters of a window (representation `event_stack`)
-PARTS = ("redundancy", "delays", "sums", "recurrence", "mosaic")
+IMAGES = 2  # of a polarizer's events: the sum of polarities and their number (representation `event_counts`)
+PARTS = ("redundancy", "sums", "recurrence", "mosaic")
 MIDDLE_DOLP = 0.3  # of the constant that is one more candidate, at the start
 WIDE = (3, 9)  # pixels, of the neighbourhoods that tell fine structure beside a pixel by itself
 MOST_POLARIZED = 0.98  # of 1: keeps atanh finite
@@ -56,8 +55,6 @@ class StokesUNetConfig:
     """Of each sum of second moments: their weight one window later."""
     scales: list[int] = field(metadata=allowed(low=0))
     """Of the neighbourhoods that are solved together, in pixels of a quarter of the size, odd; 0: the whole image."""
-    delay_scales: list[int] = field(metadata=allowed(low=0))
-    """Some of `scales`: of the neighbourhoods whose delays are taken together."""
     reach: int = field(metadata=allowed(low=1))
     """Pixels along each axis within which the scene's motion from window to window is looked for."""
     mosaic_margin: int = field(metadata=allowed(low=1))
@@ -76,9 +73,8 @@ class StokesUNetConfig:
     mosaic_share: float = field(metadata=allowed(low=0.01, high=0.99))
     """What the mosaic weighs where it is certain, at the start of the training: the U-Net learns it for each place."""
     without: list[str]
-    """Some of PARTS, to see what they bring: what the redundancy says (candidates are 0), what delays say, the movement
-    of (s1, s2) by sums of events (their gains are 0), what the recurrent layers hold (they begin anew in each window),
-    the mosaic."""
+    """Some of PARTS, to see what they bring: what the redundancy says (candidates are 0), the movement of (s1, s2) by
+    sums of events (their gains are 0), what the recurrent layers hold (they begin anew in each window), the mosaic."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -86,8 +82,6 @@ class StokesUNetConfig:
             raise ValueError(f"channels, memories, decays, scales: expected at least 3, 1, 1, 1 numbers, got {self}")
         if any(scale and scale % 2 == 0 for scale in self.scales):
             raise ValueError(f"scales: expected odd numbers, or 0 for the whole image, got {self.scales}")
-        if not (self.delay_scales and set(self.delay_scales) <= set(self.scales)):
-            raise ValueError(f"delay_scales: expected some of {self.scales}, the scales, got {self.delay_scales}")
         if self.mosaic_scale % 2 == 0:
             raise ValueError(f"mosaic_scale: expected an odd number, got {self.mosaic_scale}")
         if unknown := set(self.without) - set(PARTS):
@@ -104,21 +98,11 @@ class Candidates(NamedTuple):
     """Weighted number of events they rest on."""
 
 
-class Delayed(NamedTuple):
-    """What delays say for each decay and scale of theirs, at a quarter of the size."""
-
-    s1: Float[Tensor, "n d h w"]
-    s2: Float[Tensor, "n d h w"]
-    logit: Float[Tensor, "n d h w"]
-    """Of how far it is to be believed, before the U-Net has seen it."""
-
-
 class StokesUNet(nn.Module):
     """Events of the four polarizers to DoLP, AoLP and DoLP's expected squared error, with a recurrent state.
 
     The redundancy's candidates for (s1, s2) are mixed by weights that the U-Net chooses at each place, together with a
-    constant, and moved by what delays tell where polarizers do not differ otherwise (`polarnet.networks.delays`):
-    coarse, but on the true scale. Fine structure comes from the events themselves, because e0 - e90 counts
+    constant: coarse, but on the true scale. Fine structure comes from the events themselves, because e0 - e90 counts
     how 2 atanh(s1) has changed at a pixel: (s1, s2) are moved by their sums, times gains that the U-Net chooses too.
     What it adds last, when it has seen the result, is free. DoLP is not the length of (s1, s2): where these are
     uncertain their mean is short, as is a mean over angles. The outputs are linear, as those of the paper's network.
@@ -128,19 +112,18 @@ class StokesUNet(nn.Module):
     sees it and chooses at each place what it weighs.
     """
 
-    representation = "event_stack"
+    representation = "event_counts"
     predicts_stokes = True
     optimizer = "muon"
-    outputs = ("choose", "believe", "gains", "trust", "add")
+    outputs = ("choose", "gains", "trust", "add")
 
     def __init__(self, config: StokesUNetConfig, in_channels: int = 4 * IMAGES):
         super().__init__()
         if in_channels != 4 * IMAGES:
             raise ValueError(
-                f"network=polarnet takes {4 * IMAGES} images (representation event_stack), got {in_channels}"
+                f"network=polarnet takes {4 * IMAGES} images (representation event_counts), got {in_channels}"
             )
         self.memories, self.decays, self.scales = config.memories, config.decays, config.scales
-        self.delay_scales = config.delay_scales
         self.without = frozenset(config.without)
         self.reach, self.margin = config.reach, config.mosaic_margin
         self.memory = Memory(
@@ -148,22 +131,19 @@ class StokesUNet(nn.Module):
         )
         self.step, self.around = config.mosaic_step, config.mosaic_scale
         memories, solved = len(config.memories), len(config.memories) * len(config.decays) * len(config.scales)
-        delays = len(config.decays) * len(config.delay_scales)
         half, quarter, *smaller = config.channels
         self.moments = SecondMoments(memories)
         self.solve = LeastSquares(memories, len(config.decays), len(config.scales))
-        self.delays = Delays(memories, len(config.decays), len(config.delay_scales))
         self.stem = conv3x3(4 * (4 * memories + 1), half)
         self.from_mosaic = nn.Conv2d(5, half, kernel_size=3, padding=1, bias=False)
         self.to_quarter = nn.Conv2d(half, quarter, kernel_size=2, stride=2)
-        self.from_candidates = nn.Conv2d(len(Candidates._fields) * solved + 4 * delays, quarter, kernel_size=1)
+        self.from_candidates = nn.Conv2d(len(Candidates._fields) * solved, quarter, kernel_size=1)
         self.join = conv3x3(quarter, quarter)
         self.gru_quarter = ConvGRU(quarter)
         self.smaller = Level(quarter, smaller)
         self.recurrent = 1 + len(smaller)
         self.at_quarter = ResidualBlock(quarter)
         self.choose = nn.Conv2d(quarter, solved + 1, kernel_size=1)
-        self.believe = nn.Conv2d(quarter, delays, kernel_size=1)
         self.up_half = UpBlock(quarter, half)
         self.at_half = ResidualBlock(half)
         self.gains = nn.Conv2d(half, 4 * (1 + len(WIDE)) * memories, kernel_size=1)
@@ -172,7 +152,7 @@ class StokesUNet(nn.Module):
         self.refine = ResidualBlock(half)
         self.add = nn.Conv2d(half, 4 * 4, kernel_size=1)
         self.constant = nn.Parameter(torch.tensor(MIDDLE_DOLP))
-        for last in (self.choose, self.believe, self.gains, self.add, self.trust):
+        for last in (self.choose, self.gains, self.add, self.trust):
             assert last.bias is not None
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
@@ -180,38 +160,35 @@ class StokesUNet(nn.Module):
         nn.init.constant_(self.trust.bias, math.log(config.mosaic_share / (1 - config.mosaic_share)))
 
     def forward(
-        self, inputs: Float[Tensor, "b 16 h w"], state: list[Tensor] | None = None
+        self, inputs: Float[Tensor, "b 8 h w"], state: list[Tensor] | None = None
     ) -> tuple[Prediction, list[Tensor]]:
         """One window of b streams. `state` is what the window before handed back, None at the start."""
         prediction, state = self.unroll(inputs[None], state)
         return Prediction(*(field[0] for field in prediction if field is not None)), state
 
     def unroll(
-        self, inputs: Float[Tensor, "t b 16 h w"], state: list[Tensor] | None = None
+        self, inputs: Float[Tensor, "t b 8 h w"], state: list[Tensor] | None = None
     ) -> tuple[Prediction, list[Tensor]]:
         """t windows of b streams at once: the same numbers as `forward` window by window, in fewer operations."""
         t, b, _, height, width = inputs.shape
         inputs = F.pad(inputs, (0, -width % STRIDE, 0, -height % STRIDE))  # no events there
-        parts = inputs.unflatten(2, (4, IMAGES))
-        polarity, count = parts.sum(3), parts.abs().sum(3)
+        polarity, count = inputs.unflatten(2, (4, IMAGES)).unbind(3)
         state = state or self.initial_state(inputs[0])
         memories, decays = len(self.memories), len(self.decays)
 
         keep = inputs.new_tensor(self.memories).view(-1, 1, 1, 1)
         summed = faded(polarity.unsqueeze(2), keep, torch.stack(state[:memories], dim=1))  # t, b, memory, polarizer
         events = summed.flatten(0, 1)
-        candidates, solved_from, moments = self._candidates(events, b, state[memories : memories + decays])
-        wide = memories + 2 * decays + 1  # where its state begins
-        delayed, later = self._delayed(parts, solved_from, state[memories + decays : wide])
-        mosaic = wide + len(WIDE)
-        around = _around(polarity, state[wide:mosaic], keep)
+        candidates, moments = self._candidates(events, b, state[memories : memories + decays])
+
+        mosaic = memories + decays + len(WIDE)  # where its state begins
+        around = _around(polarity, state[memories + decays : mosaic], keep)
 
         shown, certain, carried = self._mosaic(polarity, (height, width), state[mosaic : -self.recurrent])
         x2 = on_blocks(self.stem, _images(events, count.flatten(0, 1)))
         x2 = F.relu(x2 + self.from_mosaic(_pattern(shown, certain)))
-        of_moments = [candidates.s1, candidates.s2, candidates.dolp, torch.log1p(candidates.evidence)]
-        of_delays = [delayed.s1, delayed.s2, length(delayed.s1, delayed.s2), torch.sigmoid(delayed.logit)]
-        solved = torch.cat([*of_moments, *of_delays], dim=1).contiguous(memory_format=torch.channels_last)
+        solved = torch.cat([candidates.s1, candidates.s2, candidates.dolp, torch.log1p(candidates.evidence)], dim=1)
+        solved = solved.contiguous(memory_format=torch.channels_last)
         x4 = F.relu(self.join(F.relu(self.to_quarter(x2) + self.from_candidates(solved))))
         recurrent = state[-self.recurrent :]
         began = self._nothing_held(x4) if "recurrence" in self.without else recurrent
@@ -220,7 +197,6 @@ class StokesUNet(nn.Module):
         recurrent = recurrent if "recurrence" in self.without else [held, *others]
         y4 = self.at_quarter(y4)
         mixed = self._mixed(candidates, self.choose(y4).float().softmax(1))
-        mixed = _moved_together(mixed, delayed, self._unless("delays", self._believed(delayed, y4)))
         y2 = self.at_half(self.up_half(y4, skip=x2))
         gains = self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float())
         coarse = F.interpolate(mixed, scale_factor=4, mode="bilinear")
@@ -236,15 +212,12 @@ class StokesUNet(nn.Module):
         maps = [dolp[:, 0], aolp, LOG_VARIANCE + added[:, 3], stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
         carried = [*(sums[-1] for sums in around), *carried]
-        return prediction, [*summed[-1].unbind(1), *moments, *later, *carried, *recurrent]
+        return prediction, [*summed[-1].unbind(1), *moments, *carried, *recurrent]
 
     def _candidates(
         self, events: Float[Tensor, "n m 4 h w"], streams: int, state: list[Tensor]
-    ) -> tuple[Candidates, Float[Tensor, "n m d k 6 h4 w4"], list[Tensor]]:
-        """Also the moments that they are solved from, and the sums of moments to carry on from.
-
-        In float32: the equations are solved by differences.
-        """
+    ) -> tuple[Candidates, list[Tensor]]:
+        """Also the sums of moments to carry on from. In float32: the equations are solved by differences."""
         with torch.autocast(events.device.type, enabled=False):
             windows = self._unless("redundancy", events).split(streams)  # one by one they fit into a core's cache
             moments = torch.stack([self.moments(window, pooled=4).flatten(1, 2) for window in windows]).unsqueeze(2)
@@ -254,28 +227,7 @@ class StokesUNet(nn.Module):
             near = neighbourhoods(sums.flatten(0, 1).flatten(1, 2), self.scales)
             stacked = torch.stack([mean.unflatten(1, shape).transpose(1, 2) for mean in near], dim=3)
             s1, s2, evidence = self.solve(stacked)
-            return Candidates(s1, s2, length(s1, s2), evidence), stacked, [*sums[-1].unbind(1)]
-
-    def _delayed(
-        self, parts: Float[Tensor, "t b 4 s h w"], solved_from: Float[Tensor, "n m d k 6 h4 w4"], state: list[Tensor]
-    ) -> tuple[Delayed, list[Tensor]]:
-        """What delays say, and the last part of the last window and the sums of products to carry on from."""
-        with torch.autocast(parts.device.type, enabled=False):
-            last, products = state[0][None], []
-            for window in parts.movedim(3, 1):  # one by one they fit into a core's cache
-                products.append(delay_products(torch.cat([last, window]), pooled=4))
-                last = window[-1:]
-            keep = parts.new_tensor(self.decays).view(-1, 1, 1, 1)
-            sums = faded(torch.stack(products).unsqueeze(2), keep, torch.stack(state[1:], dim=1))
-            near = neighbourhoods(sums.flatten(0, 1).flatten(1, 2), self.delay_scales)
-            stacked = torch.stack([mean.unflatten(1, (-1, DELAYS)) for mean in near], dim=2)
-            of_scales = [self.scales.index(scale) for scale in self.delay_scales]
-            delayed = Delayed(*self.delays(stacked, solved_from[:, :, :, of_scales]))
-            return delayed, [last[0], *sums[-1].unbind(1)]
-
-    def _believed(self, delayed: Delayed, y4: Float[Tensor, "n c h w"]) -> Float[Tensor, "n d h w"]:
-        """What each of the delays' (s1, s2) moves the mixture by."""
-        return torch.sigmoid(self.believe(y4).float() + delayed.logit) / delayed.logit.shape[1]
+            return Candidates(s1, s2, length(s1, s2), evidence), [*sums[-1].unbind(1)]
 
     @torch.no_grad()
     def _mosaic(
@@ -322,8 +274,8 @@ class StokesUNet(nn.Module):
         return [torch.zeros_like(x4), *self.smaller.initial_states(x4)]
 
     def initial_state(self, inputs: Float[Tensor, "b c h w"]) -> list[Tensor]:
-        """Nothing seen yet: sums of events and of moments, the last quarter window, sums of delays' products, means of
-        sums, the last window's polarities, the mosaic, and what the recurrent layers hold; all zeros.
+        """Nothing seen yet: sums of events and of moments, means of sums, the last window's polarities, the mosaic, and
+        what the recurrent layers hold; all zeros.
 
         Height and width divide by 4.
         """
@@ -331,23 +283,10 @@ class StokesUNet(nn.Module):
         quarter = inputs.new_zeros(b, height // 4, width // 4, self.gru_quarter.channels).permute(0, 3, 1, 2)
         events = [inputs.new_zeros(b, 4, height, width) for _ in self.memories]
         moments = [inputs.new_zeros(b, len(self.memories) * MOMENTS, height // 4, width // 4) for _ in self.decays]
-        delays = [inputs.new_zeros(b, DELAYS, height // 4, width // 4) for _ in self.decays]
-        late = [inputs.new_zeros(b, 4, height, width), *delays]
         wide = [inputs.new_zeros(b, len(self.memories), 2, height, width) for _ in WIDE]
         mosaic = nothing_seen(inputs[:, :4, ::2, ::2], self.margin)
         before = inputs.new_zeros(b, height, width)
-        return [*events, *moments, *late, *wide, before, *mosaic, *self._nothing_held(quarter)]
-
-
-def _moved_together(
-    mixed: Float[Tensor, "n 3 h w"], delayed: Delayed, shares: Float[Tensor, "n d h w"]
-) -> Float[Tensor, "n 3 h w"]:
-    """s1, s2 and DoLP after `shares` of what delays say were added; hypot(s1, s2) <= 1."""
-    before, dolp = mixed.split([2, 1], dim=1)
-    after = before + torch.stack([(shares * delayed.s1).sum(1), (shares * delayed.s2).sum(1)], dim=1)
-    long = length(*after.unbind(1))[:, None]
-    longer = long.clamp(max=1) - length(*before.unbind(1))[:, None]
-    return torch.cat([after / long.clamp(min=1), dolp + longer], dim=1)
+        return [*events, *moments, *wide, before, *mosaic, *self._nothing_held(quarter)]
 
 
 def _around(

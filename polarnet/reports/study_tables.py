@@ -119,7 +119,9 @@ def choices_block(results: Mapping[str, Any]) -> str:
     for name, row in rows.items():
         trainings = "-" if name == "oracle_mean" else len(row["seeds"])
         lines.append(_row(f"{row['about']} | {trainings}", row["seeds"]))
-    return "\n".join([*lines, "", f"Of several trainings the mean ± standard deviation. {origin(record)}"])
+    overrides = " ".join(f"`{override}`" for override in results["choices"]["overrides"])
+    said = f"Trained with {overrides}; of several trainings the mean ± standard deviation. {origin(record)}"
+    return "\n".join([*lines, "", said])
 
 
 def event_budget_block(results: Mapping[str, Any]) -> str:

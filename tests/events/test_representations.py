@@ -11,7 +11,6 @@ from polarnet.events.representations import (
     REPRESENTATIONS,
     channels_of,
     event_counts,
-    event_stack,
     event_tensor,
     normalise_nonzero,
     time_surface,
@@ -35,14 +34,6 @@ def test_event_tensor_does_not_depend_on_when_the_window_opened(make_events):
 def test_event_counts_are_the_net_and_the_total_number_of_events(make_events):
     events = make_events([(1, 0, 0, 1), (2, 0, 0, 1), (3, 0, 0, -1), (4, 2, 1, -1)], 2, 3)
     assert event_counts(events, 50).tolist() == [[[1, 0, 0], [0, 0, -1]], [[3, 0, 0], [0, 0, 1]]]
-
-
-def test_an_event_stack_has_the_net_number_of_events_of_each_quarter_of_the_window(make_events):
-    """Quarters of 100 us begin at 0, 25, 50 and 75."""
-    events = make_events(
-        [(0, 0, 0, 1), (24, 0, 0, 1), (25, 1, 0, -1), (74, 0, 0, 1), (75, 0, 0, 1), (100, 0, 0, 1)], 1, 2
-    )
-    assert event_stack(events, 100).tolist() == [[[2, 0]], [[0, -1]], [[1, 0]], [[2, 0]]]
 
 
 def test_voxel_grid_has_the_first_event_in_the_first_bin_and_the_last_in_the_last(make_events):
@@ -110,8 +101,7 @@ def test_every_representation_of_no_events_is_zero_and_has_its_number_of_channel
     assert image.dtype == torch.float32
     assert image.abs().max() == 0
     assert image.shape == ((channels_of(encode), 4, 6) if image.ndim == 3 else (4, 6))
-    channels = {"event_tensor": 1, "event_counts": 2, "event_stack": 4, "voxel_grid": 5, "time_surface": 1}
-    assert channels_of(encode) == channels[name]
+    assert channels_of(encode) == {"event_tensor": 1, "event_counts": 2, "voxel_grid": 5, "time_surface": 1}[name]
 
 
 @pytest.mark.parametrize("name", REPRESENTATIONS)

@@ -20,7 +20,6 @@ CONFIG = replace(
     memories=[0.0, 0.5],
     decays=[0.7, 0.9],
     scales=[1, 3, 0],
-    delay_scales=[3, 0],
     reach=5,
     mosaic_scale=5,
 )
@@ -29,7 +28,7 @@ CONFIG = replace(
 def network(**changes: Any) -> StokesUNet:
     torch.manual_seed(0)
     built = StokesUNet(replace(CONFIG, **changes))
-    for last in (built.choose, built.believe, built.gains, built.add, built.trust):  # which begin with zeros
+    for last in (built.choose, built.gains, built.add, built.trust):  # which begin with zeros
         torch.nn.init.normal_(last.weight, std=0.1)
     return built.eval()
 
@@ -40,18 +39,19 @@ def events(*shape: int) -> torch.Tensor:
 
 
 def moving_events(windows: int, height: int, width: int) -> torch.Tensor:
-    """Events of a random picture that moves left by three pixels a window: [windows, 1, 16, h, w]."""
+    """Counts of a random picture that moves left by three pixels a window: [windows, 1, 8, h, w]."""
     torch.manual_seed(1)
     picture = torch.randn(1, 4, height // 4, width // 4 + windows)
-    picture = 3 * F.interpolate(picture, scale_factor=(4, 16), mode="bilinear")[0]
-    seen = torch.stack([picture[..., 3 * k : 3 * k + 4 * width : 4] for k in range(4 * windows + 1)])
-    return seen.diff(dim=0).round().unflatten(0, (-1, 4)).transpose(1, 2).flatten(1, 2)[:, None]
+    picture = 3 * F.interpolate(picture, scale_factor=4, mode="bilinear")[0]
+    seen = torch.stack([picture[..., 3 * k : 3 * k + width] for k in range(windows + 1)])
+    polarity = seen.diff(dim=0).round()
+    return torch.stack([polarity, polarity.abs()], dim=2).flatten(1, 2)[:, None]
 
 
 @torch.no_grad()
 def test_any_height_and_width_come_back_with_everything_predicted():
     for height, width in ((16, 24), (17, 22), (120, 180)):
-        prediction, state = network()(events(2, 16, height, width))
+        prediction, state = network()(events(2, 8, height, width))
         assert prediction.aolp is not None
         assert prediction.log_variance is not None
         assert prediction.stokes is not None
@@ -61,12 +61,12 @@ def test_any_height_and_width_come_back_with_everything_predicted():
         assert prediction.stokes.shape == (2, 2, height, width)
         assert prediction.aolp.min() >= 0
         assert prediction.aolp.max() < math.pi
-        assert len(state) == 2 + 2 + 3 + 2 + 4 + 3
+        assert len(state) == 2 + 2 + 2 + 4 + 3
 
 
 @torch.no_grad()
 def test_windows_at_once_are_windows_one_by_one_with_the_state_carried():
-    built, windows = network(), events(5, 2, 16, 18, 20)
+    built, windows = network(), events(5, 2, 8, 18, 20)
     together, last = built.unroll(windows)
     state = None
     for number, window in enumerate(windows):
@@ -78,7 +78,7 @@ def test_windows_at_once_are_windows_one_by_one_with_the_state_carried():
 
 @torch.no_grad()
 def test_streams_of_a_batch_do_not_mix():
-    built, windows = network(), events(2, 3, 16, 16, 24)
+    built, windows = network(), events(2, 3, 8, 16, 24)
     together, _ = built.unroll(windows)
     alone, _ = built.unroll(windows[:, 1:2])
     torch.testing.assert_close(together.dolp[:, 1:2], alone.dolp, atol=1e-4, rtol=1e-4)
@@ -87,7 +87,7 @@ def test_streams_of_a_batch_do_not_mix():
 @torch.no_grad()
 def test_before_training_it_says_the_mean_of_the_candidates_and_of_the_constant():
     torch.manual_seed(0)
-    prediction, _ = StokesUNet(CONFIG)(torch.zeros(1, 16, 16, 16))
+    prediction, _ = StokesUNet(CONFIG)(torch.zeros(1, 8, 16, 16))
     torch.testing.assert_close(prediction.dolp, torch.full((1, 16, 16), 0.3 / 13), atol=1e-5, rtol=0)
 
 
@@ -115,7 +115,7 @@ def test_it_costs_at_most_three_times_what_the_papers_network_costs():
         residual_blocks=2,
         input_mixing="polarizers",
     )
-    assert flops(StokesUNet(SHIPPED).eval(), 16) < 3 * flops(DolpUNet(paper), 4)
+    assert flops(StokesUNet(SHIPPED).eval(), 8) < 3 * flops(DolpUNet(paper), 4)
 
 
 @torch.no_grad()
@@ -127,8 +127,7 @@ def test_each_part_can_be_left_out_and_then_does_nothing():
     assert all((one.dolp - whole.dolp).abs().max() > 1e-3 for one in found.values())
     without["redundancy"].moments.log_mismatch.add_(1)
     without["sums"].gains.weight.add_(1)
-    without["delays"].believe.weight.add_(1)
-    for part in ("redundancy", "sums", "delays"):
+    for part in ("redundancy", "sums"):
         torch.testing.assert_close(without[part].unroll(windows)[0].dolp, found[part].dolp)
     state = [images.clone() for images in network().unroll(windows)[1]]
     _, after = without["recurrence"](windows[0], state)
@@ -137,7 +136,7 @@ def test_each_part_can_be_left_out_and_then_does_nothing():
 
 @torch.no_grad()
 def test_the_mosaic_is_averaged_in_where_the_scene_moves():
-    moving, blinking = moving_events(4, 48, 64), events(4, 1, 16, 48, 64)
+    moving, blinking = moving_events(4, 48, 64), events(4, 1, 8, 48, 64)
     for windows, changes in ((moving, True), (blinking, False)):
         built = network()
         before, _ = built.unroll(windows)
@@ -164,7 +163,7 @@ def test_the_mosaic_gives_the_pattern_and_the_network_the_level():
 
 def test_a_part_that_there_is_not_is_named():
     with pytest.raises(
-        ValueError, match="without: expected some of redundancy, delays, sums, recurrence, mosaic, got attention"
+        ValueError, match="without: expected some of redundancy, sums, recurrence, mosaic, got attention"
     ):
         network(without=["attention"])
 
@@ -174,15 +173,9 @@ def test_a_network_without_an_eighth_of_the_size_is_refused():
         replace(CONFIG, channels=[8, 8])
 
 
-def test_other_input_than_a_stack_of_events_is_refused():
-    with pytest.raises(ValueError, match=r"takes 16 images \(representation event_stack\), got 4"):
+def test_other_input_than_counts_of_events_is_refused():
+    with pytest.raises(ValueError, match=r"takes 8 images \(representation event_counts\), got 4"):
         StokesUNet(CONFIG, 4)
-
-
-def test_delays_are_taken_together_where_moments_are():
-    for scales in ([5], []):
-        with pytest.raises(ValueError, match=r"delay_scales: expected some of \[1, 3, 0\]"):
-            replace(CONFIG, delay_scales=scales)
 
 
 def test_a_neighbourhood_needs_a_middle():
