@@ -114,8 +114,10 @@ def memory_handed_back() -> Iterator[None]:
     """
     if platform.libc_ver()[0] == "glibc":
         ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGEST_MIXED)
-    yield
-    keep_freed_memory()
+    try:
+        yield
+    finally:
+        keep_freed_memory()
 
 
 def tune() -> None:
