@@ -10,6 +10,8 @@ C = -s1 A + s2 B, one linear equation a pixel, in which S0 and the unknown const
 Least squares over neighbours and past windows gives s1 and s2. Events are e_k up to noise: the pixels' thresholds
 differ and changes come in whole steps, which biases the second moments that least squares needs ("errors in
 variables"). `SecondMoments` takes the expected bias out again; what it takes, and how pixels are weighed, is learnt.
+
+The same holds for changes from place to place where there is a picture of each log I_k: `SlopeMoments`.
 """
 
 from collections.abc import Iterable, Sequence
@@ -68,6 +70,33 @@ class SecondMoments(nn.Module):
         aa, ab, bb, ac, bc = (block_means(product, pooled) for product in (wa * a, wa * b, wb * b, wa * c, wb * c))
         moments = [aa - v0 - v90, ab, bb - v45 - v135, ac - v0 + v90, bc + v45 - v135, mean_steps.sum(2)]
         return torch.stack(moments, dim=2)
+
+
+class SlopeMoments(nn.Module):
+    """Products of the differences between neighbouring pixels of pictures of A, B and C.
+
+    What holds for changes in time holds for changes from place to place. How strongly a place's weight falls with its
+    energy is learnt: pictures are wrong by most at edges.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.log_activity = nn.Parameter(torch.tensor(-2.3))
+
+    def forward(self, pictures: Float[Tensor, "n 4 h w"]) -> Float[Tensor, "n 7 h/2 w/2"]:
+        """Of a mean, A, B and C in events: `MOMENTS`, the last of them the weight, and then the weighted energy.
+
+        Means over blocks of 2 x 2 pixels.
+        """
+        right = F.pad(pictures[..., 1:] - pictures[..., :-1], (0, 1))
+        down = F.pad(pictures[..., 1:, :] - pictures[..., :-1, :], (0, 0, 0, 1))
+        slopes = torch.stack([right, down], dim=1)
+        energy = slopes.square().sum(2)
+        weight = 1 / (1 + self.log_activity.exp() * energy)
+        _, a, b, c = slopes.unbind(2)
+        wa, wb = weight * a, weight * b
+        moments = torch.stack([wa * a, wa * b, wb * b, wa * c, wb * c, weight, weight * energy], dim=2)
+        return block_means(moments.sum(1), 2)
 
 
 class LeastSquares(nn.Module):

@@ -26,6 +26,7 @@ from polarnet.networks.redundancy import (
     MOMENTS,
     LeastSquares,
     SecondMoments,
+    SlopeMoments,
     block_means,
     box_means,
     faded,
@@ -36,7 +37,7 @@ from polarnet.ranges import allowed, check_ranges
 
 STRIDE = 4  # of the largest image with a recurrent layer
 IMAGES = 2  # of a polarizer's events: the sum of polarities and their number (representation `event_counts`)
-PARTS = ("redundancy", "sums", "recurrence", "mosaic")
+PARTS = ("redundancy", "slopes", "sums", "recurrence", "mosaic")
 MIDDLE_DOLP = 0.3  # of the constant that is one more candidate, at the start
 WIDE = (3, 9)  # pixels, of the neighbourhoods that tell fine structure beside a pixel by itself
 MOST_POLARIZED = 0.98  # of 1: keeps atanh finite
@@ -73,8 +74,9 @@ class StokesUNetConfig:
     mosaic_share: float = field(metadata=allowed(low=0.01, high=0.99))
     """What the mosaic weighs where it is certain, at the start of the training: the U-Net learns it for each place."""
     without: list[str]
-    """Some of PARTS, to see what they bring: what the redundancy says (candidates are 0), the movement of (s1, s2) by
-    sums of events (their gains are 0), what the recurrent layers hold (they begin anew in each window), the mosaic."""
+    """Some of PARTS, to see what they bring: what the redundancy says (candidates are 0), what it says of the mosaic's
+    slopes alone, the movement of (s1, s2) by sums of events (their gains are 0), what the recurrent layers hold (they
+    begin anew in each window), the mosaic."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -89,22 +91,23 @@ class StokesUNetConfig:
 
 
 class Candidates(NamedTuple):
-    """What least squares makes of each memory, decay and scale, at a quarter of the size."""
+    """What least squares makes of each memory, decay and scale, and of the mosaic at each scale, at a quarter of the
+    size."""
 
     s1: Float[Tensor, "n c h w"]
     s2: Float[Tensor, "n c h w"]
     dolp: Float[Tensor, "n c h w"]
     evidence: Float[Tensor, "n c h w"]
-    """Weighted number of events they rest on."""
+    """Weighted number of events they rest on; of the mosaic, weighted energy of its slopes."""
 
 
 class StokesUNet(nn.Module):
     """Events of the four polarizers to DoLP, AoLP and DoLP's expected squared error, with a recurrent state.
 
-    The redundancy's candidates for (s1, s2) are mixed by weights that the U-Net chooses at each place, together with a
-    constant: coarse, but on the true scale. Fine structure comes from the events themselves, because e0 - e90 counts
-    how 2 atanh(s1) has changed at a pixel: (s1, s2) are moved by their sums, times gains that the U-Net chooses too.
-    What it adds last, when it has seen the result, is free. DoLP is not the length of (s1, s2): where these are
+    The redundancy's candidates for (s1, s2), from changes in time and from the mosaic's slopes, are mixed by weights
+    that the U-Net chooses at each place, together with a constant: coarse, but on the true scale. Fine structure comes
+    from the events themselves, because e0 - e90 counts how 2 atanh(s1) has changed at a pixel: (s1, s2) are moved by
+    their sums, times gains that the U-Net chooses too. What it adds last, when it has seen the result, is free. DoLP is not the length of (s1, s2): where these are
     uncertain their mean is short, as is a mean over angles. The outputs are linear, as those of the paper's network.
 
     Before that last addition the result is averaged with what the mosaic shows (`polarnet.networks.mosaic`), whose
@@ -130,10 +133,13 @@ class StokesUNet(nn.Module):
             config.mosaic_prior, config.mosaic_noise, config.mosaic_drift, config.mosaic_renewal, config.mosaic_fade
         )
         self.step, self.around = config.mosaic_step, config.mosaic_scale
-        memories, solved = len(config.memories), len(config.memories) * len(config.decays) * len(config.scales)
+        memories, scales = len(config.memories), len(config.scales)
+        solved = (memories * len(config.decays) + 1) * scales
         half, quarter, *smaller = config.channels
         self.moments = SecondMoments(memories)
-        self.solve = LeastSquares(memories, len(config.decays), len(config.scales))
+        self.solve = LeastSquares(memories, len(config.decays), scales)
+        self.slopes = SlopeMoments()
+        self.solve_slopes = LeastSquares(1, 1, scales)
         self.stem = conv3x3(4 * (4 * memories + 1), half)
         self.from_mosaic = nn.Conv2d(5, half, kernel_size=3, padding=1, bias=False)
         self.to_quarter = nn.Conv2d(half, quarter, kernel_size=2, stride=2)
@@ -179,12 +185,14 @@ class StokesUNet(nn.Module):
         keep = inputs.new_tensor(self.memories).view(-1, 1, 1, 1)
         summed = faded(polarity.unsqueeze(2), keep, torch.stack(state[:memories], dim=1))  # t, b, memory, polarizer
         events = summed.flatten(0, 1)
-        candidates, moments = self._candidates(events, b, state[memories : memories + decays])
+        of_events, moments = self._candidates(events, b, state[memories : memories + decays])
 
         mosaic = memories + decays + len(WIDE)  # where its state begins
         around = _around(polarity, state[memories + decays : mosaic], keep)
 
         shown, certain, carried = self._mosaic(polarity, (height, width), state[mosaic : -self.recurrent])
+        of_slopes = self._of_slopes(shown)
+        candidates = Candidates(*(torch.cat(pair, dim=1) for pair in zip(of_events, of_slopes, strict=True)))
         x2 = on_blocks(self.stem, _images(events, count.flatten(0, 1)))
         x2 = F.relu(x2 + self.from_mosaic(_pattern(shown, certain)))
         solved = torch.cat([candidates.s1, candidates.s2, candidates.dolp, torch.log1p(candidates.evidence)], dim=1)
@@ -228,6 +236,15 @@ class StokesUNet(nn.Module):
             stacked = torch.stack([mean.unflatten(1, shape).transpose(1, 2) for mean in near], dim=3)
             s1, s2, evidence = self.solve(stacked)
             return Candidates(s1, s2, length(s1, s2), evidence), [*sums[-1].unbind(1)]
+
+    def _of_slopes(self, shown: Float[Tensor, "n 4 h w"]) -> Candidates:
+        """What the mosaic's differences from pixel to pixel say, at a quarter of the size."""
+        with torch.autocast(shown.device.type, enabled=False):
+            pictures = self._unless("redundancy", self._unless("slopes", 2 / self.step * shown))
+            moments = self.slopes(pictures)
+            stacked = torch.stack([*neighbourhoods(moments, self.scales)], dim=1)
+            s1, s2, _ = self.solve_slopes(stacked[:, None, None, :, :-1])
+            return Candidates(s1, s2, length(s1, s2), stacked[:, :, -1])
 
     @torch.no_grad()
     def _mosaic(

@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from polarnet.networks.redundancy import MOMENTS, LeastSquares, SecondMoments, faded, neighbourhoods
+from polarnet.networks.blocks import contrasts
+from polarnet.networks.redundancy import MOMENTS, LeastSquares, SecondMoments, SlopeMoments, faded, neighbourhoods
 from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
 
 
@@ -33,6 +34,32 @@ def test_polarization_follows_from_small_changes_of_the_logarithms_alone(dolp, a
     s1, s2, _ = solve(moments.mean((-1, -2), keepdim=True)[:, :, None, None])
     assert s1.item() == pytest.approx(dolp * math.cos(2 * aolp), abs=0.02)
     assert s2.item() == pytest.approx(dolp * math.sin(2 * aolp), abs=0.02)
+
+
+@pytest.mark.parametrize(("dolp", "aolp"), [(0.6, 0.3), (0.3, 2.0), (0.8, 1.2)])
+@torch.no_grad()
+def test_polarization_follows_from_a_pictures_slopes_but_for_its_constants(dolp, aolp):
+    torch.manual_seed(0)
+    s0, degree, angle = torch.tensor([0.5, dolp, aolp]).double().view(3, 1, 1) + 1e-3 * torch.randn(3, 20, 30)
+    logs = intensities_from_stokes(stokes_from_polarization(s0, degree, angle)).log() + torch.randn(4, 1, 1)
+    moments = SlopeMoments()(1e3 * contrasts(logs.float()[None]))
+    solve = LeastSquares(1, 1, 1)
+    solve.log_ridge.fill_(-torch.inf)
+    s1, s2, _ = solve(moments[:, None, None, None, :-1].mean((-1, -2), keepdim=True))
+    assert s1.item() == pytest.approx(dolp * math.cos(2 * aolp), abs=0.02)
+    assert s2.item() == pytest.approx(dolp * math.sin(2 * aolp), abs=0.02)
+
+
+@torch.no_grad()
+def test_moments_of_slopes_by_hand():
+    moments = SlopeMoments()
+    moments.log_activity.fill_(math.log(0.5))
+    picture = torch.zeros(1, 4, 2, 2)
+    picture[0, :, :, 1] = torch.tensor([1.0, 2.0, -1.0, 3.0]).view(4, 1)  # in both rows; nothing changes downwards
+    weight = 1 / (1 + 0.5 * 15)  # of two of eight slopes of a block; the others' are 0 and weigh 1
+    products = torch.tensor([4.0, -2, 1, 6, -3, 1, 15]) * weight * 2
+    expected = (products + torch.tensor([0.0, 0, 0, 0, 0, 6, 0])) / 4
+    torch.testing.assert_close(moments(picture).flatten(), expected)
 
 
 @torch.no_grad()

@@ -88,7 +88,7 @@ def test_streams_of_a_batch_do_not_mix():
 def test_before_training_it_says_the_mean_of_the_candidates_and_of_the_constant():
     torch.manual_seed(0)
     prediction, _ = StokesUNet(CONFIG)(torch.zeros(1, 8, 16, 16))
-    torch.testing.assert_close(prediction.dolp, torch.full((1, 16, 16), 0.3 / 13), atol=1e-5, rtol=0)
+    torch.testing.assert_close(prediction.dolp, torch.full((1, 16, 16), 0.3 / 16), atol=1e-5, rtol=0)
 
 
 def test_every_parameter_has_a_gradient_from_a_few_windows():
@@ -126,8 +126,9 @@ def test_each_part_can_be_left_out_and_then_does_nothing():
     found = {part: built.unroll(windows)[0] for part, built in without.items()}
     assert all((one.dolp - whole.dolp).abs().max() > 1e-3 for one in found.values())
     without["redundancy"].moments.log_mismatch.add_(1)
+    without["slopes"].slopes.log_activity.add_(1)
     without["sums"].gains.weight.add_(1)
-    for part in ("redundancy", "sums"):
+    for part in ("redundancy", "slopes", "sums"):
         torch.testing.assert_close(without[part].unroll(windows)[0].dolp, found[part].dolp)
     state = [images.clone() for images in network().unroll(windows)[1]]
     _, after = without["recurrence"](windows[0], state)
@@ -163,7 +164,7 @@ def test_the_mosaic_gives_the_pattern_and_the_network_the_level():
 
 def test_a_part_that_there_is_not_is_named():
     with pytest.raises(
-        ValueError, match="without: expected some of redundancy, sums, recurrence, mosaic, got attention"
+        ValueError, match="without: expected some of redundancy, slopes, sums, recurrence, mosaic, got attention"
     ):
         network(without=["attention"])
 
