@@ -12,7 +12,13 @@ from typing import Any
 
 from polarnet.reports.provenance import cores, measured_with, origin
 from polarnet.reports.recording_tables import recordings_block, recover_block
-from polarnet.reports.study_tables import ablation_block, choices_block, event_budget_block, study_block
+from polarnet.reports.study_tables import (
+    ablation_block,
+    choices_block,
+    designs_block,
+    event_budget_block,
+    study_block,
+)
 from polarnet.reports.tables import (
     COLUMNS,
     COSTS,
@@ -191,6 +197,7 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "network-seed_1": study_block,
     "network-ablation": ablation_block,
     "scenes-choices": choices_block,
+    "designs-rows": designs_block,
     "event_budget-budget": event_budget_block,
     "network-throughput": throughput_block,
 }
@@ -204,6 +211,7 @@ UNMEASURED = {
     "event_budget-budget": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "network-seed_1": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "network-ablation": "Not measured yet: the sweep above and `polarnet measure ablation --sweep FOLDER` do it.",
+    "designs-rows": "Not collected yet: `python tests/benchmarks/designs.py` does it.",
     "scenes-choices": "Not measured yet: `python tests/benchmarks/scenes.py --write` does it.",
     "network-throughput": "Not measured yet: `python tests/benchmarks/training.py --write` does it.",
 }

@@ -108,6 +108,21 @@ def ablation_block(results: Mapping[str, Any]) -> str:
     return "\n".join([*lines, "", f"One training each, {overrides or 'without further overrides'}. {origin(record)}"])
 
 
+def designs_block(results: Mapping[str, Any]) -> str:
+    """What was tried before today's network, in the order it was, each against the oracle mean.
+
+    `results` is docs/results/designs.json; tests/benchmarks/designs.py collects it.
+    """
+    lines = ["| | trainings | over the oracle mean ↓ | " + " | ".join(label for _, label, _ in STUDY_COLUMNS)]
+    lines[0] += " | measured MSE ↓ | commit |"
+    lines.append("|---|---:|---:" + "|---:" * len(STUDY_COLUMNS) + "|---:|---|")
+    for row in results["rows"]["designs"]:
+        trainings, ratio = len(row["seeds"]), fmean(row["mse_over_oracle_mean"])
+        line = _row(f"{row['about']} | {trainings} | {ratio:.3f}", row["seeds"])
+        lines.append(f"{line} {fmean(row['measured_mse']):.4f} | `{row['commit']}` |")
+    return "\n".join(lines)
+
+
 def choices_block(results: Mapping[str, Any]) -> str:
     """Scenes to train on, compared without the test split by tests/benchmarks/scenes.py.
 

@@ -36,7 +36,7 @@ class VariationConfig:
     s0_factor: list[float] = field(metadata=allowed(above=0, high=1))
     s0_exponent_spread: float = field(metadata=allowed(low=0))
     uniform_share: float = field(metadata=allowed(low=0, high=1))
-    """Of them whose polarization is drawn towards that of one of their points, the same everywhere ..."""
+    """Of them whose polarization is drawn towards one of any degree and angle, the same everywhere ..."""
     uniform_weight: list[float] = field(metadata=allowed(low=0, high=1))
     """... by a weight between these two; 1: DoLP and AoLP are constant."""
 
@@ -68,15 +68,10 @@ def varied(
 def _evened(
     dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"], weight: list[float], generator: np.random.Generator
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """DoLP and AoLP of a mean of the scene's own S1 / S0, S2 / S0 and those of one of its points.
-
-    So evened scenes are as polarized as scenes are: where events do not tell DoLP, a network answers with the mean of
-    what it has seen.
-    """
+    """DoLP and AoLP of a mean of the scene's own S1 / S0, S2 / S0 and a constant."""
     lightest, heaviest = weight
     share = generator.uniform(lightest, heaviest)
-    row, column = generator.integers(dolp.shape[0]), generator.integers(dolp.shape[1])
-    degree, angle = float(dolp[row, column]), float(aolp[row, column])
+    degree, angle = generator.uniform(0, GREATEST_DOLP), generator.uniform(0, math.pi)
     mean = stokes.stokes_from_polarization(torch.ones_like(dolp), (1 - share) * dolp, aolp)
     mean[1] += share * degree * math.cos(2 * angle)
     mean[2] += share * degree * math.sin(2 * angle)

@@ -5,7 +5,13 @@ import pytest
 from polarnet.measure import BENCHMARK_KEYS
 from polarnet.reports.readme import benchmark_block, update_results_blocks
 from polarnet.reports.recording_tables import recordings_block, recover_block
-from polarnet.reports.study_tables import ablation_block, choices_block, event_budget_block, study_block
+from polarnet.reports.study_tables import (
+    ablation_block,
+    choices_block,
+    designs_block,
+    event_budget_block,
+    study_block,
+)
 
 RESULTS = {
     "setup_minutes": 1.5,
@@ -253,6 +259,31 @@ def test_the_speed_of_recover_is_shown_method_by_method():
     assert "| network `x` | 1.23 | 21.8 | 40 |" in block
     assert "| `highpass+gain` | 2.00 | 9.0 | - |" in block
     assert "On 2 cores (a processor" in block
+
+
+def test_designs_stand_in_the_order_they_were_tried_with_the_commit_of_their_figures():
+    scores = {
+        "mse": 0.04,
+        "level_mse": 0.03,
+        "pattern_mse": 0.01,
+        "psnr": 14.0,
+        "ssim": 0.5,
+        "corr": 0.6,
+        "aolp_deg": 15.0,
+    }
+    found = [
+        {"about": "First.", "commit": "a1", "seeds": [scores], "mse_over_oracle_mean": [1.3], "measured_mse": [0.02]},
+        {
+            "about": "Second.", "commit": "b2", "seeds": [scores, scores | {"mse": 0.02}],
+            "mse_over_oracle_mean": [1.3, 1.1], "measured_mse": [0.02, 0.03],
+        },
+    ]  # fmt: skip
+    lines = designs_block({"rows": {"designs": found}}).splitlines()
+    assert lines[2].startswith("| First. | 1 | 1.300 | 0.0400 | 0.0300 |")
+    assert lines[2].endswith("| 0.0200 | `a1` |")
+    assert lines[3].startswith("| Second. | 2 | 1.200 | 0.0300 ± 0.0141 |")
+    assert lines[3].endswith("| 0.0250 | `b2` |")
+    assert len({line.count("|") for line in lines}) == 1
 
 
 def test_the_rig_is_shown_with_its_errors_and_its_benchmark():
