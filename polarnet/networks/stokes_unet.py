@@ -107,8 +107,9 @@ class StokesUNet(nn.Module):
     The redundancy's candidates for (s1, s2), from changes in time and from the mosaic's slopes, are mixed by weights
     that the U-Net chooses at each place, together with a constant: coarse, but on the true scale. Fine structure comes
     from the events themselves, because e0 - e90 counts how 2 atanh(s1) has changed at a pixel: (s1, s2) are moved by
-    their sums, times gains that the U-Net chooses too. What it adds last, when it has seen the result, is free. DoLP is not the length of (s1, s2): where these are
-    uncertain their mean is short, as is a mean over angles. The outputs are linear, as those of the paper's network.
+    their sums, times gains that the U-Net chooses too. What it adds last, when it has seen the result, is free. DoLP is
+    not the length of (s1, s2): where these are uncertain their mean is short, as is a mean over angles. The outputs are
+    linear, as those of the paper's network.
 
     Before that last addition the result is averaged with what the mosaic shows (`polarnet.networks.mosaic`), whose
     unknown constants are chosen to suit the result around each place. The mosaic itself has nothing to learn; the U-Net

@@ -1,4 +1,4 @@
-"""What the designs of the network scored on the way, from the figures of each commit: python tests/benchmarks/designs.py
+"""What the designs of the network scored on the way: python tests/benchmarks/designs.py
 
 Nothing is measured here. docs/results/network.json was written at each of these commits by `tests/benchmarks/study.py
 --write`, which trained and scored the network of its day on the same photographs; git still has it. Writes
@@ -47,11 +47,12 @@ def main() -> None:
         results = json.loads(git(ROOT, "show", f"{design.commit}:docs/results/network.json"))
         commit = git(ROOT, "rev-parse", "--short=10", design.commit)
         found = [results[section]["rows"] for section in design.sections]
+        simulated = [one["simulated"] for one in found]
         rows.append({
             "about": design.about,
             "commit": commit,
-            "seeds": [{key: one["simulated"]["ours"][key] for key in KEPT} for one in found],
-            "mse_over_oracle_mean": [one["simulated"]["ours"]["mse"] / one["simulated"]["oracle_mean"]["mse"] for one in found],
+            "seeds": [{key: one["ours"][key] for key in KEPT} for one in simulated],
+            "mse_over_oracle_mean": [one["ours"]["mse"] / one["oracle_mean"]["mse"] for one in simulated],
             "measured_mse": [one["measured"]["ours"]["mse"] for one in found],
         })  # fmt: skip
     print(write_section(ROOT, "designs", "rows", {"designs": rows}, machine_record(ROOT)))
