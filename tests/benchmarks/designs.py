@@ -9,11 +9,10 @@ import json
 from pathlib import Path
 from typing import NamedTuple
 
-from polarnet.measure import machine_record, write_section
+from polarnet.measure import ABLATION_KEYS, machine_record, write_section
 from polarnet.reports.provenance import git
 
 ROOT = Path(__file__).resolve().parents[2]
-KEPT = ("mse", "level_mse", "pattern_mse", "psnr", "ssim", "corr", "aolp_deg")
 
 
 class Design(NamedTuple):
@@ -51,7 +50,7 @@ def main() -> None:
         rows.append({
             "about": design.about,
             "commit": commit,
-            "seeds": [{key: one["ours"][key] for key in KEPT} for one in simulated],
+            "seeds": [{key: one["ours"][key] for key in ABLATION_KEYS} for one in simulated],
             "mse_over_oracle_mean": [one["ours"]["mse"] / one["oracle_mean"]["mse"] for one in simulated],
             "measured_mse": [one["measured"]["ours"]["mse"] for one in found],
         })  # fmt: skip

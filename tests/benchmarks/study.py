@@ -23,7 +23,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from polarnet.measure import machine_record, measure_benchmark, read_results, uncommitted, write_section
+from polarnet.measure import ABLATION_KEYS, machine_record, measure_benchmark, read_results, uncommitted, write_section
 from polarnet.reports.study_tables import best_reconstruction, over_seeds, seeds_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,8 +37,6 @@ TRAININGS: dict[str, tuple[str, ...]] = {
 """Row of the table: the stage that trains its network, and what makes the stage train this one."""
 SOLVED = [f"{row}{gain}" for row in ("cf", "highpass", "firenet_published", "firenet") for gain in ("", "+gain")]
 METHODS = ["zeros", "train_mean", "oracle_mean", *SOLVED, "e2vid", "e2p", "paper", "ours"]
-KEPT = ("mse", "level_mse", "pattern_mse", "psnr", "ssim", "corr", "aolp_deg")
-"""Of the rows in network.json; all figures are in benchmark.json."""
 BUDGET_SEQUENCES = 6
 BUDGET_METHODS = ("oracle_mean", "highpass+gain", "ours")
 
@@ -156,7 +154,7 @@ def main() -> None:
         "overrides": arguments.override,
         **headlines(tables),
         "rows": {
-            name: {row: {key: scores.get(key) for key in KEPT} for row, scores in table.items()}
+            name: {row: {key: scores.get(key) for key in ABLATION_KEYS} for row, scores in table.items()}
             for name, table in tables.items()
         },
     }
