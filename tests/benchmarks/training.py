@@ -10,7 +10,7 @@ and inputs are random. Every network of `params.yaml` that there is a class for 
 - `compiled` (with --compile): `shipped` through torch.compile, which needs a C++ compiler.
 
 Each is measured in a process of its own, in turns; figures are medians over the turns. `peak_gflop_per_s` is what the
-same threads reach in a float32 matrix product. torch.profiler's table is that of the last turn.
+same threads reach in a matrix product of the setting's precision. torch.profiler's table is that of the last turn.
 
 `--write` merges the figures into docs/results/network.json: the section `throughput` and the headline figures
 `train_speedup_over_eager_fp32` and `infer_windows_per_s` of `paper`, and `ours.infer_windows_per_s` of `polarnet`.
@@ -113,7 +113,7 @@ def measure_one(name: str, setting: str, threads: int, device_name: str) -> dict
     torch.use_deterministic_algorithms(False)  # which `configure` asks for, and `recover` does not
     figures["infer_windows_per_s"] = STREAMED / seconds_of(infer, device)
     figures["infer_profile"] = profile_of(infer)
-    figures["peak_gflop_per_s"] = peak_gflop_per_s(device)
+    figures["peak_gflop_per_s"] = peak_gflop_per_s(precision, device)
     return figures
 
 
@@ -139,9 +139,10 @@ def profile_of(run: Callable[[], None]) -> dict[str, float]:
     return {name: round(100 * times[name] / total, 1) for name in longest}
 
 
-def peak_gflop_per_s(device: torch.device) -> float:
-    """What a float32 product of large matrices reaches here."""
-    a, b = torch.randn(2, MATRIX, MATRIX, device=device)
+def peak_gflop_per_s(precision: str, device: torch.device) -> float:
+    """What a product of large matrices of a precision reaches here."""
+    dtype = torch.bfloat16 if precision == "bf16" else torch.float32
+    a, b = torch.randn(2, MATRIX, MATRIX, dtype=dtype, device=device)
     return 2 * MATRIX**3 / seconds_of(lambda: torch.mm(a, b), device) / 1e9
 
 

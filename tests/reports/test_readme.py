@@ -312,5 +312,5 @@ def test_a_section_of_a_results_file_has_a_block_of_its_own(project):
     file.write_text(json.dumps({"throughput": throughput, "records": {"throughput": RESULTS}}))
     update_results_blocks(project, check=False)
     text = (project / "docs" / "training.md").read_text()
-    assert "| `paper` | shipped | fp32 | 2.00 | 5.00 | 10.00 | 60 % | 50 % |" in text
+    assert "| `paper` | shipped | fp32 | 2.00 | 5.00 | 10.00 | 60 % | 50 % | 10 |" in text
     assert "| `paper`, naive, train | aten::mm 60 |" in text
