@@ -7,7 +7,8 @@ and inputs are random. Every network of `params.yaml` that there is a class for 
 - `naive`: float32, images as torch makes them (contiguous NCHW), a window at a time, torch as it starts;
 - `shipped`: channels_last, a run of windows at once, `train.precision`'s `auto`; in training with the settings of
   `polarnet.runtime.configure`, as in stages; in inference as many windows as `polarnet recover` takes from a file;
-- `compiled` (with --compile): `shipped` through torch.compile, which needs a C++ compiler.
+- `compiled` (with --compile): `shipped` through torch.compile, which needs a C++ compiler; a network that it fails for
+  has no such row.
 
 Each is measured in a process of its own, in turns; figures are medians over the turns. `peak_gflop_per_s` is what the
 same threads reach in a matrix product of the setting's precision. torch.profiler's table is that of the last turn.
@@ -161,8 +162,15 @@ def measure(names: list[str], settings: list[str], rounds: int, threads: int, de
     for name in names:
         turns: dict[str, list[dict[str, Any]]] = {setting: [] for setting in settings}
         for _ in range(rounds):
-            for setting in settings:
-                one = in_own_process(name, setting, threads, device)
+            for setting in list(turns):
+                try:
+                    one = in_own_process(name, setting, threads, device)
+                except subprocess.CalledProcessError:
+                    if setting != "compiled":
+                        raise
+                    print(f"{name:10s} left out: torch.compile failed, see above", flush=True)
+                    del turns[setting]
+                    continue
                 turns[setting].append(one)
                 print(f"{name:10s} {setting:9s}", *(f"{key} {one[key]:.2f}" for key in MEASURED), flush=True)
         rows = {}
