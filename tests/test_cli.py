@@ -163,7 +163,7 @@ def test_a_run_with_another_sensor_has_a_folder_of_its_own(project_root, monkeyp
         calls.append(command)
         return subprocess.CompletedProcess(command, 0)
 
-    monkeypatch.setattr("polarnet.cli.subprocess.run", ran)
+    monkeypatch.setattr("polarnet.cli.project.subprocess.run", ran)
     monkeypatch.chdir(project_root)
     assert main(["run", "experiment=smoke", "sensor=noisy"]) == 0
     assert calls[0][2:] == ["stages.ingest", "experiment=smoke", "sensor=noisy", "paths.data=outputs/run/smoke-noisy"]

@@ -1,0 +1,29 @@
+"""The `polarnet` command. Each subcommand is thin: the library does the work, and is imported when it is needed."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from polarnet import __version__
+from polarnet.cli import benchmark, networks, project, recordings, stores
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; the exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(options)
+    except (ValueError, FileNotFoundError, RuntimeError) as error:
+        print(f"polarnet {options.command}: {error}", file=sys.stderr)
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="polarnet", description="DoLP from event cameras: simulate, train, benchmark. `dvc repro` runs it all."
+    )
+    parser.add_argument("--version", action="version", version=f"polarnet {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for subject in (project, stores, recordings, networks, benchmark):
+        subject.add_to(commands)
+    return parser

@@ -1,0 +1,82 @@
+"""Command that scores methods: on your own scenes, and in the studies of the pipeline's test sequences."""
+
+import argparse
+import contextlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from polarnet.cli.parsers import Commands
+from polarnet.cli.project import project_root
+
+if TYPE_CHECKING:
+    from polarnet.config import Config
+
+
+def add_to(commands: Commands) -> None:
+    """Its commands."""
+    benchmark = commands.add_parser(
+        "benchmark",
+        help="every method on your own photographs or measured scenes; the event budget; the sensitivity",
+        description="--scenes makes event sequences of a folder, runs every method that has its weights, prints the "
+        "table and writes it with a page; nothing is trained. The other two study the pipeline's own test sequences. "
+        "Sizes, motion and sensor are those of params.yaml.",
+    )
+    asked = benchmark.add_mutually_exclusive_group(required=True)
+    asked.add_argument("--scenes", type=Path, metavar="FOLDER", help="photographs or measurements, in all subfolders")
+    asked.add_argument("--event-budget", action="store_true", help="quality against events per pixel (paper, Fig. 11)")
+    asked.add_argument("--sensitivity", action="store_true", help="quality against mismatch, noise, speed, channels")
+    benchmark.add_argument(
+        "--weights", type=Path, metavar="FILE", help="of the network; default: trained here, or shipped"
+    )
+    benchmark.add_argument(
+        "--kind", choices=("auto", "photographs", "polarization"), default="auto",
+        help="what lies in FOLDER; auto takes .npz files and NAME_0, NAME_45, ... for measured polarization",
+    )  # fmt: skip
+    benchmark.add_argument("--out", type=Path, metavar="DIR", help="default: below outputs/benchmark")
+    benchmark.add_argument("--methods", help="of the two studies, separated by commas")
+    benchmark.add_argument("--limit", type=int, metavar="N", help="of the two studies: the first N test sequences")
+    benchmark.add_argument("overrides", nargs="*", help="of params.yaml, as Hydra takes them: seed=2")
+    benchmark.set_defaults(run=_benchmark)
+
+
+def _benchmark(options: argparse.Namespace) -> int:
+    from polarnet.config import check_keys, load
+    from polarnet.runtime import configure
+
+    root = project_root()
+    scenes = options.scenes.resolve() if options.scenes else None
+    name = scenes.name if scenes else "event_budget" if options.event_budget else "sensitivity"
+    out = (options.out or root / "outputs" / "benchmark" / name).resolve()
+    weights = options.weights.resolve() if options.weights else None
+    with contextlib.chdir(root):  # paths of conf/config.yaml are relative to it
+        check_keys(root, options.overrides)
+        config = load(root, options.overrides)
+        configure(config.runtime, config.seed)
+        if scenes is None:
+            return _study(options, config, out, weights)
+        return _own_scenes(options, config, scenes, out, weights)
+
+
+def _own_scenes(options: argparse.Namespace, config: "Config", scenes: Path, out: Path, weights: Path | None) -> int:
+    from polarnet.own_scenes import benchmark_folder
+    from polarnet.reports.tables import as_plain, score_table
+
+    command = f"polarnet benchmark --scenes {options.scenes}"
+    metrics, notes = benchmark_folder(config, scenes, options.kind, out, weights, command)
+    reason = json.loads((out / "details.json").read_text())["lpips"]["reason"]
+    print(as_plain(score_table(metrics, lpips_reason=reason)))
+    for note in notes:
+        print(note)
+    print(f"the page: {out / 'index.html'}")
+    return 0
+
+
+def _study(options: argparse.Namespace, config: "Config", out: Path, weights: Path | None) -> int:
+    from polarnet.studies import STUDIED, run_event_budget, run_sensitivity
+
+    run = run_event_budget if options.event_budget else run_sensitivity
+    methods = options.methods.split(",") if options.methods else STUDIED
+    run(config, out, methods, options.limit, weights)
+    print(f"written to {out}: {', '.join(sorted(path.name for path in out.iterdir()))}")
+    return 0

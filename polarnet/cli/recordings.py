@@ -1,0 +1,175 @@
+"""Commands on recordings: look into them, lay them on one another, recover DoLP, play them."""
+
+import argparse
+import functools
+import json
+import sys
+from pathlib import Path
+
+from polarnet.cli.parsers import Commands
+from polarnet.cli.project import project_root
+
+
+def add_to(commands: Commands) -> None:
+    """Its commands."""
+    _add_inspection(commands)
+    _add_recovery(commands)
+
+
+def _add_inspection(commands: Commands) -> None:
+    inspect = commands.add_parser("inspect", help="what is in a camera's file, and a picture of its busiest moment")
+    inspect.add_argument("file", type=Path)
+    inspect.add_argument("--format", help="where the content does not show it: text, celex5_csv, celex5_bin, dat, ...")
+    inspect.add_argument("--height", type=int, help="of the sensor, where the file does not say it")
+    inspect.add_argument("--width", type=int)
+    inspect.add_argument("--part", metavar="SEQUENCE/ANGLE", help="of an event store")
+    inspect.add_argument("--clock-mhz", type=float, help="of a CeleX-5, where it was not 100 MHz")
+    inspect.add_argument("--assume-polarity", type=int, choices=(1, -1), help="of events that come without one")
+    inspect.add_argument(
+        "--hot-pixel-factor", type=float, default=4.0, help="hot: as many times the events of the busiest around (4)"
+    )
+    inspect.add_argument("--picture", type=Path, help="where to write the PNG (default: FILE.png here)")
+    inspect.add_argument("--hot-pixels", type=Path, metavar="PNG", help="where to draw how often each pixel fired")
+    inspect.set_defaults(run=_inspect)
+
+    register = commands.add_parser("register", help="lay one camera's recording on another's: the homography")
+    register.add_argument("reference", type=Path)
+    register.add_argument("file", type=Path)
+    register.add_argument("--picture", type=Path, help="where to write a PNG of both event images, before and after")
+    register.set_defaults(run=_register)
+
+
+def _add_recovery(commands: Commands) -> None:
+    recover = commands.add_parser(
+        "recover",
+        help="DoLP and AoLP of recordings, or of a camera that runs: frames, pictures, a video and a page",
+        description="INPUT is four files, one a polarizer, with --angles; one file of a camera with polarizers on its "
+        "pixels, with --mosaic; an event store; a folder of division-of-time captures; or, with --live, lines "
+        "`t x y p angle` of a file that grows or of standard input (-).",
+    )
+    recover.add_argument("input", nargs="+", metavar="INPUT")
+    recover.add_argument("--angles", nargs=4, type=int, metavar="DEG", help="polarizers of the four files, in order")
+    recover.add_argument(
+        "--mosaic", metavar="'A B / C D'", help="polarizers of 2x2 pixels: even row / odd row, degrees"
+    )
+    recover.add_argument("--sequence", metavar="NAME", help="of an event store with several")
+    recover.add_argument("--live", action="store_true", help="recover while events come, and show the latency")
+    recover.add_argument(
+        "--idle", type=float, default=5.0, metavar="S", help="a live file that stops growing has ended"
+    )
+    recover.add_argument(
+        "--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce files to so many pixels"
+    )
+    recover.add_argument(
+        "--window", default="33.333ms",
+        help="a time (33.3ms) or a number of events of all polarizers (20000ev); networks are trained on 1/30 s",
+    )  # fmt: skip
+    recover.add_argument("--step", help="time between the ends of overlapping windows, from 0.1ms; default: no overlap")
+    recover.add_argument(
+        "--weights", type=Path, metavar="FILE", help="of the network; default: shipped, or trained here"
+    )
+    recover.add_argument("--method", help="instead of the network: cf, highpass, cf+gain, e2v, ... of the benchmark")
+    recover.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N")
+    recover.add_argument("--precision", choices=("fp32", "bf16"), default="fp32", help="of the networks")
+    recover.add_argument("--out", type=Path, metavar="FOLDER", help="default: outputs/recover/NAME")
+    recover.add_argument("--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), help="default: zarr png mp4")
+    recover.add_argument("--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video")
+    recover.add_argument("--format", help="of files, where the content does not show it; like the next for inspect")
+    recover.add_argument("--height", type=int, help="of the sensor, where the files do not say it")
+    recover.add_argument("--width", type=int)
+    recover.add_argument("--clock-mhz", type=float)
+    recover.add_argument("--assume-polarity", type=int, choices=(1, -1))
+    recover.set_defaults(run=_recover)
+
+    replay = commands.add_parser(
+        "replay", help="a stored sequence as live lines, at its own pace: polarnet recover --live"
+    )
+    replay.add_argument("store", help="folder, zip or fsspec URL")
+    replay.add_argument("sequence")
+    replay.add_argument("--speed", type=float, default=1.0, help="times as fast as recorded")
+    replay.set_defaults(run=_replay)
+
+
+def _inspect(options: argparse.Namespace) -> int:
+    from polarnet.recordings.inspection import findings, inspect_recording
+    from polarnet.recordings.recording import open_recording
+    from polarnet.reports.recordings import recording_picture
+
+    chosen = {name: getattr(options, name) for name in ("height", "width", "part", "clock_mhz", "assume_polarity")}
+    inspection = inspect_recording(open_recording(options.file, options.format, **chosen), options.hot_pixel_factor)
+    for finding in findings(inspection):
+        print(finding)
+    path = options.picture or Path(f"{options.file.name}.png")
+    path.write_bytes(recording_picture(inspection))
+    print(f"picture     {path}")
+    if options.hot_pixels:
+        from polarnet.reports.calibration import draw_hot_pixels
+
+        draw_hot_pixels(inspection.counts, inspection.hot, options.hot_pixels)
+        print(f"hot pixels  {options.hot_pixels}")
+    return 0
+
+
+def _register(options: argparse.Namespace) -> int:
+    from polarnet.recordings.recording import read_recording
+    from polarnet.recordings.registration import event_image, register, warped
+    from polarnet.reports.calibration import draw_registration
+
+    reference, moving = (event_image(read_recording(path).events) for path in (options.reference, options.file))
+    found = register(reference, moving)
+    print(json.dumps({"homography": found.homography.tolist(), "correlation": found.correlation}, indent=2))
+    if options.picture:
+        draw_registration(reference, moving, warped(moving, found.homography), options.picture)
+    return 0
+
+
+def _recover(options: argparse.Namespace) -> int:
+    from polarnet.config import load
+    from polarnet.events.streaming import WindowRule, parse_window
+    from polarnet.recordings.recording import read_recording
+    from polarnet.recover import Arrangement, facts_of, open_files, open_live, open_stream, recover
+    from polarnet.reports.recovery import RecoveryWriter
+    from polarnet.stokes import parse_mosaic
+
+    config = functools.cache(lambda: load(project_root()))
+    length_us, events = parse_window(options.window)
+    step_us, step_events = parse_window(options.step) if options.step else (None, None)
+    if step_events is not None:
+        raise ValueError(f"--step: expected a time such as 0.1ms, got {options.step}")
+    rule = WindowRule(length_us, events, step_us)
+    stream, words = open_stream(options.method, options.weights, options.device, options.precision, config)
+    name = "live" if options.live else Path(options.input[0]).stem
+    out = options.out or Path("outputs") / "recover" / name
+    mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
+    lines = None
+    if options.live:
+        if len(options.input) != 1 or options.size or options.angles:
+            raise ValueError("--live: expected one file or - and, where it has one, a --mosaic; nothing else of files")
+        source, lines = open_live(options.input[0], mosaic, options.idle)
+    else:
+        sides = ("format", "height", "width", "clock_mhz", "assume_polarity")
+        read = functools.partial(read_recording, **{side: getattr(options, side) for side in sides})
+        arrangement = Arrangement(options.angles, mosaic, options.sequence)
+        size = (options.size[0], options.size[1]) if options.size else None
+        source = open_files([Path(path) for path in options.input], arrangement, read, size, out / "work", config)
+    writer = RecoveryWriter(out, options.write or ("zarr", "png", "mp4"), options.video_rate)
+    summary = recover(source, rule, stream, writer)
+    facts = facts_of(source, rule, words, summary)
+    for key, value in facts.items():
+        print(f"{key:11s} {value}")
+    left_out = {kind: count for kind, count in lines.counts.items() if count} if lines else {}
+    notes = [f"Lines that were left out: {left_out}."] if left_out else []
+    print(*notes, f"the page: {writer.write_page(source.name, facts, notes)}", sep="\n")
+    return 0
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from polarnet.events.store import EventStore
+    from polarnet.recover import replay
+
+    def write(data: bytes) -> None:
+        sys.stdout.buffer.write(data)
+        sys.stdout.buffer.flush()
+
+    replay(EventStore.open(options.store), options.sequence, options.speed, write)
+    return 0

@@ -1,0 +1,58 @@
+"""Commands on stores: check, export, import."""
+
+import argparse
+from pathlib import Path
+
+from polarnet.cli.parsers import Commands
+
+
+def add_to(commands: Commands) -> None:
+    """Its commands."""
+    verify = commands.add_parser("verify", help="check every byte of a store of events, frames or scenes")
+    verify.add_argument("store", help="folder, zip or fsspec URL")
+    verify.set_defaults(run=_verify)
+
+    export = commands.add_parser("export", help="an event store as files that other tools read")
+    export.add_argument("store", help="folder, zip or fsspec URL")
+    export.add_argument("folder", type=Path, help="gets a file for each sequence and polarizer")
+    export.add_argument("--format", choices=("hdf5", "text"), default="hdf5", help="DSEC's HDF5, or lines of t x y p")
+    export.set_defaults(run=_export)
+
+    import_ = commands.add_parser("import", help="the files that export wrote, as an event store")
+    import_.add_argument("folder", type=Path)
+    import_.add_argument("store", type=Path, help="written anew")
+    import_.set_defaults(run=_import)
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from polarnet.events import frames, store
+    from polarnet.events.table import open_group
+    from polarnet.simulation import scenes
+
+    checks = {store.FORMAT: store.verify, frames.FORMAT: frames.verify_frames, scenes.FORMAT: scenes.verify_scenes}
+    form = open_group(options.store).attrs.get("format")
+    if form not in checks:
+        raise ValueError(f"{options.store}: expected a store of {', '.join(checks)}, its format is {form!r}")
+    problems = checks[form](options.store)
+    for problem in problems:
+        print(problem)
+    if not problems:
+        print(f"{options.store}: every sequence is whole")
+    return 1 if problems else 0
+
+
+def _export(options: argparse.Namespace) -> int:
+    from polarnet.events.exchange import export_store
+    from polarnet.events.store import EventStore
+
+    export_store(EventStore.open(options.store), options.folder, options.format)
+    print(f"{options.store} -> {options.folder}")
+    return 0
+
+
+def _import(options: argparse.Namespace) -> int:
+    from polarnet.events.exchange import import_store
+
+    import_store(options.folder, options.store)
+    print(f"{options.folder} -> {options.store}")
+    return 0
