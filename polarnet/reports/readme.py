@@ -17,6 +17,7 @@ from polarnet.reports.study_tables import (
     choices_block,
     designs_block,
     event_budget_block,
+    headline_block,
     study_block,
 )
 from polarnet.reports.tables import (
@@ -194,6 +195,7 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "recordings": recordings_block,
     "recordings-recover": recover_block,
     "inspection": inspection_block,
+    "network": headline_block,
     "network-seed_1": study_block,
     "network-ablation": ablation_block,
     "scenes-choices": choices_block,
@@ -209,6 +211,7 @@ UNMEASURED = {
     "recordings": "Not measured yet: `tests/benchmarks/{recordings,fuzz_recordings,rig}.py --write` do it.",
     "recordings-recover": "Not measured yet: `python tests/benchmarks/recover.py --write` does it.",
     "event_budget-budget": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
+    "network": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "network-seed_1": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "network-ablation": "Not measured yet: the sweep above and `polarnet measure ablation --sweep FOLDER` do it.",
     "designs-rows": "Not collected yet: `python tests/benchmarks/designs.py` does it.",

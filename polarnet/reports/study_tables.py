@@ -57,6 +57,46 @@ def study_block(results: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def headline_block(results: Mapping[str, Any]) -> str:
+    """Means over the seeds alone, of the DoLP networks and of what they must beat, and how fast ours runs.
+
+    `results` is docs/results/network.json.
+    """
+    seeds = [*seeds_of(results).values()]
+    lines = ["| | " + " | ".join(f"{title}: MSE ↓ | PSNR ↑" for title in HEADLINE_SETS.values()) + " |"]
+    lines.append("|---" + "|---:" * 2 * len(HEADLINE_SETS) + "|")
+    for about, method in HEADLINE_ROWS.items():
+        cells = []
+        for name in HEADLINE_SETS:
+            row = method or best_reconstruction(seeds[0]["rows"][name])
+            scores = [found["rows"][name][row] for found in seeds if row in found["rows"][name]]
+            cells += [f"{fmean(one['mse'] for one in scores):.4f}", f"{fmean(one['psnr'] for one in scores):.2f}"]
+        lines.append(f"| {about} | " + " | ".join(cells) + " |")
+    minutes = {
+        row: [value for found in seeds if (value := found["minutes_trained"].get(row)) is not None]
+        for row in ("ours", "paper")
+    }
+    taken = ", ".join(f"{METHODS[row]} {fmean(values):.0f}" for row, values in minutes.items() if values)
+    lines += ["", f"Means of {len(seeds)} training(s); minutes that one took: {taken}."]
+    if speed := results.get("throughput"):
+        windows, record = results["ours"]["infer_windows_per_s"], results["records"]["throughput"]
+        lines[-1] += (
+            f" Ours recovers {windows:.0f} windows of {speed['height']} x {speed['width']} pixels a second with "
+            f"{speed['threads']} threads ({speed['device']}, {record['machine']})."
+        )
+    return "\n".join(lines)
+
+
+HEADLINE_SETS = {"simulated": "new photographs", "measured": "measured polarization"}
+HEADLINE_ROWS = {
+    "each frame's own mean, as if it were known": "oracle_mean",
+    "the best reconstruction of intensities from events": None,
+    "the paper's network": "paper",
+    "ours: polarnet's network": "ours",
+}
+"""Method of each line; None: `best_reconstruction` of the set."""
+
+
 def _said(found: Mapping[str, Any]) -> str:
     return (
         f"PSNR over the paper's network {found['gain_over_paper_db']:+.2f} dB, MSE over its "

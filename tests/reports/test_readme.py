@@ -10,6 +10,7 @@ from polarnet.reports.study_tables import (
     choices_block,
     designs_block,
     event_budget_block,
+    headline_block,
     study_block,
 )
 
@@ -137,28 +138,51 @@ def test_the_emulation_block_says_how_to_measure_while_nobody_has(project):
 MACHINE = {"machine": "a processor", "cores": 2, "load": 1.0, "versions": {"python": "3.11"}, "commit": "abc1234"}
 
 
-def test_the_study_of_the_networks_shows_every_seed_beside_what_must_be_beaten():
+def study_seed(mse, minutes):
+    """What docs/results/network.json holds of a seed."""
+
     def scores(mse):
         rest = dict.fromkeys(("pattern_mse", "psnr", "ssim", "corr"), 0.0)
         return {"mse": mse, "level_mse": mse / 2, **rest, "aolp_deg": None}
 
-    def seed(mse, minutes):
-        rows = {"zeros": 0.2, "oracle_mean": 0.03, "cf": 0.1, "firenet+gain": 0.05, "paper": 0.04, "ours": mse}
-        table = {row: scores(value) for row, value in rows.items()}
-        return {
-            "rows": {"simulated": table, "measured": table},
-            "minutes_trained": {"paper": minutes, "ours": None},
-            "threads": 1,
-            "gain_over_paper_db": 1.5,
-            "mse_over_paper": mse / 0.04,
-            "mse_over_oracle_mean": mse / 0.03,
-            "measured": {"mse_over_best_baseline": mse / 0.05},
-        }
+    rows = {"zeros": 0.2, "oracle_mean": 0.03, "cf": 0.1, "firenet+gain": 0.05, "paper": 0.04, "ours": mse}
+    table = {row: scores(value) for row, value in rows.items()}
+    return {
+        "rows": {"simulated": table, "measured": table},
+        "minutes_trained": {"paper": minutes, "ours": None},
+        "threads": 1,
+        "gain_over_paper_db": 1.5,
+        "mse_over_paper": mse / 0.04,
+        "mse_over_oracle_mean": mse / 0.03,
+        "measured": {"mse_over_best_baseline": mse / 0.05},
+    }
 
+
+def test_the_headlines_are_means_over_the_seeds_and_name_the_best_reconstruction_s_error():
+    record = {**MACHINE, "machine": "a laptop"}
     results = {
-        "seed_1": seed(0.02, 36.2),
-        "seed_2": seed(0.025, 30.0),
-        "shipped": seed(0.015, 1.0),
+        "seed_1": study_seed(0.02, 36.0),
+        "seed_2": study_seed(0.03, 30.0),
+        "ours": {"infer_windows_per_s": 50.6},
+        "throughput": {"height": 120, "width": 180, "threads": 2, "device": "cpu"},
+        "records": {"throughput": record},
+    }
+    *table, _, last = headline_block(results).splitlines()
+    assert table[2:] == [
+        "| each frame's own mean, as if it were known | 0.0300 | 0.00 | 0.0300 | 0.00 |",
+        "| the best reconstruction of intensities from events | 0.0500 | 0.00 | 0.0500 | 0.00 |",
+        "| the paper's network | 0.0400 | 0.00 | 0.0400 | 0.00 |",
+        "| ours: polarnet's network | 0.0250 | 0.00 | 0.0250 | 0.00 |",
+    ]
+    assert "Means of 2 training(s); minutes that one took: the paper's network 33." in last
+    assert "51 windows of 120 x 180 pixels a second with 2 threads (cpu, a laptop)" in last
+
+
+def test_the_study_of_the_networks_shows_every_seed_beside_what_must_be_beaten():
+    results = {
+        "seed_1": study_seed(0.02, 36.2),
+        "seed_2": study_seed(0.025, 30.0),
+        "shipped": study_seed(0.015, 1.0),
         "records": {"seed_1": MACHINE, "seed_2": MACHINE},
         "throughput": {},
     }
