@@ -1,9 +1,11 @@
 """One point of a sweep: train and benchmark in the job's own folder, leaving what DVC tracks alone.
 
 `python -m stages.trial -m loss.mse=1.0 loss.ssim=0.0,1.0 loss.lpips=0.0,5.0` runs every combination on the sequences
-that the pipeline has made, and ends with one table (polarnet.sweep).
+that the pipeline has made, and ends with one table (polarnet.sweep). Jobs may run side by side: what a method made of a
+sequence is kept once, and so each job keeps its own until it is scored.
 """
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -25,9 +27,10 @@ def main(config: Config) -> None:
     if not any(override.startswith("benchmark.methods=") for override in overrides):
         overrides.append(REFERENCE_METHODS)
     for stage in ("train", "benchmark"):
-        folders = [f"paths.train={job / 'train'}", f"paths.benchmark={job / 'benchmark'}"]
+        folders = [f"paths.{name}={job / name}" for name in ("train", "benchmark", "cache")]
         logs = [f"hydra.run.dir={job / 'logs' / stage}"]
         subprocess.run([sys.executable, "-m", f"stages.{stage}", *overrides, *folders, *logs], check=True)
+    shutil.rmtree(job / "cache")
 
 
 if __name__ == "__main__":

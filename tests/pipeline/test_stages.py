@@ -97,6 +97,20 @@ def test_the_same_values_give_the_same_bytes_whatever_the_number_of_workers(proj
         assert bytes_of(tmp_path / name) == bytes_of(data / name), name
 
 
+def test_a_point_of_a_sweep_leaves_what_the_pipeline_made_and_kept_alone(project_root, data, tmp_path):
+    parts = ("train", "benchmark", "cache")
+    before = {name: bytes_of(data / name) for name in parts}
+    run_stage(project_root, "trial", data, "loss.ssim=0.5", f"hydra.sweep.dir={tmp_path}", "--multirun")
+    assert {name: bytes_of(data / name) for name in parts} == before
+    (point,) = json.loads((tmp_path / "comparison.json").read_text())
+    assert "loss.ssim=0.5" in point["overrides"]
+    own = json.loads((tmp_path / point["job"] / "benchmark" / "metrics.json").read_text())
+    whole = json.loads((data / "benchmark" / "metrics.json").read_text())
+    assert point["scores"] == own["ours"] != whole["ours"]
+    assert own["oracle_mean"]["mse"] == whole["oracle_mean"]["mse"]
+    assert not (tmp_path / point["job"] / "cache").exists()
+
+
 def test_a_later_stage_without_its_input_says_which_stage_makes_it(project_root, tmp_path):
     command = [sys.executable, "-m", "stages.emulate", f"paths.data={tmp_path}", f"hydra.run.dir={tmp_path / 'log'}"]
     done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
