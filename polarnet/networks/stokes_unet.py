@@ -42,6 +42,7 @@ MIDDLE_DOLP = 0.3  # of the constant that is one more candidate, at the start
 WIDE = (3, 9)  # pixels, of the neighbourhoods that tell fine structure beside a pixel by itself
 MOST_POLARIZED = 0.98  # of 1: keeps atanh finite
 LOG_VARIANCE = -4.0  # at the start: an error of 0.14
+OF_LOG_VARIANCE = slice(12, 16)  # outputs of the last layer: the fourth map, 2 x 2 pixels of it
 
 
 @dataclass(frozen=True)
@@ -222,6 +223,14 @@ class StokesUNet(nn.Module):
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
         carried = [*(sums[-1] for sums in around), *carried]
         return prediction, [*summed[-1].unbind(1), *moments, *carried, *recurrent]
+
+    @torch.no_grad()
+    def scale_log_variance(self, offset: float, slope: float) -> None:
+        """From now on expect offset + slope * log variance where it was log variance; nothing else changes."""
+        assert self.add.bias is not None
+        weight, bias = self.add.weight[OF_LOG_VARIANCE], self.add.bias[OF_LOG_VARIANCE]
+        weight *= slope
+        bias.copy_(offset + slope * (LOG_VARIANCE + bias) - LOG_VARIANCE)
 
     def _candidates(
         self, events: Float[Tensor, "n m 4 h w"], streams: int, state: list[Tensor]

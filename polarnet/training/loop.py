@@ -13,6 +13,7 @@ from polarnet.events.windows import WindowDataset
 from polarnet.ranges import allowed
 from polarnet.runtime import precision_on
 from polarnet.similarity import correlation, mse, psnr
+from polarnet.training.calibration import Calibration, fitted
 from polarnet.training.losses import known_frames
 from polarnet.training.optimizers import OPTIMIZERS, Stepper
 from polarnet.training.parallel import add_up, place, wait_for_all
@@ -21,6 +22,7 @@ from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, k
 from polarnet.training.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
+EVERY = 4  # pixels along each axis from one whose error is looked at to the next: neighbours err alike
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,9 @@ def train(
             recorder.keep(progress, network, optimizer)
         recorder.end_epoch(progress, network, validate(task, split.val, config, device, workers))
         recorder.keep(progress, network, optimizer, at_once=True)
+    if task.expected is not None and recorder.writes:
+        network.load_state_dict(progress.best)
+        recorder.calibrated(progress, network, calibrate(task, split.val, config, device, workers))
     recorder.finish()
 
 
@@ -193,3 +198,28 @@ def set_learning_rate(optimizer: Stepper, config: LoopConfig, done: float) -> No
 def autocast(precision: str, device: torch.device) -> torch.autocast:
     """Convolutions and matrix products in bfloat16 where `precision` on this device is bf16."""
     return torch.autocast(device.type, torch.bfloat16, enabled=precision_on(device, precision) == "bf16")
+
+
+@torch.no_grad()
+def calibrate(
+    task: Task, dataset: WindowDataset, config: LoopConfig, device: torch.device, workers: int
+) -> Calibration:
+    """Make the task's network expect errors of the size that they have on `dataset` (polarnet.training.calibration)."""
+    if task.expected is None:
+        raise ValueError("expected a task whose network says how large its errors are")
+    task.network.eval()
+    expected, squared = [], []
+    for batch in batches_of(dataset, range(len(dataset)), 1, workers):
+        state = None
+        for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
+            with autocast(config.precision, device):
+                predicted, state = task.unroll(windows, state)
+            errors = (task.scored(predicted).clamp(0, 1) - task.scored(frames)).square()
+            known = torch.ones_like(errors, dtype=torch.bool) if valid is None else valid
+            here = known[..., ::EVERY, ::EVERY]
+            expected.append(task.expected(predicted)[..., ::EVERY, ::EVERY][here].double().cpu())
+            squared.append(errors[..., ::EVERY, ::EVERY][here].double().cpu())
+    found = fitted(torch.cat(expected), torch.cat(squared))
+    task.network.scale_log_variance(*found)  # type: ignore[operator]
+    task.network.train()
+    return found

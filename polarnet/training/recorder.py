@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from polarnet.networks.checkpoint import save_checkpoint
+from polarnet.training.calibration import Calibration
 from polarnet.training.optimizers import Stepper
 from polarnet.training.parallel import place
 from polarnet.training.sequences import Batch
@@ -133,6 +134,11 @@ class Recorder:
             return
         tqdm.write("  validation: " + "  ".join(f"{name} {value:.4f}" for name, value in scores.items()))
         self._write(progress, network)
+
+    def calibrated(self, progress: Progress, network: nn.Module, calibration: Calibration) -> None:
+        """Write the best checkpoint anew: the best epoch's network, its expected errors as calibrated."""
+        said = {**_result(best_row(progress.history)), "expected_errors": calibration._asdict()}
+        save_checkpoint(self.out / "best.safetensors", network.state_dict(), {**self.metadata, **said})
 
     def finish(self) -> None:
         """The training is complete: nothing is left to resume."""
