@@ -4,6 +4,7 @@ Stages start in children of a process that has imported the stage once, so that 
 minute. With POLARNET_SLOW=1 the same deaths befall `python -m stages.emulate` with two workers, each from a cold start.
 """
 
+import contextlib
 import functools
 import hashlib
 import multiprocessing
@@ -179,7 +180,8 @@ def test_ten_deaths_at_random_moments_change_no_byte_and_no_finished_sequence(
             time.sleep(generator.uniform(0, 1.5 * undisturbed.seconds_each))
         else:
             time.sleep(generator.uniform(0, undisturbed.seconds_to_first))
-        os.killpg(running.pid, signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):  # where it has ended already
+            os.killpg(running.pid, signal.SIGKILL)
         status = running.wait()
         if events.exists():  # it was quicker than its death: begin anew
             assert identities(events, set(range(SEQUENCES))).items() >= known.items()
