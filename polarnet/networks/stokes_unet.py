@@ -225,12 +225,14 @@ class StokesUNet(nn.Module):
         return prediction, [*summed[-1].unbind(1), *moments, *carried, *recurrent]
 
     @torch.no_grad()
-    def scale_log_variance(self, offset: float, slope: float) -> None:
-        """From now on expect offset + slope * log variance where it was log variance; nothing else changes."""
+    def expect(self, weight: Float[Tensor, " c"], bias: float) -> None:
+        """From now on expect, of 2 x 2 pixels, the log variance weight @ x + bias where the last layer sees x.
+
+        Nothing else changes.
+        """
         assert self.add.bias is not None
-        weight, bias = self.add.weight[OF_LOG_VARIANCE], self.add.bias[OF_LOG_VARIANCE]
-        weight *= slope
-        bias.copy_(offset + slope * (LOG_VARIANCE + bias) - LOG_VARIANCE)
+        self.add.weight[OF_LOG_VARIANCE] = weight[:, None, None].to(self.add.weight)
+        self.add.bias[OF_LOG_VARIANCE] = bias - LOG_VARIANCE
 
     def _candidates(
         self, events: Float[Tensor, "n m 4 h w"], streams: int, state: list[Tensor]

@@ -3,6 +3,7 @@
 What is stored is the scene: rendering starts from the quantised planes, so truth and events agree to the last bit.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,7 +35,26 @@ CONVENTIONS = {
     "duration_us": "length of a sequence in microseconds",
 }
 
+_VARIANT = re.compile(r"(.+)-variant[0-9]+")
+
 MASK_CONVENTION = "1 where the light of a pixel is known, 0 where saturation hid it"
+
+
+def variant_name(picture: str, number: int) -> str:
+    """Of a scene that `polarnet.simulation.variation` makes of a picture."""
+    return f"{picture}-variant{number:02d}"
+
+
+def made_from(scene: str) -> str:
+    """The picture that a scene is, or a variant of."""
+    variant = _VARIANT.fullmatch(scene)
+    return variant[1] if variant else scene
+
+
+def without_variants(sequences: Sequence[str]) -> list[str]:
+    """The sequences whose scene is a picture as it is."""
+    scenes = {name: name.rpartition("-")[0] for name in sequences}
+    return [name for name, scene in scenes.items() if made_from(scene) == scene]
 
 
 class SceneRecord(NamedTuple):

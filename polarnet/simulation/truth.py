@@ -25,7 +25,7 @@ from polarnet.simulation.scene import (
     scene_from_intensities,
     scene_from_polarization,
 )
-from polarnet.simulation.scenes import SceneStore
+from polarnet.simulation.scenes import SceneStore, made_from, variant_name
 from polarnet.simulation.variation import VariationConfig, varied
 
 
@@ -50,9 +50,6 @@ def valid_frames(
     masked = (~valid).float()
     seen = render(PolarizationScene(masked.expand(3, -1, -1)), trajectory, np.asarray(t_us) * 1e-6, height, width)
     return seen[:, 0] == 0
-
-
-VARIANT = "-variant"  # in the name of a scene made from the picture whose name comes before
 
 
 def synthesize(
@@ -104,7 +101,7 @@ def _create(
     picture_of, splits = {}, {}
     for entry in manifest.pictures:
         variants = variation.scenes_per_picture if variation and entry.split == "train" else 0
-        for scene in [entry.name, *(f"{entry.name}{VARIANT}{k:02d}" for k in range(1, variants + 1))]:
+        for scene in [entry.name, *(variant_name(entry.name, k) for k in range(1, variants + 1))]:
             for number in range(config.sequences_per_picture):
                 sequence = f"{scene}-{number:02d}"
                 picture_of[sequence], splits[sequence] = scene, entry.split
@@ -144,9 +141,9 @@ def _synthesize_scene(
     seed: int,
 ) -> None:
     """Write one picture, or a variant of it, and all its sequences."""
-    source, variant, _ = picture.partition(VARIANT)
+    source = made_from(picture)
     polarization, valid = _read_polarization(images, source)
-    if variation and variant:
+    if variation and source != picture:
         polarization = varied(polarization, variation, generator_for(seed, picture, "variation"))
     s0, dolp, aolp = polarization
     scenes.write_picture(picture, s0, dolp, aolp, valid if scenes.masked else None)

@@ -51,7 +51,7 @@ def dolp_task(
         wants_intensity=False,
         optimizer=config.optimizer or build.optimizer,
         scored=lambda maps: maps[:, :, 0],
-        expected=(lambda maps: maps[:, :, 3]) if build.predicts_stokes else None,
+        expects=network.add if build.predicts_stokes else None,
     )
 
 

@@ -7,13 +7,15 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d
 
 from polarnet.events.representations import REPRESENTATIONS
 from polarnet.events.windows import WindowDataset
 from polarnet.ranges import allowed
 from polarnet.runtime import precision_on
 from polarnet.similarity import correlation, mse, psnr
-from polarnet.training.calibration import Calibration, fitted
+from polarnet.simulation.scenes import without_variants
+from polarnet.training.calibration import Scene, fitted
 from polarnet.training.losses import known_frames
 from polarnet.training.optimizers import OPTIMIZERS, Stepper
 from polarnet.training.parallel import add_up, place, wait_for_all
@@ -22,7 +24,7 @@ from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, k
 from polarnet.training.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
-EVERY = 4  # pixels along each axis from one whose error is looked at to the next: neighbours err alike
+LOOKED_AT = 10_000  # blocks of 2 x 2 pixels of a sequence, whose errors tell how large they are: neighbours err alike
 
 
 @dataclass(frozen=True)
@@ -86,9 +88,11 @@ def train(
             recorder.keep(progress, network, optimizer)
         recorder.end_epoch(progress, network, validate(task, split.val, config, device, workers))
         recorder.keep(progress, network, optimizer, at_once=True)
-    if task.expected is not None and recorder.writes:
+    if task.expects is not None and recorder.writes:
         network.load_state_dict(progress.best)
-        recorder.calibrated(progress, network, calibrate(task, split.val, config, device, workers))
+        names = without_variants(split.train.sequences)
+        scenes = WindowDataset(split.train.events, split.train.frames, names, split.train.encode)
+        recorder.calibrated(progress, network, calibrate(task, scenes, config, device, workers))
     recorder.finish()
 
 
@@ -203,23 +207,34 @@ def autocast(precision: str, device: torch.device) -> torch.autocast:
 @torch.no_grad()
 def calibrate(
     task: Task, dataset: WindowDataset, config: LoopConfig, device: torch.device, workers: int
-) -> Calibration:
-    """Make the task's network expect errors of the size that they have on `dataset` (polarnet.training.calibration)."""
-    if task.expected is None:
+) -> dict[str, int | float]:
+    """Make the task's network expect the errors that it has on `dataset` (polarnet.training.calibration).
+
+    What a checkpoint says of it. ValueError where it has no error at all.
+    """
+    if task.expects is None:
         raise ValueError("expected a task whose network says how large its errors are")
     task.network.eval()
-    expected, squared = [], []
+    scenes, seen = [], []
+    hook = task.expects.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     for batch in batches_of(dataset, range(len(dataset)), 1, workers):
-        state = None
+        state, features, squared = None, [], []
+        every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / LOOKED_AT)))  # along each axis
         for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
             with autocast(config.precision, device):
                 predicted, state = task.unroll(windows, state)
             errors = (task.scored(predicted).clamp(0, 1) - task.scored(frames)).square()
-            known = torch.ones_like(errors, dtype=torch.bool) if valid is None else valid
-            here = known[..., ::EVERY, ::EVERY]
-            expected.append(task.expected(predicted)[..., ::EVERY, ::EVERY][here].double().cpu())
-            squared.append(errors[..., ::EVERY, ::EVERY][here].double().cpu())
-    found = fitted(torch.cat(expected), torch.cat(squared))
-    task.network.scale_log_variance(*found)  # type: ignore[operator]
+            known = torch.ones_like(errors) if valid is None else valid.to(errors)
+            of_four, all_known = (avg_pool2d(image.flatten(0, 1), 2)[:, ::every, ::every] for image in (errors, known))
+            height, width = (every * size for size in of_four.shape[-2:])
+            here = seen.pop()[..., :height:every, :width:every].permute(0, 2, 3, 1)[all_known == 1]
+            features.append(here.double().cpu())
+            squared.append(of_four[all_known == 1].double().cpu())
+        scene = Scene(torch.cat(features), torch.cat(squared))
+        scenes += [scene] if len(scene.squared) else []
+    hook.remove()
+    found = fitted(scenes)
+    task.network.expect(found.weight, found.bias)  # type: ignore[operator]
     task.network.train()
-    return found
+    mean_squared = torch.cat([scene.squared for scene in scenes]).mean().item()
+    return {"sequences": len(scenes), "mse": mean_squared, "ridge": found.ridge}

@@ -23,7 +23,6 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from polarnet.networks.checkpoint import save_checkpoint
-from polarnet.training.calibration import Calibration
 from polarnet.training.optimizers import Stepper
 from polarnet.training.parallel import place
 from polarnet.training.sequences import Batch
@@ -135,10 +134,11 @@ class Recorder:
         tqdm.write("  validation: " + "  ".join(f"{name} {value:.4f}" for name, value in scores.items()))
         self._write(progress, network)
 
-    def calibrated(self, progress: Progress, network: nn.Module, calibration: Calibration) -> None:
-        """Write the best checkpoint anew: the best epoch's network, its expected errors as calibrated."""
-        said = {**_result(best_row(progress.history)), "expected_errors": calibration._asdict()}
-        save_checkpoint(self.out / "best.safetensors", network.state_dict(), {**self.metadata, **said})
+    def calibrated(self, progress: Progress, network: nn.Module, expected_errors: Mapping[str, int | float]) -> None:
+        """Write the best checkpoint anew: the best epoch's network, and on what the errors that it expects rest."""
+        result = _result(best_row(progress.history))
+        metadata = {**self.metadata, **result, "expected_errors": dict(expected_errors)}
+        save_checkpoint(self.out / "best.safetensors", network.state_dict(), metadata)
 
     def finish(self) -> None:
         """The training is complete: nothing is left to resume."""

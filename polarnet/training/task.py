@@ -55,9 +55,9 @@ class Task:
     """A key of OPTIMIZERS."""
     scored: Callable[[Tensor], Float[Tensor, "t b h w"]] = lambda frames: frames
     """Of what it says and should say, the frames that validation scores, and by which the best epoch is chosen."""
-    expected: Callable[[Tensor], Float[Tensor, "t b h w"]] | None = None
-    """Of what it says, the log variance of the error of `scored`; None: it says none. A network that does can
-    `scale_log_variance(offset, slope)`."""
+    expects: nn.Module | None = None
+    """The layer of the network that says how large it expects the errors of `scored` to be, pixels of its input being 2
+    x 2 of the image; None: there is none. A network that has one can `expect(weight, bias)`."""
 
 
 class Split(NamedTuple):

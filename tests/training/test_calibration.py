@@ -7,9 +7,11 @@ import torch
 from test_loop import CPU, LOOP, SEED, Killed, bytes_of, run
 
 from polarnet.config import load
+from polarnet.events.representations import event_tensor
 from polarnet.events.store import EventStore
 from polarnet.networks.checkpoint import load_network
-from polarnet.training.calibration import Calibration, fitted
+from polarnet.simulation.scenes import without_variants
+from polarnet.training.calibration import RIDGES, Scene, fitted
 from polarnet.training.dolp import dolp_task
 from polarnet.training.loop import TrainConfig, calibrate
 from polarnet.training.losses import LossConfig
@@ -26,39 +28,78 @@ def task_of(project_root):
     return lambda: dolp_task("polarnet", config, TRAIN, LOSS, None, SEED)
 
 
-def test_the_scale_of_errors_is_found_again_from_what_hardly_told_them_apart():
-    generator = torch.Generator().manual_seed(0)
-    true = torch.randn(100_000, generator=generator, dtype=torch.float64) - 4
-    squared = true.exp() * torch.randn(100_000, generator=generator, dtype=torch.float64).square()
-    found = fitted(-3.9 + 0.05 * true, squared)
-    assert found.slope == pytest.approx(20, rel=0.03)
-    assert found.offset == pytest.approx(3.9 * 20, rel=0.03)
+def scenes_of(in_all: float, in_each: float) -> list[Scene]:
+    """Of scenes, features and squared errors. These depend on one feature by `in_all`, on another by `in_each`, but
+    in every other scene the other way round; a third says nothing and a fourth is always the same."""
+    generator, scenes = torch.Generator().manual_seed(0), []
+    for k in range(20):
+        features = torch.randn(5000, 4, generator=generator, dtype=torch.float64) * torch.tensor([0.01, 5, 1, 0])
+        noise = torch.randn(5000, generator=generator, dtype=torch.float64)
+        expected = 100 * in_all * features[:, 0] + (-1) ** k * in_each * features[:, 2] - 4
+        scenes.append(Scene(features, expected.exp() * noise.square()))
+    return scenes
 
 
-def test_one_expectation_for_all_gets_the_level_alone_and_no_error_is_refused():
-    squared = torch.tensor([0.01, 0.03], dtype=torch.float64)
-    found = fitted(torch.full((2,), -4.0, dtype=torch.float64), squared)
-    assert found.slope == 1
-    assert torch.tensor(found.offset - 4).exp().item() == pytest.approx(0.02)
-    with pytest.raises(ValueError, match="got 2 pixels without any"):
-        fitted(squared, 0 * squared)
+def test_what_tells_how_large_errors_are_is_found_however_small_it_is():
+    found = fitted(scenes_of(in_all=1.0, in_each=0.0))
+    assert found.ridge == min(RIDGES)
+    assert found.weight[0].item() == pytest.approx(100, rel=0.05)
+    assert found.weight[1:].abs().max() < 2e-2
+    assert found.bias == pytest.approx(-4, abs=0.05)
 
 
-def test_after_it_nothing_is_left_to_calibrate_and_dolp_is_what_it_was(stores, task_of):
-    task = task_of()
+def test_what_tells_it_of_each_scene_alone_is_not_believed():
+    scenes = scenes_of(in_all=0.0, in_each=0.5)
+    found = fitted(scenes)
+    assert found.ridge == max(RIDGES)
+    for scene in scenes:
+        expected = (scene.features @ found.weight + found.bias).exp()
+        assert expected.std() < 0.01 * expected.mean()
+
+
+def test_one_scene_says_how_large_errors_are_and_not_where():
+    scene = scenes_of(in_all=1.0, in_each=0.0)[0]
+    found = fitted([scene])
+    expected = (scene.features @ found.weight + found.bias).exp()
+    assert expected.mean().item() == pytest.approx(scene.squared.mean().item(), rel=0.01)
+    assert expected.std() < 0.02 * expected.mean()
+
+
+def test_without_any_error_there_is_nothing_to_expect():
+    scenes = [scene._replace(squared=0 * scene.squared) for scene in scenes_of(in_all=1.0, in_each=0.0)]
+    with pytest.raises(ValueError, match="got 100000 pixels without any"):
+        fitted(scenes)
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_errors_are_expected_where_they_are_and_dolp_is_what_it_was(stores, task_of, precision):
+    task, config = task_of(), dataclasses.replace(TRAIN, precision=precision)
     torch.nn.init.normal_(task.network.add.weight, std=0.1, generator=torch.Generator().manual_seed(1))
     split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
-    windows = split.val[0].inputs[:, None]
-    with torch.no_grad():
-        before = task.network.unroll(windows, None)[0]
-        first = calibrate(task, split.val, TRAIN, CPU, 0)
-        after = task.network.unroll(windows, None)[0]
-        again = calibrate(task, split.val, TRAIN, CPU, 0)
-    assert first.slope != pytest.approx(1, abs=0.1)
-    assert (again.offset, again.slope) == (pytest.approx(0, abs=1e-3), pytest.approx(1, abs=1e-3))
-    torch.testing.assert_close(after.log_variance, first.offset + first.slope * before.log_variance)
+    sequence = split.train[0]
+
+    def recovered():
+        with torch.no_grad():
+            return task.network.unroll(sequence.inputs[:, None], None)[0]
+
+    before = recovered()
+    mean_squared = calibrate(task, split.train, config, CPU, 0)["mse"]
+    after = recovered()
     for name in ("dolp", "aolp", "stokes"):
         torch.testing.assert_close(getattr(after, name), getattr(before, name))
+    errors = (after.dolp[:, 0].clamp(0, 1) - sequence.dolp).square()
+    alike = torch.full_like(errors, mean_squared).log()
+    likelihood = [
+        (errors * torch.exp(-v) + v).mean() for v in (before.log_variance[:, 0], alike, after.log_variance[:, 0])
+    ]
+    assert likelihood[2] < likelihood[1] < likelihood[0]
+    assert after.log_variance.exp().mean().item() == pytest.approx(errors.mean().item(), rel=0.3)
+
+
+def test_it_rests_on_pictures_as_they_are_without_their_variants():
+    pictures = ["a-variant1-0123abcd-00", "b-0123abcd-00", "b-0123abcd-01"]
+    variants = ["a-variant1-0123abcd-variant01-00", "b-0123abcd-variant12-01"]
+    assert without_variants([*pictures, *variants]) == pictures
 
 
 def test_a_training_ends_with_it_even_if_killed_in_its_midst(stores, tmp_path, task_of):
@@ -79,8 +120,9 @@ def test_a_training_ends_with_it_even_if_killed_in_its_midst(stores, tmp_path, t
     with pytest.raises(Killed):
         run(counting(task_of(), last), stores, tmp_path / "killed", TRAIN)
     assert bytes_of(run(task_of(), stores, tmp_path / "killed", TRAIN)) == whole
-    said = Calibration(**json.loads(whole["best.json"])["expected_errors"])
-    assert said.slope != 1
+    said = json.loads(whole["best.json"])["expected_errors"]
+    assert said["sequences"] == len(open_split(EventStore.open(stores[0]), str(stores[1]), event_tensor).train)
+    assert said["mse"] > 0
     _, metadata = load_network(tmp_path / "whole" / "out" / "best.safetensors")
-    assert metadata["expected_errors"] == said._asdict()
+    assert metadata["expected_errors"] == said
     assert "expected_errors" not in json.loads(whole["last.json"])
