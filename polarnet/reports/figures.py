@@ -77,6 +77,14 @@ class Curve(NamedTuple):
     values: Sequence[float]
 
 
+class ReliabilityLine(NamedTuple):
+    """One line of a reliability plot; `curve` holds predicted error, measured error and pixels of each bin."""
+
+    label: str
+    colour: str
+    curve: Sequence[tuple[float, float, int]]
+
+
 def png(figure: Figure) -> bytes:
     """The figure as PNG bytes that depend on nothing but what is drawn."""
     buffer = io.BytesIO()
@@ -172,21 +180,26 @@ def reliability_figure(curves: Mapping[str, Sequence[tuple[float, float, int]]],
     """
     figure = _figure((3.4, 3.2), theme)
     with matplotlib.rc_context(chart_style(theme)):
-        axes = figure.add_subplot()
-        values = [
-            value for curve in curves.values() for predicted, measured, _ in curve for value in (predicted, measured)
+        lines = [
+            ReliabilityLine(METHODS.get(method, method), METHOD_COLOURS.get(method, OTHER_COLOUR), curve)
+            for method, curve in curves.items()
         ]
-        positive = [value for value in values if value > 0]
-        axes.plot([min(positive), max(positive)], [min(positive), max(positive)], color=theme.quiet, linewidth=0.8)
-        for method, curve in curves.items():
-            predicted, measured, pixels = (np.array(column) for column in zip(*curve, strict=True))
-            colour = METHOD_COLOURS.get(method, OTHER_COLOUR)
-            axes.plot(predicted, measured, color=colour, label=METHODS.get(method, method))
-            axes.scatter(predicted, measured, s=4 + 60 * pixels / pixels.sum(), color=colour, linewidths=0, zorder=3)
-        axes.set(xscale="log", yscale="log", xlabel="predicted squared error", ylabel="measured squared error")
-        axes.legend(frameon=False)
+        draw_reliability(figure.add_subplot(), lines, theme)
     figure.tight_layout()
     return figure
+
+
+def draw_reliability(axes: Axes, lines: Sequence[ReliabilityLine], theme: Theme) -> None:
+    """Measured against predicted squared error, and the diagonal; dots grow with the pixels."""
+    ends = [value for line in lines for predicted, measured, _ in line.curve for value in (predicted, measured)]
+    diagonal = [min(value for value in ends if value > 0), max(ends)]
+    axes.plot(diagonal, diagonal, color=theme.quiet, linewidth=0.8)
+    for label, colour, curve in lines:
+        predicted, measured, pixels = (np.array(column) for column in zip(*curve, strict=True))
+        axes.plot(predicted, measured, color=colour, label=label)
+        axes.scatter(predicted, measured, s=4 + 60 * pixels / pixels.sum(), color=colour, linewidths=0, zorder=3)
+    axes.set(xscale="log", yscale="log", xlabel="predicted squared error", ylabel="measured squared error")
+    axes.legend(frameon=False)
 
 
 def score_line(recovered: Float[Tensor, "h w"], truth: Float[Tensor, "h w"]) -> str:

@@ -17,6 +17,7 @@ from polarnet.reports.study_tables import (
     choices_block,
     designs_block,
     event_budget_block,
+    expected_errors_block,
     headline_block,
     study_block,
 )
@@ -197,6 +198,7 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "inspection": inspection_block,
     "network": headline_block,
     "network-seed_1": study_block,
+    "expected_errors-seed_1": expected_errors_block,
     "network-ablation": ablation_block,
     "scenes-choices": choices_block,
     "designs-rows": designs_block,
@@ -213,6 +215,7 @@ UNMEASURED = {
     "event_budget-budget": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "network": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "network-seed_1": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
+    "expected_errors-seed_1": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
     "network-ablation": "Not measured yet: the sweep above and `polarnet measure ablation --sweep FOLDER` do it.",
     "designs-rows": "Not collected yet: `python tests/benchmarks/designs.py` does it.",
     "scenes-choices": "Not measured yet: `python tests/benchmarks/scenes.py --write` does it.",

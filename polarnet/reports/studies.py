@@ -1,5 +1,6 @@
-"""Figures of the event budget (paper, Fig. 11) and of the sensitivity to sensor and motion."""
+"""Figures of the event budget (paper, Fig. 11), the sensitivity to sensor and motion, and what trainings expect."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,8 +10,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from polarnet.reports.figures import METHOD_COLOURS, OTHER_COLOUR, Theme, chart_style
-from polarnet.reports.tables import METHODS, in_order
+from polarnet.reports.figures import (
+    METHOD_COLOURS,
+    OTHER_COLOUR,
+    ReliabilityLine,
+    Theme,
+    chart_style,
+    draw_reliability,
+)
+from polarnet.reports.tables import METHODS, SET_TITLES, in_order
 
 PAPER_EVENTS_PER_PIXEL = 1.04  # at which the paper's recovery is good (section 5)
 SETTING_LABELS = {
@@ -79,6 +87,25 @@ def sensitivity_figure(results: Mapping[str, Sequence[Mapping[str, Any]]], theme
         axes[0][0].set_ylabel("PSNR, dB")
         axes[1][0].set_ylabel("correlation")
         axes[0][-1].legend(frameon=False, fontsize=7, labelcolor=theme.text)
+    return figure
+
+
+def expected_errors_figure(seeds: Mapping[str, Mapping[str, Any]], theme: Theme) -> Figure:
+    """Measured against expected squared error of DoLP, a column a set of scenes, a line a seed.
+
+    `seeds` are those of docs/results/expected_errors.json by number.
+    """
+    sets = list(dict.fromkeys(name for found in seeds.values() for name in found["sets"]))
+    with matplotlib.rc_context(chart_style(theme)):
+        figure = Figure(figsize=(3.5 * len(sets), 3.2), layout="constrained", facecolor="none")
+        colours = matplotlib.rcParams["axes.prop_cycle"].by_key()["color"]
+        for axes, name in zip(figure.subplots(1, len(sets), squeeze=False)[0], sets, strict=True):
+            lines = [
+                ReliabilityLine(f"seed {seed}", colour, found["sets"][name]["curve"])
+                for (seed, found), colour in zip(seeds.items(), itertools.cycle(colours), strict=False)
+            ]
+            draw_reliability(axes, lines, theme)
+            axes.set_title(SET_TITLES[name], loc="left", fontsize=9)
     return figure
 
 

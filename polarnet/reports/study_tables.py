@@ -1,5 +1,6 @@
 """Tables of what tests/benchmarks/study.py and scenes.py measure: networks, their scenes, events that a frame takes."""
 
+import math
 from collections.abc import Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any
@@ -54,6 +55,24 @@ def study_block(results: Mapping[str, Any]) -> str:
             f"{found['threads'] or record['cores']} core(s) ({measured_with(record)}).",
             "",
         ]
+    return "\n".join(lines)
+
+
+def expected_errors_block(results: Mapping[str, Any]) -> str:
+    """How far the errors that trainings of ours expect are from those that are measured.
+
+    `results` is docs/results/expected_errors.json, by tests/benchmarks/study.py.
+    """
+    seeds = seeds_of(results)
+    names = next(iter(seeds.values()))["sets"]
+    titles = [f"{SET_TITLES[name]}: {column}" for name in names for column in ("MSE", "off by a factor of")]
+    lines = ["| | " + " | ".join(titles) + " |", "|---" + "|---:" * len(titles) + "|"]
+    for seed, found in seeds.items():
+        cells = [f"{one['mse']:.4f} | {math.exp(one['log_error']):.2f}" for one in found["sets"].values()]
+        lines.append(f"| ours, seed {seed} | {' | '.join(cells)} |")
+    lines += ["", "Factors are means over pixels, of larger or smaller alike; 1 is calibrated."]
+    for seed in seeds:
+        lines += ["", f"Seed {seed}: {measured_with(results['records'][f'seed_{seed}'])}."]
     return "\n".join(lines)
 
 

@@ -8,9 +8,10 @@ Runs the pipeline's stages with experiment=photographs in the folder --work, whe
 trained twice. Networks are trained one after the other, or side by side: start the command once for each with --only
 ROW, then without. Choose `--override paper:train.epochs=N` so that both DoLP networks take about as long; the minutes
 are printed. --write puts what the tables say of the two networks into docs/results/network.json, as the section of the
-seed and in the means over seeds, and if every row was scored also the tables into benchmark.json and the event budget
-into event_budget.json and docs/pictures. With --ours the section is `shipped`, and no part of the means. For further
-seeds `--rows ours paper` is enough. Nothing is trained on measured scenes or on the test split; the split is by source
+seed and in the means over seeds; the errors that ours expects into expected_errors.json and docs/pictures; and if every
+row was scored also the tables into benchmark.json and the event budget into event_budget.json and docs/pictures. With
+--ours the section is `shipped`, and no part of the means. For further seeds `--rows ours paper` is enough, and `--rows
+ours` for the expected errors alone. Nothing is trained on measured scenes or on the test split; the split is by source
 picture.
 """
 
@@ -24,6 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.measure import ABLATION_KEYS, machine_record, measure_benchmark, read_results, uncommitted, write_section
+from polarnet.reports.figures import LIGHT, png
+from polarnet.reports.studies import expected_errors_figure
 from polarnet.reports.study_tables import best_reconstruction, over_seeds, seeds_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -144,28 +147,45 @@ def main() -> None:
     methods = f"benchmark.methods=[{','.join(scored)}]"
     paths = (f"paths.train={best['ours'].parent}", f"paths.benchmark={results}")
     stage("benchmark", arguments, *sets, methods, *weights, *paths, f"runtime.workers={arguments.workers}")
-    tables = {
-        name: json.loads((path / "metrics.json").read_text())
-        for name, path in (("simulated", results), ("measured", results / "sets" / "measured"))
-    }
+    folders_of = {"simulated": results, "measured": results / "sets" / "measured"}
+    tables, details = (
+        {name: json.loads((path / file).read_text()) for name, path in folders_of.items()}
+        for file in ("metrics.json", "details.json")
+    )
     found: dict[str, Any] = {
         "minutes_trained": {row: json.loads((path / "minutes.json").read_text()) for row, path in folders.items()},
         "threads": arguments.threads,
         "overrides": arguments.override,
-        **headlines(tables),
         "rows": {
             name: {row: {key: scores.get(key) for key in ABLATION_KEYS} for row, scores in table.items()}
             for name, table in tables.items()
         },
     }
+    if {"ours", "paper"} <= set(arguments.rows):
+        found |= headlines(tables)
     print(json.dumps({key: value for key, value in found.items() if key != "rows"}, indent=2))
     if not arguments.write:
         return
-    seeds = seeds_of(read_results(ROOT, "network") | {section: found})
-    print(write_section(ROOT, "network", section, found, record, over_seeds([*seeds.values()]) if seeds else None))
+    if "ours" in arguments.rows and not arguments.ours:
+        sets_of = {
+            name: {"mse": tables[name]["ours"]["mse"], **about["reliability"]["ours"]}
+            for name, about in details.items()
+        }
+        expected_errors(section, {"minutes_trained": found["minutes_trained"]["ours"], "sets": sets_of}, record)
+    if {"ours", "paper"} <= set(arguments.rows):
+        seeds = seeds_of(read_results(ROOT, "network") | {section: found})
+        print(write_section(ROOT, "network", section, found, record, over_seeds([*seeds.values()]) if seeds else None))
     if set(arguments.rows) == set(TRAININGS):
         print(measure_benchmark(ROOT, results, record))
         print(event_budget(arguments, best["ours"], record))
+
+
+def expected_errors(section: str, found: dict[str, Any], record: dict[str, Any]) -> None:
+    """Write a seed's section of docs/results/expected_errors.json, and the picture of all seeds."""
+    print(write_section(ROOT, "expected_errors", section, found, record))
+    seeds = seeds_of(read_results(ROOT, "expected_errors"))
+    picture = ROOT / "docs" / "pictures" / "expected_errors.png"
+    picture.write_bytes(png(expected_errors_figure(seeds, LIGHT)))
 
 
 def event_budget(arguments: argparse.Namespace, weights: Path, record: dict[str, Any]) -> Path:

@@ -1,4 +1,5 @@
 import json
+import math
 
 import pytest
 
@@ -10,6 +11,7 @@ from polarnet.reports.study_tables import (
     choices_block,
     designs_block,
     event_budget_block,
+    expected_errors_block,
     headline_block,
     study_block,
 )
@@ -200,6 +202,20 @@ def test_the_study_of_the_networks_shows_every_seed_beside_what_must_be_beaten()
         in said
     )
     assert "Seed 1: minutes of training: paper 36; trained and scored on 1 core(s) (a processor" in said
+
+
+def test_expected_errors_are_shown_as_factors_a_line_for_each_seed():
+    def expecting(factor):
+        return {"sets": {name: {"mse": 0.03, "log_error": math.log(factor)} for name in ("simulated", "measured")}}
+
+    records = {"seed_1": MACHINE, "seed_2": MACHINE}
+    lines = expected_errors_block({"seed_1": expecting(1.5), "seed_2": expecting(2), "records": records}).splitlines()
+    assert lines[0].count("off by a factor of") == 2
+    assert lines[2:4] == [
+        "| ours, seed 1 | 0.0300 | 1.50 | 0.0300 | 1.50 |",
+        "| ours, seed 2 | 0.0300 | 2.00 | 0.0300 | 2.00 |",
+    ]
+    assert [line for line in lines if line.startswith("Seed 2: a processor")]
 
 
 def test_an_ablation_shows_the_whole_first_and_then_what_is_missed_most():

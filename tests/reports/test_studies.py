@@ -4,7 +4,7 @@ import matplotlib.image
 import pytest
 
 from polarnet.reports.figures import DARK, LIGHT, png
-from polarnet.reports.studies import event_budget_figure, sensitivity_figure
+from polarnet.reports.studies import event_budget_figure, expected_errors_figure, sensitivity_figure
 
 
 def scores(value):
@@ -24,11 +24,19 @@ SETTINGS = {
     "speed": [{"value": v, "scores": {"cf": scores(0.1), "ours": scores(0.6)}} for v in (0.5, 1.0)],
     "channel_error": [{"value": v, "scores": {"cf": scores(0.1), "ours": scores(0.6 - v)}} for v in (0.0, 0.2)],
 }
+EXPECTED = {
+    seed: {"sets": {name: {"curve": [(0.01, 0.02, 100), (0.1, 0.1, 300)]} for name in ("simulated", "measured")}}
+    for seed in ("1", "2")
+}
 
 
 @pytest.mark.parametrize("theme", [LIGHT, DARK])
 def test_the_figures_are_drawn_the_same_each_time(theme):
-    for draw, results in ((event_budget_figure, BUDGET), (sensitivity_figure, SETTINGS)):
+    for draw, results in (
+        (event_budget_figure, BUDGET),
+        (sensitivity_figure, SETTINGS),
+        (expected_errors_figure, EXPECTED),
+    ):
         content = png(draw(results, theme))
         assert content == png(draw(results, theme))
         assert matplotlib.image.imread(io.BytesIO(content)).std() > 0
@@ -43,3 +51,13 @@ def test_a_setting_is_a_column_with_its_values_below():
     axes = sensitivity_figure(SETTINGS, LIGHT).axes
     assert len(axes) == 4
     assert [tick.get_text() for tick in axes[1].get_xticklabels()] == ["0", "0.2"]
+
+
+def test_expected_errors_are_drawn_for_each_set_and_seed_beside_the_diagonal():
+    simulated, measured = expected_errors_figure(EXPECTED, LIGHT).axes
+    assert simulated.get_title("left") == "Simulated"
+    for axes in (simulated, measured):
+        diagonal, *seeds = axes.lines
+        assert list(diagonal.get_xdata()) == list(diagonal.get_ydata()) == [0.01, 0.1]
+        assert [line.get_label() for line in seeds] == ["seed 1", "seed 2"]
+        assert list(seeds[0].get_ydata()) == [0.02, 0.1]
