@@ -21,6 +21,7 @@ from polarnet.networks.blocks import (
     conv3x3,
     on_blocks,
 )
+from polarnet.networks.expected_error import ExpectedError, telling
 from polarnet.networks.mosaic import Memory, Motion, Picture, certainty, displacements, follow, nothing_seen
 from polarnet.networks.redundancy import (
     MOMENTS,
@@ -160,6 +161,7 @@ class StokesUNet(nn.Module):
         self.refine = ResidualBlock(half)
         self.add = nn.Conv2d(half, 4 * 4, kernel_size=1)
         self.constant = nn.Parameter(torch.tensor(MIDDLE_DOLP))
+        self.expected = ExpectedError()
         for last in (self.choose, self.gains, self.add, self.trust):
             assert last.bias is not None
             nn.init.zeros_(last.weight)
@@ -206,7 +208,8 @@ class StokesUNet(nn.Module):
         y4, others = self.smaller(g4, began[1:])
         recurrent = recurrent if "recurrence" in self.without else [held, *others]
         y4 = self.at_quarter(y4)
-        mixed = self._mixed(candidates, self.choose(y4).float().softmax(1))
+        weights = self.choose(y4).float().softmax(1)
+        mixed = self._mixed(candidates, weights)
         y2 = self.at_half(self.up_half(y4, skip=x2))
         gains = self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float())
         coarse = F.interpolate(mixed, scale_factor=4, mode="bilinear")
@@ -219,20 +222,22 @@ class StokesUNet(nn.Module):
 
         stokes, dolp = (fine + added[:, :3]).split([2, 1], dim=1)
         aolp = torch.remainder(torch.atan2(stokes[:, 1], stokes[:, 0]) / 2, math.pi)
-        maps = [dolp[:, 0], aolp, LOG_VARIANCE + added[:, 3], stokes]
+        expected = self.expected(telling(candidates.dolp, weights[:, :-1], candidates.evidence, dolp))
+        log_variance = LOG_VARIANCE + added[:, 3] + F.interpolate(expected, scale_factor=2)[:, 0]
+        maps = [dolp[:, 0], aolp, log_variance, stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
         carried = [*(sums[-1] for sums in around), *carried]
         return prediction, [*summed[-1].unbind(1), *moments, *carried, *recurrent]
 
     @torch.no_grad()
-    def expect(self, weight: Float[Tensor, " c"], bias: float) -> None:
-        """From now on expect, of 2 x 2 pixels, the log variance weight @ x + bias where the last layer sees x.
-
-        Nothing else changes.
-        """
+    def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:
+        """From now on expect the log variance weight @ x + bias, x being what `expected` is given. Nothing else
+        changes."""
         assert self.add.bias is not None
-        self.add.weight[OF_LOG_VARIANCE] = weight[:, None, None].to(self.add.weight)
-        self.add.bias[OF_LOG_VARIANCE] = bias - LOG_VARIANCE
+        self.add.weight[OF_LOG_VARIANCE] = 0
+        self.add.bias[OF_LOG_VARIANCE] = 0
+        self.expected.weight.copy_(weight)
+        self.expected.bias.fill_(bias - LOG_VARIANCE)
 
     def _candidates(
         self, events: Float[Tensor, "n m 4 h w"], streams: int, state: list[Tensor]

@@ -1,9 +1,9 @@
-"""Expected errors: once a network is trained, what its last layer sees is told how large errors are there.
+"""Expected errors: once a network is trained, how large they are is fitted to what may tell it.
 
 While a network learns, its errors change, and a likelihood of them teaches it little more than how large they are on
 the whole. When the training is over they stay as they are. Then the logarithm of the expected squared error, as a
-linear function of what the last layer sees, is the likeliest one of normal distributions: a convex problem. Pixels are
-many and scenes are few: what tells a scene's errors from another's is believed as far as it does so for scenes that
+linear function of what may tell it (features), is the likeliest one of normal distributions: a convex problem. Pixels
+are many and scenes are few: what tells a scene's errors from another's is believed as far as it does so for scenes that
 were left out of the fit, and where it does not, errors are expected to be the same everywhere.
 """
 

@@ -51,7 +51,7 @@ def dolp_task(
         wants_intensity=False,
         optimizer=config.optimizer or build.optimizer,
         scored=lambda maps: maps[:, :, 0],
-        expects=network.add if build.predicts_stokes else None,
+        expects=network.expected if build.predicts_stokes else None,
     )
 
 

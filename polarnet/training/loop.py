@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from statistics import fmean
 
 import torch
 from torch import Tensor, nn
@@ -208,33 +209,45 @@ def autocast(precision: str, device: torch.device) -> torch.autocast:
 def calibrate(
     task: Task, dataset: WindowDataset, config: LoopConfig, device: torch.device, workers: int
 ) -> dict[str, int | float]:
-    """Make the task's network expect the errors that it has on `dataset` (polarnet.training.calibration).
+    """Make the task's network expect the errors that it has on `dataset` (polarnet.training.calibration), and those of
+    one frame of each sequence that it has seen nothing of.
 
     What a checkpoint says of it. ValueError where it has no error at all.
     """
     if task.expects is None:
         raise ValueError("expected a task whose network says how large its errors are")
     task.network.eval()
-    scenes, seen = [], []
+    scenes, mean_squared, seen = [], [], []
     hook = task.expects.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+
+    def looked_at(
+        windows: Tensor, frames: Tensor, valid: Tensor | None, state: State, every: int
+    ) -> tuple[Scene, State]:
+        with autocast(config.precision, device):
+            predicted, state = task.unroll(windows, state)
+        errors = (task.scored(predicted).clamp(0, 1) - task.scored(frames)).square()
+        known = torch.ones_like(errors) if valid is None else valid.to(errors)
+        of_four, all_known = (avg_pool2d(image.flatten(0, 1), 2)[:, ::every, ::every] for image in (errors, known))
+        height, width = (every * size for size in of_four.shape[-2:])
+        here = seen.pop()[..., :height:every, :width:every].permute(0, 2, 3, 1)[all_known == 1]
+        return Scene(here.double().cpu(), of_four[all_known == 1].double().cpu()), state
+
     for batch in batches_of(dataset, range(len(dataset)), 1, workers):
-        state, features, squared = None, [], []
         every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / LOOKED_AT)))  # along each axis
+        state: State = None
+        parts: list[Scene] = []
+        still: list[Scene] = []
         for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
-            with autocast(config.precision, device):
-                predicted, state = task.unroll(windows, state)
-            errors = (task.scored(predicted).clamp(0, 1) - task.scored(frames)).square()
-            known = torch.ones_like(errors) if valid is None else valid.to(errors)
-            of_four, all_known = (avg_pool2d(image.flatten(0, 1), 2)[:, ::every, ::every] for image in (errors, known))
-            height, width = (every * size for size in of_four.shape[-2:])
-            here = seen.pop()[..., :height:every, :width:every].permute(0, 2, 3, 1)[all_known == 1]
-            features.append(here.double().cpu())
-            squared.append(of_four[all_known == 1].double().cpu())
-        scene = Scene(torch.cat(features), torch.cat(squared))
-        scenes += [scene] if len(scene.squared) else []
+            if not parts:
+                mask = None if valid is None else valid[:1]
+                still = [looked_at(torch.zeros_like(windows[:1]), frames[:1], mask, None, every)[0]]
+            part, state = looked_at(windows, frames, valid, state, every)
+            parts.append(part)
+        if any(len(part.squared) for part in parts):
+            mean_squared.append(torch.cat([part.squared for part in parts]).mean().item())
+            scenes.append(Scene(*(torch.cat(field) for field in zip(*parts, *still, strict=True))))
     hook.remove()
     found = fitted(scenes)
     task.network.expect(found.weight, found.bias)  # type: ignore[operator]
     task.network.train()
-    mean_squared = torch.cat([scene.squared for scene in scenes]).mean().item()
-    return {"sequences": len(scenes), "mse": mean_squared, "ridge": found.ridge}
+    return {"sequences": len(scenes), "mse": fmean(mean_squared), "ridge": found.ridge}

@@ -56,8 +56,8 @@ class Task:
     scored: Callable[[Tensor], Float[Tensor, "t b h w"]] = lambda frames: frames
     """Of what it says and should say, the frames that validation scores, and by which the best epoch is chosen."""
     expects: nn.Module | None = None
-    """The layer of the network that says how large it expects the errors of `scored` to be, pixels of its input being 2
-    x 2 of the image; None: there is none. A network that has one can `expect(weight, bias)`."""
+    """The part of the network that says how large it expects the errors of `scored` to be, whose input has a pixel for
+    2 x 2 of the image; None: there is none. A network that has one can `expect(weight, bias)`."""
 
 
 class Split(NamedTuple):

@@ -96,6 +96,20 @@ def test_errors_are_expected_where_they_are_and_dolp_is_what_it_was(stores, task
     assert after.log_variance.exp().mean().item() == pytest.approx(errors.mean().item(), rel=0.3)
 
 
+def test_of_what_it_has_seen_nothing_of_it_expects_the_errors_of_a_guess(stores, task_of):
+    task = task_of()
+    split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
+    calibrate(task, split.train, TRAIN, CPU, 0)
+    still, errors = [], []
+    for sequence in split.train:
+        with torch.no_grad():
+            found, _ = task.network(torch.zeros_like(sequence.inputs[:1]))
+        still.append(found.log_variance.exp().mean().item())
+        errors.append((found.dolp.clamp(0, 1) - sequence.dolp[:1]).square().mean().item())
+    assert len({round(expected, 6) for expected in still}) == 1
+    assert still[0] == pytest.approx(sum(errors) / len(errors), rel=0.25)
+
+
 def test_it_rests_on_pictures_as_they_are_without_their_variants():
     pictures = ["a-variant1-0123abcd-00", "b-0123abcd-00", "b-0123abcd-01"]
     variants = ["a-variant1-0123abcd-variant01-00", "b-0123abcd-variant12-01"]
