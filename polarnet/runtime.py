@@ -62,6 +62,21 @@ def limit_threads(threads: int) -> None:
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """torch on one thread, for bytes that do not depend on how many there are.
+
+    Threads share an image out, and at the end of a share torch computes single numbers, which it does not round as it
+    does whole vectors.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 def threads_of(config: RuntimeConfig) -> int:
     """Threads that one worker may use, so that all of them together use those of the machine."""
     return config.threads or max(1, usable_cores() // config.workers)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from polarnet import stokes
 from polarnet.events.frames import FrameStore
-from polarnet.runtime import generator_for
+from polarnet.runtime import generator_for, one_thread
 from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.pictures.images import read_rgb
 from polarnet.simulation.pictures.manifest import Manifest, read_manifest
@@ -29,6 +29,7 @@ from polarnet.simulation.scenes import SceneStore, made_from, variant_name
 from polarnet.simulation.variation import VariationConfig, varied
 
 
+@one_thread()
 def frames_of(
     scene: PolarizationScene, trajectory: Trajectory, t_us: Sequence[int], height: int, width: int
 ) -> tuple[Float[Tensor, "n 4 h w"], Float[Tensor, "n h w"], Float[Tensor, "n h w"]]:
@@ -131,6 +132,7 @@ def _create(
     return scene_store, frame_store
 
 
+@one_thread()
 def _synthesize_scene(
     picture: str,
     images: Path,

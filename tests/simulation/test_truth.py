@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import math
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,13 @@ CONFIG = MotionConfig(
     rotation_max_deg=10.0,
     zoom_max=1.2,
 )
+
+
+@pytest.fixture
+def threads_as_they_were():
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -183,3 +191,20 @@ def test_photographs_have_no_mask(stores):
     scenes, frames = stores
     assert not scenes.masked
     assert not frames.masked
+
+
+def test_the_number_of_threads_changes_no_bit_of_a_frame(threads_as_they_were):
+    config = dataclasses.replace(CONFIG, window_height=121, window_width=179, duration_s=0.4)
+    generator = np.random.default_rng(0)
+    s0, degree, angle = torch.rand(3, 300, 400, generator=torch.Generator().manual_seed(0))
+    scene = scene_from_polarization(s0, degree, math.pi * angle)
+    trajectory = random_trajectory(config, 300, 400, generator)
+
+    def frames(threads):
+        torch.set_num_threads(threads)
+        seen = frames_of(scene, trajectory, frame_times_us(config), 121, 179)
+        assert torch.get_num_threads() == threads
+        return seen
+
+    for one, several in zip(frames(1), frames(3), strict=True):
+        assert torch.equal(one, several)
