@@ -17,7 +17,7 @@ TELLING = 5
 LEAST_DISAGREEMENT = 1e-3  # squared DoLP: candidates that agree are wrong together
 LEAST_WEIGHT = 1e-6  # of all candidates together
 LEAST_ROOM = 0.05  # of dolp * (1 - dolp)
-HARDLY_ANY = 0.1  # evidence
+HARDLY_ANY = 0.1  # evidence, the mean over a frame
 
 
 class ExpectedError(nn.Module):
@@ -48,16 +48,18 @@ def telling(
 ) -> Float[Tensor, "n k 2*h 2*w"]:
     """What tells how large the errors of `dolp` are, at half its size; the candidates are at a quarter of it.
 
-    The logarithm of how far the candidates' DoLP are apart, by their weights; that of the evidence they rest on, and
-    from 0 to 1 how little it is; the mean of the first over the frame; the logarithm of what room errors have.
+    The logarithm of how far the candidates' DoLP are apart, by their weights, and that of the evidence they rest on; the
+    mean of the first over the frame, and from 0 to 1 how little evidence there is in it; the logarithm of what room
+    errors have.
     """
     whole = weights.sum(1, keepdim=True).clamp(min=LEAST_WEIGHT)
     mean = (weights * candidates).sum(1, keepdim=True) / whole
     apart = (weights * (candidates - mean).square()).sum(1, keepdim=True) / whole
     apart = torch.log(apart + LEAST_DISAGREEMENT)
-    grounds = [torch.log1p(evidence), 1 / (1 + evidence / HARDLY_ANY)]
-    coarse = torch.cat([apart, *(ground.mean(1, keepdim=True) for ground in grounds)], dim=1)
-    fine = F.interpolate(coarse, scale_factor=2, mode="bilinear")
-    of_frame = apart.mean((-1, -2), keepdim=True).expand_as(fine[:, :1])
+    at_place = torch.cat([apart, torch.log1p(evidence).mean(1, keepdim=True)], dim=1)
+    silence = 1 / (1 + evidence.mean((1, 2, 3)) / HARDLY_ANY)
+    of_frame = [apart.mean((-1, -2), keepdim=True), silence[:, None, None, None]]
     bounded = block_means(dolp, 2).clamp(0, 1)
-    return torch.cat([fine, of_frame, torch.log(bounded * (1 - bounded) + LEAST_ROOM)], dim=1)
+    room = torch.log(bounded * (1 - bounded) + LEAST_ROOM)
+    fine = F.interpolate(at_place, scale_factor=2, mode="bilinear")
+    return torch.cat([fine, *(one.expand_as(room) for one in of_frame), room], dim=1)

@@ -14,11 +14,11 @@ def told(candidates=EVEN, weights=EVEN, evidence=EVEN, dolp=0.5):
 
 def test_candidates_that_agree_say_the_least_and_the_others_how_far_they_are_apart():
     assert told().shape == (1, TELLING, 8, 12)
-    apart, _, _, of_frame, _ = told()[0]
+    apart, _, of_frame, _, _ = told()[0]
     assert apart.unique().item() == of_frame.unique().item() == pytest.approx(math.log(LEAST_DISAGREEMENT))
     candidates = EVEN.clone()
     candidates[:, 0, :, 3:] = 0.9
-    apart, _, _, of_frame, _ = told(candidates)[0]
+    apart, _, of_frame, _, _ = told(candidates)[0]
     disagree = math.log(0.2**2 + LEAST_DISAGREEMENT)
     assert apart[:, -1].unique().item() == pytest.approx(disagree)
     assert of_frame.unique().item() == pytest.approx((disagree + math.log(LEAST_DISAGREEMENT)) / 2)
@@ -31,10 +31,13 @@ def test_a_candidate_that_the_network_does_not_trust_does_not_count():
     assert told(candidates, 0 * weights).isfinite().all()
 
 
-def test_much_evidence_hardly_any_and_none_are_told_apart():
+def test_much_evidence_hardly_any_and_none_in_a_frame_are_told_apart():
     assert told(evidence=3 * EVEN)[0, 1].unique().item() == pytest.approx(math.log(2.5))
-    silence = [told(evidence=share * EVEN)[0, 2].unique().item() for share in (100, 0.2, 0)]
+    silence = [told(evidence=share * EVEN)[0, 3].unique().item() for share in (100, 0.2, 0)]
     assert silence == pytest.approx([0, 0.5, 1], abs=0.01)
+    evidence = 0 * EVEN
+    evidence[..., 0] = 60.0
+    assert told(evidence=evidence)[0, 3].unique().item() < 0.01
 
 
 def test_errors_of_middle_values_have_most_room():
