@@ -48,8 +48,8 @@ def telling(
 ) -> Float[Tensor, "n k 2*h 2*w"]:
     """What tells how large the errors of `dolp` are, at half its size; the candidates are at a quarter of it.
 
-    The logarithm of how far the candidates' DoLP are apart, by their weights, and that of the evidence they rest on; the
-    mean of the first over the frame, and from 0 to 1 how little evidence there is in it; the logarithm of what room
+    The logarithm of how far the candidates' DoLP are apart, by their weights, and that of the evidence they rest on;
+    the mean of the first over the frame, and from 0 to 1 how little evidence there is in it; the logarithm of what room
     errors have.
     """
     whole = weights.sum(1, keepdim=True).clamp(min=LEAST_WEIGHT)
