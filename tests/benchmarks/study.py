@@ -161,7 +161,8 @@ def main() -> None:
             for name, table in tables.items()
         },
     }
-    if {"ours", "paper"} <= set(arguments.rows):
+    both = {"ours", "paper"} <= set(arguments.rows)
+    if both:
         found |= headlines(tables)
     print(json.dumps({key: value for key, value in found.items() if key != "rows"}, indent=2))
     if not arguments.write:
@@ -172,7 +173,7 @@ def main() -> None:
             for name, about in details.items()
         }
         expected_errors(section, {"minutes_trained": found["minutes_trained"]["ours"], "sets": sets_of}, record)
-    if {"ours", "paper"} <= set(arguments.rows):
+    if both:
         seeds = seeds_of(read_results(ROOT, "network") | {section: found})
         print(write_section(ROOT, "network", section, found, record, over_seeds([*seeds.values()]) if seeds else None))
     if set(arguments.rows) == set(TRAININGS):
