@@ -199,6 +199,8 @@ def draw_reliability(axes: Axes, lines: Sequence[ReliabilityLine], theme: Theme)
         axes.plot(predicted, measured, color=colour, label=label)
         axes.scatter(predicted, measured, s=4 + 60 * pixels / pixels.sum(), color=colour, linewidths=0, zorder=3)
     axes.set(xscale="log", yscale="log", xlabel="predicted squared error", ylabel="measured squared error")
+    _plain_log_ticks(axes.xaxis)
+    _plain_log_ticks(axes.yaxis)
     axes.legend(frameon=False)
 
 

@@ -10,16 +10,16 @@ were left out of the fit, and where it does not, errors are expected to be the s
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
+from scipy.optimize import minimize
 from torch import Tensor
 
 RIDGES = (0.01, 0.1, 1.0, 10.0, 100.0)  # of coefficients of features scaled to a variance of 1; the last leaves nothing
 FOLDS = 5
-THINNED = 16  # times fewer pixels while a ridge is chosen
 LEAST_SPREAD = 1e-6  # of a feature that says anything
-ROUNDS = 50  # of Newton's method, which is there after a few
-ENOUGH = 1e-7  # of a mean log likelihood, not to be improved any more
+TOLERANCE = 1e-9  # of the mean log likelihood, relative, and of its slope
 
 
 class Scene(NamedTuple):
@@ -51,41 +51,31 @@ def fitted(scenes: Sequence[Scene]) -> ExpectedErrors:
     if not any(scene.squared.any() for scene in scenes):
         pixels = sum(len(scene.squared) for scene in scenes)
         raise ValueError(f"expected errors can be fitted to errors alone, got {pixels} pixels without any")
-    thin = [Scene(*(field[::THINNED] for field in scene)) for scene in scenes]
     losses = dict.fromkeys(RIDGES, 0.0)
-    for fold in range(min(FOLDS, len(thin))):
-        others = [scene for k, scene in enumerate(thin) if k % FOLDS != fold]
+    for fold in range(min(FOLDS, len(scenes))):
+        others = [scene for k, scene in enumerate(scenes) if k % FOLDS != fold]
         if not any(scene.squared.any() for scene in others):
             continue
         for ridge in RIDGES:
             found = _fitted(others, ridge)
-            losses[ridge] += sum(found.loss(scene) for scene in thin[fold::FOLDS])
+            losses[ridge] += sum(found.loss(scene) for scene in scenes[fold::FOLDS])
     return _fitted(scenes, min(reversed(RIDGES), key=losses.__getitem__))
 
 
 def _fitted(scenes: Sequence[Scene], ridge: float) -> ExpectedErrors:
-    features, squared = (torch.cat(field) for field in zip(*scenes, strict=True))
-    mean, spread = features.mean(0), features.std(0, correction=0)
-    scale = torch.where(spread > LEAST_SPREAD, 1 / spread.clamp(min=LEAST_SPREAD), 0)
-    x = torch.cat([(features - mean) * scale, torch.ones_like(squared)[:, None]], dim=1)
-    shrink = torch.cat([torch.full_like(mean, 2 * ridge), mean.new_zeros(1)])
-    w = torch.cat([torch.zeros_like(mean), squared.mean().log()[None]])
+    features, squared = (torch.cat(field).numpy() for field in zip(*scenes, strict=True))
+    mean, spread = features.mean(0), features.std(0)
+    scale = np.where(spread > LEAST_SPREAD, 1 / spread.clip(LEAST_SPREAD), 0)
+    scaled = (features - mean) * scale
 
-    def loss(w: Tensor) -> Tensor:
-        expected = x @ w
-        return (squared * torch.exp(-expected) + expected).mean() + (shrink * w.square()).sum() / 2
+    def loss_and_slope(w: Float64[np.ndarray, " k"]) -> tuple[float, Float64[np.ndarray, " k"]]:
+        expected = scaled @ w[:-1] + w[-1]
+        relative = squared * np.exp(-expected)
+        too_much = 1 - relative
+        slope = np.append(too_much @ scaled / len(scaled) + 2 * ridge * w[:-1], too_much.mean())
+        return (relative + expected).mean() + ridge * np.square(w[:-1]).sum(), slope
 
-    before = loss(w)
-    for _ in range(ROUNDS):
-        relative = squared * torch.exp(-(x @ w))
-        slope = (x * (1 - relative)[:, None]).mean(0) + shrink * w
-        bend = x.T @ (x * relative[:, None]) / len(x) + torch.diag(shrink)
-        step = torch.linalg.solve(bend, slope)
-        while (after := loss(w - step)) > before + ENOUGH:
-            step = step / 2
-        w = w - step
-        if before - after < ENOUGH:
-            break
-        before = after
-    weight = w[:-1] * scale
-    return ExpectedErrors(weight, float(w[-1] - weight @ mean), ridge)
+    start = np.append(np.zeros_like(mean), np.log(squared.mean()))
+    *coefficients, level = minimize(loss_and_slope, start, jac=True, method="L-BFGS-B", tol=TOLERANCE).x
+    weight = coefficients * scale
+    return ExpectedErrors(torch.from_numpy(weight), float(level - weight @ mean), ridge)

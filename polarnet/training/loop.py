@@ -217,8 +217,8 @@ def calibrate(
     if task.expects is None:
         raise ValueError("expected a task whose network says how large its errors are")
     task.network.eval()
-    scenes, mean_squared, seen = [], [], []
-    hook = task.expects.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    scenes, mean_squared = [], []
+    seen: list[Tensor] = []
 
     def looked_at(
         windows: Tensor, frames: Tensor, valid: Tensor | None, state: State, every: int
@@ -232,22 +232,22 @@ def calibrate(
         here = seen.pop()[..., :height:every, :width:every].permute(0, 2, 3, 1)[all_known == 1]
         return Scene(here.double().cpu(), of_four[all_known == 1].double().cpu()), state
 
-    for batch in batches_of(dataset, range(len(dataset)), 1, workers):
-        every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / LOOKED_AT)))  # along each axis
-        state: State = None
-        parts: list[Scene] = []
-        still: list[Scene] = []
-        for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
-            if not parts:
-                mask = None if valid is None else valid[:1]
-                still = [looked_at(torch.zeros_like(windows[:1]), frames[:1], mask, None, every)[0]]
-            part, state = looked_at(windows, frames, valid, state, every)
-            parts.append(part)
-        if any(len(part.squared) for part in parts):
-            mean_squared.append(torch.cat([part.squared for part in parts]).mean().item())
-            scenes.append(Scene(*(torch.cat(field) for field in zip(*parts, *still, strict=True))))
-    hook.remove()
+    with task.expects.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0])):
+        for batch in batches_of(dataset, range(len(dataset)), 1, workers):
+            every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / LOOKED_AT)))  # along each axis
+            state: State = None
+            parts: list[Scene] = []
+            still: list[Scene] = []
+            for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
+                if not parts:
+                    mask = None if valid is None else valid[:1]
+                    still = [looked_at(torch.zeros_like(windows[:1]), frames[:1], mask, None, every)[0]]
+                part, state = looked_at(windows, frames, valid, state, every)
+                parts.append(part)
+            if any(len(part.squared) for part in parts):
+                mean_squared.append(torch.cat([part.squared for part in parts]).mean().item())
+                scenes.append(Scene(*(torch.cat(field) for field in zip(*parts, *still, strict=True))))
     found = fitted(scenes)
-    task.network.expect(found.weight, found.bias)  # type: ignore[operator]
+    task.expects.set_to(found.weight, found.bias)
     task.network.train()
     return {"sequences": len(scenes), "mse": fmean(mean_squared), "ridge": found.ridge}

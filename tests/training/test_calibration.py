@@ -18,7 +18,7 @@ from polarnet.training.losses import LossConfig
 from polarnet.training.task import Task, open_split
 
 TRAIN = TrainConfig(**LOOP, representation=None, optimizer=None)
-LOSS = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=0.04)
+LOSS = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -30,12 +30,12 @@ def task_of(project_root):
 
 def scenes_of(in_all: float, in_each: float) -> list[Scene]:
     """Of scenes, features and squared errors. These depend on one feature by `in_all`, on another by `in_each`, but
-    in every other scene the other way round; a third says nothing and a fourth is always the same."""
+    in two fifths of the scenes the other way round; a third says nothing and a fourth is always the same."""
     generator, scenes = torch.Generator().manual_seed(0), []
     for k in range(20):
         features = torch.randn(5000, 4, generator=generator, dtype=torch.float64) * torch.tensor([0.01, 5, 1, 0])
         noise = torch.randn(5000, generator=generator, dtype=torch.float64)
-        expected = 100 * in_all * features[:, 0] + (-1) ** k * in_each * features[:, 2] - 4
+        expected = 100 * in_all * features[:, 0] + (-1) ** (k % 5) * in_each * features[:, 2] - 4
         scenes.append(Scene(features, expected.exp() * noise.square()))
     return scenes
 
