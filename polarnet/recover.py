@@ -28,7 +28,7 @@ from polarnet.recordings.live import LiveLines, Piece, live_lines
 from polarnet.recordings.recording import Recording, detect_format
 from polarnet.recordings.targets import calibrate_targets
 from polarnet.reports.recovery import RecoveryWriter
-from polarnet.runtime import RuntimeConfig, device_of, tune
+from polarnet.runtime import RuntimeConfig, device_of, precision_on, tune
 from polarnet.stokes import Mosaic
 from polarnet.weights import shipped_weights
 
@@ -182,16 +182,18 @@ def open_stream(
     """The method that recovers, and words for it.
 
     A network: of `weights`, else the shipped one, else what the pipeline trained. Another `method` of the benchmark:
-    as `config` says. ValueError or FileNotFoundError that says what is missing.
+    as `config` says. `precision` is that of networks: fp32, bf16, or auto: bf16 where the device has units for it.
+    ValueError or FileNotFoundError that says what is missing.
     """
     tune()
     place = device_of(RuntimeConfig(device, threads=0, workers=1, devices=1, nodes=1, rendezvous=""))
+    precision = precision_on(place, precision)
     if method in (None, "ours"):
         file = weights or _default_weights(config)
         if not file.is_file():
             raise FileNotFoundError(f"--weights {file}: expected a checkpoint (NAME.safetensors), there is none")
         network, metadata = dolp_checkpoint(file, place)
-        return Recoverer((network, metadata), place, precision), f"network {metadata['network']}, {file}"
+        return Recoverer((network, metadata), place, precision), f"network {metadata['network']} ({precision}), {file}"
     assert method is not None
     if weights is not None:
         raise ValueError(f"--weights is for the DoLP network; set baselines.weights.{method} for {method}")

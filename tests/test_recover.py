@@ -7,11 +7,12 @@ import pytest
 import torch
 import zarr
 
+from polarnet import runtime
 from polarnet.cli import main
 from polarnet.config import load
 from polarnet.evaluation.recoverer import Recoverer
 from polarnet.events.store import EventStore
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import WindowRule
 from polarnet.networks.checkpoint import load_network, save_checkpoint
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
@@ -114,6 +115,37 @@ def test_a_mosaic_is_one_file_with_channels_of_half_its_size(tmp_path, at_root):
     options = ("--mosaic", "90 45 / 135 0", "--method", "cf+gain", "--window", "500ev", "--step", "5ms")
     assert run(whole, *options, out=tmp_path / "out") == 0
     assert recovered(tmp_path / "out")["dolp"].shape[1:] == (HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize(
+    ("asked", "units", "taken"), [("auto", ["AMX"], "bf16"), ("auto", [], "fp32"), ("fp32", ["AMX"], "fp32")]
+)
+def test_the_network_computes_in_bfloat16_where_there_are_units_for_it(
+    store, weights, tmp_path, monkeypatch, capsys, asked, units, taken
+):
+    monkeypatch.setattr(runtime, "bf16_units", lambda device: units)
+    options = ("--sequence", "lake", "--weights", weights, "--device", "cpu", "--precision", asked)
+    assert run(store, *options, out=tmp_path / "auto") == 0
+    assert f"network paper ({taken})" in capsys.readouterr().out
+    assert run(store, *options[:-1], taken, out=tmp_path / "same") == 0
+    assert run(store, *options[:-1], {"bf16": "fp32", "fp32": "bf16"}[taken], out=tmp_path / "other") == 0
+    found, same, other = (recovered(tmp_path / name)["dolp"] for name in ("auto", "same", "other"))
+    assert np.array_equal(found, same)
+    assert not np.array_equal(found, other)
+
+
+def test_the_lines_on_the_page_run_as_they_stand(store, channels, weights, project_root):
+    snippet = re.search(r"```python\n(.*?)```", (project_root / "docs" / "recover.md").read_text(), re.DOTALL)
+    assert snippet is not None
+    camera = [
+        ([slice_time(events, begin, begin + 50_000) for events in channels], begin + 50_000)
+        for begin in range(0, DURATION_US, 50_000)
+    ]
+    names = {"path": weights, "height": HEIGHT, "width": WIDTH, "camera": camera}
+    exec(snippet[1].replace("recoverer.reset()", "seen = recoverer.windows; recoverer.reset()"), names)
+    assert (names["seen"], names["recoverer"].windows) == (3, 0)
+    *_, last = frames_of(opened(store), WindowRule(33_333, None, None), Recoverer(load_network(weights)))
+    torch.testing.assert_close(names["found"].dolp, last.found.dolp, atol=1e-5, rtol=1e-4)
 
 
 def test_windows_that_overlap_give_a_frame_every_tenth_of_a_millisecond(store, weights):

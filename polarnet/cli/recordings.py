@@ -70,7 +70,12 @@ def _add_recovery(commands: Commands) -> None:
     )
     recover.add_argument("--method", help="instead of the network: cf, highpass, cf+gain, e2v, ... of the benchmark")
     recover.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N")
-    recover.add_argument("--precision", choices=("fp32", "bf16"), default="fp32", help="of the networks")
+    recover.add_argument(
+        "--precision",
+        choices=("auto", "fp32", "bf16"),
+        default="auto",
+        help="auto: bf16 where the device has units for it",
+    )
     recover.add_argument("--out", type=Path, metavar="FOLDER", help="default: outputs/recover/NAME")
     recover.add_argument("--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), help="default: zarr png mp4")
     recover.add_argument("--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video")

@@ -71,7 +71,7 @@ def rig_lines(rig: Figures) -> Iterator[str]:
 def recover_block(results: Figures) -> str:
     """How fast `polarnet recover` is with each method, from a file and live."""
     found = results["recover"]
-    names = {"network": f"network `{found['network']}`"}
+    names = {"network": f"network `{found['network']}`, {found['precision']}"}
     rows = (
         [
             names.get(name, f"`{name}`"),

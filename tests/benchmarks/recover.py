@@ -1,4 +1,5 @@
-"""How fast `polarnet recover` is: python tests/benchmarks/recover.py [--write] [--weights FILE] [--picture FILE]
+"""How fast `polarnet recover` is: python tests/benchmarks/recover.py
+    [--write] [--weights FILE] [--precision auto|fp32|bf16] [--picture FILE]
 
 A window moves over a photograph of scikit-image; the events of its 120 x 180 pixels behind four polarizers, on a clock
 stretched so that 1 M of them come in a second, are recovered as the command does it: windows of 1/30 s, frames written
@@ -43,7 +44,7 @@ from polarnet.recordings.live import LiveLines, Piece
 from polarnet.recover import Input, Summary, frames_of, recover
 from polarnet.reports.provenance import git
 from polarnet.reports.recovery import RecoveryWriter
-from polarnet.runtime import tune
+from polarnet.runtime import precision_on, tune
 from polarnet.simulation import simulate
 from polarnet.weights import shipped_weights
 
@@ -54,6 +55,7 @@ WINDOWS = WindowRule(33_333, None, None)
 WRITTEN = ("zarr", "png", "mp4")
 UNTRAINED = ", untrained"
 FILTERS = ("highpass", "highpass+gain")
+CPU = torch.device("cpu")
 
 
 def stream_of_events(config: Config, seconds: float) -> list[Events]:
@@ -66,7 +68,7 @@ def stream_of_events(config: Config, seconds: float) -> list[Events]:
     return [replace(e, **{c: getattr(e, c)[e.t < seconds * 1e6] for c in "txyp"}) for e in stretched]
 
 
-def network_of(config: Config, weights: Path | None) -> tuple[Stream, str]:
+def network_of(config: Config, weights: Path | None, precision: str) -> tuple[Stream, str]:
     """The network to measure, and what it is."""
     try:
         weights = weights or shipped_weights()
@@ -75,9 +77,9 @@ def network_of(config: Config, weights: Path | None) -> tuple[Stream, str]:
         representation = config.train.representation or build.representation
         torch.manual_seed(config.seed)
         module = build(config.network_config, 4 * channels_of(REPRESENTATIONS[representation]))
-        return Recoverer((module, {"representation": representation})), config.network + UNTRAINED
+        return Recoverer((module, {"representation": representation}), CPU, precision), config.network + UNTRAINED
     network, metadata = load_network(weights)
-    return Recoverer((network, metadata)), metadata["network"]
+    return Recoverer((network, metadata), CPU, precision), metadata["network"]
 
 
 def latency_ms(channels: Sequence[Events], stream: Stream) -> float:
@@ -122,6 +124,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
     parser.add_argument("--weights", type=Path, help="of the network")
+    parser.add_argument("--precision", choices=("auto", "fp32", "bf16"), default="auto", help="of the network")
     parser.add_argument("--seconds", type=float, default=10.0, help="of the stream")
     parser.add_argument("--picture", type=Path, help="where to copy the pictures of a run")
     arguments = parser.parse_args()
@@ -132,9 +135,11 @@ def main() -> None:
     tune()
     figures: dict[str, Any] = machine_record(ROOT)
     channels = stream_of_events(config, arguments.seconds)
-    network, name = network_of(config, arguments.weights)
-    context = replace(context_of(config, 0.0), device=torch.device("cpu"))
-    figures |= {"network": name, "events": sum(map(len, channels)), "seconds": arguments.seconds, "methods": {}}
+    precision = precision_on(CPU, arguments.precision)
+    network, name = network_of(config, arguments.weights, precision)
+    context = replace(context_of(config, 0.0), device=CPU)
+    figures |= {"network": name, "precision": precision, "methods": {}}
+    figures |= {"events": sum(map(len, channels)), "seconds": arguments.seconds}
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         pictures = {}
