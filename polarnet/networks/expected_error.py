@@ -18,13 +18,12 @@ LEAST_DISAGREEMENT = 1e-3  # squared DoLP: candidates that agree are wrong toget
 LEAST_WEIGHT = 1e-6  # of all candidates together
 LEAST_ROOM = 0.05  # of dolp * (1 - dolp)
 HARDLY_ANY = 0.1  # evidence, the mean over a frame
-LOG_VARIANCE = -4.0  # until a training is over: an error of 0.14
 
 
 class ExpectedError(nn.Module):
     """The logarithm of the squared error of a pixel of half the size: weight @ what tells it + bias.
 
-    Nothing is learnt while a network trains: it is the same everywhere until `polarnet.training.loop.calibrate`.
+    Nothing is learnt while a network trains: all is 0 until `polarnet.training.loop.calibrate`.
     """
 
     weight: Float[Tensor, " k"]
@@ -33,12 +32,7 @@ class ExpectedError(nn.Module):
     def __init__(self):
         super().__init__()
         self.register_buffer("weight", torch.zeros(TELLING))
-        self.register_buffer("bias", torch.tensor(LOG_VARIANCE))
-
-    def set_to(self, weight: Float[Tensor, " k"], bias: float) -> None:
-        """From now on expect weight @ x + bias."""
-        self.weight.copy_(weight)
-        self.bias.fill_(bias)
+        self.register_buffer("bias", torch.zeros(()))
 
     def forward(self, telling: Float[Tensor, "n k h w"]) -> Float[Tensor, "n 1 h w"]:
         """Of what `telling` gives."""

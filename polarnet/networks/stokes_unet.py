@@ -42,6 +42,8 @@ PARTS = ("redundancy", "slopes", "sums", "recurrence", "mosaic")
 MIDDLE_DOLP = 0.3  # of the constant that is one more candidate, at the start
 WIDE = (3, 9)  # pixels, of the neighbourhoods that tell fine structure beside a pixel by itself
 MOST_POLARIZED = 0.98  # of 1: keeps atanh finite
+LOG_VARIANCE = -4.0  # at the start: an error of 0.14
+OF_LOG_VARIANCE = slice(12, 16)  # outputs of the last layer: the fourth map, 2 x 2 pixels of it
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,7 @@ class StokesUNet(nn.Module):
         self.trust = nn.Conv2d(half, 1, kernel_size=1)
         self.look = conv3x3(half + 4 * 3, half)
         self.refine = ResidualBlock(half)
-        self.add = nn.Conv2d(half, 4 * 3, kernel_size=1)
+        self.add = nn.Conv2d(half, 4 * 4, kernel_size=1)
         self.constant = nn.Parameter(torch.tensor(MIDDLE_DOLP))
         self.expected = ExpectedError()
         for last in (self.choose, self.gains, self.add, self.trust):
@@ -218,13 +220,24 @@ class StokesUNet(nn.Module):
         seen = torch.cat([y2, F.pixel_unshuffle(fine, 2).to(y2.dtype)], dim=1)
         added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(seen)))), 2).float()
 
-        stokes, dolp = (fine + added).split([2, 1], dim=1)
+        stokes, dolp = (fine + added[:, :3]).split([2, 1], dim=1)
         aolp = torch.remainder(torch.atan2(stokes[:, 1], stokes[:, 0]) / 2, math.pi)
         expected = self.expected(telling(candidates.dolp, weights[:, :-1], candidates.evidence, dolp))
-        maps = [dolp[:, 0], aolp, F.interpolate(expected, scale_factor=2)[:, 0], stokes]
+        log_variance = LOG_VARIANCE + added[:, 3] + F.interpolate(expected, scale_factor=2)[:, 0]
+        maps = [dolp[:, 0], aolp, log_variance, stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
         carried = [*(sums[-1] for sums in around), *carried]
         return prediction, [*summed[-1].unbind(1), *moments, *carried, *recurrent]
+
+    @torch.no_grad()
+    def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:
+        """From now on expect the log variance weight @ x + bias, x being what `expected` is given. Nothing else
+        changes."""
+        assert self.add.bias is not None
+        self.add.weight[OF_LOG_VARIANCE] = 0
+        self.add.bias[OF_LOG_VARIANCE] = 0
+        self.expected.weight.copy_(weight)
+        self.expected.bias.fill_(bias - LOG_VARIANCE)
 
     def _candidates(
         self, events: Float[Tensor, "n m 4 h w"], streams: int, state: list[Tensor]

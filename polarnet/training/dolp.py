@@ -20,7 +20,8 @@ def dolp_task(
 ) -> Task:
     """Train the network called `name` (a key of NETWORKS), new and initialised from the seed.
 
-    The truth is stacked: DoLP, s1 and s2; so is its answer, or DoLP alone where the network says no more.
+    Its answer and the truth are stacked: DoLP, s1 and s2, and of the answer the log variance; DoLP alone where the
+    network says no more.
     """
     build, _ = NETWORKS[name]
     representation = config.representation or build.representation
@@ -31,8 +32,8 @@ def dolp_task(
     def unroll(inputs: Tensor, state: State) -> tuple[Float[Tensor, "t b k h w"], State]:
         prediction, state = network.unroll(inputs, state)
         maps = prediction.dolp[:, :, None]
-        if prediction.stokes is not None:
-            maps = torch.cat([maps, prediction.stokes], dim=2)
+        if prediction.stokes is not None and prediction.log_variance is not None:
+            maps = torch.cat([maps, prediction.stokes, prediction.log_variance[:, :, None]], dim=2)
         return maps, state
 
     return Task(

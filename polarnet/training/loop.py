@@ -248,6 +248,6 @@ def calibrate(
                 mean_squared.append(torch.cat([part.squared for part in parts]).mean().item())
                 scenes.append(Scene(*(torch.cat(field) for field in zip(*parts, *still, strict=True))))
     found = fitted(scenes)
-    task.expects.set_to(found.weight, found.bias)
+    task.network.expect(found.weight, found.bias)  # type: ignore[operator]
     task.network.train()
     return {"sequences": len(scenes), "mse": fmean(mean_squared), "ridge": found.ridge}

@@ -13,12 +13,14 @@ from polarnet.similarity import Lpips, mean_where, mse, ssim, with_truth_outside
 Frames = Float[Tensor, "t b h w"]
 Valid = Bool[Tensor, "t b h w"] | None
 
+LOG_VARIANCES = (-10.0, 1.0)  # of DoLP: what an error can be
+
 
 @dataclass(frozen=True)
 class LossConfig:
     """Section `loss` of params.yaml: the weights of Eq. 9; the paper has 1, 1, 10. A weight of 0 leaves a term out.
 
-    The last is for networks that predict more than DoLP, and is left out for others.
+    The last two are for networks that predict more than DoLP, and are left out for others.
     """
 
     mse: float = field(metadata=allowed(low=0))
@@ -26,6 +28,9 @@ class LossConfig:
     lpips: float = field(metadata=allowed(low=0))
     stokes: float = field(metadata=allowed(low=0))
     """Of the squared error of (S1, S2) / S0."""
+    uncertainty: float = field(metadata=allowed(low=0))
+    """Of the negative logarithm of the likelihood of DoLP's error under its predicted variance, which alone learns
+    from it."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -73,20 +78,26 @@ class FrameLoss:
 
 
 class PolarizationLoss(FrameLoss):
-    """A `FrameLoss` of DoLP; where a network says more, also of (s1, s2)."""
+    """A `FrameLoss` of DoLP; where a network says more, also of (s1, s2) and of its uncertainty."""
 
     def __init__(self, config: LossConfig, lpips: Lpips | None, *, dolp_only: bool):
         super().__init__({"mse": config.mse, "ssim_loss": config.ssim, "lpips": config.lpips}, lpips)
-        if config.stokes and not dolp_only:
-            self.weights["stokes"] = config.stokes
+        more = {} if dolp_only else {"stokes": config.stokes, "uncertainty": config.uncertainty}
+        self._more = {name: weight for name, weight in more.items() if weight}
+        self.weights |= self._more
 
     def __call__(
         self, predicted: Float[Tensor, "t b k h w"], truth: Float[Tensor, "t b m h w"], valid: Valid = None
     ) -> dict[str, Float[Tensor, ""]]:
-        """The terms by name, without their weights. Maps: DoLP, and where a network says it s1, s2."""
+        """The terms by name, without their weights. Maps of both: DoLP, s1, s2; and predicted, the log variance."""
         terms = super().__call__(predicted[:, :, 0], truth[:, :, 0], valid)
-        if "stokes" in self.weights:
-            errors = (predicted[:, :, 1:] - truth[:, :, 1:]).square().sum(2)
-            everywhere = torch.ones_like(errors, dtype=torch.bool) if valid is None else valid
+        everywhere = truth[:, :, 0].new_ones(truth[:, :, 0].shape, dtype=torch.bool) if valid is None else valid
+        if "stokes" in self._more:
+            errors = (predicted[:, :, 1:3] - truth[:, :, 1:]).square().sum(2)
             terms["stokes"] = errors[everywhere].mean() if everywhere.any() else 0 * errors.sum()
+        if "uncertainty" in self._more:
+            log_variance = predicted[:, :, 3].clamp(*LOG_VARIANCES)
+            squared = (predicted[:, :, 0].detach().clamp(0, 1) - truth[:, :, 0]).square()
+            nll = (squared * torch.exp(-log_variance) + log_variance) / 2
+            terms["uncertainty"] = nll[everywhere].mean() if everywhere.any() else 0 * nll.sum()
         return terms

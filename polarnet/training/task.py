@@ -17,7 +17,6 @@ from polarnet.events.frames import FrameStore
 from polarnet.events.representations import Encode
 from polarnet.events.store import EventStore
 from polarnet.events.windows import EventSource, WindowDataset
-from polarnet.networks.expected_error import ExpectedError
 from polarnet.runtime import precision_on, seed_for
 from polarnet.similarity import Lpips
 from polarnet.simulation.emulator import EmulatorConfig
@@ -56,9 +55,9 @@ class Task:
     """A key of OPTIMIZERS."""
     scored: Callable[[Tensor], Float[Tensor, "t b h w"]] = lambda frames: frames
     """Of what it says and should say, the frames that validation scores, and by which the best epoch is chosen."""
-    expects: ExpectedError | None = None
+    expects: nn.Module | None = None
     """The part of the network that says how large it expects the errors of `scored` to be, whose input has a pixel for
-    2 x 2 of the image; None: there is none."""
+    2 x 2 of the image; None: there is none. A network that has one can `expect(weight, bias)`."""
 
 
 class Split(NamedTuple):
