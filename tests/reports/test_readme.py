@@ -294,9 +294,10 @@ def test_recordings_are_shown_reader_by_reader_with_libraries_beside_them():
 def test_the_speed_of_recover_is_shown_method_by_method():
     network = {"realtime_factor": 1.234, "latency_ms": 21.84, "live_latency_ms": 40.2}
     methods = {"network": network, "highpass+gain": {"realtime_factor": 2.0, "latency_ms": 9.0}}
-    block = recover_block({"recover": MACHINE | {"network": "x", "events": 2500, "seconds": 10.0, "methods": methods}})
+    about = {"network": "x", "precision": "bf16", "events": 2500, "seconds": 10.0, "methods": methods}
+    block = recover_block({"recover": MACHINE | about})
     assert block.startswith("2,500 events in 10 s")
-    assert "| network `x` | 1.23 | 21.8 | 40 |" in block
+    assert "| network `x`, bf16 | 1.23 | 21.8 | 40 |" in block
     assert "| `highpass+gain` | 2.00 | 9.0 | - |" in block
     assert "On 2 cores (a processor" in block
 
