@@ -33,9 +33,11 @@ def machine_record(root: Path) -> dict[str, Any]:
     }
 
 
-def uncommitted(root: Path) -> str:
-    """Changed files of the project at `root` but for docs/results; empty where a figure may name its commit."""
-    return git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
+def uncommitted(root: Path, *allowed: str) -> str:
+    """Changed files of the project at `root` but for what is measured and what is `allowed`; empty where a figure may
+    name its commit."""
+    but_for = [f":!{path}" for path in ("docs/results", "docs/pictures", *allowed)]
+    return git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", *but_for)
 
 
 def read_results(root: Path, name: str) -> dict[str, Any]:
@@ -112,8 +114,7 @@ def measure_benchmark(root: Path, benchmark: Path, record: Mapping[str, Any] | N
     pairs of `ours` with the others. Raises RuntimeError where the simulated or the measured set was not run, and when
     the tree has uncommitted changes.
     """
-    pipeline = (":!dvc.lock", ":!data", ":!params.yaml", ":!docs/results")
-    if git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", *pipeline):
+    if uncommitted(root, "dvc.lock", "data", "params.yaml"):
         raise RuntimeError("the tree has uncommitted changes; commit them first, the figures name a commit")
     folders = {"simulated": benchmark} | {path.name: path for path in sorted(benchmark.glob("sets/*")) if path.is_dir()}
     missing = [name for name in ("simulated", "measured") if not (folders.get(name, root) / "metrics.json").exists()]

@@ -10,6 +10,7 @@ from polarnet.measure import (
     measure_ablation,
     measure_benchmark,
     measure_pipeline,
+    uncommitted,
     write_section,
 )
 from polarnet.reports.provenance import git
@@ -63,6 +64,22 @@ def test_a_tree_with_changes_is_not_measured(tmp_path):
     git(tmp_path, "add", "file")
     with pytest.raises(RuntimeError, match="uncommitted changes"):
         measure_pipeline(tmp_path)
+
+
+def test_what_is_measured_is_no_change_of_what_it_names(tmp_path):
+    git(tmp_path, "init", "--quiet")
+    files = [tmp_path / name for name in ("docs/results/a.json", "docs/pictures/a.png", "params.yaml", "code.py")]
+    for file in files:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("one")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "-c", "user.name=a", "-c", "user.email=a@b", "commit", "--quiet", "-m", "one")
+    for file in files[:3]:
+        file.write_text("two")
+    assert uncommitted(tmp_path, "params.yaml") == ""
+    assert "params.yaml" in uncommitted(tmp_path)
+    files[3].write_text("two")
+    assert "code.py" in uncommitted(tmp_path, "params.yaml")
 
 
 def swept(root, **mse):

@@ -36,13 +36,12 @@ from polarnet.evaluation.recoverer import Recoverer, Stream, stream_of
 from polarnet.events.representations import REPRESENTATIONS, channels_of
 from polarnet.events.stream import Events
 from polarnet.events.streaming import WindowRule
-from polarnet.measure import machine_record
+from polarnet.measure import machine_record, uncommitted
 from polarnet.networks.checkpoint import load_network
 from polarnet.networks.registry import NETWORKS
 from polarnet.recordings.arrangements import write_store
 from polarnet.recordings.live import LiveLines, Piece
 from polarnet.recover import Input, Summary, frames_of, recover
-from polarnet.reports.provenance import git
 from polarnet.reports.recovery import RecoveryWriter
 from polarnet.runtime import precision_on, tune
 from polarnet.simulation import simulate
@@ -128,7 +127,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="of the stream")
     parser.add_argument("--picture", type=Path, help="where to copy the pictures of a run")
     arguments = parser.parse_args()
-    changed = git(ROOT, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
+    changed = uncommitted(ROOT)
     if arguments.write and changed:
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
     config = load(ROOT)
