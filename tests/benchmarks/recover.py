@@ -127,8 +127,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="of the stream")
     parser.add_argument("--picture", type=Path, help="where to copy the pictures of a run")
     arguments = parser.parse_args()
-    changed = uncommitted(ROOT)
-    if arguments.write and changed:
+    if arguments.write and (changed := uncommitted(ROOT)):
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
     config = load(ROOT)
     tune()
@@ -137,8 +136,8 @@ def main() -> None:
     precision = precision_on(CPU, arguments.precision)
     network, name = network_of(config, arguments.weights, precision)
     context = replace(context_of(config, 0.0), device=CPU)
-    figures |= {"network": name, "precision": precision, "methods": {}}
-    figures |= {"events": sum(map(len, channels)), "seconds": arguments.seconds}
+    count = sum(map(len, channels))
+    figures |= {"network": name, "precision": precision, "events": count, "seconds": arguments.seconds, "methods": {}}
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         pictures = {}
