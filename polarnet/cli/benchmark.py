@@ -34,7 +34,7 @@ def add_to(commands: Commands) -> None:
         help="what lies in FOLDER; auto takes .npz files and NAME_0, NAME_45, ... for measured polarization",
     )  # fmt: skip
     benchmark.add_argument("--out", type=Path, metavar="DIR", help="default: below outputs/benchmark")
-    benchmark.add_argument("--methods", help="of the two studies, separated by commas")
+    benchmark.add_argument("--methods", help="separated by commas; default: benchmark.methods, or what a study studies")
     benchmark.add_argument("--limit", type=int, metavar="N", help="of the two studies: the first N test sequences")
     benchmark.add_argument("overrides", nargs="*", help="of params.yaml, as Hydra takes them: seed=2")
     benchmark.set_defaults(run=_benchmark)
@@ -44,14 +44,17 @@ def _benchmark(options: argparse.Namespace) -> int:
     from polarnet.config import check_keys, load
     from polarnet.runtime import configure
 
+    if options.scenes and options.limit is not None:
+        raise ValueError("--limit is for --event-budget and --sensitivity; --scenes scores all that lies in its folder")
     root = project_root()
     scenes = options.scenes.resolve() if options.scenes else None
     name = scenes.name if scenes else "event_budget" if options.event_budget else "sensitivity"
     out = (options.out or root / "outputs" / "benchmark" / name).resolve()
     weights = options.weights.resolve() if options.weights else None
     with contextlib.chdir(root):  # paths of conf/config.yaml are relative to it
+        chosen = [f"benchmark.methods=[{options.methods}]"] if scenes and options.methods else []
         check_keys(root, options.overrides)
-        config = load(root, options.overrides)
+        config = load(root, [*options.overrides, *chosen])
         configure(config.runtime, config.seed)
         if scenes is None:
             return _study(options, config, out, weights)
