@@ -8,7 +8,7 @@ from typing import Any
 from polarnet.benchmarking import context_of, lpips_record, made_set, mapper_of
 from polarnet.config import Config
 from polarnet.evaluation.benchmark import run_benchmark, train_mean_dolp, write_benchmark
-from polarnet.evaluation.methods import METHODS, Context, why_absent
+from polarnet.evaluation.methods import METHODS, Context, weights_used, why_absent
 from polarnet.events.frames import FrameStore
 from polarnet.fingerprint import reach
 from polarnet.reports.set_page import write_set_page
@@ -26,7 +26,7 @@ def benchmark_folder(
     `out` gets metrics.json, details.json, frames.csv, panels and index.html, and in `out`/work what they were made
     from, so that a run that was stopped goes on and a second one with other weights makes only what is new. Methods
     whose weights are not there are left out, and `notes` says so. `weights` is a checkpoint of the DoLP network; None:
-    the one that the pipeline trained, or else the shipped one. ValueError where nothing in the folder can be used.
+    the shipped one. ValueError where nothing in the folder can be used.
     """
     if weights is not None and not weights.is_file():
         raise ValueError(
@@ -41,15 +41,14 @@ def benchmark_folder(
     notes: list[str] = []
     train_mean = _train_mean(config)
     wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
-    context = context_of(config, train_mean or 0.0, weights)
-    if why_absent("ours", context):
-        context = context_of(config, train_mean or 0.0, shipped_weights())
+    context = context_of(config, train_mean or 0.0, weights or shipped_weights())
     methods = [method for method in wanted if _runs(method, context, train_mean, notes)]
     lpips, record = _lpips_if_there(config)
     settings = dataclasses.replace(config.benchmark, methods=methods)
     test_set = made_set(root.resolve().name, work)
     benchmark = run_benchmark(test_set, context, settings, lpips, work / "cache", mapper_of(config, "benchmark"))
-    about = {"set": test_set.name, "lpips": record, "train_mean": train_mean, "left_out": notes}
+    used = weights_used(methods, context)
+    about = {"set": test_set.name, "lpips": record, "train_mean": train_mean, "left_out": notes, "weights": used}
     metrics = write_benchmark(out, benchmark, settings, config.seed, about)
     write_set_page(out, test_set.name, command, notes)
     return metrics, notes

@@ -67,11 +67,13 @@ def test_a_folder_of_photographs_is_scored_with_given_weights(
     details = json.loads((out / "details.json").read_text())
     assert len(details["scenes"]) == 2
     assert details["set"] == "holidays"
+    assert details["weights"]["ours"]["file"] == "mine.safetensors"
     printed = capsys.readouterr().out
     assert "train_mean was left out: the training split is not there" in printed
     assert "oracle mean" in printed
     page = (out / "index.html").read_text()
     assert "train_mean was left out" in page
+    assert "mine.safetensors (sha256" in page
     assert 'src="http' not in page
     assert (out / "comparison.png").exists()
     files = [path for path in (out / "work").rglob("*") if path.suffix in (".npz", ".png") and "ours" not in path.parts]

@@ -27,7 +27,7 @@ def add_to(commands: Commands) -> None:
     asked.add_argument("--event-budget", action="store_true", help="quality against events per pixel (paper, Fig. 11)")
     asked.add_argument("--sensitivity", action="store_true", help="quality against mismatch, noise, speed, channels")
     benchmark.add_argument(
-        "--weights", type=Path, metavar="FILE", help="of the network; default: trained here, or shipped"
+        "--weights", type=Path, metavar="FILE", help="of the network; default: shipped; studies: trained here"
     )
     benchmark.add_argument(
         "--kind", choices=("auto", "photographs", "polarization"), default="auto",

@@ -57,14 +57,6 @@ class Cache:
         except (FileNotFoundError, KeyError, ValueError, EOFError, zipfile.BadZipFile):  # absent, or cut short
             return None
 
-    def has_prediction(self, method: str, sequence: str, key: str) -> bool:
-        """Whether `prediction` would find one; reads no frames."""
-        try:
-            with np.load(self._path(method, sequence, "npz"), allow_pickle=False) as arrays:
-                return str(arrays["key"]) == key
-        except (FileNotFoundError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
-            return False
-
     def write_prediction(self, method: str, sequence: str, key: str, found: Polarization) -> Polarization:
         """Keep DoLP in [0, 1] and AoLP in radians; what they are in the steps of the store.
 

@@ -21,7 +21,8 @@ HARDLY_ANY = 0.1  # evidence, the mean over a frame
 
 
 class ExpectedError(nn.Module):
-    """The logarithm of the squared error of a pixel of half the size: weight @ what tells it + bias.
+    """What the logarithm of the squared error is above the network's start, of a pixel of half the size: weight @ what
+    tells it + bias.
 
     Nothing is learnt while a network trains: all is 0 until `polarnet.training.loop.calibrate`.
     """

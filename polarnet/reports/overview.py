@@ -1,7 +1,6 @@
 """The whole method in one figure: photograph, polarization, four polarizers, four event streams, recovered DoLP."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib
@@ -14,7 +13,7 @@ from matplotlib.patches import FancyArrowPatch
 from torch import Tensor
 
 from polarnet.events.stream import Events
-from polarnet.reports.figures import LIGHT, chart_style, png, show_picture
+from polarnet.reports.figures import LIGHT, chart_style, show_picture
 from polarnet.reports.maps import dolp_image, hue_wheel, intensity_image, polarization_hsv
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
@@ -48,12 +47,6 @@ class Overview(NamedTuple):
     start_us: int
     duration_us: int
     recovered: Float[Tensor, "h w"]
-
-
-def write_overview(overview: Overview, path: Path) -> None:
-    """Write the picture as a PNG."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(png(overview_figure(overview)))
 
 
 def overview_figure(overview: Overview) -> Figure:

@@ -24,7 +24,6 @@ from polarnet.simulation.pictures.polarimetry import group_by_measurement
 from polarnet.simulation.truth import synthesize
 
 MADE = "made.json"
-KINDS = ("auto", "photographs", "polarization")
 
 MakeMapper = Callable[[str], Callable[..., Iterable[Any]]]
 """`polarnet.cluster.pmap` with its workers bound, for a label; or one that gives the built-in `map`."""

@@ -71,7 +71,7 @@ def seen(sequence: WindowSequence, view: View) -> WindowSequence:
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """How a training looks at its sequences; keys of `train` and of `baselines.e2v` in params.yaml."""
+    """How a training looks at its sequences; keys of `train`, `baselines.e2v` and `baselines.e2p` in params.yaml."""
 
     visits: int = field(metadata=allowed(low=1))
     """To each sequence in an epoch, each with another view."""

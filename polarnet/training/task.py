@@ -41,11 +41,11 @@ class Task:
     encode: Encode
     """One polarizer's events in a window, as the network wants them."""
     streams: Callable[
-        [Batch], tuple[Float[Tensor, "t b c h w"], Float[Tensor, "t b h w"], Bool[Tensor, "t b h w"] | None]
+        [Batch], tuple[Float[Tensor, "t b c h w"], Float[Tensor, "t b *k h w"], Bool[Tensor, "t b h w"] | None]
     ]
     """What the network gets of a batch, what it should say, and where that is known (None: everywhere)."""
-    unroll: Callable[[Tensor, State], tuple[Float[Tensor, "t b h w"], State]]
-    """What it says for windows in a row, and its state after them."""
+    unroll: Callable[[Tensor, State], tuple[Float[Tensor, "t b *k h w"], State]]
+    """What it says for windows in a row, k maps or one alone, and its state after them."""
     loss: FrameLoss
     description: Mapping[str, Any]
     """What a checkpoint says of the network and its input: at least "network", "config" and "in_channels"."""

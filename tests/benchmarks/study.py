@@ -116,6 +116,8 @@ def parsed() -> argparse.Namespace:
     arguments = parser.parse_args()
     if arguments.write and uncommitted(ROOT):
         parser.error("the tree has uncommitted changes; commit them first, the figures name a commit")
+    if "ours" not in arguments.rows and not arguments.ours and not arguments.only:
+        parser.error(f"--rows {' '.join(arguments.rows)}: expected ours among them, or --ours FILE")
     for name in ("photographs", "measured", "work", "ours", "firenet", "lpips"):
         if path := getattr(arguments, name):
             setattr(arguments, name, path.resolve())

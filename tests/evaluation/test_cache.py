@@ -24,14 +24,12 @@ def test_a_prediction_comes_back_in_the_steps_of_the_truth(cache, recording):
     assert torch.equal(again.log_variance, kept.log_variance)
     torch.testing.assert_close(again.log_variance, found.log_variance, atol=0.002, rtol=0)
     torch.testing.assert_close(again.dolp, found.dolp, atol=0.51 / 65535, rtol=0)
-    assert cache.has_prediction("m", "a", "key")
 
 
 def test_another_key_another_method_or_another_sequence_finds_nothing(cache, recording):
     cache.write_prediction("m", "a", "key", Polarization(recording.dolp))
     for method, sequence, key in (("m", "a", "other"), ("n", "a", "key"), ("m", "b", "key")):
         assert cache.prediction(method, sequence, key) is None
-        assert not cache.has_prediction(method, sequence, key)
     assert cache.prediction("m", "a", "key").aolp is None
 
 
