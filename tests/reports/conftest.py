@@ -97,7 +97,10 @@ def run_methods(events, frames, folder):
                 {"e2v": recording.aolp[k]},
             )
         )  # fmt: skip
-    about = {"lpips": {"backbone": "squeeze", "sha256": None, "source": None, "reason": NO_WEIGHTS}}
+    about = {
+        "lpips": {"backbone": "squeeze", "sha256": None, "source": None, "reason": NO_WEIGHTS},
+        "weights": {"ours": {"file": "best.safetensors", "sha256": "5ca1ab1e" * 8}},
+    }
     costs = dict.fromkeys(methods, Cost(1.5, None, 0, 0.25)) | {"ours": Cost(1.5, 10.4, 37_777, 12.0)}
     write_benchmark(folder, Benchmark(rows, costs, panels), config, seed=1, about=about)
 
