@@ -26,7 +26,7 @@ def _add_inspection(commands: Commands) -> None:
     inspect.add_argument("--clock-mhz", type=float, help="of a CeleX-5, where it was not 100 MHz")
     inspect.add_argument("--assume-polarity", type=int, choices=(1, -1), help="of events that come without one")
     inspect.add_argument(
-        "--hot-pixel-factor", type=float, default=4.0, help="hot: as many times the events of the busiest around (4)"
+        "--hot-pixel-factor", type=float, default=4.0, help="hot: as many times the third busiest around (4)"
     )
     inspect.add_argument("--picture", type=Path, help="where to write the PNG (default: FILE.png here)")
     inspect.add_argument("--hot-pixels", type=Path, metavar="PNG", help="where to draw how often each pixel fired")

@@ -1,8 +1,8 @@
 """DoLP and AoLP window by window, as events come: every method of the benchmark as a stream.
 
 Networks learn on windows that follow each other, 1/30 s long in the paper, and their state is to summarise all that
-came before the present window. For DoLP more often than that, windows must neither be shorter (their event tensors
-would be of another kind) nor hand the state from each to the next while they overlap (most events would count many
+came before the present window. For DoLP more often than that, windows must neither be shorter (what they count would
+be of another kind) nor hand the state from each to the next while they overlap (most events would count many
 times). `StateHistory` keeps it right: a window begins with the state that the windows up to its own start left.
 """
 
@@ -67,8 +67,9 @@ class StateHistory:
 
     A window gets the newest state whose window ended no later than it begins. Windows one after the other so have their
     state handed on. Of windows that overlap, every S-th of a length of n S, each continues the one n before it, as if n
-    recoverers ran with shifted windows: no event counts twice, none is missed. At most `STATES_PER_WINDOW` states a
-    window are kept; where steps are finer, up to a 64th of a window before the present one is missed.
+    recoverers ran with shifted windows: no event counts twice, none is missed. What a step that does not divide the
+    length leaves before the present window is missed. At most `STATES_PER_WINDOW` states a window are kept; where steps
+    are finer, up to a 64th of a window is missed.
     """
 
     def __init__(self) -> None:

@@ -122,7 +122,7 @@ def export_store(store: EventStore, folder: Path, form: str) -> None:
 def import_store(folder: Path, path: str | Path) -> None:
     """Make an event store of a folder that `export_store` wrote: the same bytes as the store it came from.
 
-    For other files, read each with `read_hdf5` or `read_text` and give four to `EventStore.write`.
+    Other files are recordings: `polarnet.recordings` reads, checks and repairs them.
     """
     try:
         contents: dict[str, Any] = json.loads((folder / CONTENTS).read_text(encoding="utf-8"))

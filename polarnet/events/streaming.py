@@ -73,7 +73,7 @@ def parse_window(text: str) -> tuple[int | None, int | None]:
 class WindowCutter:
     """Cuts a stream that comes in pieces into windows, each as soon as all of its events are known.
 
-    Windows by time end at multiples of the step (or of their length), the first after one whole length. Windows by
+    Windows by time end after one whole length, and then every step (or length). Windows by
     number end with their last event; with a step, they are the last so many events before each multiple of it. A
     window's time starts where the window that many events or microseconds before it ended. What no later window needs
     is forgotten. Times count from 0.

@@ -54,7 +54,7 @@ class RecordingsConfig:
     picture_rate_hz: float | None = field(metadata=allowed(above=0))
     """Of intensity captures whose files have no times."""
     hot_pixel_factor: float | None = field(metadata=allowed(above=1))
-    """A pixel with as many times the events of the busiest around it is left out; null: none is."""
+    """A pixel that fires more than so often as the third busiest of the 5 x 5 around it is left out; null: none is."""
     alignment: str = field(metadata=allowed(choices=("landmark", "refined")))
     """Start times by the landmark alone (the paper), or refined over the whole picture."""
     refine_within_ms: float = field(metadata=allowed(above=0))

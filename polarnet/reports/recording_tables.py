@@ -83,7 +83,9 @@ def recover_block(results: Figures) -> str:
     )
     headings = ["method", "times real time", "a step, ms", "live, from event to frame, ms"]
     stream = f"{found['events']:,} events in {found['seconds']:g} s"
-    return "\n".join([f"{stream}; Zarr, PNG and video written:", "", *table(headings, rows), "", origin(found)])
+    return "\n".join(
+        [f"{stream}; Zarr, PNG and video written, live Zarr and video:", "", *table(headings, rows), "", origin(found)]
+    )
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:

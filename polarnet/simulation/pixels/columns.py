@@ -10,7 +10,7 @@ SIGNAL, LEAK, SHOT = 0, 1, 2
 
 
 class Columns(NamedTuple):
-    """Events of one plane, one array each. `label` and `seconds` have length 0 where nobody asked for them."""
+    """Events of one plane, one array each. `label` and `exact_us` have length 0 where nobody asked for them."""
 
     t: np.ndarray
     """int64, microseconds"""
