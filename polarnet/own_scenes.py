@@ -14,7 +14,9 @@ from polarnet.fingerprint import reach
 from polarnet.reports.set_page import write_set_page
 from polarnet.runtime import threads_of
 from polarnet.similarity import Lpips
+from polarnet.simulation.pictures.manifest import read_manifest
 from polarnet.simulation.sets import Recipe, make_folder_set
+from polarnet.simulation.truth import too_small
 from polarnet.weights import shipped_weights
 
 
@@ -25,8 +27,8 @@ def benchmark_folder(
 
     `out` gets metrics.json, details.json, frames.csv, panels and index.html, and in `out`/work what they were made
     from, so that a run that was stopped goes on and a second one with other weights makes only what is new. Methods
-    whose weights are not there are left out, and `notes` says so. `weights` is a checkpoint of the DoLP network; None:
-    the shipped one. ValueError where nothing in the folder can be used.
+    whose weights are not there are left out, files that cannot be used are skipped, and `notes` says so. `weights` is a
+    checkpoint of the DoLP network; None: the shipped one. ValueError where nothing in the folder can be used.
     """
     if weights is not None and not weights.is_file():
         raise ValueError(
@@ -38,7 +40,7 @@ def benchmark_folder(
         make_folder_set(root, kind, work, recipe, functools.partial(mapper_of, config))
     except ValueError as error:
         raise ValueError(f"--scenes {root}: nothing to test on. {error}") from error
-    notes: list[str] = []
+    notes = _skipped(config, work)
     train_mean = _train_mean(config)
     wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
     context = context_of(config, train_mean or 0.0, weights or shipped_weights())
@@ -52,6 +54,15 @@ def benchmark_folder(
     metrics = write_benchmark(out, benchmark, settings, config.seed, about)
     write_set_page(out, test_set.name, command, notes)
     return metrics, notes
+
+
+def _skipped(config: Config, work: Path) -> list[str]:
+    """A line for each file of the folder that is not tested on."""
+    manifest = read_manifest(work / "images")
+    unused = {skipped.file: skipped.reason for skipped in manifest.skipped}
+    unfit = too_small(manifest, config.synthesize, config.seed)
+    unused |= {entry.origin: unfit[entry.name] for entry in manifest.pictures if entry.name in unfit}
+    return [f"{file} was skipped: {reason}" for file, reason in unused.items()]
 
 
 def _train_mean(config: Config) -> float | None:

@@ -127,6 +127,27 @@ def test_measured_polarization_is_found_and_scored(project_root, tmp_path, monke
     assert json.loads((out / "metrics.json").read_text())["oracle_mean"]["skill"] == pytest.approx(0, abs=1e-3)
 
 
+def test_a_measured_scene_smaller_than_the_window_is_skipped_and_named(project_root, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "measured"
+    folder.mkdir()
+    for name, height, width in (("plate", 100, 150), ("stamp", 40, 150)):
+        picture = dead_leaves(generator_for(1, name, "picture"), height, width)
+        half, s1, s2 = picture[..., 0] / 2, 0.2 * picture[..., 0], 0.1 * picture[..., 0]
+        np.savez(folder / f"{name}.npz", I0=half + s1, I45=half + s2, I90=half - s1, I135=half - s2)
+    out = tmp_path / "out"
+    assert run(project_root, monkeypatch, folder, out, "--methods", "zeros") == 0
+    reason = "stamp.npz was skipped: a scene of 40x150 (height x width) is too small"
+    assert reason in capsys.readouterr().out
+    assert reason in (out / "index.html").read_text()
+    assert json.loads((out / "metrics.json").read_text()).keys() == {"zeros"}
+    assert [name[:6] for name in json.loads((out / "details.json").read_text())["scenes"]] == ["plate-"]
+    (folder / "plate.npz").unlink()
+    assert run(project_root, monkeypatch, folder, tmp_path / "none") == 1
+    error = capsys.readouterr().err
+    assert "nothing to test on. none of 1 pictures can be used" in error
+    assert "use larger pictures or a smaller window" in error
+
+
 @pytest.mark.skipif("POLARNET_SHARED" not in os.environ, reason="POLARNET_SHARED names no reference material")
 def test_a_scene_that_a_camera_measured(project_root, tmp_path, monkeypatch):
     folder = tmp_path / "camera"

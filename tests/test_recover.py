@@ -191,7 +191,9 @@ def test_a_sequence_is_replayed_as_lines_at_its_own_pace(store, channels):
     (("--sequence", "lake", "--method", "cf", "--step", "1s"), "events between windows would be lost"),
     (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
     (("--sequence", "lake", "--weights", "nothing.safetensors"), "expected a checkpoint"),
-    (("--live", "--method", "cf", "--size", 8, 10), "--live: expected one file"),
+    (("--live", "--method", "cf", "--size", 8, 10), "--live: expected no --size"),
+    (("--live", "--method", "cf", "--clock-mhz", 70), "--live: expected no --clock-mhz"),
+    (("--sequence", "lake", "--method", "cf", "--height", 8, "--angles", 0, 45, 90, 135), "no --angles, --height"),
 ])  # fmt: skip
 def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, capsys):
     if "cuda:9" in arguments and torch.cuda.is_available():
@@ -208,6 +210,10 @@ def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):
         ([one, one], "four files with --angles, got 2"),
         ([one] * 4, "say the polarizer of each"),
         ([one] * 4 + ["--angles", 0, 45, 90, 90], "four different angles"),
+        ([one] * 4 + ["--sequence", "lake"], "four files: expected no --sequence"),
+        ([one, "--mosaic", "90 45 / 135 0", "--angles", 0, 45, 90, 135], "with --mosaic: expected no --angles"),
+        ([one, "--live", "--sequence", "lake"], "--live: expected no --sequence"),
+        ([one, one, "--live"], "--live: expected one file or -, got 2"),
         ([tmp_path / "none.csv"], "there is no such file"),
     ):
         assert run(*files, "--method", "cf", out=tmp_path / "out") == 1

@@ -9,6 +9,17 @@ from pathlib import Path
 from polarnet.cli.parsers import Commands
 from polarnet.cli.project import project_root
 
+OF_FILES = ("format", "height", "width", "clock_mhz", "assume_polarity")
+"""Options of `polarnet recover` that say how to read a camera's files."""
+
+TAKEN = {
+    "--live": {"mosaic"},
+    "four files": {"angles", "size", *OF_FILES},
+    "one file with --mosaic": {"mosaic", "size", *OF_FILES},
+    "an event store or a folder": {"sequence", "size"},
+}
+"""Which options about its input `polarnet recover` takes."""
+
 
 def add_to(commands: Commands) -> None:
     """Its commands."""
@@ -147,13 +158,13 @@ def _recover(options: argparse.Namespace) -> int:
     out = options.out or Path("outputs") / "recover" / name
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     lines = None
+    _check_taken(options)
     if options.live:
-        if len(options.input) != 1 or options.size or options.angles:
-            raise ValueError("--live: expected one file or - and, where it has one, a --mosaic; nothing else of files")
+        if len(options.input) != 1:
+            raise ValueError(f"--live: expected one file or -, got {len(options.input)}")
         source, lines = open_live(options.input[0], mosaic, options.idle)
     else:
-        sides = ("format", "height", "width", "clock_mhz", "assume_polarity")
-        read = functools.partial(read_recording, **{side: getattr(options, side) for side in sides})
+        read = functools.partial(read_recording, **{name: getattr(options, name) for name in OF_FILES})
         arrangement = Arrangement(options.angles, mosaic, options.sequence)
         size = (options.size[0], options.size[1]) if options.size else None
         source = open_files([Path(path) for path in options.input], arrangement, read, size, out / "work", config)
@@ -166,6 +177,24 @@ def _recover(options: argparse.Namespace) -> int:
     notes = [f"Lines that were left out: {left_out}."] if left_out else []
     print(*notes, f"the page: {writer.write_page(source.name, facts, notes)}", sep="\n")
     return 0
+
+
+def _check_taken(options: argparse.Namespace) -> None:
+    """ValueError where an option about the input was given that such an input does not take."""
+    if options.live:
+        kind = "--live"
+    elif len(options.input) > 1:
+        kind = "four files"
+    elif options.mosaic is not None:
+        kind = "one file with --mosaic"
+    elif Path(options.input[0]).is_dir() or Path(options.input[0]).suffix == ".zip":
+        kind = "an event store or a folder"
+    else:
+        return  # refused for what is missing
+    given = [name for name in sorted(set().union(*TAKEN.values()) - TAKEN[kind]) if getattr(options, name) is not None]
+    if given:
+        named = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise ValueError(f"{kind}: expected no {named}, which would not be used; leave it out")
 
 
 def _replay(options: argparse.Namespace) -> int:

@@ -11,10 +11,10 @@ import torch
 
 from polarnet.events.stream import LARGEST_SIDE, Events, concatenate
 from polarnet.recordings.formats import aedat2, celex5_bin, celex5_csv, dat, evt, faery, hdf5, store, text
+from polarnet.recordings.formats.lines import HEAD_BYTES
 from polarnet.recordings.repair import repaired
 from polarnet.recordings.source import Block, Choices, RecordingError, Source
 
-HEAD_BYTES = 4096  # of a file; enough for every format to know its own
 CHUNK_EVENTS = 2**20
 
 

@@ -141,7 +141,9 @@ def read_artefacts(paths: ReportPaths) -> Artefacts:
         EventStore.open(paths.events),
     )
     manifest = read_manifest(paths.images)
-    pictures = sorted(manifest.pictures, key=lambda entry: entry.source == "dead_leaves")  # photographs first
+    seen = set(scenes.picture_of.values())
+    pictures = [entry for entry in manifest.pictures if entry.name in seen]  # others are too small for the window
+    pictures.sort(key=lambda entry: entry.source == "dead_leaves")  # photographs first
     generated = {entry.name for entry in pictures if entry.source == "dead_leaves"}
     files = sorted((paths.benchmark / "panels").glob("*.npz"))
     panels = [_panel(file, scenes.picture_of[file.stem] in generated) for file in files]

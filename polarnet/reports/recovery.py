@@ -35,7 +35,6 @@ from polarnet.reports.maps import (
 from polarnet.reports.tiles import chart, data_uri, template
 from polarnet.runtime import usable_cores
 
-OUTPUTS = ("zarr", "png", "exr", "mp4")
 VIDEO, CODEC = "recovered.mp4", "mp4v"  # MPEG-4, which players show and browsers do not
 FILM_FRAMES = 24
 """At least so many pictures, evenly spread, run on the page."""
@@ -88,7 +87,7 @@ class _Kept:
 class RecoveryWriter:
     """Writes frames into a folder as they come; use it in a `with`, which waits for the last and closes the files.
 
-    `outputs` are some of OUTPUTS. The folder gets recovered.zarr, png/*.png, exr/*.exr and recovered.mp4
+    `outputs` are some of zarr, png, exr and mp4. The folder gets recovered.zarr, png/*.png, exr/*.exr and recovered.mp4
     (`video_rate_hz` frames a second, whatever the time between them), and with `write_page` index.html and
     recovered.png.
     """

@@ -1,8 +1,10 @@
 """Pictures -> scenes, trajectories and the exact frames that an ideal camera in their place would take."""
 
+import dataclasses
 import functools
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ from polarnet.events.frames import FrameStore
 from polarnet.runtime import generator_for, one_thread
 from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.pictures.images import read_rgb
-from polarnet.simulation.pictures.manifest import Manifest, read_manifest
+from polarnet.simulation.pictures.manifest import Manifest, ManifestEntry, read_manifest
 from polarnet.simulation.pictures.polarimetry import read_intensities
 from polarnet.simulation.scene import (
     PolarizationScene,
@@ -27,6 +29,10 @@ from polarnet.simulation.scene import (
 )
 from polarnet.simulation.scenes import SceneStore, made_from, variant_name
 from polarnet.simulation.variation import VariationConfig, varied
+
+logger = logging.getLogger(__name__)
+
+REASONS_SHOWN = 5
 
 
 @one_thread()
@@ -68,8 +74,12 @@ def synthesize(
 
     `mapper` is `polarnet.cluster.pmap` with its workers bound, or the built-in `map`. Every trajectory depends on
     the seed and the sequence's name alone. An interrupted run goes on where it stopped.
+
+    Warns about every picture too small for the window and its motion, and makes no scene of it; ValueError where none
+    is left.
     """
     manifest = read_manifest(images)
+    manifest = _large_enough(manifest, too_small(manifest, config, seed, variation))
     scene_store, frame_store = _create(manifest, images, scenes, frames, config, variation, seed)
     missing = {*scene_store.missing(), *frame_store.missing()}
     pictures = {scene_store.picture_of[sequence] for sequence in missing} | set(scene_store.missing_pictures())
@@ -89,6 +99,40 @@ def synthesize(
     return len(scene_store.sequences)
 
 
+def too_small(
+    manifest: Manifest, config: MotionConfig, seed: int, variation: VariationConfig | None = None
+) -> dict[str, str]:
+    """The pictures in which the window cannot move as one of their sequences should: name and reason."""
+    reasons = {}
+    for entry in manifest.pictures:
+        try:
+            for sequence in (each for of in _sequences_of(entry, config, variation).values() for each in of):
+                random_trajectory(config, entry.height, entry.width, generator_for(seed, sequence, "motion"))
+        except ValueError as error:
+            reasons[entry.name] = str(error)
+    return reasons
+
+
+def _sequences_of(
+    entry: ManifestEntry, config: MotionConfig, variation: VariationConfig | None
+) -> dict[str, list[str]]:
+    """The names of a picture's scenes, and of the sequences of each."""
+    variants = variation.scenes_per_picture if variation and entry.split == "train" else 0
+    scenes = [entry.name, *(variant_name(entry.name, k) for k in range(1, variants + 1))]
+    return {scene: [f"{scene}-{number:02d}" for number in range(config.sequences_per_picture)] for scene in scenes}
+
+
+def _large_enough(manifest: Manifest, reasons: Mapping[str, str]) -> Manifest:
+    """The manifest without the pictures that there are reasons against; ValueError with some where none is left."""
+    for name, reason in reasons.items():
+        logger.warning("skipped %s: %s", name, reason)
+    kept = tuple(entry for entry in manifest.pictures if entry.name not in reasons)
+    if not kept:
+        shown = "".join(f"\n  {name}: {reason}" for name, reason in list(reasons.items())[:REASONS_SHOWN])
+        raise ValueError(f"none of {len(reasons)} pictures can be used:{shown}")
+    return dataclasses.replace(manifest, pictures=kept)
+
+
 def _create(
     manifest: Manifest,
     images: Path,
@@ -101,10 +145,8 @@ def _create(
     """Two unfinished stores; their attributes say what they are made from, so that only the same is resumed."""
     picture_of, splits = {}, {}
     for entry in manifest.pictures:
-        variants = variation.scenes_per_picture if variation and entry.split == "train" else 0
-        for scene in [entry.name, *(variant_name(entry.name, k) for k in range(1, variants + 1))]:
-            for number in range(config.sequences_per_picture):
-                sequence = f"{scene}-{number:02d}"
+        for scene, sequences in _sequences_of(entry, config, variation).items():
+            for sequence in sequences:
                 picture_of[sequence], splits[sequence] = scene, entry.split
     attributes = {
         "synthesize": asdict(config),
@@ -152,10 +194,7 @@ def _synthesize_scene(
     height, width = s0.shape
     t_us = frame_times_us(config)
     for sequence in [name for name, of in scenes.picture_of.items() if of == picture]:
-        try:
-            trajectory = random_trajectory(config, height, width, generator_for(seed, sequence, "motion"))
-        except ValueError as error:
-            raise ValueError(f"{picture}: {error}") from error
+        trajectory = random_trajectory(config, height, width, generator_for(seed, sequence, "motion"))
         scenes.write(sequence, torch.from_numpy(trajectory.to_vector()), t_us[-1])
         record = scenes.read(sequence)  # quantised: the scene that is emulated, and so the truth
         scene = scene_from_polarization(record.s0, record.dolp, record.aolp)

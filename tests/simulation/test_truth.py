@@ -3,6 +3,7 @@
 import dataclasses
 import logging
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,10 @@ from polarnet.simulation.motion import (
     render,
 )
 from polarnet.simulation.pictures.ingest import IngestConfig, ingest
+from polarnet.simulation.pictures.manifest import read_manifest, write_manifest
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.scenes import SceneStore
-from polarnet.simulation.truth import frames_of, synthesize, valid_frames
+from polarnet.simulation.truth import frames_of, synthesize, too_small, valid_frames
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
 
 CONFIG = MotionConfig(
@@ -93,6 +95,23 @@ def test_every_picture_gets_its_sequences_and_all_of_them_its_split(stores):
     assert [len(frames.of_split(split)) for split in ("train", "val", "test")] == [6, 2, 2]
     for split in ("train", "val", "test"):
         assert frames.of_split(split) == scenes.of_split(split)
+
+
+def test_pictures_too_small_for_the_window_are_left_out(images, stores, tmp_path, caplog):
+    smaller = tmp_path / "images"
+    shutil.copytree(images, smaller)
+    manifest = read_manifest(smaller)
+    first, *others = manifest.pictures
+    write_manifest(dataclasses.replace(manifest, pictures=(dataclasses.replace(first, height=24), *others)), smaller)
+    assert too_small(read_manifest(smaller), CONFIG, 1).keys() == {first.name}
+    scenes, frames = run(smaller, tmp_path)
+    assert f"skipped {first.name}: a scene of 24x120 (height x width) is too small" in caplog.text
+    assert set(scenes.picture_of.values()) == {entry.name for entry in others}
+    for sequence in scenes.sequences:
+        assert frames.frames(sequence).dolp.equal(stores[1].frames(sequence).dolp)
+    with pytest.raises(ValueError, match=r"none of 5 pictures can be used:\n  .*: a scene of 80x120 .* is too small"):
+        run(images, tmp_path / "none", dataclasses.replace(CONFIG, window_height=80))
+    assert not (tmp_path / "none").exists()
 
 
 def test_the_stored_truth_is_what_the_stored_scene_and_trajectory_show(stores):

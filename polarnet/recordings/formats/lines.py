@@ -12,7 +12,7 @@ from jaxtyping import Int64
 
 from polarnet.recordings.source import BLOCK_EVENTS, RecordingError
 
-HEAD_BYTES = 4096  # of a file; enough to see what its lines are
+HEAD_BYTES = 4096  # of a file; enough for every format to know its own
 BLOCK_BYTES = 2**22
 LONGEST_LINE = 2**12  # bytes
 
