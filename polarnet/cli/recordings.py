@@ -5,12 +5,13 @@ import functools
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 from polarnet.cli.parsers import Commands
 from polarnet.cli.project import project_root
 
 OF_FILES = ("format", "height", "width", "clock_mhz", "assume_polarity")
-"""Options of `polarnet recover` that say how to read a camera's files."""
+"""Options of commands that say how to read a camera's files."""
 
 TAKEN = {
     "--live": {"mosaic"},
@@ -30,12 +31,8 @@ def add_to(commands: Commands) -> None:
 def _add_inspection(commands: Commands) -> None:
     inspect = commands.add_parser("inspect", help="what is in a camera's file, and a picture of its busiest moment")
     inspect.add_argument("file", type=Path)
-    inspect.add_argument("--format", help="where the content does not show it: text, celex5_csv, celex5_bin, dat, ...")
-    inspect.add_argument("--height", type=int, help="of the sensor, where the file does not say it")
-    inspect.add_argument("--width", type=int)
+    _add_reading(inspect)
     inspect.add_argument("--part", metavar="SEQUENCE/ANGLE", help="of an event store")
-    inspect.add_argument("--clock-mhz", type=float, help="of a CeleX-5, where it was not 100 MHz")
-    inspect.add_argument("--assume-polarity", type=int, choices=(1, -1), help="of events that come without one")
     inspect.add_argument(
         "--hot-pixel-factor", type=float, default=4.0, help="hot: as many times the third busiest around (4)"
     )
@@ -46,8 +43,22 @@ def _add_inspection(commands: Commands) -> None:
     register = commands.add_parser("register", help="lay one camera's recording on another's: the homography")
     register.add_argument("reference", type=Path)
     register.add_argument("file", type=Path)
+    _add_reading(register)
     register.add_argument("--picture", type=Path, help="where to write a PNG of both event images, before and after")
     register.set_defaults(run=_register)
+
+
+def _add_reading(command: argparse.ArgumentParser) -> None:
+    """The options of `OF_FILES`."""
+    command.add_argument("--format", help="where the content does not show it: text, celex5_csv, celex5_bin, dat, ...")
+    command.add_argument("--height", type=int, help="of the sensor, where the file does not say it")
+    command.add_argument("--width", type=int)
+    command.add_argument("--clock-mhz", type=float, help="of a CeleX-5, where it was not 100 MHz")
+    command.add_argument("--assume-polarity", type=int, choices=(1, -1), help="of events that come without one")
+
+
+def _reading(options: argparse.Namespace) -> dict[str, Any]:
+    return {name: getattr(options, name) for name in OF_FILES}
 
 
 def _add_recovery(commands: Commands) -> None:
@@ -90,11 +101,7 @@ def _add_recovery(commands: Commands) -> None:
     recover.add_argument("--out", type=Path, metavar="FOLDER", help="default: outputs/recover/NAME")
     recover.add_argument("--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), help="default: zarr png mp4")
     recover.add_argument("--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video")
-    recover.add_argument("--format", help="of files, where the content does not show it; like the next for inspect")
-    recover.add_argument("--height", type=int, help="of the sensor, where the files do not say it")
-    recover.add_argument("--width", type=int)
-    recover.add_argument("--clock-mhz", type=float)
-    recover.add_argument("--assume-polarity", type=int, choices=(1, -1))
+    _add_reading(recover)
     recover.set_defaults(run=_recover)
 
     replay = commands.add_parser(
@@ -111,8 +118,8 @@ def _inspect(options: argparse.Namespace) -> int:
     from polarnet.recordings.recording import open_recording
     from polarnet.reports.recordings import recording_picture
 
-    chosen = {name: getattr(options, name) for name in ("height", "width", "part", "clock_mhz", "assume_polarity")}
-    inspection = inspect_recording(open_recording(options.file, options.format, **chosen), options.hot_pixel_factor)
+    recording = open_recording(options.file, part=options.part, **_reading(options))
+    inspection = inspect_recording(recording, options.hot_pixel_factor)
     for finding in findings(inspection):
         print(finding)
     path = options.picture or Path(f"{options.file.name}.png")
@@ -131,7 +138,8 @@ def _register(options: argparse.Namespace) -> int:
     from polarnet.recordings.registration import event_image, register, warped
     from polarnet.reports.calibration import draw_registration
 
-    reference, moving = (event_image(read_recording(path).events) for path in (options.reference, options.file))
+    files = options.reference, options.file
+    reference, moving = (event_image(read_recording(path, **_reading(options)).events) for path in files)
     found = register(reference, moving)
     print(json.dumps({"homography": found.homography.tolist(), "correlation": found.correlation}, indent=2))
     if options.picture:
@@ -164,7 +172,7 @@ def _recover(options: argparse.Namespace) -> int:
             raise ValueError(f"--live: expected one file or -, got {len(options.input)}")
         source, lines = open_live(options.input[0], mosaic, options.idle)
     else:
-        read = functools.partial(read_recording, **{name: getattr(options, name) for name in OF_FILES})
+        read = functools.partial(read_recording, **_reading(options))
         arrangement = Arrangement(options.angles, mosaic, options.sequence)
         size = (options.size[0], options.size[1]) if options.size else None
         source = open_files([Path(path) for path in options.input], arrangement, read, size, out / "work", config)
