@@ -326,8 +326,9 @@ def _manifest(entries: Sequence[ManifestEntry], skipped: Sequence[Skipped], fold
 def _check_not_empty(config: IngestConfig, manifest: Manifest) -> None:
     if not manifest.pictures:
         raise ValueError(f"ingest.source={config.source}: no picture is left; raise ingest.dead_leaves")
-    for split in ("train", "val", "test"):
-        if not manifest.counts[split]:
+    val, test = config.val_fraction, config.test_fraction
+    for split, fraction in (("train", 1 - val - test), ("val", val), ("test", test)):
+        if fraction > 0 and not manifest.counts[split]:
             logger.warning("no picture is in split %s: %d pictures are few", split, len(manifest.pictures))
 
 

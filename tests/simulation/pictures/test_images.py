@@ -1,4 +1,4 @@
-"""Reading pictures: every file of issue 2's list is made here, by another program than the one that reads it."""
+"""Reading pictures: every kind of file is made here, by another program than the one that reads it."""
 
 import io
 import struct

@@ -41,7 +41,7 @@ def photograph(seed: int, height: int = 110, width: int = 160) -> np.ndarray:
 
 @pytest.fixture
 def mixed_folder(tmp_path) -> Path:
-    """The folder of issue 2's list: good files in several formats among bad ones."""
+    """Good files in several formats among bad ones."""
     root = tmp_path / "pictures"
     (root / "deeper").mkdir(parents=True)
     Image.fromarray(photograph(0)).save(root / "good.jpg", quality=95)
@@ -166,6 +166,17 @@ def test_ingest_replaces_what_was_there(tmp_path):
         ingest(config, 1, tmp_path / "images", map)
     assert len(list((tmp_path / "images").glob("*.png"))) == 1
     assert not (tmp_path / "images.tmp").exists()
+
+
+@pytest.mark.parametrize(("fractions", "empty"), [((0.1, 0.2), ["train"]), ((0.0, 1.0), []), ((1.0, 0.0), [])])
+def test_an_empty_split_is_named_where_pictures_were_asked_for(fractions, empty, tmp_path, caplog):
+    (tmp_path / "pictures").mkdir()
+    for i in range(2):
+        Image.fromarray(photograph(i)).save(tmp_path / "pictures" / f"{i}.png")
+    val, test = fractions
+    config = dataclasses.replace(CONFIG, root=str(tmp_path / "pictures"), val_fraction=val, test_fraction=test)
+    ingest(config, 1, tmp_path / "images", map)
+    assert caplog.messages == [f"no picture is in split {split}: 2 pictures are few" for split in empty]
 
 
 def on_two_threads_backwards(function: Callable[[Any], Any], items: Sequence[Any]) -> Iterable[Any]:
