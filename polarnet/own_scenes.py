@@ -15,8 +15,9 @@ from polarnet.reports.set_page import write_set_page
 from polarnet.runtime import threads_of
 from polarnet.similarity import Lpips
 from polarnet.simulation.pictures.manifest import read_manifest
+from polarnet.simulation.scenes import SceneStore
 from polarnet.simulation.sets import Recipe, make_folder_set
-from polarnet.simulation.truth import too_small
+from polarnet.simulation.truth import motions_of
 from polarnet.weights import shipped_weights
 
 
@@ -59,10 +60,10 @@ def benchmark_folder(
 def _skipped(config: Config, work: Path) -> list[str]:
     """A line for each file of the folder that is not tested on."""
     manifest = read_manifest(work / "images")
-    unused = {skipped.file: skipped.reason for skipped in manifest.skipped}
-    unfit = too_small(manifest, config.synthesize, config.seed)
-    unused |= {entry.origin: unfit[entry.name] for entry in manifest.pictures if entry.name in unfit}
-    return [f"{file} was skipped: {reason}" for file, reason in unused.items()]
+    seen = set(SceneStore.open(work / "scenes.zarr").picture_of.values())
+    unseen = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name not in seen))
+    _, small = motions_of(unseen, config.synthesize, config.seed)
+    return [f"{skipped.file} was skipped: {skipped.reason}" for skipped in (*manifest.skipped, *small)]
 
 
 def _train_mean(config: Config) -> float | None:

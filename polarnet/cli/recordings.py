@@ -155,6 +155,7 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.reports.recovery import RecoveryWriter
     from polarnet.stokes import parse_mosaic
 
+    _check_taken(options)
     config = functools.cache(lambda: load(project_root()))
     length_us, events = parse_window(options.window)
     step_us, step_events = parse_window(options.step) if options.step else (None, None)
@@ -166,10 +167,7 @@ def _recover(options: argparse.Namespace) -> int:
     out = options.out or Path("outputs") / "recover" / name
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     lines = None
-    _check_taken(options)
     if options.live:
-        if len(options.input) != 1:
-            raise ValueError(f"--live: expected one file or -, got {len(options.input)}")
         source, lines = open_live(options.input[0], mosaic, options.idle)
     else:
         read = functools.partial(read_recording, **_reading(options))
@@ -189,6 +187,8 @@ def _recover(options: argparse.Namespace) -> int:
 
 def _check_taken(options: argparse.Namespace) -> None:
     """ValueError where an option about the input was given that such an input does not take."""
+    if options.live and len(options.input) != 1:
+        raise ValueError(f"--live: expected one file or -, got {len(options.input)}")
     if options.live:
         kind = "--live"
     elif len(options.input) > 1:

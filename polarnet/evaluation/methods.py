@@ -253,14 +253,9 @@ def why_absent(method: str, context: Context) -> str | None:
     if not path.exists():
         return f"{path} is not there"
     if kinds and path.suffix == ".safetensors" and (held := load_checkpoint(path)[1]["network"]) not in kinds:
-        expected = " or ".join(kinds)
-        return f"{path} holds a {held}, expected {expected}: set baselines.weights.{row} to such a file{_training(row)}"
+        needed = f"{path} holds a {held}, expected {' or '.join(kinds)}: set baselines.weights.{row} to such a file"
+        return f"{needed}, or train one with baselines.e2v.arch={row}" if row in NEEDED["e2v"] else needed
     return None
-
-
-def _training(row: str) -> str:
-    """How to train the network of a row that the pipeline trains only on demand, as the end of a sentence."""
-    return f", or train one with baselines.e2v.arch={row}" if row in ("firenet", "e2vid") else ""
 
 
 def weights_used(methods: Sequence[str], context: Context) -> dict[str, dict[str, str]]:

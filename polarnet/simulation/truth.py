@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from polarnet.events.frames import FrameStore
 from polarnet.runtime import generator_for, one_thread
 from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.pictures.images import read_rgb
-from polarnet.simulation.pictures.manifest import Manifest, ManifestEntry, read_manifest
+from polarnet.simulation.pictures.manifest import Manifest, ManifestEntry, Skipped, listed, read_manifest
 from polarnet.simulation.pictures.polarimetry import read_intensities
 from polarnet.simulation.scene import (
     PolarizationScene,
@@ -32,7 +32,8 @@ from polarnet.simulation.variation import VariationConfig, varied
 
 logger = logging.getLogger(__name__)
 
-REASONS_SHOWN = 5
+Motions: TypeAlias = Mapping[str, Mapping[str, Trajectory]]
+"""Of a picture: the trajectory of each sequence of each of its scenes."""
 
 
 @one_thread()
@@ -79,8 +80,13 @@ def synthesize(
     is left.
     """
     manifest = read_manifest(images)
-    manifest = _large_enough(manifest, too_small(manifest, config, seed, variation))
-    scene_store, frame_store = _create(manifest, images, scenes, frames, config, variation, seed)
+    motions, skipped = motions_of(manifest, config, seed, variation)
+    for picture in skipped:
+        logger.warning("skipped %s: %s", picture.file, picture.reason)
+    if not motions:
+        raise ValueError(f"none of {len(skipped)} pictures can be used:{listed(skipped)}")
+    manifest = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name in motions))
+    scene_store, frame_store = _create(manifest, motions, images, scenes, frames, config, variation, seed)
     missing = {*scene_store.missing(), *frame_store.missing()}
     pictures = {scene_store.picture_of[sequence] for sequence in missing} | set(scene_store.missing_pictures())
     task = functools.partial(
@@ -92,49 +98,43 @@ def synthesize(
         variation=variation,
         seed=seed,
     )
-    for _ in mapper(task, sorted(pictures)):
+    trajectories = {scene: sequences for of in motions.values() for scene, sequences in of.items()}
+    for _ in mapper(task, [(picture, trajectories[picture]) for picture in sorted(pictures)]):
         pass
     scene_store.finish()
     frame_store.finish()
     return len(scene_store.sequences)
 
 
-def too_small(
+def motions_of(
     manifest: Manifest, config: MotionConfig, seed: int, variation: VariationConfig | None = None
-) -> dict[str, str]:
-    """The pictures in which the window cannot move as one of their sequences should: name and reason."""
-    reasons = {}
+) -> tuple[dict[str, Motions], list[Skipped]]:
+    """The motions over each picture, by its name, and the pictures that are too small for the window and its motion."""
+    motions, skipped = {}, []
     for entry in manifest.pictures:
         try:
-            for sequence in (each for of in _sequences_of(entry, config, variation).values() for each in of):
-                random_trajectory(config, entry.height, entry.width, generator_for(seed, sequence, "motion"))
+            motions[entry.name] = _motions(entry, config, seed, variation)
         except ValueError as error:
-            reasons[entry.name] = str(error)
-    return reasons
+            skipped.append(Skipped(entry.origin, str(error)))
+    return motions, skipped
 
 
-def _sequences_of(
-    entry: ManifestEntry, config: MotionConfig, variation: VariationConfig | None
-) -> dict[str, list[str]]:
-    """The names of a picture's scenes, and of the sequences of each."""
+def _motions(entry: ManifestEntry, config: MotionConfig, seed: int, variation: VariationConfig | None) -> Motions:
     variants = variation.scenes_per_picture if variation and entry.split == "train" else 0
     scenes = [entry.name, *(variant_name(entry.name, k) for k in range(1, variants + 1))]
-    return {scene: [f"{scene}-{number:02d}" for number in range(config.sequences_per_picture)] for scene in scenes}
-
-
-def _large_enough(manifest: Manifest, reasons: Mapping[str, str]) -> Manifest:
-    """The manifest without the pictures that there are reasons against; ValueError with some where none is left."""
-    for name, reason in reasons.items():
-        logger.warning("skipped %s: %s", name, reason)
-    kept = tuple(entry for entry in manifest.pictures if entry.name not in reasons)
-    if not kept:
-        shown = "".join(f"\n  {name}: {reason}" for name, reason in list(reasons.items())[:REASONS_SHOWN])
-        raise ValueError(f"none of {len(reasons)} pictures can be used:{shown}")
-    return dataclasses.replace(manifest, pictures=kept)
+    names = {scene: [f"{scene}-{number:02d}" for number in range(config.sequences_per_picture)] for scene in scenes}
+    return {
+        scene: {
+            sequence: random_trajectory(config, entry.height, entry.width, generator_for(seed, sequence, "motion"))
+            for sequence in sequences
+        }
+        for scene, sequences in names.items()
+    }
 
 
 def _create(
     manifest: Manifest,
+    motions: Mapping[str, Motions],
     images: Path,
     scenes: Path,
     frames: Path,
@@ -145,7 +145,7 @@ def _create(
     """Two unfinished stores; their attributes say what they are made from, so that only the same is resumed."""
     picture_of, splits = {}, {}
     for entry in manifest.pictures:
-        for scene, sequences in _sequences_of(entry, config, variation).items():
+        for scene, sequences in motions[entry.name].items():
             for sequence in sequences:
                 picture_of[sequence], splits[sequence] = scene, entry.split
     attributes = {
@@ -176,7 +176,7 @@ def _create(
 
 @one_thread()
 def _synthesize_scene(
-    picture: str,
+    item: tuple[str, Mapping[str, Trajectory]],
     images: Path,
     scenes: SceneStore,
     frames: FrameStore,
@@ -184,17 +184,16 @@ def _synthesize_scene(
     variation: VariationConfig | None,
     seed: int,
 ) -> None:
-    """Write one picture, or a variant of it, and all its sequences."""
+    """Write one picture, or a variant of it, and all its sequences, whose motions come with it."""
+    picture, trajectories = item
     source = made_from(picture)
     polarization, valid = _read_polarization(images, source)
     if variation and source != picture:
         polarization = varied(polarization, variation, generator_for(seed, picture, "variation"))
     s0, dolp, aolp = polarization
     scenes.write_picture(picture, s0, dolp, aolp, valid if scenes.masked else None)
-    height, width = s0.shape
     t_us = frame_times_us(config)
-    for sequence in [name for name, of in scenes.picture_of.items() if of == picture]:
-        trajectory = random_trajectory(config, height, width, generator_for(seed, sequence, "motion"))
+    for sequence, trajectory in trajectories.items():
         scenes.write(sequence, torch.from_numpy(trajectory.to_vector()), t_us[-1])
         record = scenes.read(sequence)  # quantised: the scene that is emulated, and so the truth
         scene = scene_from_polarization(record.s0, record.dolp, record.aolp)

@@ -51,13 +51,18 @@ def test_register_prints_the_homography_of_two_recordings_and_draws_both(images,
     for name, image in zip(("a.txt", "b.txt"), images, strict=True):
         y, x = (np.repeat(axis.ravel(), np.rint(60 * image).astype(int).ravel()) for axis in np.indices(image.shape))
         lines = "".join(f"{t} {column} {row} 1\n" for t, (row, column) in enumerate(zip(y, x, strict=True)))
-        (tmp_path / name).write_text(lines)
+        (tmp_path / name).write_text(f"{WIDTH} {HEIGHT}\n{lines}")
     command = ["register", str(tmp_path / "a.txt"), str(tmp_path / "b.txt"), "--picture", str(tmp_path / "both.png")]
+    assert main(command) == 0
+    found = capsys.readouterr().out
+    assert corners_apart(np.array(json.loads(found)["homography"])) < 0.5
+    assert (tmp_path / "both.png").stat().st_size > 5000
+    for name in ("a.txt", "b.txt"):
+        (tmp_path / name).write_text((tmp_path / name).read_text().split("\n", 1)[1])
     assert main(command) == 1
     assert "height" in capsys.readouterr().err
     assert main([*command, "--height", str(HEIGHT), "--width", str(WIDTH)]) == 0
-    assert corners_apart(np.array(json.loads(capsys.readouterr().out)["homography"])) < 0.5
-    assert (tmp_path / "both.png").stat().st_size > 5000
+    assert capsys.readouterr().out == found
 
 
 def test_events_are_moved_to_the_reference_camera_and_those_it_does_not_see_left_out():

@@ -26,7 +26,14 @@ from polarnet.simulation.pictures.images import (
     srgb_of,
     write_png,
 )
-from polarnet.simulation.pictures.manifest import Manifest, ManifestEntry, Skipped, split_by_content, write_manifest
+from polarnet.simulation.pictures.manifest import (
+    Manifest,
+    ManifestEntry,
+    Skipped,
+    listed,
+    split_by_content,
+    write_manifest,
+)
 from polarnet.simulation.pictures.polarimetry import (
     group_by_measurement,
     read_measurement,
@@ -38,7 +45,6 @@ from polarnet.stokes import parse_mosaic
 logger = logging.getLogger(__name__)
 
 EDGE_BYTES = 1 << 16  # of a file's start and end, hashed to choose `limit` files without reading all of them
-REASONS_SHOWN = 5
 
 Mapper = Callable[..., Iterable[Any]]
 
@@ -333,12 +339,10 @@ def _check_not_empty(config: IngestConfig, manifest: Manifest) -> None:
 
 
 def _refuse_folder(config: IngestConfig, found: int, ignored: int, skipped: Sequence[Skipped]) -> NoReturn:
-    reasons = "".join(f"\n  {skip.file}: {skip.reason}" for skip in skipped[:REASONS_SHOWN])
-    more = f"\n  and {len(skipped) - REASONS_SHOWN} more" if len(skipped) > REASONS_SHOWN else ""
     raise ValueError(
         f"ingest.root={config.root}: no picture could be used. Looked, in all subfolders, for files that end in "
         f"{', '.join(sorted(_extensions(config.source)))}: found {found} pictures and {ignored} other files."
-        f"{reasons}{more}"
+        f"{listed(skipped)}"
     )
 
 

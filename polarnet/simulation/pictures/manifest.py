@@ -8,6 +8,7 @@ from pathlib import Path
 
 MANIFEST = "manifest.json"
 SPLITS = ("train", "val", "test")
+REASONS_SHOWN = 5
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,12 @@ class Manifest:
             "ignored_files": self.ignored_files,
             "unread_files": self.unread_files,
         }
+
+
+def listed(skipped: Sequence[Skipped]) -> str:
+    """Lines for an error: the first of the files, each with its reason, and how many more there are."""
+    reasons = "".join(f"\n  {skip.file}: {skip.reason}" for skip in skipped[:REASONS_SHOWN])
+    return reasons + (f"\n  and {len(skipped) - REASONS_SHOWN} more" if len(skipped) > REASONS_SHOWN else "")
 
 
 def split_by_content(hashes: Sequence[str], val_fraction: float, test_fraction: float) -> list[str]:
