@@ -16,7 +16,7 @@ help:
 
 setup: $(READY)
 
-$(READY): pyproject.toml constraints.txt .ci/setup
+$(READY): pyproject.toml constraints.txt .ci/lpips.txt .ci/setup
 	@.ci/setup "$(PYTHON)" "$(VENV)"
 	@touch $(READY)
 

@@ -19,7 +19,8 @@ from polarnet.baselines.postprocessing import PostprocessingConfig
 from polarnet.baselines.stokes_gain import GainConfig
 from polarnet.evaluation.methods import WeightsConfig
 from polarnet.evaluation.score import BenchmarkConfig
-from polarnet.lpips import LpipsConfig, lpips_problem
+from polarnet.lpips import PURPOSES, Purpose, is_stored
+from polarnet.lpips_weights import LpipsConfig, local_source
 from polarnet.networks.dolp_unet import DolpUNetConfig
 from polarnet.networks.registry import NetworkConfig
 from polarnet.networks.stokes_unet import StokesUNetConfig
@@ -173,22 +174,24 @@ def check_keys(root: Path, overrides: list[str]) -> None:
 def hydra_stage(main: Stage) -> Callable[[], None]:
     """Make `main(config)` a Hydra command line: composes, checks, sets up the runtime, then runs it.
 
-    Refuses, before anything runs, a key that does not exist, a wrong type, a value out of range, and an experiment
-    that requires LPIPS weights nobody has put in place.
+    Refuses, before anything runs, a key that does not exist, a wrong type, a value out of range, and a configuration
+    with LPIPS on a machine without its weights.
     """
-    root = Path(sys.modules[main.__module__].__file__ or "").resolve().parent.parent
+    file = Path(sys.modules[main.__module__].__file__ or "").resolve()
+    root = file.parent.parent
     os.environ[ROOT_VARIABLE] = str(root)
     register_schema()
 
     def command_line() -> None:
         overrides = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
-        _or_exit(lambda: check_keys(root, overrides))
+        or_exit(lambda: check_keys(root, overrides))
         run()
 
     @functools.wraps(main)
     def checked(node: DictConfig) -> Any:
-        config = _or_exit(lambda: typed(node))
-        _or_exit(lambda: _check_lpips(config))
+        config = or_exit(lambda: typed(node))
+        if file.stem != "weights":  # which searches and may download
+            or_exit(lambda: _check_lpips(config))
         configure(config.runtime, config.seed)
         return main(config)
 
@@ -196,9 +199,40 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
     return command_line
 
 
+def with_lpips(config: Config, purpose: Purpose, use: Callable[[str, str | None], T]) -> T | None:
+    """What `use` makes of a purpose's LPIPS, its backbone and weights file; None where the purpose needs no LPIPS.
+
+    A ValueError of `use` gets the keys that ask for LPIPS before it, and the overrides that do without behind it.
+    """
+    e2v, e2p = config.baselines.e2v, config.baselines.e2p
+    weights = {
+        "loss.lpips": config.loss.lpips,
+        "baselines.e2v.lpips": e2v.lpips,
+        "baselines.e2p.lpips": e2p.lpips,
+        "baselines.e2p.intensity_lpips": e2p.intensity_lpips,
+    }
+    if purpose == "loss":
+        backbone, asking, off = config.lpips.backbone, [key for key, weight in weights.items() if weight > 0], "0"
+    else:
+        backbone, off = config.benchmark.lpips_backbone, "false"
+        asking = ["benchmark.lpips"] if config.benchmark.lpips else []
+    if not asking:
+        return None
+    try:
+        return use(backbone, config.lpips.path_of(backbone))
+    except ValueError as error:
+        without = " ".join(f"{key}={off}" for key in asking)
+        raise ValueError(f"{', '.join(asking)}: {error}; to go without: {without}") from None
+
+
 def _check_lpips(config: Config) -> None:
-    if config.lpips.required and (problem := lpips_problem(config.lpips, config.paths.weights)):
-        raise ValueError(f"lpips.required is true: {problem}")
+    """ValueError where stage `weights` has not found what this configuration needs, and would have to download it."""
+
+    def look(purpose: Purpose, backbone: str, path: str | None) -> bool:
+        return is_stored(config.paths.weights, purpose, backbone) or bool(local_source(backbone, path))
+
+    for purpose in PURPOSES:
+        with_lpips(config, purpose, functools.partial(look, purpose))
 
 
 def _check_key(key: str, where: str) -> None:
@@ -219,7 +253,8 @@ def _leaves(values: Any, prefix: str = "") -> list[str]:
     return [leaf for key, value in values.items() for leaf in _leaves(value, f"{prefix}.{key}" if prefix else str(key))]
 
 
-def _or_exit(check: Callable[[], T]) -> T:
+def or_exit(check: Callable[[], T]) -> T:
+    """What `check` gives; ends the program with the sentence of its ValueError."""
     try:
         return check()
     except ValueError as error:

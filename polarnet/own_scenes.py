@@ -5,12 +5,14 @@ import functools
 from pathlib import Path
 from typing import Any
 
-from polarnet.benchmarking import context_of, lpips_record, made_set, mapper_of
-from polarnet.config import Config
+from polarnet.benchmarking import context_of, made_set, mapper_of
+from polarnet.config import Config, with_lpips
 from polarnet.evaluation.benchmark import run_benchmark, train_mean_dolp, write_benchmark
 from polarnet.evaluation.methods import METHODS, Context, weights_used, why_absent
 from polarnet.events.frames import FrameStore
 from polarnet.fingerprint import reach
+from polarnet.lpips import NO_RECORD
+from polarnet.lpips_weights import find_weights
 from polarnet.reports.set_page import write_set_page
 from polarnet.runtime import threads_of
 from polarnet.similarity import Lpips
@@ -29,12 +31,15 @@ def benchmark_folder(
     `out` gets metrics.json, details.json, frames.csv, panels and index.html, and in `out`/work what they were made
     from, so that a run that was stopped goes on and a second one with other weights makes only what is new. Methods
     whose weights are not there are left out, files that cannot be used are skipped, and `notes` says so. `weights` is a
-    checkpoint of the DoLP network; None: the shipped one. ValueError where nothing in the folder can be used.
+    checkpoint of the DoLP network; None: the shipped one. ValueError where nothing in the folder can be used, and where
+    the table is to have LPIPS but there are no weights for it.
     """
     if weights is not None and not weights.is_file():
         raise ValueError(
             f"--weights {weights}: expected a checkpoint of the DoLP network (.safetensors), there is none"
         )
+    lpips_weights = with_lpips(config, "benchmark", find_weights)  # which need not have been found by the pipeline
+    lpips = None if lpips_weights is None else Lpips.of(lpips_weights.backbone, lpips_weights.tensors)
     recipe = Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads_of(config.runtime))
     work = out / "work"
     try:
@@ -46,11 +51,11 @@ def benchmark_folder(
     wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
     context = context_of(config, train_mean or 0.0, weights or shipped_weights())
     methods = [method for method in wanted if _runs(method, context, train_mean, notes)]
-    lpips, record = _lpips_if_there(config)
     settings = dataclasses.replace(config.benchmark, methods=methods)
     test_set = made_set(root.resolve().name, work)
     benchmark = run_benchmark(test_set, context, settings, lpips, work / "cache", mapper_of(config, "benchmark"))
     used = weights_used(methods, context)
+    record = NO_RECORD if lpips_weights is None else lpips_weights.record
     about = {"set": test_set.name, "lpips": record, "train_mean": train_mean, "left_out": notes, "weights": used}
     metrics = write_benchmark(out, benchmark, settings, config.seed, about)
     write_set_page(out, test_set.name, command, notes)
@@ -81,10 +86,3 @@ def _runs(method: str, context: Context, train_mean: float | None, notes: list[s
         notes.append(f"{method} was left out: the training split is not there; run `dvc repro synthesize`.")
         return False
     return True
-
-
-def _lpips_if_there(config: Config) -> tuple[Lpips | None, dict[str, Any]]:
-    if (Path(config.paths.weights) / "lpips.json").exists():
-        return Lpips.load(config.paths.weights), lpips_record(config)
-    reason = f"{config.paths.weights} is not there; run `dvc repro weights`"
-    return None, {"backbone": config.lpips.backbone, "sha256": None, "source": None, "reason": reason}

@@ -3,7 +3,7 @@
 Every function takes frames in [0, 1] with any leading axes, gives one number per frame, and is differentiable.
 Where a mask `valid` is given, what the frames hold at other pixels does not matter, and a frame without any valid pixel
 gives NaN.
-The perceptual distance (LPIPS) has weights to find and lives in polarnet/lpips.py; its names are public here too.
+The perceptual distance, `Lpips`, is a network and lives in polarnet/lpips.py; its name is public here too.
 """
 
 import functools
@@ -13,16 +13,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from polarnet.lpips import Lpips, LpipsConfig, lpips_problem
+from polarnet.lpips import Lpips
 
 __all__ = [
     "Lpips",
-    "LpipsConfig",
     "aolp_error_deg",
     "correlation",
     "gradient_agreement",
     "level_mse",
-    "lpips_problem",
     "mean_where",
     "mse",
     "pattern_mse",

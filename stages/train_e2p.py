@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from polarnet.config import Config, hydra_stage
+from polarnet.config import Config, hydra_stage, or_exit
 from polarnet.runtime import device_of, threads_of
 from polarnet.training.e2p import e2p_task
 from polarnet.training.loop import train
@@ -19,7 +19,7 @@ def main(config: Config) -> None:
     device = device_of(config.runtime)
     join(device)
     e2p = config.baselines.e2p
-    lpips = lpips_of(Path(config.paths.weights), max(e2p.lpips, e2p.intensity_lpips))
+    lpips = or_exit(lambda: lpips_of(config.paths.weights, config.lpips.backbone, max(e2p.lpips, e2p.intensity_lpips)))
     task = e2p_task(e2p, lpips, config.seed)
     paths, threads = config.paths, threads_of(config.runtime)
     events = open_events(e2p.data, paths.events, paths.scenes, config.emulate, config.seed, threads)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from polarnet.config import Config, hydra_stage
+from polarnet.config import Config, hydra_stage, or_exit
 from polarnet.runtime import device_of, threads_of
 from polarnet.training.e2v import e2v_task
 from polarnet.training.loop import train
@@ -19,7 +19,7 @@ def main(config: Config) -> None:
     device = device_of(config.runtime)
     join(device)
     e2v = config.baselines.e2v
-    lpips = lpips_of(Path(config.paths.weights), e2v.lpips)
+    lpips = or_exit(lambda: lpips_of(config.paths.weights, config.lpips.backbone, e2v.lpips))
     task = e2v_task(e2v, lpips, config.seed)
     paths, threads = config.paths, threads_of(config.runtime)
     events = open_events(e2v.data, paths.events, paths.scenes, config.emulate, config.seed, threads)

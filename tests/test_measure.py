@@ -114,11 +114,16 @@ def test_an_ablation_needs_the_whole_to_compare_with(tmp_path):
 
 def write_results(folder):
     folder.mkdir(parents=True)
-    ours = dict.fromkeys(BENCHMARK_KEYS, 0.5) | {"lpips": None, "mse_ci": [0.4, 0.6], "params": 7}
+    ours = dict.fromkeys(BENCHMARK_KEYS, 0.5) | {
+        "lpips": None,
+        "lpips_backbone": None,
+        "mse_ci": [0.4, 0.6],
+        "params": 7,
+    }
     (folder / "metrics.json").write_text(json.dumps({"zeros": {"mse": 1.0}, "ours": ours}))
     pairs = {"zeros": {"mse": {"scenes": 6, "better": 6, "effect": 1.0, "p": 0.03125, "p_holm": 0.03125}}}
     about = {"frames": 12, "warmup_windows": 5, "precision": "fp32", "scenes": ["a"] * 6, "paired": pairs}
-    (folder / "details.json").write_text(json.dumps(about | {"lpips": {"reason": "none here"}}))
+    (folder / "details.json").write_text(json.dumps(about | {"lpips": {"backbone": None}}))
 
 
 @pytest.fixture
@@ -157,11 +162,11 @@ def test_a_set_that_was_not_run_is_asked_for(tmp_path, measured_project):
 def test_figures_are_kept_where_the_tests_fail(tmp_path):
     """A project of which `make repro` leaves what the record takes, and whose tests fail."""
     root = tmp_path / "project"
-    for folder in ("data/benchmark", "data/weights", "data/report", "docs/results", "docs/pictures"):
+    for folder in ("data/benchmark", "data/report", "docs/results", "docs/pictures"):
         (root / folder).mkdir(parents=True)
         (root / folder / ".keep").write_text("")
     (root / "data" / "benchmark" / "metrics.json").write_text('{"ours": {"mse": 0.1}}')
-    (root / "data" / "weights" / "lpips.json").write_text('{"reason": "none here"}')
+    (root / "data" / "benchmark" / "details.json").write_text('{"lpips": {"backbone": "alex"}}')
     (root / "data" / "report" / "overview.png").write_bytes(b"picture")
     (root / "Makefile").write_text("setup:\n\t@true\nrepro:\n\t@true\ntest:\n\t@false\n")
     git(root, "init", "--quiet")
@@ -171,5 +176,6 @@ def test_figures_are_kept_where_the_tests_fail(tmp_path):
         measure_pipeline(root)
     record = json.loads((root / "docs" / "results" / "pipeline.json").read_text())
     assert record["metrics"] == {"ours": {"mse": 0.1}}
+    assert record["lpips"] == {"backbone": "alex"}
     assert "test_minutes" not in record
     assert (root / "docs" / "pictures" / "overview.png").read_bytes() == b"picture"

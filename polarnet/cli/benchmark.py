@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -67,8 +66,7 @@ def _own_scenes(options: argparse.Namespace, config: "Config", scenes: Path, out
 
     command = f"polarnet benchmark --scenes {options.scenes}"
     metrics, notes = benchmark_folder(config, scenes, options.kind, out, weights, command)
-    reason = json.loads((out / "details.json").read_text())["lpips"]["reason"]
-    print(as_plain(score_table(metrics, lpips_reason=reason)))
+    print(as_plain(score_table(metrics)))
     for note in notes:
         print(note)
     print(f"the page: {out / 'index.html'}")

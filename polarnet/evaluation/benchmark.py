@@ -133,8 +133,16 @@ def run_benchmark(
         lpips = lpips.to(context.device)
     kept = Cache(cache / test_set.name)
     digests = {method: method_digest(METHODS[method], context) for method in config.methods}
+    scoring = digest(code_digest(score_sequence), str(config.warmup_windows), _lpips_digest(lpips))
     task = functools.partial(
-        _recover_and_score, test_set=test_set, context=context, digests=digests, config=config, lpips=lpips, cache=kept
+        _recover_and_score,
+        test_set=test_set,
+        context=context,
+        digests=digests,
+        scoring=scoring,
+        config=config,
+        lpips=lpips,
+        cache=kept,
     )
     rows = [row for of_sequence in mapper(task, names) for row in of_sequence]
     costs = _costs(test_set.recording(names[0]), context, digests, kept)
@@ -149,6 +157,7 @@ def _recover_and_score(
     test_set: BenchmarkSet,
     context: Context,
     digests: Mapping[str, str],
+    scoring: str,
     config: BenchmarkConfig,
     lpips: Lpips | None,
     cache: Cache,
@@ -156,18 +165,21 @@ def _recover_and_score(
     """The rows of every method on one sequence, made where the cache has none."""
     recording = test_set.recording(sequence)
     keys = _prediction_keys(recording, digests)
-    scoring = digest(code_digest(score_sequence), str(config.warmup_windows), _lpips_digest(lpips))
-    rows: list[FrameScore] = []
-    for method, key in keys.items():
-        score_key = digest(key, scoring)
-        if (known := cache.scores(method, sequence, score_key)) is None:
-            if (found := cache.prediction(method, sequence, key)) is None:
-                recovered = recover(method, recording, context)
-                found = cache.write_prediction(method, sequence, key, recovered.polarization)
-            known = score_sequence(recording, {method: found}, config.warmup_windows, lpips, context.device)
-            cache.write_scores(method, sequence, score_key, known)
-        rows += known
-    return rows
+    score_keys = {method: digest(key, scoring) for method, key in keys.items()}
+    known = {method: cache.scores(method, sequence, key) for method, key in score_keys.items()}
+    unscored: dict[str, Polarization] = {}
+    for method in [method for method, scores in known.items() if scores is None]:
+        if (found := cache.prediction(method, sequence, keys[method])) is None:
+            recovered = recover(method, recording, context)
+            found = cache.write_prediction(method, sequence, keys[method], recovered.polarization)
+        unscored[method] = found
+    if unscored:  # together, so that LPIPS's features of the truth are computed once
+        scored = score_sequence(recording, unscored, config.warmup_windows, lpips, context.device)
+        for method in unscored:
+            rows = [row for row in scored if row.method == method]
+            cache.write_scores(method, sequence, score_keys[method], rows)
+            known[method] = rows
+    return [row for scores in known.values() if scores is not None for row in scores]
 
 
 def _prediction_keys(recording: Recording, digests: Mapping[str, str]) -> dict[str, str]:
@@ -201,8 +213,9 @@ def write_benchmark(
     """Write metrics.json, details.json (`about` and the settings), frames.csv, panels/<sequence>.npz; the metrics."""
     shutil.rmtree(folder / "panels", ignore_errors=True)  # a run before may have shown other scenes
     (folder / "panels").mkdir(parents=True)
+    backbone = {"lpips_backbone": config.lpips_backbone} if config.lpips else {}
     metrics: dict[str, dict[str, Any]] = {
-        method: {**scores, **dataclasses.asdict(benchmark.costs[method])}
+        method: {**scores, **backbone, **dataclasses.asdict(benchmark.costs[method])}
         for method, scores in summary(benchmark.rows, config.bootstrap_samples, seed).items()
     }
     means = {metric: scene_means(benchmark.rows, metric) for metric in METRICS}

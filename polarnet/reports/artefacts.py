@@ -126,11 +126,6 @@ class Artefacts:
     thumbnails: Mapping[str, Sequence[Thumbnail]]
     """By split; photographs first, the first `MOST_THUMBNAILS` of them."""
 
-    @property
-    def lpips_reason(self) -> str | None:
-        """Why there is no LPIPS; None where there is."""
-        return self.details["lpips"]["reason"]
-
 
 def read_artefacts(paths: ReportPaths) -> Artefacts:
     """Everything under `paths`; FileNotFoundError that says which stage to run."""

@@ -106,11 +106,11 @@ def _context(artefacts: Artefacts, run: Run, overview: bytes | None) -> dict[str
         "details": details,
         "overview": None if overview is None else data_uri(overview, "png"),
         "overview_name": None if artefacts.overview is None else artefacts.overview.name,
-        "scores": score_table(metrics, artefacts.lpips_reason),
+        "scores": score_table(metrics),
         "error_parts": score_table(metrics, columns=ERROR_PARTS),
         "costs": score_table(metrics, columns=COSTS),
         "paired": paired_lines(details.get("paired", {})),
-        "sets": [_set(one, artefacts.lpips_reason) for one in artefacts.sets],
+        "sets": [_set(one) for one in artefacts.sets],
         "paper_simulated": paper_table("simulated"),
         "paper_real": paper_table("real"),
         "paper_source": PAPER_SOURCE,
@@ -144,14 +144,14 @@ def _context(artefacts: Artefacts, run: Run, overview: bytes | None) -> dict[str
     }
 
 
-def _set(one: SetResults, lpips_reason: str | None) -> dict[str, Any]:
+def _set(one: SetResults) -> dict[str, Any]:
     """A test set beyond the simulated one."""
     return {
         "title": SET_TITLES.get(one.name, one.name),
         "about": SET_ABOUT.get(one.name, ""),
         "scenes": len(one.details["scenes"]),
         "frames": one.details["frames"],
-        "scores": score_table(one.metrics, lpips_reason),
+        "scores": score_table(one.metrics),
     }
 
 

@@ -60,7 +60,7 @@ def pipeline_block(results: Mapping[str, Any]) -> str:
     `results` is docs/results/pipeline.json as `polarnet.measure` writes it; `metrics` is data/benchmark/metrics.json.
     """
     metrics = results["metrics"]
-    lines = [as_markdown(score_table(metrics, results.get("lpips_reason"))), ""]
+    lines = [as_markdown(score_table(metrics)), ""]
     if any(key.endswith("_ci") for scores in metrics.values() for key in scores):
         lines += ["Means over the test scenes; below them the 95 % bootstrap interval over scenes.", ""]
     lines += [f"- {line}" for line in standing(metrics)]
@@ -83,7 +83,7 @@ def benchmark_block(results: Mapping[str, Any]) -> str:
             continue
         about = results["about"][name]
         lines += [f"**{title}**: {about['scenes']} scenes, {about['frames']} frames", ""]
-        lines += [as_markdown(score_table(results[name], about["lpips_reason"], {**COLUMNS, **COSTS})), ""]
+        lines += [as_markdown(score_table(results[name], {**COLUMNS, **COSTS})), ""]
         lines += [f"- {line}" for line in paired_lines(results["paired"][name])]
         gains = [
             f"{METHODS[row]} {results[name][f'{row}+gain']['psnr'] - scores['psnr']:+.2f} dB"

@@ -34,7 +34,6 @@ def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str])
     `notes` are sentences that a reader of the table has to know, such as which methods did not run and why.
     """
     results = read_set(folder)
-    reason = results.details["lpips"]["reason"]
     if results.panels:
         rows = [PanelScene(panel.sequence, panel.events, panel.truth_dolp, panel.dolp) for panel in results.panels]
         comparison_panel(rows, folder / "comparison.png")
@@ -43,7 +42,7 @@ def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str])
         command=command,
         notes=notes,
         details=results.details,
-        scores=score_table(results.metrics, reason),
+        scores=score_table(results.metrics),
         error_parts=score_table(results.metrics, columns=ERROR_PARTS),
         costs=score_table(results.metrics, columns=COSTS),
         standing=standing(results.metrics),

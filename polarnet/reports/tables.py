@@ -1,7 +1,7 @@
 """Benchmark scores as tables: chosen, rounded and ranked once, then written as Markdown, plain text or HTML."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
@@ -82,6 +82,9 @@ METHODS = {
 }
 """Readable names, in the order of every table: first what needs no events, then the peers, then the network."""
 
+BACKBONES = {"squeeze": "SqueezeNet 1.1", "alex": "AlexNet", "vgg": "VGG16, like the paper's"}
+"""Readable names of those of LPIPS."""
+
 TRIVIAL = ("zeros", "train_mean", "oracle_mean")
 """Methods whose answer is one value everywhere."""
 
@@ -152,19 +155,18 @@ def in_order(methods: Iterable[str]) -> list[str]:
     return [m for m in METHODS if m in given] + [m for m in given if m not in METHODS]
 
 
-def score_table(
-    scores: Scores, lpips_reason: str | None = None, columns: Mapping[str, Column] = MappingProxyType(COLUMNS)
-) -> Table:
-    """Scores of the methods in the fixed order; a metric that no method has gets no column, except LPIPS when
-    `lpips_reason` says why it is missing. Methods this module has no name for follow under their own key.
+def score_table(scores: Scores, columns: Mapping[str, Column] = MappingProxyType(COLUMNS)) -> Table:
+    """Scores of the methods in the fixed order; a metric that no method has gets no column.
+
+    LPIPS names the backbone that its rows have as `lpips_backbone`. Methods this module has no name for follow under
+    their own key.
     """
     if not scores:
         raise ValueError("a table needs the scores of at least one method, got none")
-    keys = [
-        key
-        for key in columns
-        if any(scores[method].get(key) is not None for method in scores) or (key == "lpips" and lpips_reason)
-    ]
+    backbone = next((found for row in scores.values() if (found := row.get("lpips_backbone"))), None)
+    if backbone and "lpips" in columns:
+        columns = {**columns, "lpips": replace(columns["lpips"], label=f"LPIPS ({backbone})")}
+    keys = [key for key in columns if any(scores[method].get(key) is not None for method in scores)]
     methods = in_order(scores)
     best = {key: _best(columns[key], [scores[m].get(key) for m in methods]) for key in keys}
     rows = tuple(
@@ -177,7 +179,8 @@ def score_table(
         )
         for method in methods
     )
-    notes = (f'LPIPS "-": {lpips_reason}',) if lpips_reason else ()
+    about = f"LPIPS ({backbone}): version 0.1 on the features of {BACKBONES[backbone]}." if backbone else ""
+    notes = (about,) if about and "lpips" in keys else ()
     return Table(tuple(columns[key].heading for key in keys), rows, notes)
 
 

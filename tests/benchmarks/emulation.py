@@ -191,7 +191,6 @@ def measure_paper_set(sequences: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         overrides = [
             "experiment=paper",
-            "lpips.required=false",  # training's; without it the weights would have to be here
             "ingest.source=builtin",
             f"ingest.dead_leaves={pictures - len(BUILTIN_PHOTOS)}",
             f"synthesize.sequences_per_picture={PAPER_SEQUENCES_A_PICTURE}",

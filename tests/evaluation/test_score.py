@@ -32,6 +32,8 @@ def config(**changes):
         "sets": ["simulated"],
         "warmup_windows": 1,
         "precision": "fp32",
+        "lpips": False,
+        "lpips_backbone": "alex",
         "bootstrap_samples": 10,
         "panel_scenes": 1,
     }

