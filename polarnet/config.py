@@ -40,6 +40,7 @@ from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
+EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # below the project, where DVC runs queued experiments
 
 Stage = Callable[["Config"], None]
 T = TypeVar("T")
@@ -220,6 +221,24 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         run()
 
     return command_line
+
+
+def input_folder(key: str, folder: str) -> Path:
+    """The folder that setting `key` names; SystemExit in one line where it holds no file of a user's.
+
+    In the copy of the workspace that DVC makes for a queued experiment the line says how the files get there.
+    """
+    files = (path for path in Path(folder).rglob("*") if path.is_file() and not path.name.startswith("."))
+    if any(path.name != "README.md" and path.suffix != ".dvc" for path in files):
+        return Path(folder)
+    project, copy, _ = str(Path.cwd()).partition(EXPERIMENT_COPY)
+    advice = f"put your files there, or set {key} to another folder"
+    if copy:
+        advice = (
+            "a queued DVC experiment runs in a copy of the workspace without untracked files; queue it with "
+            f"-S {key}={Path(project) / folder}, or `dvc add` your files in a folder below {folder} first"
+        )
+    raise SystemExit(f"{key}={folder}: no files there; {advice}")
 
 
 def _root_of(main: Callable[..., None]) -> Path:

@@ -11,7 +11,7 @@ import torch
 from hydra.errors import ConfigCompositionException
 
 from polarnet.cli import main
-from polarnet.config import Config, check_keys, load
+from polarnet.config import Config, check_keys, input_folder, load
 from polarnet.experiments import BASE, preset_names, preset_values, write_preset
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 
@@ -122,6 +122,42 @@ def test_a_stage_stops_before_it_runs_anything(project_root, tmp_path):
     assert "configuration error: synthesize.duration_s: expected > 0" in done.stderr
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_without_files_of_the_users_is_refused_in_one_line_that_tells_a_queued_experiment_where_they_are(
+    project_root, tmp_path, monkeypatch
+):
+    photographs = Path("data", "photographs")
+    copy = tmp_path / ".dvc" / "tmp" / "exps" / "tmp1"
+    for project in (tmp_path, copy):
+        (project / photographs).mkdir(parents=True)
+        (project / photographs / "README.md").write_text("Put your photographs here.")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=r"ingest\.root=data/photographs: no files there; put your files there"):
+        input_folder("ingest.root", str(photographs))
+    monkeypatch.chdir(copy)
+    with pytest.raises(SystemExit, match=f"queue it with -S ingest.root={tmp_path / photographs}, or `dvc add`"):
+        input_folder("ingest.root", str(photographs))
+    (copy / photographs / "a.png").touch()
+    assert input_folder("ingest.root", str(photographs)) == photographs
+
+
+@pytest.mark.parametrize(
+    ("stage", "overrides"),
+    [
+        ("ingest", ["ingest.source=folder", "ingest.root={}"]),
+        ("sets", ["benchmark.sets=[simulated,measured]", "sets.measured_root={}"]),
+        ("import_recordings", ["recordings.enabled=true", "recordings.root={}"]),
+    ],
+)
+def test_a_stage_without_its_input_files_ends_without_a_traceback(project_root, tmp_path, stage, overrides):
+    (tmp_path / "empty").mkdir()
+    values = [override.format(tmp_path / "empty") for override in overrides]
+    command = [sys.executable, "-m", f"stages.{stage}", *values, f"paths.data={tmp_path / 'data'}"]
+    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"{values[-1]}: no files there; put your files there")
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("group", BASE)
