@@ -189,6 +189,8 @@ def loss_sweep_block(results: Mapping[str, Any]) -> str:
     overrides = " ".join(f"`{override}`" for override in about["overrides"])
     return "\n".join([
         *lines, "",
+        "![Test scores by the weights of the three terms](pictures/loss_sweep.png)", "",
+        "Lighter is better, bold the best of a score; the frame marks the smallest validation MSE.", "",
         f"Ranked by validation MSE; ± is the standard deviation over seeds. LPIPS has the backbone "
         f"`{about['lpips_backbone']}`. Further overrides: {overrides or 'none'}. {origin(record)}",
         *(["", f"Notes of the trainings: {'; '.join(notes)}."] if notes else []),
