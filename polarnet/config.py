@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import logging
 import os
 import sys
 import typing
@@ -12,6 +13,7 @@ from typing import Any, TypeVar
 
 import hydra
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from polarnet.baselines.complementary_filter import ComplementaryFilterConfig, HighPassConfig
@@ -19,6 +21,7 @@ from polarnet.baselines.postprocessing import PostprocessingConfig
 from polarnet.baselines.stokes_gain import GainConfig
 from polarnet.evaluation.methods import WeightsConfig
 from polarnet.evaluation.score import BenchmarkConfig
+from polarnet.experiments import preset_names, preset_values
 from polarnet.lpips import PURPOSES, Purpose, is_stored
 from polarnet.lpips_weights import LpipsConfig, local_source
 from polarnet.networks.dolp_unet import DolpUNetConfig
@@ -38,6 +41,7 @@ from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
+EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # below the project, where DVC runs queued experiments
 
 Stage = Callable[["Config"], None]
 T = TypeVar("T")
@@ -144,11 +148,18 @@ def typed(node: DictConfig) -> Config:
 
 
 def load(root: Path, overrides: list[str] | None = None) -> Config:
-    """The configuration that the project at `root` would run with, outside any Hydra application."""
+    """The configuration that the project at `root` would run with, outside any Hydra application.
+
+    Raises ValueError where `check_keys` does, for a value out of range, and for an ablation that changes nothing.
+    """
+    overrides = overrides or []
+    check_keys(root, overrides)
     os.environ[ROOT_VARIABLE] = str(root)
     register_schema()
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(root / "conf")):
-        return typed(hydra.compose("config", overrides=overrides or []))
+        config = typed(hydra.compose("config", overrides=overrides))
+        _check_ablation(root, config, overrides)
+    return config
 
 
 def register_schema() -> None:
@@ -159,44 +170,86 @@ def register_schema() -> None:
 def check_keys(root: Path, overrides: list[str]) -> None:
     """Raise a ValueError for the first key of params.yaml or of `overrides` that is not a setting, listing those there.
 
-    Hydra refuses such a key as well, but does not say which ones there are.
+    The same for a group's choice (`experiment`, `sensor`, `ablation`) that has no file in conf/. Hydra refuses both as
+    well; the message here names the keys and choices there are.
     """
     params = OmegaConf.to_container(OmegaConf.load(root / "params.yaml"))
     for key in _leaves(params):
         _check_key(key, "params.yaml")
     groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
     for override in overrides:
-        key = override.split("=", 1)[0].lstrip("+~").split("@")[0]
-        if key not in groups and not key.startswith(("hydra.", "hydra/", "paths.data")):
+        key, _, value = override.partition("=")
+        key = key.lstrip("+~").split("@")[0]
+        if key in groups:
+            _check_choices(root, key, value)
+        elif not key.startswith(("hydra.", "hydra/", "paths.data")):
             _check_key(key, "command line")
 
 
 def hydra_stage(main: Stage) -> Callable[[], None]:
     """Make `main(config)` a Hydra command line: composes, checks, sets up the runtime, then runs it.
 
-    Refuses, before anything runs, a key that does not exist, a wrong type, a value out of range, and a configuration
-    with LPIPS on a machine without its weights.
+    Refuses, before anything runs, a key or choice that does not exist, a wrong type, a value out of range, an ablation
+    that changes nothing, and a configuration with LPIPS on a machine without its weights.
     """
-    file = Path(sys.modules[main.__module__].__file__ or "").resolve()
-    root = file.parent.parent
+    root = _root_of(main)
+
+    @functools.wraps(main)
+    def checked(node: DictConfig) -> None:
+        config = or_exit(lambda: typed(node))
+        or_exit(lambda: _check_ablation(root, config, list(HydraConfig.get().overrides.task)))
+        if _file_of(main).stem != "weights":  # which searches and may download
+            or_exit(lambda: _check_lpips(config))
+        configure(config.runtime, config.seed)
+        main(config)
+
+    return hydra_command(checked)
+
+
+def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
+    """Make `main(node)` a Hydra command line that refuses unknown keys and choices; `node` is composed, not checked.
+
+    Warnings of Python and its packages go to Hydra's log beside those of polarnet.
+    """
+    root = _root_of(main)
     os.environ[ROOT_VARIABLE] = str(root)
     register_schema()
+    run = hydra.main(version_base="1.3", config_path=str(root / "conf"), config_name="config")(main)
 
     def command_line() -> None:
         overrides = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
         or_exit(lambda: check_keys(root, overrides))
+        logging.captureWarnings(True)
         run()
 
-    @functools.wraps(main)
-    def checked(node: DictConfig) -> Any:
-        config = or_exit(lambda: typed(node))
-        if file.stem != "weights":  # which searches and may download
-            or_exit(lambda: _check_lpips(config))
-        configure(config.runtime, config.seed)
-        return main(config)
-
-    run = hydra.main(version_base="1.3", config_path=str(root / "conf"), config_name="config")(checked)
     return command_line
+
+
+def input_folder(key: str, folder: str) -> Path:
+    """The folder that setting `key` names; SystemExit in one line where it holds no file of a user's.
+
+    In the copy of the workspace that DVC makes for a queued experiment the line says how the files get there.
+    """
+    files = (path for path in Path(folder).rglob("*") if path.is_file() and not path.name.startswith("."))
+    if any(path.name != "README.md" and path.suffix != ".dvc" for path in files):
+        return Path(folder)
+    project, copy, _ = str(Path.cwd()).partition(EXPERIMENT_COPY)
+    advice = f"put your files there, or set {key} to another folder"
+    if copy:
+        advice = (
+            "a queued DVC experiment runs in a copy of the workspace without untracked files; queue it with "
+            f"-S {key}={Path(project) / folder}, or `dvc add` your files in a folder below {folder} first"
+        )
+    raise SystemExit(f"{key}={folder}: no files there; {advice}")
+
+
+def _root_of(main: Callable[..., None]) -> Path:
+    """The project whose folder `stages` holds the module of `main`."""
+    return _file_of(main).parent.parent
+
+
+def _file_of(main: Callable[..., None]) -> Path:
+    return Path(sys.modules[main.__module__].__file__ or "").resolve()
 
 
 def with_lpips(config: Config, purpose: Purpose, use: Callable[[str, str | None], T]) -> T | None:
@@ -233,6 +286,44 @@ def _check_lpips(config: Config) -> None:
 
     for purpose in PURPOSES:
         with_lpips(config, purpose, functools.partial(look, purpose))
+
+
+def _check_choices(root: Path, group: str, value: str) -> None:
+    """ValueError where a choice of `group` has no file; Hydra resolves patterns such as glob(*) itself."""
+    names = [] if "(" in value else [name.strip("[]'\" ") for name in value.split(",")]
+    for name in names:
+        if name not in ("null", *preset_names(root, group)):
+            raise ValueError(f"{group}: there is no {name!r}; conf/{group} has {', '.join(preset_names(root, group))}")
+
+
+def _check_ablation(root: Path, config: Config, overrides: list[str]) -> None:
+    """ValueError where the chosen ablation leaves the configuration in use as it is without it.
+
+    `nothing` is the baseline of a sweep and may. Call this where Hydra is initialised.
+    """
+    chosen = dict(override.split("=", 1) for override in overrides if "=" in override)
+    name = chosen.get("ablation", "null").strip("'\"")
+    if name in ("null", "nothing"):
+        return
+    others = [override for override in overrides if not override.startswith("ablation=")]
+    without = typed(hydra.compose("config", overrides=others))
+    if _in_use(config) != _in_use(without):
+        return
+    experiment = f"experiment={chosen['experiment']}" if "experiment" in chosen else "params.yaml"
+    reasons = []
+    for key in preset_values(root, "ablation", name):
+        if key.startswith("networks.") and key.split(".")[1] != config.network:
+            reasons.append(f"{key} has no effect on network={config.network}")
+        else:
+            value = functools.reduce(getattr, key.split("."), config)
+            reasons.append(f"{key} is {value} already in {experiment}")
+    raise ValueError(f"ablation={name} changes nothing: {', '.join(reasons)}")
+
+
+def _in_use(config: Config) -> tuple[Any, ...]:
+    """The settings without the sections of networks that `network` does not name."""
+    sections = [getattr(config, field.name) for field in dataclasses.fields(config) if field.name != "networks"]
+    return (*sections, config.network_config)
 
 
 def _check_key(key: str, where: str) -> None:

@@ -1,7 +1,9 @@
 """What several test modules share."""
 
 import dataclasses
+import json
 import os
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -84,3 +86,38 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     frames.finish()
     emulate_scenes(folder / "scenes.zarr", folder / "events.zarr", emulate, 3, map, 1)
     return Simulated(folder / "scenes.zarr", folder / "frames.zarr", folder / "events.zarr", emulate, 3)
+
+
+@pytest.fixture(scope="session")
+def write_trial() -> Callable[..., None]:
+    """Writes the folder of one job of a sweep of `stages.trial`, in miniature."""
+
+    def write(
+        job: Path,
+        overrides: Sequence[str] = (),
+        weights: Sequence[float] = (10.0, 1.0, 1.0),
+        seed: int = 1,
+        validation: Mapping[str, float] | None = None,
+        test: Mapping[str, float] | None = None,
+        failure: str | None = None,
+        log: str = "",
+    ) -> None:
+        loss = dict(zip(("mse", "ssim", "lpips"), weights, strict=True))
+        config = {"seed": seed, "loss": loss, "lpips": {"backbone": "alex"}, "benchmark": {}}
+        files = {
+            ".hydra/config.yaml": json.dumps(config),
+            ".hydra/overrides.yaml": json.dumps(list(overrides)),
+            "logs/train/train.log": log,
+        }
+        if validation or test:
+            scores = validation or {"mse": 0.5, "psnr": 3.0}
+            files["train/history.json"] = json.dumps([{"train": loss, "val": scores}])
+        if test:
+            files["benchmark/metrics.json"] = json.dumps({"ours": test, "zeros": {}})
+        if failure:
+            files["failure.txt"] = f"{failure}\n"
+        for name, text in files.items():
+            (job / name).parent.mkdir(parents=True, exist_ok=True)
+            (job / name).write_text(text)
+
+    return write

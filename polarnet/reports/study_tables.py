@@ -167,6 +167,48 @@ def ablation_block(results: Mapping[str, Any]) -> str:
     return "\n".join([*lines, "", f"One training each, {overrides or 'without further overrides'}. {origin(record)}"])
 
 
+def loss_sweep_block(results: Mapping[str, Any]) -> str:
+    """Scores by the weights of Eq. 9, the smallest validation MSE first.
+
+    `results` is docs/results/sweep.json; `polarnet measure sweep` writes it.
+    """
+    about, record = results["loss_weights"], results["records"]["loss_weights"]
+    lines = [
+        "| `loss.mse` | `loss.ssim` | `loss.lpips` | seeds | " + " | ".join(h for *_, h, _ in SWEEP_COLUMNS) + " |"
+    ]
+    lines.append("|---:" * (4 + len(SWEEP_COLUMNS)) + "|")
+    for point in results["points"]:
+        weights = " | ".join(f"{point['weights'][name]:g}" for name in ("mse", "ssim", "lpips"))
+        cells = []
+        for split, key, _, decimals in SWEEP_COLUMNS:
+            score = point[split].get(key) or {"mean": None, "std": None}
+            spread = "" if score["std"] is None else f" ± {score['std']:.{decimals}f}"
+            cells.append("-" if score["mean"] is None else f"{score['mean']:.{decimals}f}{spread}")
+        lines.append(f"| {weights} | {len(point['seeds'])} | {' | '.join(cells)} |")
+    notes = dict.fromkeys(note for point in results["points"] for note in point["notes"])
+    overrides = " ".join(f"`{override}`" for override in about["overrides"])
+    return "\n".join([
+        *lines, "",
+        "![Test scores by the weights of the three terms](pictures/loss_sweep.png)", "",
+        "Lighter is better, bold the best of a score; the frame marks the smallest validation MSE.", "",
+        f"Ranked by validation MSE; ± is the standard deviation over seeds. LPIPS has the backbone "
+        f"`{about['lpips_backbone']}`. Further overrides: {overrides or 'none'}. {origin(record)}",
+        *(["", f"Notes of the trainings: {'; '.join(notes)}."] if notes else []),
+    ])  # fmt: skip
+
+
+SWEEP_COLUMNS = (
+    ("validation", "mse", "validation MSE ↓", 4),
+    ("validation", "psnr", "validation PSNR ↑", 2),
+    ("test", "mse", "test MSE ↓", 4),
+    ("test", "psnr", "test PSNR ↑", 2),
+    ("test", "ssim", "test SSIM ↑", 3),
+    ("test", "lpips", "test LPIPS ↓", 3),
+    ("test", "corr", "test corr. ↑", 3),
+)
+"""Split and key in sweep.json, heading, decimals."""
+
+
 def designs_block(results: Mapping[str, Any]) -> str:
     """What was tried before today's network, in the order it was, each against the oracle mean.
 
