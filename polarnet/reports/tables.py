@@ -94,16 +94,17 @@ SET_TITLES = {
 """Test sets, in the order of every page."""
 
 PAPER_SOURCE = "Yan et al., Photonics 2024, 11(5), 481, Table 2"
+PAPER_LABELS = METHODS | {"e2v": "E2V, default parameters", "cf": "CF, default parameters"}
 PAPER_TABLE_2: Mapping[str, Scores] = {
     "simulated": {
         "cf": {"mse": 0.1371, "psnr": 10.60, "ssim": 0.1667, "lpips": 0.5890},
         "e2v": {"mse": 0.0778, "psnr": 12.74, "ssim": 0.3068, "lpips": 0.4140},
-        "ours": {"mse": 0.0355, "psnr": 15.56, "ssim": 0.3947, "lpips": 0.3295},
+        "paper": {"mse": 0.0355, "psnr": 15.56, "ssim": 0.3947, "lpips": 0.3295},
     },
     "real": {
         "cf": {"mse": 0.0087, "psnr": 23.17, "ssim": 0.4116, "lpips": 0.3342},
         "e2v": {"mse": 0.0134, "psnr": 20.02, "ssim": 0.3819, "lpips": 0.3350},
-        "ours": {"mse": 0.0026, "psnr": 27.48, "ssim": 0.5189, "lpips": 0.1369},
+        "paper": {"mse": 0.0026, "psnr": 27.48, "ssim": 0.5189, "lpips": 0.1369},
     },
 }
 PAPER_COMPARABILITY = (
@@ -153,10 +154,13 @@ def in_order(methods: Iterable[str]) -> list[str]:
 
 
 def score_table(
-    scores: Scores, lpips_reason: str | None = None, columns: Mapping[str, Column] = MappingProxyType(COLUMNS)
+    scores: Scores,
+    lpips_reason: str | None = None,
+    columns: Mapping[str, Column] = MappingProxyType(COLUMNS),
+    labels: Mapping[str, str] = MappingProxyType(METHODS),
 ) -> Table:
     """Scores of the methods in the fixed order; a metric that no method has gets no column, except LPIPS when
-    `lpips_reason` says why it is missing. Methods this module has no name for follow under their own key.
+    `lpips_reason` says why it is missing. Methods that `labels` has no name for follow under their own key.
     """
     if not scores:
         raise ValueError("a table needs the scores of at least one method, got none")
@@ -170,7 +174,7 @@ def score_table(
     rows = tuple(
         Row(
             method,
-            METHODS.get(method, method),
+            labels.get(method, method),
             tuple(
                 _cell(columns[key], scores[method].get(key), scores[method].get(f"{key}_ci"), best[key]) for key in keys
             ),
@@ -182,8 +186,8 @@ def score_table(
 
 
 def paper_table(experiment: Literal["simulated", "real"]) -> Table:
-    """The paper's Table 2, one of its two experiments."""
-    return score_table(PAPER_TABLE_2[experiment])
+    """Published figures: the paper's Table 2, one of its two experiments."""
+    return score_table(PAPER_TABLE_2[experiment], labels=PAPER_LABELS)
 
 
 def as_markdown(table: Table) -> str:
@@ -212,21 +216,25 @@ def as_plain(table: Table) -> str:
     return "\n".join([*(line.rstrip() for line in lines), *table.notes])
 
 
-def standing(scores: Scores) -> list[str]:
+def standing(scores: Scores, labels: Mapping[str, str] = MappingProxyType(METHODS)) -> list[str]:
     """How `ours` compares with every other method: one sentence each, with the differences; none without `ours`."""
     if "ours" not in scores:
         return []
     return [
         f"ours against {label}: " + ", ".join(differences) + "."
-        for rival, label in METHODS.items()
+        for rival, label in labels.items()
         if rival in scores and rival != "ours" and (differences := _differences(scores["ours"], scores[rival]))
     ]
 
 
-def paired_lines(paired: Mapping[str, Mapping[str, Mapping[str, Any]]], metric: str = "mse") -> list[str]:
+def paired_lines(
+    paired: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    metric: str = "mse",
+    labels: Mapping[str, str] = MappingProxyType(METHODS),
+) -> list[str]:
     """How `ours` does scene by scene against each other method, from details.json's `paired`; a sentence each."""
     return [
-        f"{METHODS.get(rival, rival)}: ours is better in {one['better']} of {one['scenes']} scenes "
+        f"{labels.get(rival, rival)}: ours is better in {one['better']} of {one['scenes']} scenes "
         f"(effect {one['effect']:+.2f}, p = {one['p_holm']:.2g})."
         for rival in in_order(paired)
         if (one := paired[rival].get(metric))
