@@ -43,7 +43,14 @@ class Theme:
 LIGHT = Theme(text="#1c2330", quiet="#667085", grid="#e4e7ec", face="#ffffff")
 DARK = Theme(text="#e6e9ef", quiet="#98a2b3", grid="#313947", face="#161b24")
 
-TERMS = {"mse": "MSE", "mae": "MAE", "ssim": "1 - SSIM", "lpips": "LPIPS"}
+TERMS = {
+    "mse": "MSE",
+    "mae": "MAE",
+    "ssim_loss": "1 - SSIM",
+    "lpips": "LPIPS",
+    "stokes": "S1/S0, S2/S0",
+    "uncertainty": "likelihood of the error",
+}
 """Terms of a loss as a legend shows them."""
 
 

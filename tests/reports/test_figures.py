@@ -81,6 +81,14 @@ def test_figures_for_a_dark_page_have_light_text_and_no_background():
     assert dark[dark[..., 3] == 255][:, :3].mean() > light[light[..., 3] == 255][:, :3].mean()
 
 
+def test_every_term_of_the_losses_has_a_readable_name_in_the_legend():
+    curves = [
+        Curve(name, [0], [0.1]) for name in ("total", "mse", "mae", "ssim_loss", "lpips", "stokes", "uncertainty")
+    ]
+    legend = training_curves(curves, [CURVE], "validation", LIGHT).axes[0].get_legend()
+    assert not [text.get_text() for text in legend.get_texts() if "_" in text.get_text()]
+
+
 def test_epochs_count_from_one_on_the_axis():
     line = training_curves([CURVE], [CURVE], "validation", LIGHT).axes[0].lines[0]
     assert list(line.get_xdata()) == [1, 2, 3]
