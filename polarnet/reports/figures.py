@@ -53,6 +53,9 @@ TERMS = {
 }
 """Terms of a loss as a legend shows them."""
 
+BRANCHES = {"intensity": "intensity", "aolp": "AoLP", "dolp": "DoLP"}
+"""Maps of a network that has a loss for each, whose terms are BRANCH_TERM."""
+
 
 class PanelScene(NamedTuple):
     """One row of a comparison: a window of one test scene and what each method made of it."""
@@ -131,7 +134,7 @@ def training_curves(loss: Sequence[Curve], validation: Sequence[Curve], validati
                     curve.values,
                     marker="o",
                     markersize=3,
-                    label=TERMS.get(curve.label, curve.label),
+                    label=_term(curve.label),
                 )
             axes.set_xlabel("epoch")
             axes.set_title(label, loc="left", fontsize=9)
@@ -142,6 +145,11 @@ def training_curves(loss: Sequence[Curve], validation: Sequence[Curve], validati
             left.set_yscale("log")
             _plain_log_ticks(left.yaxis)
     return figure
+
+
+def _term(name: str) -> str:
+    branch, _, term = name.partition("_")
+    return f"{BRANCHES[branch]}: {TERMS[term]}" if branch in BRANCHES and term in TERMS else TERMS.get(name, name)
 
 
 def score_distribution(

@@ -55,7 +55,7 @@ WITHOUT_WEIGHTS = {
 """What the rows without weights are."""
 
 NETWORK_ABOUT = {
-    "polarnet": "polarnet's own network: event counts of the four polarizers in, DoLP, AoLP and the expected error of "
+    "polarnet": "Polarnet's own network: event counts of the four polarizers in, DoLP, AoLP and the expected error of "
     "DoLP out. It solves the redundancy of the four polarizers and refines the answer with a small recurrent U-Net.",
     "paper": "The network of the paper (its Fig. 6), in polarnet's implementation: events of the four polarizers in, "
     "DoLP out.",
@@ -67,7 +67,7 @@ NETWORK_ABOUT = {
 }
 """What the networks are, by the name in a checkpoint."""
 
-ROLES = {"e2v": "Events to video. ", "ours": "The DoLP network of this run. "}
+ROLES = {"e2v": "Events to video. ", "ours": "The DoLP network in use. "}
 """What a row stands for, whichever network it is."""
 
 GAINS = (

@@ -82,11 +82,11 @@ def test_figures_for_a_dark_page_have_light_text_and_no_background():
 
 
 def test_every_term_of_the_losses_has_a_readable_name_in_the_legend():
-    curves = [
-        Curve(name, [0], [0.1]) for name in ("total", "mse", "mae", "ssim_loss", "lpips", "stokes", "uncertainty")
-    ]
-    legend = training_curves(curves, [CURVE], "validation", LIGHT).axes[0].get_legend()
-    assert not [text.get_text() for text in legend.get_texts() if "_" in text.get_text()]
+    terms = ["total", "mse", "mae", "ssim_loss", "lpips", "stokes", "uncertainty", "intensity_lpips", "aolp_ssim_loss"]
+    legend = training_curves([Curve(name, [0], [0.1]) for name in terms], [CURVE], "", LIGHT).axes[0].get_legend()
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert labels[-2:] == ["intensity: LPIPS", "AoLP: 1 - SSIM"]
+    assert not [label for label in labels if "_" in label]
 
 
 def test_epochs_count_from_one_on_the_axis():

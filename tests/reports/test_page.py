@@ -54,9 +54,9 @@ def test_the_network_is_best_here_and_the_papers_table_stands_beside(page):
 def test_the_page_says_which_networks_are_behind_its_rows(page):
     assert "ours: the paper&#39;s network, events to DoLP" in page  # training
     assert "E2V: FireNet, events to intensity" in page
-    assert "<dt>ours: the paper&#39;s network</dt><dd>The DoLP network of this run. The network of the paper" in page
+    assert "<dt>ours: the paper&#39;s network</dt><dd>The DoLP network in use. The network of the paper" in page
     assert '<th scope="row">E2V: FireNet</th>' in page
-    assert "polarnet&#39;s own network" not in page
+    assert "olarnet&#39;s own network" not in page
 
 
 def test_a_baseline_that_no_row_uses_is_neither_drawn_nor_explained(page):
