@@ -16,7 +16,7 @@ def main(config: Config) -> None:
         used = is_used(baseline, config.benchmark.methods, vars(config.baselines.weights))
         (folder / f"{baseline}.json").write_text(json.dumps({"trained": used}) + "\n")
         print(
-            f"{baseline}: {'to be trained' if used else 'not to be trained, since no row of benchmark.methods uses it'}"
+            f"{baseline}: {'to be trained' if used else 'not trained, since no row of benchmark.methods uses it'}"
         )
 
 
