@@ -86,6 +86,7 @@ class Paths:
     frames: str
     events: str
     weights: str
+    baselines: str
     train: str
     train_e2v: str
     train_e2p: str

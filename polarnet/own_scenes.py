@@ -8,7 +8,8 @@ from typing import Any
 from polarnet.benchmarking import context_of, made_set, mapper_of
 from polarnet.config import Config, with_lpips
 from polarnet.evaluation.benchmark import run_benchmark, train_mean_dolp, write_benchmark
-from polarnet.evaluation.methods import METHODS, Context, weights_used, why_absent
+from polarnet.evaluation.conditions import configured, sentence, warnings
+from polarnet.evaluation.methods import METHODS, Context, metadata_used, weights_used, why_absent
 from polarnet.events.frames import FrameStore
 from polarnet.fingerprint import reach
 from polarnet.lpips import NO_RECORD
@@ -20,7 +21,10 @@ from polarnet.simulation.pictures.manifest import read_manifest
 from polarnet.simulation.scenes import SceneStore
 from polarnet.simulation.sets import Recipe, make_folder_set
 from polarnet.simulation.truth import motions_of
+from polarnet.training.baselines import USERS
 from polarnet.weights import shipped_weights
+
+SET_THEM = "To score on sequences like those of the training, add to the command, or write into params.yaml:"
 
 
 def benchmark_folder(
@@ -30,9 +34,10 @@ def benchmark_folder(
 
     `out` gets metrics.json, details.json, frames.csv, panels and index.html, and in `out`/work what they were made
     from, so that a run that was stopped goes on and a second one with other weights makes only what is new. Methods
-    whose weights are not there are left out, files that cannot be used are skipped, and `notes` says so. `weights` is a
-    checkpoint of the DoLP network; None: the shipped one. ValueError where nothing in the folder can be used, and where
-    the table is to have LPIPS but there are no weights for it.
+    whose weights are not there are left out, files that cannot be used are skipped, and `notes` says so. Size, duration
+    and sensor are printed first, with a warning where those of a network's training differ. `weights` is a checkpoint
+    of the DoLP network; None: the shipped one. ValueError where nothing in the folder can be used, and where the table
+    is to have LPIPS but there are no weights for it.
     """
     if weights is not None and not weights.is_file():
         raise ValueError(
@@ -40,25 +45,34 @@ def benchmark_folder(
         )
     lpips_weights = with_lpips(config, "benchmark", find_weights)  # which need not have been found by the pipeline
     lpips = None if lpips_weights is None else Lpips.of(lpips_weights.backbone, lpips_weights.tensors)
+    train_mean = _train_mean(config)
+    wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
+    context = context_of(config, train_mean or 0.0, weights or shipped_weights())
+    left_out: list[str] = []
+    methods = [method for method in wanted if _runs(method, context, train_mean, left_out)]
+    used = configured(config.synthesize, config.emulate)
+    differences = warnings(used, metadata_used(methods, context), SET_THEM)
+    print("\n".join([sentence(used), *(f"WARNING: {line}" for line in differences)]), flush=True)
     recipe = Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads_of(config.runtime))
     work = out / "work"
     try:
         make_folder_set(root, kind, work, recipe, functools.partial(mapper_of, config))
     except ValueError as error:
         raise ValueError(f"--scenes {root}: nothing to test on. {error}") from error
-    notes = _skipped(config, work)
-    train_mean = _train_mean(config)
-    wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
-    context = context_of(config, train_mean or 0.0, weights or shipped_weights())
-    methods = [method for method in wanted if _runs(method, context, train_mean, notes)]
+    notes = [*_skipped(config, work), *left_out]
     settings = dataclasses.replace(config.benchmark, methods=methods)
     test_set = made_set(root.resolve().name, work)
     benchmark = run_benchmark(test_set, context, settings, lpips, work / "cache", mapper_of(config, "benchmark"))
-    used = weights_used(methods, context)
-    record = NO_RECORD if lpips_weights is None else lpips_weights.record
-    about = {"set": test_set.name, "lpips": record, "train_mean": train_mean, "left_out": notes, "weights": used}
+    about = {
+        "set": test_set.name,
+        "conditions": {"sentence": sentence(used), "warnings": differences, **used._asdict()},
+        "lpips": NO_RECORD if lpips_weights is None else lpips_weights.record,
+        "train_mean": train_mean,
+        "left_out": notes,
+        "weights": weights_used(methods, context),
+    }
     metrics = write_benchmark(out, benchmark, settings, config.seed, about)
-    write_set_page(out, test_set.name, command, notes)
+    write_set_page(out, test_set.name, command, [*differences, *notes])
     return metrics, notes
 
 
@@ -80,7 +94,9 @@ def _train_mean(config: Config) -> float | None:
 def _runs(method: str, context: Context, train_mean: float | None, notes: list[str]) -> bool:
     """Whether all is there that a method needs; adds to `notes` what is not."""
     if reason := why_absent(method, context):
-        notes.append(f"{method} was left out: {reason}; run `dvc repro` for what it trains.")
+        trained = any(method.removesuffix("+gain") in rows for rows in USERS.values())
+        advice = "; name it in benchmark.methods of params.yaml and run `dvc repro`" if trained else ""
+        notes.append(f"{method} was left out: {reason}{advice}.")
         return False
     if train_mean is None and "train_mean" in reach(METHODS[method], type(context)).fields:  # type: ignore[arg-type]
         notes.append(f"{method} was left out: the training split is not there; run `dvc repro synthesize`.")

@@ -259,13 +259,24 @@ def why_absent(method: str, context: Context) -> str | None:
 
 
 def weights_used(methods: Sequence[str], context: Context) -> dict[str, dict[str, str]]:
-    """File name and sha256 of the weights behind each of these methods that needs any."""
+    """File name, sha256 and network of the weights behind each of these methods that needs any."""
     rows = [row for method in methods if (row := method.removesuffix(GAIN)) in NEEDED]
     return {
-        row: {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+        row: {
+            "file": path.name,
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "network": load_checkpoint(path)[1]["network"] if path.suffix == ".safetensors" else NEEDED[row][0],
+        }
         for row in rows
         if (path := _checkpoint(row, context)) is not None
     }
+
+
+def metadata_used(methods: Sequence[str], context: Context) -> dict[str, dict[str, Any]]:
+    """What the checkpoints behind these methods say of themselves, by row; files of other authors say nothing."""
+    paths = {row: _checkpoint(row, context) for method in methods if (row := method.removesuffix(GAIN)) in NEEDED}
+    own = {row: path for row, path in paths.items() if path is not None and path.suffix == ".safetensors"}
+    return {row: load_checkpoint(path)[1] for row, path in own.items()}
 
 
 def _checkpoint(row: str, context: Context) -> Path | None:

@@ -97,16 +97,17 @@ SET_TITLES = {
 """Test sets, in the order of every page."""
 
 PAPER_SOURCE = "Yan et al., Photonics 2024, 11(5), 481, Table 2"
+PAPER_LABELS = METHODS | {"e2v": "E2V, default parameters", "cf": "CF, default parameters"}
 PAPER_TABLE_2: Mapping[str, Scores] = {
     "simulated": {
         "cf": {"mse": 0.1371, "psnr": 10.60, "ssim": 0.1667, "lpips": 0.5890},
         "e2v": {"mse": 0.0778, "psnr": 12.74, "ssim": 0.3068, "lpips": 0.4140},
-        "ours": {"mse": 0.0355, "psnr": 15.56, "ssim": 0.3947, "lpips": 0.3295},
+        "paper": {"mse": 0.0355, "psnr": 15.56, "ssim": 0.3947, "lpips": 0.3295},
     },
     "real": {
         "cf": {"mse": 0.0087, "psnr": 23.17, "ssim": 0.4116, "lpips": 0.3342},
         "e2v": {"mse": 0.0134, "psnr": 20.02, "ssim": 0.3819, "lpips": 0.3350},
-        "ours": {"mse": 0.0026, "psnr": 27.48, "ssim": 0.5189, "lpips": 0.1369},
+        "paper": {"mse": 0.0026, "psnr": 27.48, "ssim": 0.5189, "lpips": 0.1369},
     },
 }
 PAPER_COMPARABILITY = (
@@ -155,10 +156,14 @@ def in_order(methods: Iterable[str]) -> list[str]:
     return [m for m in METHODS if m in given] + [m for m in given if m not in METHODS]
 
 
-def score_table(scores: Scores, columns: Mapping[str, Column] = MappingProxyType(COLUMNS)) -> Table:
+def score_table(
+    scores: Scores,
+    columns: Mapping[str, Column] = MappingProxyType(COLUMNS),
+    labels: Mapping[str, str] = MappingProxyType(METHODS),
+) -> Table:
     """Scores of the methods in the fixed order; a metric that no method has gets no column.
 
-    LPIPS names the backbone that its rows have as `lpips_backbone`. Methods this module has no name for follow under
+    LPIPS names the backbone that its rows have as `lpips_backbone`. Methods that `labels` has no name for follow under
     their own key.
     """
     if not scores:
@@ -172,7 +177,7 @@ def score_table(scores: Scores, columns: Mapping[str, Column] = MappingProxyType
     rows = tuple(
         Row(
             method,
-            METHODS.get(method, method),
+            labels.get(method, method),
             tuple(
                 _cell(columns[key], scores[method].get(key), scores[method].get(f"{key}_ci"), best[key]) for key in keys
             ),
@@ -185,8 +190,8 @@ def score_table(scores: Scores, columns: Mapping[str, Column] = MappingProxyType
 
 
 def paper_table(experiment: Literal["simulated", "real"]) -> Table:
-    """The paper's Table 2, one of its two experiments."""
-    return score_table(PAPER_TABLE_2[experiment])
+    """Published figures: the paper's Table 2, one of its two experiments."""
+    return score_table(PAPER_TABLE_2[experiment], labels=PAPER_LABELS)
 
 
 def as_markdown(table: Table) -> str:
@@ -215,21 +220,25 @@ def as_plain(table: Table) -> str:
     return "\n".join([*(line.rstrip() for line in lines), *table.notes])
 
 
-def standing(scores: Scores) -> list[str]:
+def standing(scores: Scores, labels: Mapping[str, str] = MappingProxyType(METHODS)) -> list[str]:
     """How `ours` compares with every other method: one sentence each, with the differences; none without `ours`."""
     if "ours" not in scores:
         return []
     return [
         f"ours against {label}: " + ", ".join(differences) + "."
-        for rival, label in METHODS.items()
+        for rival, label in labels.items()
         if rival in scores and rival != "ours" and (differences := _differences(scores["ours"], scores[rival]))
     ]
 
 
-def paired_lines(paired: Mapping[str, Mapping[str, Mapping[str, Any]]], metric: str = "mse") -> list[str]:
+def paired_lines(
+    paired: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    metric: str = "mse",
+    labels: Mapping[str, str] = MappingProxyType(METHODS),
+) -> list[str]:
     """How `ours` does scene by scene against each other method, from details.json's `paired`; a sentence each."""
     return [
-        f"{METHODS.get(rival, rival)}: ours is better in {one['better']} of {one['scenes']} scenes "
+        f"{labels.get(rival, rival)}: ours is better in {one['better']} of {one['scenes']} scenes "
         f"(effect {one['effect']:+.2f}, p = {one['p_holm']:.2g})."
         for rival in in_order(paired)
         if (one := paired[rival].get(metric))

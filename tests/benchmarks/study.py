@@ -69,7 +69,7 @@ def trained(row: str, arguments: argparse.Namespace) -> Path:
         resume = arguments.work / "resume" / folder.name
         whole, started = not any(resume.glob("*/running.pt")), time.monotonic()
         paths = (f"paths.{name}={folder}", f"paths.resume={resume}")
-        stage(name, arguments, *choice, f"seed={arguments.seed}", *paths, *chosen)
+        stage(name, arguments, *choice, f"benchmark.methods=[{row}]", f"seed={arguments.seed}", *paths, *chosen)
         minutes = round((time.monotonic() - started) / 60, 1) if whole else None
         (folder / "minutes.json").write_text(json.dumps(minutes))
     return folder

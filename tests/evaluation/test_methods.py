@@ -205,7 +205,9 @@ def test_files_of_the_configuration_come_before_what_the_stages_left(tmp_path):
 def test_the_weights_behind_a_table_are_named_by_their_hash(context, checkpoints):
     used = weights_used(["cf", "firenet", "firenet+gain"], context)
     content = checkpoints["firenet_checkpoint"].read_bytes()
-    assert used == {"firenet": {"file": "firenet.safetensors", "sha256": hashlib.sha256(content).hexdigest()}}
+    assert used == {
+        "firenet": {"file": "firenet.safetensors", "sha256": hashlib.sha256(content).hexdigest(), "network": "firenet"}
+    }
 
 
 @pytest.mark.shared

@@ -82,6 +82,22 @@ def test_the_benchmark_has_a_row_for_every_method_with_lpips_and_says_of_which_b
     assert metrics["oracle_mean"]["mse"] <= min(metrics["zeros"]["mse"], metrics["train_mean"]["mse"])
 
 
+def test_a_baseline_that_no_row_uses_is_not_trained_and_another_row_changes_nothing(project_root, data, tmp_path):
+    asked = bytes_of(data / "baselines")
+    rows = "benchmark.methods=[zeros,e2v,{}ours]".format
+    printed = run_stage(project_root, "train_e2p", tmp_path, rows(""))  # without any event: nothing is read
+    assert "no row of benchmark.methods uses weights of baselines.e2p" in printed
+    assert [path.name for path in (tmp_path / "train_e2p").iterdir()] == ["not_trained.json"]
+    run_stage(project_root, "baselines", tmp_path, rows(""))
+    without = bytes_of(tmp_path / "baselines")
+    run_stage(project_root, "baselines", tmp_path, rows("cf,e2v+gain,"))
+    assert bytes_of(tmp_path / "baselines") == without
+    run_stage(project_root, "baselines", tmp_path, rows("e2p,"))
+    assert bytes_of(tmp_path / "baselines") == asked
+    assert without["e2v.json"] == asked["e2v.json"]
+    assert without["e2p.json"] != asked["e2p.json"]
+
+
 def test_pictures_are_split_by_source(data):
     manifest = json.loads((data / "images" / "manifest.json").read_text())
     splits = [picture["split"] for picture in manifest["pictures"]]

@@ -19,6 +19,7 @@ from polarnet.simulation.motion import MotionConfig
 from polarnet.simulation.pictures.images import write_png
 from polarnet.simulation.pictures.manifest import Manifest, ManifestEntry, Skipped, write_manifest
 from polarnet.simulation.truth import synthesize
+from polarnet.training.baselines import leave_untrained
 
 SPLITS = {"park": "train", "lake": "val", "tree": "test", "leaf": "test"}
 HISTORY = [
@@ -99,7 +100,11 @@ def run_methods(events, frames, folder):
         )  # fmt: skip
     about = {
         "lpips": {"backbone": None, "sha256": None, "source": None},
-        "weights": {"ours": {"file": "best.safetensors", "sha256": "5ca1ab1e" * 8}},
+        "weights": {
+            "e2v": {"file": "best.safetensors", "sha256": "e2" * 32, "network": "firenet"},
+            "ours": {"file": "best.safetensors", "sha256": "5ca1ab1e" * 8, "network": "paper"},
+        },
+        "conditions": {"sentence": "Sequences of 24x36 pixels (height x width), 0.2 s at 30 frames a second."},
     }
     costs = dict.fromkeys(methods, Cost(1.5, None, 0, 0.25)) | {"ours": Cost(1.5, 10.4, 37_777, 12.0)}
     write_benchmark(folder, Benchmark(rows, costs, panels), config, seed=1, about=about)
@@ -121,7 +126,9 @@ def paths(tmp_path_factory):
     frames = FrameStore.open(paths.frames)
     write_events(paths.events, frames)
     run_methods(EventStore.open(paths.events), frames, paths.benchmark)
-    for folder in (paths.train, paths.train_e2v, paths.train_e2p):
+    for folder, network in ((paths.train, "paper"), (paths.train_e2v, "firenet")):
         folder.mkdir()
         (folder / "history.json").write_text(json.dumps(HISTORY))
+        (folder / "best.json").write_text(json.dumps({"network": network}))
+    leave_untrained("e2p", paths.train_e2p)
     return paths
