@@ -186,7 +186,8 @@ def test_a_sequence_is_replayed_as_lines_at_its_own_pace(store, channels):
     ((), "say --sequence, one of lake, road; got None"),
     (("--sequence", "lake", "--method", "oracle_mean"), "expected a method of cf"),
     (("--sequence", "lake", "--method", "e2vid_published"), "no weights are given"),
-    (("--sequence", "lake", "--method", "cf", "--window", "1s"), "do not fill one window"),
+    (("--sequence", "lake", "--method", "cf", "--window", "1s"),
+     "events.zarr lasts 100 ms, less than one window of 1000 ms: record for longer, or give --window 33.333ms"),
     (("--sequence", "lake", "--method", "cf", "--step", "9ev"), "expected a time such as 0.1ms"),
     (("--sequence", "lake", "--method", "cf", "--step", "1s"), "events between windows would be lost"),
     (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
@@ -199,8 +200,9 @@ def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, 
     if "cuda:9" in arguments and torch.cuda.is_available():
         pytest.skip("there is a GPU")
     method = () if {"--method", "--weights"} & set(arguments) else ("--method", "cf")
-    assert run(store, *arguments, *method, out=tmp_path / "out") == 1
+    assert run(store, *arguments, *method, out=tmp_path / "new" / "out") == 1
     assert reason in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
 
 
 def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):
