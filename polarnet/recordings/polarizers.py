@@ -21,7 +21,7 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG
 WINDOW_US = 33_333
 WINDOWS = 30  # the first second
 BLOCK = 4  # pixels, square; events of single pixels are too few to compare
-MIN_BLOCKS = 2000  # with events in a window: the ratio of two misfits is then known to about 1 / sqrt(2000), 2 %
+MIN_BLOCKS = 1000  # with events in a window: the ratio of two misfits is then known to about 1 / sqrt(1000), 3 %
 HOT_PIXEL_FACTOR = 4.0
 
 # Limits of misfits and counts: measured by tests/benchmarks/polarizers.py (docs/recover.md, section Checks).
@@ -73,7 +73,11 @@ class ChannelCheck:
                 f"There are no events behind the polarizer at {' and '.join(silent)} degrees. DoLP and AoLP are wrong."
             ]
         misfits = pair_misfits(self._windows)
-        if misfits.blocks < MIN_BLOCKS or not misfits.rms.all():
+        if misfits.blocks < MIN_BLOCKS:
+            return []
+        if not misfits.rms.any():
+            return ["The four channels are the same, event by event: one recording was given four times."]
+        if not misfits.rms[0]:
             return []
         ratio = misfits.rms / misfits.rms[0]
         spread = max(self.counts) / min(self.counts)

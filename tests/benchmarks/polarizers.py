@@ -11,7 +11,6 @@ import functools
 from collections import defaultdict
 from typing import NamedTuple
 
-import torch
 from torch.nn.functional import interpolate
 
 from polarnet.events.stream import Events, merge
@@ -95,16 +94,16 @@ def main() -> None:
     motion = dataclasses.replace(MOTIONS["default"], window_height=HEIGHT, window_width=WIDTH, duration_s=DURATION_S)
     results = defaultdict(list)
     for photo in BUILTIN_PHOTOS[: options.photographs]:
-        rgb = interpolate(read_rgb(photo.path())[None], (400, 600), mode="bilinear", antialias=True)[0].clamp(0, 1)
+        rgb = interpolate(read_rgb(photo.path)[None], (400, 600), mode="bilinear", antialias=True)[0].clamp(0, 1)
         s0, dolp, aolp = polarization_from_rgb(rgb)
         for sensor, config in SENSORS_CHECKED.items():
             for factor in FACTORS:
                 seen = simulate(scene_from_polarization(s0, factor * dolp, aolp), motion, config, seed=1)
-                case = f"{photo.path().stem}, {sensor}, x {factor:g}", float(seen.dolp.mean())
+                case = f"{photo.path.stem}, {sensor}, x {factor:g}", float(seen.dolp.mean())
                 results["four channels"].append(result_of(*case, seen.events, mosaic=False))
                 cells = split_mosaic(mosaic_of(seen.events, ORDER), ORDER)
                 results["mosaic"].append(result_of(*case, cells, mosaic=True))
-        print(f"{photo.path().stem} done", flush=True)
+        print(f"{photo.path.stem} done", flush=True)
     print(
         "| | mean DoLP | recordings | counts differ by | other pairs' misfit | said equal | said wrong | wrong named |"
     )
@@ -116,8 +115,9 @@ def main() -> None:
                 print(
                     f"| {kind} | {f'{low:g} to {high:g}' if high else '0'} | {len(of)} "
                     f"| {min(r.spread for r in of) - 1:.1%} to {max(r.spread for r in of) - 1:.1%} "
-                    f"| {min(r.lowest for r in of):.2f} to {max(r.highest for r in of):.2f} | {sum(r.equal for r in of)} "
-                    f"| {sum(r.order for r in of)} | {sum(map(sum, (r.wrong for r in of)))} of {2 * len(of)} |"
+                    f"| {min(r.lowest for r in of):.2f} to {max(r.highest for r in of):.2f} "
+                    f"| {sum(r.equal for r in of)} | {sum(r.order for r in of)} "
+                    f"| {sum(sum(r.wrong) for r in of)} of {2 * len(of)} |"
                 )
     for kind, rows in results.items():
         for row in rows:
