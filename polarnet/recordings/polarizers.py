@@ -66,38 +66,40 @@ class ChannelCheck:
             yield piece
 
     def findings(self) -> list[str]:
-        """A sentence for each thing that is wrong; none where there are too few events to say."""
-        silent = [f"{angle}" for angle, count in zip(POLARIZER_ANGLES_DEG, self.counts, strict=True) if count == 0]
-        if silent:
-            return [
-                f"There are no events behind the polarizer at {' and '.join(silent)} degrees. DoLP and AoLP are wrong."
-            ]
-        misfits = pair_misfits(self._windows)
-        if misfits.blocks < MIN_BLOCKS:
-            return []
-        if not misfits.rms.any():
-            return ["The four channels are the same, event by event: one recording was given four times."]
-        if not misfits.rms[0]:
-            return []
-        ratio = misfits.rms / misfits.rms[0]
-        spread = max(self.counts) / min(self.counts)
-        if spread < EQUAL_COUNTS and ratio.max() < (EQUAL_MISFITS_MOSAIC if self._mosaic else EQUAL_MISFITS):
-            return [
-                f"The four channels show the same: their numbers of events differ by {spread - 1:.1%}, and their sums "
-                f"fit each other in any pairs. Either the recording was made without polarizers, or its scene is "
-                f"hardly polarized (a DoLP below about 0.1); events cannot tell which. Without polarizers, DoLP and "
-                f"AoLP mean nothing."
-            ]
-        best = int(ratio.argmin())
-        if ratio[best] < BETTER_FIT:
-            (a, b), (c, d) = PAIRS[best]
-            one, other = EXCHANGED[best - 1]
-            return [
-                f"The polarizers seem to be in another order: I0 + I90 = I45 + I135 does not hold. {a} and {b}, {c} "
-                f"and {d} degrees fit better as pairs at right angles, with {ratio[best]:.0%} of the misfit. "
-                f"DoLP and AoLP are wrong; exchange {one} and {other} in --mosaic or --angles."
-            ]
+        """A sentence on what is wrong; none where nothing is, or where there are too few events to say."""
+        return channel_findings(pair_misfits(self._windows), self.counts, mosaic=self._mosaic)
+
+
+def channel_findings(misfits: Misfits, counts: Sequence[int], *, mosaic: bool) -> list[str]:
+    """A sentence on what misfits and the counts of the four channels show; none where there is too little evidence."""
+    silent = [f"{angle}" for angle, count in zip(POLARIZER_ANGLES_DEG, counts, strict=True) if count == 0]
+    if silent:
+        return [f"There are no events behind the polarizer at {' and '.join(silent)} degrees. DoLP and AoLP are wrong."]
+    if misfits.blocks < MIN_BLOCKS:
         return []
+    if not misfits.rms.any():
+        return ["The four channels are the same, event by event: one recording was given four times."]
+    if not misfits.rms[0]:
+        return []
+    ratio = misfits.rms / misfits.rms[0]
+    spread = max(counts) / min(counts)
+    if spread < EQUAL_COUNTS and ratio.max() < (EQUAL_MISFITS_MOSAIC if mosaic else EQUAL_MISFITS):
+        return [
+            f"The four channels show the same: their numbers of events differ by {spread - 1:.1%}, and their sums "
+            f"fit each other in any pairs. Either the recording was made without polarizers, or its scene is "
+            f"hardly polarized (a DoLP below about 0.1); events cannot tell which. Without polarizers, DoLP and "
+            f"AoLP mean nothing."
+        ]
+    best = int(ratio.argmin())
+    if ratio[best] < BETTER_FIT:
+        (a, b), (c, d) = PAIRS[best]
+        one, other = EXCHANGED[best - 1]
+        return [
+            f"The polarizers seem to be in another order: I0 + I90 = I45 + I135 does not hold. {a} and {b}, {c} "
+            f"and {d} degrees fit better as pairs at right angles, with {ratio[best]:.0%} of the misfit. "
+            f"DoLP and AoLP are wrong; exchange {one} and {other} in --mosaic or --angles."
+        ]
+    return []
 
 
 def pair_misfits(windows: Sequence[EventWindow]) -> Misfits:
