@@ -108,7 +108,7 @@ def main() -> None:
             if of:
                 print(
                     f"| {kind} | {f'{low:g} to {high:g}' if high else '0'} | {len(of)} "
-                    f"| {min(r.spread for r in of):.3g} to {max(r.spread for r in of):.3g} "
+                    f"| {min(r.spread for r in of):.2f} to {max(r.spread for r in of):.2f} "
                     f"| {min(r.lowest for r in of):.2f} to {max(r.highest for r in of):.2f} "
                     f"| {sum(r.equal for r in of)} | {sum(r.order for r in of)} "
                     f"| {sum(r.exchanged_45_90 + r.exchanged_90_135 for r in of)} of {2 * len(of)} |"
