@@ -28,12 +28,12 @@ SET_THEM = "To score on sequences like those of the training, add to the command
 
 
 def benchmark_folder(
-    config: Config, root: Path, kind: str, out: Path, weights: Path | None, command: str
+    config: Config, root: Path, kind: str, out: Path, work: Path, weights: Path | None, command: str
 ) -> tuple[dict[str, dict[str, Any]], list[str]]:
     """Run the benchmark on a folder of photographs or measured scenes, without training; (metrics, notes).
 
-    `out` gets metrics.json, details.json, frames.csv, panels and index.html, and in `out`/work what they were made
-    from, so that a run that was stopped goes on and a second one with other weights makes only what is new. Methods
+    `out` gets metrics.json, details.json, frames.csv, panels and index.html, and `work` what they were made from,
+    so that a run that was stopped goes on and a second one with other weights makes only what is new. Methods
     whose weights are not there are left out, files that cannot be used are skipped, and `notes` says so. Size, duration
     and sensor are printed first, with a warning where those of a network's training differ. `weights` is a checkpoint
     of the DoLP network; None: the shipped one. ValueError where nothing in the folder can be used, and where the table
@@ -54,7 +54,6 @@ def benchmark_folder(
     differences = warnings(used, metadata_used(methods, context), SET_THEM)
     print("\n".join([sentence(used), *(f"WARNING: {line}" for line in differences)]), flush=True)
     recipe = Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads_of(config.runtime))
-    work = out / "work"
     try:
         make_folder_set(root, kind, work, recipe, functools.partial(mapper_of, config))
     except ValueError as error:

@@ -52,3 +52,7 @@ def test_weights_of_other_authors_are_told_from_those_trained_here():
 @pytest.mark.parametrize(("backbone", "name"), [("vgg", "VGG16"), ("alex", "AlexNet"), ("squeeze", "SqueezeNet 1.1")])
 def test_lpips_is_explained_with_its_backbone(backbone, name):
     assert f"with {name} as its backbone" in lpips_about({"backbone": backbone})
+
+
+def test_lpips_is_not_explained_where_the_table_has_no_such_column():
+    assert lpips_about({"backbone": None}) is None
