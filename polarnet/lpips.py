@@ -22,6 +22,7 @@ from jaxtyping import Float
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
+from polarnet.arrays import Array, as_tensor, check_floating, check_range
 from polarnet.ranges import allowed, check_ranges
 
 log = logging.getLogger(__name__)
@@ -168,16 +169,22 @@ class Lpips(nn.Module):
         return cls.of(record["backbone"], load_file(file))
 
     def forward(
-        self, a: Float[Tensor, "b h w"] | Float[Tensor, "b 3 h w"], b: Float[Tensor, "b h w"] | Float[Tensor, "b 3 h w"]
+        self, a: Float[Array, "b h w"] | Float[Array, "b 3 h w"], b: Float[Array, "b h w"] | Float[Array, "b 3 h w"]
     ) -> Float[Tensor, " b"]:
-        """Distance of each pair of images, grey or RGB in [0, 1]; 0 for equal ones."""
+        """Distance of each pair of images, grey or RGB in [0, 1], numpy or torch; 0 for equal ones.
+
+        ValueError as `features`, and where `b`, the truth, is outside [0, 1].
+        """
+        check_range("b", as_tensor("b", b), 0, 1, "images")
         return self.distance(self.features(a), self.features(b))
 
-    def features(self, images: Float[Tensor, "b h w"] | Float[Tensor, "b 3 h w"]) -> list[Float[Tensor, "b _c _h _w"]]:
+    def features(self, images: Float[Array, "b h w"] | Float[Array, "b 3 h w"]) -> list[Float[Tensor, "b _c _h _w"]]:
         """Unit-length features of images in [0, 1] at each tap: what to keep of a truth that is compared often.
 
-        ValueError for images too small for the backbone.
+        TypeError for what is no array; ValueError for integers, and for images too small for the backbone.
         """
+        images = as_tensor("images", images)
+        check_floating("images", images)
         least = BACKBONES[self.backbone].least_side
         if min(images.shape[-2:]) < least:
             raise ValueError(

@@ -2,9 +2,11 @@
 
 import dataclasses
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -29,6 +31,15 @@ def shared() -> Path:
     if not folder:
         pytest.skip("POLARNET_SHARED is not set: no reference material to compare with")
     return Path(folder)
+
+
+@pytest.fixture
+def unchecked_annotations() -> Iterator[None]:
+    """Run polarnet as a user's program does: annotations are not checked, so that its own checks are on their own."""
+    was = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", was)
 
 
 class Simulated(NamedTuple):
