@@ -15,6 +15,8 @@ from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from polarnet.arrays import Array, as_tensor, check_floating, check_range
+
 SHIFT = (-0.030, -0.088, -0.188)  # of RGB in [-1, 1]; this and SCALE: LPIPS v0.1's scaling layer
 SCALE = (0.458, 0.448, 0.450)
 NORM_FLOOR = 1e-8  # under the root of a feature's length, whose slope at 0 would be infinite
@@ -143,19 +145,25 @@ class Lpips(nn.Module):
 
     def forward(
         self,
-        images: Float[Tensor, "b h w"] | Float[Tensor, "b 3 h w"],
-        truth: Float[Tensor, "b h w"] | Float[Tensor, "b 3 h w"],
+        images: Float[Array, "b h w"] | Float[Array, "b 3 h w"],
+        truth: Float[Array, "b h w"] | Float[Array, "b 3 h w"],
     ) -> Float[Tensor, " b"]:
-        """Distance of each pair of images, grey or RGB in [0, 1]; 0 for equal ones. Gradients reach `images` alone."""
+        """Distance of each pair of images, grey or RGB in [0, 1], numpy or torch; 0 for equal ones.
+
+        Gradients reach `images` alone. ValueError as `features`, and where `truth` is outside [0, 1].
+        """
+        check_range("truth", as_tensor("truth", truth), 0, 1, "images")
         with torch.no_grad():
             of_truth = self.features(truth)
         return self.distance(self.features(images), of_truth)
 
-    def features(self, images: Float[Tensor, "b h w"] | Float[Tensor, "b 3 h w"]) -> list[Float[Tensor, "b _c _h _w"]]:
+    def features(self, images: Float[Array, "b h w"] | Float[Array, "b 3 h w"]) -> list[Float[Tensor, "b _c _h _w"]]:
         """Unit-length features of images in [0, 1] at each tap: what to keep of a truth that is compared often.
 
-        ValueError for images too small for the backbone.
+        TypeError for what is no array; ValueError for integers, and for images too small for the backbone.
         """
+        images = as_tensor("images", images)
+        check_floating("images", images)
         least = BACKBONES[self.backbone].least_side
         if min(images.shape[-2:]) < least:
             raise ValueError(

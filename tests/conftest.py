@@ -3,10 +3,11 @@
 import dataclasses
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -31,6 +32,15 @@ def shared() -> Path:
     if not folder:
         pytest.skip("POLARNET_SHARED is not set: no reference material to compare with")
     return Path(folder)
+
+
+@pytest.fixture
+def unchecked_annotations() -> Iterator[None]:
+    """Run polarnet as a user's program does: annotations are not checked, so that its own checks are on their own."""
+    was = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", was)
 
 
 class Simulated(NamedTuple):
