@@ -1,12 +1,14 @@
 import builtins
+import contextlib
 import io
 import json
 import re
-from contextlib import redirect_stdout
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import jaxtyping
 import numpy as np
 import onnx
 import onnxruntime
@@ -65,9 +67,19 @@ class Written(NamedTuple):
     printed: str
 
 
+@contextlib.contextmanager
+def unchecked() -> Iterator[None]:
+    """Without the shape checks of jaxtyping, which make tracing several times slower."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        yield
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+
+
 def write_small(name: str, folder: Path) -> Written:
     checkpoint, path = save_small(name, folder), folder / "polarnet.onnx"
-    with redirect_stdout(io.StringIO()) as printed:
+    with unchecked(), contextlib.redirect_stdout(io.StringIO()) as printed:
         size = ("--height", str(HEIGHT), "--width", str(WIDTH))
         assert main(["onnx", str(path), "--weights", str(checkpoint), *size]) == 0
     return Written(path, checkpoint, printed.getvalue())
@@ -217,7 +229,7 @@ def test_the_lines_on_the_page_run_as_they_stand(of_each, monkeypatch, project_r
     snippet = re.search(r"```python\n(.*?)```", (project_root / "docs" / "network.md").read_text(), re.DOTALL)
     assert snippet is not None
     names: dict = {}
-    with redirect_stdout(io.StringIO()) as printed:
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
         exec(snippet[1], names)
     assert len(printed.getvalue().split()) == 2
     assert names["found"]["dolp"].shape == (1, HEIGHT, WIDTH)

@@ -1,11 +1,11 @@
-"""The stages themselves, at toy size, as DVC calls them."""
+"""The stages themselves, at toy size, with the command lines that DVC calls (`trial` starts two as DVC does)."""
 
 import hashlib
 import json
-import subprocess
-import sys
+import shutil
 from pathlib import Path
 
+import preloaded
 import pytest
 
 from polarnet.experiments import stage_names
@@ -41,12 +41,11 @@ GENERATED = ("images", "scenes.zarr", "frames.zarr", "events.zarr")
 
 
 def run_stage(root: Path, stage: str, data: Path, *overrides: str) -> str:
-    command = [sys.executable, "-m", f"stages.{stage}", *TINY, f"paths.data={data}", f"paths.resume={data / 'resume'}",
-               f"paths.cache={data / 'cache'}",
-               f"hydra.run.dir={data / 'logs' / stage}", *overrides]  # fmt: skip
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout + done.stderr
+    arguments = [*TINY, f"paths.data={data}", f"paths.resume={data / 'resume'}", f"paths.cache={data / 'cache'}",
+                 f"hydra.run.dir={data / 'logs' / stage}", *overrides]  # fmt: skip
+    done = preloaded.run_stage(root, stage, arguments)
+    assert done.returncode == 0, done.stdout
+    return done.stdout
 
 
 def bytes_of(folder: Path) -> dict[str, str]:
@@ -133,8 +132,29 @@ def test_a_point_of_a_sweep_leaves_what_the_pipeline_made_and_kept_alone(project
     assert not (tmp_path / point["job"] / "cache").exists()
 
 
+def test_a_removed_method_is_in_no_table_and_no_picture_though_its_files_are_there(project_root, data, tmp_path):
+    """The benchmark's folder and the cache still hold what `highpass` gave."""
+    folders = {name: tmp_path / name for name in ("benchmark", "report", "cache")}
+    for name in ("benchmark", "cache"):
+        shutil.copytree(data / name, folders[name])
+    settings = [f"paths.{name}={folder}" for name, folder in folders.items()]
+    settings.append("benchmark.methods=[zeros,train_mean,oracle_mean,cf,ours]")
+    for stage in ("benchmark", "report"):
+        run_stage(project_root, stage, data, *settings)
+    before, after = (
+        json.loads((folder / "metrics.json").read_text()) for folder in (data / "benchmark", folders["benchmark"])
+    )
+    assert set(after) == {"zeros", "train_mean", "oracle_mean", "cf", "ours"}
+    assert after["cf"]["mse"] == before["cf"]["mse"]
+    full, reduced = ((folder / "index.html").read_text() for folder in (data / "report", folders["report"]))
+    assert 'class="m-highpass"' in full
+    assert ">high-pass<" in full
+    assert 'class="m-highpass"' not in reduced
+    assert ">high-pass<" not in reduced
+
+
 def test_a_later_stage_without_its_input_says_which_stage_makes_it(project_root, tmp_path):
-    command = [sys.executable, "-m", "stages.emulate", f"paths.data={tmp_path}", f"hydra.run.dir={tmp_path / 'log'}"]
-    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    arguments = [f"paths.data={tmp_path}", f"hydra.run.dir={tmp_path / 'log'}"]
+    done = preloaded.run_stage(project_root, "emulate", arguments)
     assert done.returncode != 0
-    assert "run the stage that writes it" in done.stderr
+    assert "run the stage that writes it" in done.stdout
