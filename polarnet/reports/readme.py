@@ -19,6 +19,7 @@ from polarnet.reports.study_tables import (
     event_budget_block,
     expected_errors_block,
     headline_block,
+    lpips_block,
     study_block,
 )
 from polarnet.reports.tables import (
@@ -204,6 +205,7 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "designs-rows": designs_block,
     "event_budget-budget": event_budget_block,
     "network-throughput": throughput_block,
+    "lpips-cost": lpips_block,
 }
 """What writes the block of each name."""
 
@@ -220,6 +222,7 @@ UNMEASURED = {
     "designs-rows": "Not collected yet: `python tests/benchmarks/designs.py` does it.",
     "scenes-choices": "Not measured yet: `python tests/benchmarks/scenes.py --write` does it.",
     "network-throughput": "Not measured yet: `python tests/benchmarks/training.py --write` does it.",
+    "lpips-cost": "Not measured yet: `python tests/benchmarks/lpips.py --write` does it.",
 }
 """Blocks that may stand in a document before their results do, and what they say until then."""
 
