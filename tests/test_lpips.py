@@ -1,3 +1,6 @@
+import json
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -7,18 +10,13 @@ import torch
 from polarnet.lpips import BACKBONES, Lpips
 from polarnet.lpips_weights import find_weights
 
-CROP = slice(128, 256), slice(160, 320)
-EXPECTED = {
-    "alex": {3: 0.129260, 7: 0.376362, 15: 0.540140},
-    "vgg": {3: 0.147474, 7: 0.346574, 15: 0.521259},
-    "squeeze": {3: 0.124705, 7: 0.336987, 15: 0.492556},
-}
-"""Distances of a crop of scikit-image's astronaut from its box blur by so many pixels, by the weights' own programs."""
+GOLDEN = json.loads((Path(__file__).parent / "golden" / "lpips.json").read_text())
 
 
 def astronaut(blur):
     """The crop and its blur, RGB in [0, 1]."""
-    sharp = skimage.data.astronaut()[CROP] / np.float32(255)
+    top, bottom, left, right = GOLDEN["crop"]
+    sharp = skimage.data.astronaut()[top:bottom, left:right] / np.float32(255)
     return [torch.from_numpy(image).permute(2, 0, 1)[None] for image in (sharp, cv2.blur(sharp, (blur, blur)))]
 
 
@@ -36,12 +34,14 @@ def squeeze(shared):
 
 @pytest.mark.parametrize("blur", [3, 7, 15])
 def test_alexnet_and_vgg_give_the_values_of_the_program_that_their_weights_come_from(installed, blur):
-    assert installed(*astronaut(blur)).item() == pytest.approx(EXPECTED[installed.backbone][blur], abs=2e-6)
+    assert installed(*astronaut(blur)).item() == pytest.approx(
+        GOLDEN["distances"][installed.backbone][str(blur)], abs=2e-6
+    )
 
 
 @pytest.mark.parametrize("blur", [3, 7, 15])
 def test_squeezenet_gives_the_published_values(squeeze, blur):
-    assert squeeze(*astronaut(blur)).item() == pytest.approx(EXPECTED["squeeze"][blur], abs=2e-6)
+    assert squeeze(*astronaut(blur)).item() == pytest.approx(GOLDEN["distances"]["squeeze"][str(blur)], abs=2e-6)
 
 
 def test_the_check_pairs_of_the_reference_material_are_these(shared):

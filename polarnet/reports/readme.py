@@ -20,6 +20,7 @@ from polarnet.reports.study_tables import (
     expected_errors_block,
     headline_block,
     loss_sweep_block,
+    lpips_block,
     study_block,
 )
 from polarnet.reports.tables import (
@@ -206,6 +207,7 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "event_budget-budget": event_budget_block,
     "network-throughput": throughput_block,
     "sweep": loss_sweep_block,
+    "lpips-cost": lpips_block,
 }
 """What writes the block of each name."""
 
@@ -223,6 +225,7 @@ UNMEASURED = {
     "scenes-choices": "Not measured yet: `python tests/benchmarks/scenes.py --write` does it.",
     "sweep": "Not measured yet: the sweep above and `polarnet measure sweep --sweep FOLDER` do it.",
     "network-throughput": "Not measured yet: `python tests/benchmarks/training.py --write` does it.",
+    "lpips-cost": "Not measured yet: `python tests/benchmarks/lpips.py --write` does it.",
 }
 """Blocks that may stand in a document before their results do, and what they say until then."""
 

@@ -1,4 +1,4 @@
-"""Tables of what tests/benchmarks/study.py and scenes.py measure: networks, their scenes, events that a frame takes."""
+"""Tables of what tests/benchmarks/study.py, scenes.py and lpips.py measure: networks, scenes, events, LPIPS."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -6,7 +6,7 @@ from statistics import fmean, stdev
 from typing import Any
 
 from polarnet.evaluation.methods import GAIN, INTENSITY_METHODS
-from polarnet.reports.provenance import measured_with, origin
+from polarnet.reports.provenance import cores, measured_with, origin
 from polarnet.reports.studies import PAPER_EVENTS_PER_PIXEL
 from polarnet.reports.tables import METHODS, SET_TITLES, in_order
 
@@ -267,3 +267,31 @@ def event_budget_block(results: Mapping[str, Any]) -> str:
         f"{len(budget['sequences'])} sequences. {origin(record)}",
     ]
     return "\n".join(lines)
+
+
+def lpips_block(results: Mapping[str, Any]) -> str:
+    """How exact LPIPS is on each backbone, and its cost in scoring and in training.
+
+    `results` is docs/results/lpips.json as tests/benchmarks/lpips.py writes it.
+    """
+    cost, record = results["cost"], results["records"]["cost"]
+    demo, paper = cost["demo"], cost["paper"]
+    lines = [
+        "| backbone | largest error | scoring, ms a frame | training step, ms | share of LPIPS |",
+        "|---|---:|---:|---:|---:|",
+        f"| without LPIPS | - | - | {demo['step_ms']['none']:.0f} | - |",
+    ]
+    lines += [
+        f"| `{backbone}` | {results[f'{backbone}_error_max']:.1e} | {results['scoring_ms_per_frame'][backbone]:.1f} | "
+        f"{demo['step_ms'][backbone]:.0f} | {100 * share:.0f} % |"
+        for backbone, share in demo["share"].items()
+    ]
+    return "\n".join([
+        *lines,
+        "",
+        f"Steps of `{demo['network']}` on {demo['frames']} frames in {demo['precision']}. A step of `experiment=paper` "
+        f"on {paper['frames']} frames in {paper['precision']} takes {paper['step_ms']['vgg']:.0f} ms with VGG and "
+        f"{paper['step_ms']['none']:.0f} ms without LPIPS: {100 * paper['share']['vgg']:.0f} % are LPIPS's.",
+        "",
+        f"{cost['threads']} thread(s) on {cores(record)} ({cost['device']}; {measured_with(record)}).",
+    ])  # fmt: skip
