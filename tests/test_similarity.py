@@ -228,3 +228,41 @@ def test_a_mask_that_masks_nothing_changes_nothing_and_one_that_masks_all_leaves
     everywhere = torch.ones(2, 24, 31, dtype=torch.bool)
     torch.testing.assert_close(metric(*pair, everywhere), metric(*pair))
     assert metric(*pair, ~everywhere).isnan().all()
+
+
+@pytest.mark.parametrize("metric", [mse, psnr, ssim, correlation, gradient_agreement, level_mse, pattern_mse])
+def test_numpy_gives_what_torch_gives(pair, metric):
+    a, b = pair
+    valid = b > 0.2
+    assert torch.equal(metric(a.numpy(), b.numpy()), metric(a, b))
+    assert torch.equal(metric(a.numpy(), b.numpy(), valid.numpy()), metric(a, b, valid))
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+def test_a_truth_of_another_data_range_is_refused(pair, metric):
+    a, b = pair
+    with pytest.raises(ValueError, match=r"b: expected frames in \[0, 1\], got values up to 255; divide by 255"):
+        metric(255 * a, 255 * b / b.max())
+    metric(3 * a, b)  # a prediction may exceed it
+    metric(a, torch.where(a > 0.5, 255, b), a <= 0.5)  # so may what nobody looks at
+
+
+@pytest.mark.parametrize("metric", [mse, psnr, ssim, correlation, gradient_agreement, level_mse, pattern_mse])
+def test_frames_of_bytes_or_of_different_shapes_are_refused(unchecked_annotations, pair, metric):
+    a, b = pair
+    with pytest.raises(ValueError, match=r"a: expected floating-point numbers, got torch\.uint8; divide by 255"):
+        metric((255 * a).byte(), b)
+    with pytest.raises(ValueError, match=r"expected a and b of one shape, got a \(2, 24, 31\), b \(24, 31\)"):
+        metric(a, b[0])
+    with pytest.raises(ValueError, match="valid: expected a mask, bool of shape"):
+        metric(a, b, b)
+
+
+def test_lpips_takes_numpy_and_refuses_bytes_and_a_truth_of_another_range(unchecked_annotations):
+    network = Lpips("squeeze")
+    a, b = torch.rand(2, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(network(a.numpy(), b.numpy()), network(a, b))
+    with pytest.raises(ValueError, match=r"images: expected floating-point numbers, got torch\.uint8"):
+        network((255 * a).byte(), b)
+    with pytest.raises(ValueError, match=r"b: expected images in \[0, 1\], got values up to 2\d\d.*; divide by 255"):
+        network(a, 255 * b)

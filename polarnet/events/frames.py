@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Int64, UInt8, UInt16
+from jaxtyping import Bool, Float, Int64, Integer, UInt8, UInt16
 from torch import Tensor
 
 from polarnet.arrays import (
@@ -138,7 +138,7 @@ class FrameStore:
     def write(
         self,
         sequence: str,
-        t_us: Int[Array, " n"],
+        t_us: Integer[Array, " n"],
         intensity: Float[Array, "n 4 h w"],
         dolp: Float[Array, "n h w"],
         aolp: Float[Array, "n h w"],
@@ -227,7 +227,7 @@ class FrameStore:
     def _read(self, name: str, sequence: str) -> np.ndarray:
         return self._table.read(name, sequence, slice(len(self.t_us(sequence))))
 
-    def _checked_times(self, t_us: Int[Array, " n"]) -> Int64[Tensor, " n"]:
+    def _checked_times(self, t_us: Integer[Array, " n"]) -> Int64[Tensor, " n"]:
         times, most = whole_numbers("t_us", t_us), self._table.columns["t_us"].shape[0]
         if times.ndim != 1 or not 0 < len(times) <= most or (times < 0).any() or (times.diff() <= 0).any():
             raise ValueError(f"expected 1 to {most} frame times, increasing from 0 or later, got {times.tolist()[:40]}")

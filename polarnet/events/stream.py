@@ -8,7 +8,7 @@ from typing import no_type_check
 import numba
 import numpy as np
 import torch
-from jaxtyping import Int, Int8, Int16, Int64
+from jaxtyping import Int8, Int16, Int64, Integer
 from torch import Tensor
 
 from polarnet.arrays import Array, whole_numbers
@@ -49,10 +49,10 @@ class Events:
     @classmethod
     def from_columns(
         cls,
-        t: Int[Array, " n"],
-        x: Int[Array, " n"],
-        y: Int[Array, " n"],
-        p: Int[Array, " n"],
+        t: Integer[Array, " n"],
+        x: Integer[Array, " n"],
+        y: Integer[Array, " n"],
+        p: Integer[Array, " n"],
         height: int,
         width: int,
     ) -> "Events":

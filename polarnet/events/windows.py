@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int, Int8, Int64
+from jaxtyping import Bool, Float, Int8, Int64, Integer
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -73,7 +73,7 @@ def cut_windows(events: Events, t_us: Int64[Tensor, " n"]) -> list[Events]:
     return [slice_count(events, start, stop) for start, stop in windows_of(edges)]
 
 
-def encode_windows(channels: Sequence[Events], t_us: Int[Array, " n"], encode: Encode) -> Float[Tensor, "t c h w"]:
+def encode_windows(channels: Sequence[Events], t_us: Integer[Array, " n"], encode: Encode) -> Float[Tensor, "t c h w"]:
     """Every window of every channel through `encode`, polarizer by polarizer along the second axis.
 
     ValueError where there is no window, that is, fewer than two frame times, and for times that do not increase.

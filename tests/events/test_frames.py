@@ -177,3 +177,20 @@ def test_without_masks_nothing_is_stored_about_them(finished, tmp_path):
     assert not (finished / "valid").exists()
     with pytest.raises(ValueError, match="got a mask for a store without one"):
         store_at(tmp_path / "frames.zarr").write("a", *frames_of(1), masks(1))
+
+
+def test_numpy_frames_and_a_path_of_text_make_the_same_store(tmp_path, finished):
+    store = FrameStore.create(str(tmp_path / "n.zarr"), ["a"], {"a": "train"}, 40, 4, 6, {})
+    store.write("a", *(values.numpy() for values in frames_of(1)))
+    store.finish()
+    written, expected = (FrameStore.open(str(path)).frames("a") for path in (tmp_path / "n.zarr", finished))
+    assert all(torch.equal(a, b) for a, b in zip(written[:4], expected[:4], strict=True))
+
+
+def test_frames_of_bytes_and_times_between_microseconds_are_refused(tmp_path, unchecked_annotations):
+    store = store_at(tmp_path / "f.zarr")
+    t_us, intensity, dolp, aolp = frames_of(1)
+    with pytest.raises(ValueError, match=r"intensity: expected values in \[0, 1\], got values up to .*; divide by 255"):
+        store.write("a", t_us, (255 * intensity).byte(), dolp, aolp)
+    with pytest.raises(ValueError, match=r"t_us: expected whole numbers, got torch\.float32"):
+        store.write("a", t_us.float(), intensity, dolp, aolp)
