@@ -15,9 +15,7 @@ def main(config: Config) -> None:
     for baseline in USERS:
         used = is_used(baseline, config.benchmark.methods, vars(config.baselines.weights))
         (folder / f"{baseline}.json").write_text(json.dumps({"trained": used}) + "\n")
-        print(
-            f"{baseline}: {'to be trained' if used else 'not trained, since no row of benchmark.methods uses it'}"
-        )
+        print(f"{baseline}: {'to be trained' if used else 'not trained, since no row of benchmark.methods uses it'}")
 
 
 if __name__ == "__main__":
