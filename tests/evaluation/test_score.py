@@ -90,6 +90,24 @@ def test_frames_of_another_size_are_refused(recording):
         score_sequence(recording, {"m": Polarization(recording.dolp[:3])}, 0, None, CPU)
 
 
+def test_lpips_sees_the_truth_once_for_all_methods_and_a_constant_once(make_recording, monkeypatch):
+    torch.manual_seed(0)
+    lpips, seen = Lpips("squeeze"), []
+    features = Lpips.features
+
+    def counted(self, images):
+        seen.append(len(images))
+        return features(self, images)
+
+    monkeypatch.setattr(Lpips, "features", counted)
+    recording, other = make_recording(windows=8), make_recording(windows=8, seed=1)
+    constant, zeros = Polarization(torch.full_like(other.dolp, 0.3)), Polarization(0 * other.dolp)
+    rows = score_sequence(recording, {"m": Polarization(other.dolp), "c": constant, "z": zeros}, 0, lpips, CPU)
+    assert seen == [8, 8, 1, 1]  # the truth, m, c, z
+    of_constant = [r.lpips for r in rows if r.method == "c"]
+    assert of_constant == pytest.approx(lpips(constant.dolp, recording.dolp).tolist(), rel=1e-4)
+
+
 def test_lpips_in_chunks_is_lpips_frame_by_frame(make_recording):
     torch.manual_seed(0)
     lpips = Lpips("squeeze")
