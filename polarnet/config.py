@@ -1,9 +1,11 @@
 """The typed schema of params.yaml and conf/: what a stage gets, checked before anything runs."""
 
 import dataclasses
+import fnmatch
 import functools
 import logging
 import os
+import re
 import sys
 import typing
 from collections.abc import Callable
@@ -42,6 +44,7 @@ from polarnet.training.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
 EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # below the project, where DVC runs queued experiments
+CHOICES = re.compile(r"(?:glob\()?([^()=]*)\)?")
 
 Stage = Callable[["Config"], None]
 T = TypeVar("T")
@@ -290,11 +293,15 @@ def _check_lpips(config: Config) -> None:
 
 
 def _check_choices(root: Path, group: str, value: str) -> None:
-    """ValueError where a choice of `group` has no file; Hydra resolves patterns such as glob(*) itself."""
-    names = [] if "(" in value else [name.strip("[]'\" ") for name in value.split(",")]
-    for name in names:
-        if name not in ("null", *preset_names(root, group)):
-            raise ValueError(f"{group}: there is no {name!r}; conf/{group} has {', '.join(preset_names(root, group))}")
+    """ValueError where a name or pattern for `group`, alone, in a list or in glob(...), matches no file.
+
+    Whatever else Hydra can read, such as choice(...), Hydra refuses itself.
+    """
+    known = preset_names(root, group)
+    plain = CHOICES.fullmatch(value)
+    for name in (word.strip("[]'\" ") for word in (plain[1].split(",") if plain else [])):
+        if not fnmatch.filter(["null", *known], name):
+            raise ValueError(f"{group}: there is no {name!r}; conf/{group} has {', '.join(known)}")
 
 
 def _check_ablation(root: Path, config: Config, overrides: list[str]) -> None:
