@@ -23,7 +23,7 @@ from polarnet.events.stream import Events
 from polarnet.networks.checkpoint import load_network, save_checkpoint
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
 from polarnet.networks.stokes_unet import StokesUNet
-from polarnet.onnx_export import largest_differences, random_windows
+from polarnet.onnx_export import export_network, largest_differences, random_windows
 
 HEIGHT, WIDTH = 30, 44  # neither divides by 8
 CONFIGS = {
@@ -240,3 +240,9 @@ def test_the_lines_on_the_page_run_as_they_stand(of_each, monkeypatch, project_r
     t = torch.arange(len(x))
     images = [event_counts(Events(t[k], x[k], y[k], p[k], HEIGHT, WIDTH), 33_333) for k in of]
     assert torch.equal(torch.cat(images), torch.from_numpy(names["events"][0]))
+
+
+def test_the_path_of_an_export_may_be_text(small, tmp_path):
+    network, metadata = load_network(str(small))
+    assert max(export_network(network, metadata, str(tmp_path / "n.onnx"), 16, 24).values()) < 1e-4
+    assert (tmp_path / "n.onnx").is_file()
