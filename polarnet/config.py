@@ -24,7 +24,7 @@ from polarnet.baselines.stokes_gain import GainConfig
 from polarnet.evaluation.methods import WeightsConfig
 from polarnet.evaluation.score import BenchmarkConfig
 from polarnet.experiments import preset_names, preset_values
-from polarnet.lpips import PURPOSES, Purpose, is_stored
+from polarnet.lpips import BACKBONES, PURPOSES, Purpose, is_stored
 from polarnet.lpips_weights import LpipsConfig, local_source
 from polarnet.networks.dolp_unet import DolpUNetConfig
 from polarnet.networks.registry import NetworkConfig
@@ -138,6 +138,17 @@ class Config:
         for key, crop in crops.items():
             if crop is not None and (crop[0] > window[0] or crop[1] > window[1]):
                 raise ValueError(f"{key}: expected at most the window of section synthesize, {window}, got {crop}")
+        e2v, e2p, loss = self.baselines.e2v, self.baselines.e2p, self.lpips.backbone
+        compared = (
+            ("loss.lpips", self.loss.lpips > 0, loss, self.train.crop),
+            ("baselines.e2v.lpips", e2v.lpips > 0, loss, e2v.crop),
+            ("baselines.e2p.lpips", max(e2p.lpips, e2p.intensity_lpips) > 0, loss, e2p.crop),
+            ("benchmark.lpips", self.benchmark.lpips, self.benchmark.lpips_backbone, None),
+        )
+        for key, used, backbone, crop in compared:
+            side, size = BACKBONES[backbone].least_side, crop or window
+            if used and min(size) < side:
+                raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {size}")
 
     @property
     def network_config(self) -> NetworkConfig:

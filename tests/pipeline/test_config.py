@@ -49,6 +49,7 @@ def test_the_committed_values_pass(project_root):
         ("ingest.source=camera", r"ingest\.source: expected one of"),
         ("network=resnet", r"network: expected one of paper"),
         ("lpips.backbone=resnet", r"lpips\.backbone: expected one of"),
+        ("train.crop=[24,90]", r"loss\.lpips: LPIPS \(alex\) needs images of 31 pixels a side, got \[24, 90\]"),
         ("train.crop=[240,90]", r"train\.crop: expected at most the window of section synthesize, \[120, 180\]"),
     ],
 )
