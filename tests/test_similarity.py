@@ -5,6 +5,7 @@ from skimage.filters import sobel_h, sobel_v
 from skimage.metrics import mean_squared_error, peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from polarnet.lpips import Lpips
 from polarnet.similarity import (
     aolp_error_deg,
     correlation,
@@ -264,5 +265,7 @@ def test_lpips_takes_numpy_and_refuses_bytes_and_a_truth_of_another_range(unchec
     assert torch.equal(network(a.numpy(), b.numpy()), network(a, b))
     with pytest.raises(ValueError, match=r"images: expected floating-point numbers, got torch\.uint8"):
         network((255 * a).byte(), b)
-    with pytest.raises(ValueError, match=r"b: expected images in \[0, 1\], got values up to 2\d\d.*; divide by 255"):
+    with pytest.raises(
+        ValueError, match=r"truth: expected images in \[0, 1\], got values up to 2\d\d.*; divide by 255"
+    ):
         network(a, 255 * b)

@@ -87,7 +87,7 @@ def light_of_one_pixel(t_ms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "
     """Digital numbers: a slow swell, a quick flash, then steady dim light."""
     swell = 0.7 * (1 - np.cos(2 * math.pi * t_ms.clip(0, 180) / 180)) / 2
     flash = (_edge(t_ms, 230.0) - _edge(t_ms, 290.0)) * 1.3
-    return 70 * np.exp(swell + flash - 0.6 * _edge(t_ms, 340.0))
+    return 69 * np.exp(swell + flash - 0.6 * _edge(t_ms, 340.0))
 
 
 def _edge(t_ms: Float64[np.ndarray, " n"], at_ms: float) -> Float64[np.ndarray, " n"]:

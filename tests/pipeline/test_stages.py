@@ -123,11 +123,11 @@ def test_a_point_of_a_sweep_leaves_what_the_pipeline_made_and_kept_alone(project
     before = {name: bytes_of(data / name) for name in parts}
     run_stage(project_root, "trial", data, "loss.ssim=0.5", f"hydra.sweep.dir={tmp_path}", "--multirun")
     assert {name: bytes_of(data / name) for name in parts} == before
-    (point,) = json.loads((tmp_path / "comparison.json").read_text())
+    (point,) = json.loads((tmp_path / "comparison.json").read_text())["points"]
     assert "loss.ssim=0.5" in point["overrides"]
     own = json.loads((tmp_path / point["job"] / "benchmark" / "metrics.json").read_text())
     whole = json.loads((data / "benchmark" / "metrics.json").read_text())
-    assert point["scores"] == own["ours"] != whole["ours"]
+    assert point["test"] == own["ours"] != whole["ours"]
     assert own["oracle_mean"]["mse"] == whole["oracle_mean"]["mse"]
     assert not (tmp_path / point["job"] / "cache").exists()
 

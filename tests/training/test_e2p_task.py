@@ -35,7 +35,7 @@ LOOP: dict[str, Any] = {
     "gradient_norm": 1.0,
     "precision": "fp32",
 }
-E2P = E2pConfig(**LOOP, bins=5, intensity_lpips=3.0, lpips=0.0, mse=50.0, ssim=1.0)
+E2P = E2pConfig(**LOOP, bins=5, intensity_lpips=0.0, lpips=0.0, mse=50.0, ssim=1.0)
 
 
 def test_a_training_of_e2p_leaves_a_checkpoint_of_the_published_size(stores, tmp_path):
@@ -78,7 +78,7 @@ def test_the_truth_is_s0_the_coded_angle_and_dolp_and_dolp_is_scored(stores):
 def test_the_loss_is_the_published_one():
     torch.manual_seed(0)
     lpips = Lpips("squeeze")
-    config = dataclasses.replace(E2P, lpips=1.0)
+    config = dataclasses.replace(E2P, intensity_lpips=3.0, lpips=1.0)
     loss = e2p_task(config, lpips, SEED).loss
     assert isinstance(loss, BranchLoss)
     predicted, truth = torch.rand(2, 1, 2, 3, 32, 32).unbind()

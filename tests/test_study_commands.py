@@ -38,6 +38,8 @@ def config(project_root, simulated, tmp_path_factory):
             f"synthesize.window_height={height}", f"synthesize.window_width={width}", "synthesize.duration_s=0.2",
             "synthesize.acceleration_max_px_s2=4000.0", "train.crop=null", "baselines.e2v.crop=null",
             "baselines.e2p.crop=null", "benchmark.warmup_windows=1",
+            "loss.lpips=0.0", "baselines.e2v.lpips=0.0", "baselines.e2p.lpips=0.0", "baselines.e2p.intensity_lpips=0.0",
+            "benchmark.lpips=false",
         ],
     )  # fmt: skip
 
