@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from polarnet.events.stream import Events
 from polarnet.simulation.compilation import compiled
-from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, events_of, run
+from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, emulate_lights, events_of
 from polarnet.simulation.motion import Pose, Trajectory, bilinear, window_to_scene
 from polarnet.simulation.pixels.columns import Columns
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames, light_of_scene
@@ -63,7 +63,9 @@ def synthesize_steps(
         raise ValueError(f"expected at least one time, and each later than the one before, got {t_us[:5].tolist()}...")
     pose = trajectory.pose(t_us * 1e-6)
     _check_inside(scene, pose, t_us, height, width)
-    see = functools.partial(run, height=height, width=width, config=config, key=key, planes=POLARIZERS, threads=threads)
+    see = functools.partial(
+        emulate_lights, height=height, width=width, config=config, key=key, channels=POLARIZERS, threads=threads
+    )
     if _drifts(pose):
         columns, state = see(_lights_of_drift(scene, pose, height, width), t_us.astype(np.float64), state=state)
         return [events_of(c, height, width) for c in columns], state
@@ -92,7 +94,7 @@ def render_times_us(
     samples = 2 + math.ceil(SAMPLES_PER_STEP * duration_us * 1e-6 * max(trajectory.speed_px_s, SLOWEST_RATE_HZ))
     sampled_us = np.linspace(0, duration_us, samples)
     pose = trajectory.pose(sampled_us * 1e-6)
-    kinks_us = np.empty(0) if MODELS[config.model].is_video else _pixel_crossings(pose, sampled_us, height, width)
+    kinks_us = np.empty(0) if MODELS[config.model].EIGHT_BIT_VIDEO else _pixel_crossings(pose, sampled_us, height, width)
     if config.render_rate_hz is None:
         moved = np.hypot(*np.diff(np.stack(_corners(pose, height, width)), axis=-1)).max(axis=0)
         steps = np.maximum(
@@ -136,7 +138,7 @@ def render_intensities(
     scene: PolarizationScene, pose: Pose, height: int, width: int, config: EmulatorConfig
 ) -> UInt8[np.ndarray, "4 n h w"] | Float32[np.ndarray, "4 n h w"]:
     """Digital numbers behind the four polarizers as the window sees them; uint8 where the pixel model wants 8 bits."""
-    frames = np.empty((4, len(pose.x), height, width), np.uint8 if MODELS[config.model].is_video else np.float32)
+    frames = np.empty((4, len(pose.x), height, width), np.uint8 if MODELS[config.model].EIGHT_BIT_VIDEO else np.float32)
     _render_turning(np.ascontiguousarray(scene.stokes.numpy()), pose.x, pose.y, pose.angle, pose.zoom, frames)
     return frames
 
