@@ -1,4 +1,4 @@
-"""One picture, in memory, to the events of four polarizers and the truth that belongs to them."""
+"""Simulation in memory: one picture in, events of four channels and the matching truth out."""
 
 from typing import NamedTuple
 
@@ -9,13 +9,13 @@ from polarnet.events.stream import Events
 from polarnet.runtime import generator_for, seed_for
 from polarnet.simulation.emulator import EmulatorConfig, randomised
 from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory
+from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
-from polarnet.simulation.synthesize import synthesize_sequence
 from polarnet.simulation.truth import frames_of
 
 
 class Simulation(NamedTuple):
-    """What a moving sensor behind four polarizers reported, and what it looked at."""
+    """Events of a moving sensor behind four polarizers, and the truth at frame times."""
 
     events: list[Events]
     """Behind the polarizers at 0, 45, 90 and 135 degrees, in microseconds from the start of the motion."""
@@ -32,15 +32,15 @@ class Simulation(NamedTuple):
 def simulate(
     picture: Float[Tensor, "3 h w"] | PolarizationScene, motion: MotionConfig, sensor: EmulatorConfig, seed: int
 ) -> Simulation:
-    """Let a window move over a picture in [0, 1], or over a scene, and see it through event-camera pixels.
+    """Move an event camera's sensor over a picture in [0, 1], or over a scene.
 
     Hue becomes AoLP, saturation DoLP and value S0, as in the pipeline. The same arguments give the same numbers.
-    ValueError where the picture is too small for the window and its motion.
+    ValueError where the picture is too small for the sensor and its motion.
     """
     scene = picture if isinstance(picture, PolarizationScene) else scene_from_rgb(picture)
     trajectory = random_trajectory(motion, scene.height, scene.width, generator_for(seed, "picture", "motion"))
     t_us, size = frame_times_us(motion), (motion.window_height, motion.window_width)
     sensor = randomised(sensor, generator_for(seed, "picture", "sensor"))
     key = seed_for(seed, "picture", "emulate")
-    events = synthesize_sequence(scene, trajectory, t_us[-1], *size, sensor, key)
+    events = emulate_motion(scene, trajectory, t_us[-1], *size, sensor, key)
     return Simulation(events, tensor(t_us), *frames_of(scene, trajectory, t_us, *size), trajectory)
