@@ -4,11 +4,11 @@ import torch
 from polarnet.evaluation.event_budget import events_per_pixel, since_start, sliding_recovery
 
 
-def test_events_per_pixel_is_the_mean_over_polarizers_of_what_has_come(recording):
+def test_events_per_pixel_is_the_mean_over_channels_before_each_time(recording):
     t_us = recording.t_us
     found = events_per_pixel(recording.events, t_us)
     assert found[-1].item() == pytest.approx(300 / (18 * 20))
-    half = sum(int((e.t <= 2000).sum()) for e in recording.events) / (4 * 18 * 20)
+    half = sum(int((e.t < 2000).sum()) for e in recording.events) / (4 * 18 * 20)
     assert found[2].item() == pytest.approx(half)
 
 
