@@ -31,8 +31,8 @@ from polarnet.recordings.formats.celex5_csv import write_celex5_csv
 from polarnet.runtime import generator_for, seed_for
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory, render
+from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene
-from polarnet.simulation.synthesize import synthesize_sequence
 
 STRIPE_S0, LANDMARK_S0 = 0.8, 0.04  # unpolarized
 SHORTEST_DELAY_S = 0.08  # between the start of a capture and the landmark
@@ -112,9 +112,7 @@ def write_rig(
     delays_s = generator.uniform(SHORTEST_DELAY_S, config.longest_delay_s, len(captures))
     start_us = {capture: round(delay * 1e6) for capture, delay in zip(captures, delays_s, strict=True)}
 
-    channels = synthesize_sequence(
-        scene, path, total_us, height, width, emulator, seed_for(seed, name, "emulate"), threads
-    )
+    channels = emulate_motion(scene, path, total_us, height, width, emulator, seed_for(seed, name, "emulate"), threads)
     hot = _random_pixels(config.hot_pixels, recordings, generator)
     for capture, events in zip(EVENT_CAPTURES, channels, strict=True):
         noisy = merge([events, _hot_events(hot, total_us, height, width, generator)])

@@ -124,7 +124,7 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
         {name: name[0] for name in splits},
         splits,
         largest_picture=(60, 80),
-        window=window,
+        sensor=window,
         trajectory_names=Trajectory.vector_names(),
         attributes={},
     )

@@ -155,7 +155,7 @@ def test_a_measured_scene_smaller_than_the_window_is_skipped_and_named(project_r
     assert run(project_root, monkeypatch, folder, tmp_path / "none") == 1
     error = capsys.readouterr().err
     assert "nothing to test on. none of 1 pictures can be used" in error
-    assert "use larger pictures or a smaller window" in error
+    assert "use larger pictures or a smaller sensor" in error
 
 
 @pytest.mark.skipif("POLARNET_SHARED" not in os.environ, reason="POLARNET_SHARED names no reference material")

@@ -146,7 +146,7 @@ def step_highpass(
 def reconstruct_cf(
     channels: Sequence[Events], t_us: Int64[Tensor, " t"], config: ComplementaryFilterConfig
 ) -> Float64[Tensor, "t c h w"]:
-    """`step_cf` at rising times, each from the events up to it (inclusive).
+    """`step_cf` at rising times, each from the events before it (t < time).
 
     Times count from the start of the recording, when nothing is known.
     """
@@ -170,7 +170,7 @@ def followed_range(
 
 def _reconstructed(step: Step, channels: Sequence[Events], t_us: Int64[Tensor, " t"], config) -> Tensor:
     state = filter_at_rest(len(channels), channels[0].height, channels[0].width, config)
-    stops = [torch.searchsorted(events.t, t_us, right=True).tolist() for events in channels]
+    stops = [torch.searchsorted(events.t, t_us).tolist() for events in channels]
     images, starts = [], [0] * len(channels)
     for k, t in enumerate(t_us.tolist()):
         since = [slice_count(e, start, stop[k]) for e, start, stop in zip(channels, starts, stops, strict=True)]

@@ -38,8 +38,8 @@ EVENTS_PER_PIXEL = (0.25, 0.5, 1.0, 2.0)
 
 
 def events_per_pixel(events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """How many events a pixel has seen before each time, on average over pixels and polarizers."""
-    counts = torch.stack([torch.searchsorted(e.t, t_us, right=True) for e in events]).double().mean(dim=0)
+    """Mean number of events per pixel and channel before each time (t < time)."""
+    counts = torch.stack([torch.searchsorted(e.t, t_us) for e in events]).double().mean(dim=0)
     return (counts / (events[0].height * events[0].width)).float()
 
 

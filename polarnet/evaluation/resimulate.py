@@ -12,9 +12,9 @@ from polarnet.events.stream import Events
 from polarnet.runtime import generator_for, seed_for
 from polarnet.simulation.emulator import EmulatorConfig, randomised
 from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory
+from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.scenes import SceneRecord, SceneStore
-from polarnet.simulation.synthesize import synthesize_sequence
 from polarnet.simulation.truth import frames_of, valid_frames
 
 
@@ -59,8 +59,8 @@ def resimulated(
         seen = next((of_all for known, of_all in made if known == sensor), None)
         if seen is None:
             key = seed_for(seed, sequence, "emulate")
-            size = scenes.window_height, scenes.window_width
-            seen = synthesize_sequence(scene, trajectory, int(t_us[-1]), *size, sensor, key, threads)
+            size = scenes.sensor_height, scenes.sensor_width
+            seen = emulate_motion(scene, trajectory, int(t_us[-1]), *size, sensor, key, threads)
             made.append((sensor, seen))
         events.append(seen[polarizer])
     return _recording(scenes, record, scene, trajectory, events, t_us)
@@ -74,7 +74,7 @@ def _recording(
     events: Sequence[Events],
     t_us: Int64[Tensor, " n"],
 ) -> Recording:
-    size = scenes.window_height, scenes.window_width
+    size = scenes.sensor_height, scenes.sensor_width
     intensity, dolp, aolp = (frames[1:] for frames in frames_of(scene, trajectory, t_us.tolist(), *size))
     valid = None if record.valid is None else valid_frames(record.valid, trajectory, t_us.tolist()[1:], *size)
     s0 = intensity[:, 0] + intensity[:, 2]

@@ -67,10 +67,8 @@ def windows_of(t_us: Int64[Tensor, " n"]) -> list[tuple[int, int]]:
 
 
 def cut_windows(events: Events, t_us: Int64[Tensor, " n"]) -> list[Events]:
-    """The events of each window of `windows_of`: start <= t < stop; the last window includes its stop."""
-    edges = torch.searchsorted(events.t, t_us)
-    edges[-1] = torch.searchsorted(events.t, t_us[-1], right=True)
-    return [slice_count(events, start, stop) for start, stop in windows_of(edges)]
+    """The events of each window of `windows_of`, half-open: start <= t < stop."""
+    return [slice_count(events, start, stop) for start, stop in windows_of(torch.searchsorted(events.t, t_us))]
 
 
 def encode_windows(channels: Sequence[Events], t_us: Integer[Array, " n"], encode: Encode) -> Float[Tensor, "t c h w"]:

@@ -17,7 +17,7 @@ from polarnet.events.store import EventStore
 from polarnet.reports.figures import Curve
 from polarnet.reports.maps import polarization_hsv
 from polarnet.reports.overview import Overview
-from polarnet.simulation.motion import Pose, Trajectory, window_to_scene
+from polarnet.simulation.motion import Pose, Trajectory, sensor_to_scene
 from polarnet.simulation.pictures.manifest import SPLITS, Manifest, read_manifest
 from polarnet.simulation.scenes import SceneStore
 from polarnet.training.baselines import NOT_TRAINED
@@ -219,7 +219,7 @@ def overview_of(panel: Panel, scenes: SceneStore, frames: FrameStore, events: Ev
         name=panel.sequence,
         picture=polarization_hsv(record.s0, record.dolp, record.aolp),
         path=np.stack([path.x, path.y]) / size,
-        outline=_outline(trajectory.pose(np.array([panel.t_us / 1e6])), scenes.window_height, scenes.window_width)
+        outline=_outline(trajectory.pose(np.array([panel.t_us / 1e6])), scenes.sensor_height, scenes.sensor_width)
         / size,
         intensity=frames.intensity(panel.sequence)[panel.window + 1],
         dolp=panel.truth_dolp,
@@ -251,7 +251,7 @@ def _telling(panels: Sequence[Panel]) -> list[Panel]:
 
 def _outline(pose: Pose, height: int, width: int) -> Float[np.ndarray, "2 corners"]:
     """Corners of the window at the first pose, in pixels of the scene; one of them twice, to close the line."""
-    left, top, along, across = window_to_scene(*(float(column[0]) for column in pose), height, width)
+    left, top, along, across = sensor_to_scene(*(float(column[0]) for column in pose), height, width)
     columns, rows = np.array([[0, width, width, 0, 0], [0, 0, height, height, 0]])
     return np.stack([left + columns * along - rows * across, top + columns * across + rows * along])
 

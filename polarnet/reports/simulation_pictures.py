@@ -24,12 +24,12 @@ from polarnet.reports.figures import LIGHT, chart_style, png, show_picture
 from polarnet.reports.maps import event_image
 from polarnet.reports.overview import OFF, ON
 from polarnet.simulation.emulator import EmulatorConfig, emulate
-from polarnet.simulation.motion import MotionConfig, Trajectory, random_trajectory, window_to_scene
+from polarnet.simulation.motion import MotionConfig, Trajectory, random_trajectory, sensor_to_scene
+from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.simulation.pictures.images import read_rgb
 from polarnet.simulation.presets import MOTIONS, SENSORS
 from polarnet.simulation.scene import scene_from_rgb
-from polarnet.simulation.synthesize import synthesize_sequence
 
 FOLDER = Path("docs") / "pictures"
 PHOTO = "coffee.png"
@@ -165,7 +165,7 @@ def window_figure() -> Figure:
         panels = figure.subplots(rows, columns).ravel()
         for axes, (label, changes) in zip(panels, SETTINGS.items(), strict=True):
             config = replace(QUIET, **changes)
-            events = synthesize_sequence(scene, trajectory, WINDOW_US[1], 100, 150, config, key=1)[0]
+            events = emulate_motion(scene, trajectory, WINDOW_US[1], 100, 150, config, key=1)[0]
             window = slice_time(events, *WINDOW_US)
             show_picture(axes, event_image(_counts(window), 3.0), LIGHT)
             axes.set_title(label, loc="left", fontsize=9)
@@ -202,7 +202,7 @@ def _way(axes: Axes, trajectory: Trajectory, motion: MotionConfig) -> None:
     axes.plot(pose.x, pose.y, color="white", linewidth=1.6)
     height, width = motion.window_height, motion.window_width
     for k, place in enumerate(np.linspace(0, 199, 5).astype(int)):
-        left, top, along, across = window_to_scene(*(float(v[place]) for v in pose), height, width)
+        left, top, along, across = sensor_to_scene(*(float(v[place]) for v in pose), height, width)
         columns, rows = np.array([[0, 1, 1, 0, 0], [0, 0, 1, 1, 0]]) * np.array([[width - 1], [height - 1]])
         axes.plot(left + columns * along - rows * across, top + columns * across + rows * along, color="white",
                   linewidth=1.0, alpha=0.3 + 0.7 * k / 4)  # fmt: skip

@@ -24,7 +24,7 @@ HOMES = {
     "scene_from_polarization": "scene",
     "scene_from_rgb": "scene",
     "simulate": "sequence",
-    "synthesize_sequence": "synthesize",
+    "emulate_motion": "moving_sensor",
 }
 """The public names, and the module of each."""
 

@@ -1,6 +1,7 @@
-"""How the kernels of this folder are compiled: by numba, without the interpreter's lock, and kept on disk."""
+"""Compilation of the kernels of this folder: by numba, without the interpreter's lock, cached on disk."""
 
 import contextlib
+import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
@@ -10,26 +11,28 @@ import numba
 
 
 def compiled(kernel: Callable) -> Any:
-    """A kernel as machine code."""
+    """Compile a kernel when it is first called."""
     return numba.njit(nogil=True, cache=True, error_model="numpy")(_bare(kernel))
 
 
 def inlined(kernel: Callable) -> Any:
-    """A small kernel that becomes part of those that call it."""
+    """Compile a small kernel into each kernel that calls it."""
     return numba.njit(nogil=True, cache=True, error_model="numpy", inline="always")(_bare(kernel))
 
 
 def _bare(kernel: Callable) -> Callable:
-    return inspect.unwrap(kernel)  # of the type checker that tests wrap around every function
+    return inspect.unwrap(kernel)  # tests wrap a type checker around every function
 
 
-def _forget_stale_code(folder: Path) -> None:
-    """Delete machine code older than any source here: numba looks at a kernel's own file, not at its callees'."""
+@functools.cache
+def forget_stale_code() -> None:
+    """Delete cached machine code that is older than any source of this folder, once a process.
+
+    Call it before the first kernel: numba compares the cache with a kernel's own file, not with those of its callees.
+    """
+    folder = Path(__file__).parent
     newest = max(source.stat().st_mtime for source in folder.rglob("*.py"))
     for index in folder.rglob("__pycache__/*.nbi"):
         with contextlib.suppress(OSError):  # another process was quicker, or the installation is read-only
             if index.stat().st_mtime < newest:
                 index.unlink()
-
-
-_forget_stale_code(Path(__file__).parent)

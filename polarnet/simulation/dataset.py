@@ -1,4 +1,4 @@
-"""The event store of a scene store: every sequence emulated, each on its own, so that runs can stop and go on."""
+"""Emulation of a scene store into an event store, sequence by sequence, so that a run can stop and resume."""
 
 import functools
 from collections.abc import Callable, Iterable
@@ -12,23 +12,23 @@ from polarnet.events.stream import Events
 from polarnet.runtime import generator_for, seed_for
 from polarnet.simulation.emulator import EmulatorConfig, randomised
 from polarnet.simulation.motion import Trajectory
+from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.simulation.scenes import SceneStore
-from polarnet.simulation.synthesize import synthesize_sequence
 
 
 def emulate_scenes(
     scenes: Path, events: Path, config: EmulatorConfig, seed: int, mapper: Callable[..., Iterable[Any]], threads: int
 ) -> int:
-    """Fill the event store with the sequences of a scene store; how many there are.
+    """Emulate all sequences of a scene store into an event store; returns their number.
 
     `mapper` is `polarnet.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks emulates one
-    sequence on `threads` threads. An interrupted run of the same scenes, configuration and seed goes on where it
+    sequence on `threads` threads. An interrupted run of the same scenes, configuration and seed resumes where it
     stopped.
     """
     source = SceneStore.open(scenes)
     attributes = origin_of(source, config, seed)
-    store = EventStore.create(events, source.sequences, source.window_height, source.window_width, attributes)
+    store = EventStore.create(events, source.sequences, source.sensor_height, source.sensor_width, attributes)
     task = functools.partial(_emulate_into, scenes=source, events=store, config=config, seed=seed, threads=threads)
     for _ in mapper(task, store.missing()):
         pass
@@ -37,29 +37,29 @@ def emulate_scenes(
 
 
 def origin_of(scenes: SceneStore, config: EmulatorConfig, seed: int) -> dict[str, Any]:
-    """All that the events of a scene store depend on."""
+    """Everything that the events of a scene store depend on."""
     return {
         "emulate": asdict(config),
         "seed": seed,
         "scenes": scenes.attributes,
-        "polarnet": __version__,  # an unfinished store of another version is not gone on with
+        "polarnet": __version__,  # an unfinished store of another version is not resumed
     }
 
 
 def emulate_sequence(
     scenes: SceneStore, sequence: str, config: EmulatorConfig, seed: int, threads: int
 ) -> list[Events]:
-    """Events of the four polarizers of one stored sequence.
+    """Events of the four channels of one stored sequence.
 
     Its noise, and its sensor where `config.randomise`, depend on the seed and its name alone.
     """
     record = scenes.read(sequence)
-    return synthesize_sequence(
+    return emulate_motion(
         scene_from_polarization(record.s0, record.dolp, record.aolp),
         Trajectory.from_vector(record.trajectory.numpy()),
         record.duration_us,
-        scenes.window_height,
-        scenes.window_width,
+        scenes.sensor_height,
+        scenes.sensor_width,
         randomised(config, generator_for(seed, sequence, "sensor")),
         seed_for(seed, sequence, "emulate"),
         threads,

@@ -1,9 +1,10 @@
-"""Event-camera emulation: light on the planes of one sensor in, events and the sensor's state out."""
+"""Event-camera emulation: light on the channels of one sensor in, events and the sensor's state out."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -13,46 +14,58 @@ from torch import Tensor
 from polarnet.arrays import Array, as_tensor, check_range, check_shape
 from polarnet.events.stream import Events
 from polarnet.ranges import allowed, check_ranges
-from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
-from polarnet.simulation.pixels.columns import Columns, empty_columns
+from polarnet.simulation.compilation import forget_stale_code
+from polarnet.simulation.pixels import esim, esim_gpu, exact, v2e, voltmeter
+from polarnet.simulation.pixels.columns import Columns, empty_columns, trimmed
+from polarnet.simulation.pixels.esim import EsimConfig
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
-from polarnet.simulation.sharing import PlaneRun, run_planes
+from polarnet.simulation.pixels.steps import Steps
+from polarnet.simulation.pixels.voltmeter import VoltmeterConfig
 
-EVENTS_PER_PIXEL_AND_STEP = 0.5  # room to begin with, far more than usual: what is not written costs no memory
-LARGEST_FIRST_ROOM = 1 << 22  # events; columns grow where a scene is busier
+EVENTS_PER_PIXEL_AND_STEP = 0.5  # initial room, far more than usual: untouched pages cost no memory
+MAX_INITIAL_ROOM = 1 << 22  # events; columns grow where a scene is busier
+
+
+class PixelModel(Protocol):
+    """A pixel model: a module of `polarnet.simulation.pixels`. `start` and `advance` are compiled kernels."""
+
+    EIGHT_BIT_VIDEO: bool
+    """Whether the model sees an 8-bit video: whole digital numbers at regular times."""
+
+    def physics_of(self, config: "EmulatorConfig") -> Any:
+        """The model's parameters as a NamedTuple."""
+
+    def initial(self, height: int, width: int, physics: Any, key: np.uint64, channel: int) -> Any:
+        """Pixels before their first frame: a NamedTuple of arrays [h * w]."""
+
+    def start(self, light: Light, pixels: Any, steps: Steps) -> None:
+        """Adapt the pixels to the first frame, in place."""
+
+    def advance(self, light: Light, pixels: Any, steps: Steps, columns: Columns) -> tuple[Columns, int]:
+        """Take the pixels through the steps, in place; returns the columns with the events, and their number."""
+
+
+MODELS: dict[str, PixelModel] = {
+    "v2e": v2e,
+    "exact": exact,
+    "esim": esim,
+    "esim_gpu": esim_gpu,
+    "dvs_voltmeter": voltmeter,
+}
 
 
 @dataclass(frozen=True)
-class EmulatorConfig:
-    """Section `emulate` of params.yaml. Contrast thresholds are steps of natural-log intensity.
+class EmulatorConfig(EsimConfig, VoltmeterConfig):
+    """Section `emulate` of params.yaml: the parameters of all pixel models, and which model is in use.
 
-    A parameter that a model does not have is without effect in it: `esim` has thresholds and the refractory period
-    alone, `dvs_voltmeter` the constants of its camera.
+    A model ignores the parameters that it does not have.
     """
 
-    model: str = field(metadata=allowed(choices=["v2e", "exact", "esim", "esim_gpu", "dvs_voltmeter"]))
+    model: str = field(metadata=allowed(choices=tuple(MODELS)))
     render_rate_hz: float | None = field(metadata=allowed(above=0))
     """Frames a second of the light that the pixels see; null: a step for each pixel of motion."""
-    contrast_threshold_on: float = field(metadata=allowed(low=0.01, high=10))
-    contrast_threshold_off: float = field(metadata=allowed(low=0.01, high=10))
-    contrast_threshold_sigma: float = field(metadata=allowed(low=0))
-    """Standard deviation between pixels, drawn for each polarizer."""
-    cutoff_hz: float = field(metadata=allowed(low=0))
-    """Bandwidth of the photoreceptor at full brightness, less in the dark; 0: infinite."""
-    leak_rate_hz: float = field(metadata=allowed(low=0))
-    """ON events per second of a pixel that sees no change."""
-    leak_jitter: float = field(metadata=allowed(low=0, high=1))
-    """Relative standard deviation of the leak: in each frame for `v2e`, in each interval of events for `exact`."""
-    noise_rate_cov_decades: float = field(metadata=allowed(low=0))
-    """Spread of the leak rate between pixels, as a power of ten."""
-    shot_noise_rate_hz: float = field(metadata=allowed(low=0))
-    """Noise events per second of a pixel in the dark, ON and OFF together; a quarter of it at full brightness."""
-    refractory_period_us: float = field(metadata=allowed(low=0))
-    esim_log_eps: float = field(metadata=allowed(above=0))
-    """Added to intensity in [0, 1] before `esim` takes its logarithm."""
-    voltmeter_camera: str = field(metadata=allowed(choices=tuple(voltmeter.CAMERAS)))
     randomise: bool
-    """Draw the parameters below anew for each sequence, uniformly (rates and cutoff: in their logarithm)."""
+    """Draw the parameters below for each sequence, uniformly (rates and cutoff: uniformly in their logarithm)."""
     random_threshold_on: list[float] = field(metadata=allowed(low=0.01, high=10))
     random_threshold_off: list[float] = field(metadata=allowed(low=0.01, high=10))
     random_threshold_sigma: list[float] = field(metadata=allowed(low=0))
@@ -69,7 +82,7 @@ class EmulatorConfig:
 
 
 def randomised(config: EmulatorConfig, generator: np.random.Generator) -> EmulatorConfig:
-    """The configuration of one sequence: `config`, or with values drawn from its ranges if it says `randomise`."""
+    """The configuration of one sequence: `config`, with values drawn from its ranges if `randomise` is set."""
     if not config.randomise:
         return config
 
@@ -90,119 +103,69 @@ def randomised(config: EmulatorConfig, generator: np.random.Generator) -> Emulat
     )
 
 
-class PixelModel(NamedTuple):
-    """One way in which pixels turn light into events; see the modules of `polarnet.simulation.pixels`."""
-
-    physics: Callable[[EmulatorConfig], Any]
-    initial: Callable[[int, int, Any, np.uint64, int], Any]
-    start: Callable[..., None]
-    advance: Callable[..., tuple[Columns, int]]
-    is_video: bool
-    """Whether it sees light as a video has it: rounded to whole digital numbers, at regular times."""
-
-
-def _v2e_physics(config: EmulatorConfig) -> v2e.Physics:
-    return v2e.Physics(
-        config.contrast_threshold_on,
-        config.contrast_threshold_off,
-        config.contrast_threshold_sigma,
-        config.cutoff_hz,
-        config.leak_rate_hz,
-        config.leak_jitter,
-        config.noise_rate_cov_decades,
-        config.shot_noise_rate_hz,
-        config.refractory_period_us * 1e-6,
-    )
-
-
-def _esim_physics(config: EmulatorConfig) -> esim.Physics:
-    return esim.Physics(
-        config.contrast_threshold_on,
-        config.contrast_threshold_off,
-        config.refractory_period_us,
-        config.esim_log_eps,
-        config.model == "esim_gpu",
-    )
-
-
-def _voltmeter_physics(config: EmulatorConfig) -> voltmeter.Physics:
-    return voltmeter.CAMERAS[config.voltmeter_camera]
-
-
-_ESIM = PixelModel(_esim_physics, esim.initial, esim.start, esim.advance, is_video=False)
-MODELS = {
-    "v2e": PixelModel(_v2e_physics, v2e.initial, v2e.start, v2e.advance, is_video=True),
-    "exact": PixelModel(_v2e_physics, exact.initial, exact.start, exact.advance, is_video=False),
-    "esim": _ESIM,
-    "esim_gpu": _ESIM,
-    "dvs_voltmeter": PixelModel(
-        _voltmeter_physics, voltmeter.initial, voltmeter.start, voltmeter.advance, is_video=False
-    ),
-}
-
-
 @dataclass(frozen=True)
 class SensorState:
-    """Where the pixels of a sensor stand after its last frame; hand it back to go on from there."""
+    """State of a sensor after its last frame; hand it back to continue from there."""
 
     model: str
     height: int
     width: int
-    planes: tuple[int, ...]
+    channels: tuple[int, ...]
     pixels: tuple[Any, ...]
-    """State arrays of each plane, as the model's module defines them."""
+    """State arrays of each channel, as the model's module defines them."""
     t_us: float
     """Time of the last frame."""
     steps: int
-    """Frames seen after the first; noise is drawn by their number."""
+    """Number of frames after the first; random draws are numbered by it."""
 
 
 def emulate(
-    frames: Shaped[Array, "n planes h w"],
+    frames: Shaped[Array, "n channels h w"],
     t_us: Int64[Array, " m"] | Float64[Array, " m"],
     config: EmulatorConfig,
     key: int,
     state: SensorState | None = None,
-    planes: Sequence[int] | None = None,
+    channels: Sequence[int] | None = None,
     threads: int = 1,
 ) -> tuple[list[Events], SensorState]:
-    """Events of each plane of a sensor that sees `frames` (uint8, or float in digital numbers 0..255) at times `t_us`.
+    """Events of each channel of a sensor that sees `frames` at times `t_us`, and the sensor's state after them.
 
-    The first frame after `state=None` fires nothing: it is what the pixels have adapted to. A clip cut into pieces,
-    each given the state that the one before returned, gives the events of the whole. `key` (64 bits) seeds all noise;
-    `planes` are the numbers by which the planes draw their own mismatch and noise, 0, 1, ... by default. Events are in
-    the order (t, y, x, p), and the same to the last bit for any number of threads and any order of planes.
-    Frames and times may be numpy or torch. TypeError for what is no array; ValueError for times that do not increase,
-    values that are not finite or outside 0..255, and sizes that do not fit.
+    Frames are uint8, or float in digital numbers 0..255; frames and times may be numpy or torch.
+    Without a state, the pixels have adapted to the first frame, and it fires nothing. A clip cut into pieces, each
+    given the state that the previous piece returned, gives the events of the whole clip. `key` (64 bits) seeds all
+    noise. Each channel draws its mismatch and noise by its number in `channels` (default: 0, 1, ...). Events are in
+    the order (t, y, x, p), and identical for any number of threads and any order of channels.
+    TypeError for what is no array; ValueError for times that do not increase, values that are not finite or outside
+    0..255, and sizes that do not fit.
     """
-    columns, state = emulate_columns(frames, t_us, config, key, state, planes, threads)
+    columns, state = emulate_columns(frames, t_us, config, key, state, channels, threads)
     return [events_of(c, state.height, state.width) for c in columns], state
 
 
 def emulate_columns(
-    frames: Shaped[Array, "n planes h w"],
+    frames: Shaped[Array, "n channels h w"],
     t_us: Int64[Array, " m"] | Float64[Array, " m"],
     config: EmulatorConfig,
     key: int,
     state: SensorState | None = None,
-    planes: Sequence[int] | None = None,
+    channels: Sequence[int] | None = None,
     threads: int = 1,
     labels: bool = False,
     exact: bool = False,
 ) -> tuple[list[Columns], SensorState]:
     """As `emulate`, in numpy columns, with each event's process (`labels`) and time before rounding (`exact`)."""
     frames = as_tensor("frames", frames).detach().cpu()
-    check_shape("frames", frames, "... planes height width")
-    planes = tuple(range(frames.shape[-3])) if planes is None else tuple(planes)
+    check_shape("frames", frames, "... channels height width")
+    channels = tuple(range(frames.shape[-3])) if channels is None else tuple(channels)
     times = np.asarray(t_us, dtype=np.float64)
-    _check_frames(frames, times, planes, state, config.model)
+    _check_frames(frames, times, channels, state, config.model)
     clip = frames.numpy() if frames.dtype == torch.uint8 else frames.to(torch.float32).numpy()
-    lights = [light_of_frames(np.ascontiguousarray(clip[:, i])) for i in range(len(planes))]
+    lights = [light_of_frames(np.ascontiguousarray(clip[:, i])) for i in range(len(channels))]
     height, width = frames.shape[2:]
-    return run(lights, times, height, width, config, key, state, planes, threads, labels, exact)
+    return emulate_lights(lights, times, height, width, config, key, state, channels, threads, labels, exact)
 
 
-def run(
+def emulate_lights(
     lights: Sequence[Light],
     t_us: Float64[np.ndarray, " n"],
     height: int,
@@ -210,56 +173,52 @@ def run(
     config: EmulatorConfig,
     key: int,
     state: SensorState | None,
-    planes: tuple[int, ...],
+    channels: tuple[int, ...],
     threads: int = 1,
     labels: bool = False,
     exact: bool = False,
 ) -> tuple[list[Columns], SensorState]:
-    """Events of planes under `lights` at times `t_us`, and the state after them; planes are shared among threads."""
+    """Events of channels under `lights` at times `t_us`, and the state after them. Threads share the channels out."""
+    forget_stale_code()
     model = MODELS[config.model]
-    physics, seed = model.physics(config), np.uint64(key)
-    times, steps = (t_us, 0) if state is None else (np.concatenate([[state.t_us], t_us]), state.steps)
-    room = 1 + int(min(LARGEST_FIRST_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
+    physics, seed = model.physics_of(config), np.uint64(key)
+    times = t_us if state is None else np.concatenate([[state.t_us], t_us])
+    first_frame, first_number = (1, 0) if state is None else (0, state.steps)
+    room = 1 + int(min(MAX_INITIAL_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
+    # allocated here, because glibc returns what other threads allocate to the system as soon as they end
+    empty = [empty_columns(room, labels, exact) for _ in channels]
 
-    def begin(i: int) -> Any:
-        if state is not None:
-            return type(state.pixels[i])(*(array.copy() for array in state.pixels[i]))
-        new = model.initial(height, width, physics, seed, planes[i])
-        model.start(lights[i], new, physics, height, width, times[0], seed, planes[i])
-        return new
+    def emulate_channel(i: int) -> tuple[Columns, Any]:
+        steps = Steps(physics, height, width, times, first_frame, first_number, seed, channels[i])
+        if state is None:
+            pixels = model.initial(height, width, physics, seed, channels[i])
+            model.start(lights[i], pixels, steps)
+        else:
+            pixels = type(state.pixels[i])(*(array.copy() for array in state.pixels[i]))
+        columns, count = model.advance(lights[i], pixels, steps, empty[i])
+        return trimmed(columns, count), pixels
 
-    def plane_run(i: int) -> PlaneRun:
-        def advance(start: int, stop: int, columns: Columns) -> tuple[Columns, int]:
-            if start == 0:
-                pixels[i] = begin(i)
-            offset = start + (1 if state is None else 0)  # without a state, the first of the lights is that of `begin`
-            return model.advance(
-                lights[i], offset, pixels[i], physics, height, width, times[start : stop + 1], steps + start,
-                seed, planes[i], columns,
-            )  # fmt: skip
-
-        # room made here: what other threads allocate, glibc hands back to the system as soon as they end
-        return PlaneRun(advance, empty_columns(room, labels, exact))
-
-    pixels: list[Any] = [None] * len(planes)
-    runs = [plane_run(i) for i in range(len(planes))]
-    run_planes(runs, times, threads)
-    after = SensorState(config.model, height, width, planes, tuple(pixels), float(times[-1]), steps + len(times) - 1)
-    return [plane.events for plane in runs], after
+    if threads > 1:
+        with ThreadPoolExecutor(threads) as pool:
+            columns, pixels = zip(*pool.map(emulate_channel, range(len(channels))), strict=True)
+    else:
+        columns, pixels = zip(*map(emulate_channel, range(len(channels))), strict=True)
+    steps_taken = first_number + len(times) - 1
+    return list(columns), SensorState(config.model, height, width, channels, pixels, float(times[-1]), steps_taken)
 
 
 def events_of(columns: Columns, height: int, width: int) -> Events:
-    """The columns as events; shares their memory."""
+    """The columns as events that share their memory."""
     t, x, y, p = (torch.from_numpy(column) for column in columns[:4])
     return Events(t, x, y, p, height, width)
 
 
 def _check_frames(
-    frames: Tensor, times: Float64[np.ndarray, " m"], planes: tuple[int, ...], state: SensorState | None, model: str
+    frames: Tensor, times: Float64[np.ndarray, " m"], channels: tuple[int, ...], state: SensorState | None, model: str
 ) -> None:
     if frames.ndim != 4 or len(frames) != len(times) or len(times) == 0:
         raise ValueError(
-            f"emulate: expected frames (n, planes, h, w) with one time each and at least one frame, "
+            f"emulate: expected frames (n, channels, h, w) with one time each and at least one frame, "
             f"got frames {tuple(frames.shape)} and {len(times)} times"
         )
     if frames.dtype != torch.uint8 and not frames.is_floating_point():
@@ -268,8 +227,10 @@ def _check_frames(
         raise ValueError("emulate: expected finite frames >= 0, got NaN, infinite or negative values")
     if frames.dtype != torch.uint8:
         check_range("frames", frames, 0, FULL_SCALE, "digital numbers", f"scale white to {FULL_SCALE:g}")
-    if len(set(planes)) != frames.shape[1]:
-        raise ValueError(f"emulate: expected {frames.shape[1]} different plane numbers, one a plane, got {planes}")
+    if len(set(channels)) != frames.shape[1]:
+        raise ValueError(
+            f"emulate: expected {frames.shape[1]} different channel numbers, one per channel, got {channels}"
+        )
     before = times if state is None else np.concatenate([[state.t_us], times])
     if not (np.isfinite(before).all() and (np.diff(before) > 0).all()):
         raise ValueError(
@@ -279,8 +240,8 @@ def _check_frames(
         )
     if state is not None and state.model != model:
         raise ValueError(f"emulate: the state is of model {state.model}, the configuration of {model}")
-    if state is not None and (*state.planes, state.height, state.width) != (*planes, *frames.shape[2:]):
+    if state is not None and (*state.channels, state.height, state.width) != (*channels, *frames.shape[2:]):
         raise ValueError(
-            f"emulate: the state is of planes {state.planes} of {state.height}x{state.width} pixels, "
-            f"the frames are of planes {planes} of {frames.shape[2]}x{frames.shape[3]}"
+            f"emulate: the state is of channels {state.channels} of {state.height}x{state.width} pixels, "
+            f"the frames are of channels {channels} of {frames.shape[2]}x{frames.shape[3]}"
         )

@@ -1,4 +1,4 @@
-"""Events on the fly: a sequence is emulated when it is first asked for, and no event is written."""
+"""Events on the fly: a sequence is emulated when it is first read, and no event is written to disk."""
 
 from collections import OrderedDict
 from typing import Any
@@ -14,8 +14,8 @@ KEPT_SEQUENCES = 8  # about 25 MB each at 120x180 px and 2 million events
 class EmulatedEvents:
     """The events that `emulate_scenes` would store, made in memory: an `EventSource` of the same numbers.
 
-    A sequence is emulated whole, since its pixels remember what they saw before a window; the last `kept` sequences
-    stay in memory, so that their next windows cost nothing. A copy in another process starts without any.
+    A sequence is emulated whole, because the pixels have memory. The last `kept` sequences stay in memory, so that
+    further reads cost nothing. A copy in another process starts without any.
     """
 
     def __init__(
@@ -25,8 +25,8 @@ class EmulatedEvents:
             raise ValueError(f"expected at least one sequence to keep in memory, got kept={kept}")
         self.path = scenes.path
         self.sequences = scenes.sequences
-        self.height = scenes.window_height
-        self.width = scenes.window_width
+        self.height = scenes.sensor_height
+        self.width = scenes.sensor_width
         self.attributes = origin_of(scenes, config, seed)
         self._scenes, self._config, self._seed, self._threads, self._kept = scenes, config, seed, threads, kept
         self._in_memory: OrderedDict[str, list[Events]] = OrderedDict()

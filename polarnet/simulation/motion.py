@@ -1,4 +1,4 @@
-"""The window that moves over a scene: closed-form trajectories of bounded speed and acceleration, and what it sees."""
+"""Motion of a sensor over a scene: closed-form trajectories of bounded speed and acceleration, and rendering."""
 
 import dataclasses
 import math
@@ -21,13 +21,13 @@ GRID_SLACK = 1e-4  # relative; a maximum over PHASES is at most (HARMONICS * pi 
 BORDER_SLACK_PX = 0.02  # the same for positions, up to scenes of 4000 pixels
 TURN_SHARE = 0.2  # of the allowed speed and acceleration that roll may use, and zoom
 TURN_RATE_MAX = 2 * math.pi  # radians per second, of the sines of roll and zoom
-FASTEST_OVER_SLOWEST = 3.0  # how much quicker than the room demands the window may turn back
+FASTEST_OVER_SLOWEST = 3.0  # how much quicker than the room demands the sensor may turn back
 ATTEMPTS = 64
 
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """Section `synthesize` of params.yaml. Speeds are in pixels of the scene and hold for every pixel of the window."""
+    """Section `synthesize` of params.yaml. Speeds are in scene pixels and hold for every sensor pixel."""
 
     sequences_per_picture: int = field(metadata=allowed(low=1))
     duration_s: float = field(metadata=allowed(above=0))
@@ -51,12 +51,12 @@ class MotionConfig:
 
 
 class Pose(NamedTuple):
-    """Where the window is, at one or many times."""
+    """Place and orientation of the sensor, at one or many times."""
 
-    x: Float64[np.ndarray, "*n"]  # column of the scene under the window's centre
-    y: Float64[np.ndarray, "*n"]  # row
+    x: Float64[np.ndarray, "*n"]  # scene column under the sensor's centre
+    y: Float64[np.ndarray, "*n"]  # scene row
     angle: Float64[np.ndarray, "*n"]  # radians by which the camera is rolled, from the x axis towards the y axis (down)
-    zoom: Float64[np.ndarray, "*n"]  # window pixels per scene pixel, >= 1
+    zoom: Float64[np.ndarray, "*n"]  # sensor pixels per scene pixel, >= 1
 
 
 @dataclass(frozen=True)
@@ -74,18 +74,18 @@ class Sine:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A motion for all times, of which no part leaves the scene it was made for."""
+    """A motion for all times; the sensor never leaves the scene that the trajectory was drawn for."""
 
-    x: float  # about which the window's centre swings
-    y: float
+    x: float  # mean column of the sensor's centre
+    y: float  # mean row
     x_sines: tuple[Sine, ...]  # HARMONICS of them
     y_sines: tuple[Sine, ...]
     roll: Sine  # radians
     zoom: Sine  # about 1 + amplitude
-    speed_px_s: float  # that no pixel of the window exceeds at any time; reached once where roll and zoom are 0
+    speed_px_s: float  # maximum over all sensor pixels and times; reached once where roll and zoom are 0
 
     def pose(self, t_s: Float64[np.ndarray, "*n"]) -> Pose:
-        """The window at times in seconds from the start of the sequence."""
+        """Pose at times in seconds from the start of the sequence."""
         return Pose(
             x=self.x + sum((sine.at(t_s) for sine in self.x_sines), np.zeros_like(t_s)),
             y=self.y + sum((sine.at(t_s) for sine in self.y_sines), np.zeros_like(t_s)),
@@ -95,13 +95,13 @@ class Trajectory:
 
     @staticmethod
     def vector_names() -> list[str]:
-        """What the numbers of `to_vector` are."""
+        """Names of the numbers of `to_vector`."""
         sines = [f"{axis}_sine{k + 1}" for axis in "xy" for k in range(HARMONICS)] + ["roll", "zoom"]
         of_sines = [f"{sine}.{number.name}" for sine in sines for number in dataclasses.fields(Sine)]
         return ["x", "y", *of_sines, "speed_px_s"]
 
     def to_vector(self) -> Float64[np.ndarray, " n"]:
-        """All coefficients, always as many, in the order of the fields."""
+        """All coefficients, in the order of the fields; their number is fixed."""
         sines = (*self.x_sines, *self.y_sines, self.roll, self.zoom)
         coefficients = [number for sine in sines for number in dataclasses.astuple(sine)]
         return np.array([self.x, self.y, *coefficients, self.speed_px_s])
@@ -121,23 +121,23 @@ class Trajectory:
 def random_trajectory(
     config: MotionConfig, scene_height: int, scene_width: int, generator: np.random.Generator
 ) -> Trajectory:
-    """A smooth motion of a window inside a scene.
+    """A smooth motion of a sensor inside a scene.
 
-    The velocity along each axis is a sum of harmonics whose slowest lets the window swing over the scene and turn back
+    The velocity along each axis is a sum of harmonics whose slowest lets the sensor swing over the scene and turn back
     before the border. Its peak speed, drawn between the configured bounds, is reached at a random time of the sequence.
-    ValueError where the scene is too small for the window, or for its slowest motion.
+    ValueError where the scene is too small for the sensor, or for its slowest motion.
     """
     reach_x, reach_y = _reach(config)
     room = np.array([scene_width - 1 - 2 * reach_x, scene_height - 1 - 2 * reach_y]) - 2 * BORDER_SLACK_PX
     if room.min() <= 0:
         raise ValueError(
-            f"a scene of {scene_height}x{scene_width} (height x width) is too small: a window of "
+            f"a scene of {scene_height}x{scene_width} (height x width) is too small: a sensor of "
             f"{config.window_height}x{config.window_width} rolled by up to {config.rotation_max_deg:g} degrees needs "
-            f"more than {2 * reach_y + 1:.0f}x{2 * reach_x + 1:.0f}; use larger pictures or a smaller window"
+            f"more than {2 * reach_y + 1:.0f}x{2 * reach_x + 1:.0f}; use larger pictures or a smaller sensor"
         )
     speed = generator.uniform(config.speed_min_px_s, config.speed_max_px_s)
     turns = (config.rotation_max_deg > 0) + (config.zoom_max > 1)
-    drift = 1 - TURN_SHARE * turns  # share of speed and acceleration left for the window's centre
+    drift = 1 - TURN_SHARE * turns  # share of speed and acceleration left for the sensor's centre
     for _ in range(ATTEMPTS):
         shape = _random_shape(generator)
         crowding = max(shape.extent / room)  # per pixel
@@ -149,10 +149,10 @@ def random_trajectory(
         enough = shape.extent * (drift * shape.acceleration * config.speed_min_px_s**2 / config.acceleration_max_px_s2)
         width, height = np.array([scene_width, scene_height]) + np.maximum(enough - room, 0)
         raise ValueError(
-            f"a scene of {scene_height}x{scene_width} leaves a window of {config.window_height}x{config.window_width} "
+            f"a scene of {scene_height}x{scene_width} leaves a sensor of {config.window_height}x{config.window_width} "
             f"too little room to reach speed_min_px_s={config.speed_min_px_s:g} within "
             f"acceleration_max_px_s2={config.acceleration_max_px_s2:g} (about {highest:.0f} px/s can be reached); "
-            f"use pictures of about {math.ceil(height)}x{math.ceil(width)}, a smaller window or a lower speed"
+            f"use pictures of about {math.ceil(height)}x{math.ceil(width)}, a smaller sensor or a lower speed"
         )
     speed = min(speed, highest)
     slowest = drift * speed * crowding
@@ -229,7 +229,7 @@ def _placed(
 def _turn(
     amplitude: float, coupling: float, config: MotionConfig, speed: float, generator: np.random.Generator
 ) -> Sine:
-    """Roll or zoom slow enough that it moves the window's corners within its share of speed and acceleration.
+    """Roll or zoom slow enough to move the sensor's corners within its share of speed and acceleration.
 
     A pixel q away from the centre sees q exp(i roll) / zoom, whose second derivative is at most
     q (roll'' + 2 roll'^2 + zoom'' + 3 zoom'^2) since zoom >= 1 and 2 roll' zoom' <= roll'^2 + zoom'^2.
@@ -245,7 +245,7 @@ def _turn(
 
 
 def _reach(config: MotionConfig) -> tuple[float, float]:
-    """How far the window's corners get from its centre along x and y, at the worst roll and no zoom."""
+    """Largest distance of the sensor's corners from its centre along x and y, over all rolls, without zoom."""
     half_width, half_height = (config.window_width - 1) / 2, (config.window_height - 1) / 2
     largest = math.radians(config.rotation_max_deg)
 
@@ -265,28 +265,28 @@ def frame_times_us(config: MotionConfig) -> list[int]:
 def render(
     scene: PolarizationScene, trajectory: Trajectory, t_s: Float64[np.ndarray, " n"], height: int, width: int
 ) -> Float32[Tensor, "n 3 h w"]:
-    """Stokes pictures that the moving window sees, by bilinear interpolation of the scene's.
+    """Stokes images on the moving sensor, by bilinear interpolation of the scene's.
 
-    Pixel (row, column) of the window looks at the point of the scene that `window_to_scene` says; pixel centres are at
-    integers in both. A camera rolled by a measures angles from its own axes, so that its AoLP is the scene's minus a.
+    `sensor_to_scene` maps sensor pixel (row, column) to a point of the scene; pixel centres are at integers in both.
+    A camera rolled by a measures angles from its own axes, so that its AoLP is the scene's minus a.
     """
     out = np.empty((len(t_s), 3, height, width), dtype=np.float32)
-    planes = np.ascontiguousarray(scene.stokes.numpy(), dtype=np.float32)
+    stokes = np.ascontiguousarray(scene.stokes.numpy(), dtype=np.float32)
     pose = trajectory.pose(np.asarray(t_s, dtype=np.float64))
-    _render(planes, pose.x, pose.y, pose.angle, pose.zoom, out)
+    _render(stokes, pose.x, pose.y, pose.angle, pose.zoom, out)
     return torch.from_numpy(out)
 
 
 @no_type_check
 @numba.njit(cache=True, nogil=True)
-def window_to_scene(
+def sensor_to_scene(
     x: float, y: float, angle: float, zoom: float, height: int, width: int
 ) -> tuple[float, float, float, float]:
-    """(left, top, along, across): window pixel (row, column) looks at this point of the scene.
+    """(left, top, along, across): sensor pixel (row, column) looks at this point of the scene.
 
     x = left + column * along - row * across
     y = top + column * across + row * along
-    The centre of the window, ((height - 1) / 2, (width - 1) / 2), looks at (x, y).
+    The centre of the sensor, ((height - 1) / 2, (width - 1) / 2), looks at (x, y).
     """
     along, across = math.cos(angle) / zoom, math.sin(angle) / zoom
     middle_row, middle_column = (height - 1) / 2, (width - 1) / 2
@@ -297,29 +297,29 @@ def window_to_scene(
 
 @no_type_check
 @numba.njit(cache=True, nogil=True, inline="always")
-def bilinear(plane: Float32[np.ndarray, "h w"], x: float, y: float) -> float:
-    """Value of a plane between the four pixels around (x, y); exact where both are integers, clamped at the border."""
-    column = min(max(int(x), 0), plane.shape[1] - 2)
-    row = min(max(int(y), 0), plane.shape[0] - 2)
+def bilinear(image: Float32[np.ndarray, "h w"], x: float, y: float) -> float:
+    """Value of an image between the four pixels around (x, y); exact at integers, clamped at the border."""
+    column = min(max(int(x), 0), image.shape[1] - 2)
+    row = min(max(int(y), 0), image.shape[0] - 2)
     right, down = np.float32(x - column), np.float32(y - row)
     left, up = np.float32(1) - right, np.float32(1) - down
-    upper = left * plane[row, column] + right * plane[row, column + 1]
-    lower = left * plane[row + 1, column] + right * plane[row + 1, column + 1]
+    upper = left * image[row, column] + right * image[row, column + 1]
+    lower = left * image[row + 1, column] + right * image[row + 1, column + 1]
     return up * upper + down * lower
 
 
 @no_type_check
 @numba.njit(cache=True, nogil=True)
-def _render(planes, x, y, angle, zoom, out) -> None:
+def _render(stokes, x, y, angle, zoom, out) -> None:
     height, width = out.shape[2:]
     for k in range(len(x)):
-        left, top, along, across = window_to_scene(x[k], y[k], angle[k], zoom[k], height, width)
+        left, top, along, across = sensor_to_scene(x[k], y[k], angle[k], zoom[k], height, width)
         cos, sin = np.float32(math.cos(2 * angle[k])), np.float32(math.sin(2 * angle[k]))
         for row in range(height):
             for column in range(width):
                 at_x = left + column * along - row * across
                 at_y = top + column * across + row * along
-                s1, s2 = bilinear(planes[1], at_x, at_y), bilinear(planes[2], at_x, at_y)
-                out[k, 0, row, column] = bilinear(planes[0], at_x, at_y)
+                s1, s2 = bilinear(stokes[1], at_x, at_y), bilinear(stokes[2], at_x, at_y)
+                out[k, 0, row, column] = bilinear(stokes[0], at_x, at_y)
                 out[k, 1, row, column] = s1 * cos + s2 * sin
                 out[k, 2, row, column] = s2 * cos - s1 * sin

@@ -1,6 +1,6 @@
-"""Sensors and motions to begin with, for those who call the simulation from Python.
+"""Ready-made sensors and motions for callers from Python.
 
-The pipeline takes its values from params.yaml, which `SENSORS["default"]` and `MOTIONS["default"]` repeat.
+`SENSORS["default"]` and `MOTIONS["default"]` repeat the values of params.yaml.
 """
 
 from dataclasses import replace
@@ -52,7 +52,7 @@ SENSORS = {
         refractory_period_us=0.0,
     ),
 }
-"""v2e's command-line default, and what its options `clean` and `noisy` set; `dataclasses.replace` makes others."""
+"""v2e's command-line defaults and its options `clean` and `noisy`; `dataclasses.replace` makes others."""
 
 MOTIONS = {
     "default": MotionConfig(
@@ -68,4 +68,4 @@ MOTIONS = {
         zoom_max=1.0,
     )
 }
-"""A second of a 120 x 180 window that drifts at up to 160 px/s."""
+"""One second of a 120 x 180 px sensor that drifts at up to 160 px/s."""

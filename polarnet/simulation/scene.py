@@ -25,7 +25,7 @@ from polarnet.stokes import stokes_from_intensities, stokes_from_polarization
 
 @dataclass(frozen=True)
 class PolarizationScene:
-    """What a window moves over: S0 in [0, 1], S1, S2 with hypot(S1, S2) <= S0.
+    """Stokes parameters of the area that a sensor moves over: S0 in [0, 1], S1, S2 with hypot(S1, S2) <= S0.
 
     Making one checks shape and type alone; `check_scene` checks every pixel.
     """

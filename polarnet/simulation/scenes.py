@@ -1,6 +1,6 @@
-"""Scenes on disk: the polarization of each picture, and how the window of each sequence moves over it, in Zarr v3.
+"""Scenes on disk: the polarization of each picture, and the motion of the sensor over it in each sequence, in Zarr v3.
 
-What is stored is the scene: rendering starts from the quantised planes, so truth and events agree to the last bit.
+Rendering starts from the stored, quantised scene, so that truth and events agree to the last bit.
 """
 
 import os
@@ -84,8 +84,8 @@ class SceneStore:
         self.picture_of: dict[str, str] = dict(zip(self.sequences, metadata["picture_of_sequence"], strict=True))
         self.splits: dict[str, str] = dict(zip(self.sequences, metadata["splits"], strict=True))
         self.pictures: list[str] = list(metadata["pictures"])
-        self.window_height: int = metadata["window_height"]
-        self.window_width: int = metadata["window_width"]
+        self.sensor_height: int = metadata["window_height"]
+        self.sensor_width: int = metadata["window_width"]
         self.trajectory_names: list[str] = list(metadata["trajectory"])
         self.masked: bool = "valid" in table.columns
         """Whether there may be pixels whose light is not known."""
@@ -100,7 +100,7 @@ class SceneStore:
         splits: Mapping[str, str],
         *,
         largest_picture: tuple[int, int],
-        window: tuple[int, int],
+        sensor: tuple[int, int],
         trajectory_names: Sequence[str],
         attributes: Mapping[str, Any],
         masked: bool = False,
@@ -108,7 +108,7 @@ class SceneStore:
         """A store to write, at PATH.tmp until it is finished, with a row for each sequence and one for each picture.
 
         `picture_of` maps each sequence to its picture, `splits` each sequence to train, val or test; ValueError where
-        two sequences of one picture are in different splits. `largest_picture` and `window` are (height, width) in
+        two sequences of one picture are in different splits. `largest_picture` and `sensor` are (height, width) in
         pixels. A `masked` store says of every pixel whether its light is known. Resumes as `EventStore.create` does.
         """
         sequences = list(picture_of)
@@ -122,8 +122,8 @@ class SceneStore:
             "splits": [splits[sequence] for sequence in sequences],
             "pictures": pictures,
             "largest_picture": list(largest_picture),
-            "window_height": window[0],
-            "window_width": window[1],
+            "window_height": sensor[0],
+            "window_width": sensor[1],
             "trajectory": list(trajectory_names),
             "conventions": CONVENTIONS,
             "attributes": dict(attributes),
@@ -161,9 +161,9 @@ class SceneStore:
                 f"got one of {tuple(valid.shape)}, masked={self.masked}"
             )
         height, width = self._table.columns["s0"].shape
-        if not (self.window_height <= s0.shape[0] <= height and self.window_width <= s0.shape[1] <= width):
+        if not (self.sensor_height <= s0.shape[0] <= height and self.sensor_width <= s0.shape[1] <= width):
             raise ValueError(
-                f"{picture}: expected a picture between the window's {self.window_height}x{self.window_width} px and "
+                f"{picture}: expected a picture between the sensor's {self.sensor_height}x{self.sensor_width} px and "
                 f"{height}x{width} px, got {s0.shape[0]}x{s0.shape[1]}"
             )
         rows = {

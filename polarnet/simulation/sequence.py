@@ -1,4 +1,4 @@
-"""One picture, in memory, to the events of four polarizers and the truth that belongs to them."""
+"""Simulation in memory: one picture in, events of four channels and the matching truth out."""
 
 from typing import NamedTuple
 
@@ -11,13 +11,13 @@ from polarnet.events.stream import Events
 from polarnet.runtime import generator_for, seed_for
 from polarnet.simulation.emulator import EmulatorConfig, randomised
 from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory
+from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb
-from polarnet.simulation.synthesize import synthesize_sequence
 from polarnet.simulation.truth import frames_of
 
 
 class Simulation(NamedTuple):
-    """What a moving sensor behind four polarizers reported, and what it looked at."""
+    """Events of a moving sensor behind four polarizers, and the truth at frame times."""
 
     events: list[Events]
     """Behind the polarizers at 0, 45, 90 and 135 degrees, in microseconds from the start of the motion."""
@@ -34,14 +34,14 @@ class Simulation(NamedTuple):
 def simulate(
     picture: Float[Array, "3 h w"] | PolarizationScene, motion: MotionConfig, sensor: EmulatorConfig, seed: int
 ) -> Simulation:
-    """Let a window move over a picture, or over a scene, and see it through event-camera pixels.
+    """Move an event camera's sensor over a picture, or over a scene.
 
     A picture is RGB, numpy or torch, of shape (3, height, width), in floating-point numbers of any precision in [0, 1].
     Hue becomes AoLP, saturation DoLP and value S0, as in the pipeline. The same arguments give the same numbers.
 
     Raises TypeError for arguments of another kind. Raises ValueError for integers (divide 8 bits by 255, 16 bits by
     65535), values outside [0, 1], another order of axes, NaN and infinity, scenes that no light can make, and where the
-    picture is too small for the window and its motion; the message says what to do.
+    picture is too small for the sensor and its motion; the message says what to do.
     """
     for name, value, kind, example in (
         ("motion", motion, MotionConfig, 'MOTIONS["default"]'),
@@ -60,5 +60,5 @@ def simulate(
     t_us, size = frame_times_us(motion), (motion.window_height, motion.window_width)
     sensor = randomised(sensor, generator_for(seed, "picture", "sensor"))
     key = seed_for(seed, "picture", "emulate")
-    events = synthesize_sequence(scene, trajectory, t_us[-1], *size, sensor, key)
+    events = emulate_motion(scene, trajectory, t_us[-1], *size, sensor, key)
     return Simulation(events, tensor(t_us), *frames_of(scene, trajectory, t_us, *size), trajectory)

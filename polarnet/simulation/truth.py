@@ -40,7 +40,7 @@ Motions: TypeAlias = Mapping[str, Mapping[str, Trajectory]]
 def frames_of(
     scene: PolarizationScene, trajectory: Trajectory, t_us: Sequence[int], height: int, width: int
 ) -> tuple[Float[Tensor, "n 4 h w"], Float[Tensor, "n h w"], Float[Tensor, "n h w"]]:
-    """(intensity behind the four polarizers, DoLP, AoLP) that a window of a scene sees at times in microseconds.
+    """(intensity behind the four polarizers, DoLP, AoLP) on a sensor that moves over a scene, at times in microseconds.
 
     Light mixes between pixels, angles do not: all three follow from the interpolated Stokes vector.
     """
@@ -51,9 +51,9 @@ def frames_of(
 def valid_frames(
     valid: Bool[Tensor, "h1 w1"], trajectory: Trajectory, t_us: Sequence[int], height: int, width: int
 ) -> Bool[Tensor, "n h w"]:
-    """Where a window of a scene shows known light: at pixels whose interpolation uses valid pixels of the scene alone.
+    """Sensor pixels with known light: those whose interpolation uses valid pixels of the scene alone.
 
-    The weights of the interpolation are not negative, so that a masked plane seen through it is 0 just there.
+    The weights of the interpolation are not negative, so that a rendered mask is 0 just there.
     """
     masked = (~valid).float()
     seen = render(PolarizationScene(masked.expand(3, -1, -1)), trajectory, np.asarray(t_us) * 1e-6, height, width)
@@ -76,7 +76,7 @@ def synthesize(
     `mapper` is `polarnet.cluster.pmap` with its workers bound, or the built-in `map`. Every trajectory depends on
     the seed and the sequence's name alone. An interrupted run goes on where it stopped.
 
-    Warns about every picture too small for the window and its motion, and makes no scene of it; ValueError where none
+    Warns about every picture too small for the sensor and its motion, and makes no scene of it; ValueError where none
     is left.
     """
     manifest = read_manifest(images)
@@ -109,7 +109,7 @@ def synthesize(
 def motions_of(
     manifest: Manifest, config: MotionConfig, seed: int, variation: VariationConfig | None = None
 ) -> tuple[dict[str, Motions], list[Skipped]]:
-    """The motions over each picture, by its name, and the pictures that are too small for the window and its motion."""
+    """The motions over each picture, by its name, and the pictures that are too small for the sensor and its motion."""
     motions, skipped = {}, []
     for entry in manifest.pictures:
         try:
@@ -154,7 +154,7 @@ def _create(
         "seed": seed,
         "images_sha256": _digest(manifest, images),
     }
-    window = config.window_height, config.window_width
+    sensor = config.window_height, config.window_width
     largest = max(entry.height for entry in manifest.pictures), max(entry.width for entry in manifest.pictures)
     names = Trajectory.vector_names()
     masked = any(entry.masked_fraction for entry in manifest.pictures)  # null for photographs
@@ -163,14 +163,14 @@ def _create(
         picture_of,
         splits,
         largest_picture=largest,
-        window=window,
+        sensor=sensor,
         trajectory_names=names,
         attributes=attributes,
         masked=masked,
     )
     n_frames = len(frame_times_us(config))
     frame_attributes = {**attributes, "scenes": picture_of}
-    frame_store = FrameStore.create(frames, list(picture_of), splits, n_frames, *window, frame_attributes, masked)
+    frame_store = FrameStore.create(frames, list(picture_of), splits, n_frames, *sensor, frame_attributes, masked)
     return scene_store, frame_store
 
 

@@ -50,19 +50,20 @@ def times(*t_us):
 
 def test_cf_of_a_hand_worked_event_list(hand_list):
     found = reconstruct_cf([hand_list], times(500, 2000, 3000, 5000), cf_config())
-    # log intensity of (1, 2): 0 | 0.1 / 2 + 0.1 | 0.15 / 2 | (0.15 / 4 - 0.1) / 2; of (0, 0): 0 | 0 | -0.1 | -0.1 / 4
+    # An event shows after its time: log intensity of (1, 2): 0 | 0.1 / 2 | (0.1 / 2 + 0.1) / 2 | (0.15 / 4 - 0.1) / 2;
+    # of (0, 0): 0 | 0 | 0 | -0.1 / 4
     expected = np.zeros((4, 2, 3))
-    expected[:, 1, 2] = [0, 0.15, 0.075, -0.03125]
-    expected[:, 0, 0] = [0, 0, -0.1, -0.025]
+    expected[:, 1, 2] = [0, 0.05, 0.075, -0.03125]
+    expected[:, 0, 0] = [0, 0, 0, -0.025]
     np.testing.assert_allclose(found[:, 0], (np.exp(expected) - 1 + 0.1) / 1.3, rtol=0, atol=1e-12)
 
 
 def test_highpass_of_a_hand_worked_event_list(hand_list):
     found = reconstruct_highpass([hand_list], times(500, 2000, 3000, 5000), highpass_config())
-    # each event halves once more: (1, 2): 0 | 0.1 / 4 + 0.1 | 0.125 / 2 | (0.125 / 8 - 0.1) / 2
+    # each event halves once more: (1, 2): 0 | 0.1 / 2 | (0.1 / 4 + 0.1) / 2 | (0.125 / 8 - 0.1) / 2
     expected = np.zeros((4, 2, 3))
-    expected[:, 1, 2] = [0, 0.125, 0.0625, -0.0421875]
-    expected[:, 0, 0] = [0, 0, -0.1, -0.025]
+    expected[:, 1, 2] = [0, 0.05, 0.0625, -0.0421875]
+    expected[:, 0, 0] = [0, 0, 0, -0.025]
     np.testing.assert_allclose(found[:, 0], (1.5 * np.exp(expected) - 1 + 0.5) / 2, rtol=0, atol=1e-12)
 
 

@@ -43,10 +43,10 @@ from polarnet.events.stream import Events
 from polarnet.measure import machine_record, uncommitted
 from polarnet.runtime import tune
 from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory
+from polarnet.simulation.moving_sensor import emulate_motion, emulate_motion_steps
 from polarnet.simulation.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
-from polarnet.simulation.synthesize import synthesize_sequence, synthesize_steps
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "docs" / "results" / "emulation.json"
@@ -96,7 +96,7 @@ def measure_one(name: str, threads: int, repeats: int) -> dict[str, Any]:
     seconds = []
     for _ in range(repeats + 1):  # the first compiles
         start = time.perf_counter()
-        events = synthesize_sequence(scene, path, DURATION_US, HEIGHT, WIDTH, MODELS[name], 1, threads)
+        events = emulate_motion(scene, path, DURATION_US, HEIGHT, WIDTH, MODELS[name], 1, threads)
         seconds.append(time.perf_counter() - start)
     return {
         "seconds": seconds[1:],
@@ -152,12 +152,12 @@ def measure_timing() -> dict[str, dict[str, float]]:
 
     def at(model: str, rate: float) -> list[Events]:
         config = replace(NOISELESS, model=model, render_rate_hz=rate)
-        return synthesize_sequence(scene, path, DURATION_US, HEIGHT, WIDTH, config, 1)
+        return emulate_motion(scene, path, DURATION_US, HEIGHT, WIDTH, config, 1)
 
     def at_regular_frames(rate: float) -> list[Events]:
         t_us = np.rint(np.arange(int(rate) + 1) * 1e6 / rate).astype(np.int64)
         config = replace(NOISELESS, model="exact")
-        return synthesize_steps(scene, path, t_us, HEIGHT, WIDTH, config, 1, None)[0]
+        return emulate_motion_steps(scene, path, t_us, HEIGHT, WIDTH, config, 1, None)[0]
 
     reference = at("exact", 4800.0)
     figures: dict[str, dict[str, float]] = {"exact": {}, "v2e_default": {}}

@@ -14,11 +14,11 @@ from polarnet.events.store import EventStore
 from polarnet.simulation.scenes import SceneStore
 
 
-def test_events_per_pixel_is_the_mean_over_polarizers_of_what_has_come(recording):
+def test_events_per_pixel_is_the_mean_over_channels_before_each_time(recording):
     t_us = recording.t_us
     found = events_per_pixel(recording.events, t_us)
     assert found[-1].item() == pytest.approx(300 / (18 * 20))
-    half = sum(int((e.t <= 2000).sum()) for e in recording.events) / (4 * 18 * 20)
+    half = sum(int((e.t < 2000).sum()) for e in recording.events) / (4 * 18 * 20)
     assert found[2].item() == pytest.approx(half)
 
 

@@ -5,6 +5,7 @@ from polarnet.evaluation.methods import METHODS, recover
 from polarnet.evaluation.recoverer import STREAMED, Recoverer, StateHistory, stream_of
 from polarnet.events.stream import slice_time
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
+from polarnet.events.windows import cut_windows
 from polarnet.networks.blocks import Prediction
 from polarnet.networks.checkpoint import load_network
 
@@ -19,11 +20,22 @@ def windows_of(recording, rule=CONSECUTIVE):
 
 
 @pytest.fixture
-def tie_free(recording):
-    """Without events at the very times of the frames, which belong to the window after for one, before for another."""
+def with_boundary_events(recording):
+    """One event of each channel exactly at each frame, the last frame included."""
     for events in recording.events:
-        events.t[events.t % WINDOW_US == 0] += 1
+        for frame_us in recording.t_us[1:-1].tolist():
+            events.t[torch.searchsorted(events.t, frame_us)] = frame_us
+        events.t[-1] = recording.t_us[-1]
     return recording
+
+
+def test_an_event_at_a_windows_end_belongs_to_the_next_window_in_batches_and_streams_alike(with_boundary_events):
+    streamed = windows_of(with_boundary_events)
+    for channel, events in enumerate(with_boundary_events.events):
+        batch = cut_windows(events, with_boundary_events.t_us)
+        assert [len(window) for window in batch] == [len(window.channels[channel]) for window in streamed]
+        assert [int(window.t[0]) for window in batch[1:]] == [1000, 2000, 3000]
+        assert sum(map(len, batch)) == len(events) - 1  # the event at the last frame has no window
 
 
 def test_all_methods_but_the_constants_are_streams():
@@ -31,10 +43,10 @@ def test_all_methods_but_the_constants_are_streams():
 
 
 @pytest.mark.parametrize("method", STREAMED)
-def test_a_stream_gives_what_the_method_gives_for_the_whole_recording(method, tie_free, context):
+def test_a_stream_gives_what_the_method_gives_for_the_whole_recording(method, with_boundary_events, context):
     stream = stream_of(method, context)
-    expected = recover(method, tie_free, context)
-    found = [stream.step(window) for window in windows_of(tie_free)]
+    expected = recover(method, with_boundary_events, context)
+    found = [stream.step(window) for window in windows_of(with_boundary_events)]
     assert stream.windows == len(found) == 4
     torch.testing.assert_close(torch.stack([one.dolp for one in found]), expected.dolp, atol=2e-5, rtol=1e-4)
     if expected.aolp is None:
@@ -43,12 +55,12 @@ def test_a_stream_gives_what_the_method_gives_for_the_whole_recording(method, ti
         angle = torch.stack([one.aolp for one in found]) - expected.aolp
         assert (torch.sin(angle).abs() * expected.dolp).max() < 1e-3  # of period pi, and undefined without polarization
     stream.reset()
-    torch.testing.assert_close(stream.step(windows_of(tie_free)[0]).dolp, found[0].dolp)
+    torch.testing.assert_close(stream.step(windows_of(with_boundary_events)[0]).dolp, found[0].dolp)
 
 
 @pytest.mark.parametrize("network", ["ours_checkpoint", "paper_checkpoint"])
-def test_windows_at_once_give_what_they_give_one_by_one(network, tie_free, checkpoints):
-    windows = windows_of(tie_free)
+def test_windows_at_once_give_what_they_give_one_by_one(network, with_boundary_events, checkpoints):
+    windows = windows_of(with_boundary_events)
     one_by_one, together = Recoverer(load_network(checkpoints[network])), Recoverer(load_network(checkpoints[network]))
     expected = [one_by_one.step(window) for window in windows]
     found = [*together.step_on(windows[:3]), together.step(windows[3])]
@@ -57,8 +69,8 @@ def test_windows_at_once_give_what_they_give_one_by_one(network, tie_free, check
         torch.testing.assert_close(one.dolp, other.dolp, atol=1e-5, rtol=1e-4)
 
 
-def test_windows_at_once_must_follow_each_other(tie_free, checkpoints):
-    windows = windows_of(tie_free)
+def test_windows_at_once_must_follow_each_other(with_boundary_events, checkpoints):
+    windows = windows_of(with_boundary_events)
     with pytest.raises(ValueError, match=r"follow each other, got \[\(0, 1000\), \(2000, 3000\)\] us"):
         Recoverer(load_network(checkpoints["ours_checkpoint"])).step_on([windows[0], windows[2]])
 

@@ -84,7 +84,7 @@ def test_twice_the_speed_is_twice_the_speed(stores, config, monkeypatch):
         seen.append(trajectory.speed_px_s)
         return list(stores[2].read("leaf-00"))
 
-    monkeypatch.setattr("polarnet.evaluation.resimulate.synthesize_sequence", noting)
+    monkeypatch.setattr("polarnet.evaluation.resimulate.emulate_motion", noting)
     resimulated(scenes, "leaf-00", config.synthesize, [config.emulate] * 4, config.seed, speed=2.0)
     stored = Trajectory.from_vector(scenes.read("leaf-00").trajectory.numpy())
     assert seen == [pytest.approx(2 * stored.speed_px_s, rel=1e-6)]

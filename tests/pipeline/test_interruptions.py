@@ -57,7 +57,7 @@ def folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
         dict.fromkeys(names, "coffee"),
         dict.fromkeys(names, "train"),
         largest_picture=(200, 300),
-        window=(motion.window_height, motion.window_width),
+        sensor=(motion.window_height, motion.window_width),
         trajectory_names=Trajectory.vector_names(),
         attributes={},
     )

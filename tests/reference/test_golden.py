@@ -169,12 +169,12 @@ def test_the_number_of_events_under_v2e_settings_agrees_over_seeds(golden, descr
     seeds = 40
     frames = clip(golden, "drift8").expand(-1, seeds, -1, -1)
     events, _ = emulate(frames, times_us(golden, "t300"), v2e_config(statistics["params"]), key=9)
-    counts = np.array([len(plane) for plane in events])
+    counts = np.array([len(channel) for channel in events])
     assert counts.mean() == pytest.approx(
         statistics["n_mean"], abs=3 * statistics["n_sd"] * math.sqrt(1 / 20 + 1 / seeds)
     )
     assert counts.std(ddof=1) == pytest.approx(statistics["n_sd"], rel=0.6)
-    on = np.mean([(plane.p == 1).float().mean().item() for plane in events])
+    on = np.mean([(channel.p == 1).float().mean().item() for channel in events])
     assert on == pytest.approx(statistics["on_fraction"], abs=0.004)
 
 

@@ -35,7 +35,7 @@ def log_ramp(start: float, stop: float, steps: int) -> torch.Tensor:
 
 
 def moving_clip(dtype: torch.dtype) -> torch.Tensor:
-    """Twelve frames of four planes in which bright and dark bars of 0 to 255 DN drift."""
+    """Twelve frames of four channels in which bright and dark bars of 0 to 255 DN drift."""
     phase = torch.arange(40.0) / 6 - torch.arange(12.0).view(-1, 1, 1, 1) / 3
     amplitude = torch.linspace(20, 127, 4).view(1, 4, 1, 1) * torch.linspace(0.5, 1, 24).view(1, 1, 24, 1)
     return (127.5 + amplitude * torch.sin(phase)).to(dtype)
@@ -132,18 +132,18 @@ def test_a_clip_cut_into_pieces_gives_the_events_of_the_whole(model):
     for piece in (slice(0, 1), slice(1, 5), slice(5, 12)):
         events, state = emulate(frames[piece], t_us[piece], of(model, NOISY), key=7, state=state)
         pieces.append(events)
-    for plane in range(4):
+    for channel in range(4):
         for name in ("t", "x", "y", "p"):
-            assert torch.equal(torch.cat([getattr(p[plane], name) for p in pieces]), getattr(whole[plane], name))
+            assert torch.equal(torch.cat([getattr(p[channel], name) for p in pieces]), getattr(whole[channel], name))
     assert (state.t_us, state.steps) == (end.t_us, end.steps) == (11 * 3333, 11)
 
 
 @pytest.mark.parametrize("model", list(MODELS))
-def test_threads_and_the_order_of_planes_do_not_change_a_byte(model):
+def test_threads_and_the_order_of_channels_do_not_change_a_byte(model):
     frames, t_us = moving_clip(torch.float32), 3333 * torch.arange(12)
     alone, _ = emulate(frames, t_us, of(model, NOISY), key=7)
     together, _ = emulate(frames, t_us, of(model, NOISY), key=7, threads=2)
-    turned, _ = emulate(frames.flip(1), t_us, of(model, NOISY), key=7, planes=[3, 2, 1, 0])
+    turned, _ = emulate(frames.flip(1), t_us, of(model, NOISY), key=7, channels=[3, 2, 1, 0])
     assert all(same(a, b) for a, b in zip(alone, together, strict=True))
     assert all(same(a, b) for a, b in zip(alone, turned[::-1], strict=True))
 
@@ -151,10 +151,10 @@ def test_threads_and_the_order_of_planes_do_not_change_a_byte(model):
 @pytest.mark.parametrize("model", list(MODELS))
 def test_events_are_valid_and_in_the_order_t_y_x_p(model):
     events, _ = emulate(moving_clip(torch.uint8), 37.5 * torch.arange(12, dtype=torch.float64), of(model, NOISY), key=3)
-    for plane in events:
-        validate(plane)
-        order = np.lexsort((plane.p, plane.x, plane.y, plane.t))
-        assert np.array_equal(order, np.arange(len(plane)))
+    for channel in events:
+        validate(channel)
+        order = np.lexsort((channel.p, channel.x, channel.y, channel.t))
+        assert np.array_equal(order, np.arange(len(channel)))
 
 
 @pytest.mark.parametrize("model", list(MODELS))
@@ -180,7 +180,7 @@ def test_what_comes_in_is_not_changed(model):
 
 
 @pytest.mark.parametrize("model", ["v2e", "exact"])
-def test_every_plane_has_thresholds_of_its_own_around_the_nominal_ones(model):
+def test_every_channel_has_thresholds_of_its_own_around_the_nominal_ones(model):
     _, state = emulate(torch.full((1, 4, 100, 100), 100.0), torch.tensor([0]), of(model, NOISY), key=3)
     maps = [values for pixels in state.pixels for values in (pixels.threshold_on, pixels.threshold_off)]
     for values in maps:
@@ -246,7 +246,7 @@ CLIP, TIMES = torch.full((3, 2, 4, 5), 100.0), torch.tensor([0, 10, 20])
         (CLIP / 0, TIMES, "finite frames"),
         (-CLIP, TIMES, "negative"),
         (257 * CLIP, TIMES, r"expected digital numbers in \[0, 255\], got values up to 25700; scale white to 255"),
-        (CLIP[0, 0, 0], TIMES, r"frames: expected \(\.\.\., planes, height, width\), got \(5,\)"),
+        (CLIP[0, 0, 0], TIMES, r"frames: expected \(\.\.\., channels, height, width\), got \(5,\)"),
     ],
 )
 def test_light_that_makes_no_sense_is_refused(unchecked_annotations, frames, t_us, message):
@@ -258,12 +258,12 @@ def test_a_state_goes_on_with_its_own_sensor_and_later_times_alone():
     _, state = emulate(CLIP, TIMES, IDEAL, key=1)
     with pytest.raises(ValueError, match=r"the first after the state's 20\.0"):
         emulate(CLIP, TIMES, IDEAL, key=1, state=state)
-    with pytest.raises(ValueError, match=r"the state is of planes \(0, 1\) of 4x5 pixels"):
+    with pytest.raises(ValueError, match=r"the state is of channels \(0, 1\) of 4x5 pixels"):
         emulate(CLIP[:, :, :3], TIMES + 100, IDEAL, key=1, state=state)
     with pytest.raises(ValueError, match="the state is of model exact"):
         emulate(CLIP, TIMES + 100, of("v2e"), key=1, state=state)
-    with pytest.raises(ValueError, match="2 different plane numbers"):
-        emulate(CLIP, TIMES, IDEAL, key=1, planes=[1, 1])
+    with pytest.raises(ValueError, match="2 different channel numbers"):
+        emulate(CLIP, TIMES, IDEAL, key=1, channels=[1, 1])
 
 
 def test_numpy_frames_give_the_events_of_torch():

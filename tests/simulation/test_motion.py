@@ -17,7 +17,7 @@ from polarnet.simulation.motion import (
     frame_times_us,
     random_trajectory,
     render,
-    window_to_scene,
+    sensor_to_scene,
 )
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.stokes import aolp, dolp, intensities_from_stokes
@@ -149,10 +149,10 @@ def test_pose_follows_its_closed_form():
 
 
 def test_a_scene_too_small_for_the_window_is_refused():
-    with pytest.raises(ValueError, match=r"scene of 120x300 .* too small: a window of 120x180 .* more than 120x180"):
+    with pytest.raises(ValueError, match=r"scene of 120x300 .* too small: a sensor of 120x180 .* more than 120x180"):
         random_trajectory(CONFIG, 120, 300, np.random.default_rng(0))
     rolled = dataclasses.replace(CONFIG, rotation_max_deg=90.0)
-    with pytest.raises(ValueError, match="more than 216x216"):  # the window's diagonal
+    with pytest.raises(ValueError, match="more than 216x216"):  # the sensor's diagonal
         random_trajectory(rolled, 215, 600, np.random.default_rng(0))
 
 
@@ -248,7 +248,7 @@ def test_zoom_2_puts_neighbouring_scene_pixels_two_window_pixels_apart(scene):
 
 
 def test_the_centre_of_the_window_looks_at_the_pose():
-    left, top, along, across = window_to_scene(100.0, 50.0, 0.3, 1.5, 121, 181)
+    left, top, along, across = sensor_to_scene(100.0, 50.0, 0.3, 1.5, 121, 181)
     assert left + 90 * along - 60 * across == pytest.approx(100)
     assert top + 90 * across + 60 * along == pytest.approx(50)
     assert math.hypot(along, across) == pytest.approx(1 / 1.5)

@@ -15,7 +15,7 @@ def create(path, **changes) -> SceneStore:
         "picture_of": {"coffee-0": "coffee", "coffee-1": "coffee", "leaves-0": "leaves"},
         "splits": {"coffee-0": "train", "coffee-1": "train", "leaves-0": "test"},
         "largest_picture": (20, 30),
-        "window": (8, 12),
+        "sensor": (8, 12),
         "trajectory_names": NAMES,
         "attributes": {"seed": 1},
     }
@@ -73,7 +73,7 @@ def test_the_store_says_what_it_holds(finished):
     store = SceneStore.open(finished)
     assert store.sequences == ["coffee-0", "coffee-1", "leaves-0"]
     assert store.pictures == ["coffee", "leaves"]
-    assert (store.window_height, store.window_width) == (8, 12)
+    assert (store.sensor_height, store.sensor_width) == (8, 12)
     assert store.trajectory_names == NAMES
     assert store.of_split("train") == ["coffee-0", "coffee-1"]
     assert store.attributes == {"seed": 1}

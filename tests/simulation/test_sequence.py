@@ -81,7 +81,7 @@ def with_gaps() -> torch.Tensor:
         (with_gaps(), r"got 2 of 20736 that are NaN or infinite, the first at \(1, 5, 7\)"),
         (picture().permute(1, 2, 0), r"expected \(3, height, width\), got \(72, 96, 3\); use permute\(2, 0, 1\)"),
         (picture()[0], r"expected \(3, height, width\), got \(72, 96\)"),
-        (picture()[:, :19], r"scene of 19x96 .* too small: a window of 20x30 .* needs more than 20x30"),
+        (picture()[:, :19], r"scene of 19x96 .* too small: a sensor of 20x30 .* needs more than 20x30"),
     ],
 )
 def test_a_picture_of_another_form_is_refused_with_what_to_do(unchecked_annotations, rgb, message):

@@ -1,1 +1,1 @@
-"""Pixel models of event cameras, compiled: light and state of one plane in, events and state out."""
+"""Pixel models of event cameras, compiled: light and pixel state in, events and new state out."""

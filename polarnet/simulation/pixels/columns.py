@@ -1,4 +1,4 @@
-"""Columns that grow while a plane's events are written into them, and the order of events with equal times."""
+"""Growing columns for the events of one channel, and the order of events with equal times."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ SIGNAL, LEAK, SHOT = 0, 1, 2
 
 
 class Columns(NamedTuple):
-    """Events of one plane, one array each. `label` and `exact_us` have length 0 where nobody asked for them."""
+    """Events of one channel, one array per field. `label` and `exact_us` are empty unless requested."""
 
     t: np.ndarray
     """int64, microseconds"""
@@ -21,7 +21,7 @@ class Columns(NamedTuple):
     p: np.ndarray
     """int8, +1 or -1"""
     label: np.ndarray
-    """uint8: SIGNAL, LEAK or SHOT, the process that made the event"""
+    """uint8, the process behind the event: SIGNAL, LEAK or SHOT"""
     exact_us: np.ndarray
     """float64, microseconds before rounding to t"""
 
@@ -57,7 +57,7 @@ def _grown_column(column, used, capacity):
 
 @compiled
 def with_room(columns, used, more):
-    """`columns`, or a copy of twice the size, with room for `more` events after the first `used`."""
+    """`columns` if `more` events fit after the first `used`, else a copy of at least twice the size."""
     if used + more <= columns.t.size:
         return columns
     capacity = max(2 * columns.t.size, used + more)
@@ -73,7 +73,7 @@ def with_room(columns, used, more):
 
 @compiled
 def sort_ties(columns, start, stop):
-    """Put events start..stop, already in order of t apart from few, into the order (t, y, x, p): an insertion sort."""
+    """Sort events start .. stop by (t, y, x, p), by insertion: they are nearly in order of t already."""
     for i in range(start + 1, stop):
         t, x, y, p = columns.t[i], columns.x[i], columns.y[i], columns.p[i]
         label = columns.label[i] if columns.label.size else np.uint8(0)

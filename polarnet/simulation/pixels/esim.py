@@ -1,55 +1,78 @@
-"""The ideal pixel of ESIM (Rebecq et al., CoRL 2018), whose log intensity is linear in time between frames.
+"""The pixel model `esim` (Rebecq et al., CoRL 2018): log intensity is linear in time between frames.
 
-Its code comes in two forms, which differ where levels are met exactly: the one for the processor (`gpu` false) looks
-for levels between the values of two frames, the one for the graphics card between its reference and the new value.
-Both keep log intensity and reference in float32. There is no noise, mismatch or low-pass in this model.
+The published code has two variants that differ where a level is met exactly. The CPU variant looks for levels between
+the values of two frames; the GPU variant (model `esim_gpu`) looks between its reference and the new value. Both keep
+log intensity and reference in float32. The model has no noise, mismatch or low-pass.
 """
 
 import math
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
+from polarnet.ranges import allowed
 from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels.columns import SIGNAL
-from polarnet.simulation.pixels.light import BYTES, FULL_SCALE, intensity_rows, ln
+from polarnet.simulation.pixels.light import FULL_SCALE, intensity_rows, ln
 from polarnet.simulation.pixels.pending import event_of, pending_events, place_of, roomier, write_in_order
+from polarnet.simulation.pixels.physics import PixelConfig
 from polarnet.simulation.pixels.strips import rows_of_strip
 
-NO_CHANGE = 1e-6  # log intensity: the form for the processor takes less for a pixel at rest
+EIGHT_BIT_VIDEO = False
+NO_CHANGE = 1e-6  # log intensity: the CPU variant takes a smaller change for rest
 NEARLY = np.float32(0.99999)  # narrows a first look at thresholds by more than rounding
 
 
-class Pixels(NamedTuple):
-    """State of one plane, one array per quantity, [h * w]."""
+@dataclass(frozen=True)
+class EsimConfig(PixelConfig):
+    """Parameters of ESIM's pixel; of the inherited ones it has thresholds and refractory period alone."""
 
-    reference: np.ndarray
-    """float32, the last level met"""
-    logarithm: np.ndarray
-    """float32, log intensity of the last frame"""
-    last_event_us: np.ndarray
-    """float64"""
+    esim_log_eps: float = field(metadata=allowed(above=0))
+    """Added to intensity in [0, 1] before its logarithm is taken."""
 
 
 class Physics(NamedTuple):
-    """What the pixels of a sensor have in common."""
+    """`EsimConfig` for compiled kernels."""
 
     threshold_on: float
     threshold_off: float
     refractory_us: float
     log_eps: float
-    """added to intensity in [0, 1] before its logarithm is taken"""
     gpu: bool
 
 
-def initial(h: int, w: int, physics: Physics, key: np.uint64, plane: int) -> Pixels:
+class Pixels(NamedTuple):
+    """State of one channel, one array [h * w] per quantity."""
+
+    reference: np.ndarray
+    """float32, the last level met."""
+    logarithm: np.ndarray
+    """float32, log intensity of the last frame."""
+    last_event_us: np.ndarray
+    """float64"""
+
+
+def physics_of(config: EsimConfig, gpu: bool = False) -> Physics:
+    """The parameters of one variant."""
+    return Physics(
+        config.contrast_threshold_on,
+        config.contrast_threshold_off,
+        config.refractory_period_us,
+        config.esim_log_eps,
+        gpu,
+    )
+
+
+def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
     """Pixels before their first frame."""
-    return Pixels(np.zeros(h * w, np.float32), np.zeros(h * w, np.float32), np.full(h * w, -np.inf))
+    n = height * width
+    return Pixels(np.zeros(n, np.float32), np.zeros(n, np.float32), np.full(n, -np.inf))
 
 
 @compiled
 def _table(physics):
-    """Log intensity of DN 0 ... 255, as the float32 closest to it."""
+    """Log intensity of 0 to 255 DN, rounded to float32."""
     table = np.empty(256, np.float32)
     for dn in range(256):
         table[dn] = math.log(
@@ -59,9 +82,9 @@ def _table(physics):
 
 
 @compiled
-def _respond(light, k, y, w, physics, table, dn, logarithm):
-    intensity_rows(light, k, y, w, dn)
-    if light.kind == BYTES:
+def _respond(light, frame, y, w, physics, table, dn, logarithm):
+    intensity_rows(light, frame, y, w, dn)
+    if light.images.itemsize == 1:
         for j in range(dn.size):
             logarithm[j] = table[np.int32(dn[j])]
     else:
@@ -70,15 +93,17 @@ def _respond(light, k, y, w, physics, table, dn, logarithm):
 
 
 @compiled
-def start(light, pixels, physics, h, w, time_us, key, plane):
-    """The first frame sets the reference."""
-    _respond(light, 0, 0, w, physics, _table(physics), np.empty(h * w, np.float32), pixels.logarithm)
+def start(light, pixels, steps):
+    """Set the reference to the first frame; nothing fires."""
+    dn, table = np.empty(pixels.logarithm.size, np.float32), _table(steps.physics)
+    _respond(light, 0, 0, steps.width, steps.physics, table, dn, pixels.logarithm)
     pixels.reference[:] = pixels.logarithm
 
 
 @compiled
-def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, columns):
-    """Run steps times_us[k] .. times_us[k + 1] under light[offset + k]; the columns and how many events they hold."""
+def advance(light, pixels, steps, columns):
+    """Take the pixels through `steps`; returns the columns with the events, and the number of events."""
+    physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
     rows, table, used = rows_of_strip(h, w), _table(physics), 0
     strip = np.empty((2, rows * w), np.float32)
     pending = pending_events(h * w, columns.exact_us.size > 0)
@@ -87,20 +112,18 @@ def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, co
         for y in range(0, h, rows):
             first, stop = y * w, min(y + rows, h) * w
             dn, logarithm = strip[0, : stop - first], strip[1, : stop - first]
-            _respond(light, offset + k, y, w, physics, table, dn, logarithm)
+            _respond(light, steps.first_frame + k, y, w, physics, table, dn, logarithm)
             for r in range(y, min(y + rows, h)):
                 here = slice((r - y) * w, (r - y + 1) * w)
                 pending, n = _fire(pixels, physics, r, logarithm[here], times_us[k], times_us[k + 1], pending, n)
             pixels.logarithm[first:stop] = logarithm
-        base_us = math.floor(times_us[k])
-        longest_us = np.int64(math.ceil(times_us[k + 1]) - base_us)
-        columns, used = write_in_order(pending, n, np.int64(base_us), longest_us, columns, used)
+        columns, used = write_in_order(pending, n, times_us[k], times_us[k + 1], columns, used)
     return columns, used
 
 
 @compiled
 def _fire(pixels, physics, y, logarithm, start_us, stop_us, pending, n):
-    """Events of row y between two frames."""
+    """Append the events of row y between two frames to the n pending ones; returns both."""
     w, dt, base_us = logarithm.size, stop_us - start_us, math.floor(start_us)
     for x in range(w):
         i = y * w + x
@@ -116,9 +139,9 @@ def _fire(pixels, physics, y, logarithm, start_us, stop_us, pending, n):
         place, level = place_of(y, x), reference
         for _ in range(crossed):
             level += sign * threshold
-            event_us = start_us + dt * _share(before, after, level)
+            event_us = start_us + dt * _crossing(before, after, level)
             if physics.gpu:
-                event_us = np.floor(event_us * 1e3) * 1e-3  # it counts whole nanoseconds
+                event_us = np.floor(event_us * 1e3) * 1e-3  # this variant counts whole nanoseconds
             waited = event_us - pixels.last_event_us[i]
             if waited > physics.refractory_us or (waited == physics.refractory_us and not physics.gpu):
                 offset_us = min(np.int64(event_us), np.int64(math.ceil(stop_us)) - 1) - base_us
@@ -127,7 +150,7 @@ def _fire(pixels, physics, y, logarithm, start_us, stop_us, pending, n):
                     pending.exact_us[n] = event_us
                 pixels.last_event_us[i] = event_us
                 n += 1
-        if physics.gpu:  # which computes the new reference in one fused operation
+        if physics.gpu:  # this variant computes the new reference in one fused operation
             level = np.float32(np.float64(reference) + np.float64(sign * threshold) * crossed)
         pixels.reference[i] = level
     return pending, n
@@ -135,7 +158,7 @@ def _fire(pixels, physics, y, logarithm, start_us, stop_us, pending, n):
 
 @compiled
 def _levels(physics, before, after, reference, sign, threshold):
-    """How many levels are crossed."""
+    """Number of levels that are crossed."""
     if physics.gpu:
         return int(abs(after - reference) / threshold)
     crossed, level = 0, reference + sign * threshold
@@ -146,8 +169,8 @@ def _levels(physics, before, after, reference, sign, threshold):
 
 
 @compiled
-def _share(before, after, level):
-    """Of the time between two frames after which a level is met; at once where rounding left it behind at rest."""
+def _crossing(before, after, level):
+    """When a level is met, as a fraction of the time between two frames; 0 for a pixel at rest."""
     return (
         (np.float64(level) - np.float64(before)) / (np.float64(after) - np.float64(before)) if after != before else 0.0
     )

@@ -1,9 +1,9 @@
-"""A pixel with v2e's physics in continuous time: each event at its own threshold crossing.
+"""The pixel model `exact`: v2e's physics in continuous time, with each event at its own threshold crossing.
 
-Between frames the filtered log intensity is linear in time. Leak, refractory period and shot noise know nothing of
-frames: the leak of a pixel has a random phase at the start and a new rate after every event; an event that falls into
-the refractory period waits for its end and fires there if the change still exceeds the threshold; shot noise is a
-Poisson process of each pixel. As the frame rate grows, v2e's signal events approach these.
+Between frames the filtered log intensity is linear in time. Leak, refractory period and shot noise do not depend on
+the frame rate. The leak of a pixel has a random phase at the start and a new rate after every event. A threshold
+crossing within the refractory period waits for its end and fires there if the change still exceeds the threshold.
+Shot noise is a Poisson process of each pixel. As the frame rate grows, the signal events of v2e converge to these.
 """
 
 import math
@@ -12,60 +12,81 @@ from typing import NamedTuple
 import numpy as np
 
 from polarnet.simulation.compilation import compiled, inlined
-from polarnet.simulation.pixels import randomness
+from polarnet.simulation.pixels import physics, randomness
+from polarnet.simulation.pixels.active import empty_active, gather, keep_continuing, scatter
 from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL
-from polarnet.simulation.pixels.course import empty_course, keep, put, take
 from polarnet.simulation.pixels.light import intensity_rows, linlog
 from polarnet.simulation.pixels.pending import event_of, pending_events, place_of, roomier, write_in_order
-from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normal, uniform
-from polarnet.simulation.pixels.strips import SPARE, flag_words, flagged, flags_of, rows_of_strip
-from polarnet.simulation.pixels.v2e import (
+from polarnet.simulation.pixels.physics import (
     DARK_OFFSET,
+    DARK_SHOT_NOISE,
     SATURATION,
-    SHOT_NOISE_SLOPE,
     Physics,
     leak_factor_map,
-    threshold_map,
+    shot_noise_fraction,
+    threshold_maps,
 )
+from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normal, uniform
+from polarnet.simulation.pixels.strips import SPARE, flag_words, flagged, flags_of, rows_of_strip
 
-SHOT_NOISE_IN_THE_DARK = 1 - SHOT_NOISE_SLOPE * DARK_OFFSET / SATURATION
-SMALLEST_LAG = np.float32(1e-12)  # below, it is 0: processors are slow with the tiny numbers that decay leads to
+EIGHT_BIT_VIDEO = False
+MIN_LAG = np.float32(1e-12)  # a smaller lag becomes 0: processors are slow with denormal numbers
 LONG_AGO_US = -1e18
-ENOUGH = 2000  # pixels on the course that make it worth following them
+BATCH = 2000  # active pixels: fewer are not worth a pass of their own
 LOG2_E = np.float32(1 / math.log(2))
 # 2^f - 1 on [-1/2, 1/2]: f times a polynomial (Taylor's to f^6, whose error is below 1e-7), in pairs (Estrin's scheme)
 # because processors wait less for short chains
 EXP2 = tuple(np.float32(math.log(2) ** k / math.factorial(k)) for k in range(1, 8))
 
+physics_of = physics.physics_of
+
 
 class Pixels(NamedTuple):
-    """State of one plane, one array per quantity, [h * w]."""
+    """State of one channel, one array [h * w] per quantity; float32 unless stated."""
 
     change: np.ndarray
-    """filtered log intensity since the last event, leak included"""
+    """Filtered log intensity since the last event, leak included."""
     dn: np.ndarray
-    """light of the last frame"""
+    """Light of the last frame, DN."""
     linlog: np.ndarray
-    """its log response"""
+    """Response to that light: linear up to 20 DN, logarithmic above."""
     lag: np.ndarray
-    """how far the filtered response is above the response"""
+    """Filtered response minus response."""
     threshold_on: np.ndarray
     threshold_off: np.ndarray
     leak_nominal: np.ndarray
-    """log intensity per microsecond, frozen per pixel"""
+    """Log intensity per microsecond, frozen per pixel."""
     leak: np.ndarray
-    """the same with the jitter of the time since the last event"""
+    """Leak until the next event, jitter included."""
     last_event_us: np.ndarray
+    """float64"""
     events: np.ndarray
-    """int32, fired so far: numbers the draws of the leak's jitter"""
+    """int32, number of events so far; numbers the draws of the leak's jitter."""
     next_shot_us: np.ndarray
+    """float64, time of the next candidate for a shot-noise event."""
 
 
-def initial(h: int, w: int, physics: Physics, key: np.uint64, plane: int) -> Pixels:
-    """Pixels before their first frame, with this plane's own mismatch."""
-    n, sigma = h * w, physics.threshold_sigma
-    threshold_on = threshold_map(physics.threshold_on, sigma, n, key, randomness.THRESHOLD_ON, plane)
-    leak_factor = leak_factor_map(physics.noise_rate_cov_decades, n, key, plane)
+class Step(NamedTuple):
+    """One step of a channel."""
+
+    physics: Physics
+    start_us: float
+    stop_us: float
+    duration_us: float
+    refractory_us: float
+    jitter: float
+    """Relative standard deviation of the leak; 0 where nothing leaks."""
+    leak_key: np.uint64
+    shot_key: np.uint64
+    has_shots: bool
+    """Whether a shot-noise candidate of any pixel falls into the step."""
+
+
+def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
+    """Pixels before their first frame, with the mismatch of their channel."""
+    n = height * width
+    threshold_on, threshold_off = threshold_maps(physics, n, key, channel)
+    leak_factor = leak_factor_map(physics, n, key, channel)
     zeros = np.zeros(n, np.float32)
     return Pixels(
         change=zeros,
@@ -73,7 +94,7 @@ def initial(h: int, w: int, physics: Physics, key: np.uint64, plane: int) -> Pix
         linlog=zeros.copy(),
         lag=zeros.copy(),
         threshold_on=threshold_on,
-        threshold_off=threshold_map(physics.threshold_off, sigma, n, key, randomness.THRESHOLD_OFF, plane),
+        threshold_off=threshold_off,
         leak_nominal=np.float32(physics.leak_rate_hz * 1e-6) * leak_factor * threshold_on,
         leak=zeros.copy(),
         last_event_us=np.full(n, LONG_AGO_US),
@@ -83,15 +104,17 @@ def initial(h: int, w: int, physics: Physics, key: np.uint64, plane: int) -> Pix
 
 
 @compiled
-def start(light, pixels, physics, h, w, time_us, key, plane):
-    """The first frame: nothing fires, and what has leaked since each pixel's last event is anyone's guess."""
-    intensity_rows(light, 0, 0, w, pixels.dn)
+def start(light, pixels, steps):
+    """Adapt the pixels to the first frame, and draw each pixel's phase of the leak and first shot-noise candidate."""
+    physics, time_us = steps.physics, steps.times_us[0]
+    intensity_rows(light, 0, 0, steps.width, pixels.dn)
     linlog(pixels.dn, pixels.linlog)
-    phase_key, jitter_key = key_for(key, randomness.LEAK_PHASE, plane), key_for(key, randomness.LEAK_JITTER, plane)
-    shot_key = key_for(key, randomness.SHOT_NOISE, plane)
-    for i in range(h * w):
+    phase_key = key_for(steps.key, randomness.LEAK_PHASE, steps.channel)
+    jitter_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
+    shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
+    for i in range(pixels.dn.size):
         if physics.leak_rate_hz > 0:
-            pixels.leak[i] = jittered_leak(pixels.leak_nominal[i], physics.leak_jitter, jitter_key, i, 0)
+            pixels.leak[i] = _jittered_leak(pixels.leak_nominal[i], physics.leak_jitter, jitter_key, i, 0)
             pixels.change[i] = uniform(mixed(phase_key, i)) * pixels.threshold_on[i]
             if pixels.leak[i] > 0:
                 pixels.last_event_us[i] = time_us - pixels.change[i] / pixels.leak[i]
@@ -103,24 +126,32 @@ def start(light, pixels, physics, h, w, time_us, key, plane):
 
 
 @compiled
-def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, columns):
-    """Run steps times_us[k] .. times_us[k + 1] under light[offset + k]; the columns and how many events they hold."""
+def advance(light, pixels, steps, columns):
+    """Take the pixels through `steps`; returns the columns with the events, and the number of events."""
+    physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
     rows = rows_of_strip(h, w)
     strip = np.empty((4, rows * w), np.float32)
     words = flag_words(rows * w)
-    course = empty_course(ENOUGH + rows * w + SPARE)
-    keys = key_for(key, randomness.LEAK_JITTER, plane), key_for(key, randomness.SHOT_NOISE, plane)
+    active = empty_active(BATCH + rows * w + SPARE)
+    leak_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
+    shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
+    jitter = physics.leak_jitter if physics.leak_rate_hz > 0 else 0.0
     pending = pending_events(h * w, columns.exact_us.size > 0)
     soonest_us = np.array([pixels.next_shot_us[y * w : (y + rows) * w].min() for y in range(0, h, rows)])
     used = 0
     for k in range(times_us.size - 1):
         start_us, stop_us = times_us[k], times_us[k + 1]
-        n, active, shooting = 0, 0, soonest_us.min() < stop_us
+        has_shots = soonest_us.min() < stop_us
+        step = Step(
+            physics, start_us, stop_us, stop_us - start_us, physics.refractory_s * 1e6, jitter, leak_key, shot_key,
+            has_shots,
+        )  # fmt: skip
+        n, count = 0, 0
         for y in range(0, h, rows):
             first, stop = y * w, min(y + rows, h) * w
             dn, response = strip[0, : stop - first], strip[1, : stop - first]
             rise, before = strip[2, : stop - first], strip[3, : stop - first]
-            intensity_rows(light, offset + k, y, w, dn)
+            intensity_rows(light, steps.first_frame + k, y, w, dn)
             linlog(dn, response)
             if physics.cutoff_hz > 0:
                 rate = np.float32(2e-6 * math.pi * physics.cutoff_hz * (stop_us - start_us) / SATURATION)
@@ -135,18 +166,15 @@ def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, co
             _move(change, leak, rise, np.float32(stop_us - start_us), before, threshold_on, threshold_off, fires)
             if soonest_us[y // rows] < stop_us:
                 _flag_shots(pixels.next_shot_us[first:stop], stop_us, fires)
-            active = _line_up(words, first, before, rise, pixels, start_us, stop_us, course, active)
-            if active >= ENOUGH or y + rows >= h:
-                pending, n = _fire(pixels, physics, keys, course, active, shooting, w, start_us, stop_us, pending, n)
-                active = 0
-        if shooting:
+            count = _activate(words, first, before, rise, pixels, step, active, count)
+            if count >= BATCH or y + rows >= h:
+                pending, n = _fire(pixels, step, active, count, w, pending, n)
+                count = 0
+        if has_shots:
             for y in range(0, h, rows):
                 if soonest_us[y // rows] < stop_us:
                     soonest_us[y // rows] = pixels.next_shot_us[y * w : (y + rows) * w].min()
-        base_us = math.floor(start_us)
-        columns, used = write_in_order(
-            pending, n, np.int64(base_us), np.int64(math.ceil(stop_us) - base_us), columns, used
-        )
+        columns, used = write_in_order(pending, n, start_us, stop_us, columns, used)
     return columns, used
 
 
@@ -161,8 +189,8 @@ def _difference(dn, response, dn_before, response_before, rise):
 def _filter(dn, response, dn_before, response_before, lag, rate, rise):
     """First-order low-pass of a response that is linear in time, with the bandwidth at the mean light of the step.
 
-    Solved exactly over the step, so that the result does not hang on the frame rate: with a = bandwidth * dt,
-    lag <- lag exp(-a) - (change of response) (1 - exp(-a)) / a.
+    The solution over the step is exact, so that the result does not depend on the frame rate. With
+    a = bandwidth * dt: lag <- lag exp(-a) - (change of response) (1 - exp(-a)) / a.
     """
     c1, c2, c3, c4, c5, c6, c7 = EXP2
     half_rate = np.float32(0.5) * rate
@@ -178,7 +206,7 @@ def _filter(dn, response, dn_before, response_before, lag, rate, rise):
         decayed = (np.float32(1) - scale) - scale * above_one  # 1 - exp(-a), accurate for small a as well
         step = response[j] - response_before[j]
         lag_after = (lag[j] - lag[j] * decayed) - step * (decayed * per_a)
-        lag_after = lag_after if abs(lag_after) > SMALLEST_LAG else np.float32(0)
+        lag_after = lag_after if abs(lag_after) > MIN_LAG else np.float32(0)
         rise[j] = step + (lag_after - lag[j])
         lag[j], dn_before[j], response_before[j] = lag_after, dn[j], response[j]
 
@@ -200,59 +228,60 @@ def _flag_shots(next_shot_us, stop_us, fires):
 
 
 @inlined
-def _line_up(words, first, before, rise, pixels, start_us, stop_us, course, active):
-    """Append the flagged pixels of a strip that begins at pixel `first` to the course; how many are on it then."""
-    pixel, index = course.pixel[active:], course.entry[active:]
-    stop = active + flagged(words, before.size, index, pixel)
-    pixel, index = course.pixel[active:stop], course.entry[active:stop]
-    for a in range(stop - active):
+def _activate(words, first, before, rise, pixels, step, active, count):
+    """Append the flagged pixels of a strip to the `count` active ones; returns their new number.
+
+    `first` is the strip's first pixel.
+    """
+    pixel, index = active.pixel[count:], active.scratch[count:]
+    stop = count + flagged(words, before.size, index, pixel)
+    pixel, index = active.pixel[count:stop], active.scratch[count:stop]
+    for a in range(stop - count):
         pixel[a] = first + index[a]
-    take(before, index, course.change[active:stop])
-    take(rise, index, course.drift[active:stop])
-    take(pixels.threshold_on, pixel, course.threshold_on[active:stop])
-    take(pixels.threshold_off, pixel, course.threshold_off[active:stop])
-    take(pixels.leak, pixel, course.leak[active:stop])
-    take(pixels.leak_nominal, pixel, course.leak_nominal[active:stop])
-    take(pixels.events, pixel, course.events[active:stop])
-    take(pixels.last_event_us, pixel, course.last_event[active:stop])
-    per_us = 1 / (stop_us - start_us)
-    for a in range(active, stop):
-        course.drift[a] *= per_us
-        course.last_event[a] -= start_us
-        course.now[a] = 0.0
+    gather(before, index, active.change[count:stop])
+    gather(rise, index, active.slope[count:stop])
+    gather(pixels.threshold_on, pixel, active.threshold_on[count:stop])
+    gather(pixels.threshold_off, pixel, active.threshold_off[count:stop])
+    gather(pixels.leak, pixel, active.leak[count:stop])
+    gather(pixels.leak_nominal, pixel, active.leak_nominal[count:stop])
+    gather(pixels.events, pixel, active.events[count:stop])
+    gather(pixels.last_event_us, pixel, active.last_event[count:stop])
+    per_us = 1 / step.duration_us
+    for a in range(count, stop):
+        active.slope[a] *= per_us
+        active.last_event[a] -= step.start_us
+        active.now[a] = 0.0
     return stop
 
 
 @inlined
-def _fire(pixels, physics, keys, course, active, shooting, w, start_us, stop_us, pending, n):
-    """Follow the pixels on `course` through a step, in rounds: in each, a pixel fires once at most.
+def _fire(pixels, step, active, count, width, pending, n):
+    """Follow the active pixels through a step, in rounds: in each round, a pixel fires at most once.
 
-    Rounds instead of pixels, and choices instead of branches, because what a pixel does next is not to be guessed.
+    Rounds instead of one pixel after another, and selections instead of branches, because the branch is unpredictable.
     Returns the pending events and their number.
     """
-    dt = stop_us - start_us
-    jitter = physics.leak_jitter if physics.leak_rate_hz > 0 else 0.0
-    while active > 0:
-        while n + active > pending.events.size:
+    while count > 0:
+        while n + count > pending.events.size:
             pending = roomier(pending)
-        _cross(course, active, physics.refractory_s * 1e6, dt)
-        course.again[:active] = 0
-        if shooting:
-            _shoot(pixels, physics, keys[1], course, active, start_us, stop_us)
-        _settle(course, active, jitter, keys[0], dt)
-        n = _collect(course, active, w, start_us, pending, n)
-        _hand_back(pixels, course, active, start_us)
-        active = keep(course, active)
+        _next_crossing(active, count, step.refractory_us, step.duration_us)
+        active.continues[:count] = 0
+        if step.has_shots:
+            _insert_shots(pixels, step, active, count)
+        _move_on(active, count, step.jitter, step.leak_key, step.duration_us)
+        n = _append_events(active, count, width, step.start_us, pending, n)
+        _store_state(pixels, active, count, step.start_us)
+        count = keep_continuing(active, count)
     return pending, n
 
 
 @inlined
-def _cross(course, active, refractory_us, dt):
-    """When each pixel next meets a threshold, and what of its change is left then."""
-    for a in range(active):
-        threshold_on, threshold_off = np.float64(course.threshold_on[a]), np.float64(course.threshold_off[a])
-        leak, change, now, last = np.float64(course.leak[a]), course.change[a], course.now[a], course.last_event[a]
-        slope = course.drift[a] + leak
+def _next_crossing(active, count, refractory_us, duration_us):
+    """Find when each pixel next fires, and its change right after."""
+    for a in range(count):
+        threshold_on, threshold_off = np.float64(active.threshold_on[a]), np.float64(active.threshold_off[a])
+        leak, change, now, last = np.float64(active.leak[a]), active.change[a], active.now[a], active.last_event[a]
+        slope = active.slope[a] + leak
         ready = max(now, last + refractory_us)
         at_ready = change + slope * (ready - now)
         on = (at_ready >= threshold_on) | ((at_ready > -threshold_off) & (slope > 0))
@@ -263,85 +292,87 @@ def _cross(course, active, refractory_us, dt):
         left = max(excess, 0.0)  # a crossing leaves nothing of the change; after waiting, the excess remains
         left = left if on else -left
         leaked = on & (leak * (event - last) > 0.5 * threshold_on)
-        fires = event < dt
-        course.kind[a] = event_of(0, 0, on, LEAK if leaked else SIGNAL)
-        course.fires[a], course.after[a], course.since[a] = fires, left if fires else change, event if fires else now
+        fires = event < duration_us
+        active.event[a] = event_of(0, 0, on, LEAK if leaked else SIGNAL)
+        active.fires[a] = fires
+        active.next_change[a], active.next_now[a] = left if fires else change, event if fires else now
 
 
 @compiled
-def _shoot(pixels, physics, key, course, active, start_us, stop_us):
-    """Put the shot noise that comes before a pixel's next crossing in its place."""
-    dt = stop_us - start_us
-    for a in range(active):
-        i = course.pixel[a]
-        shot = pixels.next_shot_us[i] - start_us
-        if shot < (course.since[a] if course.fires[a] else dt):
+def _insert_shots(pixels, step, active, count):
+    """Let shot noise that precedes a pixel's next crossing take its place."""
+    for a in range(count):
+        i = active.pixel[a]
+        shot = pixels.next_shot_us[i] - step.start_us
+        if shot < (active.next_now[a] if active.fires[a] else step.duration_us):
             on, off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
-            happens, is_on = _shot(physics, key, i, start_us + shot, on, off, pixels.dn[i])
-            pixels.next_shot_us[i] += _until_next_shot(physics, key, i, start_us + shot, on, off)
-            fires = happens & (shot >= course.last_event[a] + physics.refractory_s * 1e6)
-            course.kind[a], course.fires[a] = event_of(0, 0, is_on, SHOT), fires
-            course.after[a], course.since[a] = (0.0, shot) if fires else (course.change[a], course.now[a])
-        course.again[a] = pixels.next_shot_us[i] < stop_us
+            shot_us = step.start_us + shot
+            accepted, is_on = _shot(step.physics, step.shot_key, i, shot_us, on, off, pixels.dn[i])
+            pixels.next_shot_us[i] += _until_next_shot(step.physics, step.shot_key, i, shot_us, on, off)
+            fires = accepted & (shot >= active.last_event[a] + step.refractory_us)
+            active.event[a], active.fires[a] = event_of(0, 0, is_on, SHOT), fires
+            active.next_change[a] = 0.0 if fires else active.change[a]
+            active.next_now[a] = shot if fires else active.now[a]
+        active.continues[a] = pixels.next_shot_us[i] < step.stop_us
 
 
 @inlined
-def _settle(course, active, jitter, key, dt):
-    """Where pixels are after their events, and whether they are to be followed further."""
-    pixel, events, leak_nominal = course.pixel[:active], course.events[:active], course.leak_nominal[:active]
-    leak, last_event, fires = course.leak[:active], course.last_event[:active], course.fires[:active]
-    for a in range(active):
+def _move_on(active, count, jitter, key, duration_us):
+    """Draw a new leak after each event, and find which pixels may fire again."""
+    pixel, events, leak_nominal = active.pixel[:count], active.events[:count], active.leak_nominal[:count]
+    leak, last_event, fires = active.leak[:count], active.last_event[:count], active.fires[:count]
+    for a in range(count):
         events[a] += fires[a]
         if jitter > 0:
-            drawn = jittered_leak(leak_nominal[a], jitter, key, pixel[a], events[a])
+            drawn = _jittered_leak(leak_nominal[a], jitter, key, pixel[a], events[a])
             leak[a] = drawn if fires[a] else leak[a]
-    for a in range(active):
-        after, since = course.after[a], course.since[a]
-        last_event[a] = since if fires[a] else last_event[a]
-        end = after + (course.drift[a] + leak[a]) * (dt - since)
-        beyond = (max(after, end) >= course.threshold_on[a]) | (min(after, end) <= -course.threshold_off[a])
-        course.at_end[a] = end
-        course.again[a] |= fires[a] & beyond
+    for a in range(count):
+        change, now = active.next_change[a], active.next_now[a]
+        last_event[a] = now if fires[a] else last_event[a]
+        final = change + (active.slope[a] + leak[a]) * (duration_us - now)
+        beyond = (max(change, final) >= active.threshold_on[a]) | (min(change, final) <= -active.threshold_off[a])
+        active.final_change[a] = final
+        active.continues[a] |= fires[a] & beyond
 
 
 @inlined
-def _collect(course, active, w, start_us, pending, n):
-    """Append the events of a round to the pending ones; how many those are then."""
-    since_whole_us, per_row = start_us - math.floor(start_us), 1 / w
-    for a in range(active):
-        y = np.int64((course.pixel[a] + 0.5) * per_row)
-        place = place_of(y, course.pixel[a] - y * w)
-        course.kind[a] |= event_of(since_whole_us + course.since[a], place, 0, 0)
-    for a in range(active):
-        at = np.uint64(n)  # what does not fire is overwritten by the next
-        pending.events[at] = course.kind[a]
+def _append_events(active, count, width, start_us, pending, n):
+    """Append the events of a round to the n pending ones; returns their new number."""
+    since_whole_us, per_row = start_us - math.floor(start_us), 1 / width
+    for a in range(count):
+        y = np.int64((active.pixel[a] + 0.5) * per_row)
+        place = place_of(y, active.pixel[a] - y * width)
+        active.event[a] |= event_of(since_whole_us + active.next_now[a], place, 0, 0)
+    for a in range(count):
+        at = np.uint64(n)  # the entry of a pixel that does not fire is overwritten by the next
+        pending.events[at] = active.event[a]
         if pending.exact_us.size:
-            pending.exact_us[at] = start_us + course.since[a]
-        n += course.fires[a]
+            pending.exact_us[at] = start_us + active.next_now[a]
+        n += active.fires[a]
     return n
 
 
 @inlined
-def _hand_back(pixels, course, active, start_us):
-    """What has become of the pixels, for the next step."""
-    pixel = course.pixel[:active]
-    for a in range(active):
-        course.now[a] = start_us + course.last_event[a]
-    put(course.at_end, pixel, pixels.change)
-    put(course.leak, pixel, pixels.leak)
-    put(course.events, pixel, pixels.events)
-    put(course.now, pixel, pixels.last_event_us)
+def _store_state(pixels, active, count, start_us):
+    """Write the state at the end of the step back, as it is if no further event follows."""
+    pixel = active.pixel[:count]
+    for a in range(count):
+        active.now[a] = start_us + active.last_event[a]
+    scatter(active.final_change, pixel, pixels.change)
+    scatter(active.leak, pixel, pixels.leak)
+    scatter(active.events, pixel, pixels.events)
+    scatter(active.now, pixel, pixels.last_event_us)
 
 
 @inlined
 def _bits(key, i, time_us):
-    """Random bits of what pixel i draws at a time."""
+    """Random bits of pixel i for a draw at a time."""
     return mixed(key ^ np.uint64(np.float64(time_us).view(np.int64)), i)
 
 
 @compiled
-def jittered_leak(nominal, jitter, key, i, number):
-    """The leak of pixel i from its event of this number to its next."""
+def _jittered_leak(nominal, jitter, key, i, number):
+    """Leak of pixel i from event `number` to the next."""
     return nominal * np.float32(
         max(1 - jitter * rough_normal(mixed(key, (np.uint64(i) << np.uint64(32)) + np.uint64(number))), 0.0)
     )
@@ -349,16 +380,16 @@ def jittered_leak(nominal, jitter, key, i, number):
 
 @compiled
 def _until_next_shot(physics, key, i, time_us, threshold_on, threshold_off):
-    """Microseconds to the next event of a Poisson process with the rate that the pixel has in the dark."""
+    """Microseconds to the next event of a Poisson process with the rate of the pixel in the dark."""
     share = physics.threshold_on / threshold_on + physics.threshold_off / threshold_off
-    rate_hz = physics.shot_noise_rate_hz / 2 * SHOT_NOISE_IN_THE_DARK * share
+    rate_hz = physics.shot_noise_rate_hz / 2 * DARK_SHOT_NOISE * share
     return -1e6 * math.log(uniform(_bits(key, i, time_us))) / rate_hz
 
 
 @compiled
 def _shot(physics, key, i, time_us, threshold_on, threshold_off, dn):
-    """Whether the shot event that is due happens at this light, and whether it is ON."""
+    """Thin a shot-noise candidate to the rate at this light: (whether it becomes an event, whether it is ON)."""
     on, off = physics.threshold_on / threshold_on, physics.threshold_off / threshold_off
-    chance = (1 - SHOT_NOISE_SLOPE * (np.float64(dn) + DARK_OFFSET) / SATURATION) / SHOT_NOISE_IN_THE_DARK
+    chance = shot_noise_fraction(dn) / DARK_SHOT_NOISE
     u = uniform(_bits(~key, i, time_us))
     return u < chance, u < chance * on / (on + off)

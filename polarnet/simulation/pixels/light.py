@@ -1,6 +1,6 @@
-"""What falls on one plane of pixels, row by row: frames, or a window that moves over a still scene.
+"""Light on the pixels of one channel, row by row, and the pixels' response to it.
 
-Light is in digital numbers (DN): 0 dark, 255 the brightest a picture can be.
+Light is in digital numbers (DN): 0 is dark, 255 the brightest value of a picture.
 """
 
 import math
@@ -10,7 +10,6 @@ import numpy as np
 
 from polarnet.simulation.compilation import compiled, inlined
 
-BYTES, FLOATS, SCENE = range(3)
 FULL_SCALE = 255.0  # DN
 KNEE = 20.0  # DN below which v2e's response is linear
 LINLOG_TABLE = np.array(
@@ -19,48 +18,36 @@ LINLOG_TABLE = np.array(
 
 
 class Light(NamedTuple):
-    """The light of one plane at successive times; `kind` says which of the fields holds it."""
+    """The light on one channel at successive times: a clip of frames, or a still scene under a drifting sensor."""
 
-    frames_8bit: np.ndarray
-    """uint8 [n, h, w]"""
-    frames: np.ndarray
-    """float32 [n, h, w], DN"""
-    scene: np.ndarray
-    """float32 [H + 1, W + 1], DN: the last row and column repeat their neighbours, so that 2x2 pixels always exist"""
+    images: np.ndarray
+    """A clip: uint8 or float32 [n, h, w], DN. A scene: float32 [1, H + 1, W + 1], DN; the last row and column repeat
+    their neighbours, so that each sensor pixel lies between 2x2 scene pixels."""
     top: np.ndarray
-    """float64 [n]: row of the scene at the window's first pixel"""
+    """float64 [n], scene row at the sensor's first pixel; empty for a clip"""
     left: np.ndarray
-    """float64 [n]: its column"""
-    kind: int
-
-
-NO_8BIT, NO_FRAMES = np.empty((0, 0, 0), np.uint8), np.empty((0, 0, 0), np.float32)
-NO_SCENE, NO_PLACES = np.empty((0, 0), np.float32), np.empty(0, np.float64)
+    """float64 [n], scene column at the sensor's first pixel; empty for a clip"""
 
 
 def light_of_frames(frames: np.ndarray) -> Light:
-    """Light from frames [n, h, w], uint8 or float32."""
-    if frames.dtype == np.uint8:
-        return Light(frames, NO_FRAMES, NO_SCENE, NO_PLACES, NO_PLACES, BYTES)
-    return Light(NO_8BIT, frames, NO_SCENE, NO_PLACES, NO_PLACES, FLOATS)
+    """Light from frames [n, h, w], uint8 or float32 DN."""
+    return Light(frames, np.empty(0), np.empty(0))
 
 
 def light_of_scene(scene: np.ndarray, top: np.ndarray, left: np.ndarray) -> Light:
-    """Light in a window that moves over `scene` (padded, see `Light`) without turning."""
-    return Light(NO_8BIT, NO_FRAMES, scene, top, left, SCENE)
+    """Light on a sensor that moves over `scene` (float32 DN, padded as in `Light`) without turning or zooming."""
+    return Light(scene[np.newaxis], top, left)
 
 
 @compiled
-def intensity_rows(light, k, y, w, dn):
-    """Fill `dn` (float32, whole rows of w pixels) with the light at time k from row y on."""
-    for r in range(dn.size // w):
-        row = dn[r * w : (r + 1) * w]
-        if light.kind == BYTES:
-            row[:] = light.frames_8bit[k, y + r]
-        elif light.kind == FLOATS:
-            row[:] = light.frames[k, y + r]
+def intensity_rows(light, frame, row, width, dn):
+    """Fill `dn` (float32, whole rows of `width` pixels) with the light of one frame from `row` on."""
+    for r in range(dn.size // width):
+        target = dn[r * width : (r + 1) * width]
+        if light.top.size:
+            _bilinear_row(light.images[0], light.top[frame] + (row + r), light.left[frame], target)
         else:
-            _bilinear_row(light.scene, light.top[k] + (y + r), light.left[k], row)
+            target[:] = light.images[frame, row + r]
 
 
 @compiled
@@ -79,7 +66,7 @@ def _bilinear_row(scene, row, column, dn):
 
 @compiled
 def linlog_8bit(dn, linlog):
-    """v2e's response to `dn`, which is rounded to whole numbers, as an 8-bit video would hold."""
+    """v2e's response to 8-bit light: rounds `dn` to whole numbers in place, then looks the response up."""
     for j in range(dn.size):
         whole = np.int32(dn[j] + np.float32(0.5)) & np.int32(255)
         dn[j] = np.float32(whole)
@@ -88,7 +75,7 @@ def linlog_8bit(dn, linlog):
 
 @compiled
 def linlog_as_v2e(dn, linlog):
-    """v2e's response to any DN >= 0, with its rounding: ln(DN) above 20, linear below; double precision inside."""
+    """v2e's response to any DN >= 0, rounded as v2e rounds it: ln(DN) above 20, linear below, computed in float64."""
     for j in range(dn.size):
         value = np.float64(dn[j])
         response = value * (math.log(KNEE) / KNEE) if value <= KNEE else math.log(value)

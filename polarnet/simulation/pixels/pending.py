@@ -1,9 +1,10 @@
-"""Events of one step of one plane: collected pixel by pixel, then written in order of time.
+"""Events of one step of one channel: collected pixel by pixel, then written in the order (t, y, x, p).
 
-An event is one 64-bit number whose order is that of (t, y, x, p): microseconds since the step's first one (31 bits),
-row (15), column (15), whether it is ON (1), label (2).
+An event is one 64-bit integer that sorts by (t, y, x, p): whole microseconds since the step's start (31 bits), row
+(15), column (15), 1 for ON (1), label (2).
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -13,16 +14,16 @@ from polarnet.simulation.pixels.columns import sort_ties, with_room
 
 TIME_SHIFT, ROW_SHIFT, COLUMN_SHIFT, POLARITY_SHIFT = np.int64(33), np.int64(18), np.int64(3), np.int64(2)
 PLACE_MASK, LABEL_MASK = np.int64(0x7FFF), np.int64(3)
-FINEST_BUCKETS = 4096  # microseconds of a step that counting alone tells apart
+MAX_BUCKETS = 4096  # of the counting sort: one per microsecond in steps up to this long
 
 
 class Pending(NamedTuple):
     """Events of one step in any order."""
 
     events: np.ndarray
-    """int64"""
+    """int64, see the module"""
     exact_us: np.ndarray
-    """float64, length 0 where nobody asked for times before rounding"""
+    """float64, times before rounding; empty if not requested"""
     in_order: np.ndarray
     """int64, scratch"""
 
@@ -45,19 +46,24 @@ def roomier(pending):
 
 @inlined
 def place_of(y, x):
-    """The part of an event's number that its pixel decides."""
+    """Row and column as part of an event's integer."""
     return np.int64(y) << ROW_SHIFT | np.int64(x) << COLUMN_SHIFT
 
 
 @inlined
 def event_of(offset_us, place, on, label):
-    """An event's number."""
+    """The integer of an event."""
     return np.int64(offset_us) << TIME_SHIFT | place | np.int64(on) << POLARITY_SHIFT | np.int64(label)
 
 
 @compiled
-def write_in_order(pending, n, base_us, longest_us, columns, used):
-    """Append the n pending events to the columns in the order (t, y, x, p); t = base_us + offset, offset <= longest."""
+def write_in_order(pending, n, start_us, stop_us, columns, used):
+    """Append the n pending events of a step to the first `used` of the columns, in the order (t, y, x, p).
+
+    Returns the columns, enlarged where necessary, and the new number of events.
+    """
+    base_us = np.int64(math.floor(start_us))
+    longest_us = np.int64(math.ceil(stop_us)) - base_us
     columns = with_room(columns, used, n)
     if columns.exact_us.size:
         columns.exact_us[used : used + n] = pending.exact_us[:n][np.argsort(pending.events[:n], kind="mergesort")]
@@ -72,7 +78,7 @@ def write_in_order(pending, n, base_us, longest_us, columns, used):
     if columns.label.size:
         for i in range(n):
             columns.label[used + i] = pending.in_order[i] & LABEL_MASK
-    tied = used  # a step that does not begin at a whole microsecond can share one with the step before
+    tied = used  # a step that does not start at a whole microsecond can share one with the step before it
     while n > 0 and tied > 0 and columns.t[tied - 1] >= columns.t[used]:
         tied -= 1
     if tied < used:
@@ -82,9 +88,9 @@ def write_in_order(pending, n, base_us, longest_us, columns, used):
 
 @compiled
 def _sort(events, longest_us, in_order):
-    """A counting sort by time, then insertion among events of about the same time."""
+    """Sort by counting over buckets of time, then by insertion within a bucket."""
     shift = TIME_SHIFT
-    while longest_us >> (shift - TIME_SHIFT) >= FINEST_BUCKETS:
+    while longest_us >> (shift - TIME_SHIFT) >= MAX_BUCKETS:
         shift += 1
     starts = np.zeros((longest_us >> (shift - TIME_SHIFT)) + 2, np.int32)
     for i in range(events.size):

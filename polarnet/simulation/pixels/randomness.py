@@ -1,4 +1,4 @@
-"""Counter-based random numbers: a value is a hash of (key, counter), so no order of evaluation can change it."""
+"""Counter-based random numbers: a value is a hash of (key, counter), independent of the order of evaluation."""
 
 import math
 
@@ -11,7 +11,7 @@ MIX_1, MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)  # i
 DIGITS, BYTE_SUMS = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
 DIGITS_MEAN, DIGITS_SCALE = np.float32(60.0), np.float32(1 / math.sqrt(170.0))  # of the sum of eight numbers in 0..15
 
-# Purposes: no two random quantities of one plane share a key.
+# Purposes: each random quantity of a channel has a key of its own.
 THRESHOLD_ON, THRESHOLD_OFF, NOISE_RATE, LEAK_PHASE, LEAK_JITTER, SHOT_NOISE, FIRST_PASSAGE = range(1, 8)
 
 
@@ -25,9 +25,9 @@ def mixed(key, counter):
 
 
 @compiled
-def key_for(key, purpose, plane):
-    """The key of one purpose in one plane, from the key of the sequence."""
-    return mixed(mixed(key, purpose), plane)
+def key_for(key, purpose, channel):
+    """The key of one purpose in one channel, from the key of the sequence."""
+    return mixed(mixed(key, purpose), channel)
 
 
 @inlined
@@ -85,9 +85,9 @@ def normal(u):
 
 
 @compiled
-def normal_map(key, purpose, plane, pixels):
-    """One standard normal number per pixel of a plane, float32."""
-    key = key_for(key, purpose, plane)
+def normal_map(key, purpose, channel, pixels):
+    """One standard normal number per pixel of a channel, float32."""
+    key = key_for(key, purpose, channel)
     values = np.empty(pixels, np.float32)
     for i in range(pixels):
         values[i] = normal(uniform(mixed(key, i)))

@@ -1,38 +1,38 @@
-"""A plane is worked on in strips of whole rows, small enough to stay in the fastest cache."""
+"""Strips of whole rows, small enough for the fastest cache, and flags on their pixels."""
 
 import numpy as np
 
 from polarnet.simulation.compilation import compiled
 
-STRIP = 4000  # pixels, about
+STRIP = 4000  # pixels, approximately
 SPARE = 8  # entries that `flagged` may write beyond the pixels of a strip
 
 
 @compiled
 def rows_of_strip(h, w):
-    """Rows of a strip."""
+    """Number of rows of a strip."""
     return min(h, 1 + STRIP // w)
 
 
 @compiled
 def flag_words(pixels):
-    """A byte for each pixel, eight to a word, all 0."""
+    """One byte per pixel, eight bytes to a word, all 0."""
     return np.zeros((pixels + 7) // 8, np.uint64)
 
 
 @compiled
 def flags_of(words, pixels):
-    """The bytes of the first pixels, to be set to 0 or 1."""
-    words[(pixels - 1) // 8] = 0  # of which the last strip of a plane may leave some unset
+    """The bytes of the first pixels, to be set to 0 or 1 each."""
+    words[(pixels - 1) // 8] = 0  # the last strip may leave bytes of this word unset
     return words.view(np.uint8)[:pixels]
 
 
 @compiled
 def flagged(words, pixels, positions, groups):
-    """Write the positions of the flags that are set, among the first `pixels`, into `positions`; how many they are.
+    """Write the indices of the flags set among the first `pixels` into `positions`; returns their number.
 
-    Which pixels fire is not to be guessed, so there is no branch on it. `groups` is scratch; both hold 8 more entries
-    than there are pixels.
+    There is no branch on a flag, because it would be unpredictable. `groups` is scratch. Both arrays need room for
+    `pixels` + SPARE entries.
     """
     marked = 0
     for group in range((pixels + 7) // 8):

@@ -1,14 +1,16 @@
-"""The pixel of DVS-Voltmeter (Lin et al., ECCV 2022): its voltage is a Brownian motion with drift between thresholds.
+"""The pixel model `dvs_voltmeter` (Lin et al., ECCV 2022): a voltage in Brownian motion with drift between thresholds.
 
 All constants are the paper's, in microseconds and thresholds: an event fires when the voltage has moved by 1. Signal
-and noise are one process, so that events bear no label but SIGNAL.
+and noise are one process, so every event has the label SIGNAL.
 """
 
 import math
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
+from polarnet.ranges import allowed
 from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.columns import SIGNAL
@@ -16,6 +18,7 @@ from polarnet.simulation.pixels.light import intensity_rows
 from polarnet.simulation.pixels.pending import event_of, pending_events, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.randomness import key_for, mixed, normal, uniform
 
+EIGHT_BIT_VIDEO = False
 DRAWS = 3  # random numbers for a passage
 
 
@@ -23,17 +26,17 @@ class Physics(NamedTuple):
     """k1 to k6 of the paper's Eq. 10, fitted to one camera."""
 
     k1: float
-    """drift per relative change of light"""
+    """Drift per relative change of light."""
     k2: float
-    """DN, dark offset"""
+    """Dark offset, DN."""
     k3: float
-    """photon noise"""
+    """Photon noise."""
     k4: float
-    """leak in the dark, per microsecond"""
+    """Leak in the dark, per microsecond."""
     k5: float
-    """leak per DN"""
+    """Leak per DN."""
     k6: float
-    """noise that does not depend on light"""
+    """Noise that does not depend on light."""
 
 
 CAMERAS = {
@@ -42,53 +45,76 @@ CAMERAS = {
 }
 
 
+@dataclass(frozen=True)
+class VoltmeterConfig:
+    """Parameters of DVS-Voltmeter's pixel."""
+
+    voltmeter_camera: str = field(metadata=allowed(choices=tuple(CAMERAS)))
+    """Camera whose fitted constants are used."""
+
+
 class Pixels(NamedTuple):
-    """State of one plane, one array per quantity, [h * w]."""
+    """State of one channel, one array [h * w] per quantity."""
 
     dn: np.ndarray
-    """float32, light of the last frame"""
+    """float32, light of the last frame, DN."""
     voltage: np.ndarray
-    """float64, in thresholds since the last event"""
+    """float64, thresholds since the last event."""
 
 
-def initial(h: int, w: int, physics: Physics, key: np.uint64, plane: int) -> Pixels:
+class Step(NamedTuple):
+    """One step of a channel."""
+
+    physics: Physics
+    start_us: float
+    duration_us: float
+    key: np.uint64
+
+
+def physics_of(config: VoltmeterConfig) -> Physics:
+    """The constants of the configured camera."""
+    return CAMERAS[config.voltmeter_camera]
+
+
+def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
     """Pixels before their first frame."""
-    return Pixels(np.zeros(h * w, np.float32), np.zeros(h * w))
+    return Pixels(np.zeros(height * width, np.float32), np.zeros(height * width))
 
 
 @compiled
-def start(light, pixels, physics, h, w, time_us, key, plane):
-    """The first frame is what the pixels have adapted to."""
-    intensity_rows(light, 0, 0, w, pixels.dn)
+def start(light, pixels, steps):
+    """Adapt the pixels to the first frame; nothing fires."""
+    intensity_rows(light, 0, 0, steps.width, pixels.dn)
 
 
 @compiled
-def advance(light, offset, pixels, physics, h, w, times_us, step, key, plane, columns):
-    """Run steps times_us[k] .. times_us[k + 1] under light[offset + k]; the columns and how many events they hold."""
-    passage_key, used, dn = key_for(key, randomness.FIRST_PASSAGE, plane), 0, np.empty(w, np.float32)
+def advance(light, pixels, steps, columns):
+    """Take the pixels through `steps`; returns the columns with the events, and the number of events."""
+    times_us, h, w = steps.times_us, steps.height, steps.width
+    passage_key, used, dn = key_for(steps.key, randomness.FIRST_PASSAGE, steps.channel), 0, np.empty(w, np.float32)
     pending = pending_events(h * w, columns.exact_us.size > 0)
     for k in range(times_us.size - 1):
-        n, step_key = 0, mixed(passage_key, step + k)
+        n, key = 0, mixed(passage_key, steps.first_number + k)
+        step = Step(steps.physics, times_us[k], times_us[k + 1] - times_us[k], key)
         for y in range(h):
-            intensity_rows(light, offset + k, y, w, dn)
-            pending, n = _walk(pixels, physics, step_key, y, dn, times_us[k], times_us[k + 1], pending, n)
-        base_us = math.floor(times_us[k])
-        longest_us = np.int64(math.ceil(times_us[k + 1]) - base_us)
-        columns, used = write_in_order(pending, n, np.int64(base_us), longest_us, columns, used)
+            intensity_rows(light, steps.first_frame + k, y, w, dn)
+            pending, n = _walk(pixels, step, y, dn, pending, n)
+        columns, used = write_in_order(pending, n, times_us[k], times_us[k + 1], columns, used)
     return columns, used
 
 
 @compiled
-def _walk(pixels, physics, step_key, y, dn, start_us, stop_us, pending, n):
-    """Let the voltages of row y pass from threshold to threshold through a step."""
-    dt, base_us = stop_us - start_us, math.floor(start_us)
+def _walk(pixels, step, y, dn, pending, n):
+    """Move the voltages of row y from threshold to threshold through a step; returns the pending events."""
+    physics, start_us, dt = step.physics, step.start_us, step.duration_us
+    base_us = math.floor(start_us)
     for x in range(dn.size):
         i = y * dn.size + x
         before, after = np.float64(pixels.dn[i]), np.float64(dn[x])
         mean = (before + after) / 2
         drift = physics.k1 * (after - before) / dt / (mean + physics.k2) + physics.k4 + physics.k5 * mean
         noise = physics.k3 * math.sqrt(mean) / (mean + physics.k2) + physics.k6
-        pixel_key, draw, now, voltage, place = mixed(step_key, i), 0, 0.0, pixels.voltage[i], place_of(y, x)
+        pixel_key, draw, now, voltage, place = mixed(step.key, i), 0, 0.0, pixels.voltage[i], place_of(y, x)
         while True:
             on = uniform(mixed(pixel_key, draw)) < chance_of_on(drift, noise, 1 - voltage, 1 + voltage)
             distance = 1 - voltage if on else 1 + voltage
@@ -112,7 +138,7 @@ def _walk(pixels, physics, step_key, y, dn, start_us, stop_us, pending, n):
 
 @compiled
 def chance_of_on(drift, noise, above, below):
-    """Probability that a voltage `above` under the ON and `below` over the OFF threshold meets the ON one first."""
+    """Probability that the ON threshold, `above` the voltage, is met before the OFF threshold, `below` it."""
     if drift == 0:
         return 0.5
     scale = 2 * drift / (noise * noise)
@@ -122,9 +148,9 @@ def chance_of_on(drift, noise, above, below):
 
 @compiled
 def first_passage(distance, drift, noise, bits_1, bits_2):
-    """Time in which a Brownian motion covers a distance: inverse Gaussian, by Michael, Schucany and Haas (1976).
+    """Time until a Brownian motion has covered a distance: inverse Gaussian, by Michael, Schucany and Haas (1976).
 
-    Against the drift it is conditional on arriving at all; the normal number then has to lie in its lower tail.
+    Against the drift, the time is conditional on arrival; the normal number then lies in its lower tail.
     """
     shape, u = (distance / noise) ** 2, uniform(bits_1)
     if drift == 0:

@@ -10,16 +10,11 @@ from skimage import data
 from polarnet.events.stream import validate
 from polarnet.simulation.emulator import emulate
 from polarnet.simulation.motion import HARMONICS, Sine, Trajectory, render
+from polarnet.simulation.moving_sensor import emulate_motion, emulate_motion_steps, emulation_times_us
 from polarnet.simulation.pixels.light import intensity_rows
 from polarnet.simulation.presets import SENSORS
+from polarnet.simulation.rendering import lights_of_drift, render_intensities
 from polarnet.simulation.scene import scene_from_rgb
-from polarnet.simulation.synthesize import (
-    _lights_of_drift,
-    render_intensities,
-    render_times_us,
-    synthesize_sequence,
-    synthesize_steps,
-)
 from polarnet.stokes import intensities_from_stokes
 
 CONFIG = dataclasses.replace(SENSORS["default"], leak_rate_hz=0.1, shot_noise_rate_hz=1.0)
@@ -28,7 +23,7 @@ H, W = 24, 32
 
 
 def trajectory(roll: float = 0.0, zoom: float = 0.0, speed: float = 150.0) -> Trajectory:
-    """A window that swings 20 px to either side, 8 px up and down, and turns and zooms as asked."""
+    """A sensor that swings 20 px to either side, 8 px up and down, and turns and zooms as asked."""
     rest = [STILL] * (HARMONICS - 1)
     return Trajectory(
         x=60.3,
@@ -55,23 +50,23 @@ def same(a, b) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("t", "x", "y", "p"))
 
 
-def test_the_drifting_window_sees_what_render_sees(scene):
+def test_a_drifting_sensor_sees_what_render_sees(scene):
     t_us = times_us()
     expected = 255 * intensities_from_stokes(render(scene, trajectory(), t_us * 1e-6, H, W))
     pose = trajectory().pose(t_us * 1e-6)
-    for polarizer, light in enumerate(_lights_of_drift(scene, pose, H, W)):
+    for polarizer, light in enumerate(lights_of_drift(scene, pose, H, W)):
         seen = np.empty((len(t_us), H * W), np.float32)
         for k in range(len(t_us)):
             intensity_rows(light, k, 0, W, seen[k])
         assert seen.reshape(-1, H, W) / 255 == pytest.approx(expected[:, polarizer].numpy() / 255, abs=1e-5)
 
 
-def test_the_turning_window_sees_what_render_sees_with_polarizers_that_turn_along(scene):
+def test_a_turning_sensor_sees_what_render_sees_with_polarizers_that_turn_along(scene):
     t_us, turning = times_us(31), trajectory(roll=0.3, zoom=0.2)
     expected = 255 * intensities_from_stokes(render(scene, turning, t_us * 1e-6, H, W)).transpose(0, 1).numpy()
-    seen = render_intensities(scene, turning.pose(t_us * 1e-6), H, W, CONFIG)
+    seen = render_intensities(scene, turning.pose(t_us * 1e-6), H, W, eight_bit=False)
     assert seen == pytest.approx(np.maximum(expected, 0), abs=255e-5)
-    rounded = render_intensities(scene, turning.pose(t_us * 1e-6), H, W, dataclasses.replace(CONFIG, model="v2e"))
+    rounded = render_intensities(scene, turning.pose(t_us * 1e-6), H, W, eight_bit=True)
     assert rounded.dtype == np.uint8
     assert abs(rounded - expected).max() <= 0.501
 
@@ -84,7 +79,7 @@ def test_events_are_those_of_the_rendered_clip(scene, model, turning):
     if model == "v2e":
         frames = (frames + 0.5).to(torch.uint8)
     expected, _ = emulate(frames, torch.from_numpy(times_us()), config, key=5)
-    events, _ = synthesize_steps(scene, path, times_us(), H, W, config, key=5, state=None)
+    events, _ = emulate_motion_steps(scene, path, times_us(), H, W, config, key=5, state=None)
     for ours, theirs in zip(events, expected, strict=True):
         validate(ours)
         assert len(theirs) > 1000
@@ -98,12 +93,12 @@ def test_events_are_those_of_the_rendered_clip(scene, model, turning):
 @pytest.mark.parametrize("turning", [False, True])
 def test_a_sequence_in_pieces_or_on_two_threads_has_the_same_bytes(scene, model, turning):
     path, config = trajectory(roll=0.3 * turning, zoom=0.2 * turning), dataclasses.replace(CONFIG, model=model)
-    whole = synthesize_sequence(scene, path, 200_000, H, W, config, key=5)
-    threaded = synthesize_sequence(scene, path, 200_000, H, W, config, key=5, threads=2)
+    whole = emulate_motion(scene, path, 200_000, H, W, config, key=5)
+    threaded = emulate_motion(scene, path, 200_000, H, W, config, key=5, threads=2)
     assert all(same(a, b) for a, b in zip(whole, threaded, strict=True))
-    t_us, state, pieces = render_times_us(path, 200_000, H, W, config), None, []
+    t_us, state, pieces = emulation_times_us(path, 200_000, H, W, config), None, []
     for first in range(0, len(t_us), 23):
-        events, state = synthesize_steps(scene, path, t_us[first : first + 23], H, W, config, 5, state)
+        events, state = emulate_motion_steps(scene, path, t_us[first : first + 23], H, W, config, 5, state)
         pieces.append(events)
     for polarizer in range(4):
         for name in ("t", "x", "y", "p"):
@@ -112,17 +107,17 @@ def test_a_sequence_in_pieces_or_on_two_threads_has_the_same_bytes(scene, model,
 
 
 def test_v2e_renders_at_regular_times():
-    t_us = render_times_us(trajectory(), 100_000, H, W, dataclasses.replace(CONFIG, model="v2e"))
+    t_us = emulation_times_us(trajectory(), 100_000, H, W, dataclasses.replace(CONFIG, model="v2e"))
     assert t_us.tolist() == [round(k * 1e6 / 300) for k in range(31)]
 
 
 def test_a_rate_that_does_not_divide_the_duration_ends_with_it():
     config = dataclasses.replace(CONFIG, model="v2e", render_rate_hz=100.0)
-    assert render_times_us(trajectory(), 25_000, H, W, config).tolist() == [0, 10_000, 20_000, 25_000]
+    assert emulation_times_us(trajectory(), 25_000, H, W, config).tolist() == [0, 10_000, 20_000, 25_000]
 
 
 def test_exact_renders_as_often_but_when_pixels_meet():
-    t_us = render_times_us(trajectory(), 200_000, H, W, CONFIG)
+    t_us = emulation_times_us(trajectory(), 200_000, H, W, CONFIG)
     assert len(t_us) == 61
     assert (t_us[0], t_us[-1]) == (0, 200_000)
     assert abs(t_us - times_us()).max() <= 1e6 / 300 / 2
@@ -138,7 +133,7 @@ def test_an_adaptive_rate_takes_steps_of_at_most_a_pixel(model):
     config = dataclasses.replace(CONFIG, model=model, render_rate_hz=None)
     path = trajectory(roll=0.3, zoom=0.2, speed=250.0)
     for motion in (path, trajectory()):
-        t_us = render_times_us(motion, 500_000, H, W, config)
+        t_us = emulation_times_us(motion, 500_000, H, W, config)
         pose = motion.pose(t_us * 1e-6)
         corner = np.hypot(H - 1, W - 1) / 2
         moved = np.hypot(np.diff(pose.x), np.diff(pose.y)) * pose.zoom[1:]
@@ -147,16 +142,16 @@ def test_an_adaptive_rate_takes_steps_of_at_most_a_pixel(model):
         assert (t_us[0], t_us[-1]) == (0, 500_000)
 
 
-def test_a_window_that_stands_still_is_still_looked_at_thirty_times_a_second():
+def test_a_sensor_that_stands_still_is_rendered_thirty_times_a_second():
     still = Trajectory(60.0, 40.0, (STILL,) * HARMONICS, (STILL,) * HARMONICS, STILL, STILL, speed_px_s=0.0)
-    t_us = render_times_us(still, 1_000_000, H, W, dataclasses.replace(CONFIG, render_rate_hz=None))
+    t_us = emulation_times_us(still, 1_000_000, H, W, dataclasses.replace(CONFIG, render_rate_hz=None))
     assert np.diff(t_us) == pytest.approx(1e6 / 30, abs=1)
 
 
-def test_a_window_that_leaves_the_scene_is_refused_with_its_place(scene):
+def test_a_sensor_that_leaves_the_scene_is_refused_with_its_place(scene):
     far = dataclasses.replace(trajectory(), x=100.0)
     with pytest.raises(ValueError, match=r"reaches rows .* of a scene of 80x120; use a trajectory made for this scene"):
-        synthesize_sequence(scene, far, 200_000, H, W, CONFIG, key=5)
+        emulate_motion(scene, far, 200_000, H, W, CONFIG, key=5)
 
 
 def test_exact_needs_few_frames_for_the_times_of_many(scene):
@@ -165,7 +160,7 @@ def test_exact_needs_few_frames_for_the_times_of_many(scene):
         refractory_period_us=0.0,
     )  # fmt: skip
     many, few = (
-        synthesize_sequence(scene, trajectory(), 200_000, H, W, dataclasses.replace(config, render_rate_hz=rate), key=5)
+        emulate_motion(scene, trajectory(), 200_000, H, W, dataclasses.replace(config, render_rate_hz=rate), key=5)
         for rate in (4800.0, 300.0)
     )
     errors = []

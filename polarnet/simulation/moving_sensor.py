@@ -1,0 +1,84 @@
+"""Events of a sensor behind four polarizers that moves over a scene, without a clip of frames in between."""
+
+import functools
+
+import numpy as np
+from jaxtyping import Int64
+
+from polarnet.events.stream import Events
+from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, emulate_lights, events_of
+from polarnet.simulation.motion import Pose, Trajectory
+from polarnet.simulation.pixels.columns import Columns
+from polarnet.simulation.pixels.light import light_of_frames
+from polarnet.simulation.rendering import check_inside, drifts, lights_of_drift, render_intensities, render_times_us
+from polarnet.simulation.scene import PolarizationScene
+
+CHANNELS = (0, 1, 2, 3)  # behind the polarizers at 0, 45, 90 and 135 degrees
+CHUNK = 16  # frames that are rendered before their events are made, where the sensor turns or zooms
+
+
+def emulate_motion(
+    scene: PolarizationScene,
+    trajectory: Trajectory,
+    duration_us: int,
+    height: int,
+    width: int,
+    config: EmulatorConfig,
+    key: int,
+    threads: int = 1,
+) -> list[Events]:
+    """Events of the four channels of a sensor of height x width pixels that moves over a scene for `duration_us`.
+
+    Times count from the start of the motion. `key` (64 bits) seeds the mismatch of the pixels and all noise.
+    """
+    t_us = emulation_times_us(trajectory, duration_us, height, width, config)
+    events, _ = emulate_motion_steps(scene, trajectory, t_us, height, width, config, key, None, threads)
+    return events
+
+
+def emulation_times_us(
+    trajectory: Trajectory, duration_us: int, height: int, width: int, config: EmulatorConfig
+) -> Int64[np.ndarray, " n"]:
+    """Times of the frames that the configured pixel model sees: see `render_times_us`."""
+    regular = MODELS[config.model].EIGHT_BIT_VIDEO
+    return render_times_us(trajectory, duration_us, height, width, config.render_rate_hz, regular)
+
+
+def emulate_motion_steps(
+    scene: PolarizationScene,
+    trajectory: Trajectory,
+    t_us: Int64[np.ndarray, " n"],
+    height: int,
+    width: int,
+    config: EmulatorConfig,
+    key: int,
+    state: SensorState | None,
+    threads: int = 1,
+) -> tuple[list[Events], SensorState]:
+    """As `emulate_motion`, for light rendered at times `t_us`; hand the state back to continue from there.
+
+    The light on a sensor that only drifts is rendered row by row as its pixels need it. The light on one that turns
+    or zooms is rendered a few frames at a time. Both interpolate the scene's Stokes parameters as `motion.render` does.
+    ValueError where the sensor leaves the scene.
+    """
+    if len(t_us) == 0 or (np.diff(t_us) <= 0).any():
+        raise ValueError(f"expected at least one time, and strictly increasing times, got {t_us[:5].tolist()}...")
+    pose = trajectory.pose(t_us * 1e-6)
+    check_inside(scene, pose, t_us, height, width)
+    advance = functools.partial(
+        emulate_lights, height=height, width=width, config=config, key=key, channels=CHANNELS, threads=threads
+    )
+    if drifts(pose):
+        columns, state = advance(lights_of_drift(scene, pose, height, width), t_us.astype(np.float64), state=state)
+        return [events_of(c, height, width) for c in columns], state
+    pieces = []
+    for first in range(0, len(t_us), CHUNK):
+        chunk = slice(first, first + CHUNK)
+        chunk_pose = Pose(*(values[chunk] for values in pose))
+        frames = render_intensities(scene, chunk_pose, height, width, MODELS[config.model].EIGHT_BIT_VIDEO)
+        lights = [light_of_frames(frames[channel]) for channel in CHANNELS]
+        columns, state = advance(lights, t_us[chunk].astype(np.float64), state=state)
+        pieces.append(columns)
+    joined = [Columns(*map(np.concatenate, zip(*channel, strict=True))) for channel in zip(*pieces, strict=True)]
+    assert state is not None  # there was at least one time
+    return [events_of(c, height, width) for c in joined], state

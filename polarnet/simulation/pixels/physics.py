@@ -1,0 +1,98 @@
+"""Parameters and formulas that the pixel models share: contrast thresholds, photoreceptor, leak and shot noise of v2e.
+
+Formulas and constants are those of v2e (Hu, Liu, Delbruck, CVPRW 2021).
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from polarnet.ranges import allowed
+from polarnet.simulation.compilation import inlined
+from polarnet.simulation.pixels import randomness
+
+THRESHOLD_FLOOR = 0.01  # natural-log intensity: v2e clips drawn thresholds here
+DARK_OFFSET = 20.0  # DN: bandwidth and shot noise follow (DN + 20) / 275
+SATURATION = 275.0
+SHOT_NOISE_SLOPE = 0.75  # shot noise falls by this fraction from dark to bright
+DARK_SHOT_NOISE = 1 - SHOT_NOISE_SLOPE * DARK_OFFSET / SATURATION  # fraction of the nominal rate at 0 DN
+
+
+@dataclass(frozen=True)
+class PixelConfig:
+    """Parameters of v2e's pixel. Contrast thresholds are steps of natural-log intensity."""
+
+    contrast_threshold_on: float = field(metadata=allowed(low=0.01, high=10))
+    contrast_threshold_off: float = field(metadata=allowed(low=0.01, high=10))
+    contrast_threshold_sigma: float = field(metadata=allowed(low=0))
+    """Standard deviation between pixels, drawn for each channel."""
+    cutoff_hz: float = field(metadata=allowed(low=0))
+    """Bandwidth of the photoreceptor at full brightness, less in the dark; 0: infinite."""
+    leak_rate_hz: float = field(metadata=allowed(low=0))
+    """ON events per second of a pixel that sees no change."""
+    leak_jitter: float = field(metadata=allowed(low=0, high=1))
+    """Relative standard deviation of the leak: in each frame for `v2e`, in each interval of events for `exact`."""
+    noise_rate_cov_decades: float = field(metadata=allowed(low=0))
+    """Spread of the leak rate between pixels, as a power of ten."""
+    shot_noise_rate_hz: float = field(metadata=allowed(low=0))
+    """Noise events per second of a pixel in the dark, ON and OFF together; a quarter of it at full brightness."""
+    refractory_period_us: float = field(metadata=allowed(low=0))
+
+
+class Physics(NamedTuple):
+    """`PixelConfig` for compiled kernels, in v2e's units."""
+
+    threshold_on: float
+    threshold_off: float
+    threshold_sigma: float
+    cutoff_hz: float
+    leak_rate_hz: float
+    leak_jitter: float
+    noise_rate_cov_decades: float
+    shot_noise_rate_hz: float
+    refractory_s: float
+
+
+def physics_of(config: PixelConfig) -> Physics:
+    """The parameters of `config`, with the refractory period in seconds."""
+    return Physics(
+        config.contrast_threshold_on,
+        config.contrast_threshold_off,
+        config.contrast_threshold_sigma,
+        config.cutoff_hz,
+        config.leak_rate_hz,
+        config.leak_jitter,
+        config.noise_rate_cov_decades,
+        config.shot_noise_rate_hz,
+        config.refractory_period_us * 1e-6,
+    )
+
+
+def threshold_maps(physics: Physics, pixels: int, key: np.uint64, channel: int) -> tuple[np.ndarray, np.ndarray]:
+    """ON and OFF thresholds of the pixels of a channel, float32: normally distributed, at least `THRESHOLD_FLOOR`."""
+    on = _threshold_map(physics.threshold_on, physics.threshold_sigma, pixels, key, randomness.THRESHOLD_ON, channel)
+    off = _threshold_map(physics.threshold_off, physics.threshold_sigma, pixels, key, randomness.THRESHOLD_OFF, channel)
+    return on, off
+
+
+def _threshold_map(nominal: float, sigma: float, pixels: int, key: np.uint64, purpose: int, channel: int) -> np.ndarray:
+    if sigma == 0:
+        return np.full(pixels, nominal, np.float32)
+    deviations = randomness.normal_map(key, purpose, channel, pixels)
+    return np.maximum(np.float32(nominal) + np.float32(sigma) * deviations, np.float32(THRESHOLD_FLOOR))
+
+
+def leak_factor_map(physics: Physics, pixels: int, key: np.uint64, channel: int) -> np.ndarray:
+    """Leak rates of the pixels of a channel relative to the nominal rate, float32: log-normally distributed."""
+    cov_decades = physics.noise_rate_cov_decades
+    if cov_decades == 0:
+        return np.ones(pixels, np.float32)
+    exponents = randomness.normal_map(key, randomness.NOISE_RATE, channel, pixels)
+    return np.float32(10) ** (np.float32(cov_decades) * exponents)
+
+
+@inlined
+def shot_noise_fraction(dn):
+    """Shot-noise rate at `dn` relative to the nominal rate: 0.95 in the dark, 0.25 at 255 DN."""
+    return 1 - SHOT_NOISE_SLOPE * (np.float64(dn) + DARK_OFFSET) / SATURATION

@@ -1,0 +1,149 @@
+"""Light that a moving sensor sees behind four polarizers: when it is rendered, and its values at those times."""
+
+import itertools
+import math
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from polarnet.simulation.compilation import compiled, forget_stale_code
+from polarnet.simulation.motion import Pose, Trajectory, bilinear, sensor_to_scene
+from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_scene
+from polarnet.simulation.scene import PolarizationScene
+from polarnet.stokes import POLARIZER_ANGLES_DEG, behind_polarizer
+
+MIN_RATE_HZ = 30.0  # of an adaptive rate, for a sensor that stands still
+SAMPLES_PER_STEP = 8  # of the motion, for each pixel it moves
+STEP_SLACK = 1e-3  # pixels by which a step may be longer than one
+
+
+def render_times_us(
+    trajectory: Trajectory, duration_us: int, height: int, width: int, rate_hz: float | None, regular: bool
+) -> Int64[np.ndarray, " n"]:
+    """Times of the rendered frames, from 0 to `duration_us`: `rate_hz` a second.
+
+    Without a rate, there is a frame whenever the sensor has moved by a pixel, and at least 30 a second.
+    Between two pixels of the scene light changes smoothly, and at each pixel its slope jumps. A drifting sensor meets
+    the pixels of the scene with all its own at once. Unless times are to be `regular`, the frame nearest to each
+    such moment is moved there.
+    """
+    samples = 2 + math.ceil(SAMPLES_PER_STEP * duration_us * 1e-6 * max(trajectory.speed_px_s, MIN_RATE_HZ))
+    sampled_us = np.linspace(0, duration_us, samples)
+    pose = trajectory.pose(sampled_us * 1e-6)
+    kinks_us = np.empty(0) if regular else _pixel_crossings(pose, sampled_us, height, width)
+    if rate_hz is None:
+        times = _adaptive_times(pose, sampled_us, kinks_us, height, width)
+    else:
+        even = np.arange(math.ceil(duration_us * 1e-6 * rate_hz) + 1) * (1e6 / rate_hz)
+        times, nearest = even.copy(), np.rint(kinks_us * 1e-6 * rate_hz).astype(int)
+        inner = (nearest > 0) & (nearest < len(even) - 1)
+        times[nearest[inner]] = kinks_us[inner]
+    times[-1] = duration_us
+    return np.unique(np.minimum(np.rint(times), duration_us).astype(np.int64))
+
+
+def _adaptive_times(
+    pose: Pose,
+    sampled_us: Float64[np.ndarray, " n"],
+    kinks_us: Float64[np.ndarray, " k"],
+    height: int,
+    width: int,
+) -> Float64[np.ndarray, " m"]:
+    """Times between which no corner moves by more than a sensor pixel, through all `kinks_us`."""
+    moved = np.hypot(*np.diff(np.stack(_corners(pose, height, width)), axis=-1)).max(axis=0)
+    steps = np.maximum(moved * np.maximum(pose.zoom[1:], pose.zoom[:-1]), MIN_RATE_HZ * 1e-6 * np.diff(sampled_us))
+    progress = np.concatenate([[0], np.cumsum(steps)])
+    anchors = np.unique(np.concatenate([[0, progress[-1]], np.interp(kinks_us, sampled_us, progress)]))
+    pieces = [np.linspace(a, b, 1 + math.ceil(b - a - STEP_SLACK)) for a, b in itertools.pairwise(anchors)]
+    return np.interp(np.concatenate(pieces), progress, sampled_us)
+
+
+def _pixel_crossings(
+    pose: Pose, sampled_us: Float64[np.ndarray, " n"], height: int, width: int
+) -> Float64[np.ndarray, " m"]:
+    """Times at which the pixels of a drifting sensor lie on rows or columns of the scene; none if it turns or zooms."""
+    if not drifts(pose):
+        return np.empty(0)
+    crossings = []
+    for place in (pose.x - (width - 1) / 2, pose.y - (height - 1) / 2):
+        before, after = place[:-1], place[1:]
+        k = np.flatnonzero(np.floor(before) != np.floor(after))
+        line = np.maximum(np.floor(before[k]), np.floor(after[k]))
+        crossings.append(
+            sampled_us[k] + (line - before[k]) / (after[k] - before[k]) * (sampled_us[k + 1] - sampled_us[k])
+        )
+    return np.sort(np.concatenate(crossings))
+
+
+def drifts(pose: Pose) -> bool:
+    """Whether the sensor never turns or zooms."""
+    return bool((pose.angle == 0).all() and (pose.zoom == 1).all())
+
+
+def render_intensities(
+    scene: PolarizationScene, pose: Pose, height: int, width: int, eight_bit: bool
+) -> UInt8[np.ndarray, "4 n h w"] | Float32[np.ndarray, "4 n h w"]:
+    """Digital numbers behind the four polarizers for any motion; uint8, rounded, if `eight_bit`."""
+    forget_stale_code()
+    frames = np.empty((4, len(pose.x), height, width), np.uint8 if eight_bit else np.float32)
+    _render(np.ascontiguousarray(scene.stokes.numpy()), pose.x, pose.y, pose.angle, pose.zoom, frames)
+    return frames
+
+
+@compiled
+def _render(stokes, x, y, angle, zoom, frames) -> None:  # pragma: no cover (compiled)
+    height, width = frames.shape[2:]
+    half, rounding = np.float32(FULL_SCALE / 2), np.float32(0.5 if frames.itemsize == 1 else 0.0)
+    for k in range(len(x)):
+        left, top, along, across = sensor_to_scene(x[k], y[k], angle[k], zoom[k], height, width)
+        cos, sin = np.float32(math.cos(2 * angle[k])), np.float32(math.sin(2 * angle[k]))
+        for row in range(height):
+            for column in range(width):
+                at_x = left + column * along - row * across
+                at_y = top + column * across + row * along
+                s0 = bilinear(stokes[0], at_x, at_y)
+                s1, s2 = bilinear(stokes[1], at_x, at_y), bilinear(stokes[2], at_x, at_y)
+                # the polarizers roll with the camera
+                for channel, part in enumerate((s1 * cos + s2 * sin, s2 * cos - s1 * sin)):
+                    frames[channel, k, row, column] = max(half * (s0 + part), np.float32(0)) + rounding
+                    frames[channel + 2, k, row, column] = max(half * (s0 - part), np.float32(0)) + rounding
+
+
+def lights_of_drift(scene: PolarizationScene, pose: Pose, height: int, width: int) -> list[Light]:
+    """Light behind the four polarizers of a sensor that only drifts, over the part of the scene that it sees."""
+    left, top = pose.x - (width - 1) / 2, pose.y - (height - 1) / 2
+    rows, columns = _visible(top, height, scene.height), _visible(left, width, scene.width)
+    # numpy: torch's threads would wait for more work on the cores that the channels' threads are about to use
+    s0, s1, s2 = scene.stokes[:, rows, columns].numpy()
+    lights = []
+    for angle in POLARIZER_ANGLES_DEG:
+        intensity = np.maximum(behind_polarizer(s0, s1, s2, math.radians(angle)), 0) * FULL_SCALE
+        intensity = np.pad(intensity, (0, 1), mode="edge")
+        lights.append(light_of_scene(intensity, top - rows.start, left - columns.start))
+    return lights
+
+
+def _visible(first: Float64[np.ndarray, " n"], size: int, limit: int) -> slice:
+    """Rows or columns of a scene that a sensor needs, given the places of its first row or column and its size."""
+    return slice(math.floor(first.min()), min(math.floor(first.max()) + size + 1, limit))
+
+
+def _corners(pose: Pose, height: int, width: int) -> tuple[Float64[np.ndarray, "4 n"], Float64[np.ndarray, "4 n"]]:
+    """Columns and rows of the scene under the sensor's corner pixels."""
+    across = np.array([[-1], [1], [-1], [1]]) * (width - 1) / 2 / pose.zoom
+    down = np.array([[-1], [-1], [1], [1]]) * (height - 1) / 2 / pose.zoom
+    cos, sin = np.cos(pose.angle), np.sin(pose.angle)
+    return pose.x + across * cos - down * sin, pose.y + across * sin + down * cos
+
+
+def check_inside(scene: PolarizationScene, pose: Pose, t_us: Int64[np.ndarray, " n"], height: int, width: int) -> None:
+    """ValueError that names the first time at which the sensor leaves the scene."""
+    x, y = _corners(pose, height, width)
+    outside = ((x < 0) | (x > scene.width - 1) | (y < 0) | (y > scene.height - 1)).any(axis=0)
+    if outside.any():
+        k = int(outside.argmax())
+        raise ValueError(
+            f"at {t_us[k]} us a sensor of {height}x{width} pixels reaches rows {y[:, k].min():.1f} to "
+            f"{y[:, k].max():.1f}, columns {x[:, k].min():.1f} to {x[:, k].max():.1f} of a scene of "
+            f"{scene.height}x{scene.width}; use a trajectory made for this scene and sensor"
+        )
