@@ -45,21 +45,21 @@ def intensity_rows(light, frame, row, width, dn):
     for r in range(dn.size // width):
         target = dn[r * width : (r + 1) * width]
         if light.top.size:
-            _bilinear_row(light.images[0], light.top[frame] + (row + r), light.left[frame], target)
+            _bilinear_row(light.images, light.top[frame] + (row + r), light.left[frame], target)
         else:
             target[:] = light.images[frame, row + r]
 
 
 @compiled
-def _bilinear_row(scene, row, column, dn):
+def _bilinear_row(images, row, column, dn):
     i, j, w = math.floor(row), math.floor(column), dn.size
     down, right = np.float32(row - i), np.float32(column - j)
     one = np.float32(1)
     w00, w01 = (one - down) * (one - right), (one - down) * right
     w10, w11 = down * (one - right), down * right
     # four slices with one index: the compiler vectorises these, and not offsets of one slice
-    a, b = scene[i, j : j + w], scene[i, j + 1 : j + 1 + w]
-    c, d = scene[i + 1, j : j + w], scene[i + 1, j + 1 : j + 1 + w]
+    a, b = images[0, i, j : j + w], images[0, i, j + 1 : j + 1 + w]
+    c, d = images[0, i + 1, j : j + w], images[0, i + 1, j + 1 : j + 1 + w]
     for x in range(w):
         dn[x] = (w00 * a[x] + w01 * b[x]) + (w10 * c[x] + w11 * d[x])
 
