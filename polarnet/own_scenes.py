@@ -8,9 +8,8 @@ from typing import Any
 from polarnet.benchmarking import context_of, lpips_record, made_set, mapper_of
 from polarnet.config import Config
 from polarnet.evaluation.benchmark import run_benchmark, train_mean_dolp, write_benchmark
-from polarnet.evaluation.methods import METHODS, Context, weights_used, why_absent
+from polarnet.evaluation.rows import available, weights_used
 from polarnet.events.frames import FrameStore
-from polarnet.fingerprint import reach
 from polarnet.reports.set_page import write_set_page
 from polarnet.runtime import threads_of
 from polarnet.similarity import Lpips
@@ -44,8 +43,9 @@ def benchmark_folder(
     notes = _skipped(config, work)
     train_mean = _train_mean(config)
     wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
-    context = context_of(config, train_mean or 0.0, weights or shipped_weights())
-    methods = [method for method in wanted if _runs(method, context, train_mean, notes)]
+    context = context_of(config, train_mean, weights or shipped_weights())
+    methods, left_out = available(wanted, context)
+    notes += [f"{row} was left out: {reason}" for row, reason in left_out.items()]
     lpips, record = _lpips_if_there(config)
     settings = dataclasses.replace(config.benchmark, methods=methods)
     test_set = made_set(root.resolve().name, work)
@@ -70,17 +70,6 @@ def _train_mean(config: Config) -> float | None:
     """Of the pipeline's training split; None where the pipeline has not made it."""
     frames = Path(config.paths.frames)
     return train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None
-
-
-def _runs(method: str, context: Context, train_mean: float | None, notes: list[str]) -> bool:
-    """Whether all is there that a method needs; adds to `notes` what is not."""
-    if reason := why_absent(method, context):
-        notes.append(f"{method} was left out: {reason}; run `dvc repro` for what it trains.")
-        return False
-    if train_mean is None and "train_mean" in reach(METHODS[method], type(context)).fields:  # type: ignore[arg-type]
-        notes.append(f"{method} was left out: the training split is not there; run `dvc repro synthesize`.")
-        return False
-    return True
 
 
 def _lpips_if_there(config: Config) -> tuple[Lpips | None, dict[str, Any]]:

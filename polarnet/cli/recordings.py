@@ -151,7 +151,7 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.config import load
     from polarnet.events.streaming import WindowRule, parse_window
     from polarnet.recordings.recording import read_recording
-    from polarnet.recover import Arrangement, facts_of, open_files, open_live, open_stream, recover
+    from polarnet.recover import Arrangement, facts_of, open_files, open_live, open_method, recover
     from polarnet.reports.recovery import RecoveryWriter
     from polarnet.stokes import parse_mosaic
 
@@ -162,7 +162,7 @@ def _recover(options: argparse.Namespace) -> int:
     if step_events is not None:
         raise ValueError(f"--step: expected a time such as 0.1ms, got {options.step}")
     rule = WindowRule(length_us, events, step_us)
-    stream, words = open_stream(options.method, options.weights, options.device, options.precision, config)
+    recoverer, words = open_method(options.method, options.weights, options.device, options.precision, config)
     name = "live" if options.live else Path(options.input[0]).stem
     out = options.out or Path("outputs") / "recover" / name
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
@@ -175,7 +175,7 @@ def _recover(options: argparse.Namespace) -> int:
         size = (options.size[0], options.size[1]) if options.size else None
         source = open_files([Path(path) for path in options.input], arrangement, read, size, out / "work", config)
     writer = RecoveryWriter(out, options.write or ("zarr", "png", "mp4"), options.video_rate)
-    summary = recover(source, rule, stream, writer)
+    summary = recover(source, rule, recoverer, writer)
     facts = facts_of(source, rule, words, summary)
     for key, value in facts.items():
         print(f"{key:11s} {value}")

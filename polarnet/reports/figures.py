@@ -1,9 +1,8 @@
 """Figures drawn with matplotlib: comparison panels, training curves, how scores spread over scenes.
 
-A figure is returned, not shown, and `png` writes it without a date or software name: same input, same bytes.
+A figure is returned, not shown; `polarnet.reports.png` writes it.
 """
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,17 +14,15 @@ from cycler import cycler
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from torch import Tensor
 
 from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image
-from polarnet.reports.tables import COLUMNS, METHODS, TRIVIAL, in_order
+from polarnet.reports.png import png
+from polarnet.reports.tables import COLUMNS, colour_of, label_of, with_structure
 from polarnet.similarity import mse, psnr
-
-DOTS_PER_INCH = 160
 
 
 @dataclass(frozen=True)
@@ -42,22 +39,8 @@ class Theme:
 LIGHT = Theme(text="#1c2330", quiet="#667085", grid="#e4e7ec", face="#ffffff")
 DARK = Theme(text="#e6e9ef", quiet="#98a2b3", grid="#313947", face="#161b24")
 
-METHOD_COLOURS = {
-    "zeros": "#98a2b3",
-    "train_mean": "#98a2b3",
-    "oracle_mean": "#98a2b3",
-    "cf": "#e08a1e",
-    "highpass": "#b0851f",
-    "e2v": "#3d8fd9",
-    "e2vid": "#2f6fb0",
-    "firenet": "#3d8fd9",
-    "e2p": "#7a5cc4",
-    "ours": "#d6336c",
-}
 TERMS = {"mse": "MSE", "mae": "MAE", "ssim": "1 - SSIM", "lpips": "LPIPS"}
 """Terms of a loss as a legend shows them."""
-
-OTHER_COLOUR = "#4aa37c"
 
 
 class PanelScene(NamedTuple):
@@ -85,15 +68,6 @@ class ReliabilityLine(NamedTuple):
     curve: Sequence[tuple[float, float, int]]
 
 
-def png(figure: Figure) -> bytes:
-    """The figure as PNG bytes that depend on nothing but what is drawn."""
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure)
-    compression = {"compress_level": 9}
-    figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None}, pil_kwargs=compression)
-    return buffer.getvalue()
-
-
 def comparison_panel(rows: Sequence[PanelScene], path: Path, theme: Theme = LIGHT) -> None:
     """Write a picture like the paper's Fig. 10: a row a scene; events, truth and each method; MSE and PSNR below.
 
@@ -101,7 +75,7 @@ def comparison_panel(rows: Sequence[PanelScene], path: Path, theme: Theme = LIGH
     """
     if not rows:
         raise ValueError("a comparison panel needs at least one scene, got none")
-    methods = [method for method in in_order(rows[0].recovered) if method not in TRIVIAL]
+    methods = with_structure(rows[0].recovered)
     height, width = rows[0].truth.shape
     grid = _TileGrid(len(rows), 2 + len(methods), tile_width=1.35, aspect=height / width)
     figure = _figure(grid.size, theme)
@@ -110,7 +84,7 @@ def comparison_panel(rows: Sequence[PanelScene], path: Path, theme: Theme = LIGH
         full_scale = event_full_scale(row.events)
         tiles = [(event_image(row.events[0], full_scale), ""), (dolp_image(row.truth), "")]
         tiles += [(dolp_image(row.recovered[m]), score_line(row.recovered[m], row.truth)) for m in methods]
-        headings = ["events, 0°", "true DoLP", *(METHODS.get(m, m) for m in methods)]
+        headings = ["events, 0°", "true DoLP", *(label_of(m) for m in methods)]
         for j, ((picture, below), heading) in enumerate(zip(tiles, headings, strict=True)):
             axes = figure.add_axes(grid.rectangle(i, j))
             show_picture(axes, picture, theme)
@@ -166,7 +140,7 @@ def score_distribution(per_scene: Mapping[str, Mapping[str, Sequence[float]]], t
             if metric == "mse":
                 axes.set_xscale("log")  # errors of good and bad methods differ by an order of magnitude
                 _plain_log_ticks(axes.xaxis)
-            axes.set_yticks(range(len(methods)), [METHODS.get(m, m) for m in methods])
+            axes.set_yticks(range(len(methods)), [label_of(m) for m in methods])
             axes.set_ylim(len(methods) - 0.4, -0.6)
             axes.grid(axis="y", visible=False)
             axes.tick_params(axis="y", length=0)
@@ -180,10 +154,7 @@ def reliability_figure(curves: Mapping[str, Sequence[tuple[float, float, int]]],
     """
     figure = _figure((3.4, 3.2), theme)
     with matplotlib.rc_context(chart_style(theme)):
-        lines = [
-            ReliabilityLine(METHODS.get(method, method), METHOD_COLOURS.get(method, OTHER_COLOUR), curve)
-            for method, curve in curves.items()
-        ]
+        lines = [ReliabilityLine(label_of(method), colour_of(method), curve) for method, curve in curves.items()]
         draw_reliability(figure.add_subplot(), lines, theme)
     figure.tight_layout()
     return figure
@@ -309,7 +280,7 @@ def _strip(axes: Axes, position: int, values: Sequence[float], method: str, them
     known = np.array([value for value in values if np.isfinite(value)])
     if len(known) == 0:
         return
-    colour = METHOD_COLOURS.get(method, OTHER_COLOUR)
+    colour = colour_of(method)
     axes.boxplot(
         known, positions=[position], orientation="horizontal", widths=0.62, whis=(0, 100), patch_artist=True,
         manage_ticks=False,

@@ -6,29 +6,24 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, SetResults, read_artefacts
-from polarnet.reports.figures import (
-    PanelScene,
-    comparison_panel,
-    dolp_bar,
-    png,
-    training_curves,
-)
+from polarnet.reports.figures import PanelScene, comparison_panel, dolp_bar, training_curves
 from polarnet.reports.maps import (
     encode_jpeg,
     encode_png,
     hue_wheel,
 )
 from polarnet.reports.overview import overview_figure
+from polarnet.reports.png import png
 from polarnet.reports.provenance import Run
 from polarnet.reports.tables import (
     COLUMNS,
     COSTS,
     ERROR_PARTS,
-    METHODS,
     PAPER_COMPARABILITY,
     PAPER_SOURCE,
     SET_TITLES,
     Scores,
+    label_of,
     paired_lines,
     paper_table,
     score_table,
@@ -163,7 +158,7 @@ def _cards(metrics: Scores) -> list[Card]:
     for key, label in CARDS.items():
         column = COLUMNS[key]
         others = [m for m in ("e2v", "oracle_mean" if column.ranked else "cf") if m in metrics]
-        rivals = [f"{METHODS[m]} {column.printed(metrics[m][key])}" for m in others]
+        rivals = [f"{label_of(m)} {column.printed(metrics[m][key])}" for m in others]
         cards.append(Card(label, column.printed(metrics["ours"][key]) + column.unit, ", ".join(rivals)))
     return cards
 

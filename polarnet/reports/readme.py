@@ -24,9 +24,9 @@ from polarnet.reports.study_tables import (
 from polarnet.reports.tables import (
     COLUMNS,
     COSTS,
-    METHODS,
     SET_TITLES,
     as_markdown,
+    label_of,
     paired_lines,
     score_table,
     standing,
@@ -86,7 +86,7 @@ def benchmark_block(results: Mapping[str, Any]) -> str:
         lines += [as_markdown(score_table(results[name], about["lpips_reason"], {**COLUMNS, **COSTS})), ""]
         lines += [f"- {line}" for line in paired_lines(results["paired"][name])]
         gains = [
-            f"{METHODS[row]} {results[name][f'{row}+gain']['psnr'] - scores['psnr']:+.2f} dB"
+            f"{label_of(row)} {results[name][f'{row}+gain']['psnr'] - scores['psnr']:+.2f} dB"
             for row, scores in results[name].items()
             if f"{row}+gain" in results[name]
         ]

@@ -11,14 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from polarnet.reports.figures import (
-    METHOD_COLOURS,
-    OTHER_COLOUR,
     ReliabilityLine,
     Theme,
     chart_style,
     draw_reliability,
 )
-from polarnet.reports.tables import METHODS, SET_TITLES, in_order
+from polarnet.reports.tables import SET_TITLES, colour_of, in_order, label_of
 
 PAPER_EVENTS_PER_PIXEL = 1.04  # at which the paper's recovery is good (section 5)
 SETTING_LABELS = {
@@ -48,7 +46,7 @@ def event_budget_figure(results: Mapping[str, Any], theme: Theme) -> Figure:
                     [entry[metric] for entry in entries],
                     marker=marker,
                     markersize=3.5,
-                    color=METHOD_COLOURS["ours"],
+                    color=colour_of("ours"),
                     linestyle="-" if carry else ":",
                     label="state carried on" if carry else "each window alone",
                 )
@@ -79,8 +77,8 @@ def sensitivity_figure(results: Mapping[str, Sequence[Mapping[str, Any]]], theme
                         [entry["scores"][method][metric] for entry in entries],
                         marker="o",
                         markersize=3,
-                        color=METHOD_COLOURS.get(method, OTHER_COLOUR),
-                        label=METHODS.get(method, method),
+                        color=colour_of(method),
+                        label=label_of(method),
                     )
                 axes[row][column].set_xticks(range(len(entries)), [f"{entry['value']:g}" for entry in entries])
             axes[1][column].set_xlabel(SETTING_LABELS.get(setting, setting), fontsize=7)
@@ -119,8 +117,8 @@ def _lines(
             [entry[y] for entry in entries],
             marker="o",
             markersize=3,
-            color=METHOD_COLOURS.get(method, OTHER_COLOUR),
-            label=METHODS.get(method, method),
+            color=colour_of(method),
+            label=label_of(method),
         )
 
 

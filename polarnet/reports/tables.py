@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
+from polarnet.evaluation.references import REFERENCES
+from polarnet.evaluation.rows import ROWS
+
 Scores = Mapping[str, Mapping[str, Any]]
 """Method, then metric: data/benchmark/metrics.json. None where there is no value; `<metric>_ci` holds an interval."""
 
@@ -56,34 +59,8 @@ COSTS = {
 }
 """What a method costs on the machine of the run."""
 
-METHODS = {
-    "zeros": "zeros",
-    "train_mean": "training mean",
-    "oracle_mean": "oracle mean",
-    "cf": "CF",
-    "highpass": "high-pass",
-    "cf+gain": "CF, gains solved",
-    "highpass+gain": "high-pass, gains solved",
-    "e2v": "E2V",
-    "e2v+gain": "E2V, gains solved",
-    "e2vid": "E2VID",
-    "e2vid+gain": "E2VID, gains solved",
-    "e2vid_published": "E2VID, published weights",
-    "e2vid_published+gain": "E2VID, published weights, gains solved",
-    "firenet": "FireNet",
-    "firenet+gain": "FireNet, gains solved",
-    "firenet_published": "FireNet, published weights",
-    "firenet_published+gain": "FireNet, published weights, gains solved",
-    "firenetplus_published": "FireNet+, published weights",
-    "firenetplus_published+gain": "FireNet+, published weights, gains solved",
-    "e2p": "E2P",
-    "paper": "the paper's network",
-    "ours": "ours",
-}
-"""Readable names, in the order of every table: first what needs no events, then the peers, then the network."""
-
-TRIVIAL = ("zeros", "train_mean", "oracle_mean")
-"""Methods whose answer is one value everywhere."""
+OTHER_COLOUR = "#4aa37c"
+"""Colour of rows of older results that no method has any more."""
 
 SET_TITLES = {
     "simulated": "Simulated",
@@ -146,17 +123,32 @@ class Table(NamedTuple):
     notes: tuple[str, ...]
 
 
-def in_order(methods: Iterable[str]) -> list[str]:
-    """Methods in the order of every table and figure; those that METHODS does not name come last."""
-    given = list(methods)
-    return [m for m in METHODS if m in given] + [m for m in given if m not in METHODS]
+def in_order(rows: Iterable[str]) -> list[str]:
+    """Rows in the order of every table and figure; unknown ones, of older results, come last."""
+    given = list(rows)
+    return [name for name in ROWS if name in given] + [name for name in given if name not in ROWS]
+
+
+def label_of(row: str) -> str:
+    """A row's name in tables and figures; its key where it is unknown."""
+    return ROWS[row].label if row in ROWS else row
+
+
+def colour_of(row: str) -> str:
+    """A row's colour in figures."""
+    return ROWS[row].colour if row in ROWS else OTHER_COLOUR
+
+
+def with_structure(rows: Iterable[str]) -> list[str]:
+    """Rows in order, without the references, whose prediction is one value everywhere."""
+    return [name for name in in_order(rows) if name not in REFERENCES]
 
 
 def score_table(
     scores: Scores, lpips_reason: str | None = None, columns: Mapping[str, Column] = MappingProxyType(COLUMNS)
 ) -> Table:
     """Scores of the methods in the fixed order; a metric that no method has gets no column, except LPIPS when
-    `lpips_reason` says why it is missing. Methods this module has no name for follow under their own key.
+    `lpips_reason` says why it is missing. Unknown methods follow under their own key.
     """
     if not scores:
         raise ValueError("a table needs the scores of at least one method, got none")
@@ -170,7 +162,7 @@ def score_table(
     rows = tuple(
         Row(
             method,
-            METHODS.get(method, method),
+            label_of(method),
             tuple(
                 _cell(columns[key], scores[method].get(key), scores[method].get(f"{key}_ci"), best[key]) for key in keys
             ),
@@ -217,16 +209,16 @@ def standing(scores: Scores) -> list[str]:
     if "ours" not in scores:
         return []
     return [
-        f"ours against {label}: " + ", ".join(differences) + "."
-        for rival, label in METHODS.items()
-        if rival in scores and rival != "ours" and (differences := _differences(scores["ours"], scores[rival]))
+        f"ours against {label_of(rival)}: " + ", ".join(differences) + "."
+        for rival in in_order(scores)
+        if rival in ROWS and rival != "ours" and (differences := _differences(scores["ours"], scores[rival]))
     ]
 
 
 def paired_lines(paired: Mapping[str, Mapping[str, Mapping[str, Any]]], metric: str = "mse") -> list[str]:
     """How `ours` does scene by scene against each other method, from details.json's `paired`; a sentence each."""
     return [
-        f"{METHODS.get(rival, rival)}: ours is better in {one['better']} of {one['scenes']} scenes "
+        f"{label_of(rival)}: ours is better in {one['better']} of {one['scenes']} scenes "
         f"(effect {one['effect']:+.2f}, p = {one['p_holm']:.2g})."
         for rival in in_order(paired)
         if (one := paired[rival].get(metric))

@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
 
 from polarnet.reports.artefacts import Panel
-from polarnet.reports.figures import DARK, LIGHT, Theme, png, reliability_figure, score_distribution, score_line
+from polarnet.reports.figures import DARK, LIGHT, Theme, reliability_figure, score_distribution, score_line
 from polarnet.reports.maps import (
     dolp_image,
     encode_png,
@@ -20,7 +20,8 @@ from polarnet.reports.maps import (
     intensity_image,
     polarization_hsv,
 )
-from polarnet.reports.tables import METHODS, TRIVIAL, in_order
+from polarnet.reports.png import png
+from polarnet.reports.tables import in_order, label_of, with_structure
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 DISTRIBUTION_METRICS = ("mse", "psnr", "ssim", "corr")
@@ -58,11 +59,11 @@ def panel_tiles(panel: Panel) -> list[Tile]:
         tile(event_image(panel.events[0], full_scale), "events, 0°", f"{panel.t_us / 1000:.0f} ms"),
         tile(dolp_image(panel.truth_dolp), "truth"),
     ]
-    methods = [method for method in in_order(panel.dolp) if method not in TRIVIAL]
+    methods = with_structure(panel.dolp)
     return tiles + [
         tile(
             dolp_image(panel.dolp[method]),
-            METHODS.get(method, method),
+            label_of(method),
             score_line(panel.dolp[method], panel.truth_dolp),
         )
         for method in methods
@@ -79,7 +80,7 @@ def polarization_tiles(panel: Panel) -> list[Tile]:
         tile(polarization_hsv(s0, panel.truth_dolp, panel.truth_aolp), "truth"),
     ]
     return tiles + [
-        tile(polarization_hsv(s0, panel.dolp[method], panel.aolp[method]), METHODS.get(method, method), "with true S0")
+        tile(polarization_hsv(s0, panel.dolp[method], panel.aolp[method]), label_of(method), "with true S0")
         for method in in_order(panel.aolp)
     ]
 
