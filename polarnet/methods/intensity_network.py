@@ -12,7 +12,7 @@ from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.intensities import from_intensities
 from polarnet.methods.method import Recoverer, Setup, State, weights_file
-from polarnet.methods.postprocessing import PostprocessingConfig, postprocessed
+from polarnet.methods.postprocessing import PostprocessingConfig, stretched, unsharp_masked
 from polarnet.networks.checkpoint import load_checkpoint, load_tensors
 from polarnet.stokes import Prediction
 
@@ -38,18 +38,18 @@ def intensity_network(
     through the post-processing of published weights; otherwise they are on their true scale and only clipped.
     """
     network = load(weights_file(setup)).to(setup.device)
-    shown = setup.postprocessing if published else None
+    postprocessing = setup.postprocessing if published else None
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        inner, raw = state
+        inner, sharp = state
         images = []
         for window in windows:
             grids = voxel_grids(window, network.bins).to(setup.device)
             with setup.autocast():
                 intensity, inner = network(normalise_nonzero(grids) if normalised else grids, inner)
             images.append(intensity.float())
-        intensities, raw = _displayed(torch.stack(images), raw, shown)
-        return (inner, raw), from_intensities(intensities)
+        intensities, sharp = _displayed(torch.stack(images), sharp, postprocessing)
+        return (inner, sharp), from_intensities(intensities)
 
     def start(height: int, width: int) -> State:
         return None, torch.zeros(0, 4, height, width, device=setup.device)
@@ -65,9 +65,9 @@ def voxel_grids(window: EventWindow, bins: int) -> Float[Tensor, "4 bins h w"]:
 def _displayed(
     images: Float[Tensor, "n 4 h w"], before: Float[Tensor, "m 4 h w"], config: PostprocessingConfig | None
 ) -> tuple[Float[Tensor, "n 4 h w"], Float[Tensor, "k 4 h w"]]:
-    """Intensities in [0, 1] of n images that follow m, and the images that the next ones need for their range."""
+    """Intensities in [0, 1] of n images that follow m, and the images that the range of the next ones depends on."""
     if config is None:
         return images.clamp(0, 1), before
-    raw = torch.cat([before, images])
+    sharp = torch.cat([before, unsharp_masked(images, config.unsharp_amount, config.unsharp_sigma)])
     kept = config.auto_hdr_frames - 1 if config.auto_hdr else 0
-    return postprocessed(raw, config)[len(before) :], raw[max(0, len(raw) - kept) :]
+    return stretched(sharp, config)[len(before) :], sharp[len(sharp) - min(kept, len(sharp)) :]

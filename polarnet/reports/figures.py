@@ -21,7 +21,7 @@ from torch import Tensor
 
 from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image
 from polarnet.reports.png import png
-from polarnet.reports.tables import COLUMNS, colour_of, label_of, with_structure
+from polarnet.reports.tables import COLUMNS, colour_of, in_order, label_of, with_structure
 from polarnet.similarity import mse, psnr
 
 

@@ -61,8 +61,8 @@ def test_scores_and_costs_come_back_to_the_last_bit(cache, sequence):
 
 
 def test_sequences_that_are_gone_are_forgotten(cache, sequence):
-    for sequence in ("a", "b"):
-        cache.write_prediction("m", sequence, "key", Prediction(sequence.dolp))
+    for name in ("a", "b"):
+        cache.write_prediction("m", name, "key", Prediction(sequence.dolp))
     cache.write_cost("m", "key", Cost(1.0, None, 0, 0.0))
     cache.forget(["b"])
     assert sorted(path.name for path in cache.folder.glob("*/*")) == ["b.npz", "cost.json"]
