@@ -12,6 +12,7 @@ from polarnet.methods.method import Setup
 from polarnet.methods.postprocessing import PostprocessingConfig
 from polarnet.methods.stokes_gain import GainConfig
 from polarnet.networks.checkpoint import save_checkpoint
+from polarnet.networks.cista_tc import CistaTc
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
 from polarnet.networks.e2p import E2p
 from polarnet.networks.e2vid import E2vid
@@ -82,6 +83,8 @@ def checkpoints(tmp_path_factory):
     for name, build in {"firenet": FireNet, "firenetplus": FireNet, "e2vid": E2vid}.items():
         files[f"{name}_published"] = folder / f"{name}.pth.tar"
         torch.save({"state_dict": build(5).state_dict()}, files[f"{name}_published"])
+    files["cista_tc"] = folder / "cista_tc.pth.tar"
+    torch.save({"state_dict": CistaTc(5).state_dict()}, files["cista_tc"])
     return files
 
 
