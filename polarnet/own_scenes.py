@@ -10,6 +10,7 @@ from polarnet.config import Config
 from polarnet.evaluation.benchmark import run_benchmark, train_mean_dolp, write_benchmark
 from polarnet.evaluation.rows import available, weights_used
 from polarnet.events.frames import FrameStore
+from polarnet.methods import METHODS
 from polarnet.reports.set_page import write_set_page
 from polarnet.runtime import threads_of
 from polarnet.similarity import Lpips
@@ -45,7 +46,9 @@ def benchmark_folder(
     wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
     context = context_of(config, train_mean, weights or shipped_weights())
     methods, left_out = available(wanted, context)
-    notes += [f"{row} was left out: {reason}" for row, reason in left_out.items()]
+    for row, reason in left_out.items():
+        trained = "; run `dvc repro` for what it trains" if row in METHODS else ""
+        notes.append(f"{row} was left out: {reason}{trained}.")
     lpips, record = _lpips_if_there(config)
     settings = dataclasses.replace(config.benchmark, methods=methods)
     test_set = made_set(root.resolve().name, work)

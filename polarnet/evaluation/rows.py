@@ -10,6 +10,7 @@ from torch import Tensor
 
 from polarnet.evaluation.references import REFERENCES, Reference
 from polarnet.evaluation.sequences import TestSequence
+from polarnet.events.streaming import EventWindow
 from polarnet.methods import METHODS
 from polarnet.methods.method import (
     Method,
@@ -64,7 +65,7 @@ def predictions_of(names: Sequence[str], sequence: TestSequence, context: Contex
     return {name: each_map(predictions[name]._replace(stokes=None, intensities=None), Tensor.cpu) for name in names}
 
 
-def run(recoverer: Recoverer, windows: Sequence) -> Prediction:
+def run(recoverer: Recoverer, windows: Sequence[EventWindow]) -> Prediction:
     """A method over consecutive windows from the start, one at a time, as events come from a camera."""
     first = windows[0].channels[0]
     state: State = recoverer.start(first.height, first.width)

@@ -14,7 +14,9 @@ def _assembled() -> dict[str, Method]:
     modules = [importlib.import_module(f"{__name__}.{name}") for _, name, _ in pkgutil.iter_modules(__path__)]
     records = [method for module in modules for method in getattr(module, "METHODS", ())]
     records.sort(key=lambda method: (method.weights is not None, not method.reconstructs))
-    return {method.name: method for method in records}
+    by_name = {method.name: method for method in records}
+    assert len(by_name) == len(records), f"two methods have one name: {[method.name for method in records]}"
+    return by_name
 
 
 METHODS = _assembled()

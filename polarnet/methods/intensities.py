@@ -1,11 +1,13 @@
 """DoLP from reconstructed intensities, and the wrapper NAME+gain, which first solves the gains of the polarizers."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Method, Recoverer, Setup, State
 from polarnet.methods.stokes_gain import consistent
 from polarnet.stokes import Prediction, aolp, dolp, stokes_from_intensities
@@ -41,7 +43,7 @@ def with_gain(method: Method) -> Method:
         def start(height: int, width: int) -> State:
             return inner.start(height, width), None
 
-        def predict(state: State, windows) -> tuple[State, Prediction]:
+        def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
             state, images = state
             state, prediction = inner.step(state, windows)
             images, prediction = convert(setup, images, prediction)
