@@ -16,7 +16,7 @@ help:
 
 setup: $(READY)
 
-$(READY): pyproject.toml constraints.txt .ci/setup
+$(READY): pyproject.toml constraints.txt .ci/lpips.txt .ci/setup
 	@.ci/setup "$(PYTHON)" "$(VENV)"
 	@touch $(READY)
 
@@ -24,7 +24,7 @@ repro: setup
 	dvc repro
 
 test: setup
-	python -m pytest -n 2 --dist loadfile
+	python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 lint: setup
 	ruff check .

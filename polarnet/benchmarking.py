@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from polarnet.evaluation.benchmark import BenchmarkSet, run_benchmark, train_mea
 from polarnet.evaluation.rows import Context, available, weights_used
 from polarnet.events.frames import FrameStore
 from polarnet.events.store import EventStore
+from polarnet.lpips import NO_RECORD, stored_record
 from polarnet.methods import METHODS
 from polarnet.methods.method import Method, Setup
 from polarnet.runtime import device_of
@@ -73,19 +73,26 @@ def set_folder(config: Config, name: str) -> Path:
     return folder if name == "simulated" else folder / "sets" / name
 
 
-def run_pipeline_benchmark(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
+def run_pipeline_benchmark(config: Config, lpips: Lpips | None) -> dict[str, dict[str, dict[str, Any]]]:
     """Run all of `benchmark.sets` and write what each gave; set, then method: the metrics.
 
-    Real targets are one more set, `RECORDINGS`, while `recordings.enabled` is true.
+    Real targets are one more set, `RECORDINGS`, while `recordings.enabled` is true. `lpips` is that of `lpips_of`.
     """
     (Path(config.paths.benchmark) / "sets").mkdir(parents=True, exist_ok=True)
     tests = {name: pipeline_set(config, name) for name in config.benchmark.sets}
     if config.recordings.enabled:
         tests[RECORDINGS] = made_set(RECORDINGS, Path(config.paths.calibrated))
-    return {name: run_on(config, test_set, set_folder(config, name)) for name, test_set in tests.items()}
+    return {name: run_on(config, test_set, lpips, set_folder(config, name)) for name, test_set in tests.items()}
 
 
-def run_on(config: Config, test_set: BenchmarkSet, folder: Path) -> dict[str, dict[str, Any]]:
+def lpips_of(config: Config) -> Lpips | None:
+    """The table's LPIPS, from what stage `weights` left; None where it is no column. ValueError where it left none."""
+    if not config.benchmark.lpips:
+        return None
+    return Lpips.load(config.paths.weights, "benchmark", config.benchmark.lpips_backbone)
+
+
+def run_on(config: Config, test_set: BenchmarkSet, lpips: Lpips | None, folder: Path) -> dict[str, dict[str, Any]]:
     """Run the methods whose weights are there on a set, write what they gave to `folder`; method: the metrics."""
     train_mean = train_mean_dolp(FrameStore.open(config.paths.frames), config.benchmark.warmup_windows)
     context = context_of(config, train_mean)
@@ -93,11 +100,11 @@ def run_on(config: Config, test_set: BenchmarkSet, folder: Path) -> dict[str, di
     for method, reason in left_out.items():
         print(f"{method} is left out: {reason}")
     settings = dataclasses.replace(config.benchmark, methods=methods)
-    lpips, mapper = Lpips.load(config.paths.weights), mapper_of(config, test_set.name)
+    mapper = mapper_of(config, test_set.name)
     benchmark = run_benchmark(test_set, context, settings, lpips, cache_of(config), mapper)
     about = {
         "set": test_set.name,
-        "lpips": lpips_record(config),
+        "lpips": stored_record(config.paths.weights, "benchmark") if settings.lpips else NO_RECORD,
         "train_mean": train_mean,
         "left_out": left_out,
         "weights": weights_used(methods, context),
@@ -109,8 +116,3 @@ def run_on(config: Config, test_set: BenchmarkSet, folder: Path) -> dict[str, di
 def cache_of(config: Config) -> Path:
     """Where predictions and scores are kept between runs."""
     return Path(config.paths.cache) / "benchmark"
-
-
-def lpips_record(config: Config) -> dict[str, Any]:
-    """What the stage weights found: backbone, sha256, source, and the reason where there are none."""
-    return json.loads((Path(config.paths.weights) / "lpips.json").read_text())

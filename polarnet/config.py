@@ -1,8 +1,11 @@
 """The typed schema of params.yaml and conf/: what a stage gets, checked before anything runs."""
 
 import dataclasses
+import fnmatch
 import functools
+import logging
 import os
+import re
 import sys
 import typing
 from collections.abc import Callable
@@ -12,10 +15,13 @@ from typing import Any, TypeVar
 
 import hydra
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from polarnet.evaluation.score import BenchmarkConfig
-from polarnet.lpips import LpipsConfig, lpips_problem
+from polarnet.experiments import preset_names, preset_values
+from polarnet.lpips import BACKBONES, PURPOSES, Purpose, is_stored
+from polarnet.lpips_weights import LpipsConfig, local_source
 from polarnet.methods import METHODS
 from polarnet.methods.postprocessing import PostprocessingConfig
 from polarnet.methods.stokes_gain import GainConfig
@@ -36,6 +42,8 @@ from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
+EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # below the project, where DVC runs queued experiments
+CHOICES = re.compile(r"(?:glob\()?([^()=]*)\)?")
 
 Stage = Callable[["Config"], None]
 T = TypeVar("T")
@@ -86,6 +94,7 @@ class Paths:
     frames: str
     events: str
     weights: str
+    baselines: str
     train: str
     train_e2v: str
     train_e2p: str
@@ -135,6 +144,17 @@ class Config:
         for key, crop in crops.items():
             if crop is not None and (crop[0] > window[0] or crop[1] > window[1]):
                 raise ValueError(f"{key}: expected at most the window of section synthesize, {window}, got {crop}")
+        e2v, e2p, loss = self.baselines.e2v, self.baselines.e2p, self.lpips.backbone
+        compared = (
+            ("loss.lpips", self.loss.lpips > 0, loss, self.train.crop),
+            ("baselines.e2v.lpips", e2v.lpips > 0, loss, e2v.crop),
+            ("baselines.e2p.lpips", max(e2p.lpips, e2p.intensity_lpips) > 0, loss, e2p.crop),
+            ("benchmark.lpips", self.benchmark.lpips, self.benchmark.lpips_backbone, None),
+        )
+        for key, used, backbone, crop in compared:
+            side, size = BACKBONES[backbone].least_side, crop or window
+            if used and min(size) < side:
+                raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {size}")
 
     @property
     def network_config(self) -> NetworkConfig:
@@ -149,11 +169,18 @@ def typed(node: DictConfig) -> Config:
 
 
 def load(root: Path, overrides: list[str] | None = None) -> Config:
-    """The configuration that the project at `root` would run with, outside any Hydra application."""
+    """The configuration that the project at `root` would run with, outside any Hydra application.
+
+    Raises ValueError where `check_keys` does, for a value out of range, and for an ablation that changes nothing.
+    """
+    overrides = overrides or []
+    check_keys(root, overrides)
     os.environ[ROOT_VARIABLE] = str(root)
     register_schema()
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(root / "conf")):
-        return typed(hydra.compose("config", overrides=overrides or []))
+        config = typed(hydra.compose("config", overrides=overrides))
+        _check_ablation(root, config, overrides)
+    return config
 
 
 def register_schema() -> None:
@@ -164,47 +191,164 @@ def register_schema() -> None:
 def check_keys(root: Path, overrides: list[str]) -> None:
     """Raise a ValueError for the first key of params.yaml or of `overrides` that is not a setting, listing those there.
 
-    Hydra refuses such a key as well, but does not say which ones there are.
+    The same for a group's choice (`experiment`, `sensor`, `ablation`) that has no file in conf/. Hydra refuses both as
+    well; the message here names the keys and choices there are.
     """
     params = OmegaConf.to_container(OmegaConf.load(root / "params.yaml"))
     for key in _leaves(params):
         _check_key(key, "params.yaml")
     groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
     for override in overrides:
-        key = override.split("=", 1)[0].lstrip("+~").split("@")[0]
-        if key not in groups and not key.startswith(("hydra.", "hydra/", "paths.data")):
+        key, _, value = override.partition("=")
+        key = key.lstrip("+~").split("@")[0]
+        if key in groups:
+            _check_choices(root, key, value)
+        elif not key.startswith(("hydra.", "hydra/", "paths.data")):
             _check_key(key, "command line")
 
 
 def hydra_stage(main: Stage) -> Callable[[], None]:
     """Make `main(config)` a Hydra command line: composes, checks, sets up the runtime, then runs it.
 
-    Refuses, before anything runs, a key that does not exist, a wrong type, a value out of range, and an experiment
-    that requires LPIPS weights nobody has put in place.
+    Refuses, before anything runs, a key or choice that does not exist, a wrong type, a value out of range, an ablation
+    that changes nothing, and a configuration with LPIPS on a machine without its weights.
     """
-    root = Path(sys.modules[main.__module__].__file__ or "").resolve().parent.parent
+    root = _root_of(main)
+
+    @functools.wraps(main)
+    def checked(node: DictConfig) -> None:
+        config = or_exit(lambda: typed(node))
+        or_exit(lambda: _check_ablation(root, config, list(HydraConfig.get().overrides.task)))
+        if _file_of(main).stem != "weights":  # which searches and may download
+            or_exit(lambda: _check_lpips(config))
+        configure(config.runtime, config.seed)
+        main(config)
+
+    return hydra_command(checked)
+
+
+def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
+    """Make `main(node)` a Hydra command line that refuses unknown keys and choices; `node` is composed, not checked.
+
+    Warnings of Python and its packages go to Hydra's log beside those of polarnet.
+    """
+    root = _root_of(main)
     os.environ[ROOT_VARIABLE] = str(root)
     register_schema()
+    run = hydra.main(version_base="1.3", config_path=str(root / "conf"), config_name="config")(main)
 
     def command_line() -> None:
         overrides = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
-        _or_exit(lambda: check_keys(root, overrides))
+        or_exit(lambda: check_keys(root, overrides))
+        logging.captureWarnings(True)
         run()
 
-    @functools.wraps(main)
-    def checked(node: DictConfig) -> Any:
-        config = _or_exit(lambda: typed(node))
-        _or_exit(lambda: _check_lpips(config))
-        configure(config.runtime, config.seed)
-        return main(config)
-
-    run = hydra.main(version_base="1.3", config_path=str(root / "conf"), config_name="config")(checked)
     return command_line
 
 
+def input_folder(key: str, folder: str) -> Path:
+    """The folder that setting `key` names; SystemExit in one line where it holds no file of a user's.
+
+    In the copy of the workspace that DVC makes for a queued experiment the line says how the files get there.
+    """
+    files = (path for path in Path(folder).rglob("*") if path.is_file() and not path.name.startswith("."))
+    if any(path.name != "README.md" and path.suffix != ".dvc" for path in files):
+        return Path(folder)
+    project, copy, _ = str(Path.cwd()).partition(EXPERIMENT_COPY)
+    advice = f"put your files there, or set {key} to another folder"
+    if copy:
+        advice = (
+            "a queued DVC experiment runs in a copy of the workspace without untracked files; queue it with "
+            f"-S {key}={Path(project) / folder}, or `dvc add` your files in a folder below {folder} first"
+        )
+    raise SystemExit(f"{key}={folder}: no files there; {advice}")
+
+
+def _root_of(main: Callable[..., None]) -> Path:
+    """The project whose folder `stages` holds the module of `main`."""
+    return _file_of(main).parent.parent
+
+
+def _file_of(main: Callable[..., None]) -> Path:
+    return Path(sys.modules[main.__module__].__file__ or "").resolve()
+
+
+def with_lpips(config: Config, purpose: Purpose, use: Callable[[str, str | None], T]) -> T | None:
+    """What `use` makes of a purpose's LPIPS, its backbone and weights file; None where the purpose needs no LPIPS.
+
+    A ValueError of `use` gets the keys that ask for LPIPS before it, and the overrides that do without behind it.
+    """
+    e2v, e2p = config.baselines.e2v, config.baselines.e2p
+    weights = {
+        "loss.lpips": config.loss.lpips,
+        "baselines.e2v.lpips": e2v.lpips,
+        "baselines.e2p.lpips": e2p.lpips,
+        "baselines.e2p.intensity_lpips": e2p.intensity_lpips,
+    }
+    if purpose == "loss":
+        backbone, asking, off = config.lpips.backbone, [key for key, weight in weights.items() if weight > 0], "0"
+    else:
+        backbone, off = config.benchmark.lpips_backbone, "false"
+        asking = ["benchmark.lpips"] if config.benchmark.lpips else []
+    if not asking:
+        return None
+    try:
+        return use(backbone, config.lpips.path_of(backbone))
+    except ValueError as error:
+        without = " ".join(f"{key}={off}" for key in asking)
+        raise ValueError(f"{', '.join(asking)}: {error}; to go without: {without}") from None
+
+
 def _check_lpips(config: Config) -> None:
-    if config.lpips.required and (problem := lpips_problem(config.lpips, config.paths.weights)):
-        raise ValueError(f"lpips.required is true: {problem}")
+    """ValueError where stage `weights` has not found what this configuration needs, and would have to download it."""
+
+    def look(purpose: Purpose, backbone: str, path: str | None) -> bool:
+        return is_stored(config.paths.weights, purpose, backbone) or bool(local_source(backbone, path))
+
+    for purpose in PURPOSES:
+        with_lpips(config, purpose, functools.partial(look, purpose))
+
+
+def _check_choices(root: Path, group: str, value: str) -> None:
+    """ValueError where a name or pattern for `group`, alone, in a list or in glob(...), matches no file.
+
+    Whatever else Hydra can read, such as choice(...), Hydra refuses itself.
+    """
+    known = preset_names(root, group)
+    plain = CHOICES.fullmatch(value)
+    for name in (word.strip("[]'\" ") for word in (plain[1].split(",") if plain else [])):
+        if not fnmatch.filter(["null", *known], name):
+            raise ValueError(f"{group}: there is no {name!r}; conf/{group} has {', '.join(known)}")
+
+
+def _check_ablation(root: Path, config: Config, overrides: list[str]) -> None:
+    """ValueError where the chosen ablation leaves the configuration in use as it is without it.
+
+    `nothing` is the baseline of a sweep and may. Call this where Hydra is initialised.
+    """
+    chosen = dict(override.split("=", 1) for override in overrides if "=" in override)
+    name = chosen.get("ablation", "null").strip("'\"")
+    if name in ("null", "nothing"):
+        return
+    others = [override for override in overrides if not override.startswith("ablation=")]
+    without = typed(hydra.compose("config", overrides=others))
+    if _in_use(config) != _in_use(without):
+        return
+    experiment = f"experiment={chosen['experiment']}" if "experiment" in chosen else "params.yaml"
+    reasons = []
+    for key in preset_values(root, "ablation", name):
+        if key.startswith("networks.") and key.split(".")[1] != config.network:
+            reasons.append(f"{key} has no effect on network={config.network}")
+        else:
+            value = functools.reduce(getattr, key.split("."), config)
+            reasons.append(f"{key} is {value} already in {experiment}")
+    raise ValueError(f"ablation={name} changes nothing: {', '.join(reasons)}")
+
+
+def _in_use(config: Config) -> tuple[Any, ...]:
+    """The settings without the sections of networks that `network` does not name."""
+    sections = [getattr(config, field.name) for field in dataclasses.fields(config) if field.name != "networks"]
+    return (*sections, config.network_config)
 
 
 def _check_key(key: str, where: str) -> None:
@@ -225,7 +369,8 @@ def _leaves(values: Any, prefix: str = "") -> list[str]:
     return [leaf for key, value in values.items() for leaf in _leaves(value, f"{prefix}.{key}" if prefix else str(key))]
 
 
-def _or_exit(check: Callable[[], T]) -> T:
+def or_exit(check: Callable[[], T]) -> T:
+    """What `check` gives; ends the program with the sentence of its ValueError."""
     try:
         return check()
     except ValueError as error:

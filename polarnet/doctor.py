@@ -8,7 +8,8 @@ from collections.abc import Iterator
 import psutil
 import torch
 
-from polarnet.lpips import BACKBONES, LpipsConfig, lpips_problem
+from polarnet.lpips import BACKBONES
+from polarnet.lpips_weights import local_source
 from polarnet.runtime import bf16_units, usable_cores
 
 PACKAGES = ("torch", "numpy", "numba", "zarr", "OpenImageIO", "opencv-contrib-python-headless", "scikit-image",
@@ -24,11 +25,17 @@ def findings() -> Iterator[str]:
     yield f"threads    {usable_cores()} cores, torch uses {torch.get_num_threads()}"
     yield f"bf16       {_bf16()}"
     for backbone in BACKBONES:
-        problem = lpips_problem(LpipsConfig(backbone=backbone, path=None, required=False))
-        yield f"LPIPS      {backbone}: {problem or 'weights found'}"
+        yield f"LPIPS      {_lpips(backbone)}"
     memory = psutil.virtual_memory()
     yield f"memory     {memory.available / 2**30:.1f} of {memory.total / 2**30:.1f} GiB free"
     yield f"disk       {shutil.disk_usage('.').free / 2**30:.1f} GiB free here"
+
+
+def _lpips(backbone: str) -> str:
+    try:
+        return f"{backbone}: {local_source(backbone, None)}"
+    except ValueError as error:
+        return str(error)
 
 
 def _version(package: str) -> str:

@@ -1,52 +1,31 @@
-"""LPIPS v0.1, the learned perceptual distance (Zhang et al., CVPR 2018), and where its weights come from.
+"""LPIPS v0.1, the learned perceptual distance (Zhang et al., CVPR 2018).
 
 The backbones are torchvision's classifiers up to the last layer that LPIPS looks at, written out here so that
-torchvision, whose builds often disagree with torch's, is not needed. polarnet ships no weights: see `find_weights`.
+torchvision, whose builds often disagree with torch's, is not needed. Their weights: polarnet/lpips_weights.py.
 """
 
 import hashlib
-import importlib.util
 import json
-import logging
-import socket
-import threading
-import urllib.request
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors.torch import load_file, save
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from polarnet.ranges import allowed, check_ranges
-
-log = logging.getLogger(__name__)
+from polarnet.arrays import Array, as_tensor, check_floating, check_range
 
 SHIFT = (-0.030, -0.088, -0.188)  # of RGB in [-1, 1]; this and SCALE: LPIPS v0.1's scaling layer
 SCALE = (0.458, 0.448, 0.450)
 NORM_FLOOR = 1e-8  # under the root of a feature's length, whose slope at 0 would be infinite
-MODELS_URL = "https://download.pytorch.org/models/"
-REACH_TIMEOUT_S = 3.0  # a machine without a network must not wait
-STALL_TIMEOUT_S = 30.0  # of a download that has begun
 
-
-@dataclass(frozen=True)
-class LpipsConfig:
-    """Section `lpips` of params.yaml."""
-
-    backbone: str = field(metadata=allowed(choices=("squeeze", "alex", "vgg")))
-    """The paper uses vgg; squeeze is the smallest."""
-    path: str | None
-    """Weights file (.pth, .npz or .safetensors; torchvision's keys, with or without LPIPS's heads); null: search."""
-    required: bool
-    """Refuse to run without the weights."""
-
-    def __post_init__(self):
-        check_ranges(self)
+Purpose = Literal["loss", "benchmark"]
+"""What compares images: the losses of the trainings, or the benchmark's table."""
+PURPOSES: tuple[Purpose, ...] = get_args(Purpose)
+NO_RECORD: Mapping[str, str | None] = {"backbone": None, "sha256": None, "source": None}
+"""What is on record of a purpose without LPIPS."""
 
 
 class Fire(nn.Module):
@@ -109,21 +88,17 @@ class Backbone(NamedTuple):
     """At each tap."""
     least_side: int
     """Pixels that an image must have for the last tap to see anything."""
-    file: str
-    """torchvision's name of the weights; its last part begins the file's sha256."""
 
 
 BACKBONES = {
-    "squeeze": Backbone(
-        squeezenet1_1, (2, 5, 8, 10, 11, 12, 13), (64, 128, 256, 384, 384, 512, 512), 17, "squeezenet1_1-b8a52dc0.pth"
-    ),
-    "alex": Backbone(alexnet, (2, 5, 8, 10, 12), (64, 192, 384, 256, 256), 31, "alexnet-owt-7be5be79.pth"),
-    "vgg": Backbone(vgg16, (4, 9, 16, 23, 30), (64, 128, 256, 512, 512), 16, "vgg16-397923af.pth"),
+    "squeeze": Backbone(squeezenet1_1, (2, 5, 8, 10, 11, 12, 13), (64, 128, 256, 384, 384, 512, 512), 17),
+    "alex": Backbone(alexnet, (2, 5, 8, 10, 12), (64, 192, 384, 256, 256), 31),
+    "vgg": Backbone(vgg16, (4, 9, 16, 23, 30), (64, 128, 256, 512, 512), 16),
 }
 
 
 class Lpips(nn.Module):
-    """LPIPS v0.1: differences of unit-length features, weighted per channel. Frozen; gradients reach the images only.
+    """LPIPS v0.1: differences of unit-length features, weighted per channel. Its weights are frozen.
 
     Grey images are repeated to three channels. Under autocast the convolutions run in its precision, features are
     normalised and compared in float32.
@@ -157,27 +132,38 @@ class Lpips(nn.Module):
         return lpips
 
     @classmethod
-    def load(cls, folder: Path | str) -> "Lpips | None":
-        """What stage `weights` left in `folder`; None where it found nothing (lpips.json says why)."""
-        record = json.loads((Path(folder) / "lpips.json").read_text())
-        if record["sha256"] is None:
-            return None
-        file = Path(folder) / "lpips.safetensors"
-        if _sha256(file) != record["sha256"]:
-            raise ValueError(f"{file} is not the file that lpips.json describes; run stage `weights` again")
-        return cls.of(record["backbone"], load_file(file))
+    def load(cls, folder: Path | str, purpose: Purpose, backbone: str) -> "Lpips":
+        """The network that stage `weights` left in `folder` for a purpose; ValueError where it left no such one."""
+        if not is_stored(folder, purpose, backbone):
+            raise ValueError(f"{folder} has no weights of LPIPS ({backbone}) for the {purpose}; run stage `weights`")
+        file = Path(folder) / f"{backbone}.safetensors"
+        with file.open("rb") as content:
+            found = hashlib.file_digest(content, "sha256").hexdigest()
+        if found != stored_record(folder, purpose)["sha256"]:
+            raise ValueError(f"{file} is not the file that {purpose}.json describes; run stage `weights` again")
+        return cls.of(backbone, load_file(file))
 
     def forward(
-        self, a: Float[Tensor, "b h w"] | Float[Tensor, "b 3 h w"], b: Float[Tensor, "b h w"] | Float[Tensor, "b 3 h w"]
+        self,
+        images: Float[Array, "b h w"] | Float[Array, "b 3 h w"],
+        truth: Float[Array, "b h w"] | Float[Array, "b 3 h w"],
     ) -> Float[Tensor, " b"]:
-        """Distance of each pair of images, grey or RGB in [0, 1]; 0 for equal ones."""
-        return self.distance(self.features(a), self.features(b))
+        """Distance of each pair of images, grey or RGB in [0, 1], numpy or torch; 0 for equal ones.
 
-    def features(self, images: Float[Tensor, "b h w"] | Float[Tensor, "b 3 h w"]) -> list[Float[Tensor, "b _c _h _w"]]:
+        Gradients reach `images` alone. ValueError as `features`, and where `truth` is outside [0, 1].
+        """
+        check_range("truth", as_tensor("truth", truth), 0, 1, "images")
+        with torch.no_grad():
+            of_truth = self.features(truth)
+        return self.distance(self.features(images), of_truth)
+
+    def features(self, images: Float[Array, "b h w"] | Float[Array, "b 3 h w"]) -> list[Float[Tensor, "b _c _h _w"]]:
         """Unit-length features of images in [0, 1] at each tap: what to keep of a truth that is compared often.
 
-        ValueError for images too small for the backbone.
+        TypeError for what is no array; ValueError for integers, and for images too small for the backbone.
         """
+        images = as_tensor("images", images)
+        check_floating("images", images)
         least = BACKBONES[self.backbone].least_side
         if min(images.shape[-2:]) < least:
             raise ValueError(
@@ -190,8 +176,8 @@ class Lpips(nn.Module):
         for number, layer in enumerate(self.layers, start=1):
             x = layer(x)
             if number in BACKBONES[self.backbone].taps:
-                found = x.float()
-                tapped.append(found / (found.square().sum(dim=1, keepdim=True) + NORM_FLOOR).sqrt())
+                exact = x.to(torch.promote_types(x.dtype, torch.float32))
+                tapped.append(exact / (exact.square().sum(dim=1, keepdim=True) + NORM_FLOOR).sqrt())
         return tapped
 
     def distance(
@@ -205,166 +191,12 @@ class Lpips(nn.Module):
         return torch.stack(per_tap).sum(dim=0)
 
 
-class Weights(NamedTuple):
-    """What a search for weights found."""
-
-    tensors: dict[str, Tensor] | None
-    source: str | None
-    """Name of the file."""
-    reason: str | None
-    """Why there are none."""
+def stored_record(folder: Path | str, purpose: Purpose) -> Mapping[str, str | None]:
+    """Backbone, sha256 and source of a purpose's weights in the folder of stage `weights`; None each where none are."""
+    file = Path(folder) / f"{purpose}.json"
+    return json.loads(file.read_text()) if file.is_file() else NO_RECORD
 
 
-def find_weights(config: LpipsConfig) -> Weights:
-    """Weights from `config.path`; else torchvision's file from torch's hub cache; else from the network into it.
-
-    LPIPS's heads come from the same file, or else from the torchmetrics wheel.
-    Raises ValueError where `config.path` is given and cannot be used.
-    """
-    if config.path is not None:
-        file = Path(config.path)
-        if not file.is_file():
-            raise ValueError(f"lpips.path: there is no file {file}; correct it, or set it to null to search")
-        return Weights(_checked(config.backbone, _read(file), file), file.name, None)
-    file, name = _cached(config.backbone), BACKBONES[config.backbone].file
-    if not file.is_file() and not _download(MODELS_URL + name, file):
-        return Weights(None, None, f"{name} is not in torch's hub cache and could not be downloaded")
-    if not _sha256(file).startswith(_hash_in(name)):
-        log.warning("%s is damaged: its sha256 does not begin as its name ends; delete it", file)
-        return Weights(None, None, f"{name} in torch's hub cache is damaged")
-    return Weights(_checked(config.backbone, _read(file), file), name, None)
-
-
-def write_weights(folder: Path | str, backbone: str, weights: Weights) -> None:
-    """Write what `Lpips.load` reads: lpips.json, and lpips.safetensors where there are weights.
-
-    No path and no date enters, so that equal weights are equal bytes on every machine.
-    """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    content = save(weights.tensors) if weights.tensors is not None else None
-    file = folder / "lpips.safetensors"
-    file.unlink(missing_ok=True)
-    if content is not None:
-        file.write_bytes(content)
-    record = {
-        "backbone": backbone,
-        "sha256": hashlib.sha256(content).hexdigest() if content is not None else None,
-        "source": weights.source,
-        "reason": weights.reason,
-    }
-    (folder / "lpips.json").write_text(json.dumps(record, indent=2, sort_keys=True) + "\n")
-
-
-def lpips_problem(config: LpipsConfig, folder: Path | str | None = None) -> str | None:
-    """Why stage `weights` would find nothing, and what to do; None where it would, or already did into `folder`.
-
-    Reads no weights and downloads nothing: at most a few seconds for a machine without a network.
-    """
-    if folder is not None and _holds(Path(folder), config.backbone):
-        return None
-    if config.path is not None:
-        return None if Path(config.path).is_file() else f"lpips.path: there is no file {config.path}"
-    if _cached(config.backbone).is_file() or _reachable(MODELS_URL + BACKBONES[config.backbone].file):
-        return None
-    return f"no LPIPS weights; {where_to_put(config.backbone)}"
-
-
-def where_to_put(backbone: str) -> str:
-    """What a user does to supply the weights."""
-    name = BACKBONES[backbone].file
-    return f"put {MODELS_URL}{name} at {_cached(backbone)}, or set lpips.path to a copy of it"
-
-
-def _holds(folder: Path, backbone: str) -> bool:
-    record = folder / "lpips.json"
-    if not record.is_file():
-        return False
-    found = json.loads(record.read_text())
-    return found["backbone"] == backbone and found["sha256"] is not None
-
-
-def _cached(backbone: str) -> Path:
-    return Path(torch.hub.get_dir()) / "checkpoints" / BACKBONES[backbone].file
-
-
-def _hash_in(name: str) -> str:
-    return Path(name).stem.rsplit("-", 1)[1]
-
-
-def _sha256(file: Path) -> str:
-    with file.open("rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()
-
-
-def _read(file: Path) -> dict[str, Tensor]:
-    try:
-        if file.suffix == ".npz":
-            with np.load(file, allow_pickle=False) as arrays:
-                return {name: torch.from_numpy(arrays[name]) for name in arrays.files}
-        if file.suffix == ".safetensors":
-            return load_file(file)
-        return torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # each of three readers raises its own kinds
-        raise ValueError(f"{file.name}: expected weights as .pth, .npz or .safetensors, got {error}") from error
-
-
-def _checked(backbone: str, tensors: Mapping[str, Tensor], file: Path) -> dict[str, Tensor]:
-    """Backbone and heads as LPIPS needs them, without the classifier; ValueError that names the file."""
-    last = BACKBONES[backbone].taps[-1]
-    wanted = {
-        name: value.contiguous()
-        for name, value in tensors.items()
-        if name.startswith("lin") or (name.startswith("features.") and int(name.split(".")[1]) < last)
-    }
-    if not any(name.startswith("lin") for name in wanted):
-        wanted |= _read(_heads_file(backbone))
-    try:
-        Lpips.of(backbone, wanted)
-    except ValueError as error:
-        raise ValueError(f"{file.name}: {error}") from None
-    return wanted
-
-
-def _heads_file(backbone: str) -> Path:
-    """LPIPS v0.1's heads in the torchmetrics wheel, found without importing it (2 s)."""
-    package = importlib.util.find_spec("torchmetrics")
-    for root in (package and package.submodule_search_locations) or []:
-        file = Path(root) / "functional" / "image" / "lpips_models" / f"{backbone}.pth"
-        if file.is_file():
-            return file
-    raise ValueError("LPIPS's heads are not in the installed torchmetrics; install torchmetrics>=1.7")
-
-
-def _reachable(url: str) -> bool:
-    """Whether a server answers for `url`; in a thread, because a name look-up heeds no timeout."""
-    answered: list[bool] = []
-
-    def ask() -> None:
-        try:
-            with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=REACH_TIMEOUT_S):
-                answered.append(True)
-        except OSError:
-            pass
-
-    asking = threading.Thread(target=ask, daemon=True)
-    asking.start()
-    asking.join(REACH_TIMEOUT_S)
-    return bool(answered)
-
-
-def _download(url: str, file: Path) -> bool:
-    """Fetch `url` into torch's hub cache, checking its sha256; False, with a line in the log, where that fails."""
-    if not _reachable(url):
-        return False
-    file.parent.mkdir(parents=True, exist_ok=True)
-    usual = socket.getdefaulttimeout()
-    socket.setdefaulttimeout(STALL_TIMEOUT_S)
-    try:
-        torch.hub.download_url_to_file(url, str(file), hash_prefix=_hash_in(file.name))
-    except (OSError, RuntimeError) as error:
-        log.warning("download of %s failed: %s", url, error)
-        return False
-    finally:
-        socket.setdefaulttimeout(usual)
-    return True
+def is_stored(folder: Path | str, purpose: Purpose, backbone: str) -> bool:
+    """Whether stage `weights` left this backbone in `folder` for this purpose."""
+    return stored_record(folder, purpose)["backbone"] == backbone

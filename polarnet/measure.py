@@ -10,13 +10,16 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from polarnet.reports.figures import LIGHT
+from polarnet.reports.png import png
 from polarnet.reports.provenance import git, processor
+from polarnet.reports.studies import loss_sweep_figure
 from polarnet.runtime import usable_cores
-from polarnet.sweep import sweep_points
+from polarnet.sweep import COLUMNS, mean_scores, sweep_points
 
 VERSIONS_OF = ("torch", "numpy", "numba", "zarr", "dvc", "hydra-core")
 STAGE_STARTS = re.compile(r"Running stage '([\w@]+)'")  # what dvc repro prints
@@ -89,7 +92,7 @@ def measure_pipeline(root: Path) -> Path:
         if again:
             raise RuntimeError(f"a second make repro ran {', '.join(again)}; everything should have been cached")
         record["metrics"] = json.loads((clone / "data" / "benchmark" / "metrics.json").read_text())
-        record["lpips_reason"] = json.loads((clone / "data" / "weights" / "lpips.json").read_text())["reason"]
+        record["lpips"] = json.loads((clone / "data" / "benchmark" / "details.json").read_text())["lpips"]
         shutil.copy(clone / "data" / "report" / "overview.png", root / "docs" / "pictures" / "overview.png")
         path = root / "docs" / "results" / "pipeline.json"
         path.write_text(json.dumps(record, indent=2) + "\n")  # a test that fails does not lose what was measured
@@ -99,8 +102,8 @@ def measure_pipeline(root: Path) -> Path:
 
 
 BENCHMARK_KEYS = (
-    "mse", "psnr", "ssim", "lpips", "level_mse", "pattern_mse", "corr", "grad", "skill", "aolp_deg", "ms_per_window",
-    "gflop", "params", "peak_mib",
+    "mse", "psnr", "ssim", "lpips", "lpips_backbone", "level_mse", "pattern_mse", "corr", "grad", "skill", "aolp_deg",
+    "ms_per_window", "gflop", "params", "peak_mib",
 )  # fmt: skip
 """Of each method in docs/results/benchmark.json; intervals stay in metrics.json."""
 
@@ -130,7 +133,7 @@ def measure_benchmark(root: Path, benchmark: Path, record: Mapping[str, Any] | N
         found["paired"][name] = details["paired"]
         found["about"][name] = {key: details[key] for key in ("frames", "warmup_windows", "precision")} | {
             "scenes": len(details["scenes"]),
-            "lpips_reason": details["lpips"]["reason"],
+            "lpips": details["lpips"],
         }
     path = root / "docs" / "results" / "benchmark.json"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -146,23 +149,79 @@ def measure_ablation(root: Path, sweep: Path) -> Path:
     """Write section `ablation` of docs/results/network.json from a sweep's folder: jobs that name conf/ablation/NAME.
 
     What each leaves out is the comment of its file. RuntimeError where a job has no `ablation=NAME`, where there is
-    none with `ablation=nothing` to compare with, or where the tree has uncommitted changes.
+    none with `ablation=nothing` to compare with, where an ablation has two jobs, or where the tree has uncommitted
+    changes. Jobs that failed are left out.
     """
     if uncommitted(root):
         raise RuntimeError("the tree has uncommitted changes; commit them first, the figures name a commit")
     rows, overrides = {}, set()
     for point in sweep_points(sweep):
+        if point["failure"]:
+            continue
         given = dict(one.lstrip("+").split("=", 1) for one in point["overrides"])
         if "ablation" not in given:
             raise RuntimeError(f"{sweep / point['job']}: expected ablation=NAME among its overrides, got {given}")
         name = given.pop("ablation")
+        if name in rows:
+            raise RuntimeError(f"{sweep / point['job']}: expected one job with ablation={name}, got a second")
         about = (root / "conf" / "ablation" / f"{name}.yaml").read_text().splitlines()[1].removeprefix("# ")
-        rows[name] = {"about": about} | {key: point["scores"].get(key) for key in ABLATION_KEYS}
+        rows[name] = {"about": about} | {key: point["test"].get(key) for key in ABLATION_KEYS}
         overrides |= {f"{key}={value}" for key, value in given.items() if not key.startswith(("paths.", "ingest.root"))}
     if "nothing" not in rows:
         raise RuntimeError(f"{sweep}: expected a finished job with ablation=nothing, got {', '.join(rows) or 'no job'}")
     found = {"overrides": sorted(overrides), "rows": rows}
     return write_section(root, "network", "ablation", found, machine_record(root))
+
+
+EQ9_WEIGHTS = ("mse", "ssim", "lpips")
+
+
+def measure_sweep(root: Path, sweeps: Sequence[Path]) -> list[Path]:
+    """Write docs/results/sweep.json and docs/pictures/loss_sweep.png from sweeps over the weights of Eq. 9.
+
+    `points` has the weights, seeds, and means and standard deviations over seeds of each combination; smallest
+    validation MSE first. The sweeps may differ in `loss.mse`, `loss.ssim`, `loss.lpips` and `seed` alone. RuntimeError
+    where they differ in more, where a job failed or none is there, or where the tree has uncommitted changes.
+    """
+    if uncommitted(root):
+        raise RuntimeError("the tree has uncommitted changes; commit them first, the figures name a commit")
+    varied = ("seed", *(f"loss.{name}" for name in EQ9_WEIGHTS))
+    jobs: dict[tuple[float, ...], dict[int, dict[str, Any]]] = {}
+    settings: set[tuple[str, ...]] = set()
+    for folder in sweeps:
+        for point in sweep_points(folder):
+            if point["failure"]:
+                raise RuntimeError(f"{folder / point['job']} failed: {point['failure']}; run this point again")
+            overrides = [one for one in point["overrides"] if one.split("=", 1)[0] not in varied]
+            settings.add(tuple(sorted(one for one in overrides if not one.startswith(("paths.", "runtime.")))))
+            seeds = jobs.setdefault(tuple(float(point["weights"][name]) for name in EQ9_WEIGHTS), {})
+            if point["seed"] in seeds:
+                raise RuntimeError(
+                    f"{folder / point['job']}: expected new weights or a new seed, got a second such job"
+                )
+            seeds[point["seed"]] = point
+    if len(settings) != 1:
+        listed = "; ".join(" ".join(one) or "none" for one in sorted(settings)) or "no job"
+        raise RuntimeError(
+            f"expected sweeps that differ in {', '.join(varied)} alone, got as other overrides: {listed}"
+        )
+    points: list[dict[str, Any]] = [
+        {
+            "weights": dict(zip(EQ9_WEIGHTS, weights, strict=True)),
+            "seeds": sorted(seeds),
+            **{split: mean_scores([one[split] for one in seeds.values()], names) for split, names in COLUMNS.items()},
+            "notes": list(dict.fromkeys(note for one in seeds.values() for note in one["notes"])),
+        }
+        for weights, seeds in jobs.items()
+    ]
+    points.sort(key=lambda point: point["validation"]["mse"]["mean"])
+    one_job = next(iter(next(iter(jobs.values())).values()))
+    about = {"overrides": [*settings.pop()], "lpips_backbone": one_job["lpips_backbone"]}
+    path = write_section(root, "sweep", "loss_weights", about, machine_record(root), {"points": points})
+    picture = root / "docs" / "pictures" / "loss_sweep.png"
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    picture.write_bytes(png(loss_sweep_figure(points, LIGHT)))
+    return [path, picture]
 
 
 def _timed(target: str, folder: Path) -> tuple[float, dict[str, float]]:

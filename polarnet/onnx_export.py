@@ -60,7 +60,7 @@ def outputs_by_name(prediction: Prediction, state: Sequence[Tensor]) -> dict[str
 
 
 def export_network(
-    network: nn.Module, metadata: Mapping[str, Any], path: Path, height: int, width: int
+    network: nn.Module, metadata: Mapping[str, Any], path: str | os.PathLike[str], height: int, width: int
 ) -> dict[str, float]:
     """Write what `load_network` gave to `path` (.onnx), for images of one size; its `largest_differences` from torch.
 
@@ -69,6 +69,7 @@ def export_network(
     `TOLERANCE`: then there is no file, or still the one that was there before.
     """
     onnx, _ = _packages()
+    path = Path(path)
     _check_path(path)
     if min(height, width) < 1:
         raise ValueError(f"expected a height and a width of at least 1 pixel, got {height}x{width}")
@@ -87,14 +88,16 @@ def export_network(
 
 
 @torch.no_grad()
-def largest_differences(path: Path, network: nn.Module, windows: Float[Tensor, "t 1 c h w"]) -> dict[str, float]:
+def largest_differences(
+    path: str | os.PathLike[str], network: nn.Module, windows: Float[Tensor, "t 1 c h w"]
+) -> dict[str, float]:
     """How far each output of the file is from torch's, at any pixel of consecutive windows.
 
     Both sides carry their own state, and begin with none. Where a map exceeds 1, relative to its largest value. Of the
     angle, the circular difference times the length of (s1, s2): light that is not polarized has no angle. RuntimeError
     for a file that ONNX Runtime does not take.
     """
-    session = _session(path)
+    session = _session(Path(path))
     states = json.loads(session.get_modelmeta().custom_metadata_map[KEY])["state"]
     names = [output.name for output in session.get_outputs()]
     carried = {entry["input"]: torch.zeros(entry["shape"]).numpy() for entry in states}

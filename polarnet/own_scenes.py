@@ -5,11 +5,14 @@ import functools
 from pathlib import Path
 from typing import Any
 
-from polarnet.benchmarking import context_of, lpips_record, made_set, mapper_of
-from polarnet.config import Config
+from polarnet.benchmarking import context_of, made_set, mapper_of
+from polarnet.config import Config, with_lpips
 from polarnet.evaluation.benchmark import run_benchmark, train_mean_dolp, write_benchmark
-from polarnet.evaluation.rows import available, weights_used
+from polarnet.evaluation.conditions import configured, sentence, warnings
+from polarnet.evaluation.rows import available, metadata_used, weights_used
 from polarnet.events.frames import FrameStore
+from polarnet.lpips import NO_RECORD
+from polarnet.lpips_weights import find_weights
 from polarnet.methods import METHODS
 from polarnet.reports.set_page import write_set_page
 from polarnet.runtime import threads_of
@@ -20,43 +23,53 @@ from polarnet.simulation.sets import Recipe, make_folder_set
 from polarnet.simulation.truth import motions_of
 from polarnet.weights import shipped_weights
 
+SET_THEM = "To score on sequences like those of the training, add to the command, or write into params.yaml:"
+
 
 def benchmark_folder(
-    config: Config, root: Path, kind: str, out: Path, weights: Path | None, command: str
+    config: Config, root: Path, kind: str, out: Path, work: Path, weights: Path | None, command: str
 ) -> tuple[dict[str, dict[str, Any]], list[str]]:
     """Run the benchmark on a folder of photographs or measured scenes, without training; (metrics, notes).
 
-    `out` gets metrics.json, details.json, frames.csv, panels and index.html, and in `out`/work what they were made
-    from, so that a run that was stopped goes on and a second one with other weights makes only what is new. Methods
-    whose weights are not there are left out, files that cannot be used are skipped, and `notes` says so. `weights` is a
-    checkpoint of the DoLP network; None: the shipped one. ValueError where nothing in the folder can be used.
+    `out` gets metrics.json, details.json, frames.csv, panels and index.html, and `work` what they were made from,
+    so that a run that was stopped goes on and a second one with other weights makes only what is new. Methods
+    whose weights are not there are left out, files that cannot be used are skipped, and `notes` says so. Size, duration
+    and sensor are printed first, with a warning where those of a network's training differ. `weights` is a checkpoint
+    of the DoLP network; None: the shipped one. ValueError where nothing in the folder can be used, and where the table
+    is to have LPIPS but there are no weights for it.
     """
     if weights is not None and not weights.is_file():
         raise ValueError(
             f"--weights {weights}: expected a checkpoint of the DoLP network (.safetensors), there is none"
         )
-    recipe = Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads_of(config.runtime))
-    work = out / "work"
-    try:
-        make_folder_set(root, kind, work, recipe, functools.partial(mapper_of, config))
-    except ValueError as error:
-        raise ValueError(f"--scenes {root}: nothing to test on. {error}") from error
-    notes = _skipped(config, work)
+    lpips_weights = with_lpips(config, "benchmark", find_weights)  # which need not have been found by the pipeline
+    lpips = None if lpips_weights is None else Lpips.of(lpips_weights.backbone, lpips_weights.tensors)
     train_mean = _train_mean(config)
     wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
     context = context_of(config, train_mean, weights or shipped_weights())
     methods, left_out = available(wanted, context)
-    for row, reason in left_out.items():
-        trained = "; run `dvc repro` for what it trains" if row in METHODS else ""
-        notes.append(f"{row} was left out: {reason}{trained}.")
-    lpips, record = _lpips_if_there(config)
+    used = configured(config.synthesize, config.emulate)
+    differences = warnings(used, metadata_used(methods, context), SET_THEM)
+    print("\n".join([sentence(used), *(f"WARNING: {line}" for line in differences)]), flush=True)
+    recipe = Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads_of(config.runtime))
+    try:
+        make_folder_set(root, kind, work, recipe, functools.partial(mapper_of, config))
+    except ValueError as error:
+        raise ValueError(f"--scenes {root}: nothing to test on. {error}") from error
+    notes = [*_skipped(config, work), *(_left_out(row, reason) for row, reason in left_out.items())]
     settings = dataclasses.replace(config.benchmark, methods=methods)
     test_set = made_set(root.resolve().name, work)
     benchmark = run_benchmark(test_set, context, settings, lpips, work / "cache", mapper_of(config, "benchmark"))
-    used = weights_used(methods, context)
-    about = {"set": test_set.name, "lpips": record, "train_mean": train_mean, "left_out": notes, "weights": used}
+    about = {
+        "set": test_set.name,
+        "conditions": {"sentence": sentence(used), "warnings": differences, **used._asdict()},
+        "lpips": NO_RECORD if lpips_weights is None else lpips_weights.record,
+        "train_mean": train_mean,
+        "left_out": notes,
+        "weights": weights_used(methods, context),
+    }
     metrics = write_benchmark(out, benchmark, settings, config.seed, about)
-    write_set_page(out, test_set.name, command, notes)
+    write_set_page(out, test_set.name, command, [*differences, *notes])
     return metrics, notes
 
 
@@ -75,8 +88,9 @@ def _train_mean(config: Config) -> float | None:
     return train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None
 
 
-def _lpips_if_there(config: Config) -> tuple[Lpips | None, dict[str, Any]]:
-    if (Path(config.paths.weights) / "lpips.json").exists():
-        return Lpips.load(config.paths.weights), lpips_record(config)
-    reason = f"{config.paths.weights} is not there; run `dvc repro weights`"
-    return None, {"backbone": config.lpips.backbone, "sha256": None, "source": None, "reason": reason}
+def _left_out(row: str, reason: str) -> str:
+    """A line for a row that cannot run."""
+    weights = METHODS[row].weights if row in METHODS else None
+    trained = weights is not None and weights.trained_by is not None
+    advice = "; name it in benchmark.methods of params.yaml and run `dvc repro`" if trained else ""
+    return f"{row} was left out: {reason}{advice}."

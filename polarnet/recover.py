@@ -19,7 +19,7 @@ from polarnet.benchmarking import setup_of
 from polarnet.config import Config
 from polarnet.events.store import EventStore
 from polarnet.events.stream import Events, downscale
-from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
+from polarnet.events.streaming import SHORTEST_STEP_US, EventWindow, WindowCutter, WindowRule
 from polarnet.methods import METHODS
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.methods.method import Recoverer, each_map, why_absent
@@ -40,6 +40,8 @@ STANDARD_INPUT = "-"
 PIXELS_AT_ONCE = 4 * 120 * 180  # of windows that go through a network together; bounds its memory
 BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}{postfix}]"
 LIVE_BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
+TRAINED_WINDOW_US = 33_333
+"""Networks are trained on 1/30 s."""
 
 
 @dataclass(frozen=True)
@@ -278,7 +280,7 @@ def recover(source: Input, rule: WindowRule, recoverer: Recoverer, writer: Recov
             shown = {"latency": f"{1000 * frame.latency_s:.1f} ms"} if live else {}
             bar.set_postfix(frames=len(steps), step=f"{1000 * frame.step_s:.1f} ms", refresh=False, **shown)
     if not steps:
-        raise ValueError(f"{source.name}: its events do not fill one window; give a shorter --window")
+        raise ValueError(_too_short(source, rule))
     return Summary(
         len(steps),
         last_us * 1e-6,
@@ -287,6 +289,24 @@ def recover(source: Input, rule: WindowRule, recoverer: Recoverer, writer: Recov
         1000 * statistics.median(latencies) if live else None,
         1000 * sorted(latencies)[int(0.95 * (len(latencies) - 1))] if live else None,
     )
+
+
+def _too_short(source: Input, rule: WindowRule) -> str:
+    """Why there is no frame, and what to do."""
+    if rule.length_us is None:
+        return f"{source.name} ends before {rule.events:,} events, one window: record for longer, or give fewer events"
+    length = f"one window of {rule.length_us / 1000:g} ms"
+    if source.duration_us is None:
+        return f"{source.name} ended before {length} was full: record for longer"
+    lasts = f"{source.name} lasts {source.duration_us / 1000:g} ms, less than {length}: record for longer"
+    if source.duration_us >= TRAINED_WINDOW_US:
+        return f"{lasts}, or give --window {TRAINED_WINDOW_US / 1000:g}ms"
+    if source.duration_us >= SHORTEST_STEP_US:
+        return (
+            f"{lasts}. Networks need windows of {TRAINED_WINDOW_US / 1000:g} ms, filters do not: "
+            f"--method highpass --window {source.duration_us}us"
+        )
+    return lasts
 
 
 def facts_of(source: Input, rule: WindowRule, words: str, summary: Summary) -> dict[str, str]:

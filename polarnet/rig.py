@@ -9,6 +9,7 @@ from the right: the region in the upper right corner is bright until then. Each 
 
 import dataclasses
 import json
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -88,7 +89,7 @@ class Drift(Trajectory):
 
 
 def write_rig(
-    folder: Path,
+    folder: str | os.PathLike[str],
     picture: PolarizationScene,
     config: RigConfig,
     recordings: RecordingsConfig,
@@ -100,6 +101,7 @@ def write_rig(
 
     `picture` is enlarged to what the moving sensor sees. Everything random depends on the seed and the folder's name.
     """
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     name, (height, width) = folder.name, recordings.sensor
     scene, path = rig_scene(picture, config, recordings)

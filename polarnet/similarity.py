@@ -1,9 +1,11 @@
 """Similarity of two images, per frame: one definition for the loss and for the table.
 
-Every function takes frames in [0, 1] with any leading axes, gives one number per frame, and is differentiable.
+Every function takes frames in [0, 1], numpy or torch, with any leading axes, gives one number per frame, and is
+differentiable. TypeError for what is no array; ValueError for integers, frames or masks of different shapes, and where
+the data range enters (`psnr`, `ssim`) for a second frame, the truth, outside [0, 1].
 Where a mask `valid` is given, what the frames hold at other pixels does not matter, and a frame without any valid pixel
 gives NaN.
-The perceptual distance (LPIPS) has weights to find and lives in polarnet/lpips.py; its names are public here too.
+The perceptual distance, `Lpips`, is a network and lives in polarnet/lpips.py; its name is public here too.
 """
 
 import functools
@@ -13,16 +15,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from polarnet.lpips import Lpips, LpipsConfig, lpips_problem
+from polarnet.arrays import Array, as_tensor, check_floating, check_range, check_same_shape, check_shape, mask_of
+from polarnet.lpips import Lpips
 
 __all__ = [
     "Lpips",
-    "LpipsConfig",
     "aolp_error_deg",
     "correlation",
     "gradient_agreement",
     "level_mse",
-    "lpips_problem",
     "mean_where",
     "mse",
     "pattern_mse",
@@ -32,7 +33,7 @@ __all__ = [
     "with_truth_outside",
 ]
 
-Valid = Bool[Tensor, "*b h w"] | None
+Valid = Bool[Array, "*b h w"] | None
 
 SSIM_SIGMA = 1.5  # pixels; this and the next three: Wang et al., IEEE TIP 2004
 SSIM_RADIUS = 5  # pixels: an 11 x 11 window
@@ -43,7 +44,7 @@ SOBEL_SMOOTH, SOBEL_SLOPE = (0.25, 0.5, 0.25), (-0.5, 0.0, 0.5)  # across and al
 CHANCE_AOLP_DEG = 45.0  # mean error of an angle that knows nothing: the mean of |d| over -90 ... 90 degrees
 
 
-def mean_where(values: Float[Tensor, "*b h w"], valid: Valid) -> Float[Tensor, "*b"]:
+def mean_where(values: Float[Tensor, "*b h w"], valid: Bool[Tensor, "*b h w"] | None) -> Float[Tensor, "*b"]:
     """Mean over the valid pixels of a frame; over all where `valid` is None."""
     if valid is None:
         return values.mean(dim=(-2, -1))
@@ -51,7 +52,7 @@ def mean_where(values: Float[Tensor, "*b h w"], valid: Valid) -> Float[Tensor, "
 
 
 def with_truth_outside(
-    predicted: Float[Tensor, "*b h w"], truth: Float[Tensor, "*b h w"], valid: Valid
+    predicted: Float[Tensor, "*b h w"], truth: Float[Tensor, "*b h w"], valid: Bool[Tensor, "*b h w"] | None
 ) -> Float[Tensor, "*b h w"]:
     """`predicted` at valid pixels and `truth` at the others, where nothing is to be said against it then.
 
@@ -60,36 +61,49 @@ def with_truth_outside(
     return predicted if valid is None else torch.where(valid, predicted, truth)
 
 
-def mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
+def mse(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Mean squared error."""
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     return mean_where((a - b).square(), valid)
 
 
-def level_mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
+def level_mse(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Squared error of the frame's mean: the part of `mse` that a constant offset explains."""
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     return mean_where(a - b, valid).square()
 
 
-def pattern_mse(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
+def pattern_mse(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """What remains of `mse` once both frames have the same mean: mse = level_mse + pattern_mse."""
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     return mse(_centred(a, valid), _centred(b, valid), valid)
 
 
-def spread_mse(truth: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
+def spread_mse(truth: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """`mse` of the best constant, the frame's own mean: its variance over the pixels, against which skill counts."""
+    (truth,) = _frames(truth=truth)
+    valid = None if valid is None else mask_of("valid", valid, truth.shape)
     return mean_where(_centred(truth, valid).square(), valid)
 
 
-def psnr(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
+def psnr(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Peak signal-to-noise ratio in dB for the data range 1; 100 dB, not infinity, where the frames agree."""
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
+    _check_unit(b, valid)
     return -10 * torch.log10(mse(a, b, valid).clamp(min=LEAST_MSE))
 
 
-def correlation(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
+def correlation(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Pearson's correlation over the pixels of a frame, in [-1, 1]; 0 where either frame is constant.
 
     A constant frame shows nothing of the other's pattern, so 0 is its score and no frame is left out.
     """
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     dtype = torch.promote_types(a.dtype, b.dtype)
     a, b = _centred(a.double(), valid), _centred(b.double(), valid)
     variance = mean_where(a.square(), valid) * mean_where(b.square(), valid)
@@ -102,7 +116,7 @@ def correlation(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: V
 
 
 def gradient_agreement(
-    a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None
+    a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None
 ) -> Float[Tensor, "*b"]:
     """How well edges agree in place, direction and height: 2 sum(grad a . grad b) / sum(|grad a|^2 + |grad b|^2).
 
@@ -113,6 +127,8 @@ def gradient_agreement(
     magnitudes, and pooled over the frame before the division, so that it needs no constant.
     ValueError for a frame smaller than 3 pixels.
     """
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     if min(a.shape[-2:]) < len(SOBEL_SLOPE):
         raise ValueError(f"gradients need frames of at least 3 pixels a side, got {tuple(a.shape[-2:])}")
     dtype = torch.promote_types(a.dtype, b.dtype)
@@ -129,13 +145,15 @@ def gradient_agreement(
 
 
 def aolp_error_deg(
-    a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], weight: Float[Tensor, "*b h w"], valid: Valid = None
+    a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], weight: Float[Array, "*b h w"], valid: Valid = None
 ) -> Float[Tensor, "*b"]:
     """Mean of the angle between two AoLP in radians, in degrees [0, 90]: the shorter way round the half circle.
 
     `weight` is the true DoLP, as an angle matters as much as light is polarized. A frame without any polarization
     has no angle and nobody can be right or wrong: it counts as chance, 45 degrees, so that no frame is left out.
     """
+    a, b, weight = _frames(a=a, b=b, weight=weight)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     period = math.pi
     between = ((a - b).double() + period / 2).remainder(period) - period / 2
     counted = weight.double() if valid is None else torch.where(valid, weight.double(), 0.0)
@@ -144,7 +162,7 @@ def aolp_error_deg(
     return torch.where(total > 0, mean.rad2deg(), CHANCE_AOLP_DEG).to(torch.promote_types(a.dtype, b.dtype))
 
 
-def ssim(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
+def ssim(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Structural similarity (Wang et al. 2004) for the data range 1, Gaussian window of 11 pixels and sigma 1.5.
 
     The mean over the whole frame, which is mirrored at its borders (the edge pixel is not repeated): torchmetrics'
@@ -154,6 +172,9 @@ def ssim(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = 
     Computed in float32 at least, whatever autocast says: variances are small differences of large means.
     ValueError for a frame smaller than 6 pixels.
     """
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
+    _check_unit(b, valid)
     if min(a.shape[-2:]) <= SSIM_RADIUS:
         raise ValueError(f"ssim needs frames of at least {SSIM_RADIUS + 1} pixels a side, got {tuple(a.shape[-2:])}")
     with torch.autocast(a.device.type, enabled=False):
@@ -167,11 +188,26 @@ def ssim(a: Float[Tensor, "*b h w"], b: Float[Tensor, "*b h w"], valid: Valid = 
         return mean_where(luminance * structure, valid)
 
 
-def _centred(frames: Tensor, valid: Valid = None) -> Tensor:
+def _frames(**frames: Array) -> tuple[Tensor, ...]:
+    """The frames as tensors, once they are known to be of one shape and floating-point."""
+    tensors = {name: as_tensor(name, values) for name, values in frames.items()}
+    for name, values in tensors.items():
+        check_shape(name, values, "... height width")
+        check_floating(name, values)
+    check_same_shape(tensors)
+    return tuple(tensors.values())
+
+
+def _check_unit(truth: Tensor, valid: Tensor | None) -> None:
+    """ValueError for a truth outside [0, 1]; a prediction may exceed it."""
+    check_range("b", truth if valid is None else torch.where(valid, truth, 0.0), 0, 1, "frames")
+
+
+def _centred(frames: Tensor, valid: Tensor | None) -> Tensor:
     return frames - mean_where(frames, valid)[..., None, None]
 
 
-def _deviation(centred: Tensor, valid: Valid = None) -> Tensor:
+def _deviation(centred: Tensor, valid: Tensor | None) -> Tensor:
     return mean_where(centred.detach().square(), valid).sqrt()
 
 

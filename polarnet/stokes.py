@@ -1,4 +1,8 @@
-"""Polarization optics: Stokes vectors, DoLP, AoLP and what a polarizer lets through (paper Eq. 1-4)."""
+"""Polarization optics: Stokes vectors, DoLP, AoLP and what a polarizer lets through (paper Eq. 1-4).
+
+Functions take numpy or torch and give torch. They raise TypeError for what is no array of real numbers, and ValueError
+for other axes or integers, whose differences wrap round. Values may be any, NaN included.
+"""
 
 import math
 import re
@@ -8,6 +12,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from polarnet.arrays import Array, as_tensor, check_floating, check_same_shape, check_shape
 
 POLARIZER_ANGLES_DEG = (0, 45, 90, 135)
 
@@ -30,16 +36,20 @@ class Prediction(NamedTuple):
     """Intensities behind the polarizers at 0, 45, 90 and 135 degrees that DoLP was computed from."""
 
 
-def stokes_from_intensities(intensities: Float[Tensor, "*b 4 h w"]) -> Float[Tensor, "*b 3 h w"]:
+def stokes_from_intensities(intensities: Float[Array, "*b 4 h w"]) -> Float[Tensor, "*b 3 h w"]:
     """(S0, S1, S2) from intensities behind linear polarizers at 0, 45, 90 and 135 degrees (paper Eq. 1)."""
-    i0, i45, i90, i135 = intensities.unbind(-3)
+    i0, i45, i90, i135 = _planes("intensities", intensities, "... 4 height width").unbind(-3)
     return torch.stack([i0 + i90, i0 - i90, i45 - i135], dim=-3)
 
 
 def stokes_from_polarization(
-    s0: Float[Tensor, "*b h w"], dolp: Float[Tensor, "*b h w"], aolp: Float[Tensor, "*b h w"]
+    s0: Float[Array, "*b h w"], dolp: Float[Array, "*b h w"], aolp: Float[Array, "*b h w"]
 ) -> Float[Tensor, "*b 3 h w"]:
     """(S0, S1, S2) from intensity, degree and angle (radians) of linear polarization: Eq. 2 and 3 inverted."""
+    s0, dolp, aolp = (
+        _planes(name, plane, "... height width") for name, plane in (("s0", s0), ("dolp", dolp), ("aolp", aolp))
+    )
+    check_same_shape({"s0": s0, "dolp": dolp, "aolp": aolp})
     polarized = s0 * dolp
     return torch.stack([s0, polarized * torch.cos(2 * aolp), polarized * torch.sin(2 * aolp)], dim=-3)
 
@@ -55,32 +65,32 @@ def behind_polarizer(s0: Plane, s1: Plane, s2: Plane, angle: float) -> Plane:
     return (s0 + s1 * math.cos(2 * angle) + s2 * math.sin(2 * angle)) / 2
 
 
-def intensity_behind_polarizer(stokes: Float[Tensor, "*b 3 h w"], angle: float) -> Float[Tensor, "*b h w"]:
+def intensity_behind_polarizer(stokes: Float[Array, "*b 3 h w"], angle: float) -> Float[Tensor, "*b h w"]:
     """As `behind_polarizer`, of Stokes vectors."""
-    s0, s1, s2 = stokes.unbind(-3)
+    s0, s1, s2 = _planes("stokes", stokes, "... 3 height width").unbind(-3)
     return behind_polarizer(s0, s1, s2, angle)
 
 
-def intensities_from_stokes(stokes: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 4 h w"]:
+def intensities_from_stokes(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b 4 h w"]:
     """Intensities behind polarizers at 0, 45, 90 and 135 degrees (paper Eq. 4)."""
     return torch.stack(
         [intensity_behind_polarizer(stokes, math.radians(angle)) for angle in POLARIZER_ANGLES_DEG], dim=-3
     )
 
 
-def dolp(stokes: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
+def dolp(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
     """Degree of linear polarization (paper Eq. 2); 0 where there is no light.
 
     Not clamped: intensities reconstructed from events can be unphysical and exceed 1.
     """
-    s0, s1, s2 = stokes.unbind(-3)
+    s0, s1, s2 = _planes("stokes", stokes, "... 3 height width").unbind(-3)
     lit = s0 > 0
     return torch.where(lit, torch.hypot(s1, s2) / torch.where(lit, s0, 1.0), 0.0)
 
 
-def aolp(stokes: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
+def aolp(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
     """Angle of linear polarization in radians, [0, pi) (paper Eq. 3, over the whole circle); 0 where unpolarized."""
-    _, s1, s2 = stokes.unbind(-3)
+    _, s1, s2 = _planes("stokes", stokes, "... 3 height width").unbind(-3)
     angle = torch.atan2(s2, s1) / 2
     folded = torch.where(angle < 0, angle + math.pi, angle)
     return torch.where(folded >= math.pi, 0.0, folded)  # -1e-9 + pi rounds to pi
@@ -93,3 +103,10 @@ def parse_mosaic(order: str) -> Mosaic:
     if sorted(angles) != sorted(POLARIZER_ANGLES_DEG):
         raise ValueError(f'mosaic: expected the angles 0, 45, 90 and 135 like "90 45 / 135 0", got {order!r}')
     return (angles[0], angles[1]), (angles[2], angles[3])
+
+
+def _planes(name: str, values: Array, axes: str) -> Float[Tensor, "*shape"]:
+    tensor = as_tensor(name, values)
+    check_shape(name, values, axes)
+    check_floating(name, tensor)
+    return tensor

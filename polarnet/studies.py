@@ -1,5 +1,6 @@
 """The event budget and the sensitivity, on the pipeline's test sequences: JSON and a figure each."""
 
+import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,8 +9,9 @@ from typing import Any
 from polarnet.benchmarking import context_of, pipeline_set
 from polarnet.config import Config
 from polarnet.evaluation.benchmark import train_mean_dolp
+from polarnet.evaluation.conditions import Conditions, configured, sentence, stored, warnings
 from polarnet.evaluation.event_budget import by_sliding_window, by_window_length, since_start
-from polarnet.evaluation.rows import ROWS, why_left_out
+from polarnet.evaluation.rows import ROWS, Context, metadata_used, why_left_out
 from polarnet.evaluation.sensitivity import sensitivity
 from polarnet.reports.figures import LIGHT
 from polarnet.reports.png import png
@@ -20,6 +22,7 @@ from polarnet.simulation.scenes import SceneStore
 WINDOW_LENGTHS_US = (5_000, 10_000, 20_000, 33_333, 50_000, 100_000)
 SPACING_US = 500
 SLIDING_FRAMES = 60
+SET_THEM = "To study sequences like those of the training, write into params.yaml and run `dvc repro`:"
 STUDIED = ("oracle_mean", "cf", "highpass", "ours")
 
 
@@ -30,6 +33,8 @@ def run_event_budget(
     sequences, context, tests, scenes = _prepared(config, methods, limit, weights)
     if reason := why_left_out("ours", context):
         raise ValueError(f"the event budget needs the DoLP network: {reason}; give --weights FILE")
+    events = tests.events
+    conditions = _announced(stored(events.attributes, events.height, events.width), methods, context)
     end_us = min(scenes.duration_us(name) for name in sequences)
     settle_us = round(config.benchmark.warmup_windows * 1e6 / config.synthesize.frame_rate_hz)
     lengths = [length for length in WINDOW_LENGTHS_US if settle_us + length <= end_us]
@@ -38,6 +43,7 @@ def run_event_budget(
     results = {
         "methods": list(methods),
         "sequences": list(sequences),
+        "conditions": conditions,
         "since_start": since_start((tests.sequence(name) for name in sequences), methods, context),
         "window_length": by_window_length(scenes, tests.events, sequences, lengths, settle_us, methods, context),
         "sliding": by_sliding_window(scenes, tests.events, sequences, span, SPACING_US, "ours", context),
@@ -50,11 +56,14 @@ def run_sensitivity(
 ) -> dict[str, Any]:
     """Write sensitivity.json and sensitivity.png to `out`."""
     sequences, context, _, scenes = _prepared(config, methods, limit, weights)
+    size = {"window_height": scenes.window_height, "window_width": scenes.window_width}
+    motion = dataclasses.replace(config.synthesize, **size)  # sequences are emulated again at the size of their scenes
+    conditions = _announced(configured(motion, config.emulate), methods, context)
     table = sensitivity(
         scenes, sequences, config.synthesize, config.emulate, config.seed, config.benchmark.warmup_windows, methods,
         context, threads=threads_of(config.runtime),
     )  # fmt: skip
-    results = {"methods": list(methods), "sequences": list(sequences), "settings": table}
+    results = {"methods": list(methods), "sequences": list(sequences), "conditions": conditions, "settings": table}
     return _written(out, "sensitivity", results, png(sensitivity_figure(table, LIGHT)))
 
 
@@ -66,6 +75,13 @@ def _prepared(config: Config, methods: Sequence[str], limit: int | None, weights
     scenes = SceneStore.open(config.paths.scenes)
     context = context_of(config, train_mean_dolp(tests.frames, config.benchmark.warmup_windows), weights)
     return tests.sequences[:limit], context, tests, scenes
+
+
+def _announced(used: Conditions, methods: Sequence[str], context: Context) -> dict[str, Any]:
+    """Print size, duration and sensor, and where those of a network's training differ; what the results say of it."""
+    differences = warnings(used, metadata_used(methods, context), SET_THEM)
+    print("\n".join([sentence(used), *(f"WARNING: {line}" for line in differences)]), flush=True)
+    return {"sentence": sentence(used), "warnings": differences, **used._asdict()}
 
 
 def _written(out: Path, name: str, results: dict[str, Any], picture: bytes) -> dict[str, Any]:

@@ -1,47 +1,174 @@
-"""One table at the end of a Hydra multirun of trials: each point's overrides beside its scores."""
+"""One table at the end of a Hydra multirun of trials: points ranked by validation scores, seeds averaged."""
 
+import csv
 import json
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import fmean, stdev
 from typing import Any
 
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-COLUMNS = ("mse", "psnr", "ssim", "lpips", "corr")
+FAILURE = "failure.txt"
+"""In the folder of a job that failed: the reason in one line."""
+COLUMNS = {
+    "validation": {"mse": "validation MSE ↓", "psnr": "validation PSNR ↑"},
+    "test": {
+        "mse": "test MSE ↓",
+        "psnr": "test PSNR ↑",
+        "ssim": "test SSIM ↑",
+        "lpips": "test LPIPS ↓",
+        "corr": "test corr. ↑",
+    },
+}
+"""Scores of the table by split, and their headings."""
+ABOUT = (
+    "Ranked by validation MSE; test scores rank nothing. Of several seeds: mean ± standard deviation, over the seeds "
+    "that finished."
+)
+LOG_RECORD = re.compile(r"^\[[^\]]*\]\[[^\]]*\]\[(\w+)\] - ", re.MULTILINE)  # Hydra's format of job logs
+PYTHON_WARNING = re.compile(r"^\S+:\d+: (\w+: .*)$", re.MULTILINE)
 
 
 class SweepTable(Callback):
-    """Writes `comparison.md` and `comparison.json` into the sweep's folder and prints the table (conf/config.yaml)."""
+    """Writes comparison.md, .json and .csv into the sweep's folder and prints the table (conf/config.yaml)."""
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Gather the benchmark of every job that has one; a sweep of another entry point has none and gets no table."""
+        """Gather the trials; a sweep of another entry point has none and gets no table.
+
+        Raises SystemExit where a point failed: the only exception that Hydra lets a callback end the sweep with.
+        """
         folder = Path(config.hydra.sweep.dir)
         points = sweep_points(folder)
         if not points:
             return
-        table = sweep_table(points)
-        (folder / "comparison.md").write_text(table + "\n")
-        (folder / "comparison.json").write_text(json.dumps(points, indent=2) + "\n")
-        print(f"\n{table}\n\nwritten to {folder / 'comparison.md'}")
+        rows = sweep_rows(points)
+        table = sweep_table(rows)
+        (folder / "comparison.md").write_text(f"{table}\n\n{ABOUT}\n")
+        (folder / "comparison.json").write_text(json.dumps({"rows": rows, "points": points}, indent=2) + "\n")
+        write_csv(rows, folder / "comparison.csv")
+        print(f"\n{table}\n\n{ABOUT}\nwritten to {folder / 'comparison.md'}, .json and .csv")
+        if failed := sum(point["failure"] is not None for point in points):
+            raise SystemExit(f"{failed} of {len(points)} points failed; the table has their reasons")
 
 
 def sweep_points(folder: Path) -> list[dict[str, Any]]:
-    """Job number, overrides and scores of `ours` for each finished job of a sweep, best MSE first."""
-    points = []
-    for metrics in folder.glob("*/benchmark/metrics.json"):
-        job = metrics.parent.parent
-        overrides = OmegaConf.load(job / ".hydra" / "overrides.yaml")
-        points.append(
-            {"job": job.name, "overrides": list(overrides), "scores": json.loads(metrics.read_text())["ours"]}
-        )
-    return sorted(points, key=lambda point: point["scores"]["mse"])
+    """Each trial of a sweep in the order of the jobs: overrides, seed, loss weights, scores, notes, reason of failure.
+
+    `validation` holds the scores of the epoch that was kept, `test` those of `ours`; null where a trial has none.
+    """
+    jobs = [path.parent.parent for path in folder.glob("*/.hydra/overrides.yaml")]
+    trials = [job for job in jobs if (job / "train").exists() or (job / FAILURE).exists()]
+    return [_point(job) for job in sorted(trials, key=lambda job: (len(job.name), job.name))]
 
 
-def sweep_table(points: list[dict[str, Any]]) -> str:
-    """A markdown table of `sweep_points`, one row a job."""
-    lines = ["| job | overrides | " + " | ".join(COLUMNS) + " |", "|" + "---|" * (2 + len(COLUMNS))]
+def sweep_rows(points: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The points, those that differ in the seed alone as one row; smallest validation MSE first, rows without it last.
+
+    Scores become `mean` and `std`, the standard deviation over seeds (null for one seed).
+    """
+    groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
     for point in points:
-        scores = [point["scores"].get(column) for column in COLUMNS]
-        cells = ["-" if score is None else f"{score:.4f}" for score in scores]
-        lines.append(f"| {point['job']} | {' '.join(point['overrides'])} | {' | '.join(cells)} |")
+        groups.setdefault(tuple(one for one in point["overrides"] if not one.startswith("seed=")), []).append(point)
+    rows = []
+    for overrides, group in groups.items():
+        finished = [point for point in group if not point["failure"]]
+        failures = [f"seed {point['seed']} failed: {point['failure']}" for point in group if point["failure"]]
+        rows.append({
+            "jobs": [point["job"] for point in group],
+            "overrides": list(overrides),
+            "seeds": [point["seed"] for point in finished],
+            "failed_seeds": [point["seed"] for point in group if point["failure"]],
+            **{split: mean_scores([point[split] for point in finished], names) for split, names in COLUMNS.items()},
+            "notes": list(dict.fromkeys([*failures, *(note for point in group for note in point["notes"])])),
+        })  # fmt: skip
+    return sorted(rows, key=lambda row: row["validation"]["mse"]["mean"] if row["validation"] else float("inf"))
+
+
+def mean_scores(scores: Sequence[Mapping[str, float | None]], names: Mapping[str, str]) -> dict[str, Any]:
+    """Mean and standard deviation of each of the scores `names` over trainings; without a score that one lacks."""
+    means = {}
+    for name in names:
+        values = [value for one in scores if (value := one.get(name)) is not None]
+        if values and len(values) == len(scores):
+            means[name] = {"mean": fmean(values), "std": stdev(values) if len(values) > 1 else None}
+    return means
+
+
+def sweep_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A markdown table of `sweep_rows`."""
+    headings = [heading for names in COLUMNS.values() for heading in names.values()]
+    lines = [f"| jobs | overrides | seeds | {' | '.join(headings)} | notes |", "|" + "---|" * (4 + len(headings))]
+    for row in rows:
+        finished, failed = len(row["seeds"]), len(row["failed_seeds"])
+        seeds = f"{finished} of {finished + failed}" if failed else f"{finished}"
+        cells = [_cell(row[split].get(name)) for split, names in COLUMNS.items() for name in names]
+        notes = "; ".join(row["notes"]).replace("|", "/")
+        lines.append(
+            f"| {' '.join(row['jobs'])} | {' '.join(row['overrides'])} | {seeds} | {' | '.join(cells)} | {notes} |"
+        )
     return "\n".join(lines)
+
+
+def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """`sweep_rows` as one line each: columns SPLIT_SCORE and SPLIT_SCORE_std."""
+    with path.open("w", newline="") as file:
+        names = [f"{split}_{name}{end}" for split in COLUMNS for name in COLUMNS[split] for end in ("", "_std")]
+        writer = csv.DictWriter(file, ["jobs", "overrides", "seeds", "failed_seeds", *names, "notes"])
+        writer.writeheader()
+        for row in rows:
+            line = {key: " ".join(map(str, row[key])) for key in ("jobs", "overrides", "seeds", "failed_seeds")}
+            for split in COLUMNS:
+                for name, score in row[split].items():
+                    line |= {f"{split}_{name}": score["mean"], f"{split}_{name}_std": score["std"]}
+            writer.writerow({**line, "notes": "; ".join(row["notes"])})
+
+
+def _point(job: Path) -> dict[str, Any]:
+    config: Any = OmegaConf.load(job / ".hydra" / "config.yaml")
+    history = _read(job / "train" / "history.json")
+    metrics = _read(job / "benchmark" / "metrics.json")
+    unfinished = None if metrics else "it did not finish"
+    failure = (job / FAILURE).read_text().strip() if (job / FAILURE).exists() else unfinished
+    weights = OmegaConf.to_container(config.loss)
+    return {
+        "job": job.name,
+        "overrides": list(OmegaConf.load(job / ".hydra" / "overrides.yaml")),
+        "seed": config.seed,
+        "weights": weights,
+        "lpips_backbone": config.benchmark.get("lpips_backbone") or config.lpips.backbone,
+        "validation": min((row["val"] for row in history), key=lambda scores: scores["mse"]) if history else None,
+        "test": metrics["ours"] if metrics else None,
+        "notes": [*(_dropped_terms(weights, history[-1]["train"]) if history else []), *_warnings(job / "logs")],
+        "failure": failure,
+    }
+
+
+def _dropped_terms(weights: Any, terms: Mapping[str, float]) -> list[str]:
+    """A note where the loss lacks terms whose weight is not 0."""
+    names = [name for name, weight in weights.items() if weight and name not in terms]
+    return [f"not in this training's loss: {', '.join(names)}"] if names else []
+
+
+def _warnings(logs: Path) -> list[str]:
+    """What training and benchmark logged as warnings or worse, one line each."""
+    notes = []
+    for log in sorted(logs.glob("*/*.log")):
+        _, *records = LOG_RECORD.split(log.read_text())
+        for level, text in zip(records[::2], records[1::2], strict=True):
+            if level not in ("DEBUG", "INFO"):
+                python = PYTHON_WARNING.search(text)
+                notes.append(" ".join((python[1] if python else text).split()))
+    return notes
+
+
+def _read(path: Path) -> Any:
+    return json.loads(path.read_text()) if path.exists() else None
+
+
+def _cell(score: Mapping[str, float | None] | None) -> str:
+    if score is None:
+        return "-"
+    return f"{score['mean']:.4f}" + (f" ± {score['std']:.4f}" if score["std"] is not None else "")

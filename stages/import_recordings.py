@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from polarnet.config import Config, hydra_stage
+from polarnet.config import Config, hydra_stage, input_folder
 from polarnet.recordings.imported import import_targets
 from polarnet.recordings.status import start_over
 
@@ -15,8 +15,9 @@ def main(config: Config) -> None:
         start_over(out, enabled=False)
         print("recordings.enabled is false")
         return
+    root = input_folder("recordings.root", config.recordings.root)
     try:
-        names = import_targets(Path(config.recordings.root), out, config.recordings)
+        names = import_targets(root, out, config.recordings)
     except ValueError as error:
         raise SystemExit(str(error)) from None
     print(f"{len(names)} targets: {', '.join(names)}")

@@ -4,7 +4,7 @@ import functools
 from pathlib import Path
 
 from polarnet.cluster import pmap
-from polarnet.config import Config, hydra_stage
+from polarnet.config import Config, hydra_stage, input_folder
 from polarnet.simulation.pictures.ingest import ingest
 
 
@@ -12,7 +12,12 @@ from polarnet.simulation.pictures.ingest import ingest
 def main(config: Config) -> None:
     """Fill data/images and say what lies there."""
     mapper = functools.partial(pmap, workers=config.runtime.workers, label="ingest", address=config.cluster.address)
-    manifest = ingest(config.ingest, config.seed, Path(config.paths.images), mapper)
+    if config.ingest.source != "builtin":
+        input_folder("ingest.root", config.ingest.root)
+    try:
+        manifest = ingest(config.ingest, config.seed, Path(config.paths.images), mapper)
+    except ValueError as error:
+        raise SystemExit(str(error)) from None
     print(", ".join(f"{count} {name.replace('_', ' ')}" for name, count in manifest.counts.items()))
 
 

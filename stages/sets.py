@@ -4,7 +4,7 @@ import functools
 from pathlib import Path
 
 from polarnet.cluster import pmap
-from polarnet.config import Config, hydra_stage
+from polarnet.config import Config, hydra_stage, input_folder
 from polarnet.runtime import threads_of
 from polarnet.simulation.sets import Recipe, make_complex_motion, make_folder_set
 
@@ -23,7 +23,8 @@ def main(config: Config) -> None:
     if "complex_motion" in config.benchmark.sets:
         make_complex_motion(Path(config.paths.images), folder / "complex_motion", config.sets, recipe, mapper)
     if "measured" in config.benchmark.sets:
-        make_folder_set(Path(config.sets.measured_root), "polarization", folder / "measured", recipe, mapper)
+        root = input_folder("sets.measured_root", config.sets.measured_root)
+        make_folder_set(root, "polarization", folder / "measured", recipe, mapper)
     made = [name for name in config.benchmark.sets if name != "simulated"]
     print(f"test sets beyond simulated: {', '.join(made) or 'none asked for'}")
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from polarnet.config import Config, hydra_stage
+from polarnet.config import Config, hydra_stage, or_exit
 from polarnet.runtime import device_of, threads_of
 from polarnet.training.dolp import dolp_task
 from polarnet.training.loop import train
@@ -18,7 +18,7 @@ def main(config: Config) -> None:
         return
     device = device_of(config.runtime)
     join(device)
-    lpips = lpips_of(Path(config.paths.weights), config.loss.lpips)
+    lpips = or_exit(lambda: lpips_of(config.paths.weights, config.lpips.backbone, config.loss.lpips))
     task = dolp_task(config.network, config.network_config, config.train, config.loss, lpips, config.seed)
     paths, threads = config.paths, threads_of(config.runtime)
     events = open_events(config.train.data, paths.events, paths.scenes, config.emulate, config.seed, threads)

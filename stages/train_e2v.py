@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
-from polarnet.config import Config, hydra_stage
+from polarnet.config import Config, hydra_stage, or_exit
 from polarnet.runtime import device_of, threads_of
+from polarnet.training.baselines import is_used, leave_untrained
 from polarnet.training.e2v import e2v_task
 from polarnet.training.loop import train
 from polarnet.training.parallel import join, launched
@@ -13,13 +14,19 @@ from polarnet.training.task import describe, lpips_of, open_events, open_split
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Train `baselines.e2v.arch` on the training split; a killed run of the same training goes on where it stopped."""
+    """Train `baselines.e2v.arch` on the training split; a killed run of the same training goes on where it stopped.
+
+    Train nothing, and say so, where no row of `benchmark.methods` uses the weights.
+    """
+    if not is_used("e2v", config.benchmark.methods, config.methods):
+        print(leave_untrained("e2v", Path(config.paths.train_e2v)))
+        return
     if launched("stages.train_e2v", config.runtime):
         return
     device = device_of(config.runtime)
     join(device)
     e2v = config.baselines.e2v
-    lpips = lpips_of(Path(config.paths.weights), e2v.lpips)
+    lpips = or_exit(lambda: lpips_of(config.paths.weights, config.lpips.backbone, e2v.lpips))
     task = e2v_task(e2v, lpips, config.seed)
     paths, threads = config.paths, threads_of(config.runtime)
     events = open_events(e2v.data, paths.events, paths.scenes, config.emulate, config.seed, threads)

@@ -1,36 +1,68 @@
 """One point of a sweep: train and benchmark in the job's own folder, leaving what DVC tracks alone.
 
-`python -m stages.trial -m loss.mse=1.0 loss.ssim=0.0,1.0 loss.lpips=0.0,5.0` runs every combination on the sequences
-that the pipeline has made, and ends with one table (polarnet.sweep). Jobs may run side by side: what a method made of a
-sequence is kept once, and so each job keeps its own until it is scored.
+`python -m stages.trial -m loss.mse=1.0 loss.ssim=0.0,1.0 seed=1,2,3` runs every combination on the sequences that the
+pipeline has made, and ends with one table (polarnet.sweep). Jobs may run side by side: what a method made of a sequence
+is kept once, and so each job keeps its own until it is scored.
+
+A point that fails leaves its reason in `failure.txt` and stops no other.
 """
 
+import io
 import shutil
 import subprocess
 import sys
+from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
 
-from polarnet.config import Config, hydra_stage
+from polarnet.config import hydra_command
+from polarnet.sweep import FAILURE
 
 # What a training run is held against; the other rows of the benchmark do not depend on it.
 REFERENCE_METHODS = "benchmark.methods=[zeros,train_mean,oracle_mean,ours]"
+HYDRAS_HINT = "Set the environment variable HYDRA_FULL_ERROR"  # the last line below each traceback
 
 
-@hydra_stage
-def main(config: Config) -> None:
-    """Run the train and benchmark stages as child processes with this job's overrides and folder."""
+@hydra_command
+def main(node: DictConfig) -> None:
+    """Run the train and benchmark stages as child processes with this job's overrides and folder.
+
+    The children check the configuration, so that a point with a refused value is a failed point of the sweep.
+    """
     hydra = HydraConfig.get()
     job = Path(hydra.runtime.output_dir)
     overrides = list(hydra.overrides.task)
     if not any(override.startswith("benchmark.methods=") for override in overrides):
         overrides.append(REFERENCE_METHODS)
+    failure = None
     for stage in ("train", "benchmark"):
         folders = [f"paths.{name}={job / name}" for name in ("train", "benchmark", "cache")]
         logs = [f"hydra.run.dir={job / 'logs' / stage}"]
-        subprocess.run([sys.executable, "-m", f"stages.{stage}", *overrides, *folders, *logs], check=True)
-    shutil.rmtree(job / "cache")
+        failure = _failure([sys.executable, "-m", f"stages.{stage}", *overrides, *folders, *logs])
+        if failure:
+            (job / FAILURE).write_text(f"{stage}: {failure}\n")
+            break
+    shutil.rmtree(job / "cache", ignore_errors=True)
+    if failure and hydra.mode == RunMode.RUN:  # in a multirun the table says it, and sets the exit status at the end
+        raise SystemExit(1)
+
+
+def _failure(command: Sequence[str]) -> str | None:
+    """The last line that a failing command prints; None where it succeeds. Its errors are shown as they come."""
+    lines: deque[str] = deque(maxlen=20)
+    with subprocess.Popen(command, stderr=subprocess.PIPE) as child:
+        assert child.stderr is not None
+        for line in io.TextIOWrapper(child.stderr, errors="replace", newline=""):  # progress bars end lines with \r
+            print(line, end="", file=sys.stderr, flush=True)
+            if line.strip() and not line.startswith(HYDRAS_HINT):
+                lines.append(line.strip())
+    if child.returncode < 0:
+        return f"killed by signal {-child.returncode}"
+    return (lines[-1] if lines else f"exit status {child.returncode}") if child.returncode else None
 
 
 if __name__ == "__main__":

@@ -1,19 +1,64 @@
 """What several test modules share."""
 
 import dataclasses
+import importlib
+import json
 import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pytest
-import torch
 
-torch.set_num_threads(1)  # tests run side by side; threads that wait for each other would only slow them down
+HERE = Path(__file__).parent
+SLOWEST_FIRST = (
+    "pipeline/test_stages.py",
+    "test_onnx_export.py",
+    "pipeline/test_interruptions.py",
+    "test_rig.py",
+    "reference/test_golden.py",
+    "recordings/test_fuzz.py",
+    "pipeline/test_config.py",
+    "simulation/test_emulator.py",
+)
+"""Files that take longest; the others follow, so no worker is left with a long one when the rest is done."""
+LARGE_PACKAGES = ("torch", "scipy.stats", "numba", "cv2", "zarr", "matplotlib.figure", "hydra", "dvclive")
+FUZZ_CASES = {"local": 50, "ci": 150}
+
+
+def pytest_collection() -> None:
+    """Choose how many cases hypothesis tries, and import what every worker needs.
+
+    Large packages come before polarnet: the import hook of jaxtyping renames the bytecode files of whatever a module of
+    polarnet imports first, so Python would compile those packages once more.
+    """
+    from hypothesis import settings  # here and not above, because the controller of several workers needs none of this
+
+    for name, cases in FUZZ_CASES.items():
+        settings.register_profile(name, max_examples=cases, deadline=None)
+    settings.load_profile("ci" if os.environ.get("CI") else "local")
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        for package in LARGE_PACKAGES:
+            importlib.import_module(package)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the slowest files first; `--dist loadfile` hands files out in this order."""
+    order = {HERE / name: place for place, name in enumerate(SLOWEST_FIRST)}
+    missing = [str(path) for path in order if not path.exists()]
+    if missing:
+        raise pytest.UsageError(f"SLOWEST_FIRST in {__file__} names files that are not there: {', '.join(missing)}")
+    items.sort(key=lambda item: order.get(item.path, len(order)))
 
 
 def pytest_runtest_setup() -> None:
-    """Undo what `polarnet.runtime.tune`, called by an earlier test, leaves on: hypothesis wants numbers below 1e-38."""
+    """Undo what a stage that an earlier test ran in this process has set (`polarnet.runtime.configure`).
+
+    Tests run side by side, so each has one thread; hypothesis wants numbers below 1e-38.
+    """
+    import torch
+
+    torch.set_num_threads(1)
     torch.set_flush_denormal(False)
 
 
@@ -31,6 +76,17 @@ def shared() -> Path:
     return Path(folder)
 
 
+@pytest.fixture
+def unchecked_annotations() -> Iterator[None]:
+    """Run polarnet as a user's program does: annotations are not checked, so that its own checks are on their own."""
+    import jaxtyping
+
+    was = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", was)
+
+
 class Simulated(NamedTuple):
     """Four short sequences, and what their events were made with."""
 
@@ -44,7 +100,10 @@ class Simulated(NamedTuple):
 @pytest.fixture(scope="session")
 def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Simulated:
     """Scenes of smooth noise, frames and events of a sensor that differs from sequence to sequence and is noisy."""
-    from polarnet.config import load  # here, after pytest has installed jaxtyping's import hook
+    import numpy as np
+    import torch
+
+    from polarnet.config import load
     from polarnet.events.frames import FrameStore
     from polarnet.simulation.dataset import emulate_scenes
     from polarnet.simulation.motion import Trajectory, frame_times_us, random_trajectory
@@ -84,3 +143,38 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     frames.finish()
     emulate_scenes(folder / "scenes.zarr", folder / "events.zarr", emulate, 3, map, 1)
     return Simulated(folder / "scenes.zarr", folder / "frames.zarr", folder / "events.zarr", emulate, 3)
+
+
+@pytest.fixture(scope="session")
+def write_trial() -> Callable[..., None]:
+    """Writes the folder of one job of a sweep of `stages.trial`, in miniature."""
+
+    def write(
+        job: Path,
+        overrides: Sequence[str] = (),
+        weights: Sequence[float] = (10.0, 1.0, 1.0),
+        seed: int = 1,
+        validation: Mapping[str, float] | None = None,
+        test: Mapping[str, float] | None = None,
+        failure: str | None = None,
+        log: str = "",
+    ) -> None:
+        loss = dict(zip(("mse", "ssim", "lpips"), weights, strict=True))
+        config = {"seed": seed, "loss": loss, "lpips": {"backbone": "alex"}, "benchmark": {}}
+        files = {
+            ".hydra/config.yaml": json.dumps(config),
+            ".hydra/overrides.yaml": json.dumps(list(overrides)),
+            "logs/train/train.log": log,
+        }
+        if validation or test:
+            scores = validation or {"mse": 0.5, "psnr": 3.0}
+            files["train/history.json"] = json.dumps([{"train": loss, "val": scores}])
+        if test:
+            files["benchmark/metrics.json"] = json.dumps({"ours": test, "zeros": {}})
+        if failure:
+            files["failure.txt"] = f"{failure}\n"
+        for name, text in files.items():
+            (job / name).parent.mkdir(parents=True, exist_ok=True)
+            (job / name).write_text(text)
+
+    return write

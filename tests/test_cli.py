@@ -41,7 +41,7 @@ def test_the_stages_come_in_the_order_they_run_in(capsys, project_root, monkeypa
     monkeypatch.chdir(project_root / "tests")
     assert main(["stages"]) == 0
     assert capsys.readouterr().out.split() == [
-        "ingest", "synthesize", "emulate", "weights", "train", "train_e2v", "train_e2p",
+        "ingest", "synthesize", "emulate", "weights", "baselines", "train", "train_e2v", "train_e2p",
         "import_recordings", "calibrate", "sets", "benchmark", "report",
     ]  # fmt: skip
 

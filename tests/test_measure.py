@@ -10,11 +10,13 @@ from polarnet.measure import (
     measure_ablation,
     measure_benchmark,
     measure_pipeline,
+    measure_sweep,
     uncommitted,
     write_section,
 )
 from polarnet.reports.provenance import git
 from polarnet.reports.readme import benchmark_block
+from polarnet.reports.study_tables import loss_sweep_block
 
 
 def test_the_minutes_of_a_target_are_those_of_its_stages(tmp_path):
@@ -82,14 +84,11 @@ def test_what_is_measured_is_no_change_of_what_it_names(tmp_path):
     assert "code.py" in uncommitted(tmp_path, "params.yaml")
 
 
-def swept(root, **mse):
+def swept(root, write_trial, **mse):
     (root / "conf" / "ablation").mkdir(parents=True)
     for number, (name, value) in enumerate(mse.items()):
-        job = root / "sweep" / str(number)
-        (job / ".hydra").mkdir(parents=True)
-        (job / "benchmark").mkdir()
-        (job / ".hydra" / "overrides.yaml").write_text(f"- ablation={name}\n- train.epochs=1\n- paths.data=x\n")
-        (job / "benchmark" / "metrics.json").write_text(json.dumps({"ours": {"mse": value, "psnr": 15.0}}))
+        overrides = [f"ablation={name}", "train.epochs=1", "paths.data=x"]
+        write_trial(root / "sweep" / str(number), overrides, test={"mse": value, "psnr": 15.0})
         (root / "conf" / "ablation" / f"{name}.yaml").write_text(f"# @package _global_\n# Without {name}.\n")
     (root / "conf" / "file").write_text("")
     git(root, "init", "--quiet")
@@ -98,8 +97,8 @@ def swept(root, **mse):
     return root / "sweep"
 
 
-def test_an_ablation_is_what_a_sweep_found_with_what_each_job_leaves_out(tmp_path):
-    sweep = swept(tmp_path, nothing=0.03, sums=0.05)
+def test_an_ablation_is_what_a_sweep_found_with_what_each_job_leaves_out(tmp_path, write_trial):
+    sweep = swept(tmp_path, write_trial, nothing=0.03, sums=0.05)
     found = json.loads(measure_ablation(tmp_path, sweep).read_text())
     assert found["ablation"]["overrides"] == ["train.epochs=1"]
     assert found["ablation"]["rows"]["sums"]["about"] == "Without sums."
@@ -107,18 +106,68 @@ def test_an_ablation_is_what_a_sweep_found_with_what_each_job_leaves_out(tmp_pat
     assert found["records"]["ablation"]["commit"] == git(tmp_path, "rev-parse", "HEAD")
 
 
-def test_an_ablation_needs_the_whole_to_compare_with(tmp_path):
+def test_an_ablation_needs_the_whole_to_compare_with(tmp_path, write_trial):
     with pytest.raises(RuntimeError, match="expected a finished job with ablation=nothing, got sums"):
-        measure_ablation(tmp_path, swept(tmp_path, sums=0.05))
+        measure_ablation(tmp_path, swept(tmp_path, write_trial, sums=0.05))
+
+
+def loss_sweep(root, write_trial):
+    """Two sweeps, of the weights (10, 0, 0) and (10, 1, 0), the first with two seeds; the folder of each."""
+    git(root, "init", "--quiet")
+    git(root, "-c", "user.name=a", "-c", "user.email=a@b.c", "commit", "--quiet", "--allow-empty", "-m", "one")
+    for number, mse in enumerate((0.03, 0.05)):
+        overrides = ["network=paper", f"loss.ssim={0.0}", f"seed={number + 1}", "runtime.threads=1"]
+        scores = {"mse": mse, "psnr": 15.0, "ssim": 0.5, "lpips": 0.4}
+        validation = {"mse": 2 * mse, "psnr": 14.0}
+        write_trial(root / "one" / str(number), overrides, (10.0, 0.0, 0.0), number + 1, validation, scores)
+    scores = {"mse": 0.02, "psnr": 17.0, "ssim": 0.6, "lpips": 0.3}
+    validation = {"mse": 0.09, "psnr": 12.0}
+    write_trial(root / "two" / "0", ["network=paper", "loss.ssim=1.0"], (10.0, 1.0, 0.0), 1, validation, scores)
+    return [root / "one", root / "two"]
+
+
+def test_a_loss_sweep_becomes_means_over_seeds_a_table_and_a_heat_map(tmp_path, write_trial):
+    path, picture = measure_sweep(tmp_path, loss_sweep(tmp_path, write_trial))
+    found = json.loads(path.read_text())
+    assert [point["weights"] for point in found["points"]] == [
+        {"mse": 10.0, "ssim": 0.0, "lpips": 0.0},  # the smaller validation MSE, though the larger test MSE
+        {"mse": 10.0, "ssim": 1.0, "lpips": 0.0},
+    ]
+    assert found["points"][0]["seeds"] == [1, 2]
+    assert found["points"][0]["test"]["mse"] == {"mean": pytest.approx(0.04), "std": pytest.approx(0.01 * 2**0.5)}
+    assert found["points"][1]["test"]["mse"] == {"mean": 0.02, "std": None}
+    assert found["loss_weights"] == {"overrides": ["network=paper"], "lpips_backbone": "alex"}
+    assert found["records"]["loss_weights"]["commit"] == git(tmp_path, "rev-parse", "HEAD")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    lines = loss_sweep_block(found).splitlines()
+    assert lines[2].startswith("| 10 | 0 | 0 | 2 | 0.0800 ± 0.0283 | 14.00 ± 0.00 | 0.0400 ± 0.0141 |")
+    assert lines[3].startswith("| 10 | 1 | 0 | 1 | 0.0900 | 12.00 | 0.0200 | 17.00 | 0.600 | 0.300 | - |")
+
+
+def test_a_loss_sweep_is_complete_and_of_one_setting(tmp_path, write_trial):
+    sweeps = loss_sweep(tmp_path, write_trial)
+    with pytest.raises(RuntimeError, match="expected new weights or a new seed, got a second such job"):
+        measure_sweep(tmp_path, [*sweeps, sweeps[0]])
+    write_trial(tmp_path / "other" / "0", ["network=polarnet"], (1.0, 0.0, 0.0), test={"mse": 0.1})
+    with pytest.raises(RuntimeError, match="got as other overrides: network=paper; network=polarnet"):
+        measure_sweep(tmp_path, [*sweeps, tmp_path / "other"])
+    write_trial(tmp_path / "other" / "0", ["network=paper"], failure="train: it broke")
+    with pytest.raises(RuntimeError, match="other/0 failed: train: it broke; run this point again"):
+        measure_sweep(tmp_path, [tmp_path / "other"])
 
 
 def write_results(folder):
     folder.mkdir(parents=True)
-    ours = dict.fromkeys(BENCHMARK_KEYS, 0.5) | {"lpips": None, "mse_ci": [0.4, 0.6], "params": 7}
+    ours = dict.fromkeys(BENCHMARK_KEYS, 0.5) | {
+        "lpips": None,
+        "lpips_backbone": None,
+        "mse_ci": [0.4, 0.6],
+        "params": 7,
+    }
     (folder / "metrics.json").write_text(json.dumps({"zeros": {"mse": 1.0}, "ours": ours}))
     pairs = {"zeros": {"mse": {"scenes": 6, "better": 6, "effect": 1.0, "p": 0.03125, "p_holm": 0.03125}}}
     about = {"frames": 12, "warmup_windows": 5, "precision": "fp32", "scenes": ["a"] * 6, "paired": pairs}
-    (folder / "details.json").write_text(json.dumps(about | {"lpips": {"reason": "none here"}}))
+    (folder / "details.json").write_text(json.dumps(about | {"lpips": {"backbone": None}}))
 
 
 @pytest.fixture
@@ -157,11 +206,11 @@ def test_a_set_that_was_not_run_is_asked_for(tmp_path, measured_project):
 def test_figures_are_kept_where_the_tests_fail(tmp_path):
     """A project of which `make repro` leaves what the record takes, and whose tests fail."""
     root = tmp_path / "project"
-    for folder in ("data/benchmark", "data/weights", "data/report", "docs/results", "docs/pictures"):
+    for folder in ("data/benchmark", "data/report", "docs/results", "docs/pictures"):
         (root / folder).mkdir(parents=True)
         (root / folder / ".keep").write_text("")
     (root / "data" / "benchmark" / "metrics.json").write_text('{"ours": {"mse": 0.1}}')
-    (root / "data" / "weights" / "lpips.json").write_text('{"reason": "none here"}')
+    (root / "data" / "benchmark" / "details.json").write_text('{"lpips": {"backbone": "alex"}}')
     (root / "data" / "report" / "overview.png").write_bytes(b"picture")
     (root / "Makefile").write_text("setup:\n\t@true\nrepro:\n\t@true\ntest:\n\t@false\n")
     git(root, "init", "--quiet")
@@ -171,5 +220,6 @@ def test_figures_are_kept_where_the_tests_fail(tmp_path):
         measure_pipeline(root)
     record = json.loads((root / "docs" / "results" / "pipeline.json").read_text())
     assert record["metrics"] == {"ours": {"mse": 0.1}}
+    assert record["lpips"] == {"backbone": "alex"}
     assert "test_minutes" not in record
     assert (root / "docs" / "pictures" / "overview.png").read_bytes() == b"picture"

@@ -1,12 +1,14 @@
 import builtins
+import contextlib
 import io
 import json
 import re
-from contextlib import redirect_stdout
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import jaxtyping
 import numpy as np
 import onnx
 import onnxruntime
@@ -21,7 +23,7 @@ from polarnet.events.stream import Events
 from polarnet.networks.checkpoint import load_network, save_checkpoint
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
 from polarnet.networks.stokes_unet import StokesUNet
-from polarnet.onnx_export import largest_differences, random_windows
+from polarnet.onnx_export import export_network, largest_differences, random_windows
 
 HEIGHT, WIDTH = 30, 44  # neither divides by 8
 CONFIGS = {
@@ -65,9 +67,19 @@ class Written(NamedTuple):
     printed: str
 
 
+@contextlib.contextmanager
+def unchecked() -> Iterator[None]:
+    """Without the shape checks of jaxtyping, which make tracing several times slower."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        yield
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+
+
 def write_small(name: str, folder: Path) -> Written:
     checkpoint, path = save_small(name, folder), folder / "polarnet.onnx"
-    with redirect_stdout(io.StringIO()) as printed:
+    with unchecked(), contextlib.redirect_stdout(io.StringIO()) as printed:
         size = ("--height", str(HEIGHT), "--width", str(WIDTH))
         assert main(["onnx", str(path), "--weights", str(checkpoint), *size]) == 0
     return Written(path, checkpoint, printed.getvalue())
@@ -217,7 +229,7 @@ def test_the_lines_on_the_page_run_as_they_stand(of_each, monkeypatch, project_r
     snippet = re.search(r"```python\n(.*?)```", (project_root / "docs" / "network.md").read_text(), re.DOTALL)
     assert snippet is not None
     names: dict = {}
-    with redirect_stdout(io.StringIO()) as printed:
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
         exec(snippet[1], names)
     assert len(printed.getvalue().split()) == 2
     assert names["found"]["dolp"].shape == (1, HEIGHT, WIDTH)
@@ -228,3 +240,9 @@ def test_the_lines_on_the_page_run_as_they_stand(of_each, monkeypatch, project_r
     t = torch.arange(len(x))
     images = [event_counts(Events(t[k], x[k], y[k], p[k], HEIGHT, WIDTH), 33_333) for k in of]
     assert torch.equal(torch.cat(images), torch.from_numpy(names["events"][0]))
+
+
+def test_the_path_of_an_export_may_be_text(small, tmp_path):
+    network, metadata = load_network(str(small))
+    assert max(export_network(network, metadata, str(tmp_path / "n.onnx"), 16, 24).values()) < 1e-4
+    assert (tmp_path / "n.onnx").is_file()

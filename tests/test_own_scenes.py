@@ -70,16 +70,26 @@ def test_a_folder_of_photographs_is_scored_with_given_weights(
     assert details["weights"]["ours"]["file"] == "mine.safetensors"
     printed = capsys.readouterr().out
     assert "train_mean was left out: the training split is not there" in printed
+    assert printed.startswith("Sequences of 60x90 pixels (height x width), 0.2 s at 30 frames a second; sensor: model")
+    assert "WARNING: ours: the checkpoint does not say what it was trained on" in printed
     assert "oracle mean" in printed
     page = (out / "index.html").read_text()
     assert "train_mean was left out" in page
     assert "mine.safetensors (sha256" in page
+    assert "Sequences of 60x90 pixels (height x width), 0.2 s" in page
+    assert "does not say what it was trained on" in page
     assert 'src="http' not in page
     assert (out / "comparison.png").exists()
     files = [path for path in (out / "work").rglob("*") if path.suffix in (".npz", ".png") and "ours" not in path.parts]
     made = {path: path.stat().st_mtime_ns for path in files}
     given = metrics["ours"]
     assert run(project_root, monkeypatch, photographs, out) == 0  # by the shipped weights; no other method runs again
+    warning = (
+        "ours: these sequences differ from those of its training: synthesize.duration_s 0.2 (training: 1.0), "
+        "synthesize.window_height 60 (training: 120), synthesize.window_width 90 (training: 180)."
+    )
+    assert f"WARNING: {warning}" in capsys.readouterr().out
+    assert warning in (out / "index.html").read_text()
     metrics = json.loads((out / "metrics.json").read_text())
     assert set(metrics) == {"zeros", "oracle_mean", "cf", "ours"}
     assert metrics["ours"]["mse"] != given["mse"]

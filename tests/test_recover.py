@@ -185,7 +185,8 @@ def test_a_sequence_is_replayed_as_lines_at_its_own_pace(store, channels):
     ((), "say --sequence, one of lake, road; got None"),
     (("--sequence", "lake", "--method", "oracle_mean"), "expected a method of cf"),
     (("--sequence", "lake", "--method", "e2vid_published"), "no weights are given"),
-    (("--sequence", "lake", "--method", "cf", "--window", "1s"), "do not fill one window"),
+    (("--sequence", "lake", "--method", "cf", "--window", "1s"),
+     "events.zarr lasts 100 ms, less than one window of 1000 ms: record for longer, or give --window 33.333ms"),
     (("--sequence", "lake", "--method", "cf", "--step", "9ev"), "expected a time such as 0.1ms"),
     (("--sequence", "lake", "--method", "cf", "--step", "1s"), "events between windows would be lost"),
     (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
@@ -198,8 +199,66 @@ def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, 
     if "cuda:9" in arguments and torch.cuda.is_available():
         pytest.skip("there is a GPU")
     method = () if {"--method", "--weights"} & set(arguments) else ("--method", "cf")
-    assert run(store, *arguments, *method, out=tmp_path / "out") == 1
+    assert run(store, *arguments, *method, out=tmp_path / "new" / "out") == 1
     assert reason in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_second_recovery_replaces_the_first_and_other_files_are_refused(store, tmp_path, at_root, capsys):
+    out, arguments = tmp_path / "out", ("recover", str(store), "--sequence", "lake", "--method", "highpass")
+    arguments = (*arguments, "--out", str(out), "--write")
+    assert main([*arguments, "png", "mp4", "--window", "10ms"]) == 0
+    assert len(list((out / "png").iterdir())) == 10
+    assert main([*arguments, "png", "--window", "50ms"]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["index.html", "png", "recovered.png", "run.json"]
+    assert len(list((out / "png").iterdir())) == 2
+    assert f"the page: {out / 'index.html'}" in capsys.readouterr().out
+    assert main([*arguments, "png", "--window", "1s"]) == 1
+    assert len(list((out / "png").iterdir())) == 2
+    (tmp_path / "out" / "run.json").unlink()
+    assert main([*arguments, "png", "--window", "50ms"]) == 1
+    assert "holds files that `polarnet recover` did not write; name another folder" in capsys.readouterr().err
+
+
+def test_a_mosaic_without_polarizers_is_named_on_the_terminal_and_on_the_page(tmp_path, at_root, capsys):
+    """Every pixel fires at once in a random pattern of edges, whatever its place in a cell."""
+    generator = np.random.default_rng(2)
+    t = np.repeat(np.arange(0, 330_000, 1000), 60)
+    cells = generator.integers(0, (40, 60), (len(t), 2))
+    p = generator.choice([-1, 1], len(t))
+    y, x, t, p = (np.repeat(values, 4) for values in (2 * cells[:, 0], 2 * cells[:, 1], t, p))
+    y, x = y + np.tile([0, 0, 1, 1], len(cells)), x + np.tile([0, 1, 0, 1], len(cells))
+    keep = generator.random(len(t)) < 0.9  # pixels do not fire alike to the last event
+    columns = (t[keep], x[keep].astype(np.int16), y[keep].astype(np.int16), p[keep].astype(np.int8))
+    camera = write_lines(tmp_path / "camera.txt", Events(*map(torch.from_numpy, columns), 80, 120))
+    out = tmp_path / "out"
+    assert run(camera, "--mosaic", "90 45 / 135 0", "--method", "highpass", out=out) == 0
+    printed = capsys.readouterr()
+    assert "warning: The four channels show the same" in printed.err
+    assert re.search(r"events +[\d,]+ at 0, [\d,]+ at 45, [\d,]+ at 90, [\d,]+ at 135 degrees", printed.out)
+    assert "was made without polarizers" in (out / "index.html").read_text()
+
+
+@pytest.mark.parametrize(("window", "advice"), [
+    ("1s", "lasts 100 ms, less than one window of 1000 ms: record for longer, or give --window 33.333ms"),
+    ("9000ev", "ends before 9,000 events, one window: record for longer, or give fewer events"),
+])  # fmt: skip
+def test_a_recording_shorter_than_a_window_is_told_what_works(window, advice, store, tmp_path, at_root, capsys):
+    arguments = (store, "--sequence", "lake", "--method", "highpass")
+    assert run(*arguments, "--window", window, out=tmp_path / "out") == 1
+    assert advice in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_a_very_short_recording_is_told_works(channels, tmp_path, at_root, capsys):
+    early = [slice_time(events, 0, 8000) for events in channels]
+    files = [write_lines(tmp_path / f"{angle}.txt", e) for angle, e in zip(ANGLES, early, strict=True)]
+    arguments = (*files, "--angles", *ANGLES, "--method", "highpass")
+    assert run(*arguments, out=tmp_path / "out") == 1
+    told = re.search(r"record for longer\. Networks need .*--method highpass --window (\d+us)", capsys.readouterr().err)
+    assert told is not None
+    assert not (tmp_path / "out").exists()
+    assert run(*arguments, "--window", told[1], out=tmp_path / "out") == 0
 
 
 def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):
@@ -216,6 +275,7 @@ def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):
         ([tmp_path / "none.csv"], "there is no such file"),
     ):
         assert run(*files, "--method", "cf", out=tmp_path / "out") == 1
+        assert not (tmp_path / "out").exists()
         assert reason in capsys.readouterr().err
 
 

@@ -1,30 +1,16 @@
-import hashlib
-import http.server
-import json
-import os
-import threading
-import time
-from functools import partial
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
 from skimage.filters import sobel_h, sobel_v
 from skimage.metrics import mean_squared_error, peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from polarnet import lpips
-from polarnet.lpips import BACKBONES, Weights, find_weights, write_weights
+from polarnet.lpips import Lpips
 from polarnet.similarity import (
-    Lpips,
-    LpipsConfig,
     aolp_error_deg,
     correlation,
     gradient_agreement,
     level_mse,
-    lpips_problem,
     mse,
     pattern_mse,
     psnr,
@@ -32,19 +18,12 @@ from polarnet.similarity import (
     ssim,
 )
 
-SHARED = os.environ.get("POLARNET_SHARED")
-needs_shared = pytest.mark.skipif(SHARED is None, reason="POLARNET_SHARED names no folder of reference material")
-
 
 @pytest.fixture
 def pair():
     generator = torch.Generator().manual_seed(3)
     smooth = torch.linspace(0, 1, 31).expand(2, 24, 31)
     return smooth.clone(), (smooth + 0.2 * torch.rand(2, 24, 31, generator=generator)).clamp(0, 1)
-
-
-def config(backbone="squeeze", path=None, required=False):
-    return LpipsConfig(backbone, path, required)
 
 
 def test_an_offset_of_a_tenth_is_20_db_and_all_level():
@@ -213,224 +192,6 @@ def test_leading_axes_are_kept(pair):
         assert score(a, b).shape == (1, 2)
 
 
-@pytest.mark.parametrize(("backbone", "parameters"), [("squeeze", 722_496), ("alex", 2_469_696), ("vgg", 14_714_688)])
-def test_a_backbone_has_the_parameters_of_torchvisions_features(backbone, parameters):
-    with torch.device("meta"):
-        layers = BACKBONES[backbone].features()
-    assert sum(p.numel() for p in layers.parameters()) == parameters
-
-
-@pytest.mark.parametrize("backbone", ["squeeze", "alex", "vgg"])
-def test_taps_have_the_channels_that_the_heads_expect(backbone):
-    features = Lpips(backbone).features(torch.rand(1, 64, 64))
-    assert tuple(x.shape[1] for x in features) == BACKBONES[backbone].channels
-
-
-@pytest.mark.parametrize(("backbone", "side"), [("squeeze", 17), ("alex", 31), ("vgg", 16)])
-def test_the_smallest_image_that_a_backbone_takes(backbone, side):
-    distance = Lpips(backbone)
-    assert distance(torch.zeros(1, side, side), torch.ones(1, side, side)).isfinite().all()
-    with pytest.raises(ValueError, match=rf"LPIPS \({backbone}\) needs images of {side} pixels a side"):
-        distance.features(torch.zeros(1, 50, side - 1))
-
-
-def test_lpips_is_0_for_equal_images_symmetric_and_reaches_only_the_images():
-    torch.manual_seed(0)
-    distance = Lpips("squeeze")
-    a, b = torch.rand(2, 2, 40, 48, generator=torch.Generator().manual_seed(0))
-    assert distance(a, a).tolist() == [0.0, 0.0]
-    torch.testing.assert_close(distance(a, b), distance(b, a))
-    distance(a.requires_grad_(), b).sum().backward()
-    assert a.grad.isfinite().all()
-    assert a.grad.abs().sum() > 0
-    assert all(p.grad is None for p in distance.parameters())
-
-
-def test_lpips_of_a_grey_image_is_that_of_three_equal_channels():
-    distance = Lpips("squeeze")
-    a, b = torch.rand(2, 1, 40, 48, generator=torch.Generator().manual_seed(0))
-    rgb = [x[:, None].expand(-1, 3, -1, -1) for x in (a, b)]
-    torch.testing.assert_close(distance(a, b), distance(*rgb))
-
-
-def test_a_blank_image_has_a_finite_gradient():
-    blank = torch.zeros(1, 40, 40, requires_grad=True)
-    Lpips("squeeze")(blank, torch.rand(1, 40, 40)).sum().backward()
-    assert blank.grad.isfinite().all()
-
-
-@pytest.fixture(scope="module")
-def published():
-    file = Path(SHARED) / "weights" / "lpips_squeeze_v0.1.npz"
-    return Lpips.of("squeeze", find_weights(config(path=str(file))).tensors)
-
-
-def check_pair(kernel):
-    with np.load(Path(SHARED) / "weights" / "lpips_squeeze_check.npz") as arrays:
-        return torch.from_numpy(arrays[f"pair{kernel}"])
-
-
-@needs_shared
-@pytest.mark.parametrize(("kernel", "expected"), [(3, 0.124705), (7, 0.336987), (15, 0.492556)])
-def test_lpips_of_the_check_pairs(published, kernel, expected):
-    a, b = check_pair(kernel).permute(0, 3, 1, 2)[:, None]
-    assert published(a, b).item() == pytest.approx(expected, abs=2e-6)
-
-
-@needs_shared
-def test_lpips_of_the_grey_check_pair_in_float32_and_near_it_in_bf16(published):
-    a, b = check_pair(7).mean(-1)[:, None]
-    assert published(a, b).item() == pytest.approx(0.360800, abs=2e-6)
-    with torch.autocast("cpu", torch.bfloat16):
-        low = published(a, b)
-    assert low.dtype == torch.float32
-    assert low.item() == pytest.approx(0.360800, rel=0.05)
-
-
-@needs_shared
-def test_torchmetrics_heads_are_the_published_ones():
-    with np.load(Path(SHARED) / "weights" / "lpips_squeeze_v0.1.npz") as arrays:
-        backbone = {name: torch.from_numpy(arrays[name]) for name in arrays.files if name.startswith("features")}
-        heads = {name: torch.from_numpy(arrays[name]) for name in arrays.files if name.startswith("lin")}
-    found = lpips._checked("squeeze", backbone, Path("x"))
-    assert all(torch.equal(found[name], head) for name, head in heads.items())
-
-
-@pytest.fixture
-def hub(tmp_path, monkeypatch):
-    """An empty torch hub cache, and a squeeze backbone whose published file name carries the hash of our random one."""
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    folder = tmp_path / "torch" / "hub" / "checkpoints"
-    folder.mkdir(parents=True)
-    monkeypatch.setattr(lpips, "REACH_TIMEOUT_S", 0.5)
-    monkeypatch.setattr(lpips, "MODELS_URL", "http://127.0.0.1:9/")  # the discard port: nothing answers
-    torch.manual_seed(1)
-    layers = BACKBONES["squeeze"].features()
-    classifier = {"classifier.1.weight": torch.zeros(4, 512, 1, 1)}
-    state = {f"features.{name}": value for name, value in layers.state_dict().items()} | classifier
-    torch.save(state, tmp_path / "made.pth")
-    content = (tmp_path / "made.pth").read_bytes()
-    name = f"squeezenet1_1-{hashlib.sha256(content).hexdigest()[:8]}.pth"
-    monkeypatch.setitem(BACKBONES, "squeeze", BACKBONES["squeeze"]._replace(file=name))
-    return folder, name, content
-
-
-def test_weights_in_the_hub_cache_are_found_without_the_classifier_and_loaded_back(hub, tmp_path):
-    folder, name, content = hub
-    (folder / name).write_bytes(content)
-    assert lpips_problem(config()) is None
-    weights = find_weights(config())
-    assert weights.source == name
-    assert weights.reason is None
-    assert not any(key.startswith("classifier") for key in weights.tensors)
-    write_weights(tmp_path / "out", "squeeze", weights)
-    loaded = Lpips.load(tmp_path / "out")
-    image = torch.rand(1, 40, 40)
-    expected = Lpips.of("squeeze", weights.tensors)(image, 1 - image)
-    assert torch.equal(loaded(image, 1 - image), expected)
-
-
-def test_the_same_weights_from_a_file_given_by_path_give_the_same_bytes(hub, tmp_path):
-    folder, name, content = hub
-    (folder / name).write_bytes(content)
-    write_weights(tmp_path / "cache", "squeeze", find_weights(config()))
-    (tmp_path / name).write_bytes(content)
-    write_weights(tmp_path / "path", "squeeze", find_weights(config(path=str(tmp_path / name))))
-    for file in ("lpips.json", "lpips.safetensors"):
-        assert (tmp_path / "cache" / file).read_bytes() == (tmp_path / "path" / file).read_bytes()
-
-
-def test_npz_and_safetensors_files_are_read_too(hub, tmp_path):
-    folder, name, content = hub
-    (folder / name).write_bytes(content)
-    tensors = find_weights(config()).tensors
-    save_file(tensors, tmp_path / "w.safetensors")
-    np.savez(tmp_path / "w.npz", **{key: value.numpy() for key, value in tensors.items()})
-    for file in ("w.safetensors", "w.npz"):
-        again = find_weights(config(path=str(tmp_path / file))).tensors
-        assert again.keys() == tensors.keys()
-        assert all(torch.equal(again[key], value) for key, value in tensors.items())
-
-
-def test_a_damaged_file_in_the_hub_cache_is_not_used(hub):
-    folder, name, content = hub
-    (folder / name).write_bytes(content[:-1])
-    assert find_weights(config()) == Weights(None, None, f"{name} in torch's hub cache is damaged")
-
-
-def test_without_a_network_the_search_fails_fast_and_says_where_to_put_the_file(hub, tmp_path):
-    folder, name, _ = hub
-    start = time.perf_counter()
-    weights = find_weights(config())
-    problem = lpips_problem(config())
-    assert time.perf_counter() - start < 5
-    assert weights.tensors is None
-    assert weights.reason == f"{name} is not in torch's hub cache and could not be downloaded"
-    assert str(folder / name) in problem
-    assert "lpips.path" in problem
-    write_weights(tmp_path / "out", "squeeze", weights)
-    record = json.loads((tmp_path / "out" / "lpips.json").read_text())
-    assert record == {"backbone": "squeeze", "reason": weights.reason, "sha256": None, "source": None}
-    assert Lpips.load(tmp_path / "out") is None
-
-
-def test_with_a_network_the_file_is_downloaded_into_the_hub_cache(hub, tmp_path, monkeypatch):
-    folder, name, content = hub
-    (tmp_path / "served").mkdir()
-    (tmp_path / "served" / name).write_bytes(content)
-
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *args):
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=tmp_path / "served")) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        monkeypatch.setattr(lpips, "MODELS_URL", f"http://127.0.0.1:{server.server_port}/")
-        assert lpips_problem(config()) is None
-        assert not (folder / name).exists()
-        assert find_weights(config()).source == name
-        server.shutdown()
-    assert (folder / name).read_bytes() == content
-
-
-def test_weights_that_a_stage_already_wrote_are_no_problem_elsewhere(hub, tmp_path):
-    folder, name, content = hub
-    (folder / name).write_bytes(content)
-    write_weights(tmp_path / "out", "squeeze", find_weights(config()))
-    (folder / name).unlink()
-    assert lpips_problem(config(), tmp_path / "out") is None
-    assert lpips_problem(config("vgg"), tmp_path / "out") is not None
-    assert lpips_problem(config(), tmp_path / "elsewhere") is not None
-
-
-def test_a_path_that_names_no_file_or_other_weights_is_an_error(hub, tmp_path):
-    missing = str(tmp_path / "missing.npz")
-    assert "there is no file" in lpips_problem(config(path=missing))
-    with pytest.raises(ValueError, match=r"lpips.path: there is no file .*missing.npz"):
-        find_weights(config(path=missing))
-    (tmp_path / "text.pth").write_text("no weights")
-    with pytest.raises(ValueError, match=r"text.pth: expected weights as .pth, .npz or .safetensors"):
-        find_weights(config(path=str(tmp_path / "text.pth")))
-    (tmp_path / "made.pth").write_bytes(hub[2])
-    with pytest.raises(ValueError, match=r"made.pth: these are not the weights of LPIPS's vgg backbone"):
-        find_weights(config("vgg", str(tmp_path / "made.pth")))
-
-
-def test_weights_that_are_not_those_of_the_record_are_refused(hub, tmp_path):
-    folder, name, content = hub
-    (folder / name).write_bytes(content)
-    write_weights(tmp_path, "squeeze", find_weights(config()))
-    file = tmp_path / "lpips.safetensors"
-    file.write_bytes(file.read_bytes()[:-4] + b"\0\0\0\0")
-    with pytest.raises(ValueError, match=r"not the file that lpips.json describes"):
-        Lpips.load(tmp_path)
-
-
-def test_an_unknown_backbone_is_refused():
-    with pytest.raises(ValueError, match="backbone: expected one of squeeze, alex, vgg, got 'resnet'"):
-        config("resnet")
-
-
 PIXELWISE = [mse, level_mse, pattern_mse, psnr, correlation]
 
 
@@ -468,3 +229,43 @@ def test_a_mask_that_masks_nothing_changes_nothing_and_one_that_masks_all_leaves
     everywhere = torch.ones(2, 24, 31, dtype=torch.bool)
     torch.testing.assert_close(metric(*pair, everywhere), metric(*pair))
     assert metric(*pair, ~everywhere).isnan().all()
+
+
+@pytest.mark.parametrize("metric", [mse, psnr, ssim, correlation, gradient_agreement, level_mse, pattern_mse])
+def test_numpy_gives_what_torch_gives(pair, metric):
+    a, b = pair
+    valid = b > 0.2
+    assert torch.equal(metric(a.numpy(), b.numpy()), metric(a, b))
+    assert torch.equal(metric(a.numpy(), b.numpy(), valid.numpy()), metric(a, b, valid))
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+def test_a_truth_of_another_data_range_is_refused(pair, metric):
+    a, b = pair
+    with pytest.raises(ValueError, match=r"b: expected frames in \[0, 1\], got values up to 255; divide by 255"):
+        metric(255 * a, 255 * b / b.max())
+    metric(3 * a, b)  # a prediction may exceed it
+    metric(a, torch.where(a > 0.5, 255, b), a <= 0.5)  # so may what nobody looks at
+
+
+@pytest.mark.parametrize("metric", [mse, psnr, ssim, correlation, gradient_agreement, level_mse, pattern_mse])
+def test_frames_of_bytes_or_of_different_shapes_are_refused(unchecked_annotations, pair, metric):
+    a, b = pair
+    with pytest.raises(ValueError, match=r"a: expected floating-point numbers, got torch\.uint8; divide by 255"):
+        metric((255 * a).byte(), b)
+    with pytest.raises(ValueError, match=r"expected a and b of one shape, got a \(2, 24, 31\), b \(24, 31\)"):
+        metric(a, b[0])
+    with pytest.raises(ValueError, match="valid: expected a mask, bool of shape"):
+        metric(a, b, b)
+
+
+def test_lpips_takes_numpy_and_refuses_bytes_and_a_truth_of_another_range(unchecked_annotations):
+    network = Lpips("squeeze")
+    a, b = torch.rand(2, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(network(a.numpy(), b.numpy()), network(a, b))
+    with pytest.raises(ValueError, match=r"images: expected floating-point numbers, got torch\.uint8"):
+        network((255 * a).byte(), b)
+    with pytest.raises(
+        ValueError, match=r"truth: expected images in \[0, 1\], got values up to 2\d\d.*; divide by 255"
+    ):
+        network(a, 255 * b)

@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -72,3 +73,28 @@ def test_round_trip_and_redundancy_on_random_polarization():
     torch.testing.assert_close(dolp(stokes), degree)
     torch.testing.assert_close(aolp(stokes), angle)
     torch.testing.assert_close(intensities[:, 0] + intensities[:, 2], intensities[:, 1] + intensities[:, 3])
+
+
+def test_numpy_gives_what_torch_gives():
+    light = np.random.default_rng(0).random((2, 4, 5, 6))
+    stokes = stokes_from_intensities(light)
+    assert torch.equal(stokes, stokes_from_intensities(torch.from_numpy(light)))
+    assert torch.equal(dolp(stokes.numpy()), dolp(stokes))
+
+
+@pytest.mark.parametrize(
+    ("light", "message"),
+    [
+        (np.zeros((4, 2, 2), np.uint8), "intensities: expected floating-point numbers, got torch.uint8; divide by 255"),
+        (torch.zeros(2, 2, 4), r"expected \(\.\.\., 4, height, width\), got \(2, 2, 4\); use permute\(2, 0, 1\)"),
+        (torch.zeros(4), r"got \(4,\)"),
+    ],
+)
+def test_intensities_whose_differences_would_be_wrong_are_refused(unchecked_annotations, light, message):
+    with pytest.raises(ValueError, match=message):
+        stokes_from_intensities(light)
+
+
+def test_planes_are_not_stretched_to_fit(unchecked_annotations):
+    with pytest.raises(ValueError, match=r"one shape, got s0 \(2, 3\), dolp \(1, 3\), aolp \(2, 3\)"):
+        stokes_from_polarization(torch.ones(2, 3), torch.ones(1, 3), torch.ones(2, 3))

@@ -2,10 +2,10 @@
 
 import argparse
 import contextlib
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from polarnet.cli.outputs import MARKER, WORK, run_folder
 from polarnet.cli.parsers import Commands
 from polarnet.cli.project import project_root
 
@@ -66,9 +66,9 @@ def _own_scenes(options: argparse.Namespace, config: "Config", scenes: Path, out
     from polarnet.reports.tables import as_plain, score_table
 
     command = f"polarnet benchmark --scenes {options.scenes}"
-    metrics, notes = benchmark_folder(config, scenes, options.kind, out, weights, command)
-    reason = json.loads((out / "details.json").read_text())["lpips"]["reason"]
-    print(as_plain(score_table(metrics, lpips_reason=reason)))
+    with run_folder(out, "benchmark --scenes") as folder:
+        metrics, notes = benchmark_folder(config, scenes, options.kind, folder, out / WORK, weights, command)
+    print(as_plain(score_table(metrics)))
     for note in notes:
         print(note)
     print(f"the page: {out / 'index.html'}")
@@ -80,6 +80,7 @@ def _study(options: argparse.Namespace, config: "Config", out: Path, weights: Pa
 
     run = run_event_budget if options.event_budget else run_sensitivity
     methods = options.methods.split(",") if options.methods else STUDIED
-    run(config, out, methods, options.limit, weights)
-    print(f"written to {out}: {', '.join(sorted(path.name for path in out.iterdir()))}")
+    with run_folder(out, f"benchmark {'--event-budget' if options.event_budget else '--sensitivity'}") as folder:
+        run(config, folder, methods, options.limit, weights)
+    print(f"written to {out}: {', '.join(sorted(path.name for path in out.iterdir() if path.name != MARKER))}")
     return 0

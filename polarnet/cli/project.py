@@ -31,11 +31,14 @@ def add_to(commands: Commands) -> None:
 
     measure = commands.add_parser("measure", help="write the figures that README and docs show")
     measure.add_argument(
-        "what", nargs="?", choices=("pipeline", "benchmark", "ablation"), default="pipeline",
+        "what", nargs="?", choices=("pipeline", "benchmark", "ablation", "sweep"), default="pipeline",
         help="pipeline: time the README's two commands in a fresh clone of HEAD; benchmark: what data/benchmark holds; "
-        "ablation: what a sweep over conf/ablation has left",
+        "ablation: what a sweep over conf/ablation has left; sweep: the same of sweeps over the weights of the loss",
     )  # fmt: skip
-    measure.add_argument("--sweep", type=Path, metavar="FOLDER", help="of ablation: below outputs/sweeps")
+    measure.add_argument(
+        "--sweep", type=Path, nargs="+", default=[], metavar="FOLDER",
+        help="below outputs/sweeps: one for ablation, one or more for sweep",
+    )  # fmt: skip
     measure.set_defaults(run=_measure)
 
 
@@ -102,13 +105,18 @@ def _docs(options: argparse.Namespace) -> int:
 
 
 def _measure(options: argparse.Namespace) -> int:
-    from polarnet.measure import measure_ablation, measure_benchmark, measure_pipeline
+    from polarnet.measure import measure_ablation, measure_benchmark, measure_pipeline, measure_sweep
 
     root = project_root()
+    if options.what in ("ablation", "sweep") and not options.sweep:
+        raise ValueError(f"measure {options.what}: say --sweep FOLDER, the one that the sweep named at its end")
     if options.what == "ablation":
-        if options.sweep is None:
-            raise ValueError("measure ablation: say --sweep FOLDER, the one that the sweep named at its end")
-        path = measure_ablation(root, options.sweep)
+        if len(options.sweep) > 1:
+            raise ValueError(f"measure ablation: expected one --sweep FOLDER, got {len(options.sweep)}")
+        path = measure_ablation(root, options.sweep[0])
+    elif options.what == "sweep":
+        path, picture = measure_sweep(root, options.sweep)
+        print(f"wrote {picture}")
     elif options.what == "benchmark":
         path = measure_benchmark(root, root / "data" / "benchmark")
     else:

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.parsers import Commands
 from polarnet.cli.project import project_root
 
@@ -135,13 +136,20 @@ def _inspect(options: argparse.Namespace) -> int:
 
 def _register(options: argparse.Namespace) -> int:
     from polarnet.recordings.recording import read_recording
-    from polarnet.recordings.registration import event_image, register, warped
+    from polarnet.recordings.registration import UNRELATED, event_image, register, warped
     from polarnet.reports.calibration import draw_registration
 
     files = options.reference, options.file
     reference, moving = (event_image(read_recording(path, **_reading(options)).events) for path in files)
     found = register(reference, moving)
-    print(json.dumps({"homography": found.homography.tolist(), "correlation": found.correlation}, indent=2))
+    print(json.dumps({**found._asdict(), "homography": found.homography.tolist()}, indent=2))
+    if found.edge_correlation < UNRELATED:
+        print(
+            f"polarnet register: warning: the edges of the two recordings do not meet (correlation "
+            f"{found.edge_correlation:.2f}, expected at least {UNRELATED:g}): do not use this homography. They show "
+            f"other scenes, too few edges, or cameras too far apart",
+            file=sys.stderr,
+        )
     if options.picture:
         draw_registration(reference, moving, warped(moving, found.homography), options.picture)
     return 0
@@ -150,10 +158,11 @@ def _register(options: argparse.Namespace) -> int:
 def _recover(options: argparse.Namespace) -> int:
     from polarnet.config import load
     from polarnet.events.streaming import WindowRule, parse_window
+    from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recordings.recording import read_recording
     from polarnet.recover import Arrangement, facts_of, open_files, open_live, open_method, recover
     from polarnet.reports.recovery import RecoveryWriter
-    from polarnet.stokes import parse_mosaic
+    from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
     _check_taken(options)
     config = functools.cache(lambda: load(project_root()))
@@ -167,21 +176,30 @@ def _recover(options: argparse.Namespace) -> int:
     out = options.out or Path("outputs") / "recover" / name
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     lines = None
-    if options.live:
-        source, lines = open_live(options.input[0], mosaic, options.idle)
-    else:
-        read = functools.partial(read_recording, **_reading(options))
-        arrangement = Arrangement(options.angles, mosaic, options.sequence)
-        size = (options.size[0], options.size[1]) if options.size else None
-        source = open_files([Path(path) for path in options.input], arrangement, read, size, out / "work", config)
-    writer = RecoveryWriter(out, options.write or ("zarr", "png", "mp4"), options.video_rate)
-    summary = recover(source, rule, recoverer, writer)
-    facts = facts_of(source, rule, words, summary)
+    with run_folder(out, "recover") as folder:
+        if options.live:
+            print(f"frames come into {folder}, and move to {out} at the end", file=sys.stderr)
+            source, lines = open_live(options.input[0], mosaic, options.idle)
+        else:
+            read = functools.partial(read_recording, **_reading(options))
+            arrangement = Arrangement(options.angles, mosaic, options.sequence)
+            size = (options.size[0], options.size[1]) if options.size else None
+            source = open_files([Path(path) for path in options.input], arrangement, read, size, folder / WORK, config)
+        check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
+        source = source._replace(pieces=check.watch(source.pieces))
+        writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
+        summary = recover(source, rule, recoverer, writer)
+        left_out = {kind: count for kind, count in lines.counts.items() if count} if lines else {}
+        notes = [*check.findings(), *([f"Lines that were left out: {left_out}."] if left_out else [])]
+        counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)
+        facts = facts_of(source, rule, words, summary)
+        facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
+        page = writer.write_page(source.name, facts, notes)
     for key, value in facts.items():
         print(f"{key:11s} {value}")
-    left_out = {kind: count for kind, count in lines.counts.items() if count} if lines else {}
-    notes = [f"Lines that were left out: {left_out}."] if left_out else []
-    print(*notes, f"the page: {writer.write_page(source.name, facts, notes)}", sep="\n")
+    for note in notes:
+        print(f"polarnet recover: warning: {note}", file=sys.stderr)
+    print(f"the page: {out / page.name}")
     return 0
 
 

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from polarnet.cli.outputs import run_folder
 from polarnet.cli.parsers import Commands
 
 
@@ -45,7 +46,9 @@ def _export(options: argparse.Namespace) -> int:
     from polarnet.events.exchange import export_store
     from polarnet.events.store import EventStore
 
-    export_store(EventStore.open(options.store), options.folder, options.format)
+    store = EventStore.open(options.store)
+    with run_folder(options.folder, "export") as folder:
+        export_store(store, folder, options.format)
     print(f"{options.store} -> {options.folder}")
     return 0
 

@@ -141,12 +141,14 @@ def run_benchmark(
         lpips = lpips.to(context.device)
     kept = Cache(cache / test_set.name)
     digests = {row: _row_digest(row, context) for row in config.methods}
+    scoring = digest(code_digest(score_sequence), str(config.warmup_windows), _lpips_digest(lpips))
     shown = _spread(names, config.panel_scenes, {name: test_set.scene_of(name) for name in names})
     task = functools.partial(
         _measured,
         test_set=test_set,
         context=context,
         digests=digests,
+        scoring=scoring,
         config=config,
         lpips=lpips,
         cache=kept,
@@ -169,6 +171,7 @@ def _measured(
     test_set: BenchmarkSet,
     context: Context,
     digests: Mapping[str, str],
+    scoring: str,
     config: BenchmarkConfig,
     lpips: Lpips | None,
     cache: Cache,
@@ -180,15 +183,16 @@ def _measured(
     predictions = {row: known for row, key in keys.items() if (known := cache.prediction(row, name, key)) is not None}
     made = predictions_of([row for row in keys if row not in predictions], sequence, context)
     predictions |= {row: cache.write_prediction(row, name, keys[row], made[row]) for row in made}
-    scoring = digest(code_digest(score_sequence), str(config.warmup_windows), _lpips_digest(lpips))
-    rows: list[FrameScore] = []
-    for row, key in keys.items():
-        score_key = digest(key, scoring)
-        if (scores := cache.scores(row, name, score_key)) is None:
-            scores = score_sequence(sequence, {row: predictions[row]}, config.warmup_windows, lpips, context.device)
-            cache.write_scores(row, name, score_key, scores)
-        rows += scores
     ordered = {row: predictions[row] for row in keys}
+    score_keys = {row: digest(key, scoring) for row, key in keys.items()}
+    scores = {row: rows for row, key in score_keys.items() if (rows := cache.scores(row, name, key)) is not None}
+    unscored = {row: prediction for row, prediction in ordered.items() if row not in scores}
+    if unscored:  # together, so that LPIPS's features of the truth are computed once
+        scored = score_sequence(sequence, unscored, config.warmup_windows, lpips, context.device)
+        for row in unscored:
+            scores[row] = [score for score in scored if score.method == row]
+            cache.write_scores(row, name, score_keys[row], scores[row])
+    rows = [score for row in keys for score in scores[row]]
     panel = _panel(sequence, ordered, config.warmup_windows) if name in shown else None
     return SequenceResult(rows, _reliability(sequence, ordered, config.warmup_windows), panel)
 
@@ -233,8 +237,9 @@ def write_benchmark(
     """Write metrics.json, details.json (`about` and the settings), frames.csv, panels/<sequence>.npz; the metrics."""
     shutil.rmtree(folder / "panels", ignore_errors=True)  # a run before may have shown other scenes
     (folder / "panels").mkdir(parents=True)
+    backbone = {"lpips_backbone": config.lpips_backbone} if config.lpips else {}
     metrics: dict[str, dict[str, Any]] = {
-        method: {**scores, **dataclasses.asdict(benchmark.costs[method])}
+        method: {**scores, **backbone, **dataclasses.asdict(benchmark.costs[method])}
         for method, scores in summary(benchmark.rows, config.bootstrap_samples, seed).items()
     }
     means = {metric: scene_means(benchmark.rows, metric) for metric in METRICS}

@@ -20,6 +20,8 @@ class Reference:
     name: str
     label: str
     colour: str
+    about: str
+    """Sentence of the glossary of pages."""
     predict: Callable[[TestSequence, float | None], Prediction]
     """The sequence and the mean DoLP of the training split -> a frame a window."""
     needs_train_mean: bool = False
@@ -47,9 +49,23 @@ def own_mean(sequence: TestSequence, train_mean: float | None) -> Prediction:
 REFERENCES = {
     row.name: row
     for row in (
-        Reference("zeros", "zeros", COLOUR, zeros),
-        Reference("train_mean", "training mean", COLOUR, train_mean, needs_train_mean=True),
-        Reference("oracle_mean", "oracle mean", COLOUR, own_mean),
+        Reference("zeros", "zeros", COLOUR, "A constant: no polarization anywhere.", zeros),
+        Reference(
+            "train_mean",
+            "training mean",
+            COLOUR,
+            "A constant: the mean DoLP of the training split.",
+            train_mean,
+            needs_train_mean=True,
+        ),
+        Reference(
+            "oracle_mean",
+            "oracle mean",
+            COLOUR,
+            "Each true frame's own mean, the best constant there is. It looks at the truth, so it is no method; what "
+            "does not beat it shows little spatial skill in MSE.",
+            own_mean,
+        ),
     )
 }
 """Reference row by name, in the order of every table."""

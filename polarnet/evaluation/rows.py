@@ -4,6 +4,7 @@ import functools
 from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,9 +20,11 @@ from polarnet.methods.method import (
     State,
     clamped,
     each_map,
+    weights_file,
     weights_record,
     why_absent,
 )
+from polarnet.networks.checkpoint import load_checkpoint
 from polarnet.stokes import Prediction
 
 ROWS: Mapping[str, Reference | Method] = ChainMap(METHODS, REFERENCES)  # type: ignore[arg-type]
@@ -105,6 +108,18 @@ def why_left_out(name: str, context: Context) -> str | None:
 
 
 def weights_used(names: Sequence[str], context: Context) -> dict[str, dict[str, str]]:
-    """Section of `methods`, then file name and sha256 of the weights, for each of these rows that needs any."""
-    methods = [METHODS[name] for name in names if name in METHODS and METHODS[name].weights is not None]
-    return {method.section: weights_record(context.setup_of(method)) for method in methods}
+    """Section of `methods`, then file name, sha256 and network of the weights, for each of these rows that needs any.
+
+    ValueError or FileNotFoundError where they are missing or of another network.
+    """
+    return {method.section: weights_record(method, context.setup_of(method)) for method in _with_weights(names)}
+
+
+def metadata_used(names: Sequence[str], context: Context) -> dict[str, dict[str, Any]]:
+    """Section of `methods`, then the metadata of its checkpoint, for each of these rows that has one of polarnet."""
+    paths = {method.section: weights_file(context.setup_of(method)) for method in _with_weights(names)}
+    return {row: load_checkpoint(path)[1] for row, path in paths.items() if path.suffix == ".safetensors"}
+
+
+def _with_weights(names: Sequence[str]) -> list[Method]:
+    return [METHODS[name] for name in names if name in METHODS and METHODS[name].weights is not None]

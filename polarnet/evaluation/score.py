@@ -14,6 +14,7 @@ from torch import Tensor
 
 from polarnet.evaluation.rows import ROWS
 from polarnet.evaluation.sequences import TestSequence
+from polarnet.lpips import BACKBONES
 from polarnet.ranges import allowed, check_ranges
 from polarnet.runtime import generator_for
 from polarnet.similarity import (
@@ -52,6 +53,10 @@ class BenchmarkConfig:
     """First windows of a sequence that no score counts, for every method alike: nothing has moved far enough yet."""
     precision: str = field(metadata=allowed(choices=("fp32", "bf16")))
     """Of the networks; scores in fp32 do not depend on a processor's bf16 kernels."""
+    lpips: bool
+    """Whether LPIPS is a column."""
+    lpips_backbone: str = field(metadata=allowed(choices=tuple(BACKBONES)))
+    """Of that column, always in fp32; the paper's is vgg."""
     bootstrap_samples: int = field(metadata=allowed(low=1))
     panel_scenes: int = field(metadata=allowed(low=0))
     """Scenes shown as pictures."""
@@ -79,7 +84,7 @@ class FrameScore(NamedTuple):
     psnr: float
     ssim: float
     lpips: float | None
-    """None without LPIPS weights."""
+    """None where LPIPS is no column."""
     corr: float
     grad: float
     """`similarity.gradient_agreement`."""
@@ -250,8 +255,15 @@ def _lpips_of(
         chunk = slice(start, start + FRAMES_AT_ONCE)
         of_truth = lpips.features(truth[chunk])
         for method, frames in recovered.items():
-            parts[method].append(lpips.distance(lpips.features(frames[chunk]), of_truth))
+            parts[method].append(lpips.distance(_features_of(frames[chunk], lpips), of_truth))
     return {method: torch.cat(distances) for method, distances in parts.items()}
+
+
+def _features_of(frames: Float[Tensor, "n h w"], lpips: Lpips) -> list[Float[Tensor, "n _c _h _w"]]:
+    """LPIPS's features, computed once where every frame is the same: a constant."""
+    if torch.equal(frames, frames[:1].expand_as(frames)):
+        return [features.expand(len(frames), -1, -1, -1) for features in lpips.features(frames[:1])]
+    return lpips.features(frames)
 
 
 def _finite(row: FrameScore) -> FrameScore:

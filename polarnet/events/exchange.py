@@ -1,6 +1,7 @@
 """Events to and from the files of other tools: HDF5 as DSEC lays it out, and text lines `t x y p`."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ CONTENTS = "store.json"
 HDF5_CHUNK = 2**16  # events
 
 
-def write_hdf5(path: Path, events: Events, duration_us: int) -> None:
+def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:
     """One polarizer as DSEC (Gehrig et al. 2021) stores a camera: events/{x,y,t,p}, ms_to_idx and t_offset.
 
     Polarity is 1 or 0 there. The sensor's size is added as the attributes height and width. Needs h5py.
@@ -36,7 +37,7 @@ def write_hdf5(path: Path, events: Events, duration_us: int) -> None:
         file.attrs["height"], file.attrs["width"] = events.height, events.width
 
 
-def read_hdf5(path: Path, height: int | None = None, width: int | None = None) -> Events:
+def read_hdf5(path: str | os.PathLike[str], height: int | None = None, width: int | None = None) -> Events:
     """The events of a DSEC file, at times t + t_offset; the sensor's size from the file where it says so.
 
     ValueError that names the file where it has no events, no size (give one; DSEC is 480x640) or broken events.
@@ -52,24 +53,24 @@ def read_hdf5(path: Path, height: int | None = None, width: int | None = None) -
     return _events(path, t.astype(np.int64) + offset_us, x, y, p, height, width)
 
 
-def write_text(path: Path, events: Events, duration_us: int) -> None:
+def write_text(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:
     """One polarizer as a line `width height`, then a line `t x y p` for each event: what E2VID's tools read.
 
     t in seconds, six decimals; p is 1 or 0. The duration has no place in such a file.
     """
-    with path.open("w", encoding="ascii") as file:
+    with Path(path).open("w", encoding="ascii") as file:
         file.write(f"{events.width} {events.height}\n")
         rows = zip(*(column.tolist() for column in (events.t, events.x, events.y, events.p)), strict=True)
         file.writelines(f"{t // 1_000_000}.{t % 1_000_000:06d} {x} {y} {int(p > 0)}\n" for t, x, y, p in rows)
 
 
-def read_text(path: Path, height: int | None = None, width: int | None = None) -> Events:
+def read_text(path: str | os.PathLike[str], height: int | None = None, width: int | None = None) -> Events:
     """Events from lines `t x y p`, under a line `width height` or with the size given; # starts a comment.
 
     t is in seconds where the first event's t has a decimal point, else in microseconds; p is 1 or 0, or 1 or -1.
     ValueError that names the file where it is anything else.
     """
-    lines = [text for line in path.read_text(encoding="ascii", errors="replace").splitlines()
+    lines = [text for line in Path(path).read_text(encoding="ascii", errors="replace").splitlines()
              if (text := line.split("#")[0].strip())]  # fmt: skip
     try:
         if lines and len(lines[0].split()) == 2:
@@ -95,11 +96,12 @@ class Form(NamedTuple):
 FORMS = {"hdf5": Form(".h5", write_hdf5, read_hdf5), "text": Form(".txt", write_text, read_text)}
 
 
-def export_store(store: EventStore, folder: Path, form: str) -> None:
+def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -> None:
     """Write FOLDER/SEQUENCE/polarizer_{000,045,090,135}.{h5,txt} for every sequence, then FOLDER/store.json.
 
     `form` is hdf5 or text. store.json holds what these files have no place for; `import_store` reads it.
     """
+    folder = Path(folder)
     suffix, write, _ = _form(form)
     for sequence in store.sequences:
         if Path(sequence).name != sequence:
@@ -119,11 +121,12 @@ def export_store(store: EventStore, folder: Path, form: str) -> None:
     (folder / CONTENTS).write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
 
 
-def import_store(folder: Path, path: str | Path) -> None:
+def import_store(folder: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
     """Make an event store of a folder that `export_store` wrote: the same bytes as the store it came from.
 
     Other files are recordings: `polarnet.recordings` reads, checks and repairs them.
     """
+    folder = Path(folder)
     try:
         contents: dict[str, Any] = json.loads((folder / CONTENTS).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -147,7 +150,7 @@ def _files(folder: Path, suffix: str) -> list[Path]:
 
 
 def _events(
-    path: Path,
+    path: str | os.PathLike[str],
     t_us: np.ndarray,
     x: np.ndarray,
     y: np.ndarray,

@@ -1,15 +1,25 @@
 """Ground truth of event sequences: exact frames of intensity, DoLP and AoLP, quantised to 16 bits, in Zarr v3."""
 
 import math
+import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64, UInt8, UInt16
+from jaxtyping import Bool, Float, Int64, Integer, UInt8, UInt16
 from torch import Tensor
 
+from polarnet.arrays import (
+    Array,
+    as_tensor,
+    check_range,
+    check_shape,
+    floats,
+    fractions,
+    mask_of,
+    whole_numbers,
+)
 from polarnet.events.table import Column, Columns, Table, check_names, create_table, open_table, refuse_missing
 
 FORMAT = "polarnet.frames"
@@ -18,7 +28,6 @@ VERSION = 1
 SPLITS = ("train", "val", "test")
 FRACTION_STEPS = 2**16 - 1
 ANGLE_STEPS = 2**16
-TOLERANCE = 1e-4  # float32 arithmetic may leave [0, 1] by some of its steps; more is a mistake of the caller's
 FRAMES_A_CHUNK = 32
 
 CONVENTIONS = {
@@ -42,10 +51,9 @@ class Frames(NamedTuple):
     """Where the truth is known; None: everywhere."""
 
 
-def quantise_fraction(fraction: Float[Tensor, "*shape"]) -> UInt16[np.ndarray, "*shape"]:
+def quantise_fraction(fraction: Float[Array, "*shape"], name: str = "fraction") -> UInt16[np.ndarray, "*shape"]:
     """A quantity of [0, 1] in 65535 steps; ValueError outside, beyond float32's own error."""
-    _check_range(fraction, 1.0)
-    return (fraction * FRACTION_STEPS).round().clamp(0, FRACTION_STEPS).numpy().astype(np.uint16)
+    return (fractions(name, fraction, "...") * FRACTION_STEPS).round().numpy().astype(np.uint16)
 
 
 def dequantise_fraction(steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
@@ -53,10 +61,11 @@ def dequantise_fraction(steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*
     return torch.from_numpy(steps.astype(np.float32)).div_(FRACTION_STEPS)
 
 
-def quantise_angle(angle: Float[Tensor, "*shape"]) -> UInt16[np.ndarray, "*shape"]:
+def quantise_angle(angle: Float[Array, "*shape"], name: str = "angle") -> UInt16[np.ndarray, "*shape"]:
     """Radians of [0, pi) in 65536 steps round the circle (what rounds up to pi is 0); ValueError outside."""
-    _check_range(angle, math.pi)
-    return ((angle * (ANGLE_STEPS / math.pi)).round().numpy().astype(np.int64) % ANGLE_STEPS).astype(np.uint16)
+    checked = floats(name, angle, "...")
+    check_range(name, checked, 0, math.pi, "radians", "fold them into [0, pi), degrees after torch.deg2rad")
+    return ((checked * (ANGLE_STEPS / math.pi)).round().numpy().astype(np.int64) % ANGLE_STEPS).astype(np.uint16)
 
 
 def dequantise_angle(steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
@@ -92,7 +101,7 @@ class FrameStore:
     @classmethod
     def create(
         cls,
-        path: str | Path,
+        path: str | os.PathLike[str],
         sequences: Sequence[str],
         splits: Mapping[str, str],
         n_frames: int,
@@ -122,36 +131,38 @@ class FrameStore:
         return cls(create_table(path, FORMAT, VERSION, metadata, _columns(metadata)))
 
     @classmethod
-    def open(cls, path: str | Path) -> "FrameStore":
+    def open(cls, path: str | os.PathLike[str]) -> "FrameStore":
         """A finished store: a local folder, a zip, or an fsspec URL. See `polarnet.events.table.open_table`."""
         return cls(open_table(path, FORMAT, VERSION, _columns))
 
     def write(
         self,
         sequence: str,
-        t_us: Int64[Tensor, " n"],
-        intensity: Float[Tensor, "n 4 h w"],
-        dolp: Float[Tensor, "n h w"],
-        aolp: Float[Tensor, "n h w"],
-        valid: Bool[Tensor, "n h w"] | None = None,
+        t_us: Integer[Array, " n"],
+        intensity: Float[Array, "n 4 h w"],
+        dolp: Float[Array, "n h w"],
+        aolp: Float[Array, "n h w"],
+        valid: Bool[Array, "n h w"] | None = None,
     ) -> None:
         """Put the frames of a sequence in its row; a sequence that is there already stays as it is.
 
-        ValueError for values out of range, times that do not increase, or a mask (None: all pixels are valid) in a
-        store that has none.
+        Arrays may be numpy or torch. Raises TypeError for what is no array, and ValueError for values out of range or
+        not finite, integers as intensities, other shapes, times that do not increase, or a mask (None: all pixels are
+        valid) in a store that has none.
         """
-        self._check(t_us, intensity, dolp, aolp, valid)
+        t_us = self._checked_times(t_us)
+        self._check_shapes(len(t_us), intensity, dolp, aolp)
+        known = self._checked_mask(valid, dolp.shape)
         if self._table.is_written("t_us", sequence):
             return
         values = {
-            "intensity": quantise_fraction(intensity),
-            "dolp": quantise_fraction(dolp),
-            "aolp": quantise_angle(aolp),
+            "intensity": quantise_fraction(intensity, "intensity"),
+            "dolp": quantise_fraction(dolp, "dolp"),
+            "aolp": quantise_angle(aolp, "aolp"),
         }
         for name, steps in values.items():
             self._table.write(name, sequence, steps)
         if self.masked:
-            known = torch.ones(dolp.shape, dtype=torch.bool) if valid is None else valid
             self._table.write("valid", sequence, pack_mask(known))
         self._table.write("t_us", sequence, t_us.numpy())
 
@@ -216,20 +227,22 @@ class FrameStore:
     def _read(self, name: str, sequence: str) -> np.ndarray:
         return self._table.read(name, sequence, slice(len(self.t_us(sequence))))
 
-    def _check(self, t_us: Tensor, intensity: Tensor, dolp: Tensor, aolp: Tensor, valid: Tensor | None) -> None:
-        if valid is not None and not self.masked:
+    def _checked_times(self, t_us: Integer[Array, " n"]) -> Int64[Tensor, " n"]:
+        times, most = whole_numbers("t_us", t_us), self._table.columns["t_us"].shape[0]
+        if times.ndim != 1 or not 0 < len(times) <= most or (times < 0).any() or (times.diff() <= 0).any():
+            raise ValueError(f"expected 1 to {most} frame times, increasing from 0 or later, got {times.tolist()[:40]}")
+        return times
+
+    def _check_shapes(self, n: int, intensity: Array, dolp: Array, aolp: Array) -> None:
+        for name, frames, channels in (("intensity", intensity, "4 "), ("dolp", dolp, ""), ("aolp", aolp, "")):
+            check_shape(name, as_tensor(name, frames), f"{n} {channels}{self.height} {self.width}")
+
+    def _checked_mask(self, valid: Bool[Array, "n h w"] | None, shape: Sequence[int]) -> Bool[Tensor, "n h w"]:
+        if valid is None:
+            return torch.ones(tuple(shape), dtype=torch.bool)
+        if not self.masked:
             raise ValueError(f"{self.path}: got a mask for a store without one; create it with masked=True")
-        n, most = len(t_us), self._table.columns["t_us"].shape[0]
-        if not 0 < n <= most or (t_us < 0).any() or (t_us.diff() <= 0).any():
-            raise ValueError(f"expected 1 to {most} frame times, increasing from 0 or later, got {t_us.tolist()[:40]}")
-        for name, frames, shape in (
-            ("intensity", intensity, (n, 4, self.height, self.width)),
-            ("dolp", dolp, (n, self.height, self.width)),
-            ("aolp", aolp, (n, self.height, self.width)),
-            ("valid", dolp if valid is None else valid, (n, self.height, self.width)),
-        ):
-            if tuple(frames.shape) != shape:
-                raise ValueError(f"expected {name} of shape {shape}, got {tuple(frames.shape)}")
+        return mask_of("valid", valid, shape).cpu()
 
 
 def check_splits(names: Sequence[str], splits: Mapping[str, str]) -> None:
@@ -246,7 +259,7 @@ def names_of_split(splits: Mapping[str, str], split: str) -> list[str]:
     return [name for name, its_split in splits.items() if its_split == split]
 
 
-def verify_frames(path: str | Path) -> list[str]:
+def verify_frames(path: str | os.PathLike[str]) -> list[str]:
     """Everything that is wrong with a frame store, each with its sequence and column; empty when it is whole."""
     try:
         store = FrameStore.open(path)
@@ -293,11 +306,3 @@ def _columns(metadata: Mapping[str, Any]) -> Columns:
             shuffle="bitshuffle",
         )
     return columns
-
-
-def _check_range(values: Tensor, most: float) -> None:
-    if not values.numel():
-        return
-    low, high = float(values.min()), float(values.max())
-    if not (low >= -TOLERANCE and high <= most + TOLERANCE):  # false for NaN too
-        raise ValueError(f"expected values of 0 to {most:.6g}, got {low:.6g} to {high:.6g}")

@@ -18,7 +18,9 @@ def event_tensor(events: Events, window_us: int) -> Float[Tensor, "h w"]:
 
     Time counts from the first event of this channel in the window, in window lengths: that event weighs 0, one at the
     very end of the window less than 1 (1, when the first came as the window opened).
+    ValueError for a window without a length.
     """
+    _check_length(window_us)
     elapsed = (events.t - events.t[:1]) / window_us
     image = elapsed.new_zeros(events.height * events.width).index_add_(0, _pixel(events), events.p * elapsed)
     return image.view(events.height, events.width)
@@ -28,8 +30,10 @@ def voxel_grid(events: Events, bins: int) -> Float[Tensor, "bins h w"]:
     """Polarities shared out between the two nearest of `bins` instants (E2VID, Rebecq et al. 2019).
 
     t* = (bins - 1) (t - first) / (last - first): the first event is in bin 0, the last in bin n-1, however long the
-    window is. Bilinear in time only. Events that all have one time are in bin 0.
+    window is. Bilinear in time only. Events that all have one time are in bin 0. ValueError for no bins.
     """
+    if bins < 1:
+        raise ValueError(f"voxel_grid: expected at least one bin, got {bins}")
     size = events.height * events.width
     grid = torch.zeros(bins * size, device=events.t.device)
     if len(events):
@@ -61,7 +65,9 @@ def time_surface(events: Events, window_us: int) -> Float[Tensor, "h w"]:
     """Polarity of each pixel's last event, faded by its age: p exp(-(t_last - t) / window) (Lagorce et al. 2017).
 
     Ages count back from the last event of the channel, which therefore weighs 1. Pixels without an event are 0.
+    ValueError for a window without a length.
     """
+    _check_length(window_us)
     size = events.height * events.width
     number = torch.arange(1, len(events) + 1, device=events.t.device)
     latest = number.new_zeros(size).scatter_reduce_(0, _pixel(events), number, "amax")  # 0: no event
@@ -99,6 +105,11 @@ def channels_of(encode: Encode) -> int:
     """How many images a representation makes of one polarizer's events."""
     shape = encode(Events.empty(1, 1), 1).shape
     return shape[0] if len(shape) == 3 else 1
+
+
+def _check_length(window_us: int) -> None:
+    if window_us <= 0:
+        raise ValueError(f"expected a window longer than 0 us, got {window_us}")
 
 
 def _pixel(events: Events) -> Int64[Tensor, " n"]:

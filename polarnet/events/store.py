@@ -7,8 +7,8 @@ starts, and where the last one ends; it is written last. `duration_us` is the le
 """
 
 import itertools
+import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,7 +64,12 @@ class EventStore:
 
     @classmethod
     def create(
-        cls, path: str | Path, sequences: Sequence[str], height: int, width: int, attributes: Mapping[str, Any]
+        cls,
+        path: str | os.PathLike[str],
+        sequences: Sequence[str],
+        height: int,
+        width: int,
+        attributes: Mapping[str, Any],
     ) -> "EventStore":
         """A store to write, at PATH.tmp until it is finished.
 
@@ -86,7 +91,7 @@ class EventStore:
         return cls(create_table(path, FORMAT, VERSION, metadata, _columns(metadata)))
 
     @classmethod
-    def open(cls, path: str | Path) -> "EventStore":
+    def open(cls, path: str | os.PathLike[str]) -> "EventStore":
         """A finished store: a local folder, a zip, or an fsspec URL. See `polarnet.events.table.open_table`."""
         return cls(open_table(path, FORMAT, VERSION, _columns))
 
@@ -221,7 +226,7 @@ class EventStore:
                 raise ValueError(f"polarizer {angle}: {error}") from None
 
 
-def verify(path: str | Path) -> list[str]:
+def verify(path: str | os.PathLike[str]) -> list[str]:
     """Everything that is wrong with an event store, each with its sequence and column; empty when it is whole."""
     try:
         store = EventStore.open(path)

@@ -8,8 +8,10 @@ from typing import no_type_check
 import numba
 import numpy as np
 import torch
-from jaxtyping import Int8, Int16, Int64
+from jaxtyping import Int8, Int16, Int64, Integer
 from torch import Tensor
+
+from polarnet.arrays import Array, whole_numbers
 
 LARGEST_SIDE = 2**15 - 1  # pixels; coordinates are int16
 
@@ -43,6 +45,31 @@ class Events:
 
     def __len__(self) -> int:
         return len(self.t)
+
+    @classmethod
+    def from_columns(
+        cls,
+        t: Integer[Array, " n"],
+        x: Integer[Array, " n"],
+        y: Integer[Array, " n"],
+        p: Integer[Array, " n"],
+        height: int,
+        width: int,
+    ) -> "Events":
+        """Events from numpy or torch columns of any integer type: microseconds, column, row, and +1 or -1.
+
+        Every event is checked. Raises TypeError for what is no array, and ValueError for floats, columns of different
+        lengths, and as `validate` does.
+        """
+        columns = {}
+        for (name, dtype), values in zip(_COLUMNS.items(), (t, x, y, p), strict=True):
+            wide = whole_numbers(name, values)
+            columns[name] = wide.to(dtype)
+            if not torch.equal(columns[name].long(), wide):
+                raise ValueError(
+                    f"events: expected {name} that fit {dtype}, got {int(wide.min())} to {int(wide.max())}"
+                )
+        return validate(cls(**columns, height=height, width=width))
 
     @classmethod
     def empty(cls, height: int, width: int) -> "Events":

@@ -81,7 +81,12 @@ class WindowCutter:
         self._start_us = 0
 
     def add(self, channels: Sequence[Events], until_us: int) -> Iterator[EventWindow]:
-        """The windows that are complete once every event before `until_us` has come; `channels` are the new ones."""
+        """The windows that are complete once every event before `until_us` has come; `channels` are the new ones.
+
+        ValueError for other than four channels, of another size than before, or with events before those of the last.
+        """
+        if len(channels) != 4:
+            raise ValueError(f"expected the events of four polarizers, got {len(channels)} channels")
         self._held = [concatenate([held, new]) for held, new in zip(self._held, channels, strict=True)]
         if self.rule.length_us is not None:
             return self._by_time(self.rule.length_us, until_us)

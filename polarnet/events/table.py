@@ -177,7 +177,9 @@ def refuse_missing(path: str, missing: Sequence[str]) -> None:
         raise ValueError(f"{path}: {len(missing)} not written yet: {', '.join(missing[:8])}; write them, then finish")
 
 
-def create_table(path: str | Path, form: str, version: int, attributes: Mapping[str, Any], columns: Columns) -> Table:
+def create_table(
+    path: str | os.PathLike[str], form: str, version: int, attributes: Mapping[str, Any], columns: Columns
+) -> Table:
     """A table to write at PATH.tmp: the unfinished one that lies there, if its attributes are equal, else a new one.
 
     One process creates, and hands the table to the others that write.
@@ -195,7 +197,9 @@ def create_table(path: str | Path, form: str, version: int, attributes: Mapping[
     return table
 
 
-def open_table(path: str | Path, form: str, version: int, columns_of: Callable[[Attributes], Columns]) -> Table:
+def open_table(
+    path: str | os.PathLike[str], form: str, version: int, columns_of: Callable[[Attributes], Columns]
+) -> Table:
     """A finished table to read; `columns_of(attributes)` says which columns it has.
 
     `path` is a local folder, a zip of one (its zarr.json at the top, as `cd STORE; zip -r0 ../STORE.zip .` makes it),
@@ -218,7 +222,7 @@ def open_table(path: str | Path, form: str, version: int, columns_of: Callable[[
     return Table(os.fspath(path), group, columns_of(header))
 
 
-def open_group(path: str | Path) -> zarr.Group:
+def open_group(path: str | os.PathLike[str]) -> zarr.Group:
     """The Zarr group in a local folder, a zip or at an fsspec URL, to read; FileNotFoundError where there is none."""
     name = os.fspath(path)
     store: FsspecStore | ZipStore | LocalStore

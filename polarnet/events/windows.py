@@ -5,10 +5,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int8, Int64
+from jaxtyping import Bool, Float, Int8, Int64, Integer
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from polarnet.arrays import Array, whole_numbers
 from polarnet.events.frames import FrameStore
 from polarnet.events.representations import Encode
 from polarnet.events.stream import Events, slice_count
@@ -72,13 +73,16 @@ def cut_windows(events: Events, t_us: Int64[Tensor, " n"]) -> list[Events]:
     return [slice_count(events, start, stop) for start, stop in windows_of(edges)]
 
 
-def encode_windows(channels: Sequence[Events], t_us: Int64[Tensor, " n"], encode: Encode) -> Float[Tensor, "t c h w"]:
+def encode_windows(channels: Sequence[Events], t_us: Integer[Array, " n"], encode: Encode) -> Float[Tensor, "t c h w"]:
     """Every window of every channel through `encode`, polarizer by polarizer along the second axis.
 
-    ValueError where there is no window, that is, fewer than two frame times.
+    ValueError where there is no window, that is, fewer than two frame times, and for times that do not increase.
     """
-    if len(t_us) < 2:
-        raise ValueError(f"expected at least two frame times to have a window, got {t_us.tolist()}")
+    t_us = whole_numbers("t_us", t_us)
+    if t_us.ndim != 1 or len(t_us) < 2 or (t_us.diff() <= 0).any():
+        raise ValueError(
+            f"expected at least two frame times, each later than the last, to have a window, got {t_us.tolist()}"
+        )
     lengths = [stop - start for start, stop in windows_of(t_us)]
     per_channel = [
         torch.stack([encode(window, length) for window, length in zip(cut_windows(events, t_us), lengths, strict=True)])

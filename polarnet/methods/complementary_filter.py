@@ -227,6 +227,24 @@ def open_highpass(setup: Setup) -> Recoverer:
     return filtered(step_highpass, setup.config)
 
 
-CF = Method("cf", "CF", "#e08a1e", open_cf, ComplementaryFilterConfig, reconstructs=True)
-HIGHPASS = Method("highpass", "high-pass", "#b0851f", open_highpass, HighPassConfig, reconstructs=True)
+CF = Method(
+    name="cf",
+    label="CF",
+    colour="#e08a1e",
+    open=open_cf,
+    config=ComplementaryFilterConfig,
+    reconstructs=True,
+    about="The complementary filter without frames (Scheerlinck et al. 2018): intensity from events, one polarizer at "
+    "a time, then DoLP by the Stokes formula.",
+)
+HIGHPASS = Method(
+    name="highpass",
+    label="high-pass",
+    colour="#b0851f",
+    open=open_highpass,
+    config=HighPassConfig,
+    reconstructs=True,
+    about="The high-pass filter (Scheerlinck et al. 2018): intensity from events, one polarizer at a time, then DoLP "
+    "by the Stokes formula.",
+)
 METHODS = (CF, HIGHPASS, with_gain(CF), with_gain(HIGHPASS))

@@ -36,5 +36,6 @@ METHODS = (
         open=open_e2p,
         config=WeightsConfig,
         weights=Weights(("e2p",), trained_by="train_e2p"),
+        about="E2P (Mei et al. 2023), a published network from events to polarization.",
     ),
 )

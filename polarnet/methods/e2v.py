@@ -34,5 +34,6 @@ E2V = Method(
     config=WeightsConfig,
     weights=Weights(tuple(NETWORKS), trained_by="train_e2v"),
     reconstructs=True,
+    about="Events to video.",
 )
 METHODS = (E2V, with_gain(E2V))

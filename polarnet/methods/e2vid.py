@@ -2,7 +2,7 @@
 
 import functools
 
-from polarnet.methods.intensities import COLOUR, with_gain
+from polarnet.methods.intensities import with_gain
 from polarnet.methods.intensity_network import intensity_network, load_baseline
 from polarnet.methods.method import Method, Recoverer, Setup, Weights, WeightsConfig
 from polarnet.networks.e2vid import E2vid
@@ -28,11 +28,13 @@ E2VID = Method(
     config=WeightsConfig,
     weights=Weights(("e2vid",), trained_by="train_e2v", remedy="train one with baselines.e2v.arch=e2vid"),
     reconstructs=True,
+    about="E2VID (Rebecq et al. 2019), a recurrent network from events to intensity, one polarizer at a time, then "
+    "DoLP by the Stokes formula.",
 )
 PUBLISHED = Method(
     name="e2vid_published",
     label="E2VID, published weights",
-    colour=COLOUR,
+    colour=E2VID.colour,
     open=open_e2vid_published,
     config=WeightsConfig,
     weights=Weights(("e2vid",)),

@@ -2,7 +2,7 @@
 
 import functools
 
-from polarnet.methods.intensities import COLOUR, with_gain
+from polarnet.methods.intensities import with_gain
 from polarnet.methods.intensity_network import intensity_network, load_baseline
 from polarnet.methods.method import Method, Recoverer, Setup, Weights, WeightsConfig
 from polarnet.networks.firenet import FireNet
@@ -33,11 +33,13 @@ FIRENET = Method(
     config=WeightsConfig,
     weights=Weights(("firenet",), trained_by="train_e2v", remedy="train one with baselines.e2v.arch=firenet"),
     reconstructs=True,
+    about="FireNet (Scheerlinck et al. 2020), a recurrent network from events to intensity, one polarizer at a time, "
+    "then DoLP by the Stokes formula.",
 )
 PUBLISHED = Method(
     name="firenet_published",
     label="FireNet, published weights",
-    colour=COLOUR,
+    colour=FIRENET.colour,
     open=open_firenet_published,
     config=WeightsConfig,
     weights=Weights(("firenet",)),
@@ -46,7 +48,7 @@ PUBLISHED = Method(
 PLUS = Method(
     name="firenetplus_published",
     label="FireNet+, published weights",
-    colour=COLOUR,
+    colour=FIRENET.colour,
     open=open_firenetplus_published,
     config=WeightsConfig,
     weights=Weights(("firenet",)),

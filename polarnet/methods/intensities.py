@@ -13,7 +13,6 @@ from polarnet.methods.stokes_gain import consistent
 from polarnet.stokes import Prediction, aolp, dolp, stokes_from_intensities
 
 GAIN = "+gain"
-COLOUR = "#4aa37c"
 
 
 def from_intensities(intensities: Float[Tensor, "n 4 h w"]) -> Prediction:
@@ -55,7 +54,6 @@ def with_gain(method: Method) -> Method:
         method,
         name=method.name + GAIN,
         label=f"{method.label}, gains solved",
-        colour=COLOUR,
         open=open_both,
         config=None,
         wraps=method,

@@ -100,7 +100,7 @@ class Method:
     label: str
     """Name in tables and figures."""
     colour: str
-    """Colour in figures, #rrggbb."""
+    """Colour in figures, #rrggbb, of NAME+gain too."""
     open: Callable[[Setup], Recoverer]
     """Loads what is needed. FileNotFoundError or ValueError where the weights are missing or of another network."""
     config: type | None = None
@@ -109,6 +109,9 @@ class Method:
     """None: it needs none."""
     reconstructs: bool = False
     """Whether DoLP comes from reconstructed intensities, which `Prediction.intensities` then holds."""
+    about: str = ""
+    """Sentence of the glossary of pages. Of a row that may hold several networks, or published weights: what it stands
+    for beside its network; empty where the network's own sentence says all."""
     wraps: "Method | None" = None
     """The method whose predictions `convert` turns into this one's."""
     convert: Callable[[Setup, State, Prediction], tuple[State, Prediction]] | None = None
@@ -144,10 +147,17 @@ def why_absent(method: Method, setup: Setup) -> str | None:
     return None
 
 
-def weights_record(setup: Setup) -> dict[str, str]:
-    """File name and sha256 of a method's weights."""
+def weights_record(method: Method, setup: Setup) -> dict[str, str]:
+    """File name, sha256 and network of a method's weights; FileNotFoundError or ValueError where it has none."""
+    if method.weights is None:
+        raise ValueError(f"{method.name} needs no weights, so there is no record of them")
     path = weights_file(setup)
-    return {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    own = path.suffix == ".safetensors"
+    return {
+        "file": path.name,
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "network": load_checkpoint(path)[1]["network"] if own else method.weights.networks[0],
+    }
 
 
 def clamped(prediction: Prediction) -> Prediction:

@@ -11,5 +11,6 @@ METHODS = (
         open=open_dolp_network,
         config=WeightsConfig,
         weights=Weights(DOLP_NETWORKS, trained_by="train"),
+        about="The DoLP network in use.",
     ),
 )

@@ -20,11 +20,12 @@ from polarnet.networks.registry import NETWORKS
 FORMAT = "polarnet-checkpoint-1"
 
 
-def save_checkpoint(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
+def save_checkpoint(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
     """Write `path` (.safetensors) and the .json beside it. `metadata` says at least "network", "config", "in_channels".
 
     The JSON is written last and names the hash of the tensors, so a pair from two saves is never taken for one.
     """
+    path = Path(path)
     _check_suffix(path)
     content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
     record = {"format": FORMAT, "sha256": hashlib.sha256(content).hexdigest(), **metadata}
@@ -32,8 +33,9 @@ def save_checkpoint(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping
     _write(path.with_suffix(".json"), (json.dumps(record, indent=2) + "\n").encode())
 
 
-def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def load_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors (on the CPU) and metadata; ValueError or FileNotFoundError for anything but an intact pair of files."""
+    path = Path(path)
     _check_suffix(path)
     for file in (path, path.with_suffix(".json")):
         if not file.exists():
@@ -53,7 +55,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise ValueError(f"{path} is not a safetensors file: {error}") from None
 
 
-def load_network(path: Path) -> tuple[nn.Module, dict[str, Any]]:
+def load_network(path: str | os.PathLike[str]) -> tuple[nn.Module, dict[str, Any]]:
     """The DoLP network of a checkpoint, ready to evaluate, and its metadata (representation, training, versions)."""
     tensors, metadata = load_checkpoint(path)
     if metadata["network"] not in NETWORKS:
@@ -64,7 +66,7 @@ def load_network(path: Path) -> tuple[nn.Module, dict[str, Any]]:
     needed, given = {entry.name for entry in fields(config_class)}, set(metadata["config"])
     if needed != given:
         raise ValueError(
-            f"{path.with_suffix('.json')}: expected a config with the keys of networks.{metadata['network']} in "
+            f"{Path(path).with_suffix('.json')}: expected a config with the keys of networks.{metadata['network']} in "
             f"params.yaml, got one that lacks {_listed(needed - given)} and has besides {_listed(given - needed)}; "
             "edit the JSON, or train again"
         )
@@ -73,7 +75,7 @@ def load_network(path: Path) -> tuple[nn.Module, dict[str, Any]]:
     return network.eval(), metadata
 
 
-def load_tensors(network: nn.Module, tensors: Mapping[str, Tensor], path: Path) -> None:
+def load_tensors(network: nn.Module, tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> None:
     """Give `network` the tensors of a file; ValueError that names what is missing, left over or of another shape."""
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}

@@ -6,9 +6,9 @@ the network itself, its first layer included, is the published one and its resul
 """
 
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -70,7 +70,7 @@ class E2p(nn.Module):
         return torch.stack(maps), state or []
 
     @classmethod
-    def load(cls, path: Path) -> "E2p":
+    def load(cls, path: str | os.PathLike[str]) -> "E2p":
         """A checkpoint with the authors' names of the tensors, read without running code from it.
 
         ValueError for one of another network.

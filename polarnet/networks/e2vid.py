@@ -5,8 +5,8 @@ The network of the published "lightweight" checkpoint, E2VID_lightweight.pth.tar
 
 import itertools
 import math
+import os
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -83,7 +83,7 @@ class E2vid(nn.Module):
         return torch.stack(frames), state or []
 
     @classmethod
-    def load(cls, path: Path) -> "E2vid":
+    def load(cls, path: str | os.PathLike[str]) -> "E2vid":
         """The published checkpoint, read without running code from it; ValueError for one of another network."""
         content = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(content, dict) or "state_dict" not in content:
@@ -189,7 +189,7 @@ def reflected(images: Float[Tensor, "b c h w"]) -> tuple[int, int, Float[Tensor,
     return top, left, F.pad(images, (left, columns - left, top, rows - top), mode="reflect")
 
 
-def _check_settings(path: Path, content: dict) -> None:
+def _check_settings(path: str | os.PathLike[str], content: dict) -> None:
     """The file says which network it holds; E2VID has had several, with equally named tensors."""
     if content.get("arch", PUBLISHED_ARCH) != PUBLISHED_ARCH:
         raise ValueError(f"{path} holds no E2VID: its arch is {content['arch']!r}, expected {PUBLISHED_ARCH!r}")

@@ -3,7 +3,7 @@
 Published checkpoints, of FireNet and of FireNet+ (Stoffregen et al., ECCV 2020), load with `FireNet.load`.
 """
 
-from pathlib import Path
+import os
 
 import torch
 from jaxtyping import Float
@@ -63,7 +63,7 @@ class FireNet(nn.Module):
         return torch.stack(frames), state
 
     @classmethod
-    def load(cls, path: Path) -> "FireNet":
+    def load(cls, path: str | os.PathLike[str]) -> "FireNet":
         """A published checkpoint, of FireNet or FireNet+, read without running code from it.
 
         ValueError for a file that holds something else.

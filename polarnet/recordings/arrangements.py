@@ -5,6 +5,7 @@ polarizers on its pixels (division of focal plane). Division-of-time captures: `
 """
 
 import hashlib
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 
 
 def read_four(
-    files: Mapping[int, Path],
+    files: Mapping[int, str | os.PathLike[str]],
     start_us: Mapping[int, int] | None = None,
     homographies: Mapping[int, Float64[np.ndarray, "3 3"]] | None = None,
     read: Callable[[Path], Recording] = read_recording,
@@ -41,7 +42,7 @@ def read_four(
     channels = []
     for angle in POLARIZER_ANGLES_DEG:
         key = by_angle[angle]
-        events = read(files[key]).events
+        events = read(Path(files[key])).events
         if homographies is not None and key in homographies:
             events = warp_events(events, homographies[key])
         channels.append(events)
@@ -76,9 +77,13 @@ def split_mosaic(events: Events, mosaic: Mosaic) -> list[Events]:
     return channels
 
 
-def read_mosaic(path: Path, mosaic: Mosaic, read: Callable[[Path], Recording] = read_recording) -> list[Events]:
+def read_mosaic(
+    path: str | os.PathLike[str],
+    mosaic: Mosaic,
+    read: Callable[[Path], Recording] = read_recording,
+) -> list[Events]:
     """The four channels of one file of a camera with a mosaic; time starts with its first event."""
-    channels = split_mosaic(read(path).events, mosaic)
+    channels = split_mosaic(read(Path(path)).events, mosaic)
     first = first_time_us(channels)
     return [since(channel, first) for channel in channels]
 
@@ -101,7 +106,7 @@ def since(events: Events, start_us: int) -> Events:
     )
 
 
-def write_store(path: Path, sequences: Mapping[str, Sequence[Events]]) -> None:
+def write_store(path: str | os.PathLike[str], sequences: Mapping[str, Sequence[Events]]) -> None:
     """Sequences of four channels from time 0 on as an event store; each lasts until its last event."""
     sizes = {(channel.height, channel.width) for channels in sequences.values() for channel in channels}
     if len(sizes) != 1:

@@ -1,5 +1,6 @@
 """Files of event cameras as events: whole with `read_recording`, in chunks of constant memory with `open_recording`."""
 
+import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -78,7 +79,7 @@ class RecordingReader:
 
 
 def open_recording(
-    path: str | Path,
+    path: str | os.PathLike[str],
     format: str | None = None,
     *,
     height: int | None = None,
@@ -117,7 +118,7 @@ def open_recording(
 
 
 def read_recording(
-    path: str | Path,
+    path: str | os.PathLike[str],
     format: str | None = None,
     *,
     height: int | None = None,
@@ -141,9 +142,9 @@ def read_recording(
     return Recording(events, reader.format, {kind: count for kind, count in reader.repairs.items() if count})
 
 
-def detect_format(path: Path) -> str:
+def detect_format(path: str | os.PathLike[str]) -> str:
     """The key of FORMATS that a file's first bytes show; RecordingError where it is none of them."""
-    head = b""
+    path, head = Path(path), b""
     if path.is_file():
         with path.open("rb") as file:
             head = file.read(HEAD_BYTES)

@@ -20,6 +20,8 @@ SCALES = (4, 2, 1)
 SMALLEST_SIDE = 48  # pixels; coarser images show too little
 BLUR = 5  # pixels, of the images while they are compared
 ITERATIONS, CHANGE = 200, 1e-6
+FINE, COARSE = 1.0, 4.0  # pixels, standard deviations between which edges lie
+UNRELATED = 0.25  # of simulated recordings of other scenes at most 0.18 (docs/recordings.md)
 
 
 class Registration(NamedTuple):
@@ -28,6 +30,8 @@ class Registration(NamedTuple):
     homography: Float64[np.ndarray, "3 3"]
     correlation: float
     """Of the two event images where they overlap, after."""
+    edge_correlation: float
+    """Of their fine detail where they overlap, after: below `UNRELATED`, the homography means nothing."""
 
 
 def event_image(events: Events) -> Float32[np.ndarray, "h w"]:
@@ -72,7 +76,24 @@ def register(reference: Float32[np.ndarray, "h w"], moving: Float32[np.ndarray, 
             )
         warp = (np.linalg.inv(to_coarse) @ coarse @ to_coarse).astype(np.float32)
     homography = np.linalg.inv(warp.astype(np.float64))
-    return Registration(homography / homography[2, 2], float(correlation))
+    homography /= homography[2, 2]
+    return Registration(homography, float(correlation), _edge_correlation(reference, moving, homography))
+
+
+def _edge_correlation(
+    reference: Float32[np.ndarray, "h w"],
+    moving: Float32[np.ndarray, "h w"],
+    homography: Float64[np.ndarray, "3 3"],
+) -> float:
+    """Correlation of fine detail; a homography that lays broad shapes on one another does not raise it."""
+    both = warped(np.ones_like(moving), homography) > 1 - 1e-3
+    a, b = (_edges(image)[both] for image in (reference, warped(moving, homography)))
+    spread = float(a.std() * b.std()) if both.any() else 0.0
+    return float(((a - a.mean()) * (b - b.mean())).mean()) / spread if spread > 0 else 0.0
+
+
+def _edges(image: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    return cv2.GaussianBlur(image, (0, 0), FINE) - cv2.GaussianBlur(image, (0, 0), COARSE)
 
 
 def warped(image: Float32[np.ndarray, "h w"], homography: Float64[np.ndarray, "3 3"]) -> Float32[np.ndarray, "h w"]:

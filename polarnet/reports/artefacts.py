@@ -20,6 +20,7 @@ from polarnet.reports.overview import Overview
 from polarnet.simulation.motion import Pose, Trajectory, window_to_scene
 from polarnet.simulation.pictures.manifest import SPLITS, Manifest, read_manifest
 from polarnet.simulation.scenes import SceneStore
+from polarnet.training.baselines import NOT_TRAINED
 
 THUMBNAIL_WIDTH = 208  # pixels, twice the size shown
 MOST_THUMBNAILS = 24  # of a split
@@ -46,12 +47,13 @@ class ReportPaths:
             self.frames: "synthesize",
             self.events: "emulate",
             self.train / "history.json": "train",
-            self.train_e2v / "history.json": "train_e2v",
-            self.train_e2p / "history.json": "train_e2p",
             self.benchmark / "metrics.json": "benchmark",
             self.benchmark / "details.json": "benchmark",
         }
-        if missing := [f"{path} (stage {stage})" for path, stage in needed.items() if not path.exists()]:
+        missing = [f"{path} (stage {stage})" for path, stage in needed.items() if not path.exists()]
+        baselines = {"train_e2v": self.train_e2v, "train_e2p": self.train_e2p}
+        missing += [f"{folder} (stage {stage})" for stage, folder in baselines.items() if not folder.exists()]
+        if missing:
             raise FileNotFoundError(f"the report needs {', '.join(missing)}; run `dvc repro` to make what is missing")
 
 
@@ -92,6 +94,8 @@ class EventRate(NamedTuple):
 class History(NamedTuple):
     """Training curves of one network; epochs count from 0."""
 
+    network: str
+    """As the checkpoint names it."""
     loss: Sequence[Curve]
     validation: Mapping[str, Curve]
     best_epoch: int
@@ -118,18 +122,14 @@ class Artefacts:
     sets: Sequence[SetResults]
     """Test sets beyond the simulated one."""
     ours: History
-    e2v: History
-    e2p: History
+    e2v: History | None
+    """None where no row of the benchmark uses it, so that it was not trained; so is the next."""
+    e2p: History | None
     rates: Sequence[EventRate]
     overview: Overview | None
     """None where the benchmark kept no panel of the network."""
     thumbnails: Mapping[str, Sequence[Thumbnail]]
     """By split; photographs first, the first `MOST_THUMBNAILS` of them."""
-
-    @property
-    def lpips_reason(self) -> str | None:
-        """Why there is no LPIPS; None where there is."""
-        return self.details["lpips"]["reason"]
 
 
 def read_artefacts(paths: ReportPaths) -> Artefacts:
@@ -155,8 +155,8 @@ def read_artefacts(paths: ReportPaths) -> Artefacts:
         panels=panels,
         sets=[read_set(folder) for folder in sorted(paths.benchmark.glob("sets/*")) if folder.is_dir()],
         ours=read_history(paths.train / "history.json"),
-        e2v=read_history(paths.train_e2v / "history.json"),
-        e2p=read_history(paths.train_e2p / "history.json"),
+        e2v=_history_of(paths.train_e2v),
+        e2p=_history_of(paths.train_e2p),
         rates=event_rates(events, frames),
         overview=next((overview_of(panel, scenes, frames, events) for panel in _telling(panels)), None),
         thumbnails={
@@ -176,7 +176,7 @@ def read_set(folder: Path) -> SetResults:
 
 
 def read_history(path: Path) -> History:
-    """Curves of a history.json: a row an epoch, each with the mean loss terms and the validation scores."""
+    """Curves of a history.json, a row an epoch with mean loss terms and validation scores, and whose they are."""
     rows = _json(path)
     if not rows:
         raise ValueError(f"{path}: expected a row for each epoch, got none; train again")
@@ -186,7 +186,13 @@ def read_history(path: Path) -> History:
         return {name: Curve(name, epochs, [row[split][name] for row in rows]) for name in rows[0][split]}
 
     best = min(rows, key=lambda row: row["val"]["mse"])
-    return History(list(curves("train").values()), curves("val"), best["epoch"])
+    network = _json(path.with_name("best.json"))["network"]
+    return History(network, list(curves("train").values()), curves("val"), best["epoch"])
+
+
+def _history_of(folder: Path) -> History | None:
+    """Curves of a baseline's training; None where its stage left the reason why it did not train."""
+    return None if (folder / NOT_TRAINED).exists() else read_history(folder / "history.json")
 
 
 def event_rates(events: EventStore, frames: FrameStore) -> list[EventRate]:

@@ -19,9 +19,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from torch import Tensor
 
+from polarnet.reports.legend import GENERAL, Legend
 from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image
 from polarnet.reports.png import png
-from polarnet.reports.tables import COLUMNS, colour_of, in_order, label_of, with_structure
+from polarnet.reports.tables import COLUMNS, in_order, with_structure
 from polarnet.similarity import mse, psnr
 
 
@@ -39,8 +40,18 @@ class Theme:
 LIGHT = Theme(text="#1c2330", quiet="#667085", grid="#e4e7ec", face="#ffffff")
 DARK = Theme(text="#e6e9ef", quiet="#98a2b3", grid="#313947", face="#161b24")
 
-TERMS = {"mse": "MSE", "mae": "MAE", "ssim": "1 - SSIM", "lpips": "LPIPS"}
+TERMS = {
+    "mse": "MSE",
+    "mae": "MAE",
+    "ssim_loss": "1 - SSIM",
+    "lpips": "LPIPS",
+    "stokes": "S1/S0, S2/S0",
+    "uncertainty": "likelihood of the error",
+}
 """Terms of a loss as a legend shows them."""
+
+BRANCHES = {"intensity": "intensity", "aolp": "AoLP", "dolp": "DoLP"}
+"""Maps of a network that has a loss for each, whose terms are BRANCH_TERM."""
 
 
 class PanelScene(NamedTuple):
@@ -68,7 +79,7 @@ class ReliabilityLine(NamedTuple):
     curve: Sequence[tuple[float, float, int]]
 
 
-def comparison_panel(rows: Sequence[PanelScene], path: Path, theme: Theme = LIGHT) -> None:
+def comparison_panel(rows: Sequence[PanelScene], path: Path, legend: Legend = GENERAL, theme: Theme = LIGHT) -> None:
     """Write a picture like the paper's Fig. 10: a row a scene; events, truth and each method; MSE and PSNR below.
 
     Methods that answer with one value everywhere are left out.
@@ -84,7 +95,7 @@ def comparison_panel(rows: Sequence[PanelScene], path: Path, theme: Theme = LIGH
         full_scale = event_full_scale(row.events)
         tiles = [(event_image(row.events[0], full_scale), ""), (dolp_image(row.truth), "")]
         tiles += [(dolp_image(row.recovered[m]), score_line(row.recovered[m], row.truth)) for m in methods]
-        headings = ["events, 0°", "true DoLP", *(label_of(m) for m in methods)]
+        headings = ["events, 0°", "true DoLP", *map(legend.label, methods)]
         for j, ((picture, below), heading) in enumerate(zip(tiles, headings, strict=True)):
             axes = figure.add_axes(grid.rectangle(i, j))
             show_picture(axes, picture, theme)
@@ -111,7 +122,7 @@ def training_curves(loss: Sequence[Curve], validation: Sequence[Curve], validati
                     curve.values,
                     marker="o",
                     markersize=3,
-                    label=TERMS.get(curve.label, curve.label),
+                    label=_term(curve.label),
                 )
             axes.set_xlabel("epoch")
             axes.set_title(label, loc="left", fontsize=9)
@@ -124,7 +135,14 @@ def training_curves(loss: Sequence[Curve], validation: Sequence[Curve], validati
     return figure
 
 
-def score_distribution(per_scene: Mapping[str, Mapping[str, Sequence[float]]], theme: Theme) -> Figure:
+def _term(name: str) -> str:
+    branch, _, term = name.partition("_")
+    return f"{BRANCHES[branch]}: {TERMS[term]}" if branch in BRANCHES and term in TERMS else TERMS.get(name, name)
+
+
+def score_distribution(
+    per_scene: Mapping[str, Mapping[str, Sequence[float]]], theme: Theme, legend: Legend = GENERAL
+) -> Figure:
     """Every test scene as a dot over each method's box, one plot a metric.
 
     `per_scene` is metric, then method, then the scenes' means. Boxes span the quartiles, whiskers all scenes.
@@ -135,26 +153,30 @@ def score_distribution(per_scene: Mapping[str, Mapping[str, Sequence[float]]], t
         figure = Figure(figsize=(9.4, 0.62 + 0.27 * len(methods)), layout="constrained", facecolor="none")
         for axes, metric in zip(np.atleast_1d(figure.subplots(1, len(metrics), sharey=True)), metrics, strict=True):
             for position, method in enumerate(methods):
-                _strip(axes, position, per_scene[metric].get(method, ()), method, theme)
+                _strip(axes, position, per_scene[metric].get(method, ()), legend.colour(method), theme)
             axes.set_title(COLUMNS[metric].heading, loc="left", fontsize=9)
             if metric == "mse":
                 axes.set_xscale("log")  # errors of good and bad methods differ by an order of magnitude
                 _plain_log_ticks(axes.xaxis)
-            axes.set_yticks(range(len(methods)), [label_of(m) for m in methods])
+            axes.set_yticks(range(len(methods)), [*map(legend.label, methods)])
             axes.set_ylim(len(methods) - 0.4, -0.6)
             axes.grid(axis="y", visible=False)
             axes.tick_params(axis="y", length=0)
     return figure
 
 
-def reliability_figure(curves: Mapping[str, Sequence[tuple[float, float, int]]], theme: Theme) -> Figure:
+def reliability_figure(
+    curves: Mapping[str, Sequence[tuple[float, float, int]]], theme: Theme, legend: Legend = GENERAL
+) -> Figure:
     """Measured against predicted squared error of DoLP, a line a method; on the diagonal its uncertainty is right.
 
     `curves` are those of `polarnet.evaluation.reliability`: predicted, measured, pixels. Dots grow with the pixels.
     """
     figure = _figure((3.4, 3.2), theme)
     with matplotlib.rc_context(chart_style(theme)):
-        lines = [ReliabilityLine(label_of(method), colour_of(method), curve) for method, curve in curves.items()]
+        lines = [
+            ReliabilityLine(legend.label(method), legend.colour(method), curve) for method, curve in curves.items()
+        ]
         draw_reliability(figure.add_subplot(), lines, theme)
     figure.tight_layout()
     return figure
@@ -276,11 +298,10 @@ def _plain_log_ticks(axis: Axis) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def _strip(axes: Axes, position: int, values: Sequence[float], method: str, theme: Theme) -> None:
+def _strip(axes: Axes, position: int, values: Sequence[float], colour: str, theme: Theme) -> None:
     known = np.array([value for value in values if np.isfinite(value)])
     if len(known) == 0:
         return
-    colour = colour_of(method)
     axes.boxplot(
         known, positions=[position], orientation="horizontal", widths=0.62, whis=(0, 100), patch_artist=True,
         manage_ticks=False,

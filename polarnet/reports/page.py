@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, SetResults, read_artefacts
 from polarnet.reports.figures import PanelScene, comparison_panel, dolp_bar, training_curves
+from polarnet.reports.legend import Legend, glossary, legend_of, lpips_about, network_label
 from polarnet.reports.maps import (
     encode_jpeg,
     encode_png,
@@ -23,7 +24,6 @@ from polarnet.reports.tables import (
     PAPER_SOURCE,
     SET_TITLES,
     Scores,
-    label_of,
     paired_lines,
     paper_table,
     score_table,
@@ -44,7 +44,7 @@ from polarnet.reports.tiles import (
 from polarnet.simulation.pictures.manifest import SPLITS
 
 CARDS = {
-    "psnr": "PSNR, ours",
+    "psnr": "PSNR",
     "mse": "MSE",
     "ssim": "SSIM",
     "corr": "correlation",
@@ -79,6 +79,7 @@ def write_report(paths: ReportPaths, run: Run, folder: Path) -> Path:
     The page needs no other file and no network. FileNotFoundError that names what is missing and the stage to run.
     """
     artefacts = read_artefacts(paths)
+    legend = legend_of(artefacts.details["weights"])
     folder.mkdir(parents=True, exist_ok=True)
     overview = None
     if artefacts.overview is not None:
@@ -86,49 +87,56 @@ def write_report(paths: ReportPaths, run: Run, folder: Path) -> Path:
         (folder / "overview.png").write_bytes(overview)
     if artefacts.panels:
         rows = [PanelScene(panel.sequence, panel.events, panel.truth_dolp, panel.dolp) for panel in artefacts.panels]
-        comparison_panel(rows, folder / "comparison.png")
-    page = template("page.html.jinja").render(_context(artefacts, run, overview))
+        comparison_panel(rows, folder / "comparison.png", legend)
+    page = template("page.html.jinja").render(_context(artefacts, run, overview, legend))
     path = folder / "index.html"
     path.write_text(page, encoding="utf-8")
     return path
 
 
-def _context(artefacts: Artefacts, run: Run, overview: bytes | None) -> dict[str, Any]:
-    metrics, details, manifest = artefacts.metrics, artefacts.details, artefacts.manifest
+def _context(artefacts: Artefacts, run: Run, overview: bytes | None, legend: Legend) -> dict[str, Any]:
+    metrics, details, manifest, labels = artefacts.metrics, artefacts.details, artefacts.manifest, legend.labels
     return {
         "metrics": metrics,
-        "cards": _cards(metrics),
+        "cards": _cards(metrics, legend),
         "details": details,
         "overview": None if overview is None else data_uri(overview, "png"),
         "overview_name": None if artefacts.overview is None else artefacts.overview.name,
-        "scores": score_table(metrics, artefacts.lpips_reason),
-        "error_parts": score_table(metrics, columns=ERROR_PARTS),
-        "costs": score_table(metrics, columns=COSTS),
-        "paired": paired_lines(details.get("paired", {})),
-        "sets": [_set(one, artefacts.lpips_reason) for one in artefacts.sets],
+        "scores": score_table(metrics, labels=labels),
+        "error_parts": score_table(metrics, columns=ERROR_PARTS, labels=labels),
+        "costs": score_table(metrics, columns=COSTS, labels=labels),
+        "paired": paired_lines(details.get("paired", {}), labels=labels),
+        "sets": [_set(one, legend) for one in artefacts.sets],
         "paper_simulated": paper_table("simulated"),
         "paper_real": paper_table("real"),
         "paper_source": PAPER_SOURCE,
         "comparability": PAPER_COMPARABILITY,
-        "standing": standing(metrics),
-        "distribution": distribution(details["scene_means"]),
-        "reliability": reliability_chart(details),
+        "standing": standing(metrics, labels),
+        "distribution": distribution(details["scene_means"], legend),
+        "reliability": reliability_chart(details, legend),
         "dolp_bar": chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
         "wheel": data_uri(encode_png(hue_wheel(192)), "png"),
-        "panels": [TileRow(panel.sequence, panel_tiles(panel)) for panel in artefacts.panels]
+        "panels": [TileRow(panel.sequence, panel_tiles(panel, legend)) for panel in artefacts.panels]
         + [
-            TileRow(f"{SET_TITLES.get(one.name, one.name)}: {panel.sequence}", panel_tiles(panel))
+            TileRow(f"{SET_TITLES.get(one.name, one.name)}: {panel.sequence}", panel_tiles(panel, legend))
             for one in artefacts.sets
             for panel in one.panels
         ],
-        "polarization": [TileRow(panel.sequence, polarization_tiles(panel)) for panel in artefacts.panels],
+        "polarization": [TileRow(panel.sequence, polarization_tiles(panel, legend)) for panel in artefacts.panels],
         "events": [TileRow(panel.sequence, event_tiles(panel)) for panel in artefacts.panels[:MOST_EVENT_ROWS]],
         "rates": artefacts.rates,
         "training": {
-            "The DoLP network": _training(artefacts.ours),
-            "E2V, events to intensity": _training(artefacts.e2v),
-            "E2P, events to polarization": _training(artefacts.e2p),
+            f"{row}{network_label(history.network)}, events to {of}": _training(history, of)
+            for row, history, of in (
+                ("ours: ", artefacts.ours, "DoLP"),
+                ("E2V: ", artefacts.e2v, "intensity"),
+                ("", artefacts.e2p, "polarization"),
+            )
+            if history is not None
         },
+        "ours": labels["ours"],
+        "rows": glossary(metrics, details["weights"]),
+        "lpips_about": lpips_about(details["lpips"]),
         "ours_has_aolp": any("ours" in panel.aolp for panel in artefacts.panels),
         "manifest": manifest,
         "source_names": SOURCE_NAMES,
@@ -139,18 +147,18 @@ def _context(artefacts: Artefacts, run: Run, overview: bytes | None) -> dict[str
     }
 
 
-def _set(one: SetResults, lpips_reason: str | None) -> dict[str, Any]:
+def _set(one: SetResults, legend: Legend) -> dict[str, Any]:
     """A test set beyond the simulated one."""
     return {
         "title": SET_TITLES.get(one.name, one.name),
         "about": SET_ABOUT.get(one.name, ""),
         "scenes": len(one.details["scenes"]),
         "frames": one.details["frames"],
-        "scores": score_table(one.metrics, lpips_reason),
+        "scores": score_table(one.metrics, labels=legend.labels),
     }
 
 
-def _cards(metrics: Scores) -> list[Card]:
+def _cards(metrics: Scores, legend: Legend) -> list[Card]:
     """The network's scores, each with what it has to beat."""
     if "ours" not in metrics:
         return []
@@ -158,7 +166,7 @@ def _cards(metrics: Scores) -> list[Card]:
     for key, label in CARDS.items():
         column = COLUMNS[key]
         others = [m for m in ("e2v", "oracle_mean" if column.ranked else "cf") if m in metrics]
-        rivals = [f"{label_of(m)} {column.printed(metrics[m][key])}" for m in others]
+        rivals = [f"{legend.label(m)} {column.printed(metrics[m][key])}" for m in others]
         cards.append(Card(label, column.printed(metrics["ours"][key]) + column.unit, ", ".join(rivals)))
     return cards
 
@@ -169,16 +177,17 @@ def _thumbnails(artefacts: Artefacts, split: str) -> TileRow:
     return TileRow(split, tiles, artefacts.manifest.counts[split] - len(tiles))
 
 
-def _training(history: History) -> dict[str, Any]:
+def _training(history: History, of: str) -> dict[str, Any]:
     validation = [history.validation["psnr"]]
     curves = chart(
-        lambda theme: training_curves(history.loss, validation, "validation PSNR, dB", theme),
+        lambda theme: training_curves(history.loss, validation, f"validation PSNR of {of}, dB", theme),
         "training loss and validation PSNR over epochs",
     )
     return {
         "chart": curves,
         "epochs": len(history.loss[0].epochs),
         "best_epoch": history.best_epoch + 1,
+        "of": of,
         "best_psnr": history.validation["psnr"].values[history.best_epoch],
     }
 

@@ -19,14 +19,16 @@ from polarnet.reports.study_tables import (
     event_budget_block,
     expected_errors_block,
     headline_block,
+    loss_sweep_block,
+    lpips_block,
     study_block,
 )
 from polarnet.reports.tables import (
     COLUMNS,
     COSTS,
+    LABELS,
     SET_TITLES,
     as_markdown,
-    label_of,
     paired_lines,
     score_table,
     standing,
@@ -60,7 +62,7 @@ def pipeline_block(results: Mapping[str, Any]) -> str:
     `results` is docs/results/pipeline.json as `polarnet.measure` writes it; `metrics` is data/benchmark/metrics.json.
     """
     metrics = results["metrics"]
-    lines = [as_markdown(score_table(metrics, results.get("lpips_reason"))), ""]
+    lines = [as_markdown(score_table(metrics)), ""]
     if any(key.endswith("_ci") for scores in metrics.values() for key in scores):
         lines += ["Means over the test scenes; below them the 95 % bootstrap interval over scenes.", ""]
     lines += [f"- {line}" for line in standing(metrics)]
@@ -83,10 +85,10 @@ def benchmark_block(results: Mapping[str, Any]) -> str:
             continue
         about = results["about"][name]
         lines += [f"**{title}**: {about['scenes']} scenes, {about['frames']} frames", ""]
-        lines += [as_markdown(score_table(results[name], about["lpips_reason"], {**COLUMNS, **COSTS})), ""]
+        lines += [as_markdown(score_table(results[name], {**COLUMNS, **COSTS})), ""]
         lines += [f"- {line}" for line in paired_lines(results["paired"][name])]
         gains = [
-            f"{label_of(row)} {results[name][f'{row}+gain']['psnr'] - scores['psnr']:+.2f} dB"
+            f"{LABELS[row]} {results[name][f'{row}+gain']['psnr'] - scores['psnr']:+.2f} dB"
             for row, scores in results[name].items()
             if f"{row}+gain" in results[name]
         ]
@@ -204,6 +206,8 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "designs-rows": designs_block,
     "event_budget-budget": event_budget_block,
     "network-throughput": throughput_block,
+    "sweep": loss_sweep_block,
+    "lpips-cost": lpips_block,
 }
 """What writes the block of each name."""
 
@@ -219,7 +223,9 @@ UNMEASURED = {
     "network-ablation": "Not measured yet: the sweep above and `polarnet measure ablation --sweep FOLDER` do it.",
     "designs-rows": "Not collected yet: `python tests/benchmarks/designs.py` does it.",
     "scenes-choices": "Not measured yet: `python tests/benchmarks/scenes.py --write` does it.",
+    "sweep": "Not measured yet: the sweep above and `polarnet measure sweep --sweep FOLDER` do it.",
     "network-throughput": "Not measured yet: `python tests/benchmarks/training.py --write` does it.",
+    "lpips-cost": "Not measured yet: `python tests/benchmarks/lpips.py --write` does it.",
 }
 """Blocks that may stand in a document before their results do, and what they say until then."""
 

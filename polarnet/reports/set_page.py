@@ -5,6 +5,7 @@ from pathlib import Path
 
 from polarnet.reports.artefacts import read_set
 from polarnet.reports.figures import PanelScene, comparison_panel, dolp_bar
+from polarnet.reports.legend import glossary, legend_of, lpips_about
 from polarnet.reports.maps import encode_png, hue_wheel
 from polarnet.reports.tables import (
     COSTS,
@@ -34,30 +35,34 @@ def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str])
     `notes` are sentences that a reader of the table has to know, such as which methods did not run and why.
     """
     results = read_set(folder)
-    reason = results.details["lpips"]["reason"]
+    legend = legend_of(results.details["weights"])
+    labels = legend.labels
     if results.panels:
         rows = [PanelScene(panel.sequence, panel.events, panel.truth_dolp, panel.dolp) for panel in results.panels]
-        comparison_panel(rows, folder / "comparison.png")
+        comparison_panel(rows, folder / "comparison.png", legend)
     page = template("set.html.jinja").render(
         title=title,
         command=command,
         notes=notes,
         details=results.details,
-        scores=score_table(results.metrics, reason),
-        error_parts=score_table(results.metrics, columns=ERROR_PARTS),
-        costs=score_table(results.metrics, columns=COSTS),
-        standing=standing(results.metrics),
-        paired=paired_lines(results.details["paired"]),
+        scores=score_table(results.metrics, labels=labels),
+        error_parts=score_table(results.metrics, columns=ERROR_PARTS, labels=labels),
+        costs=score_table(results.metrics, columns=COSTS, labels=labels),
+        standing=standing(results.metrics, labels),
+        paired=paired_lines(results.details["paired"], labels=labels),
+        labels=labels,
+        rows=glossary(results.metrics, results.details["weights"]),
+        lpips_about=lpips_about(results.details["lpips"]),
         paper_simulated=paper_table("simulated"),
         paper_real=paper_table("real"),
         paper_source=PAPER_SOURCE,
         comparability=PAPER_COMPARABILITY,
-        distribution=distribution(results.details["scene_means"]),
-        reliability=reliability_chart(results.details),
+        distribution=distribution(results.details["scene_means"], legend),
+        reliability=reliability_chart(results.details, legend),
         dolp_bar=chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
         wheel=data_uri(encode_png(hue_wheel(192)), "png"),
-        panels=[TileRow(panel.sequence, panel_tiles(panel)) for panel in results.panels],
-        polarization=[TileRow(panel.sequence, polarization_tiles(panel)) for panel in results.panels],
+        panels=[TileRow(panel.sequence, panel_tiles(panel, legend)) for panel in results.panels],
+        polarization=[TileRow(panel.sequence, polarization_tiles(panel, legend)) for panel in results.panels],
     )
     path = folder / "index.html"
     path.write_text(page, encoding="utf-8")

@@ -8,6 +8,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import NullLocator
 
 from polarnet.reports.figures import (
@@ -16,7 +17,8 @@ from polarnet.reports.figures import (
     chart_style,
     draw_reliability,
 )
-from polarnet.reports.tables import SET_TITLES, colour_of, in_order, label_of
+from polarnet.reports.legend import GENERAL
+from polarnet.reports.tables import SET_TITLES, in_order
 
 PAPER_EVENTS_PER_PIXEL = 1.04  # at which the paper's recovery is good (section 5)
 SETTING_LABELS = {
@@ -25,6 +27,13 @@ SETTING_LABELS = {
     "speed": "speed, times the configured",
     "channel_error": "threshold error between polarizers",
 }
+SWEEP_SCORES = {
+    "mse": ("MSE ↓", -1, 4),
+    "psnr": ("PSNR ↑", 1, 2),
+    "ssim": ("SSIM ↑", 1, 3),
+    "lpips": ("LPIPS ↓", -1, 3),
+}
+"""Heading, 1 where more is better and -1 where less is, decimals."""
 
 
 def event_budget_figure(results: Mapping[str, Any], theme: Theme) -> Figure:
@@ -46,7 +55,7 @@ def event_budget_figure(results: Mapping[str, Any], theme: Theme) -> Figure:
                     [entry[metric] for entry in entries],
                     marker=marker,
                     markersize=3.5,
-                    color=colour_of("ours"),
+                    color=GENERAL.colour("ours"),
                     linestyle="-" if carry else ":",
                     label="state carried on" if carry else "each window alone",
                 )
@@ -77,8 +86,8 @@ def sensitivity_figure(results: Mapping[str, Sequence[Mapping[str, Any]]], theme
                         [entry["scores"][method][metric] for entry in entries],
                         marker="o",
                         markersize=3,
-                        color=colour_of(method),
-                        label=label_of(method),
+                        color=GENERAL.colour(method),
+                        label=GENERAL.label(method),
                     )
                 axes[row][column].set_xticks(range(len(entries)), [f"{entry['value']:g}" for entry in entries])
             axes[1][column].set_xlabel(SETTING_LABELS.get(setting, setting), fontsize=7)
@@ -107,6 +116,49 @@ def expected_errors_figure(seeds: Mapping[str, Mapping[str, Any]], theme: Theme)
     return figure
 
 
+def loss_sweep_figure(points: Sequence[Mapping[str, Any]], theme: Theme) -> Figure:
+    """Test scores by the weights of Eq. 9: a row a score, a column a weight of the MSE, SSIM against LPIPS inside.
+
+    `points` are those of docs/results/sweep.json. Lighter is better, the best of a score is bold, and the frame marks
+    the point with the smallest validation MSE. Combinations that were not trained stay empty.
+    """
+    scores = [key for key in SWEEP_SCORES if any(key in point["test"] for point in points)]
+    mse, ssim, lpips = (sorted({point["weights"][name] for point in points}) for name in ("mse", "ssim", "lpips"))
+    chosen = min(points, key=lambda point: point["validation"]["mse"]["mean"])
+    with matplotlib.rc_context(chart_style(theme)):
+        size = (1.0 + 0.85 * len(lpips) * len(mse), 0.9 + (0.45 + 0.42 * len(ssim)) * len(scores))
+        figure = Figure(figsize=size, layout="constrained", facecolor="none")
+        for row, key in zip(figure.subplots(len(scores), len(mse), squeeze=False), scores, strict=True):
+            label, sign, decimals = SWEEP_SCORES[key]
+            values = {id(point): point["test"][key]["mean"] for point in points if key in point["test"]}
+            best = max(values.values(), key=lambda value: sign * value)
+            low, high = min(sign * value for value in values.values()), max(sign * value for value in values.values())
+            for axes, weight in zip(row, mse, strict=True):
+                image = np.full((len(ssim), len(lpips)), np.nan)
+                for point in points:
+                    if point["weights"]["mse"] != weight or id(point) not in values:
+                        continue
+                    i, j = ssim.index(point["weights"]["ssim"]), lpips.index(point["weights"]["lpips"])
+                    value = values[id(point)]
+                    image[i, j] = goodness = (sign * value - low) / (high - low) if high > low else 1.0
+                    axes.text(
+                        j, i, f"{value:.{decimals}f}", ha="center", va="center", fontsize=7,
+                        color="black" if goodness > 0.5 else "white", weight="bold" if value == best else "normal",
+                    )  # fmt: skip
+                    if point is chosen:
+                        frame = Rectangle((j - 0.46, i - 0.46), 0.92, 0.92, fill=False, color="#d6336c", linewidth=1.8)
+                        axes.add_patch(frame)
+                axes.imshow(image, cmap="cividis", vmin=0, vmax=1, aspect="auto")
+                axes.grid(False)
+                axes.set_xticks(range(len(lpips)), [f"{value:g}" for value in lpips])
+                axes.set_yticks(range(len(ssim)), [f"{value:g}" for value in ssim])
+                axes.set_title(f"{label}, loss.mse={weight:g}", loc="left", fontsize=8)
+            row[0].set_ylabel("loss.ssim")
+        for axes in figure.axes[-len(mse) :]:
+            axes.set_xlabel("loss.lpips")
+    return figure
+
+
 def _lines(
     axes: Axes, of_methods: Mapping[str, Sequence[Mapping[str, Any]]], x: str, y: str, scale: float = 1.0
 ) -> None:
@@ -117,8 +169,8 @@ def _lines(
             [entry[y] for entry in entries],
             marker="o",
             markersize=3,
-            color=colour_of(method),
-            label=label_of(method),
+            color=GENERAL.colour(method),
+            label=GENERAL.label(method),
         )
 
 

@@ -1,4 +1,4 @@
-"""Tables of what tests/benchmarks/study.py and scenes.py measure: networks, their scenes, events that a frame takes."""
+"""Tables of what tests/benchmarks/study.py, scenes.py and lpips.py measure: networks, scenes, events, LPIPS."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -6,9 +6,9 @@ from statistics import fmean, stdev
 from typing import Any
 
 from polarnet.methods import METHODS
-from polarnet.reports.provenance import measured_with, origin
+from polarnet.reports.provenance import cores, measured_with, origin
 from polarnet.reports.studies import PAPER_EVENTS_PER_PIXEL
-from polarnet.reports.tables import SET_TITLES, in_order, label_of
+from polarnet.reports.tables import LABELS, SET_TITLES, in_order
 
 
 def seeds_of(results: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -35,11 +35,11 @@ def study_block(results: Mapping[str, Any]) -> str:
         lines += [f"**{SET_TITLES[name]}**", "", "| | " + " | ".join(label for _, label, _ in STUDY_COLUMNS) + " |"]
         lines.append("|---" + "|---:" * len(STUDY_COLUMNS) + "|")
         for row in ("oracle_mean", best_reconstruction(first["rows"][name])):
-            lines.append(_row(label_of(row), [first["rows"][name][row]]))
+            lines.append(_row(LABELS[row], [first["rows"][name][row]]))
         for row in ("paper", "ours"):
-            lines += [_row(f"{label_of(row)}, seed {n}", [found["rows"][name][row]]) for n, found in seeds.items()]
+            lines += [_row(f"{LABELS[row]}, seed {n}", [found["rows"][name][row]]) for n, found in seeds.items()]
             if len(seeds) > 1:
-                label = f"{label_of(row)}, mean of {len(seeds)} seeds ± standard deviation"
+                label = f"{LABELS[row]}, mean of {len(seeds)} seeds ± standard deviation"
                 lines.append(_row(label, [found["rows"][name][row] for found in seeds.values()]))
         if "shipped" in results:
             lines.append(_row("ours, shipped weights", [results["shipped"]["rows"][name]["ours"]]))
@@ -95,7 +95,7 @@ def headline_block(results: Mapping[str, Any]) -> str:
         row: [value for found in seeds if (value := found["minutes_trained"].get(row)) is not None]
         for row in ("ours", "paper")
     }
-    taken = ", ".join(f"{label_of(row)} {fmean(values):.0f}" for row, values in minutes.items() if values)
+    taken = ", ".join(f"{LABELS[row]} {fmean(values):.0f}" for row, values in minutes.items() if values)
     lines += ["", f"Means of {len(seeds)} training(s); minutes that one took: {taken}."]
     if speed := results.get("throughput"):
         windows, record = results["ours"]["infer_windows_per_s"], results["records"]["throughput"]
@@ -167,6 +167,48 @@ def ablation_block(results: Mapping[str, Any]) -> str:
     return "\n".join([*lines, "", f"One training each, {overrides or 'without further overrides'}. {origin(record)}"])
 
 
+def loss_sweep_block(results: Mapping[str, Any]) -> str:
+    """Scores by the weights of Eq. 9, the smallest validation MSE first.
+
+    `results` is docs/results/sweep.json; `polarnet measure sweep` writes it.
+    """
+    about, record = results["loss_weights"], results["records"]["loss_weights"]
+    lines = [
+        "| `loss.mse` | `loss.ssim` | `loss.lpips` | seeds | " + " | ".join(h for *_, h, _ in SWEEP_COLUMNS) + " |"
+    ]
+    lines.append("|---:" * (4 + len(SWEEP_COLUMNS)) + "|")
+    for point in results["points"]:
+        weights = " | ".join(f"{point['weights'][name]:g}" for name in ("mse", "ssim", "lpips"))
+        cells = []
+        for split, key, _, decimals in SWEEP_COLUMNS:
+            score = point[split].get(key) or {"mean": None, "std": None}
+            spread = "" if score["std"] is None else f" ± {score['std']:.{decimals}f}"
+            cells.append("-" if score["mean"] is None else f"{score['mean']:.{decimals}f}{spread}")
+        lines.append(f"| {weights} | {len(point['seeds'])} | {' | '.join(cells)} |")
+    notes = dict.fromkeys(note for point in results["points"] for note in point["notes"])
+    overrides = " ".join(f"`{override}`" for override in about["overrides"])
+    return "\n".join([
+        *lines, "",
+        "![Test scores by the weights of the three terms](pictures/loss_sweep.png)", "",
+        "Lighter is better, bold the best of a score; the frame marks the smallest validation MSE.", "",
+        f"Ranked by validation MSE; ± is the standard deviation over seeds. LPIPS has the backbone "
+        f"`{about['lpips_backbone']}`. Further overrides: {overrides or 'none'}. {origin(record)}",
+        *(["", f"Notes of the trainings: {'; '.join(notes)}."] if notes else []),
+    ])  # fmt: skip
+
+
+SWEEP_COLUMNS = (
+    ("validation", "mse", "validation MSE ↓", 4),
+    ("validation", "psnr", "validation PSNR ↑", 2),
+    ("test", "mse", "test MSE ↓", 4),
+    ("test", "psnr", "test PSNR ↑", 2),
+    ("test", "ssim", "test SSIM ↑", 3),
+    ("test", "lpips", "test LPIPS ↓", 3),
+    ("test", "corr", "test corr. ↑", 3),
+)
+"""Split and key in sweep.json, heading, decimals."""
+
+
 def designs_block(results: Mapping[str, Any]) -> str:
     """What was tried before today's network, in the order it was, each against the oracle mean.
 
@@ -207,7 +249,7 @@ def event_budget_block(results: Mapping[str, Any]) -> str:
     rows = budget["since_start"]
     methods = in_order(rows)
     lines = [
-        "| events per pixel | scenes | " + " | ".join(f"{label_of(m)}: PSNR | corr." for m in methods) + " |",
+        "| events per pixel | scenes | " + " | ".join(f"{LABELS[m]}: PSNR | corr." for m in methods) + " |",
         "|---" + "|---:" * (1 + 2 * len(methods)) + "|",
     ]
     for entries in zip(*(rows[method] for method in methods), strict=True):
@@ -225,3 +267,31 @@ def event_budget_block(results: Mapping[str, Any]) -> str:
         f"{len(budget['sequences'])} sequences. {origin(record)}",
     ]
     return "\n".join(lines)
+
+
+def lpips_block(results: Mapping[str, Any]) -> str:
+    """How exact LPIPS is on each backbone, and its cost in scoring and in training.
+
+    `results` is docs/results/lpips.json as tests/benchmarks/lpips.py writes it.
+    """
+    cost, record = results["cost"], results["records"]["cost"]
+    demo, paper = cost["demo"], cost["paper"]
+    lines = [
+        "| backbone | largest error | scoring, ms a frame | training step, ms | share of LPIPS |",
+        "|---|---:|---:|---:|---:|",
+        f"| without LPIPS | - | - | {demo['step_ms']['none']:.0f} | - |",
+    ]
+    lines += [
+        f"| `{backbone}` | {results[f'{backbone}_error_max']:.1e} | {results['scoring_ms_per_frame'][backbone]:.1f} | "
+        f"{demo['step_ms'][backbone]:.0f} | {100 * share:.0f} % |"
+        for backbone, share in demo["share"].items()
+    ]
+    return "\n".join([
+        *lines,
+        "",
+        f"Steps of `{demo['network']}` on {demo['frames']} frames in {demo['precision']}. A step of `experiment=paper` "
+        f"on {paper['frames']} frames in {paper['precision']} takes {paper['step_ms']['vgg']:.0f} ms with VGG and "
+        f"{paper['step_ms']['none']:.0f} ms without LPIPS: {100 * paper['share']['vgg']:.0f} % are LPIPS's.",
+        "",
+        f"{cost['threads']} thread(s) on {cores(record)} ({cost['device']}; {measured_with(record)}).",
+    ])  # fmt: skip

@@ -1,7 +1,7 @@
 """Benchmark scores as tables: chosen, rounded and ranked once, then written as Markdown, plain text or HTML."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
@@ -59,8 +59,11 @@ COSTS = {
 }
 """What a method costs on the machine of the run."""
 
-OTHER_COLOUR = "#4aa37c"
-"""Colour of rows of older results that no method has any more."""
+LABELS: Mapping[str, str] = MappingProxyType({name: row.label for name, row in ROWS.items()})
+"""Names of the rows where nothing says which networks are behind them, in the order of every table."""
+
+BACKBONES = {"squeeze": "SqueezeNet 1.1", "alex": "AlexNet", "vgg": "VGG16, like the paper's"}
+"""Readable names of those of LPIPS."""
 
 SET_TITLES = {
     "simulated": "Simulated",
@@ -71,16 +74,17 @@ SET_TITLES = {
 """Test sets, in the order of every page."""
 
 PAPER_SOURCE = "Yan et al., Photonics 2024, 11(5), 481, Table 2"
+PAPER_LABELS = {**LABELS, "e2v": "E2V, default parameters", "cf": "CF, default parameters"}
 PAPER_TABLE_2: Mapping[str, Scores] = {
     "simulated": {
         "cf": {"mse": 0.1371, "psnr": 10.60, "ssim": 0.1667, "lpips": 0.5890},
         "e2v": {"mse": 0.0778, "psnr": 12.74, "ssim": 0.3068, "lpips": 0.4140},
-        "ours": {"mse": 0.0355, "psnr": 15.56, "ssim": 0.3947, "lpips": 0.3295},
+        "paper": {"mse": 0.0355, "psnr": 15.56, "ssim": 0.3947, "lpips": 0.3295},
     },
     "real": {
         "cf": {"mse": 0.0087, "psnr": 23.17, "ssim": 0.4116, "lpips": 0.3342},
         "e2v": {"mse": 0.0134, "psnr": 20.02, "ssim": 0.3819, "lpips": 0.3350},
-        "ours": {"mse": 0.0026, "psnr": 27.48, "ssim": 0.5189, "lpips": 0.1369},
+        "paper": {"mse": 0.0026, "psnr": 27.48, "ssim": 0.5189, "lpips": 0.1369},
     },
 }
 PAPER_COMPARABILITY = (
@@ -129,53 +133,47 @@ def in_order(rows: Iterable[str]) -> list[str]:
     return [name for name in ROWS if name in given] + [name for name in given if name not in ROWS]
 
 
-def label_of(row: str) -> str:
-    """A row's name in tables and figures; its key where it is unknown."""
-    return ROWS[row].label if row in ROWS else row
-
-
-def colour_of(row: str) -> str:
-    """A row's colour in figures."""
-    return ROWS[row].colour if row in ROWS else OTHER_COLOUR
-
-
 def with_structure(rows: Iterable[str]) -> list[str]:
     """Rows in order, without the references, whose prediction is one value everywhere."""
     return [name for name in in_order(rows) if name not in REFERENCES]
 
 
 def score_table(
-    scores: Scores, lpips_reason: str | None = None, columns: Mapping[str, Column] = MappingProxyType(COLUMNS)
+    scores: Scores,
+    columns: Mapping[str, Column] = MappingProxyType(COLUMNS),
+    labels: Mapping[str, str] = LABELS,
 ) -> Table:
-    """Scores of the methods in the fixed order; a metric that no method has gets no column, except LPIPS when
-    `lpips_reason` says why it is missing. Unknown methods follow under their own key.
+    """Scores of the methods in the fixed order; a metric that no method has gets no column.
+
+    LPIPS names the backbone that its rows have as `lpips_backbone`. Methods that `labels` has no name for follow under
+    their own key.
     """
     if not scores:
         raise ValueError("a table needs the scores of at least one method, got none")
-    keys = [
-        key
-        for key in columns
-        if any(scores[method].get(key) is not None for method in scores) or (key == "lpips" and lpips_reason)
-    ]
+    backbone = next((found for row in scores.values() if (found := row.get("lpips_backbone"))), None)
+    if backbone and "lpips" in columns:
+        columns = {**columns, "lpips": replace(columns["lpips"], label=f"LPIPS ({backbone})")}
+    keys = [key for key in columns if any(scores[method].get(key) is not None for method in scores)]
     methods = in_order(scores)
     best = {key: _best(columns[key], [scores[m].get(key) for m in methods]) for key in keys}
     rows = tuple(
         Row(
             method,
-            label_of(method),
+            labels.get(method, method),
             tuple(
                 _cell(columns[key], scores[method].get(key), scores[method].get(f"{key}_ci"), best[key]) for key in keys
             ),
         )
         for method in methods
     )
-    notes = (f'LPIPS "-": {lpips_reason}',) if lpips_reason else ()
+    about = f"LPIPS ({backbone}): version 0.1 on the features of {BACKBONES[backbone]}." if backbone else ""
+    notes = (about,) if about and "lpips" in keys else ()
     return Table(tuple(columns[key].heading for key in keys), rows, notes)
 
 
 def paper_table(experiment: Literal["simulated", "real"]) -> Table:
-    """The paper's Table 2, one of its two experiments."""
-    return score_table(PAPER_TABLE_2[experiment])
+    """Published figures: the paper's Table 2, one of its two experiments."""
+    return score_table(PAPER_TABLE_2[experiment], labels=PAPER_LABELS)
 
 
 def as_markdown(table: Table) -> str:
@@ -204,21 +202,25 @@ def as_plain(table: Table) -> str:
     return "\n".join([*(line.rstrip() for line in lines), *table.notes])
 
 
-def standing(scores: Scores) -> list[str]:
+def standing(scores: Scores, labels: Mapping[str, str] = LABELS) -> list[str]:
     """How `ours` compares with every other method: one sentence each, with the differences; none without `ours`."""
     if "ours" not in scores:
         return []
     return [
-        f"ours against {label_of(rival)}: " + ", ".join(differences) + "."
-        for rival in in_order(scores)
-        if rival in ROWS and rival != "ours" and (differences := _differences(scores["ours"], scores[rival]))
+        f"ours against {label}: " + ", ".join(differences) + "."
+        for rival, label in labels.items()
+        if rival in scores and rival != "ours" and (differences := _differences(scores["ours"], scores[rival]))
     ]
 
 
-def paired_lines(paired: Mapping[str, Mapping[str, Mapping[str, Any]]], metric: str = "mse") -> list[str]:
+def paired_lines(
+    paired: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    metric: str = "mse",
+    labels: Mapping[str, str] = LABELS,
+) -> list[str]:
     """How `ours` does scene by scene against each other method, from details.json's `paired`; a sentence each."""
     return [
-        f"{label_of(rival)}: ours is better in {one['better']} of {one['scenes']} scenes "
+        f"{labels.get(rival, rival)}: ours is better in {one['better']} of {one['scenes']} scenes "
         f"(effect {one['effect']:+.2f}, p = {one['p_holm']:.2g})."
         for rival in in_order(paired)
         if (one := paired[rival].get(metric))

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from polarnet.reports.artefacts import Panel
 from polarnet.reports.figures import DARK, LIGHT, Theme, reliability_figure, score_distribution, score_line
+from polarnet.reports.legend import Legend
 from polarnet.reports.maps import (
     dolp_image,
     encode_png,
@@ -21,7 +22,7 @@ from polarnet.reports.maps import (
     polarization_hsv,
 )
 from polarnet.reports.png import png
-from polarnet.reports.tables import in_order, label_of, with_structure
+from polarnet.reports.tables import in_order, with_structure
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 DISTRIBUTION_METRICS = ("mse", "psnr", "ssim", "corr")
@@ -52,7 +53,7 @@ class TileRow(NamedTuple):
     """Pictures that are left out."""
 
 
-def panel_tiles(panel: Panel) -> list[Tile]:
+def panel_tiles(panel: Panel, legend: Legend) -> list[Tile]:
     """Events, truth, and every method that is not a constant."""
     full_scale = event_full_scale(panel.events)
     tiles = [
@@ -63,14 +64,14 @@ def panel_tiles(panel: Panel) -> list[Tile]:
     return tiles + [
         tile(
             dolp_image(panel.dolp[method]),
-            label_of(method),
+            legend.label(method),
             score_line(panel.dolp[method], panel.truth_dolp),
         )
         for method in methods
     ]
 
 
-def polarization_tiles(panel: Panel) -> list[Tile]:
+def polarization_tiles(panel: Panel, legend: Legend) -> list[Tile]:
     """The truth's S0, DoLP and AoLP, alone and as one colour picture; then every method that has AoLP, lit by S0."""
     ones, s0 = torch.ones_like(panel.truth_s0), panel.truth_s0
     tiles = [
@@ -80,7 +81,7 @@ def polarization_tiles(panel: Panel) -> list[Tile]:
         tile(polarization_hsv(s0, panel.truth_dolp, panel.truth_aolp), "truth"),
     ]
     return tiles + [
-        tile(polarization_hsv(s0, panel.dolp[method], panel.aolp[method]), label_of(method), "with true S0")
+        tile(polarization_hsv(s0, panel.dolp[method], panel.aolp[method]), legend.label(method), "with true S0")
         for method in in_order(panel.aolp)
     ]
 
@@ -94,7 +95,7 @@ def event_tiles(panel: Panel) -> list[Tile]:
     ]
 
 
-def reliability_chart(details: Mapping[str, Any]) -> Chart | None:
+def reliability_chart(details: Mapping[str, Any], legend: Legend) -> Chart | None:
     """Of the methods in details.json that expect an error; None where there is none."""
     curves = {
         method: [(predicted, measured, pixels) for predicted, measured, pixels in found["curve"]]
@@ -102,17 +103,19 @@ def reliability_chart(details: Mapping[str, Any]) -> Chart | None:
     }
     if not curves:
         return None
-    return chart(lambda theme: reliability_figure(curves, theme), "measured against predicted squared error of DoLP")
+    return chart(
+        lambda theme: reliability_figure(curves, theme, legend), "measured against predicted squared error of DoLP"
+    )
 
 
-def distribution(scene_means: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Chart:
+def distribution(scene_means: Mapping[str, Mapping[str, Mapping[str, float]]], legend: Legend) -> Chart:
     """Every scene of a test set, from metric, then method, then scene."""
     shown = {
         metric: {method: list(scenes.values()) for method, scenes in scene_means[metric].items()}
         for metric in DISTRIBUTION_METRICS
         if metric in scene_means
     }
-    return chart(lambda theme: score_distribution(shown, theme), "scores of each method, a dot a scene")
+    return chart(lambda theme: score_distribution(shown, theme, legend), "scores of each method, a dot a scene")
 
 
 def chart(draw: Callable[[Theme], Figure], alt: str) -> Chart:

@@ -10,11 +10,12 @@ import torch
 from jaxtyping import Float64, Int64, Shaped
 from torch import Tensor
 
+from polarnet.arrays import Array, as_tensor, check_range, check_shape
 from polarnet.events.stream import Events
 from polarnet.ranges import allowed, check_ranges
 from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
 from polarnet.simulation.pixels.columns import Columns, empty_columns
-from polarnet.simulation.pixels.light import Light, light_of_frames
+from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
 from polarnet.simulation.sharing import PlaneRun, run_planes
 
 EVENTS_PER_PIXEL_AND_STEP = 0.5  # room to begin with, far more than usual: what is not written costs no memory
@@ -157,8 +158,8 @@ class SensorState:
 
 
 def emulate(
-    frames: Shaped[Tensor, "n planes h w"],
-    t_us: Int64[Tensor, " m"] | Float64[Tensor, " m"],
+    frames: Shaped[Array, "n planes h w"],
+    t_us: Int64[Array, " m"] | Float64[Array, " m"],
     config: EmulatorConfig,
     key: int,
     state: SensorState | None = None,
@@ -171,15 +172,16 @@ def emulate(
     each given the state that the one before returned, gives the events of the whole. `key` (64 bits) seeds all noise;
     `planes` are the numbers by which the planes draw their own mismatch and noise, 0, 1, ... by default. Events are in
     the order (t, y, x, p), and the same to the last bit for any number of threads and any order of planes.
-    ValueError for times that do not increase, values that are not finite or negative, and sizes that do not fit.
+    Frames and times may be numpy or torch. TypeError for what is no array; ValueError for times that do not increase,
+    values that are not finite or outside 0..255, and sizes that do not fit.
     """
     columns, state = emulate_columns(frames, t_us, config, key, state, planes, threads)
     return [events_of(c, state.height, state.width) for c in columns], state
 
 
 def emulate_columns(
-    frames: Shaped[Tensor, "n planes h w"],
-    t_us: Int64[Tensor, " m"] | Float64[Tensor, " m"],
+    frames: Shaped[Array, "n planes h w"],
+    t_us: Int64[Array, " m"] | Float64[Array, " m"],
     config: EmulatorConfig,
     key: int,
     state: SensorState | None = None,
@@ -189,7 +191,9 @@ def emulate_columns(
     exact: bool = False,
 ) -> tuple[list[Columns], SensorState]:
     """As `emulate`, in numpy columns, with each event's process (`labels`) and time before rounding (`exact`)."""
-    planes = tuple(range(frames.shape[1])) if planes is None else tuple(planes)
+    frames = as_tensor("frames", frames).detach().cpu()
+    check_shape("frames", frames, "... planes height width")
+    planes = tuple(range(frames.shape[-3])) if planes is None else tuple(planes)
     times = np.asarray(t_us, dtype=np.float64)
     _check_frames(frames, times, planes, state, config.model)
     clip = frames.numpy() if frames.dtype == torch.uint8 else frames.to(torch.float32).numpy()
@@ -262,6 +266,8 @@ def _check_frames(
         raise ValueError(f"emulate: expected frames as uint8 or float digital numbers (0..255), got {frames.dtype}")
     if frames.dtype != torch.uint8 and not (torch.isfinite(frames).all() and (frames >= 0).all()):
         raise ValueError("emulate: expected finite frames >= 0, got NaN, infinite or negative values")
+    if frames.dtype != torch.uint8:
+        check_range("frames", frames, 0, FULL_SCALE, "digital numbers", f"scale white to {FULL_SCALE:g}")
     if len(set(planes)) != frames.shape[1]:
         raise ValueError(f"emulate: expected {frames.shape[1]} different plane numbers, one a plane, got {planes}")
     before = times if state is None else np.concatenate([[state.t_us], times])

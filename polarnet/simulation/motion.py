@@ -146,11 +146,13 @@ def random_trajectory(
         if highest >= config.speed_min_px_s:
             break
     else:
+        enough = shape.extent * (drift * shape.acceleration * config.speed_min_px_s**2 / config.acceleration_max_px_s2)
+        width, height = np.array([scene_width, scene_height]) + np.maximum(enough - room, 0)
         raise ValueError(
             f"a scene of {scene_height}x{scene_width} leaves a window of {config.window_height}x{config.window_width} "
             f"too little room to reach speed_min_px_s={config.speed_min_px_s:g} within "
             f"acceleration_max_px_s2={config.acceleration_max_px_s2:g} (about {highest:.0f} px/s can be reached); "
-            f"use larger pictures, a smaller window or a lower speed"
+            f"use pictures of about {math.ceil(height)}x{math.ceil(width)}, a smaller window or a lower speed"
         )
     speed = min(speed, highest)
     slowest = drift * speed * crowding

@@ -9,14 +9,33 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
+from polarnet.arrays import (
+    TOLERANCE,
+    Array,
+    as_tensor,
+    check_finite,
+    check_range,
+    check_same_shape,
+    check_shape,
+    floats,
+    fractions,
+)
 from polarnet.stokes import stokes_from_intensities, stokes_from_polarization
 
 
 @dataclass(frozen=True)
 class PolarizationScene:
-    """What a window moves over: S0 in [0, 1], S1, S2 with hypot(S1, S2) <= S0."""
+    """What a window moves over: S0 in [0, 1], S1, S2 with hypot(S1, S2) <= S0.
+
+    Making one checks shape and type alone; `check_scene` checks every pixel.
+    """
 
     stokes: Float32[Tensor, "3 h w"]
+
+    def __post_init__(self):
+        check_shape("stokes", as_tensor("stokes", self.stokes), "3 height width")
+        if not isinstance(self.stokes, Tensor) or self.stokes.dtype != torch.float32:
+            raise TypeError(f"stokes: expected a torch tensor of float32, got {self.stokes.dtype}")
 
     @property
     def height(self) -> int:
@@ -29,34 +48,64 @@ class PolarizationScene:
         return self.stokes.shape[2]
 
 
-def polarization_from_rgb(rgb: Float[Tensor, "3 h w"]) -> Float32[Tensor, "3 h w"]:
-    """(S0, DoLP, AoLP) of a picture in [0, 1]: its value, saturation and hue (paper, section 3.1).
+def check_scene(scene: PolarizationScene) -> None:
+    """ValueError for a scene that no light can make: NaN, S0 outside [0, 1], or hypot(S1, S2) above S0."""
+    check_finite("scene", scene.stokes)
+    s0, s1, s2 = scene.stokes
+    check_range("scene", s0, 0, 1, "S0")
+    excess = float((torch.hypot(s1, s2) - s0).max())
+    if excess > TOLERANCE:
+        raise ValueError(
+            f"scene: expected hypot(S1, S2) <= S0, got one that is {excess:g} larger; "
+            f"scene_from_intensities shrinks what noise left"
+        )
 
+
+def polarization_from_rgb(rgb: Float[Array, "3 h w"]) -> Float32[Tensor, "3 h w"]:
+    """(S0, DoLP, AoLP) of a picture: its value, saturation and hue (paper, section 3.1).
+
+    The picture is RGB in [0, 1] as floating-point numbers of any precision; hue and saturation are computed in float32.
     The circle of hues is the half circle of angles: red 0, green pi/3, blue 2 pi/3. Grey has DoLP 0 and AoLP 0.
+    Raises TypeError for what is no array, and ValueError that says what to do for integers, values outside [0, 1],
+    another order of axes, NaN and infinity.
     """
-    hue, saturation, value = _hsv(rgb)
+    hue, saturation, value = _hsv(fractions("picture", rgb, "3 height width", "RGB"))
     aolp = hue * (math.pi / 360)
     return torch.stack([value, saturation, torch.where(aolp >= math.pi, 0.0, aolp)])
 
 
 def scene_from_polarization(
-    s0: Float[Tensor, "h w"], dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]
+    s0: Float[Array, "h w"], dolp: Float[Array, "h w"], aolp: Float[Array, "h w"]
 ) -> PolarizationScene:
-    """The scene of given intensity in [0, 1], degree and angle (radians) of linear polarization."""
+    """The scene of given intensity and degree of linear polarization, both in [0, 1], and its angle in radians.
+
+    Raises TypeError for what is no array, and ValueError for different shapes, integers, NaN, intensities and degrees
+    outside [0, 1] and angles outside [-pi, pi], which are taken for degrees.
+    """
+    s0, dolp = (fractions(name, plane, "height width").float() for name, plane in (("s0", s0), ("dolp", dolp)))
+    aolp = floats("aolp", aolp, "height width").float()
+    check_same_shape({"s0": s0, "dolp": dolp, "aolp": aolp})
+    check_range("aolp", aolp, -math.pi, math.pi, "radians", "convert degrees with torch.deg2rad")
     return PolarizationScene(stokes_from_polarization(s0, dolp, aolp))
 
 
-def scene_from_rgb(rgb: Float[Tensor, "3 h w"]) -> PolarizationScene:
-    """The scene whose (S0, DoLP, AoLP) are the value, saturation and hue of a picture in [0, 1]."""
+def scene_from_rgb(rgb: Float[Array, "3 h w"]) -> PolarizationScene:
+    """The scene whose (S0, DoLP, AoLP) are the value, saturation and hue of a picture in [0, 1].
+
+    Raises TypeError and ValueError as `polarization_from_rgb`.
+    """
     return scene_from_polarization(*polarization_from_rgb(rgb))
 
 
-def scene_from_intensities(intensities: Float[Tensor, "4 h w"]) -> PolarizationScene:
+def scene_from_intensities(intensities: Float[Array, "4 h w"]) -> PolarizationScene:
     """The scene measured behind polarizers at 0, 45, 90 and 135 degrees, in linear light, I0 + I90 at most 1.
 
     Noise makes some measurements unphysical: S1 and S2 are shrunk where their length exceeds S0.
+    Raises TypeError for what is no array, and ValueError for integers, NaN, another order of axes, negative values, and
+    light above 1.
     """
-    stokes = stokes_from_intensities(intensities.float())
+    stokes = stokes_from_intensities(fractions("intensities", intensities, "4 height width").float())
+    check_range("intensities", stokes[0], 0, 1, "S0 = I0 + I90", "divide by the S0 that is to be 1")
     s0, s1, s2 = stokes
     length = torch.hypot(s1, s2)
     shrink = torch.where(length > s0, s0 / torch.where(length > 0, length, 1.0), 1.0)

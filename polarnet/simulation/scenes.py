@@ -3,9 +3,9 @@
 What is stored is the scene: rendering starts from the quantised planes, so truth and events agree to the last bit.
 """
 
+import os
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from polarnet.arrays import Array, as_tensor, check_same_shape, check_shape, mask_of
 from polarnet.events.frames import (
     check_splits,
     dequantise_angle,
@@ -94,7 +95,7 @@ class SceneStore:
     @classmethod
     def create(
         cls,
-        path: str | Path,
+        path: str | os.PathLike[str],
         picture_of: Mapping[str, str],
         splits: Mapping[str, str],
         *,
@@ -132,22 +133,28 @@ class SceneStore:
         return cls(create_table(path, FORMAT, VERSION, metadata, _columns(metadata)))
 
     @classmethod
-    def open(cls, path: str | Path) -> "SceneStore":
+    def open(cls, path: str | os.PathLike[str]) -> "SceneStore":
         """A finished store: a local folder, a zip, or an fsspec URL. See `polarnet.events.table.open_table`."""
         return cls(open_table(path, FORMAT, VERSION, _columns))
 
     def write_picture(
         self,
         picture: str,
-        s0: Float[Tensor, "h w"],
-        dolp: Float[Tensor, "h w"],
-        aolp: Float[Tensor, "h w"],
-        valid: Bool[Tensor, "h w"] | None = None,
+        s0: Float[Array, "h w"],
+        dolp: Float[Array, "h w"],
+        aolp: Float[Array, "h w"],
+        valid: Bool[Array, "h w"] | None = None,
     ) -> None:
         """Put a picture in its row; one that is there already stays as it is. `valid` None: all its light is known.
 
-        ValueError for values out of range, a picture of a size that cannot be, or a mask in a store that has none.
+        Arrays may be numpy or torch. Raises TypeError for what is no array, and ValueError for values out of range or
+        not finite, integers, planes of different shapes, a picture of a size that cannot be, or a mask in a store that
+        has none.
         """
+        planes = {name: as_tensor(name, plane) for name, plane in (("s0", s0), ("dolp", dolp), ("aolp", aolp))}
+        for name, plane in planes.items():
+            check_shape(name, plane, "height width")
+        check_same_shape(planes)
         if valid is not None and (not self.masked or valid.shape != s0.shape):
             raise ValueError(
                 f"{picture}: expected a mask of {tuple(s0.shape)} in a store created with masked=True, "
@@ -159,19 +166,25 @@ class SceneStore:
                 f"{picture}: expected a picture between the window's {self.window_height}x{self.window_width} px and "
                 f"{height}x{width} px, got {s0.shape[0]}x{s0.shape[1]}"
             )
-        planes = {"s0": quantise_fraction(s0), "dolp": quantise_fraction(dolp), "aolp": quantise_angle(aolp)}
+        rows = {
+            "s0": quantise_fraction(s0, "s0"),
+            "dolp": quantise_fraction(dolp, "dolp"),
+            "aolp": quantise_angle(aolp, "aolp"),
+        }
         if self._table.is_written("picture_size", picture):
             return
         if self.masked:
-            known = torch.ones(s0.shape, dtype=torch.bool) if valid is None else valid
-            planes["valid"] = known.numpy().astype(np.uint8)
-        for name, steps in planes.items():
+            known = (
+                torch.ones(tuple(s0.shape), dtype=torch.bool) if valid is None else mask_of("valid", valid, s0.shape)
+            )
+            rows["valid"] = known.cpu().numpy().astype(np.uint8)
+        for name, steps in rows.items():
             self._table.write(name, picture, steps)
         self._table.write("picture_size", picture, np.array(s0.shape))
 
-    def write(self, sequence: str, trajectory: Float64[Tensor, " k"], duration_us: int) -> None:
+    def write(self, sequence: str, trajectory: Float64[Array, " k"], duration_us: int) -> None:
         """Put the trajectory of a sequence in its row, if it is not there yet; its picture may come before or after."""
-        names = self.trajectory_names
+        names, trajectory = self.trajectory_names, as_tensor("trajectory", trajectory)
         if len(trajectory) != len(names) or not trajectory.isfinite().all():
             raise ValueError(f"{sequence}: expected {len(names)} finite numbers ({', '.join(names)}), got {trajectory}")
         if duration_us <= 0:
@@ -230,7 +243,7 @@ class SceneStore:
         return []
 
 
-def verify_scenes(path: str | Path) -> list[str]:
+def verify_scenes(path: str | os.PathLike[str]) -> list[str]:
     """Everything that is wrong with a scene store, each with its sequence or picture and column; empty when whole."""
     try:
         store = SceneStore.open(path)

@@ -2,14 +2,16 @@
 
 from typing import NamedTuple
 
+import numpy as np
 from jaxtyping import Float, Int64
 from torch import Tensor, tensor
 
+from polarnet.arrays import Array
 from polarnet.events.stream import Events
 from polarnet.runtime import generator_for, seed_for
 from polarnet.simulation.emulator import EmulatorConfig, randomised
 from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory
-from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
+from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb
 from polarnet.simulation.synthesize import synthesize_sequence
 from polarnet.simulation.truth import frames_of
 
@@ -30,14 +32,30 @@ class Simulation(NamedTuple):
 
 
 def simulate(
-    picture: Float[Tensor, "3 h w"] | PolarizationScene, motion: MotionConfig, sensor: EmulatorConfig, seed: int
+    picture: Float[Array, "3 h w"] | PolarizationScene, motion: MotionConfig, sensor: EmulatorConfig, seed: int
 ) -> Simulation:
-    """Let a window move over a picture in [0, 1], or over a scene, and see it through event-camera pixels.
+    """Let a window move over a picture, or over a scene, and see it through event-camera pixels.
 
+    A picture is RGB, numpy or torch, of shape (3, height, width), in floating-point numbers of any precision in [0, 1].
     Hue becomes AoLP, saturation DoLP and value S0, as in the pipeline. The same arguments give the same numbers.
-    ValueError where the picture is too small for the window and its motion.
+
+    Raises TypeError for arguments of another kind. Raises ValueError for integers (divide 8 bits by 255, 16 bits by
+    65535), values outside [0, 1], another order of axes, NaN and infinity, scenes that no light can make, and where the
+    picture is too small for the window and its motion; the message says what to do.
     """
-    scene = picture if isinstance(picture, PolarizationScene) else scene_from_rgb(picture)
+    for name, value, kind, example in (
+        ("motion", motion, MotionConfig, 'MOTIONS["default"]'),
+        ("sensor", sensor, EmulatorConfig, 'SENSORS["default"]'),
+    ):
+        if not isinstance(value, kind):
+            raise TypeError(f"{name}: expected {kind.__name__} such as {example}, got {value!r}")
+    if not isinstance(seed, (int, np.integer)):
+        raise TypeError(f"seed: expected a whole number, got {seed!r}")
+    if isinstance(picture, PolarizationScene):
+        scene = picture
+        check_scene(scene)
+    else:
+        scene = scene_from_rgb(picture)
     trajectory = random_trajectory(motion, scene.height, scene.width, generator_for(seed, "picture", "motion"))
     t_us, size = frame_times_us(motion), (motion.window_height, motion.window_width)
     sensor = randomised(sensor, generator_for(seed, "picture", "sensor"))

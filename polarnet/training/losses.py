@@ -51,19 +51,22 @@ def known_frames(predicted: Frames, truth: Frames, valid: Valid) -> tuple[Tensor
 class FrameLoss:
     """A weighted sum of terms, each a mean over all frames: mse, mae, ssim_loss (1 - SSIM, Eq. 7) and lpips.
 
-    Without an LPIPS network its term is left out of `weights`, and so of the sum. Pixels that are not valid count in no
-    term, as `polarnet.similarity` says, nor do frames without a valid pixel.
+    Pixels that are not valid count in no term, as `polarnet.similarity` says, nor do frames without a valid pixel.
+    ValueError where LPIPS has a weight but `lpips` is None.
     """
 
     def __init__(self, weights: Mapping[str, float], lpips: Lpips | None):
-        known: dict[str, Callable[[Tensor, Tensor, Tensor | None], Tensor] | None] = {
+        if lpips is None and weights.get("lpips", 0) > 0:
+            raise ValueError(f"lpips: its weight is {weights['lpips']}, but there is no LPIPS network; load one")
+        known: dict[str, Callable[[Tensor, Tensor, Tensor | None], Tensor]] = {
             "mse": mse,
             "mae": lambda a, b, valid: (a - b).abs() if valid is None else mean_where((a - b).abs(), valid),
             "ssim_loss": lambda a, b, valid: 1 - ssim(a, b, valid),
-            "lpips": None if lpips is None else lambda a, b, valid: lpips(with_truth_outside(a, b, valid), b),
         }
-        self.weights = {name: weight for name, weight in weights.items() if weight and known[name] is not None}
-        self._terms = {name: term for name in self.weights if (term := known[name]) is not None}
+        if lpips is not None:
+            known["lpips"] = lambda a, b, valid: lpips(with_truth_outside(a, b, valid), b)
+        self.weights = {name: weight for name, weight in weights.items() if weight}
+        self._terms = {name: known[name] for name in self.weights}
 
     def __call__(self, predicted: Frames, truth: Frames, valid: Valid = None) -> dict[str, Float[Tensor, ""]]:
         """The terms by name, without their weights; 0 where nothing is known of any frame."""

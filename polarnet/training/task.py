@@ -1,8 +1,6 @@
 """What is trained on what: the parts of a training that differ from one network to another, and its data."""
 
 import hashlib
-import json
-import logging
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,6 +15,7 @@ from polarnet.events.frames import FrameStore
 from polarnet.events.representations import Encode
 from polarnet.events.store import EventStore
 from polarnet.events.windows import EventSource, WindowDataset
+from polarnet.lpips import NO_RECORD, stored_record
 from polarnet.runtime import precision_on, seed_for
 from polarnet.similarity import Lpips
 from polarnet.simulation.emulator import EmulatorConfig
@@ -24,8 +23,6 @@ from polarnet.simulation.fly import EmulatedEvents
 from polarnet.simulation.scenes import SceneStore
 from polarnet.training.losses import FrameLoss
 from polarnet.training.sequences import Batch
-
-logger = logging.getLogger(__name__)
 
 BLOCK = 2**20  # bytes
 
@@ -95,16 +92,12 @@ def initialised(build: Callable[[], Network], seed: int) -> Network:
         return build()
 
 
-def lpips_of(folder: Path, weight: float) -> Lpips | None:
-    """The LPIPS network that stage `weights` left in `folder`, if the loss wants it; a warning where there is none."""
-    if weight == 0:
-        return None
-    lpips = Lpips.load(folder)
-    if lpips is None:
-        reason = json.loads((folder / "lpips.json").read_text())["reason"]
-        rule = "!" * 100
-        logger.warning("\n%s\nLPIPS IS LEFT OUT OF THE LOSS: %s\n%s", rule, reason, rule)
-    return lpips
+def lpips_of(folder: str, backbone: str, weight: float) -> Lpips | None:
+    """The LPIPS network of a loss, from what stage `weights` left in `folder`; None where its weight is 0.
+
+    ValueError where the stage left none of this backbone.
+    """
+    return Lpips.load(folder, "loss", backbone) if weight > 0 else None
 
 
 def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, device: torch.device) -> dict[str, Any]:
@@ -113,9 +106,7 @@ def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, de
     `training.precision` is the one that is used on `device`, `training.optimizer` the one that the network gets.
     """
     events, frames = split.train.events, split.train.frames
-    lpips = (
-        json.loads((weights / "lpips.json").read_text()) if any("lpips" in term for term in task.loss.weights) else {}
-    )
+    lpips = stored_record(weights, "loss") if any("lpips" in term for term in task.loss.weights) else NO_RECORD
     return {
         **task.description,
         "training": {
@@ -125,7 +116,7 @@ def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, de
             "precision": precision_on(device, config.precision),
         },
         "loss": dict(task.loss.weights),
-        "lpips": {key: lpips.get(key) for key in ("backbone", "sha256")},
+        "lpips": {key: lpips[key] for key in ("backbone", "sha256")},
         "data": {
             "train_sequences": len(split.train),
             "val_sequences": len(split.val),

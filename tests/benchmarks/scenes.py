@@ -64,7 +64,7 @@ def scored(name: str, seed: int, photographs: Path, arguments: argparse.Namespac
     choice, run = CHOICES[name], f"{name}_{seed}"
     data, results, trained = (arguments.work / folder for folder in (name, f"benchmark_{run}", f"train_{run}"))
     fractions = (f"ingest.root={photographs}", f"ingest.test_fraction={HELD_OUT}")
-    if not (data / "weights" / "lpips.json").exists():
+    if not (data / "weights" / "loss.json").exists():
         for step in ("ingest", "synthesize", "emulate", "weights"):
             stage(step, arguments, data, *fractions, *choice.synthesis)
     if not (results / "metrics.json").exists():

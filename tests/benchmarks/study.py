@@ -1,7 +1,7 @@
 """Every network trained on the same photographs, then every method on held-out photographs and on measured scenes.
 
 python tests/benchmarks/study.py --photographs FOLDER --measured FOLDER --work FOLDER
-    [--ours FILE] [--firenet FILE] [--lpips FILE] [--override ROW:KEY=VALUE ...] [--only ROW]
+    [--ours FILE] [--firenet FILE] [--override ROW:KEY=VALUE ...] [--only ROW]
     [--seed N] [--rows ROW ...] [--write]
 
 Runs the pipeline's stages with experiment=photographs in the folder --work, where a killed run goes on and nothing is
@@ -53,7 +53,6 @@ def common(arguments: argparse.Namespace) -> list[str]:
         f"paths.data={arguments.work / 'data'}",
         f"paths.cache={arguments.work / 'cache'}",
         f"runtime.threads={arguments.threads}",
-        *([f"lpips.path={arguments.lpips}"] if arguments.lpips else []),
     ]
 
 
@@ -71,7 +70,7 @@ def trained(row: str, arguments: argparse.Namespace) -> Path:
         resume = arguments.work / "resume" / folder.name
         whole, started = not any(resume.glob("*/running.pt")), time.monotonic()
         paths = (f"paths.{name}={folder}", f"paths.resume={resume}")
-        stage(name, arguments, *choice, f"seed={arguments.seed}", *paths, *chosen)
+        stage(name, arguments, *choice, f"benchmark.methods=[{row}]", f"seed={arguments.seed}", *paths, *chosen)
         minutes = round((time.monotonic() - started) / 60, 1) if whole else None
         (folder / "minutes.json").write_text(json.dumps(minutes))
     return folder
@@ -106,7 +105,6 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--ours", type=Path, help="weights of `ours`, such as the shipped ones, instead of training it")
     parser.add_argument("--firenet", type=Path, help="FireNet's published weights; without them its rows are left out")
-    parser.add_argument("--lpips", type=Path, help="of SqueezeNet, for the column and for the baselines' losses")
     parser.add_argument("--override", action="append", default=[], metavar="ROW:KEY=VALUE", help="of a row's training")
     parser.add_argument("--only", choices=tuple(TRAININGS), help="train this one and stop")
     parser.add_argument("--rows", nargs="+", choices=tuple(TRAININGS), default=[*TRAININGS], help="to train and score")
@@ -119,7 +117,7 @@ def parsed() -> argparse.Namespace:
         parser.error("the tree has uncommitted changes; commit them first, the figures name a commit")
     if "ours" not in arguments.rows and not arguments.ours and not arguments.only:
         parser.error(f"--rows {' '.join(arguments.rows)}: expected ours among them, or --ours FILE")
-    for name in ("photographs", "measured", "work", "ours", "firenet", "lpips"):
+    for name in ("photographs", "measured", "work", "ours", "firenet"):
         if path := getattr(arguments, name):
             setattr(arguments, name, path.resolve())
     return arguments
@@ -129,9 +127,10 @@ def main() -> None:
     """Train, benchmark, print and perhaps write."""
     arguments = parsed()
     record = machine_record(ROOT)
-    if not (arguments.work / "data" / "weights" / "lpips.json").exists():
-        for name in ("ingest", "synthesize", "emulate", "weights"):
+    if not (arguments.work / "data" / "events.zarr").exists():
+        for name in ("ingest", "synthesize", "emulate"):
             stage(name, arguments)
+    stage("weights", arguments)  # those of the table may be others than when the data were made
     if arguments.only:
         trained(arguments.only, arguments)
         return

@@ -23,6 +23,8 @@ def config(**changes):
         "sets": ["simulated"],
         "warmup_windows": 1,
         "precision": "fp32",
+        "lpips": False,
+        "lpips_backbone": "alex",
         "bootstrap_samples": 50,
     }
     return BenchmarkConfig(**{**values, "panel_scenes": 2, **changes})
@@ -45,13 +47,14 @@ def test_the_training_mean_counts_training_frames_after_the_warm_up(five_scenes,
 def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
     benchmark = run_benchmark(five_scenes, context, config(), None, tmp_path / "cache")
     folder = tmp_path / "benchmark"
-    returned = write_benchmark(folder, benchmark, config(), 1, {"lpips": {"reason": "no weights"}, "train_mean": 0.25})
+    returned = write_benchmark(folder, benchmark, config(), 1, {"lpips": {"backbone": None}, "train_mean": 0.25})
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics == returned
     assert list(metrics) == list(ROWS)
     for scores in metrics.values():
         assert scores["ms_per_window"] > 0
         assert scores["lpips"] is None
+        assert "lpips_backbone" not in scores
         assert scores["mse_ci"][0] <= scores["mse"] <= scores["mse_ci"][1]
         assert scores["mse"] == pytest.approx(scores["level_mse"] + scores["pattern_mse"], rel=1e-4)
     assert metrics["oracle_mean"]["skill"] == pytest.approx(0, abs=1e-3)  # frames are scored in steps of 1/65535
@@ -64,7 +67,7 @@ def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
     assert metrics["oracle_mean"]["mse"] < min(metrics["zeros"]["mse"], metrics["train_mean"]["mse"])
     assert len((folder / "frames.csv").read_text().splitlines()) == 1 + len(ROWS) * 4 * 3
     details = json.loads((folder / "details.json").read_text())
-    assert details["lpips"]["reason"] == "no weights"
+    assert details["lpips"] == {"backbone": None}
     assert details["scenes"] == ["lake", "town", "wood"]
     assert details["frames"] == 12
     assert "lpips" not in details["scene_means"]
@@ -83,7 +86,7 @@ def test_expected_errors_are_held_against_measured_ones_in_the_scored_windows(
         off = torch.where(sequence.dolp < 0.5, 0.1, -0.1)
         return Prediction(sequence.dolp + off, None, log_variance)
 
-    monkeypatch.setitem(REFERENCES, "train_mean", Reference("train_mean", "sure", "#000000", sure))
+    monkeypatch.setitem(REFERENCES, "train_mean", Reference("train_mean", "sure", "#000000", "Knows its error.", sure))
     for _ in range(2):  # made, and from the cache
         found = run_benchmark(five_scenes, context, config(methods=["zeros", "train_mean"]), None, tmp_path / "cache")
         assert set(found.reliability) == {"train_mean"}

@@ -41,7 +41,7 @@ def with_activity(activity, context, make_setup):
 
 
 def test_it_is_a_row_of_the_benchmark_with_its_name_in_tables(activity, with_activity, five_scenes, tmp_path):
-    config = BenchmarkConfig(["zeros", "activity", "ours"], ["simulated"], 1, "fp32", 20, 1)
+    config = BenchmarkConfig(["zeros", "activity", "ours"], ["simulated"], 1, "fp32", False, "alex", 20, 1)
     benchmark = run_benchmark(five_scenes, with_activity, config, None, tmp_path / "cache")
     metrics = write_benchmark(tmp_path / "out", benchmark, config, 1, {})
     assert set(metrics) == {"zeros", "activity", "ours"}

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from polarnet.evaluation.references import oracle_mean
-from polarnet.evaluation.rows import ROWS, available, predictions_of, weights_used
+from polarnet.evaluation.rows import ROWS, available, metadata_used, predictions_of, weights_used
 from polarnet.events.stream import Events
 from polarnet.methods import METHODS
 from polarnet.similarity import mse
@@ -86,3 +86,8 @@ def test_weights_that_are_not_there_are_missed_by_their_methods_alone(sequence, 
 def test_the_weights_behind_a_table_are_named_once_a_section(context):
     used = weights_used(["zeros", "cf", "firenet", "firenet+gain"], context)
     assert {section: one["file"] for section, one in used.items()} == {"firenet": "firenet.safetensors"}
+
+
+def test_checkpoints_of_polarnet_say_what_they_are_and_files_of_other_authors_say_nothing(context):
+    metadata = metadata_used(["zeros", "cf", "e2v", "e2v+gain", "firenet_published", "ours"], context)
+    assert {row: one["network"] for row, one in metadata.items()} == {"e2v": "firenet", "ours": "paper"}

@@ -32,6 +32,8 @@ def config(**changes):
         "sets": ["simulated"],
         "warmup_windows": 1,
         "precision": "fp32",
+        "lpips": False,
+        "lpips_backbone": "alex",
         "bootstrap_samples": 10,
         "panel_scenes": 1,
     }
@@ -86,6 +88,24 @@ def test_a_sequence_with_nothing_left_after_the_warm_up_is_refused(sequence):
 def test_frames_of_another_size_are_refused(sequence):
     with pytest.raises(ValueError, match=r"m on a: expected frames of \(4, 18, 20\), got \(3, 18, 20\)"):
         score_sequence(sequence, {"m": Prediction(sequence.dolp[:3])}, 0, None, CPU)
+
+
+def test_lpips_sees_the_truth_once_for_all_methods_and_a_constant_once(make_sequence, monkeypatch):
+    torch.manual_seed(0)
+    lpips, seen = Lpips("squeeze"), []
+    features = Lpips.features
+
+    def counted(self, images):
+        seen.append(len(images))
+        return features(self, images)
+
+    monkeypatch.setattr(Lpips, "features", counted)
+    sequence, other = make_sequence(windows=8), make_sequence(windows=8, seed=1)
+    constant, zeros = Prediction(torch.full_like(other.dolp, 0.3)), Prediction(0 * other.dolp)
+    rows = score_sequence(sequence, {"m": Prediction(other.dolp), "c": constant, "z": zeros}, 0, lpips, CPU)
+    assert seen == [8, 8, 1, 1]  # the truth, m, c, z
+    of_constant = [r.lpips for r in rows if r.method == "c"]
+    assert of_constant == pytest.approx(lpips(constant.dolp, sequence.dolp).tolist(), rel=1e-4)
 
 
 def test_lpips_in_chunks_is_lpips_frame_by_frame(make_sequence):

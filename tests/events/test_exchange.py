@@ -147,3 +147,13 @@ def test_columns_of_a_file_keep_the_types_of_events(make_random_events, tmp_path
     events = make_random_events(0, 100, 1000, HEIGHT, WIDTH)
     write_hdf5(tmp_path / "e.h5", events, 1000)
     assert all(torch.equal(getattr(read_hdf5(tmp_path / "e.h5"), c), getattr(events, c)) for c in "txyp")
+
+
+@pytest.mark.parametrize("form", ["hdf5", "text"])
+def test_paths_may_be_text(store, make_events, tmp_path, form):
+    export_store(store, str(tmp_path / "files"), form)
+    import_store(str(tmp_path / "files"), str(tmp_path / "again.zarr"))
+    assert _digest(tmp_path / "again.zarr") == _digest(store.path)
+    write, read = {"hdf5": (write_hdf5, read_hdf5), "text": (write_text, read_text)}[form]
+    write(str(tmp_path / "e"), make_events([(5, 1, 2, 1)], 3, 4), 10)
+    assert read(str(tmp_path / "e")).t.tolist() == [5]

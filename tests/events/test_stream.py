@@ -1,6 +1,8 @@
 """What can be done to a stream of events."""
 
+import numpy as np
 import pytest
+import torch
 
 from polarnet.events.stream import (
     Events,
@@ -136,3 +138,27 @@ def test_columns_of_a_wrong_type_or_length_are_refused(make_events):
         Events(events.t, events.x.repeat(2), events.y, events.p, 1, 1)
     with pytest.raises(ValueError, match="sides of 1 to 32767 px, got 0x1"):
         Events.empty(0, 1)
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.int32, np.int64])
+def test_columns_of_any_integer_type_make_events(dtype):
+    t, x, y = (np.array(values, dtype) for values in ([5, 7], [0, 3], [1, 2]))
+    events = Events.from_columns(t, torch.from_numpy(x.astype(np.int64)), y, np.array([1, -1]), height=3, width=4)
+    assert rows(events) == [(5, 0, 1, 1), (7, 3, 2, -1)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"p": np.array([0, 1])}, r"event 0 of 2: expected polarity \+1 or -1, got t=5, x=0, y=1, p=0"),
+        ({"x": np.array([0, 4])}, "event 1 of 2: expected x from 0 to 3"),
+        ({"x": np.array([0, 65536])}, "expected x that fit torch.int16, got 0 to 65536"),
+        ({"t": np.array([7, 5])}, "event 1 of 2: expected a time no earlier"),
+        ({"t": np.array([0.5, 0.7])}, "t: expected whole numbers, got torch.float64"),
+        ({"y": np.array([1])}, r"expected y as torch.int16 of shape \(2,\)"),
+    ],
+)
+def test_columns_that_are_no_events_are_refused(unchecked_annotations, changes, message):
+    columns = {"t": np.array([5, 7]), "x": np.array([0, 3]), "y": np.array([1, 2]), "p": np.array([1, -1])}
+    with pytest.raises(ValueError, match=message):
+        Events.from_columns(**(columns | changes), height=3, width=4)

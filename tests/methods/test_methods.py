@@ -254,10 +254,16 @@ def test_a_blank_file_name_is_refused():
         WeightsConfig(" ")
 
 
-def test_weights_are_named_by_their_hash(make_setup, checkpoints):
+def test_weights_are_named_by_their_hash_and_network(make_setup, checkpoints):
     content = checkpoints["firenet"].read_bytes()
-    expected = {"file": "firenet.safetensors", "sha256": hashlib.sha256(content).hexdigest()}
-    assert weights_record(make_setup("firenet")) == expected
+    assert weights_record(METHODS["firenet"], make_setup("firenet")) == {
+        "file": "firenet.safetensors", "sha256": hashlib.sha256(content).hexdigest(), "network": "firenet"
+    }  # fmt: skip
+
+
+def test_weights_name_the_network_behind_a_row_whose_key_does_not(make_setup):
+    for name, network in {"ours": "paper", "e2v": "firenet", "cista_tc": "cista_tc"}.items():
+        assert weights_record(METHODS[name], make_setup(name))["network"] == network
 
 
 @pytest.mark.shared

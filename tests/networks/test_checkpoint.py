@@ -104,3 +104,14 @@ def test_a_torch_pickle_is_refused_without_being_read(tmp_path):
     torch.save({"a": torch.zeros(1)}, tmp_path / "n.pth")
     with pytest.raises(ValueError, match=r"NAME\.safetensors, got .*n\.pth"):
         load_checkpoint(tmp_path / "n.pth")
+
+
+def test_a_path_may_be_text(saved):
+    path, network = saved
+    loaded, metadata = load_network(str(path))
+    assert loaded.state_dict().keys() == network.state_dict().keys()
+    copy = str(path.with_name("copy.safetensors"))
+    save_checkpoint(copy, network.state_dict(), metadata)
+    assert load_checkpoint(copy)[0].keys() == network.state_dict().keys()
+    with pytest.raises(FileNotFoundError, match=r"x\.safetensors is missing"):
+        load_network("x.safetensors")

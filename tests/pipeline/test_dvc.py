@@ -7,6 +7,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from polarnet.experiments import stage_names
+from polarnet.training.baselines import USERS
 
 # What starts a stage and checks its values decides no output; listing it would re-run everything at each new setting.
 PLUMBING = {"polarnet", "polarnet.config", "polarnet.cluster"}
@@ -49,6 +50,18 @@ def test_a_change_of_network_loss_metric_or_figure_never_reruns_the_simulation(p
         behind = modules_behind(stage, imports)
         for package in ("networks", "training", "similarity", "lpips", "evaluation", "reports", "methods"):
             assert not any(module.startswith(f"polarnet.{package}") for module in behind), (stage, package)
+
+
+def test_another_row_of_the_benchmark_trains_a_baseline_only_if_it_uses_one(project_root):
+    stages = YAML(typ="safe").load(project_root / "dvc.yaml")["stages"]
+    assert "benchmark.methods" in stages["baselines"]["params"]
+    for baseline in USERS:
+        training = stages[f"train_{baseline}"]
+        assert f"data/baselines/{baseline}.json" in training["deps"]
+        assert f"data/baselines/{baseline}.json" in stages["baselines"]["outs"]
+        assert not any(param.startswith(("benchmark", "methods")) for param in training["params"])
+        assert {f"methods.{row}.weights" for row in USERS[baseline]} <= {*stages["baselines"]["params"]}
+        assert not [dep for dep in training["deps"] if dep.startswith("data/baselines") and baseline not in dep]
 
 
 def _modules(root: Path, dependency: str) -> set[str]:

@@ -7,7 +7,6 @@ minute. With POLARNET_SLOW=1 the same deaths befall `python -m stages.emulate` w
 import contextlib
 import functools
 import hashlib
-import multiprocessing
 import os
 import shutil
 import signal
@@ -22,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
+from preloaded import FORKSERVER
 from skimage import data
 
 SEQUENCES = 10
@@ -84,11 +84,8 @@ def run_stage(arguments: list[str]) -> None:
 
 @pytest.fixture(scope="module")
 def start_forked() -> Callable[[list[str]], Running]:
-    forkserver = multiprocessing.get_context("forkserver")
-    forkserver.set_forkserver_preload(["stages.emulate", "distributed"])
-
     def start(arguments: list[str]) -> Running:
-        process = forkserver.Process(target=run_stage, args=([*arguments, "runtime.threads=1"],))
+        process = FORKSERVER.Process(target=run_stage, args=([*arguments, "runtime.threads=1"],))
         process.start()
         pid = process.pid
         assert pid is not None

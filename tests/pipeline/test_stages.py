@@ -1,14 +1,15 @@
-"""The stages themselves, at toy size, as DVC calls them."""
+"""The stages themselves, at toy size, with the command lines that DVC calls (`trial` starts two as DVC does)."""
 
 import hashlib
 import json
-import subprocess
-import sys
+import shutil
 from pathlib import Path
 
+import preloaded
 import pytest
 
 from polarnet.experiments import stage_names
+from polarnet.lpips import PURPOSES
 
 TINY = [
     "ingest.dead_leaves=4",
@@ -40,12 +41,11 @@ GENERATED = ("images", "scenes.zarr", "frames.zarr", "events.zarr")
 
 
 def run_stage(root: Path, stage: str, data: Path, *overrides: str) -> str:
-    command = [sys.executable, "-m", f"stages.{stage}", *TINY, f"paths.data={data}", f"paths.resume={data / 'resume'}",
-               f"paths.cache={data / 'cache'}",
-               f"hydra.run.dir={data / 'logs' / stage}", *overrides]  # fmt: skip
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout + done.stderr
+    arguments = [*TINY, f"paths.data={data}", f"paths.resume={data / 'resume'}", f"paths.cache={data / 'cache'}",
+                 f"hydra.run.dir={data / 'logs' / stage}", *overrides]  # fmt: skip
+    done = preloaded.run_stage(root, stage, arguments)
+    assert done.returncode == 0, done.stdout
+    return done.stdout
 
 
 def bytes_of(folder: Path) -> dict[str, str]:
@@ -62,18 +62,39 @@ def data(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_benchmark_has_a_row_for_every_method_and_says_that_lpips_is_missing(data):
+def test_the_benchmark_has_a_row_for_every_method_with_lpips_and_says_of_which_backbone(data):
     metrics = json.loads((data / "benchmark" / "metrics.json").read_text())
     assert set(metrics) == {"zeros", "train_mean", "oracle_mean", "cf", "highpass", "cf+gain", "e2v", "e2p", "ours"}
     details = json.loads((data / "benchmark" / "details.json").read_text())
     assert set(details["left_out"]) == {"e2vid", "firenet_published"}
     assert set(details["weights"]) == {"e2v", "e2p", "ours"}
-    weights = json.loads((data / "weights" / "lpips.json").read_text())
+    weights = {purpose: json.loads((data / "weights" / f"{purpose}.json").read_text()) for purpose in PURPOSES}
+    assert details["lpips"] == weights["benchmark"]
+    for network in ("train", "train_e2v", "train_e2p"):
+        trained = json.loads((data / network / "best.json").read_text())["lpips"]
+        assert trained == {key: weights["loss"][key] for key in ("backbone", "sha256")}
     for method, row in metrics.items():
         assert {"mse", "psnr", "ssim", "lpips", "corr", "ms_per_window"} <= set(row), method
         assert 0 <= row["mse"] <= 1
-        assert (row["lpips"] is None) == (weights["sha256"] is None)
+        assert row["lpips"] > 0, method
+        assert row["lpips_backbone"] == "alex"
     assert metrics["oracle_mean"]["mse"] <= min(metrics["zeros"]["mse"], metrics["train_mean"]["mse"])
+
+
+def test_a_baseline_that_no_row_uses_is_not_trained_and_another_row_changes_nothing(project_root, data, tmp_path):
+    asked = bytes_of(data / "baselines")
+    rows = "benchmark.methods=[zeros,e2v,{}ours]".format
+    printed = run_stage(project_root, "train_e2p", tmp_path, rows(""))  # without any event: nothing is read
+    assert "no row of benchmark.methods uses weights of baselines.e2p" in printed
+    assert [path.name for path in (tmp_path / "train_e2p").iterdir()] == ["not_trained.json"]
+    run_stage(project_root, "baselines", tmp_path, rows(""))
+    without = bytes_of(tmp_path / "baselines")
+    run_stage(project_root, "baselines", tmp_path, rows("cf,e2v+gain,"))
+    assert bytes_of(tmp_path / "baselines") == without
+    run_stage(project_root, "baselines", tmp_path, rows("e2p,"))
+    assert bytes_of(tmp_path / "baselines") == asked
+    assert without["e2v.json"] == asked["e2v.json"]
+    assert without["e2p.json"] != asked["e2p.json"]
 
 
 def test_pictures_are_split_by_source(data):
@@ -111,8 +132,29 @@ def test_a_point_of_a_sweep_leaves_what_the_pipeline_made_and_kept_alone(project
     assert not (tmp_path / point["job"] / "cache").exists()
 
 
+def test_a_removed_method_is_in_no_table_and_no_picture_though_its_files_are_there(project_root, data, tmp_path):
+    """The benchmark's folder and the cache still hold what `highpass` gave."""
+    folders = {name: tmp_path / name for name in ("benchmark", "report", "cache")}
+    for name in ("benchmark", "cache"):
+        shutil.copytree(data / name, folders[name])
+    settings = [f"paths.{name}={folder}" for name, folder in folders.items()]
+    settings.append("benchmark.methods=[zeros,train_mean,oracle_mean,cf,ours]")
+    for stage in ("benchmark", "report"):
+        run_stage(project_root, stage, data, *settings)
+    before, after = (
+        json.loads((folder / "metrics.json").read_text()) for folder in (data / "benchmark", folders["benchmark"])
+    )
+    assert set(after) == {"zeros", "train_mean", "oracle_mean", "cf", "ours"}
+    assert after["cf"]["mse"] == before["cf"]["mse"]
+    full, reduced = ((folder / "index.html").read_text() for folder in (data / "report", folders["report"]))
+    assert 'class="m-highpass"' in full
+    assert ">high-pass<" in full
+    assert 'class="m-highpass"' not in reduced
+    assert ">high-pass<" not in reduced
+
+
 def test_a_later_stage_without_its_input_says_which_stage_makes_it(project_root, tmp_path):
-    command = [sys.executable, "-m", "stages.emulate", f"paths.data={tmp_path}", f"hydra.run.dir={tmp_path / 'log'}"]
-    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    arguments = [f"paths.data={tmp_path}", f"hydra.run.dir={tmp_path / 'log'}"]
+    done = preloaded.run_stage(project_root, "emulate", arguments)
     assert done.returncode != 0
-    assert "run the stage that writes it" in done.stderr
+    assert "run the stage that writes it" in done.stdout

@@ -1,9 +1,8 @@
 """Damaged files of every format end in events or in a RecordingError, and in nothing else.
 
-POLARNET_FUZZ_CASES sets how many for each reader; tests/benchmarks/fuzz_recordings.py runs 10 000 and counts them.
+tests/conftest.py says how many for each reader; tests/benchmarks/fuzz_recordings.py runs 10 000 and counts them.
 """
 
-import os
 from collections import Counter
 
 import pytest
@@ -13,10 +12,8 @@ from hypothesis import strategies as st
 
 from polarnet.recordings.recording import FORMATS
 
-CASES = int(os.environ.get("POLARNET_FUZZ_CASES", "150"))
-FUZZ = settings(
-    max_examples=CASES, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
-)
+FUZZ = settings(deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
+CASES = FUZZ.max_examples
 
 
 @pytest.mark.parametrize("form", FORMATS)

@@ -49,9 +49,7 @@ def test_the_homography_between_two_cameras_is_found_to_a_fraction_of_a_pixel(im
 
 def test_register_prints_the_homography_of_two_recordings_and_draws_both(images, tmp_path, capsys):
     for name, image in zip(("a.txt", "b.txt"), images, strict=True):
-        y, x = (np.repeat(axis.ravel(), np.rint(60 * image).astype(int).ravel()) for axis in np.indices(image.shape))
-        lines = "".join(f"{t} {column} {row} 1\n" for t, (row, column) in enumerate(zip(y, x, strict=True)))
-        (tmp_path / name).write_text(f"{WIDTH} {HEIGHT}\n{lines}")
+        write_recording(tmp_path / name, image)
     command = ["register", str(tmp_path / "a.txt"), str(tmp_path / "b.txt"), "--picture", str(tmp_path / "both.png")]
     assert main(command) == 0
     found = capsys.readouterr().out
@@ -63,6 +61,28 @@ def test_register_prints_the_homography_of_two_recordings_and_draws_both(images,
     assert "height" in capsys.readouterr().err
     assert main([*command, "--height", str(HEIGHT), "--width", str(WIDTH)]) == 0
     assert capsys.readouterr().out == found
+
+
+def write_recording(path, image):
+    y, x = (np.repeat(axis.ravel(), np.rint(60 * image).astype(int).ravel()) for axis in np.indices(image.shape))
+    lines = "".join(f"{t} {column} {row} 1\n" for t, (row, column) in enumerate(zip(y, x, strict=True)))
+    path.write_text(f"{WIDTH} {HEIGHT}\n{lines}")
+
+
+def test_recordings_of_other_scenes_are_named(images, tmp_path, capsys):
+    reference, moving = images
+    generator = np.random.default_rng(6)
+    other = np.zeros((HEIGHT, WIDTH), np.float32)
+    for _ in range(60):
+        x, y = generator.integers(0, [WIDTH, HEIGHT])
+        cv2.circle(other, (int(x), int(y)), int(generator.integers(4, 20)), float(generator.uniform(0.3, 1)), 1)
+    assert register(reference, moving).edge_correlation > 0.9
+    for name, image in (("a", reference), ("b", moving), ("c", cv2.GaussianBlur(other, (0, 0), 1))):
+        write_recording(tmp_path / f"{name}.txt", image)
+    assert main(["register", str(tmp_path / "a.txt"), str(tmp_path / "b.txt")]) == 0
+    assert capsys.readouterr().err == ""
+    assert main(["register", str(tmp_path / "a.txt"), str(tmp_path / "c.txt")]) == 0
+    assert "the edges of the two recordings do not meet" in capsys.readouterr().err
 
 
 def test_events_are_moved_to_the_reference_camera_and_those_it_does_not_see_left_out():

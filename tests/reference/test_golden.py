@@ -1,4 +1,4 @@
-"""What v2e and ESIM really produced, event for event (golden/README.md of the reference material)."""
+"""Events of v2e and ESIM themselves, compared one by one (tests/golden/README.md)."""
 
 import dataclasses
 import json
@@ -40,8 +40,8 @@ CONFIG = dataclasses.replace(SENSORS["clean"], model="v2e", contrast_threshold_s
 
 
 @pytest.fixture(scope="module")
-def golden(shared) -> Path:
-    return shared / "golden"
+def golden(project_root) -> Path:
+    return project_root / "tests" / "golden"
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,6 @@ def v2e_config(params: dict) -> EmulatorConfig:
     )
 
 
-@pytest.mark.shared
 @pytest.mark.parametrize("name", V2E_CASES)
 def test_v2e_case(golden, described, name):
     case = described["cases"][name]
@@ -130,7 +129,6 @@ def ties(frames: torch.Tensor, config: EmulatorConfig) -> set[int]:
     return set(np.flatnonzero(found))
 
 
-@pytest.mark.shared
 @pytest.mark.parametrize("refractory_us", [0, 2000])
 @pytest.mark.parametrize("name", ["drift8", "synth8"])
 def test_esim_case(golden, name, refractory_us):
@@ -149,7 +147,6 @@ def test_esim_case(golden, name, refractory_us):
     assert differing(by_pixel(columns.x, columns.y, columns.exact_us, columns.p), theirs) == []
 
 
-@pytest.mark.shared
 @pytest.mark.parametrize("refractory_us", [0, 2000])
 @pytest.mark.parametrize("name", ["drift8", "synth8"])
 def test_esim_gpu_case(golden, name, refractory_us):
@@ -166,7 +163,6 @@ def test_esim_gpu_case(golden, name, refractory_us):
     assert set(differ) <= ties(frames, config)
 
 
-@pytest.mark.shared
 @pytest.mark.parametrize("setting", ["cli", "noisy", "clean"])
 def test_the_number_of_events_under_v2e_settings_agrees_over_seeds(golden, described, setting):
     statistics = described["noise_statistics"][f"drift8_v2e_{setting}_20seeds"]
@@ -182,7 +178,6 @@ def test_the_number_of_events_under_v2e_settings_agrees_over_seeds(golden, descr
     assert on == pytest.approx(statistics["on_fraction"], abs=0.004)
 
 
-@pytest.mark.shared
 @pytest.mark.parametrize("dn", [0, 10, 20, 64, 128, 255])
 @pytest.mark.parametrize("model", ["v2e", "exact"])
 def test_shot_noise_has_the_rate_that_v2e_showed(described, model, dn):

@@ -19,9 +19,9 @@ from polarnet.simulation.pictures.images import write_png
 from polarnet.simulation.pictures.manifest import Manifest, ManifestEntry, Skipped, write_manifest
 from polarnet.simulation.truth import synthesize
 from polarnet.stokes import Prediction
+from polarnet.training.baselines import leave_untrained
 
 SPLITS = {"park": "train", "lake": "val", "tree": "test", "leaf": "test"}
-NO_WEIGHTS = "no weights lie in the hub cache"
 HISTORY = [
     {"epoch": e, "train": {"total": 1.0 / (e + 1), "mse": 0.1 / (e + 1)}, "val": {"mse": mse, "psnr": 10.0 + e}}
     for e, mse in enumerate((0.09, 0.04, 0.05))
@@ -79,8 +79,9 @@ def run_methods(events, frames, folder):
     """Benchmark outputs for two constants, E2V (with AoLP) and ours, of the true frames made worse."""
     methods = ["zeros", "oracle_mean", "e2v", "ours"]
     config = BenchmarkConfig(
-        methods, ["simulated"], warmup_windows=1, precision="fp32", bootstrap_samples=20, panel_scenes=2
-    )
+        methods, ["simulated"], warmup_windows=1, precision="fp32", lpips=False, lpips_backbone="alex",
+        bootstrap_samples=20, panel_scenes=2,
+    )  # fmt: skip
     rows, panels = [], []
     test_set = BenchmarkSet("simulated", events, frames)
     for sequence in map(test_set.sequence, test_set.sequences):
@@ -99,8 +100,12 @@ def run_methods(events, frames, folder):
             )
         )  # fmt: skip
     about = {
-        "lpips": {"backbone": "squeeze", "sha256": None, "source": None, "reason": NO_WEIGHTS},
-        "weights": {"ours": {"file": "best.safetensors", "sha256": "5ca1ab1e" * 8}},
+        "lpips": {"backbone": None, "sha256": None, "source": None},
+        "weights": {
+            "e2v": {"file": "best.safetensors", "sha256": "e2" * 32, "network": "firenet"},
+            "ours": {"file": "best.safetensors", "sha256": "5ca1ab1e" * 8, "network": "paper"},
+        },
+        "conditions": {"sentence": "Sequences of 24x36 pixels (height x width), 0.2 s at 30 frames a second."},
     }
     costs = dict.fromkeys(methods, Cost(1.5, None, 0, 0.25)) | {"ours": Cost(1.5, 10.4, 37_777, 12.0)}
     write_benchmark(folder, Benchmark(rows, costs, panels), config, seed=1, about=about)
@@ -122,7 +127,9 @@ def paths(tmp_path_factory):
     frames = FrameStore.open(paths.frames)
     write_events(paths.events, frames)
     run_methods(EventStore.open(paths.events), frames, paths.benchmark)
-    for folder in (paths.train, paths.train_e2v, paths.train_e2p):
+    for folder, network in ((paths.train, "paper"), (paths.train_e2v, "firenet")):
         folder.mkdir()
         (folder / "history.json").write_text(json.dumps(HISTORY))
+        (folder / "best.json").write_text(json.dumps({"network": network}))
+    leave_untrained("e2p", paths.train_e2p)
     return paths

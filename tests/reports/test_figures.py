@@ -81,6 +81,14 @@ def test_figures_for_a_dark_page_have_light_text_and_no_background():
     assert dark[dark[..., 3] == 255][:, :3].mean() > light[light[..., 3] == 255][:, :3].mean()
 
 
+def test_every_term_of_the_losses_has_a_readable_name_in_the_legend():
+    terms = ["total", "mse", "mae", "ssim_loss", "lpips", "stokes", "uncertainty", "intensity_lpips", "aolp_ssim_loss"]
+    legend = training_curves([Curve(name, [0], [0.1]) for name in terms], [CURVE], "", LIGHT).axes[0].get_legend()
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert labels[-2:] == ["intensity: LPIPS", "AoLP: 1 - SSIM"]
+    assert not [label for label in labels if "_" in label]
+
+
 def test_epochs_count_from_one_on_the_axis():
     line = training_curves([CURVE], [CURVE], "validation", LIGHT).axes[0].lines[0]
     assert list(line.get_xdata()) == [1, 2, 3]

@@ -51,9 +51,33 @@ def test_the_network_is_best_here_and_the_papers_table_stands_beside(page):
     assert "27.48" in page
 
 
-def test_missing_lpips_is_said_with_its_reason_and_never_a_number(page):
-    assert "LPIPS was left out" in page
-    assert page.count("no weights lie in the hub cache") == 3  # warning, table, what was run
+def test_the_page_says_which_networks_are_behind_its_rows(page):
+    assert "ours: the paper&#39;s network, events to DoLP" in page  # training
+    assert "E2V: FireNet, events to intensity" in page
+    assert "<dt>ours: the paper&#39;s network</dt><dd>The DoLP network in use. The network of the paper" in page
+    assert '<th scope="row">E2V: FireNet</th>' in page
+    assert "olarnet&#39;s own network" not in page
+
+
+def test_a_baseline_that_no_row_uses_is_neither_drawn_nor_explained(page):
+    assert "E2P" not in page
+    assert "2 networks trained on them" in page
+
+
+def test_the_papers_figures_are_told_from_those_of_the_run(page):
+    published = re.search(r'<aside class="published">.*?</aside>', page, re.DOTALL)[0]
+    assert "Published figures of the paper, not of this run." in published
+    assert "15.56" in published
+    assert "27.48" in published
+    assert '<tr class="m-ours">' not in published
+    assert "15.56" not in page.replace(published, "")
+
+
+def test_without_lpips_the_table_has_no_such_column_and_the_page_no_warning(page):
+    assert "LPIPS was left out" not in page
+    assert 'class="warning"' not in page
+    assert "LPIPS (" not in page
+    assert "none: benchmark.lpips is false" in page
 
 
 def test_parameters_are_listed_with_their_full_keys(page):

@@ -13,6 +13,7 @@ from polarnet.reports.study_tables import (
     event_budget_block,
     expected_errors_block,
     headline_block,
+    lpips_block,
     study_block,
 )
 
@@ -251,12 +252,26 @@ def test_choices_of_scenes_are_means_over_their_trainings():
 
 def test_the_benchmark_says_what_solved_gains_bring():
     rows = {"zeros": 9.0, "cf": 8.0, "cf+gain": 9.25, "highpass": 12.0, "highpass+gain": 11.5, "ours": 17.0}
-    scores = {row: dict.fromkeys(BENCHMARK_KEYS, 0.1) | {"psnr": psnr} for row, psnr in rows.items()}
-    about = {"scenes": 30, "frames": 750, "lpips_reason": None}
+    scores = {
+        row: dict.fromkeys(BENCHMARK_KEYS, 0.1) | {"psnr": psnr, "lpips_backbone": "vgg"} for row, psnr in rows.items()
+    }
+    about = {"scenes": 30, "frames": 750}
     results = MACHINE | {"simulated": scores, "about": {"simulated": about}, "paired": {"simulated": {}}}
     block = benchmark_block(results)
     assert "**Simulated**: 30 scenes, 750 frames" in block
     assert "- PSNR that solved gains bring: CF +1.25 dB, high-pass -0.50 dB." in block
+
+
+def test_the_cost_of_lpips_has_a_row_for_each_backbone_and_one_without():
+    demo = {"network": "polarnet", "precision": "bf16", "frames": 40, "step_ms": {"none": 900.0, "alex": 1000.0}}
+    paper = {"network": "paper", "precision": "fp32", "frames": 10, "step_ms": {"none": 500.0, "vgg": 2000.0}}
+    shares = {"demo": demo | {"share": {"alex": 0.1}}, "paper": paper | {"share": {"vgg": 0.75}}}
+    cost = {"threads": 2, "device": "cpu"} | shares
+    found = {"alex_error_max": 4e-7, "scoring_ms_per_frame": {"alex": 2.54}}
+    block = lpips_block(found | {"cost": cost, "records": {"cost": MACHINE}})
+    assert "| without LPIPS | - | - | 900 | - |" in block
+    assert "| `alex` | 4.0e-07 | 2.5 | 1000 | 10 % |" in block
+    assert "takes 2000 ms with VGG and 500 ms without LPIPS: 75 % are LPIPS's." in block
 
 
 def test_the_event_budget_is_held_against_the_papers_claim():

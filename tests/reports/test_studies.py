@@ -5,7 +5,7 @@ import pytest
 
 from polarnet.reports.figures import DARK, LIGHT
 from polarnet.reports.png import png
-from polarnet.reports.studies import event_budget_figure, expected_errors_figure, sensitivity_figure
+from polarnet.reports.studies import event_budget_figure, expected_errors_figure, loss_sweep_figure, sensitivity_figure
 
 
 def scores(value):
@@ -62,3 +62,21 @@ def test_expected_errors_are_drawn_for_each_set_and_seed_beside_the_diagonal():
         assert list(diagonal.get_xdata()) == list(diagonal.get_ydata()) == [0.01, 0.1]
         assert [line.get_label() for line in seeds] == ["seed 1", "seed 2"]
         assert list(seeds[0].get_ydata()) == [0.02, 0.1]
+
+
+def swept(mse, ssim, lpips, value):
+    score = {"mean": value, "std": None}
+    weights = {"mse": mse, "ssim": ssim, "lpips": lpips}
+    return {"weights": weights, "validation": {"mse": score}, "test": {"mse": score, "psnr": {**score, "mean": 15.0}}}
+
+
+def test_a_loss_sweep_has_a_cell_a_point_the_best_in_bold_and_one_frame():
+    points = [swept(m, s, p, m + s + p / 100) for m in (1.0, 10.0) for s in (0.0, 1.0) for p in (0.0, 10.0)][1:]
+    figure = loss_sweep_figure(points, LIGHT)
+    assert len(figure.axes) == 4  # two scores, two weights of the MSE
+    assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == ["MSE ↓, loss.mse=1", "MSE ↓, loss.mse=10"]
+    assert [len(axes.texts) for axes in figure.axes] == [3, 4, 3, 4]  # the first point was not trained
+    bold = [text.get_text() for axes in figure.axes[:2] for text in axes.texts if text.get_weight() == "bold"]
+    assert bold == ["1.1000"]
+    assert [len(axes.patches) for axes in figure.axes] == [1, 0, 1, 0]
+    assert png(figure) == png(loss_sweep_figure(points, LIGHT))

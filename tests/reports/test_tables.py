@@ -56,15 +56,16 @@ def test_arrows_say_which_way_a_metric_improves():
     assert score_table(SCORES).headings[:3] == ("MSE ↓", "PSNR ↑", "SSIM ↑")
 
 
-def test_a_missing_lpips_is_a_dash_with_the_reason_below():
-    table = score_table(SCORES, lpips_reason="no squeeze weights were found")
-    column = table.headings.index("LPIPS ↓")
-    assert {r.cells[column].text for r in table.rows} == {"-"}
-    assert 'LPIPS "-": no squeeze weights were found' in table.notes
+def test_lpips_names_its_backbone_in_heading_and_caption():
+    scores = {method: row | {"lpips": 0.25, "lpips_backbone": "alex"} for method, row in SCORES.items()}
+    table = score_table(scores)
+    assert "LPIPS (alex) ↓" in table.headings
+    assert table.notes == ("LPIPS (alex): version 0.1 on the features of AlexNet.",)
+    assert score_table(scores, ERROR_PARTS).notes == ()
 
 
 def test_a_metric_that_nobody_measured_has_no_column():
-    assert "LPIPS ↓" not in score_table(SCORES).headings
+    assert not any("LPIPS" in heading for heading in score_table(SCORES).headings)
 
 
 def test_a_value_that_is_missing_is_never_the_best():
@@ -96,10 +97,10 @@ def test_plain_columns_line_up():
     assert "17.00*" in lines[4]
 
 
-def test_the_papers_table_is_ours_best_everywhere_in_both_experiments():
+def test_the_papers_network_is_best_everywhere_in_both_of_the_papers_experiments():
     for experiment in ("simulated", "real"):
-        assert all(cell.best for cell in row(paper_table(experiment), "ours").cells)
-        assert set(PAPER_TABLE_2[experiment]) == {"cf", "e2v", "ours"}
+        assert all(cell.best for cell in row(paper_table(experiment), "paper").cells)
+        assert set(PAPER_TABLE_2[experiment]) == {"cf", "e2v", "paper"}
 
 
 def test_paper_psnr_is_near_the_psnr_of_the_papers_mse():

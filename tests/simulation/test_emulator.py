@@ -245,9 +245,11 @@ CLIP, TIMES = torch.full((3, 2, 4, 5), 100.0), torch.tensor([0, 10, 20])
         (CLIP.to(torch.int64), TIMES, "uint8 or float digital numbers .* got torch.int64"),
         (CLIP / 0, TIMES, "finite frames"),
         (-CLIP, TIMES, "negative"),
+        (257 * CLIP, TIMES, r"expected digital numbers in \[0, 255\], got values up to 25700; scale white to 255"),
+        (CLIP[0, 0, 0], TIMES, r"frames: expected \(\.\.\., planes, height, width\), got \(5,\)"),
     ],
 )
-def test_light_that_makes_no_sense_is_refused(frames, t_us, message):
+def test_light_that_makes_no_sense_is_refused(unchecked_annotations, frames, t_us, message):
     with pytest.raises(ValueError, match=message):
         emulate(frames, t_us, IDEAL, key=1)
 
@@ -262,3 +264,10 @@ def test_a_state_goes_on_with_its_own_sensor_and_later_times_alone():
         emulate(CLIP, TIMES + 100, of("v2e"), key=1, state=state)
     with pytest.raises(ValueError, match="2 different plane numbers"):
         emulate(CLIP, TIMES, IDEAL, key=1, planes=[1, 1])
+
+
+def test_numpy_frames_give_the_events_of_torch():
+    frames, t_us = moving_clip(torch.uint8), 1000 * torch.arange(12)
+    expected, _ = emulate(frames, t_us, IDEAL, key=1)
+    from_numpy, _ = emulate(frames.numpy(), t_us.numpy(), IDEAL, key=1)
+    assert all(torch.equal(a.t, b.t) for a, b in zip(from_numpy, expected, strict=True))

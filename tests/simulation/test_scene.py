@@ -5,7 +5,12 @@ import math
 import pytest
 import torch
 
-from polarnet.simulation.scene import polarization_from_rgb, scene_from_intensities, scene_from_rgb
+from polarnet.simulation.scene import (
+    polarization_from_rgb,
+    scene_from_intensities,
+    scene_from_polarization,
+    scene_from_rgb,
+)
 from polarnet.stokes import aolp, dolp, intensities_from_stokes, intensity_behind_polarizer
 
 
@@ -69,3 +74,29 @@ def test_an_unphysical_measurement_is_fully_polarized_at_its_angle():
     assert dolp(stokes).item() == pytest.approx(1)  # measured: sqrt(2)
     assert aolp(stokes).item() == pytest.approx(math.pi / 8)
     assert stokes[0].item() == pytest.approx(0.4)
+
+
+def test_numpy_planes_make_the_same_scene():
+    planes = torch.rand(3, 5, 6, generator=torch.Generator().manual_seed(0))
+    expected = scene_from_polarization(*planes).stokes
+    assert torch.equal(scene_from_polarization(*planes.numpy()).stokes, expected)
+    light = intensities_from_stokes(expected)
+    assert torch.equal(scene_from_intensities(light.numpy()).stokes, scene_from_intensities(light).stokes)
+
+
+@pytest.mark.parametrize(
+    ("s0", "dolp", "aolp", "message"),
+    [
+        (1.0, 1.0, 90.0, r"aolp: expected radians in \[-3\.14159, 3\.14159\], got values up to 90; .*deg2rad"),
+        (1.0, 100.0, 0.0, r"dolp: expected values in \[0, 1\], got values up to 100"),
+        (255.0, 1.0, 0.0, r"s0: expected values in \[0, 1\], got values up to 255; divide by 255"),
+    ],
+)
+def test_degrees_percentages_and_bytes_are_no_polarization(s0, dolp, aolp, message):
+    with pytest.raises(ValueError, match=message):
+        scene_from_polarization(*(torch.full((2, 2), value) for value in (s0, dolp, aolp)))
+
+
+def test_light_above_white_is_refused():
+    with pytest.raises(ValueError, match=r"expected S0 = I0 \+ I90 in \[0, 1\], got values up to 1\.6"):
+        scene_from_intensities(torch.full((4, 2, 2), 0.8))

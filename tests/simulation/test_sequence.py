@@ -7,13 +7,17 @@ import subprocess
 import sys
 from dataclasses import asdict, replace
 
+import hypothesis.extra.numpy as arrays
+import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
 
 import polarnet.simulation
 from polarnet.config import load
 from polarnet.events.stream import validate
-from polarnet.simulation import MOTIONS, SENSORS, scene_from_rgb, simulate
+from polarnet.simulation import MOTIONS, SENSORS, PolarizationScene, Simulation, scene_from_rgb, simulate
 from polarnet.stokes import dolp, stokes_from_intensities
 
 MOTION = replace(MOTIONS["default"], window_height=20, window_width=30, duration_s=0.2, acceleration_max_px_s2=4000.0)
@@ -45,6 +49,100 @@ def test_a_scene_gives_what_its_picture_gives():
     from_picture = simulate(picture(), MOTION, SENSORS["clean"], seed=1)
     from_scene = simulate(scene_from_rgb(picture()), MOTION, SENSORS["clean"], seed=1)
     assert all(torch.equal(a.t, b.t) for a, b in zip(from_picture.events, from_scene.events, strict=True))
+
+
+def columns_of(result: Simulation) -> list[list[int]]:
+    return [column.tolist() for events in result.events for column in (events.t, events.x, events.y, events.p)]
+
+
+@pytest.mark.parametrize(
+    "same",
+    [torch.Tensor.numpy, torch.Tensor.double, lambda rgb: rgb.double().numpy(), lambda rgb: rgb.requires_grad_()],
+    ids=["numpy", "float64", "numpy float64", "with gradient"],
+)
+def test_the_container_of_a_picture_changes_no_event(same):
+    expected = simulate(picture(), MOTION, SENSORS["clean"], seed=1)
+    assert columns_of(simulate(same(picture()), MOTION, SENSORS["clean"], seed=1)) == columns_of(expected)
+
+
+def with_gaps() -> torch.Tensor:
+    gaps = picture()
+    gaps[1, 5, 7], gaps[2, 0, 0] = torch.nan, torch.inf
+    return gaps
+
+
+@pytest.mark.parametrize(
+    ("rgb", "message"),
+    [
+        (255 * picture(), r"picture: expected RGB in \[0, 1\], got values up to 2\d\d.*; divide by 255"),
+        ((255 * picture()).byte(), r"picture: expected RGB in \[0, 1\], got values up to 2\d\d; divide by 255"),
+        ((65535 * picture()).numpy().astype(np.uint16), r"got values up to 6\d+; divide by 65535"),
+        (picture() - 0.5, r"expected RGB in \[0, 1\], got values down to -0\.\d+"),
+        (with_gaps(), r"got 2 of 20736 that are NaN or infinite, the first at \(1, 5, 7\)"),
+        (picture().permute(1, 2, 0), r"expected \(3, height, width\), got \(72, 96, 3\); use permute\(2, 0, 1\)"),
+        (picture()[0], r"expected \(3, height, width\), got \(72, 96\)"),
+        (picture()[:, :19], r"scene of 19x96 .* too small: a window of 20x30 .* needs more than 20x30"),
+    ],
+)
+def test_a_picture_of_another_form_is_refused_with_what_to_do(unchecked_annotations, rgb, message):
+    with pytest.raises(ValueError, match=message):
+        simulate(rgb, MOTION, SENSORS["clean"], seed=1)
+
+
+def test_a_picture_too_small_to_move_over_is_told_which_size_would_do():
+    motion = replace(MOTION, acceleration_max_px_s2=800.0)
+    with pytest.raises(ValueError, match=r"too little room .* use pictures of about") as caught:
+        simulate(picture()[:, :22, :32], motion, SENSORS["clean"], seed=1)
+    height, width = map(int, re.findall(r"about (\d+)x(\d+),", str(caught.value))[0])
+    assert simulate(picture()[:, :height, :width], motion, SENSORS["clean"], seed=1).trajectory.speed_px_s >= 40
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"picture": "coffee.png"}, "picture: expected a numpy array or torch tensor of real numbers, got str"),
+        ({"motion": "default"}, r'motion: expected MotionConfig such as MOTIONS\["default"\], got'),
+        ({"sensor": "noisy"}, r'sensor: expected EmulatorConfig such as SENSORS\["default"\], got'),
+        ({"seed": None}, "seed: expected a whole number, got None"),
+    ],
+)
+def test_an_argument_of_another_kind_is_named(unchecked_annotations, changes, message):
+    arguments = {"picture": picture(), "motion": MOTION, "sensor": SENSORS["clean"], "seed": 1}
+    with pytest.raises(TypeError, match=message):
+        simulate(**(arguments | changes))
+
+
+@pytest.mark.parametrize(
+    ("stokes", "message"),
+    [
+        (2 * scene_from_rgb(picture()).stokes, r"scene: expected S0 in \[0, 1\], got values up to"),
+        (torch.full((3, 60, 80), 0.5), r"scene: expected hypot\(S1, S2\) <= S0, got one that is 0\.2071"),
+        (with_gaps(), "scene: expected finite numbers, got 2"),
+    ],
+)
+def test_a_scene_that_no_light_can_make_is_refused(stokes, message):
+    with pytest.raises(ValueError, match=message):
+        simulate(PolarizationScene(stokes), MOTION, SENSORS["clean"], seed=1)
+
+
+SMALL = replace(MOTION, window_height=2, window_width=2, duration_s=0.01, frame_rate_hz=100.0, speed_min_px_s=1.0)
+SIDES = st.one_of(st.lists(st.integers(0, 9), max_size=4), st.tuples(st.just(3), st.integers(4, 9), st.integers(4, 9)))
+DTYPES = st.one_of(
+    arrays.scalar_dtypes(), arrays.unicode_string_dtypes(), arrays.byte_string_dtypes(), st.just(np.dtype(object))
+)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(values=DTYPES.flatmap(lambda dtype: SIDES.flatmap(lambda shape: arrays.arrays(dtype, tuple(shape)))))
+@example(values=np.full((3, 9, 9), 0.5, np.float16))
+@example(values=np.linspace(0, 1, 243, dtype=np.longdouble).reshape(3, 9, 9))
+def test_any_array_is_simulated_or_refused_in_our_words(unchecked_annotations, values):
+    refusal = None
+    try:
+        simulate(values, SMALL, SENSORS["clean"], seed=1)
+    except (TypeError, ValueError) as error:
+        refusal = str(error)
+    assert refusal is None or re.search(r"^picture: expected .*, got |^a scene of .*(too small|too little)", refusal)
 
 
 def test_the_default_presets_are_what_params_yaml_says(project_root):

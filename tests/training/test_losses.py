@@ -50,10 +50,10 @@ def test_lpips_is_weighed_with_the_rest_where_there_is_a_network():
     torch.testing.assert_close(loss.total(terms), terms["mse"] + 10 * terms["lpips"])
 
 
-def test_without_a_network_lpips_is_left_out_and_not_made_up():
-    loss = of_dolp(1.0, 1.0, 10.0)
-    assert loss.weights == {"mse": 1.0, "ssim_loss": 1.0}
-    assert list(loss(frames(0.1)[:, :, None], frames(0.2)[:, :, None])) == ["mse", "ssim_loss"]
+def test_a_weight_of_lpips_without_a_network_is_refused_and_never_left_out():
+    with pytest.raises(ValueError, match=r"lpips: its weight is 10.0, but there is no LPIPS network"):
+        of_dolp(1.0, 1.0, 10.0)
+    assert of_dolp(1.0, 1.0, 0.0).weights == {"mse": 1.0, "ssim_loss": 1.0}
 
 
 def of_everything(dolp: float, s1: float, s2: float, log_variance: float) -> torch.Tensor:

@@ -1,6 +1,7 @@
 """RGB pictures from any file that OpenImageIO reads: upright, without alpha, in sRGB, cut and scaled to one size."""
 
 import hashlib
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,13 +82,13 @@ def picture_extensions() -> frozenset[str]:
     return frozenset(known - NO_PICTURES) | CAMERA_RAW | NOT_IN_THE_WHEEL
 
 
-def read_picture(path: Path) -> Picture:
+def read_picture(path: str | os.PathLike[str]) -> Picture:
     """The first picture of a file, without alpha and turned as its EXIF orientation says.
 
     Raises UnreadablePicture: not a picture, damaged or cut off (a JPEG that ends early is), camera raw,
     fewer than three channels, or a number that is not finite.
     """
-    pixels, spec, file_format = _read(path)
+    pixels, spec, file_format = _read(Path(path))
     profile = spec.get("ICCProfile")
     linear = file_format in LINEAR_FORMATS
     return Picture(
@@ -100,9 +101,9 @@ def read_picture(path: Path) -> Picture:
     )
 
 
-def read_channels(path: Path) -> Shaped[np.ndarray, "h w c"]:
+def read_channels(path: str | os.PathLike[str]) -> Shaped[np.ndarray, "h w c"]:
     """The upright code values of all channels but alpha, whatever they mean; raises as `read_picture` does."""
-    pixels, spec, _ = _read(path)
+    pixels, spec, _ = _read(Path(path))
     return pixels[..., [i for i in range(spec.nchannels) if i != spec.alpha_channel]]
 
 
@@ -164,17 +165,17 @@ def fit(
     return np.clip(scaled, 0, 1) if enlargement > 1 else scaled  # cubic interpolation overshoots at edges
 
 
-def write_png(path: Path, rgb: Float32[np.ndarray, "h w 3"], bits: int) -> None:
+def write_png(path: str | os.PathLike[str], rgb: Float32[np.ndarray, "h w 3"], bits: int) -> None:
     """sRGB code values in [0, 1] as PNG with 8 or 16 bits; the same values give the same bytes."""
     levels = 2**bits - 1
     quantised = np.round(rgb.astype(np.float64) * levels).astype(np.uint8 if bits == 8 else np.uint16)
     done, encoded = cv2.imencode(".png", quantised[..., ::-1])
     if not done:
         raise OSError(f"{path}: OpenCV could not encode {rgb.shape} as PNG")
-    path.write_bytes(encoded.tobytes())
+    Path(path).write_bytes(encoded.tobytes())
 
 
-def read_rgb(path: Path) -> Float[Tensor, "3 h w"]:
+def read_rgb(path: str | os.PathLike[str]) -> Float[Tensor, "3 h w"]:
     """sRGB code values in [0, 1] of a whole picture; raises like `read_picture` and `srgb_of`."""
     picture = read_picture(path)
     rows, columns = picture.pixels.shape[:2]

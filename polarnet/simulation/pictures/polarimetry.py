@@ -3,6 +3,7 @@
 Code values are taken as proportional to light, as cameras for measuring write them.
 """
 
+import os
 import re
 import zipfile
 from collections.abc import Sequence
@@ -34,29 +35,32 @@ class Measurement:
     saturated: float  # share of pixels with at least one saturated angle
 
 
-def group_by_measurement(files: Sequence[Path]) -> list[tuple[Path, ...]]:
+def group_by_measurement(files: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, ...]]:
     """Files NAME_0, NAME_45, NAME_90, NAME_135 of one folder together, as far as they are there; others alone."""
     groups: dict[Path, list[Path]] = {}
-    for file in files:
+    for file in map(Path, files):
         match = ANGLE_SUFFIX.fullmatch(file.stem) if file.suffix.lower() != ".npz" else None
         groups.setdefault(file.with_name(match["name"]) if match else file, []).append(file)
     return [tuple(sorted(group)) for group in groups.values()]
 
 
-def read_measurement(files: Sequence[Path], mosaic: Mosaic) -> Measurement:
+def read_measurement(files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], mosaic: Mosaic) -> Measurement:
     """The measurement in a group of files: four pictures, one .npz with I0, I45, I90, I135, or one raw mosaic.
 
     Where one angle is saturated it follows from the other three, I0 + I90 = I45 + I135; where more are, the pixel is
     not valid. UnreadablePicture where files are missing, damaged, or do not belong together.
     """
-    if files[0].suffix.lower() == ".npz":
-        values, white = _scaled(_read_npz(files[0]))
+    paths = [Path(files)] if isinstance(files, (str, os.PathLike)) else [Path(file) for file in files]
+    if not paths:
+        raise UnreadablePicture("expected the files of a measurement, got none")
+    if paths[0].suffix.lower() == ".npz":
+        values, white = _scaled(_read_npz(paths[0]))
         saturated = values >= white
-    elif ANGLE_SUFFIX.fullmatch(files[0].stem):
-        values, white = _scaled(_read_angles(files))
+    elif ANGLE_SUFFIX.fullmatch(paths[0].stem):
+        values, white = _scaled(_read_angles(paths))
         saturated = values >= white
     else:
-        raw, white = _scaled(_read_raw(files[0]))
+        raw, white = _scaled(_read_raw(paths[0]))
         values = demosaic(raw[0], mosaic)
         saturated = demosaic((raw[0] >= white).astype(np.float64), mosaic) > 0
     return _measurement(values / (2 * white), saturated)
@@ -105,13 +109,13 @@ def shrink(measurement: Measurement, height: int, width: int) -> Measurement:
     )
 
 
-def write_intensities(path: Path, measurement: Measurement) -> None:
+def write_intensities(path: str | os.PathLike[str], measurement: Measurement) -> None:
     """As .npz with I0, I45, I90, I135 (uint16, 65535 is S0 = 1) and valid; equal measurements give equal bytes."""
     steps = np.round(np.clip(measurement.intensities, 0, 1) * STEPS).astype(np.uint16)
     np.savez_compressed(path, **dict(zip(NPZ_KEYS, steps, strict=True)), valid=measurement.valid)
 
 
-def read_intensities(path: Path) -> tuple[Float32[Tensor, "4 h w"], Bool[Tensor, "h w"]]:
+def read_intensities(path: str | os.PathLike[str]) -> tuple[Float32[Tensor, "4 h w"], Bool[Tensor, "h w"]]:
     """What `write_intensities` wrote: intensities behind the four polarizers, and where they are valid."""
     with np.load(path) as file:
         steps = np.stack([file[key] for key in NPZ_KEYS])

@@ -309,3 +309,12 @@ def test_a_profile_made_of_tables_is_followed():
 def test_a_profile_that_cannot_be_used_is_named(tmp_path, rgb8, profile, message):
     with pytest.raises(ValueError, match=message):
         srgb_from_profile(rgb8.astype(np.float32) / 255, profile)
+
+
+def test_a_path_may_be_text(tmp_path, rgb8):
+    Image.fromarray(rgb8).save(tmp_path / "a.png")
+    assert read_rgb(str(tmp_path / "a.png")).equal(read_rgb(tmp_path / "a.png"))
+    write_png(str(tmp_path / "b.png"), rgb8 / np.float32(255), 8)
+    assert np.array_equal(read_picture(str(tmp_path / "b.png")).pixels, rgb8)
+    with pytest.raises(UnreadablePicture, match=r'Could not open file "missing.jpg"'):
+        read_rgb("missing.jpg")

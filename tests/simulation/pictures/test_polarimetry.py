@@ -151,8 +151,8 @@ def test_every_angle_of_a_mosaic_is_seen_at_the_centre_of_its_cell(order):
 
 
 def test_an_unpolarized_edge_looks_less_polarized_than_with_one_pixel_per_angle():
-    raw = np.full((40, 40), 20.0)
-    raw[:, 21:] = 200.0  # an edge through cells
+    raw = np.full((40, 40), 0.05)
+    raw[:, 21:] = 0.5  # an edge through cells
     at_centre = scene_from_intensities(torch.from_numpy(demosaic(raw, SONY)))
     naive = scene_from_intensities(
         torch.from_numpy(np.stack([raw[1::2, 1::2], raw[::2, 1::2], raw[::2, ::2], raw[1::2, ::2]]))
@@ -280,3 +280,15 @@ def test_measured_samples_are_taken_with_the_residuals_their_notes_state(shared,
     assert 0.5 < dolp(scene_from_intensities(intensities).stokes)[valid].median() < 0.6  # light reflected by water
     other = ingest(dataclasses.replace(config, mosaic="0 45 / 90 135"), 1, tmp_path / "other", map)
     assert [skipped.file for skipped in other.skipped] == ["carps_IMX250MZR.png"]
+
+
+def test_a_path_may_be_text_and_one_file_needs_no_list(tmp_path):
+    save_npz(tmp_path / "a.npz", light())
+    expected = read_measurement([tmp_path / "a.npz"], SONY)
+    for files in (str(tmp_path / "a.npz"), tmp_path / "a.npz", [str(tmp_path / "a.npz")]):
+        assert np.array_equal(read_measurement(files, SONY).intensities, expected.intensities)
+    write_intensities(str(tmp_path / "b.npz"), expected)
+    assert read_intensities(str(tmp_path / "b.npz"))[1].all()
+    assert group_by_measurement([str(tmp_path / "s_0.png")]) == [(tmp_path / "s_0.png",)]
+    with pytest.raises(UnreadablePicture, match="expected the files of a measurement, got none"):
+        read_measurement([], SONY)

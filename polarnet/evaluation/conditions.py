@@ -1,0 +1,105 @@
+"""Size, duration, motion and sensor of sequences, and how they differ from those that a network was trained on."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.motion import MotionConfig
+
+NOT_COMPARED = ("synthesize.sequences_per_picture",)
+MODEL_ALONE = {"esim_log_eps": ("esim", "esim_gpu"), "voltmeter_camera": ("dvs_voltmeter",)}
+"""Parameters that only these pixel models have."""
+
+
+class Conditions(NamedTuple):
+    """The sections `synthesize` and `emulate` that sequences were made with; a key that is unknown is not there."""
+
+    synthesize: Mapping[str, Any]
+    emulate: Mapping[str, Any]
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """By the full keys of params.yaml; without those that change nothing that a network sees."""
+        emulate = {
+            key: value
+            for key, value in self.emulate.items()
+            if (self.emulate["randomise"] or not key.startswith("random_"))
+            and (key not in MODEL_ALONE or self.emulate["model"] in MODEL_ALONE[key])
+        }
+        keyed = {f"synthesize.{key}": value for key, value in self.synthesize.items()}
+        keyed |= {f"emulate.{key}": value for key, value in emulate.items()}
+        return {key: value for key, value in keyed.items() if key not in NOT_COMPARED}
+
+
+def configured(synthesize: MotionConfig, emulate: EmulatorConfig) -> Conditions:
+    """Of sequences made with these sections."""
+    return Conditions(dataclasses.asdict(synthesize), dataclasses.asdict(emulate))
+
+
+def stored(attributes: Mapping[str, Any], height: int, width: int) -> Conditions:
+    """From what an event store says of itself; its size alone where its events were not simulated."""
+    size = {"window_height": height, "window_width": width}
+    return Conditions(attributes.get("scenes", {}).get("synthesize", {}) | size, attributes.get("emulate", {}))
+
+
+def trained_on(metadata: Mapping[str, Any]) -> Conditions | None:
+    """From the JSON of a checkpoint; None where it does not say what the network was trained on."""
+    if "data" not in metadata:
+        return None
+    data = metadata["data"]
+    return stored(data.get("events_from", {}), data["height"], data["width"])
+
+
+def sentence(conditions: Conditions) -> str:
+    """Size, duration, frame rate and sensor in words."""
+    scene, sensor = conditions
+    text = f"Sequences of {scene['window_height']}x{scene['window_width']} pixels (height x width)"
+    if "duration_s" in scene:
+        text += f", {scene['duration_s']:g} s at {scene['frame_rate_hz']:g} frames a second"
+    if not sensor:
+        return f"{text}."
+    text += f"; sensor: model {sensor['model']}"
+    if sensor["model"] == "dvs_voltmeter":
+        return f"{text} with the constants of {sensor['voltmeter_camera']}."
+    if sensor["randomise"]:
+        return f"{text}, its parameters drawn for each sequence (emulate.randomise)."
+    on, off = sensor["contrast_threshold_on"], sensor["contrast_threshold_off"]
+    text += f", contrast thresholds {on:g} (ON) and {off:g} (OFF)"
+    if sensor["model"] not in MODEL_ALONE["esim_log_eps"]:
+        cutoff = f"{sensor['cutoff_hz']:g} Hz" if sensor["cutoff_hz"] else "none"
+        text += (
+            f", mismatch {sensor['contrast_threshold_sigma']:g}, cutoff {cutoff}, leak {sensor['leak_rate_hz']:g} Hz, "
+            f"shot noise {sensor['shot_noise_rate_hz']:g} Hz"
+        )
+    return f"{text}, refractory period {sensor['refractory_period_us']:g} us."
+
+
+def warnings(used: Conditions, checkpoints: Mapping[str, Mapping[str, Any]], advice: str) -> list[str]:
+    """A sentence for each training whose sequences differ from those used: both values of every key, and what to set.
+
+    `checkpoints` is the metadata of each row's weights. `advice` says where the keys are set; they follow it.
+    """
+    rows: dict[str, list[str]] = {}
+    for row, metadata in checkpoints.items():
+        rows.setdefault(_warning(used, trained_on(metadata), advice), []).append(row)
+    return [f"{', '.join(of)}: {text}" for text, of in rows.items() if text]
+
+
+def _warning(used: Conditions, trained: Conditions | None, advice: str) -> str:
+    if trained is None:
+        return "the checkpoint does not say what it was trained on, so size and sensor were not compared."
+    here, there = used.values, trained.values
+    keys = [key for key in there if key in here and here[key] != there[key]]
+    if not keys:
+        return ""
+    both = ", ".join(f"{key} {_printed(here[key])} (training: {_printed(there[key])})" for key in keys)
+    settings = " ".join(f"{key}={_printed(there[key])}" for key in keys)
+    return f"these sequences differ from those of its training: {both}. {advice} {settings}"
+
+
+def _printed(value: Any) -> str:
+    """As Hydra's command line takes it."""
+    if isinstance(value, list):
+        return f"[{','.join(map(_printed, value))}]"
+    return {True: "true", False: "false"}[value] if isinstance(value, bool) else "null" if value is None else str(value)

@@ -1,0 +1,134 @@
+"""Whether four channels look like one scene behind polarizers at 0, 45, 90 and 135 degrees.
+
+Behind ideal polarizers I0 + I90 = I45 + I135. To first order, events obey it too: summed over a small area and a short
+time, ON minus OFF events of 0 and 90 degrees equal those of 45 and 135. The two other ways to pair the four channels
+differ by the polarization. So the pairs that fit best are at right angles, and channels that differ neither in counts
+nor between pairs saw no polarization.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from polarnet.events.stream import Events, slice_time
+from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
+from polarnet.recordings.live import Piece
+from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
+from polarnet.stokes import POLARIZER_ANGLES_DEG
+
+WINDOW_US = 33_333
+WINDOWS = 30  # the first second
+BLOCK = 4  # pixels, square; events of single pixels are too few to compare
+MIN_BLOCKS = 1000  # with events in a window: the ratio of two misfits is then known to about 1 / sqrt(1000), 3 %
+HOT_PIXEL_FACTOR = 4.0
+
+# Limits of misfits and counts: measured by tests/benchmarks/polarizers.py (docs/recover.md, section Checks).
+BETTER_FIT = 0.9  # misfit of other pairs over that of the pairs at right angles: less only where the order is wrong
+EQUAL_COUNTS = 1.1  # events of the busiest channel over those of the quietest: less without polarization
+EQUAL_MISFITS = 1.1  # misfit of other pairs over that of the pairs at right angles: less without polarization ...
+EQUAL_MISFITS_MOSAIC = 3.5  # ... and in a mosaic, whose four pixels look at places half a cell apart
+
+PAIRS = (((0, 90), (45, 135)), ((0, 45), (90, 135)), ((0, 135), (45, 90)))
+"""The ways to pair the four angles; the first is that of polarizers at right angles."""
+EXCHANGED = ((45, 90), (90, 135))
+"""Angles to exchange where the second or the third of `PAIRS` fits best, so that the first does."""
+
+
+class Misfits(NamedTuple):
+    """How the sums of two pairs of channels differ."""
+
+    rms: Float64[np.ndarray, " 3"]
+    """Of ON minus OFF events of a block in a window, for each of `PAIRS`."""
+    blocks: int
+    """Blocks with events, of all windows."""
+
+
+class ChannelCheck:
+    """Looks at the pieces of a recording as they pass through `watch`; then `findings` says what is wrong with them."""
+
+    def __init__(self, height: int, width: int, *, mosaic: bool):
+        self.counts = [0, 0, 0, 0]
+        """Events of each channel."""
+        self._mosaic = mosaic
+        self._cutter = WindowCutter(WindowRule(WINDOW_US, None, None), height, width)
+        self._windows: list[EventWindow] = []
+
+    def watch(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
+        """The pieces, unchanged; events of the first second are kept."""
+        for piece in pieces:
+            self.counts = [n + len(events) for n, events in zip(self.counts, piece.channels, strict=True)]
+            if len(self._windows) < WINDOWS:
+                end_us = WINDOWS * WINDOW_US
+                early = [slice_time(events, 0, end_us) for events in piece.channels]
+                self._windows += self._cutter.add(early, min(piece.until_us, end_us))
+            yield piece
+
+    def findings(self) -> list[str]:
+        """A sentence on what is wrong; none where nothing is, or where there are too few events to say."""
+        return channel_findings(pair_misfits(self._windows), self.counts, mosaic=self._mosaic)
+
+
+def channel_findings(misfits: Misfits, counts: Sequence[int], *, mosaic: bool) -> list[str]:
+    """A sentence on what misfits and the counts of the four channels show; none where there is too little evidence."""
+    silent = [f"{angle}" for angle, count in zip(POLARIZER_ANGLES_DEG, counts, strict=True) if count == 0]
+    if silent:
+        return [f"There are no events behind the polarizer at {' and '.join(silent)} degrees. DoLP and AoLP are wrong."]
+    if misfits.blocks < MIN_BLOCKS:
+        return []
+    if not misfits.rms.any():
+        return ["The four channels are the same, event by event: one recording was given four times."]
+    if not misfits.rms[0]:
+        return []
+    ratio = misfits.rms / misfits.rms[0]
+    spread = max(counts) / min(counts)
+    if spread < EQUAL_COUNTS and ratio.max() < (EQUAL_MISFITS_MOSAIC if mosaic else EQUAL_MISFITS):
+        return [
+            f"The four channels show the same: their numbers of events differ by {spread - 1:.1%}, and their sums "
+            f"fit each other in any pairs. Either the recording was made without polarizers, or its scene is "
+            f"hardly polarized (a DoLP below about 0.1); events cannot tell which. Without polarizers, DoLP and "
+            f"AoLP mean nothing."
+        ]
+    best = int(ratio.argmin())
+    if ratio[best] < BETTER_FIT:
+        (a, b), (c, d) = PAIRS[best]
+        one, other = EXCHANGED[best - 1]
+        return [
+            f"The polarizers seem to be in another order: I0 + I90 = I45 + I135 does not hold. {a} and {b}, {c} "
+            f"and {d} degrees fit better as pairs at right angles, with {ratio[best]:.0%} of the misfit. "
+            f"DoLP and AoLP are wrong; exchange {one} and {other} in --mosaic or --angles."
+        ]
+    return []
+
+
+def pair_misfits(windows: Sequence[EventWindow]) -> Misfits:
+    """How far the sums of each two pairs of channels are apart, without hot pixels.
+
+    OFF events weigh as much as makes all ON and OFF events of the recording cancel: thresholds may differ.
+    """
+    if not windows:
+        return Misfits(np.zeros(3), 0)
+    first = windows[0].channels[0]
+    seconds = len(windows) * WINDOW_US * 1e-6
+    counts = np.sum([[event_counts(events) for events in window.channels] for window in windows], axis=0)
+    hot = [hot_pixels(count, seconds, HOT_PIXEL_FACTOR) for count in counts]
+    cleaned = [[without_pixels(e, bad) for e, bad in zip(w.channels, hot, strict=True)] for w in windows]
+    on = sum(int((events.p > 0).sum()) for channels in cleaned for events in channels)
+    off = sum(len(events) for channels in cleaned for events in channels) - on
+    columns = -(-first.width // BLOCK)
+    blocks = -(-first.height // BLOCK) * columns
+    squares, lit = np.zeros(3), 0
+    for channels in cleaned:
+        place = [_block(events, columns) for events in channels]
+        sums = dict(zip(POLARIZER_ANGLES_DEG, (
+            np.bincount(at, np.where(events.p.numpy() > 0, 1.0, -on / max(off, 1)), blocks)
+            for at, events in zip(place, channels, strict=True)
+        ), strict=True))  # fmt: skip
+        lit += int(np.count_nonzero(np.bincount(np.concatenate(place), minlength=blocks)))
+        squares += [((sums[a] + sums[b] - sums[c] - sums[d]) ** 2).sum() for (a, b), (c, d) in PAIRS]
+    return Misfits(np.sqrt(squares / max(lit, 1)), lit)
+
+
+def _block(events: Events, columns: int) -> Int64[np.ndarray, " n"]:
+    return events.y.numpy().astype(np.int64) // BLOCK * columns + events.x.numpy() // BLOCK

@@ -1,0 +1,92 @@
+"""Output folders hold one run."""
+
+import json
+
+import pytest
+
+from polarnet.cli import main
+from polarnet.cli.outputs import MARKER, WORK, run_folder
+from polarnet.events.store import EventStore
+from polarnet.events.stream import Events
+
+
+def names(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def write(folder, *files):
+    with run_folder(folder, "recover") as partial:
+        for file in files:
+            (partial / file).parent.mkdir(parents=True, exist_ok=True)
+            (partial / file).write_text(file)
+
+
+def fail(folder, error, *files):
+    with run_folder(folder, "recover") as partial:
+        (partial / "png").mkdir()
+        for file in files:
+            (partial / file).parent.mkdir(exist_ok=True)
+            (partial / file).touch()
+        raise error
+
+
+def test_a_second_run_leaves_nothing_of_the_first(tmp_path):
+    write(tmp_path / "out", "png/0.png", "png/1.png", "video.mp4")
+    write(tmp_path / "out", "png/0.png")
+    assert names(tmp_path) == ["out/png/0.png", f"out/{MARKER}"]
+
+
+def test_files_move_into_the_folder_at_the_end_alone(tmp_path):
+    out = tmp_path / "out"
+    with run_folder(out, "recover") as partial:
+        (partial / "0.png").touch()
+        assert partial == tmp_path / "out.partial"
+        assert not out.exists()
+    assert names(tmp_path) == ["out/0.png", f"out/{MARKER}"]
+    assert not partial.exists()
+
+
+def test_a_folder_with_other_files_is_refused_and_untouched(tmp_path):
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(ValueError, match="holds files that `polarnet recover` did not write; name another folder"):
+        write(tmp_path, "0.png")
+    with run_folder(tmp_path / "out", "export") as partial:
+        (partial / "events.h5").touch()
+    with pytest.raises(ValueError, match="`polarnet recover` did not write"):
+        write(tmp_path / "out", "0.png")
+    with pytest.raises(ValueError, match="is a file; name a folder"):
+        write(tmp_path / "thesis.tex", "0.png")
+    assert names(tmp_path) == ["out/events.h5", f"out/{MARKER}", "thesis.tex"]
+
+
+def test_a_run_that_fails_before_its_first_file_leaves_no_folder(tmp_path):
+    with pytest.raises(ValueError, match="refused"):
+        fail(tmp_path / "a" / "out", ValueError("refused"), f"{WORK}/imported")
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_run_that_is_stopped_keeps_its_files_apart_and_the_next_run_replaces_them(tmp_path, capsys):
+    write(tmp_path / "out", "before.png")
+    with pytest.raises(KeyboardInterrupt):
+        fail(tmp_path / "out", KeyboardInterrupt(), "0.png")
+    assert f"files made until then: {tmp_path / 'out.partial'}" in capsys.readouterr().err
+    assert names(tmp_path) == ["out.partial/0.png", f"out.partial/{MARKER}", "out/before.png", f"out/{MARKER}"]
+    write(tmp_path / "out", "after.png")
+    assert names(tmp_path) == ["out/after.png", f"out/{MARKER}"]
+
+
+def test_work_that_a_later_run_goes_on_from_stays(tmp_path):
+    (tmp_path / "out" / WORK).mkdir(parents=True)
+    (tmp_path / "out" / WORK / "scenes").touch()
+    write(tmp_path / "out", "metrics.json")
+    assert names(tmp_path / "out") == ["metrics.json", MARKER, "work/scenes"]
+
+
+def test_an_export_holds_the_sequences_of_one_store(tmp_path):
+    for name in ("lake", "road"):
+        store = EventStore.create(tmp_path / f"{name}.zarr", [name], 4, 6, {})
+        store.write(name, [Events.empty(4, 6)] * 4, 1000)
+        store.finish()
+        assert main(["export", str(tmp_path / f"{name}.zarr"), str(tmp_path / "out"), "--format", "text"]) == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"road", "store.json", MARKER}
+    assert json.loads((tmp_path / "out" / MARKER).read_text()) == {"command": "polarnet export"}
