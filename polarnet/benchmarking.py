@@ -9,31 +9,42 @@ from typing import Any
 from polarnet.cluster import pmap
 from polarnet.config import Config
 from polarnet.evaluation.benchmark import BenchmarkSet, run_benchmark, train_mean_dolp, write_benchmark
-from polarnet.evaluation.methods import Context, available, checkpoints_of, weights_used
+from polarnet.evaluation.rows import Context, available, weights_used
 from polarnet.events.frames import FrameStore
 from polarnet.events.store import EventStore
 from polarnet.lpips import NO_RECORD, stored_record
+from polarnet.methods import METHODS
+from polarnet.methods.method import Method, Setup
 from polarnet.runtime import device_of
 from polarnet.similarity import Lpips
 
 RECORDINGS = "recordings"  # the set of real targets
 
 
-def context_of(config: Config, train_mean: float, weights: Path | None = None) -> Context:
-    """What methods get; `weights` replaces those of `ours` that the pipeline trained."""
-    checkpoints = checkpoints_of(
-        config.baselines.weights,
-        Path(config.paths.train),
-        Path(config.paths.train_e2v),
-        Path(config.paths.train_e2p),
-    )
-    return Context(
-        train_mean=train_mean,
-        cf=config.baselines.cf,
-        highpass=config.baselines.highpass,
+def context_of(config: Config, train_mean: float | None, weights: Path | None = None) -> Context:
+    """What the rows of the benchmark get; `weights` replaces those of `ours` that the pipeline trained."""
+    given = {"ours": weights} if weights else {}
+    setups = {
+        method.section: setup_of(config, method, given.get(method.section))
+        for method in METHODS.values()
+        if method.wraps is None
+    }
+    return Context(train_mean, setups, device_of(config.runtime))
+
+
+def setup_of(config: Config, method: Method, weights: Path | None = None) -> Setup:
+    """What a method gets; `weights` comes before its section, and that before what its training stage left."""
+    section = getattr(config.methods, method.section)
+    if weights is None and method.weights is not None:
+        if section.weights:
+            weights = Path(section.weights)
+        elif method.weights.trained_by:
+            weights = Path(getattr(config.paths, method.weights.trained_by)) / "best.safetensors"
+    return Setup(
+        config=section,
+        weights=weights,
         postprocessing=config.baselines.postprocessing,
         gain=config.baselines.gain,
-        **checkpoints | ({"ours_checkpoint": weights} if weights else {}),
         device=device_of(config.runtime),
         precision=config.benchmark.precision,
     )
@@ -97,7 +108,7 @@ def run_on(config: Config, test_set: BenchmarkSet, lpips: Lpips | None, folder: 
         "train_mean": train_mean,
         "left_out": left_out,
         "weights": weights_used(methods, context),
-        "postprocessing": dataclasses.asdict(context.postprocessing),
+        "postprocessing": dataclasses.asdict(config.baselines.postprocessing),
     }
     return write_benchmark(folder, benchmark, settings, config.seed, about)
 

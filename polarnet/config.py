@@ -18,14 +18,13 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from polarnet.baselines.complementary_filter import ComplementaryFilterConfig, HighPassConfig
-from polarnet.baselines.postprocessing import PostprocessingConfig
-from polarnet.baselines.stokes_gain import GainConfig
-from polarnet.evaluation.methods import WeightsConfig
 from polarnet.evaluation.score import BenchmarkConfig
 from polarnet.experiments import preset_names, preset_values
 from polarnet.lpips import BACKBONES, PURPOSES, Purpose, is_stored
 from polarnet.lpips_weights import LpipsConfig, local_source
+from polarnet.methods import METHODS
+from polarnet.methods.postprocessing import PostprocessingConfig
+from polarnet.methods.stokes_gain import GainConfig
 from polarnet.networks.dolp_unet import DolpUNetConfig
 from polarnet.networks.registry import NetworkConfig
 from polarnet.networks.stokes_unet import StokesUNetConfig
@@ -58,15 +57,21 @@ class NetworksConfig:
     polarnet: StokesUNetConfig
 
 
+if typing.TYPE_CHECKING:
+    MethodsConfig = Any
+else:
+    MethodsConfig = dataclasses.make_dataclass(
+        "MethodsConfig", [(m.name, m.config) for m in METHODS.values() if m.config is not None], frozen=True
+    )
+    """Section `methods` of params.yaml: the sections that the records declare."""
+
+
 @dataclass(frozen=True)
 class BaselinesConfig:
     """Section `baselines` of params.yaml."""
 
-    cf: ComplementaryFilterConfig
-    highpass: HighPassConfig
     postprocessing: PostprocessingConfig
     gain: GainConfig
-    weights: WeightsConfig
     e2v: E2vConfig
     e2p: E2pConfig
 
@@ -116,6 +121,7 @@ class Config:
     loss: LossConfig
     train: TrainConfig
     lpips: LpipsConfig
+    methods: MethodsConfig
     baselines: BaselinesConfig
     benchmark: BenchmarkConfig
     sets: SetsConfig

@@ -1,9 +1,9 @@
 """What a method's answer depends on, as a hash: its own code, parameters and weights, and of no other method.
 
-Nothing is declared: the functions that a method reaches are read. Inside `polarnet.evaluation`, whose modules hold
-several methods, each function counts on its own; any other module of polarnet that is reached counts as a whole, with
-what it imports. Comments, docstrings and layout do not count. Too much may be found, never too little, as long as
-methods reach each other and the context by name.
+Nothing is declared: the functions that a method reaches are read. Inside `polarnet.methods` and `polarnet.evaluation`,
+each function counts on its own; any other module of polarnet that is reached counts as a whole, with what it imports.
+Comments, docstrings and layout do not count. Too much may be found, never too little, as long as methods reach each
+other and their setup by name.
 """
 
 import ast
@@ -22,7 +22,10 @@ import numpy as np
 import torch
 
 PACKAGE = "polarnet"
-FUNCTION_BY_FUNCTION = "polarnet.evaluation."  # in these modules a method depends on the functions that it reaches
+FUNCTION_BY_FUNCTION = (
+    "polarnet.evaluation.",
+    "polarnet.methods.",
+)  # in these modules a method depends on the functions that it reaches
 
 
 def method_digest(method: Callable[..., Any], context: Any) -> str:
@@ -69,7 +72,7 @@ class Reach:
     code: set[str] = dataclasses.field(default_factory=set)
     """Normalised source of functions and modules, each with its name."""
     names: set[str] = dataclasses.field(default_factory=set)
-    """Of attributes and variables that functions of `polarnet.evaluation` use."""
+    """Of attributes and variables that functions of methods use."""
     seen: set[int] = dataclasses.field(default_factory=set)
     modules: set[str] = dataclasses.field(default_factory=set)
     fields: list[str] = dataclasses.field(default_factory=list)
@@ -123,6 +126,9 @@ def _visit(thing: Any, reached: Reach, context: type | None) -> None:
             _visit(item, reached, context)
     elif isinstance(thing, (str, int, float, bool, bytes, type(None))):
         reached.code.add(f"value {thing!r}")
+    elif dataclasses.is_dataclass(thing) and not isinstance(thing, type):
+        for field in dataclasses.fields(thing):
+            _visit(getattr(thing, field.name), reached, context)
     elif callable(thing):
         _visit_callable(inspect.unwrap(getattr(thing, "py_func", thing)), reached, context)
 
@@ -194,7 +200,7 @@ def _normalised(source: str) -> str:
 
 def _visit_module(name: str, reached: Reach) -> None:
     """The whole module, then what it imports of polarnet; modules of methods are left to their functions."""
-    if name in reached.modules or f"{name}." == FUNCTION_BY_FUNCTION or name.startswith(FUNCTION_BY_FUNCTION):
+    if name in reached.modules or f"{name}.".startswith(FUNCTION_BY_FUNCTION):
         return
     reached.modules.add(name)
     try:

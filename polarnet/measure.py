@@ -14,7 +14,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from polarnet.reports.figures import LIGHT, png
+from polarnet.reports.figures import LIGHT
+from polarnet.reports.png import png
 from polarnet.reports.provenance import git, processor
 from polarnet.reports.studies import loss_sweep_figure
 from polarnet.runtime import usable_cores

@@ -21,8 +21,7 @@ from torch import Tensor, nn
 from polarnet.events.representations import REPRESENTATIONS, channels_of
 from polarnet.events.stream import Events
 from polarnet.events.windows import encode_windows
-from polarnet.networks.blocks import Prediction
-from polarnet.stokes import POLARIZER_ANGLES_DEG
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
 
 FORMAT = "polarnet-onnx-1"
 KEY = "polarnet"  # of the JSON among the file's metadata_props

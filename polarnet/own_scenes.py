@@ -9,11 +9,11 @@ from polarnet.benchmarking import context_of, made_set, mapper_of
 from polarnet.config import Config, with_lpips
 from polarnet.evaluation.benchmark import run_benchmark, train_mean_dolp, write_benchmark
 from polarnet.evaluation.conditions import configured, sentence, warnings
-from polarnet.evaluation.methods import METHODS, Context, metadata_used, weights_used, why_absent
+from polarnet.evaluation.rows import available, metadata_used, weights_used
 from polarnet.events.frames import FrameStore
-from polarnet.fingerprint import reach
 from polarnet.lpips import NO_RECORD
 from polarnet.lpips_weights import find_weights
+from polarnet.methods import METHODS
 from polarnet.reports.set_page import write_set_page
 from polarnet.runtime import threads_of
 from polarnet.similarity import Lpips
@@ -21,7 +21,6 @@ from polarnet.simulation.pictures.manifest import read_manifest
 from polarnet.simulation.scenes import SceneStore
 from polarnet.simulation.sets import Recipe, make_folder_set
 from polarnet.simulation.truth import motions_of
-from polarnet.training.baselines import USERS
 from polarnet.weights import shipped_weights
 
 SET_THEM = "To score on sequences like those of the training, add to the command, or write into params.yaml:"
@@ -47,9 +46,8 @@ def benchmark_folder(
     lpips = None if lpips_weights is None else Lpips.of(lpips_weights.backbone, lpips_weights.tensors)
     train_mean = _train_mean(config)
     wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
-    context = context_of(config, train_mean or 0.0, weights or shipped_weights())
-    left_out: list[str] = []
-    methods = [method for method in wanted if _runs(method, context, train_mean, left_out)]
+    context = context_of(config, train_mean, weights or shipped_weights())
+    methods, left_out = available(wanted, context)
     used = configured(config.synthesize, config.emulate)
     differences = warnings(used, metadata_used(methods, context), SET_THEM)
     print("\n".join([sentence(used), *(f"WARNING: {line}" for line in differences)]), flush=True)
@@ -58,7 +56,7 @@ def benchmark_folder(
         make_folder_set(root, kind, work, recipe, functools.partial(mapper_of, config))
     except ValueError as error:
         raise ValueError(f"--scenes {root}: nothing to test on. {error}") from error
-    notes = [*_skipped(config, work), *left_out]
+    notes = [*_skipped(config, work), *(_left_out(row, reason) for row, reason in left_out.items())]
     settings = dataclasses.replace(config.benchmark, methods=methods)
     test_set = made_set(root.resolve().name, work)
     benchmark = run_benchmark(test_set, context, settings, lpips, work / "cache", mapper_of(config, "benchmark"))
@@ -90,14 +88,9 @@ def _train_mean(config: Config) -> float | None:
     return train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None
 
 
-def _runs(method: str, context: Context, train_mean: float | None, notes: list[str]) -> bool:
-    """Whether all is there that a method needs; adds to `notes` what is not."""
-    if reason := why_absent(method, context):
-        trained = any(method.removesuffix("+gain") in rows for rows in USERS.values())
-        advice = "; name it in benchmark.methods of params.yaml and run `dvc repro`" if trained else ""
-        notes.append(f"{method} was left out: {reason}{advice}.")
-        return False
-    if train_mean is None and "train_mean" in reach(METHODS[method], type(context)).fields:  # type: ignore[arg-type]
-        notes.append(f"{method} was left out: the training split is not there; run `dvc repro synthesize`.")
-        return False
-    return True
+def _left_out(row: str, reason: str) -> str:
+    """A line for a row that cannot run."""
+    weights = METHODS[row].weights if row in METHODS else None
+    trained = weights is not None and weights.trained_by is not None
+    advice = "; name it in benchmark.methods of params.yaml and run `dvc repro`" if trained else ""
+    return f"{row} was left out: {reason}{advice}."

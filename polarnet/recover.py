@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import operator
 import statistics
 import sys
 import time
@@ -10,17 +11,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from polarnet.benchmarking import context_of
+from polarnet.benchmarking import setup_of
 from polarnet.config import Config
-from polarnet.evaluation.methods import dolp_checkpoint, why_absent
-from polarnet.evaluation.recoverer import Recoverer, Stream, WindowRecoverer, each_map, stream_of
 from polarnet.events.store import EventStore
 from polarnet.events.stream import Events, downscale
 from polarnet.events.streaming import SHORTEST_STEP_US, EventWindow, WindowCutter, WindowRule
-from polarnet.networks.blocks import Prediction
+from polarnet.methods import METHODS
+from polarnet.methods.dolp_network import dolp_recoverer
+from polarnet.methods.method import Recoverer, each_map, why_absent
+from polarnet.methods.overlap import advance, begin, warm_up
+from polarnet.networks.checkpoint import load_network
 from polarnet.recordings.arrangements import read_four, read_mosaic
 from polarnet.recordings.dot import EVENT_CAPTURES
 from polarnet.recordings.imported import import_targets
@@ -29,7 +33,7 @@ from polarnet.recordings.recording import Recording, detect_format
 from polarnet.recordings.targets import calibrate_targets
 from polarnet.reports.recovery import RecoveryWriter
 from polarnet.runtime import RuntimeConfig, device_of, precision_on, tune
-from polarnet.stokes import Mosaic
+from polarnet.stokes import Mosaic, Prediction
 from polarnet.weights import shipped_weights
 
 STANDARD_INPUT = "-"
@@ -63,10 +67,10 @@ class Input(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """What was recovered from a window, on the CPU, and how long it took."""
+    """The prediction for a window, on the CPU, and how long it took."""
 
     window: EventWindow
-    found: Prediction
+    prediction: Prediction
     step_s: float
     """From the window's events in memory to the frame in memory; of windows that went together, a share of it."""
     latency_s: float
@@ -178,31 +182,35 @@ def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> tuple[Input, L
     return Input(name, lines.height, lines.width, lines, None), lines
 
 
-def open_stream(
-    method: str | None, weights: Path | None, device: str, precision: str, config: Callable[[], Config]
-) -> tuple[Stream, str]:
+def open_method(
+    name: str | None, weights: Path | None, device: str, precision: str, config: Callable[[], Config]
+) -> tuple[Recoverer, str]:
     """The method that recovers, and words for it.
 
-    A network: of `weights`, else the shipped one, else what the pipeline trained. Another `method` of the benchmark:
-    as `config` says. `precision` is that of networks: fp32, bf16, or auto: bf16 where the device has units for it.
+    A network: of `weights`, else the shipped one, else what the pipeline trained. Another method, by its `name`: as
+    `config` says. `precision` is that of networks: fp32, bf16, or auto: bf16 where the device has units for it.
     ValueError or FileNotFoundError that says what is missing.
     """
     tune()
     place = device_of(RuntimeConfig(device, threads=0, workers=1, devices=1, nodes=1, rendezvous=""))
     precision = precision_on(place, precision)
-    if method in (None, "ours"):
+    if name in (None, "ours"):
         file = weights or _default_weights(config)
         if not file.is_file():
             raise FileNotFoundError(f"--weights {file}: expected a checkpoint (NAME.safetensors), there is none")
-        network, metadata = dolp_checkpoint(file, place)
-        return Recoverer((network, metadata), place, precision), f"network {metadata['network']} ({precision}), {file}"
-    assert method is not None
+        network, metadata = load_network(file)
+        words = f"network {metadata['network']} ({precision}), {file}"
+        return dolp_recoverer(network, metadata, place, precision), words
+    assert name is not None
+    if name not in METHODS:
+        raise ValueError(f"--method: expected a method of {', '.join(METHODS)}, got {name!r}")
+    method = METHODS[name]
     if weights is not None:
-        raise ValueError(f"--weights is for the DoLP network; set baselines.weights.{method} for {method}")
-    context = dataclasses.replace(context_of(config(), 0.0), device=place, precision=precision)
-    if reason := why_absent(method, context):
-        raise ValueError(f"--method {method}: {reason}")
-    return stream_of(method, context), method
+        raise ValueError(f"--weights is for the DoLP network; set methods.{method.section}.weights for {name}")
+    setup = dataclasses.replace(setup_of(config(), method), device=place, precision=precision)
+    if reason := why_absent(method, setup):
+        raise ValueError(f"--method {name}: {reason}")
+    return method.open(setup), name
 
 
 def _default_weights(config: Callable[[], Config]) -> Path:
@@ -218,23 +226,27 @@ def _default_weights(config: Callable[[], Config]) -> Path:
         raise
 
 
-def frames_of(source: Input, rule: WindowRule, stream: Stream, pixels_at_once: int = PIXELS_AT_ONCE) -> Iterator[Frame]:
+@torch.inference_mode()
+def frames_of(
+    source: Input, rule: WindowRule, recoverer: Recoverer, pixels_at_once: int = PIXELS_AT_ONCE
+) -> Iterator[Frame]:
     """A frame for each window, as soon as the window's last event has come.
 
-    Windows that wait already, as all of a file do, go through a network of DoLP together, up to `pixels_at_once`.
+    Windows that wait already, as all of a file do, go through a method together, up to `pixels_at_once`.
     """
-    if isinstance(stream, WindowRecoverer):
-        stream.prepare(source.height, source.width)
+    warm_up(recoverer, source.height, source.width)
     cutter = WindowCutter(rule, source.height, source.width)
-    most = max(1, pixels_at_once // (source.height * source.width)) if isinstance(stream, Recoverer) else 1
+    history = begin(recoverer, source.height, source.width)
+    most = max(1, pixels_at_once // (source.height * source.width))
     for piece in source.pieces:
         for windows in _runs(cutter.add(piece.channels, piece.until_us), most):
             start = time.perf_counter()
-            found = stream.step_on(windows) if isinstance(stream, Recoverer) else [stream.step(windows[0])]
-            maps = [each_map(one, Tensor.cpu) for one in found]
+            history, prediction = advance(recoverer, history, windows)
+            maps = each_map(prediction, Tensor.cpu)
             done = time.perf_counter()
-            for window, one in zip(windows, maps, strict=True):
-                yield Frame(window, one, (done - start) / len(windows), done - piece.read_at)
+            for k, window in enumerate(windows):
+                frame = each_map(maps, operator.itemgetter(k))
+                yield Frame(window, frame, (done - start) / len(windows), done - piece.read_at)
 
 
 def _runs(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWindow]]:
@@ -249,7 +261,7 @@ def _runs(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWindo
         yield run
 
 
-def recover(source: Input, rule: WindowRule, stream: Stream, writer: RecoveryWriter) -> Summary:
+def recover(source: Input, rule: WindowRule, recoverer: Recoverer, writer: RecoveryWriter) -> Summary:
     """Recover and write every frame, behind a progress bar; ValueError where there is not one window."""
     live = source.duration_us is None
     steps: list[float] = []
@@ -259,8 +271,8 @@ def recover(source: Input, rule: WindowRule, stream: Stream, writer: RecoveryWri
         writer,
         tqdm(total=source.duration_us, desc="recover", unit_scale=1e-6, bar_format=LIVE_BAR if live else BAR) as bar,
     ):
-        for frame in frames_of(source, rule, stream):
-            writer.add(frame.window, frame.found)
+        for frame in frames_of(source, rule, recoverer):
+            writer.add(frame.window, frame.prediction)
             steps.append(frame.step_s)
             latencies.append(frame.latency_s)
             bar.update(frame.window.stop_us - last_us)

@@ -6,7 +6,7 @@ for other axes or integers, whose differences wrap round. Values may be any, NaN
 
 import math
 import re
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +19,21 @@ POLARIZER_ANGLES_DEG = (0, 45, 90, 135)
 
 Mosaic = tuple[tuple[int, int], tuple[int, int]]
 """Polarizer angles over 2x2 pixels: of the even row, then of the odd one."""
+
+
+class Prediction(NamedTuple):
+    """Polarization as a network or any other method predicts it; a map that the method does not give is None."""
+
+    dolp: Float[Tensor, "*b h w"]
+    """In [0, 1] once a method has returned it; the output of a network is not clamped."""
+    aolp: Float[Tensor, "*b h w"] | None = None
+    """Radians in [0, pi)."""
+    log_variance: Float[Tensor, "*b h w"] | None = None
+    """Natural logarithm of the expected squared error of DoLP."""
+    stokes: Float[Tensor, "*b 2 h w"] | None = None
+    """s1 = S1 / S0 and s2 = S2 / S0, whose angle is `aolp`."""
+    intensities: Float[Tensor, "*b 4 h w"] | None = None
+    """Intensities behind the polarizers at 0, 45, 90 and 135 degrees that DoLP was computed from."""
 
 
 def stokes_from_intensities(intensities: Float[Array, "*b 4 h w"]) -> Float[Tensor, "*b 3 h w"]:

@@ -11,9 +11,10 @@ from polarnet.config import Config
 from polarnet.evaluation.benchmark import train_mean_dolp
 from polarnet.evaluation.conditions import Conditions, configured, sentence, stored, warnings
 from polarnet.evaluation.event_budget import by_sliding_window, by_window_length, since_start
-from polarnet.evaluation.methods import METHODS, Context, metadata_used, why_absent
+from polarnet.evaluation.rows import ROWS, Context, metadata_used, why_left_out
 from polarnet.evaluation.sensitivity import sensitivity
-from polarnet.reports.figures import LIGHT, png
+from polarnet.reports.figures import LIGHT
+from polarnet.reports.png import png
 from polarnet.reports.studies import event_budget_figure, sensitivity_figure
 from polarnet.runtime import threads_of
 from polarnet.simulation.scenes import SceneStore
@@ -30,7 +31,7 @@ def run_event_budget(
 ) -> dict[str, Any]:
     """Write event_budget.json and event_budget.png to `out`; ValueError where `ours` has no weights."""
     sequences, context, tests, scenes = _prepared(config, methods, limit, weights)
-    if reason := why_absent("ours", context):
+    if reason := why_left_out("ours", context):
         raise ValueError(f"the event budget needs the DoLP network: {reason}; give --weights FILE")
     events = tests.events
     conditions = _announced(stored(events.attributes, events.height, events.width), methods, context)
@@ -43,9 +44,9 @@ def run_event_budget(
         "methods": list(methods),
         "sequences": list(sequences),
         "conditions": conditions,
-        "since_start": since_start((tests.recording(name) for name in sequences), methods, context),
+        "since_start": since_start((tests.sequence(name) for name in sequences), methods, context),
         "window_length": by_window_length(scenes, tests.events, sequences, lengths, settle_us, methods, context),
-        "sliding": by_sliding_window(scenes, tests.events, sequences, span, SPACING_US, context),
+        "sliding": by_sliding_window(scenes, tests.events, sequences, span, SPACING_US, "ours", context),
     }
     return _written(out, "event_budget", results, png(event_budget_figure(results, LIGHT)))
 
@@ -67,9 +68,9 @@ def run_sensitivity(
 
 
 def _prepared(config: Config, methods: Sequence[str], limit: int | None, weights: Path | None) -> Any:
-    unknown = [method for method in methods if method not in METHODS]
+    unknown = [method for method in methods if method not in ROWS]
     if unknown or not methods:
-        raise ValueError(f"--methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown) or 'none'}")
+        raise ValueError(f"--methods: expected some of {', '.join(ROWS)}, got {', '.join(unknown) or 'none'}")
     tests = pipeline_set(config, "simulated")
     scenes = SceneStore.open(config.paths.scenes)
     context = context_of(config, train_mean_dolp(tests.frames, config.benchmark.warmup_windows), weights)

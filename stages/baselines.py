@@ -1,4 +1,4 @@
-"""benchmark.methods, baselines.weights -> data/baselines: whether each baseline is trained, for DVC to act on."""
+"""benchmark.methods, methods.NAME.weights -> data/baselines: whether each baseline is trained, for DVC to act on."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ def main(config: Config) -> None:
     folder = Path(config.paths.baselines)
     folder.mkdir(parents=True, exist_ok=True)
     for baseline in USERS:
-        used = is_used(baseline, config.benchmark.methods, vars(config.baselines.weights))
+        used = is_used(baseline, config.benchmark.methods, config.methods)
         (folder / f"{baseline}.json").write_text(json.dumps({"trained": used}) + "\n")
         print(f"{baseline}: {'to be trained' if used else 'not trained, since no row of benchmark.methods uses it'}")
 

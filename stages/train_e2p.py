@@ -18,7 +18,7 @@ def main(config: Config) -> None:
 
     Train nothing, and say so, where no row of `benchmark.methods` uses the weights.
     """
-    if not is_used("e2p", config.benchmark.methods, vars(config.baselines.weights)):
+    if not is_used("e2p", config.benchmark.methods, config.methods):
         print(leave_untrained("e2p", Path(config.paths.train_e2p)))
         return
     if launched("stages.train_e2p", config.runtime):

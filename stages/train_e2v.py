@@ -18,7 +18,7 @@ def main(config: Config) -> None:
 
     Train nothing, and say so, where no row of `benchmark.methods` uses the weights.
     """
-    if not is_used("e2v", config.benchmark.methods, vars(config.baselines.weights)):
+    if not is_used("e2v", config.benchmark.methods, config.methods):
         print(leave_untrained("e2v", Path(config.paths.train_e2v)))
         return
     if launched("stages.train_e2v", config.runtime):

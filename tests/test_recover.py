@@ -10,10 +10,10 @@ import zarr
 from polarnet import runtime
 from polarnet.cli import main
 from polarnet.config import load
-from polarnet.evaluation.recoverer import Recoverer
 from polarnet.events.store import EventStore
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import WindowRule
+from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks.checkpoint import load_network, save_checkpoint
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
 from polarnet.recordings.formats.lines import lines_of
@@ -142,31 +142,30 @@ def test_the_lines_on_the_page_run_as_they_stand(store, channels, weights, proje
         for begin in range(0, DURATION_US, 50_000)
     ]
     names = {"path": weights, "height": HEIGHT, "width": WIDTH, "camera": camera}
-    exec(snippet[1].replace("recoverer.reset()", "seen = recoverer.windows; recoverer.reset()"), names)
-    assert (names["seen"], names["recoverer"].windows) == (3, 0)
-    *_, last = frames_of(opened(store), WindowRule(33_333, None, None), Recoverer(load_network(weights)))
-    torch.testing.assert_close(names["found"].dolp, last.found.dolp, atol=1e-5, rtol=1e-4)
+    exec(snippet[1], names)
+    *_, last = frames_of(opened(store), WindowRule(33_333, None, None), dolp_recoverer(*load_network(weights)))
+    torch.testing.assert_close(names["prediction"].dolp[0], last.prediction.dolp, atol=1e-5, rtol=1e-4)
 
 
 def test_windows_that_overlap_give_a_frame_every_tenth_of_a_millisecond(store, weights):
     source = opened(store)
-    frames = list(frames_of(source, WindowRule(33_333, None, 100), Recoverer(load_network(weights))))
+    frames = list(frames_of(source, WindowRule(33_333, None, 100), dolp_recoverer(*load_network(weights))))
     ends = [frame.window.stop_us for frame in frames]
     assert ends == list(range(33_333, DURATION_US + 1, 100))
-    change = torch.stack([frame.found.dolp for frame in frames]).diff(dim=0).abs().mean(dim=(1, 2))
+    change = torch.stack([frame.prediction.dolp for frame in frames]).diff(dim=0).abs().mean(dim=(1, 2))
     assert change.max() < 0.05
 
 
 def test_a_file_goes_through_the_network_several_windows_at_once_and_gives_the_same(store, weights):
     rule, source = WindowRule(20_000, None, None), opened(store)
     by_one, by_two = (
-        list(frames_of(source, rule, Recoverer(load_network(weights)), pixels_at_once=n * HEIGHT * WIDTH))
+        list(frames_of(source, rule, dolp_recoverer(*load_network(weights)), pixels_at_once=n * HEIGHT * WIDTH))
         for n in (1, 2)
     )
     assert [frame.window.stop_us for frame in by_two] == [20_000, 40_000, 60_000, 80_000, 100_000]
     assert [frame.step_s == after.step_s for frame, after in itertools.pairwise(by_two)] == [True, False, True, False]
     for one, other in zip(by_one, by_two, strict=True):
-        torch.testing.assert_close(one.found.dolp, other.found.dolp, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(one.prediction.dolp, other.prediction.dolp, atol=1e-5, rtol=1e-4)
 
 
 def test_files_are_reduced_to_the_size_that_is_asked_for(store):

@@ -160,7 +160,7 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.events.streaming import WindowRule, parse_window
     from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recordings.recording import read_recording
-    from polarnet.recover import Arrangement, facts_of, open_files, open_live, open_stream, recover
+    from polarnet.recover import Arrangement, facts_of, open_files, open_live, open_method, recover
     from polarnet.reports.recovery import RecoveryWriter
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
@@ -171,7 +171,7 @@ def _recover(options: argparse.Namespace) -> int:
     if step_events is not None:
         raise ValueError(f"--step: expected a time such as 0.1ms, got {options.step}")
     rule = WindowRule(length_us, events, step_us)
-    stream, words = open_stream(options.method, options.weights, options.device, options.precision, config)
+    recoverer, words = open_method(options.method, options.weights, options.device, options.precision, config)
     name = "live" if options.live else Path(options.input[0]).stem
     out = options.out or Path("outputs") / "recover" / name
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
@@ -188,7 +188,7 @@ def _recover(options: argparse.Namespace) -> int:
         check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
         source = source._replace(pieces=check.watch(source.pieces))
         writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
-        summary = recover(source, rule, stream, writer)
+        summary = recover(source, rule, recoverer, writer)
         left_out = {kind: count for kind, count in lines.counts.items() if count} if lines else {}
         notes = [*check.findings(), *([f"Lines that were left out: {left_out}."] if left_out else [])]
         counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)

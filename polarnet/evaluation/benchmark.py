@@ -5,7 +5,7 @@ import functools
 import json
 import platform
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from polarnet.baselines.trivial import mean_dolp
 from polarnet.evaluation.cache import FORMAT, Cache, sequence_digest
 from polarnet.evaluation.cost import Cost, cost_of
-from polarnet.evaluation.methods import METHODS, Context, Polarization, Recording, recover
 from polarnet.evaluation.paired import paired_comparisons
+from polarnet.evaluation.references import REFERENCES, mean_dolp
 from polarnet.evaluation.reliability import Reliability, reliability
+from polarnet.evaluation.rows import Context, predictions_of
 from polarnet.evaluation.score import (
     METRICS,
     BenchmarkConfig,
@@ -31,12 +31,15 @@ from polarnet.evaluation.score import (
     summary,
     write_frames,
 )
+from polarnet.evaluation.sequences import TestSequence
 from polarnet.events.frames import FrameStore
 from polarnet.events.representations import event_tensor
 from polarnet.events.store import EventStore
 from polarnet.events.windows import encode_windows
 from polarnet.fingerprint import code_digest, digest, method_digest, value_digest
+from polarnet.methods import METHODS
 from polarnet.similarity import Lpips
+from polarnet.stokes import Prediction
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,16 @@ class Benchmark:
     costs: Mapping[str, Cost]
     panels: Sequence[Panel]
     reliability: Mapping[str, Reliability] = field(default_factory=dict)
-    """Of the methods that say how large their error is to be expected."""
+    """Reliability of the expected errors, for the methods that predict them."""
+
+
+@dataclass(frozen=True)
+class SequenceResult:
+    """All that was measured on one sequence, from one pass over it."""
+
+    rows: Sequence[FrameScore]
+    reliability: Mapping[str, Reliability]
+    panel: Panel | None
 
 
 @dataclass(frozen=True)
@@ -90,18 +102,14 @@ class BenchmarkSet:
         """The source picture of a sequence. A frame store that names no scenes has one for each sequence."""
         return self.frames.attributes.get("scenes", {}).get(sequence, sequence)
 
-    def recording(self, sequence: str) -> Recording:
+    def sequence(self, name: str) -> TestSequence:
         """One sequence with its truth."""
-        truth = self.frames.frames(sequence)
+        truth = self.frames.frames(name)
         i0, _, i90, _ = truth.intensity[1:].unbind(1)
-        events = self.events.read(sequence)
-        scene = self.scene_of(sequence)
+        events = self.events.read(name)
+        scene = self.scene_of(name)
         valid = None if truth.valid is None else truth.valid[1:]
-        return Recording(sequence, scene, events, truth.t_us, truth.dolp[1:], truth.aolp[1:], i0 + i90, valid)
-
-    def recordings(self) -> Iterator[Recording]:
-        """All of them, one after another."""
-        return map(self.recording, self.sequences)
+        return TestSequence(name, scene, events, truth.t_us, truth.dolp[1:], truth.aolp[1:], i0 + i90, valid)
 
 
 def train_mean_dolp(frames: FrameStore, warmup_windows: int) -> float:
@@ -132,10 +140,11 @@ def run_benchmark(
     if lpips is not None:
         lpips = lpips.to(context.device)
     kept = Cache(cache / test_set.name)
-    digests = {method: method_digest(METHODS[method], context) for method in config.methods}
+    digests = {row: _row_digest(row, context) for row in config.methods}
     scoring = digest(code_digest(score_sequence), str(config.warmup_windows), _lpips_digest(lpips))
+    shown = _spread(names, config.panel_scenes, {name: test_set.scene_of(name) for name in names})
     task = functools.partial(
-        _recover_and_score,
+        _measured,
         test_set=test_set,
         context=context,
         digests=digests,
@@ -143,17 +152,22 @@ def run_benchmark(
         config=config,
         lpips=lpips,
         cache=kept,
+        shown=shown,
     )
-    rows = [row for of_sequence in mapper(task, names) for row in of_sequence]
-    costs = _costs(test_set.recording(names[0]), context, digests, kept)
-    shown = _spread(names, config.panel_scenes, {name: test_set.scene_of(name) for name in names})
-    panels = [_panel(test_set.recording(name), digests, kept, config.warmup_windows) for name in names if name in shown]
+    results: list[SequenceResult] = list(mapper(task, names))
+    costs = _costs(test_set.sequence(names[0]), context, digests, kept)
     kept.forget([*names])
-    return Benchmark(rows, costs, panels, _reliability(test_set, digests, kept, config.warmup_windows))
+    sums: dict[str, Reliability] = {}
+    for result in results:
+        for method, here in result.reliability.items():
+            sums[method] = sums[method] + here if method in sums else here
+    rows = [row for result in results for row in result.rows]
+    panels = [result.panel for result in results if result.panel is not None]
+    return Benchmark(rows, costs, panels, sums)
 
 
-def _recover_and_score(
-    sequence: str,
+def _measured(
+    name: str,
     test_set: BenchmarkSet,
     context: Context,
     digests: Mapping[str, str],
@@ -161,29 +175,39 @@ def _recover_and_score(
     config: BenchmarkConfig,
     lpips: Lpips | None,
     cache: Cache,
-) -> list[FrameScore]:
-    """The rows of every method on one sequence, made where the cache has none."""
-    recording = test_set.recording(sequence)
-    keys = _prediction_keys(recording, digests)
-    score_keys = {method: digest(key, scoring) for method, key in keys.items()}
-    known = {method: cache.scores(method, sequence, key) for method, key in score_keys.items()}
-    unscored: dict[str, Polarization] = {}
-    for method in [method for method, scores in known.items() if scores is None]:
-        if (found := cache.prediction(method, sequence, keys[method])) is None:
-            recovered = recover(method, recording, context)
-            found = cache.write_prediction(method, sequence, keys[method], recovered.polarization)
-        unscored[method] = found
+    shown: Collection[str],
+) -> SequenceResult:
+    """Every row on one sequence, which is read once; predictions and scores come from the cache where it has them."""
+    sequence = test_set.sequence(name)
+    keys = _prediction_keys(sequence, digests)
+    predictions = {row: known for row, key in keys.items() if (known := cache.prediction(row, name, key)) is not None}
+    made = predictions_of([row for row in keys if row not in predictions], sequence, context)
+    predictions |= {row: cache.write_prediction(row, name, keys[row], made[row]) for row in made}
+    ordered = {row: predictions[row] for row in keys}
+    score_keys = {row: digest(key, scoring) for row, key in keys.items()}
+    scores = {row: rows for row, key in score_keys.items() if (rows := cache.scores(row, name, key)) is not None}
+    unscored = {row: prediction for row, prediction in ordered.items() if row not in scores}
     if unscored:  # together, so that LPIPS's features of the truth are computed once
-        scored = score_sequence(recording, unscored, config.warmup_windows, lpips, context.device)
-        for method in unscored:
-            rows = [row for row in scored if row.method == method]
-            cache.write_scores(method, sequence, score_keys[method], rows)
-            known[method] = rows
-    return [row for scores in known.values() if scores is not None for row in scores]
+        scored = score_sequence(sequence, unscored, config.warmup_windows, lpips, context.device)
+        for row in unscored:
+            scores[row] = [score for score in scored if score.method == row]
+            cache.write_scores(row, name, score_keys[row], scores[row])
+    rows = [score for row in keys for score in scores[row]]
+    panel = _panel(sequence, ordered, config.warmup_windows) if name in shown else None
+    return SequenceResult(rows, _reliability(sequence, ordered, config.warmup_windows), panel)
 
 
-def _prediction_keys(recording: Recording, digests: Mapping[str, str]) -> dict[str, str]:
-    of_sequence = sequence_digest(recording)
+def _row_digest(row: str, context: Context) -> str:
+    """A hash of a row's code, settings and weights."""
+    if row in REFERENCES:
+        reference = REFERENCES[row]
+        return digest(code_digest(reference.predict), str(context.train_mean if reference.needs_train_mean else None))
+    method = METHODS[row]
+    return method_digest(method.open, context.setup_of(method))
+
+
+def _prediction_keys(sequence: TestSequence, digests: Mapping[str, str]) -> dict[str, str]:
+    of_sequence = sequence_digest(sequence)
     return {method: digest(FORMAT, of_method, of_sequence) for method, of_method in digests.items()}
 
 
@@ -193,15 +217,15 @@ def _lpips_digest(lpips: Lpips | None) -> str:
     return digest(lpips.backbone, *(f"{name}={value_digest(t)}" for name, t in lpips.state_dict().items()))
 
 
-def _costs(recording: Recording, context: Context, digests: Mapping[str, str], cache: Cache) -> dict[str, Cost]:
+def _costs(sequence: TestSequence, context: Context, digests: Mapping[str, str], cache: Cache) -> dict[str, Cost]:
     """Each method's, from the cache where this machine has measured it with as many threads."""
     device = torch.cuda.get_device_name(context.device) if context.device.type == "cuda" else "cpu"
     here = digest(platform.node(), platform.machine(), device, str(torch.get_num_threads()))
     costs = {}
-    for method, key in _prediction_keys(recording, digests).items():
+    for method, key in _prediction_keys(sequence, digests).items():
         cost_key = digest(key, here)
         if (cost := cache.cost(method, cost_key)) is None:
-            cost = cost_of(method, recording, context)
+            cost = cost_of(method, sequence, context)
             cache.write_cost(method, cost_key, cost)
         costs[method] = cost
     return costs
@@ -250,44 +274,34 @@ def _spread(names: Sequence[str], count: int, scenes: Mapping[str, str]) -> set[
 
 
 def _reliability(
-    test_set: BenchmarkSet, digests: Mapping[str, str], cache: Cache, warmup_windows: int
+    sequence: TestSequence, predictions: Mapping[str, Prediction], warmup_windows: int
 ) -> dict[str, Reliability]:
-    """Over the scored windows of all sequences, of each method that expects an error."""
-    sums: dict[str, Reliability] = {}
-    speaking = dict(digests)  # all that may say something of it, until the first sequence tells
-    for recording in test_set.recordings():
-        windows = slice(scored_windows(recording, warmup_windows).start, None)
-        valid = None if recording.valid is None else recording.valid[windows]
-        for method, key in _prediction_keys(recording, speaking).items():
-            found = cache.prediction(method, recording.name, key)
-            if found is None or found.log_variance is None:
-                del speaking[method]
-                continue
-            here = reliability(found.log_variance[windows], found.dolp[windows], recording.dolp[windows], valid)
-            sums[method] = sums[method] + here if method in sums else here
-    return sums
+    """Over the scored windows, of each method that expects an error."""
+    windows = slice(scored_windows(sequence, warmup_windows).start, None)
+    valid = None if sequence.valid is None else sequence.valid[windows]
+    truth = sequence.dolp[windows]
+    return {
+        method: reliability(prediction.log_variance[windows], prediction.dolp[windows], truth, valid)
+        for method, prediction in predictions.items()
+        if prediction.log_variance is not None
+    }
 
 
-def _panel(recording: Recording, digests: Mapping[str, str], cache: Cache, warmup_windows: int) -> Panel:
+def _panel(sequence: TestSequence, predictions: Mapping[str, Prediction], warmup_windows: int) -> Panel:
     """The middle one of the scored windows."""
-    windows = scored_windows(recording, warmup_windows)
+    windows = scored_windows(sequence, warmup_windows)
     k = windows[len(windows) // 2]
-    found: dict[str, Polarization] = {}
-    for method, key in _prediction_keys(recording, digests).items():
-        if (prediction := cache.prediction(method, recording.name, key)) is None:
-            raise RuntimeError(f"{cache.folder}: {method} on {recording.name} is gone; something else clears the cache")
-        found[method] = prediction
     return Panel(
-        recording.name,
-        recording.scene,
+        sequence.name,
+        sequence.scene,
         k,
-        int(recording.t_us[k + 1]),
-        encode_windows(recording.events, recording.t_us[k : k + 2], event_tensor)[0],
-        recording.dolp[k],
-        recording.aolp[k],
-        recording.s0[k],
-        {method: polarization.dolp[k] for method, polarization in found.items()},
-        {method: polarization.aolp[k] for method, polarization in found.items() if polarization.aolp is not None},
+        int(sequence.t_us[k + 1]),
+        encode_windows(sequence.events, sequence.t_us[k : k + 2], event_tensor)[0],
+        sequence.dolp[k],
+        sequence.aolp[k],
+        sequence.s0[k],
+        {method: prediction.dolp[k] for method, prediction in predictions.items()},
+        {method: prediction.aolp[k] for method, prediction in predictions.items() if prediction.aolp is not None},
     )
 
 

@@ -17,22 +17,23 @@ import torch
 from torch import Tensor
 
 from polarnet.evaluation.cost import Cost
-from polarnet.evaluation.methods import Polarization, Recording
 from polarnet.evaluation.reliability import HIGHEST, LOWEST
 from polarnet.evaluation.score import FrameScore
+from polarnet.evaluation.sequences import TestSequence
 from polarnet.events.frames import dequantise_angle, dequantise_fraction, quantise_angle, quantise_fraction
 from polarnet.fingerprint import digest
+from polarnet.stokes import Prediction
 
-FORMAT = "2"  # part of every hash: raise it when what is stored, or `methods.recover`, changes
+FORMAT = "3"  # part of every hash: raise it when what is stored, or `rows.predictions_of`, changes
 
 
-def sequence_digest(recording: Recording) -> str:
+def sequence_digest(sequence: TestSequence) -> str:
     """A hash of events, times and truth."""
-    parts = [recording.name, recording.scene]
-    columns = [column for e in recording.events for column in (e.t, e.x, e.y, e.p)]
-    arrays = [*columns, recording.t_us, recording.dolp, recording.aolp, recording.s0]
-    if recording.valid is not None:
-        arrays.append(recording.valid)
+    parts = [sequence.name, sequence.scene]
+    columns = [column for e in sequence.events for column in (e.t, e.x, e.y, e.p)]
+    arrays = [*columns, sequence.t_us, sequence.dolp, sequence.aolp, sequence.s0]
+    if sequence.valid is not None:
+        arrays.append(sequence.valid)
     return digest(*parts, *(np.ascontiguousarray(array.numpy()).tobytes() for array in arrays))
 
 
@@ -46,7 +47,7 @@ class Cache:
     def __init__(self, folder: Path):
         self.folder = folder
 
-    def prediction(self, method: str, sequence: str, key: str) -> Polarization | None:
+    def prediction(self, method: str, sequence: str, key: str) -> Prediction | None:
         """What `write_prediction` was given under this key, in its steps; None where there is nothing of the kind."""
         path = self._path(method, sequence, "npz")
         try:
@@ -57,22 +58,22 @@ class Cache:
         except (FileNotFoundError, KeyError, ValueError, EOFError, zipfile.BadZipFile):  # absent, or cut short
             return None
 
-    def write_prediction(self, method: str, sequence: str, key: str, found: Polarization) -> Polarization:
+    def write_prediction(self, method: str, sequence: str, key: str, prediction: Prediction) -> Prediction:
         """Keep DoLP in [0, 1] and AoLP in radians; what they are in the steps of the store.
 
         ValueError that names the method and window where a value is not a number.
         """
-        for frames in found:
+        for frames in (prediction.dolp, prediction.aolp, prediction.log_variance):
             if frames is not None and not (finite := frames.isfinite().flatten(1).all(dim=1)).all():
                 raise ValueError(
                     f"{method} on {sequence}, window {int((~finite).nonzero()[0])}: it recovered values that are not "
                     f"numbers; the method, its weights or the events are damaged"
                 )
-        arrays = {"dolp": quantise_fraction(found.dolp)}
-        if found.aolp is not None:
-            arrays["aolp"] = quantise_angle(_wrapped(found.aolp))
-        if found.log_variance is not None:
-            arrays["log_variance"] = found.log_variance.clamp(LOWEST, HIGHEST).numpy().astype(np.float16)
+        arrays = {"dolp": quantise_fraction(prediction.dolp)}
+        if prediction.aolp is not None:
+            arrays["aolp"] = quantise_angle(_wrapped(prediction.aolp))
+        if prediction.log_variance is not None:
+            arrays["log_variance"] = prediction.log_variance.clamp(LOWEST, HIGHEST).numpy().astype(np.float16)
         path = self._path(method, sequence, "npz")
         temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -123,11 +124,11 @@ class Cache:
         temporary.replace(path)
 
 
-def _kept(arrays: Mapping[str, np.ndarray]) -> Polarization:
+def _kept(arrays: Mapping[str, np.ndarray]) -> Prediction:
     """What an entry holds, in its steps."""
     aolp = dequantise_angle(arrays["aolp"]) if "aolp" in arrays else None
     log_variance = torch.from_numpy(arrays["log_variance"].astype(np.float32)) if "log_variance" in arrays else None
-    return Polarization(dequantise_fraction(arrays["dolp"]), aolp, log_variance)
+    return Prediction(dequantise_fraction(arrays["dolp"]), aolp, log_variance)
 
 
 def _wrapped(aolp: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """What a method costs: time, arithmetic, parameters and memory of a window, measured on the machine at hand."""
 
 import statistics
+import time
 import tracemalloc
 import weakref
 from collections.abc import Callable
@@ -8,14 +9,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from torch import nn
-from torch.nn.modules.module import register_module_forward_pre_hook
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop
 
-from polarnet.evaluation.methods import Context, Recording, recover
+from polarnet.evaluation.rows import Context, opened, predictions_of
+from polarnet.evaluation.sequences import TestSequence
 from polarnet.events.stream import slice_time
+from polarnet.methods import METHODS
 
 COUNTED_WINDOWS = 3  # arithmetic and memory are counted over so many windows: enough for a state to be carried on
 TIMED_WINDOWS = 10
@@ -41,56 +42,50 @@ class Cost:
     params: int
     """Of the networks that it runs."""
     peak_mib: float
-    """The most memory that tensors and arrays held at once beside the recording, over `COUNTED_WINDOWS` windows."""
+    """The most memory that tensors and arrays held at once beside the sequence, over `COUNTED_WINDOWS` windows."""
 
 
-def cost_of(method: str, recording: Recording, context: Context) -> Cost:
-    """Run `method` on the first windows of a recording, a few times over; the first call is not timed."""
-    short = first_windows(recording, COUNTED_WINDOWS)
-    windows = len(short.dolp)
-    modules = _modules_called(lambda: recover(method, short, context))  # loads, compiles and allocates
-    params = {id(p): p.numel() for module in modules for p in module.parameters()}
+def cost_of(row: str, sequence: TestSequence, context: Context) -> Cost:
+    """Run a row on the first windows of a sequence, a few times over; the first call is not timed."""
+    network = opened(METHODS[row], context).network if row in METHODS else None
+
+    def run(count: int) -> Callable[[], Any]:
+        part = first_windows(sequence, count)
+        return lambda: predictions_of([row], part, context)
+
+    counted, timed = run(COUNTED_WINDOWS), run(TIMED_WINDOWS)
+    counted()  # compiles and allocates
     with FlopCounterMode(display=False, custom_mapping=CPU_ATTENTION) as counter:
-        recover(method, short, context)
-    peak = _peak_bytes(lambda: recover(method, short, context), context.device)
-    timed = first_windows(recording, TIMED_WINDOWS)
-    seconds = [recover(method, timed, context).seconds for _ in range(REPEATS)]
+        counted()
+    peak = _peak_bytes(counted, context.device)
+    windows = len(sequence.dolp)
     return Cost(
-        ms_per_window=1000 * statistics.median(seconds) / len(timed.dolp),
-        gflop=counter.get_total_flops() / windows / 1e9 if modules else None,
-        params=sum(params.values()),
+        ms_per_window=1000 * statistics.median(_seconds(timed) for _ in range(REPEATS)) / min(TIMED_WINDOWS, windows),
+        gflop=counter.get_total_flops() / min(COUNTED_WINDOWS, windows) / 1e9 if network is not None else None,
+        params=sum(p.numel() for p in network.parameters()) if network is not None else 0,
         peak_mib=peak / MIB,
     )
 
 
-def first_windows(recording: Recording, count: int) -> Recording:
-    """A recording cut after `count` windows, or all of it where it has no more."""
-    t_us = recording.t_us[: count + 1]
+def first_windows(sequence: TestSequence, count: int) -> TestSequence:
+    """A sequence cut after `count` windows, or all of it where it has no more."""
+    t_us = sequence.t_us[: count + 1]
     end_us = int(t_us[-1]) + 1
     return replace(
-        recording,
-        events=[slice_time(events, 0, end_us) for events in recording.events],
+        sequence,
+        events=[slice_time(events, 0, end_us) for events in sequence.events],
         t_us=t_us,
-        dolp=recording.dolp[:count],
-        aolp=recording.aolp[:count],
-        s0=recording.s0[:count],
-        valid=None if recording.valid is None else recording.valid[:count],
+        dolp=sequence.dolp[:count],
+        aolp=sequence.aolp[:count],
+        s0=sequence.s0[:count],
+        valid=None if sequence.valid is None else sequence.valid[:count],
     )
 
 
-def _modules_called(run: Callable[[], Any]) -> list[nn.Module]:
-    """Every module whose forward `run` calls, once each."""
-    found: dict[int, nn.Module] = {}
-
-    def note(module: nn.Module, _: Any) -> None:
-        found[id(module)] = module
-
-    handle = register_module_forward_pre_hook(note)
-    try:
-        run()
-    finally:
-        handle.remove()
-    return list(found.values())
+def _seconds(run: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start
 
 
 def _peak_bytes(run: Callable[[], Any], device: torch.device) -> float:
@@ -123,7 +118,7 @@ class _TensorMemory(TorchDispatchMode):
         """Run the operation and note the storage of what it returns, unless that is a view of a known one."""
         for tensor in tree_leaves((args, kwargs)):
             if isinstance(tensor, torch.Tensor):
-                self._known.add(tensor.untyped_storage())  # weights and recordings were there before
+                self._known.add(tensor.untyped_storage())  # weights and events were there before
         out = operation(*args, **(kwargs or {}))
         for tensor in tree_leaves(out):
             if isinstance(tensor, torch.Tensor):

@@ -20,13 +20,14 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 from tqdm import tqdm
 
-from polarnet.evaluation.methods import Context, Polarization, Recording, degree, recover
-from polarnet.evaluation.resimulate import recording_at
+from polarnet.evaluation.resimulate import sequence_at
+from polarnet.evaluation.rows import Context, opened, predictions_of
 from polarnet.evaluation.score import FrameScore, scene_means, score_sequence
-from polarnet.events.representations import REPRESENTATIONS, event_tensor
+from polarnet.evaluation.sequences import TestSequence
 from polarnet.events.store import EventStore
 from polarnet.events.stream import Events, slice_count
-from polarnet.events.streaming import SlidingEventTensor
+from polarnet.events.streaming import EventWindow
+from polarnet.methods import METHODS
 from polarnet.similarity import correlation, mse, psnr
 from polarnet.simulation.scenes import SceneStore
 
@@ -43,17 +44,17 @@ def events_per_pixel(events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> Flo
     return (counts / (events[0].height * events[0].width)).float()
 
 
-def since_start(recordings: Iterable[Recording], methods: Sequence[str], context: Context) -> dict[str, list[dict]]:
+def since_start(sequences: Iterable[TestSequence], methods: Sequence[str], context: Context) -> dict[str, list[dict]]:
     """Method, then bin of events per pixel since the start: frames, scenes and mean scores; no window is warm-up.
 
     A bin's means are over frames, then scenes; bins that no frame falls into are left out.
     """
     rows: dict[int, list[FrameScore]] = {}
     rates: dict[int, list[float]] = {}
-    for recording in tqdm(list(recordings), "events since the start", unit="sequence"):
-        answers = {method: _answer(method, recording, context) for method in methods}
-        per_pixel = events_per_pixel(recording.events, recording.t_us[1:]).tolist()
-        for row in score_sequence(recording, answers, 0, None, context.device):
+    for sequence in tqdm(list(sequences), "events since the start", unit="sequence"):
+        predictions = predictions_of(methods, sequence, context)
+        per_pixel = events_per_pixel(sequence.events, sequence.t_us[1:]).tolist()
+        for row in score_sequence(sequence, predictions, 0, None, context.device):
             k = int(np.searchsorted(BIN_EDGES, per_pixel[row.window], side="right")) - 1
             rows.setdefault(k, []).append(row)
             rates.setdefault(k, []).append(per_pixel[row.window])
@@ -96,19 +97,15 @@ def by_window_length(
                 raise ValueError(
                     f"{sequence}: windows of {length_us} us leave none after the first {settle_us} us of {end_us} us"
                 )
-            recording = recording_at(scenes, sequence, events.read(sequence), t_us)
-            answers = {method: _answer(method, recording, context) for method in methods}
-            rows += score_sequence(recording, answers, warmup, None, context.device)
-            per_window.append(float(events_per_pixel(recording.events, t_us).diff().mean()))
+            test = sequence_at(scenes, sequence, events.read(sequence), t_us)
+            predictions = predictions_of(methods, test, context)
+            rows += score_sequence(test, predictions, warmup, None, context.device)
+            per_window.append(float(events_per_pixel(test.events, t_us).diff().mean()))
         for method in methods:
             of_method = [row for row in rows if row.method == method]
             entry = {"window_us": length_us, "events_per_pixel": float(np.mean(per_window)), **_means(of_method)}
             table[method].append(entry)
     return table
-
-
-def _answer(method: str, recording: Recording, context: Context) -> Polarization:
-    return recover(method, recording, context).polarization
 
 
 def _means(rows: Sequence[FrameScore]) -> dict[str, Any]:
@@ -117,41 +114,23 @@ def _means(rows: Sequence[FrameScore]) -> dict[str, Any]:
     return {"frames": len(rows), "scenes": len({row.scene for row in rows}), **scores}
 
 
-def move_to_last(sliding: SlidingEventTensor, events: Events, count: int, t_us: int) -> Float[Tensor, "h w"]:
-    """The event tensor of the last `count` of the events before `t_us`; time only goes forward.
-
-    The window ends with its last event; 0 everywhere while fewer than two events have come.
-    """
-    stop = int(torch.searchsorted(events.t, t_us))
-    first = max(0, stop - count)
-    sliding.move_to(first, slice_count(events, first, stop))
-    times = sliding.window.t
-    return sliding.tensor(max(1, int(times[-1] - times[0])) if len(times) else 1)
-
-
 @torch.no_grad()
 def sliding_recovery(
-    recording: Recording, count: int, t_us: Sequence[int], carry: bool, context: Context
+    sequence: TestSequence, count: int, t_us: Sequence[int], carry: bool, method: str, context: Context
 ) -> Float[Tensor, "n h w"]:
-    """DoLP at times `t_us` from the last `count` events of each polarizer, by the network `ours`.
+    """DoLP at times `t_us` from the last `count` events of each polarizer.
 
-    Event tensors are updated as the window moves, other input is encoded anew. `carry`: whether the network's state
-    goes from one overlapping window to the next, or each stands alone.
+    `carry`: whether the method's state goes from one overlapping window to the next, or each stands alone.
     """
-    network, metadata = context.ours
-    encode = REPRESENTATIONS[metadata["representation"]]
-    windows = [SlidingEventTensor(events.height, events.width) for events in recording.events]
-    state, frames = None, []
+    recoverer = opened(METHODS[method], context)
+    start = recoverer.start(sequence.events[0].height, sequence.events[0].width)
+    state, frames = start, []
     for t in t_us:
-        if encode is event_tensor:
-            images = [move_to_last(w, events, count, t) for w, events in zip(windows, recording.events, strict=True)]
-        else:
-            images = [encode(last, max(1, _length_us(last))) for last in _last(recording.events, count, t)]
-        inputs = torch.cat([image.view(-1, *image.shape[-2:]) for image in images])[None].to(context.device)
-        with context.autocast():
-            prediction, after = network(inputs, state)
-        state = after if carry else None
-        frames.append(degree(prediction.dolp[0]).cpu())
+        channels = _last(sequence.events, count, t)
+        first_us = min((int(events.t[0]) for events in channels if len(events)), default=t)
+        after, prediction = recoverer.step(state, [EventWindow(channels, first_us, t)])
+        state = after if carry else start
+        frames.append(prediction.dolp[0].cpu())
     return torch.stack(frames)
 
 
@@ -172,6 +151,7 @@ def by_sliding_window(
     sequences: Sequence[str],
     span_us: tuple[int, int],
     spacing_us: int,
+    method: str,
     context: Context,
 ) -> list[dict]:
     """For each of `EVENTS_PER_PIXEL`, with the state carried on and without: mean scores of a frame every `spacing_us`.
@@ -181,26 +161,26 @@ def by_sliding_window(
     """
     times = list(range(span_us[0], span_us[1] + 1, spacing_us))
     table = []
-    recordings = [
-        recording_at(scenes, name, events.read(name), torch.tensor([times[0] - spacing_us, *times]))
+    tests = [
+        sequence_at(scenes, name, events.read(name), torch.tensor([times[0] - spacing_us, *times]))
         for name in tqdm(sequences, "truth", unit="sequence")
     ]
     for per_pixel in tqdm(EVENTS_PER_PIXEL, "overlapping windows", unit="size"):
         for carry in (False, True):
-            found = [_sliding_scores(one, per_pixel, times, carry, context) for one in recordings]
-            means = {name: float(np.mean([scores[name] for scores in found])) for name in found[0]}
+            of_sequences = [_sliding_scores(one, per_pixel, times, carry, method, context) for one in tests]
+            means = {name: float(np.mean([scores[name] for scores in of_sequences])) for name in of_sequences[0]}
             table.append({"events_per_pixel": per_pixel, "carry": carry, "spacing_us": spacing_us, **means})
     return table
 
 
 def _sliding_scores(
-    recording: Recording, per_pixel: float, times: Sequence[int], carry: bool, context: Context
+    sequence: TestSequence, per_pixel: float, times: Sequence[int], carry: bool, method: str, context: Context
 ) -> Mapping[str, float]:
-    first = recording.events[0]
+    first = sequence.events[0]
     count = max(2, round(per_pixel * first.height * first.width))
-    frames = sliding_recovery(recording, count, times, carry, context)
-    truth, valid = recording.dolp, recording.valid
-    spans = [_length_us(last) for last in _last(recording.events, count, times[len(times) // 2])]
+    frames = sliding_recovery(sequence, count, times, carry, method, context)
+    truth, valid = sequence.dolp, sequence.valid
+    spans = [_length_us(last) for last in _last(sequence.events, count, times[len(times) // 2])]
     scores = {
         "mse": mse(frames, truth, valid),
         "psnr": psnr(frames, truth, valid),

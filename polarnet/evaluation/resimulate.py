@@ -1,4 +1,4 @@
-"""Recordings made anew from stored scenes: other window lengths, other sensors, other speeds; all in memory."""
+"""Test sequences made anew from stored scenes: other window lengths, other sensors, other speeds; all in memory."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from polarnet.evaluation.methods import Recording
+from polarnet.evaluation.sequences import TestSequence
 from polarnet.events.stream import Events
 from polarnet.runtime import generator_for, seed_for
 from polarnet.simulation.emulator import EmulatorConfig, randomised
@@ -18,12 +18,12 @@ from polarnet.simulation.scenes import SceneRecord, SceneStore
 from polarnet.simulation.truth import frames_of, valid_frames
 
 
-def recording_at(scenes: SceneStore, sequence: str, events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> Recording:
+def sequence_at(scenes: SceneStore, sequence: str, events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> TestSequence:
     """A stored sequence's events with its exact truth at the times `t_us`, which bound its windows."""
     record = scenes.read(sequence)
     trajectory = Trajectory.from_vector(record.trajectory.numpy())
     scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
-    return _recording(scenes, record, scene, trajectory, events, t_us)
+    return _test_sequence(scenes, record, scene, trajectory, events, t_us)
 
 
 def resimulated(
@@ -34,7 +34,7 @@ def resimulated(
     seed: int,
     speed: float = 1.0,
     threads: int = 1,
-) -> Recording:
+) -> TestSequence:
     """A stored sequence seen again, behind polarizers whose sensors may differ: one configuration for each of the four.
 
     The noise is that of the stored sequence. `speed` other than 1 lets the window move over the same picture at so
@@ -63,19 +63,19 @@ def resimulated(
             seen = emulate_motion(scene, trajectory, int(t_us[-1]), *size, sensor, key, threads)
             made.append((sensor, seen))
         events.append(seen[polarizer])
-    return _recording(scenes, record, scene, trajectory, events, t_us)
+    return _test_sequence(scenes, record, scene, trajectory, events, t_us)
 
 
-def _recording(
+def _test_sequence(
     scenes: SceneStore,
     record: SceneRecord,
     scene: PolarizationScene,
     trajectory: Trajectory,
     events: Sequence[Events],
     t_us: Int64[Tensor, " n"],
-) -> Recording:
+) -> TestSequence:
     size = scenes.sensor_height, scenes.sensor_width
     intensity, dolp, aolp = (frames[1:] for frames in frames_of(scene, trajectory, t_us.tolist(), *size))
     valid = None if record.valid is None else valid_frames(record.valid, trajectory, t_us.tolist()[1:], *size)
     s0 = intensity[:, 0] + intensity[:, 2]
-    return Recording(record.name, record.picture, events, t_us, dolp, aolp, s0, valid)
+    return TestSequence(record.name, record.picture, events, t_us, dolp, aolp, s0, valid)

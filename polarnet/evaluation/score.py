@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from polarnet.evaluation.methods import METHODS, Polarization, Recording
+from polarnet.evaluation.rows import ROWS
+from polarnet.evaluation.sequences import TestSequence
 from polarnet.lpips import BACKBONES
 from polarnet.ranges import allowed, check_ranges
 from polarnet.runtime import generator_for
@@ -30,6 +31,7 @@ from polarnet.similarity import (
     ssim,
     with_truth_outside,
 )
+from polarnet.stokes import Prediction
 
 METRICS = ("mse", "psnr", "ssim", "lpips", "corr", "grad", "level_mse", "pattern_mse", "aolp_deg", "skill")
 SETS = ("simulated", "complex_motion", "measured")
@@ -43,7 +45,8 @@ FRAMES_AT_ONCE = 8  # of LPIPS: bounds the memory that its features need
 class BenchmarkConfig:
     """Section `benchmark` of params.yaml."""
 
-    methods: list[str] = field(metadata=allowed(choices=tuple(METHODS)))
+    methods: list[str]
+    """Rows: references and methods."""
     sets: list[str] = field(metadata=allowed(choices=SETS))
     """Test sets; simulated is always among them."""
     warmup_windows: int = field(metadata=allowed(low=0))
@@ -60,6 +63,8 @@ class BenchmarkConfig:
 
     def __post_init__(self):
         check_ranges(self)
+        if unknown := [row for row in self.methods if row not in ROWS]:
+            raise ValueError(f"methods: expected some of {', '.join(ROWS)}, got {', '.join(unknown)}")
         if not self.methods or len(set(self.methods)) != len(self.methods):
             raise ValueError(f"methods: expected at least one and none twice, got {self.methods}")
         if SETS[0] not in self.sets or len(set(self.sets)) != len(self.sets):
@@ -91,38 +96,38 @@ class FrameScore(NamedTuple):
     """MSE of the true frame's own mean: no score, but what skill is measured against."""
 
 
-def scored_windows(recording: Recording, warmup_windows: int) -> range:
+def scored_windows(sequence: TestSequence, warmup_windows: int) -> range:
     """Windows that count; ValueError where the warm-up leaves none."""
-    if len(recording.dolp) <= warmup_windows:
+    if len(sequence.dolp) <= warmup_windows:
         raise ValueError(
-            f"{recording.name} has {len(recording.dolp)} windows and the first {warmup_windows} are warm-up: nothing "
+            f"{sequence.name} has {len(sequence.dolp)} windows and the first {warmup_windows} are warm-up: nothing "
             f"is left to score; lower benchmark.warmup_windows or lengthen the sequences"
         )
-    return range(warmup_windows, len(recording.dolp))
+    return range(warmup_windows, len(sequence.dolp))
 
 
 @torch.no_grad()
 def score_sequence(
-    recording: Recording,
-    recovered: Mapping[str, Polarization],
+    sequence: TestSequence,
+    predictions: Mapping[str, Prediction],
     warmup_windows: int,
     lpips: Lpips | None,
     device: torch.device,
 ) -> list[FrameScore]:
-    """A row per method and window after the warm-up; `recovered` is each method's polarization, a frame a window.
+    """A row per method and window after the warm-up; `predictions` holds a frame a window of each method.
 
     Computed on `device`, where `lpips` has to be. Pixels that are not valid count in no score but LPIPS, which sees the
-    truth there in place of the method's answer.
+    truth there in place of the prediction.
 
     ValueError, which names the frame, for a score that is not a number, or a frame without a valid pixel: no frame is
     ever left out.
     """
-    windows = scored_windows(recording, warmup_windows)
-    for method, found in recovered.items():
-        for frames in found:
-            if frames is not None and frames.shape != recording.dolp.shape:
+    windows = scored_windows(sequence, warmup_windows)
+    for method, prediction in predictions.items():
+        for frames in (prediction.dolp, prediction.aolp):
+            if frames is not None and frames.shape != sequence.dolp.shape:
                 raise ValueError(
-                    f"{method} on {recording.name}: expected frames of {tuple(recording.dolp.shape)}, "
+                    f"{method} on {sequence.name}: expected frames of {tuple(sequence.dolp.shape)}, "
                     f"got {tuple(frames.shape)}"
                 )
 
@@ -130,19 +135,19 @@ def score_sequence(
         return frames[warmup_windows:].to(device)
 
     counted = {
-        method: Polarization(scored(found.dolp), None if found.aolp is None else scored(found.aolp))
-        for method, found in recovered.items()
+        method: (scored(prediction.dolp), None if prediction.aolp is None else scored(prediction.aolp))
+        for method, prediction in predictions.items()
     }
-    truth, true_aolp = (x[warmup_windows:].to(device) for x in (recording.dolp, recording.aolp))
-    valid = None if recording.valid is None else scored(recording.valid)
+    truth, true_aolp = (x[warmup_windows:].to(device) for x in (sequence.dolp, sequence.aolp))
+    valid = None if sequence.valid is None else scored(sequence.valid)
     if valid is not None and not (known := valid.any(-1).any(-1)).all():
         window = warmup_windows + int(known.logical_not().nonzero()[0])
-        raise ValueError(f"{recording.name}, window {window}: no pixel is valid; leave this measurement out")
+        raise ValueError(f"{sequence.name}, window {window}: no pixel is valid; leave this measurement out")
     oracle_mse = spread_mse(truth, valid)
-    shown = {method: with_truth_outside(found.dolp, truth, valid) for method, found in counted.items()}
+    shown = {method: with_truth_outside(dolp, truth, valid) for method, (dolp, _) in counted.items()}
     distances = _lpips_of(shown, truth, lpips)
     rows = []
-    for method, (dolp, aolp, _) in counted.items():
+    for method, (dolp, aolp) in counted.items():
         per_frame: dict[str, Tensor | None] = {
             "mse": mse(dolp, truth, valid),
             "psnr": psnr(dolp, truth, valid),
@@ -160,8 +165,8 @@ def score_sequence(
         }
         for i, window in enumerate(windows):
             scores: dict[str, Any] = {name: values[i] for name, values in columns.items()}
-            t_us = int(recording.t_us[window + 1])
-            rows.append(_finite(FrameScore(method, recording.scene, recording.name, window, t_us, **scores)))
+            t_us = int(sequence.t_us[window + 1])
+            rows.append(_finite(FrameScore(method, sequence.scene, sequence.name, window, t_us, **scores)))
     return rows
 
 

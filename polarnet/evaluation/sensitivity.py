@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from polarnet.evaluation.methods import Context, recover
 from polarnet.evaluation.resimulate import resimulated
+from polarnet.evaluation.rows import Context, predictions_of
 from polarnet.evaluation.score import FrameScore, scene_means, score_sequence
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import MotionConfig
@@ -76,19 +76,17 @@ def sensitivity(
         for sequence in sequences:
             speed = value if setting == "speed" else 1.0
             try:
-                recording = resimulated(
-                    scenes, sequence, motion, sensors(setting, value, emulate), seed, speed, threads
-                )
+                test = resimulated(scenes, sequence, motion, sensors(setting, value, emulate), seed, speed, threads)
             except ValueError as error:
                 if setting != "speed":
                     raise
                 left_out.append(f"{sequence}: {error}")
                 continue
-            answers = {method: recover(method, recording, context).polarization for method in methods}
-            rows += score_sequence(recording, answers, warmup_windows, None, context.device)
-            pixels = recording.events[0].height * recording.events[0].width
-            seconds = (int(recording.t_us[-1]) - int(recording.t_us[0])) / 1e6
-            rates.append(sum(map(len, recording.events)) / (4 * pixels * seconds))
+            predictions = predictions_of(methods, test, context)
+            rows += score_sequence(test, predictions, warmup_windows, None, context.device)
+            pixels = test.events[0].height * test.events[0].width
+            seconds = (int(test.t_us[-1]) - int(test.t_us[0])) / 1e6
+            rates.append(sum(map(len, test.events)) / (4 * pixels * seconds))
         if rows:
             entry = {
                 "value": value,

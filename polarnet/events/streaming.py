@@ -1,7 +1,6 @@
 """A stream of events cut into windows as it comes: by time or by number of events, one after the other or overlapping.
 
-Whoever has events, all at once or little by little, hands them to a `WindowCutter`; a `SlidingEventTensor` keeps the
-input of a window that moves up to date.
+Whoever has events, all at once or little by little, hands them to a `WindowCutter`.
 """
 
 import re
@@ -10,8 +9,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from polarnet.events.stream import Events, concatenate, slice_count
 
@@ -24,8 +21,6 @@ class EventWindow(NamedTuple):
     channels: Sequence[Events]
     start_us: int
     stop_us: int
-    first: Sequence[int]
-    """How many events of each channel came before the window, so that consecutive windows can be told apart."""
 
     @property
     def length_us(self) -> int:
@@ -82,7 +77,6 @@ class WindowCutter:
     def __init__(self, rule: WindowRule, height: int, width: int):
         self.rule = rule
         self._held = [Events.empty(height, width) for _ in range(4)]
-        self._forgotten = [0, 0, 0, 0]
         self._next_us = rule.length_us if rule.length_us is not None else rule.step_us
         self._start_us = 0
 
@@ -139,54 +133,7 @@ class WindowCutter:
 
     def _window(self, start_us: int, stop_us: int, stops: Sequence[int]) -> EventWindow:
         channels = [slice_count(held, 0, stop) for held, stop in zip(self._held, stops, strict=True)]
-        return EventWindow(channels, start_us, stop_us, list(self._forgotten))
+        return EventWindow(channels, start_us, stop_us)
 
     def _forget(self, places: Sequence[int]) -> None:
         self._held = [slice_count(held, place, len(held)) for held, place in zip(self._held, places, strict=True)]
-        self._forgotten = [before + place for before, place in zip(self._forgotten, places, strict=True)]
-
-
-class SlidingEventTensor:
-    """The event tensor (paper Eq. 5) of one polarizer in a window that moves, updated by what comes and goes.
-
-    Two integers a pixel are kept, the sum of polarities and of polarity times time, to which an event that comes is
-    added and from which one that leaves is taken: the work of a step is in proportion to the events of the step, not
-    of the window, and as integers do not round, the tensor is that of a window cut out anew.
-    """
-
-    def __init__(self, height: int, width: int):
-        self.window = Events.empty(height, width)
-        self.first = 0
-        self._polarity = torch.zeros(height * width, dtype=torch.int64)
-        self._moment = torch.zeros(height * width, dtype=torch.int64)
-
-    def move_to(self, first: int, window: Events) -> None:
-        """Show `window`, which begins with event number `first` of the stream; neither end goes back."""
-        gone, stop = first - self.first, self.first + len(self.window)
-        if gone < 0 or first + len(window) < stop:
-            raise ValueError(
-                f"a window only goes forward: from events {self.first} to {stop}, it cannot move to "
-                f"{first} to {first + len(window)}"
-            )
-        if gone < len(self.window):
-            self._add(slice_count(self.window, 0, gone), -1)
-            self._add(slice_count(window, stop - first, len(window)), 1)
-        else:
-            self._polarity.zero_()
-            self._moment.zero_()
-            self._add(window, 1)
-        self.first, self.window = first, window
-
-    def tensor(self, window_us: int) -> Float[Tensor, "h w"]:
-        """Polarities summed per pixel, each weighted by its time since the window's first event, in window lengths."""
-        height, width = self.window.height, self.window.width
-        if len(self.window) == 0:
-            return torch.zeros(height, width)
-        weighted = (self._moment - self.window.t[0] * self._polarity).double() / window_us
-        return weighted.float().view(height, width)
-
-    def _add(self, events: Events, sign: int) -> None:
-        pixel = events.y.long() * events.width + events.x.long()
-        polarity = sign * events.p.long()
-        self._polarity.index_add_(0, pixel, polarity)
-        self._moment.index_add_(0, pixel, polarity * events.t)

@@ -5,24 +5,11 @@ everything but the recurrence itself is one large operation.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
-
-
-class Prediction(NamedTuple):
-    """What a network says about each pixel. `dolp` is not clamped; fields that a network does not predict are None."""
-
-    dolp: Float[Tensor, "*b h w"]
-    aolp: Float[Tensor, "*b h w"] | None = None
-    """Radians in [0, pi)."""
-    log_variance: Float[Tensor, "*b h w"] | None = None
-    """Logarithm of the expected squared error of DoLP."""
-    stokes: Float[Tensor, "*b 2 h w"] | None = None
-    """s1, s2 = S1 / S0, S2 / S0, of which `aolp` is the angle."""
 
 
 def contrasts(events: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b c h w"]:

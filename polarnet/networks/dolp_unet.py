@@ -8,9 +8,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.blocks import ConvGRU, Prediction, ResidualBlock, UpBlock, compressed, contrasts, conv3x3
+from polarnet.networks.blocks import ConvGRU, ResidualBlock, UpBlock, compressed, contrasts, conv3x3
 from polarnet.networks.swin import SwinStage
 from polarnet.ranges import allowed, check_ranges
+from polarnet.stokes import Prediction
 
 STRIDE = 4  # two stages that halve the size
 MIDDLE_DOLP = 0.5  # the output's bias at the start: DoLP lies in [0, 1]

@@ -13,7 +13,6 @@ from torch.nn import functional as F
 from polarnet.networks.blocks import (
     ConvGRU,
     Level,
-    Prediction,
     ResidualBlock,
     UpBlock,
     compressed,
@@ -35,6 +34,7 @@ from polarnet.networks.redundancy import (
     neighbourhoods,
 )
 from polarnet.ranges import allowed, check_ranges
+from polarnet.stokes import Prediction
 
 STRIDE = 4  # of the largest image with a recurrent layer
 IMAGES = 2  # of a polarizer's events: the sum of polarities and their number (representation `event_counts`)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from polarnet.recordings.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
 from polarnet.recordings.targets import Calibrated
-from polarnet.reports.figures import png
+from polarnet.reports.png import png
 
 COLOURS = ("#d6336c", "#e08a1e", "#3d8fd9", "#4aa37c")
 SHOWN_MS = 60.0  # around the start

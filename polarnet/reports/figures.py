@@ -1,9 +1,8 @@
 """Figures drawn with matplotlib: comparison panels, training curves, how scores spread over scenes.
 
-A figure is returned, not shown, and `png` writes it without a date or software name: same input, same bytes.
+A figure is returned, not shown; `polarnet.reports.png` writes it.
 """
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,6 @@ from cycler import cycler
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
@@ -23,10 +21,9 @@ from torch import Tensor
 
 from polarnet.reports.legend import GENERAL, Legend
 from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image
-from polarnet.reports.tables import COLUMNS, TRIVIAL, in_order
+from polarnet.reports.png import png
+from polarnet.reports.tables import COLUMNS, in_order, with_structure
 from polarnet.similarity import mse, psnr
-
-DOTS_PER_INCH = 160
 
 
 @dataclass(frozen=True)
@@ -82,15 +79,6 @@ class ReliabilityLine(NamedTuple):
     curve: Sequence[tuple[float, float, int]]
 
 
-def png(figure: Figure) -> bytes:
-    """The figure as PNG bytes that depend on nothing but what is drawn."""
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure)
-    compression = {"compress_level": 9}
-    figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None}, pil_kwargs=compression)
-    return buffer.getvalue()
-
-
 def comparison_panel(rows: Sequence[PanelScene], path: Path, legend: Legend = GENERAL, theme: Theme = LIGHT) -> None:
     """Write a picture like the paper's Fig. 10: a row a scene; events, truth and each method; MSE and PSNR below.
 
@@ -98,7 +86,7 @@ def comparison_panel(rows: Sequence[PanelScene], path: Path, legend: Legend = GE
     """
     if not rows:
         raise ValueError("a comparison panel needs at least one scene, got none")
-    methods = [method for method in in_order(rows[0].recovered) if method not in TRIVIAL]
+    methods = with_structure(rows[0].recovered)
     height, width = rows[0].truth.shape
     grid = _TileGrid(len(rows), 2 + len(methods), tile_width=1.35, aspect=height / width)
     figure = _figure(grid.size, theme)

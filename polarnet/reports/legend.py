@@ -3,72 +3,40 @@
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-from polarnet.reports.tables import METHODS, in_order
+from polarnet.evaluation.rows import ROWS
+from polarnet.methods import METHODS
+from polarnet.methods.intensities import GAIN
+from polarnet.reports.tables import LABELS, in_order
 
-GAIN = "+gain"
-NETWORK_NAMES = {
-    "polarnet": "polarnet's network",
-    "paper": "the paper's network",
-    "firenet": "FireNet",
-    "e2vid": "E2VID",
-    "e2p": "E2P",
+
+class Network(NamedTuple):
+    """A network as tables, figures and the glossary present it."""
+
+    label: str
+    colour: str
+    about: str
+
+
+POLARNET = Network(
+    "polarnet's network",
+    METHODS["ours"].colour,
+    "Polarnet's own network: event counts of the four polarizers in, DoLP, AoLP and the expected error of DoLP out. It "
+    "solves the redundancy of the four polarizers and refines the answer with a small recurrent U-Net.",
+)
+NETWORKS = {"polarnet": POLARNET} | {
+    name: Network(METHODS[name].label, METHODS[name].colour, METHODS[name].about)
+    for method in METHODS.values()
+    if method.weights is not None
+    for name in method.weights.networks
+    if name in METHODS
 }
-"""Networks by the name in a checkpoint."""
+"""Networks by the name in a checkpoint; but for polarnet's, each is presented as the method of its name is."""
 
 NAMED_BY_NETWORK = ("e2v", "paper", "ours")
 """Rows whose key does not say which network they are."""
 
-NETWORK_COLOURS = {
-    "polarnet": "#d6336c",
-    "paper": "#0ca678",
-    "firenet": "#3d8fd9",
-    "e2vid": "#2f6fb0",
-    "e2p": "#7a5cc4",
-}
-METHOD_COLOURS = {
-    "zeros": "#98a2b3",
-    "train_mean": "#98a2b3",
-    "oracle_mean": "#98a2b3",
-    "cf": "#e08a1e",
-    "highpass": "#b0851f",
-    "e2v": NETWORK_COLOURS["firenet"],
-    "e2vid": NETWORK_COLOURS["e2vid"],
-    "firenet": NETWORK_COLOURS["firenet"],
-    "e2p": NETWORK_COLOURS["e2p"],
-    "paper": NETWORK_COLOURS["paper"],
-    "ours": NETWORK_COLOURS["polarnet"],
-}
-"""Colours of rows where nothing says which network is behind them."""
-
 OTHER_COLOUR = "#4aa37c"
-
-WITHOUT_WEIGHTS = {
-    "zeros": "A constant: no polarization anywhere.",
-    "train_mean": "A constant: the mean DoLP of the training split.",
-    "oracle_mean": "Each true frame's own mean, the best constant there is. It looks at the truth, so it is no method; "
-    "what does not beat it shows little spatial skill in MSE.",
-    "cf": "The complementary filter without frames (Scheerlinck et al. 2018): intensity from events, one polarizer at "
-    "a time, then DoLP by the Stokes formula.",
-    "highpass": "The high-pass filter (Scheerlinck et al. 2018): intensity from events, one polarizer at a time, then "
-    "DoLP by the Stokes formula.",
-}
-"""What the rows without weights are."""
-
-NETWORK_ABOUT = {
-    "polarnet": "Polarnet's own network: event counts of the four polarizers in, DoLP, AoLP and the expected error of "
-    "DoLP out. It solves the redundancy of the four polarizers and refines the answer with a small recurrent U-Net.",
-    "paper": "The network of the paper (its Fig. 6), in polarnet's implementation: events of the four polarizers in, "
-    "DoLP out.",
-    "firenet": "FireNet (Scheerlinck et al. 2020), a recurrent network from events to intensity, one polarizer at a "
-    "time, then DoLP by the Stokes formula.",
-    "e2vid": "E2VID (Rebecq et al. 2019), a recurrent network from events to intensity, one polarizer at a time, then "
-    "DoLP by the Stokes formula.",
-    "e2p": "E2P (Mei et al. 2023), a published network from events to polarization.",
-}
-"""What the networks are, by the name in a checkpoint."""
-
-ROLES = {"e2v": "Events to video. ", "ours": "The DoLP network in use. "}
-"""What a row stands for, whichever network it is."""
+"""Colour of rows of older results that polarnet no longer has."""
 
 GAINS = (
     "The same intensities, each polarizer's scale solved from I0 + I90 = I45 + I135 before the Stokes formula. Nothing "
@@ -92,24 +60,29 @@ class Legend(NamedTuple):
         return self.colours.get(method.removesuffix(GAIN), OTHER_COLOUR)
 
 
-GENERAL = Legend(METHODS, METHOD_COLOURS)
+GENERAL = Legend(LABELS, {name: row.colour for name, row in ROWS.items()})
 """Where nothing says which networks are behind the rows."""
 
 
 def legend_of(weights: Mapping[str, Mapping[str, Any]]) -> Legend:
     """The legend of a benchmark from details.json's `weights`, which names the network behind each row."""
     networks = {row: file["network"] for row, file in weights.items()}
-    labels, colours = dict(METHODS), dict(METHOD_COLOURS)
-    colours |= {row: NETWORK_COLOURS[network] for row, network in networks.items() if network in NETWORK_COLOURS}
+    labels, colours = dict(GENERAL.labels), dict(GENERAL.colours)
+    colours |= {row: NETWORKS[network].colour for row, network in networks.items() if network in NETWORKS}
     for row in NAMED_BY_NETWORK:
-        name = NETWORK_NAMES.get(networks.get(row, ""))
-        if name and METHODS[row] != name:
+        network = NETWORKS.get(networks.get(row, ""))
+        if network and LABELS[row] != network.label:
             for method in (row, row + GAIN):
-                if method in METHODS:
-                    labels[method] = METHODS[method].replace(METHODS[row], f"{METHODS[row]}: {name}")
+                if method in LABELS:
+                    labels[method] = LABELS[method].replace(LABELS[row], f"{LABELS[row]}: {network.label}")
     if networks.get("paper", "paper") != "paper":
-        labels["paper"] = f"second network: {NETWORK_NAMES.get(networks['paper'], networks['paper'])}"
+        labels["paper"] = f"second network: {network_label(networks['paper'])}"
     return Legend(labels, colours)
+
+
+def network_label(network: str) -> str:
+    """The readable name of a network; one that polarnet does not know keeps the name in its checkpoint."""
+    return NETWORKS[network].label if network in NETWORKS else network
 
 
 def glossary(methods: Iterable[str], weights: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
@@ -118,7 +91,7 @@ def glossary(methods: Iterable[str], weights: Mapping[str, Mapping[str, Any]]) -
     entries = [
         (legend.label(row), _about(row, weights.get(row)))
         for row in dict.fromkeys(method.removesuffix(GAIN) for method in rows)
-        if row in WITHOUT_WEIGHTS or row in weights
+        if row in weights or (row in ROWS and ROWS[row].about and not _needs_weights(row))
     ]
     return entries + ([("gains solved", GAINS)] if any(method.endswith(GAIN) for method in rows) else [])
 
@@ -135,7 +108,15 @@ def lpips_about(lpips: Mapping[str, Any]) -> str | None:
 
 
 def _about(row: str, file: Mapping[str, Any] | None) -> str:
+    """Description of a row: its network's where it has one, after what the row itself stands for."""
+    about = ROWS[row].about if row in ROWS else ""
     if file is None:
-        return WITHOUT_WEIGHTS[row]
+        return about
+    if network := NETWORKS.get(file["network"]):
+        about = network.about if row in NETWORKS else f"{about} {network.about}".lstrip()
     origin = "trained by polarnet" if file["file"].endswith(".safetensors") else "as its authors published them"
-    return f"{ROLES.get(row, '')}{NETWORK_ABOUT[file['network']]} Weights: {file['file']}, {origin}."
+    return f"{about} Weights: {file['file']}, {origin}.".lstrip()
+
+
+def _needs_weights(row: str) -> bool:
+    return row in METHODS and METHODS[row].weights is not None

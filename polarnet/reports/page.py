@@ -6,20 +6,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, SetResults, read_artefacts
-from polarnet.reports.figures import (
-    PanelScene,
-    comparison_panel,
-    dolp_bar,
-    png,
-    training_curves,
-)
-from polarnet.reports.legend import NETWORK_NAMES, Legend, glossary, legend_of, lpips_about
+from polarnet.reports.figures import PanelScene, comparison_panel, dolp_bar, training_curves
+from polarnet.reports.legend import Legend, glossary, legend_of, lpips_about, network_label
 from polarnet.reports.maps import (
     encode_jpeg,
     encode_png,
     hue_wheel,
 )
 from polarnet.reports.overview import overview_figure
+from polarnet.reports.png import png
 from polarnet.reports.provenance import Run
 from polarnet.reports.tables import (
     COLUMNS,
@@ -131,7 +126,7 @@ def _context(artefacts: Artefacts, run: Run, overview: bytes | None, legend: Leg
         "events": [TileRow(panel.sequence, event_tiles(panel)) for panel in artefacts.panels[:MOST_EVENT_ROWS]],
         "rates": artefacts.rates,
         "training": {
-            f"{row}{NETWORK_NAMES.get(history.network, history.network)}, events to {of}": _training(history, of)
+            f"{row}{network_label(history.network)}, events to {of}": _training(history, of)
             for row, history, of in (
                 ("ours: ", artefacts.ours, "DoLP"),
                 ("E2V: ", artefacts.e2v, "intensity"),

@@ -26,7 +26,7 @@ from polarnet.reports.study_tables import (
 from polarnet.reports.tables import (
     COLUMNS,
     COSTS,
-    METHODS,
+    LABELS,
     SET_TITLES,
     as_markdown,
     paired_lines,
@@ -88,7 +88,7 @@ def benchmark_block(results: Mapping[str, Any]) -> str:
         lines += [as_markdown(score_table(results[name], {**COLUMNS, **COSTS})), ""]
         lines += [f"- {line}" for line in paired_lines(results["paired"][name])]
         gains = [
-            f"{METHODS[row]} {results[name][f'{row}+gain']['psnr'] - scores['psnr']:+.2f} dB"
+            f"{LABELS[row]} {results[name][f'{row}+gain']['psnr'] - scores['psnr']:+.2f} dB"
             for row, scores in results[name].items()
             if f"{row}+gain" in results[name]
         ]

@@ -21,7 +21,6 @@ from torch import Tensor
 from zarr.codecs import BloscCodec
 
 from polarnet.events.streaming import EventWindow
-from polarnet.networks.blocks import Prediction
 from polarnet.reports.figures import dolp_bar
 from polarnet.reports.maps import (
     dolp_image,
@@ -34,6 +33,7 @@ from polarnet.reports.maps import (
 )
 from polarnet.reports.tiles import chart, data_uri, template
 from polarnet.runtime import usable_cores
+from polarnet.stokes import Prediction
 
 VIDEO, CODEC = "recovered.mp4", "mp4v"  # MPEG-4, which players show and browsers do not
 FILM_FRAMES = 24

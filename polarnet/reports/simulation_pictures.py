@@ -20,9 +20,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from polarnet.events.stream import Events, slice_time
-from polarnet.reports.figures import LIGHT, chart_style, png, show_picture
+from polarnet.reports.figures import LIGHT, chart_style, show_picture
 from polarnet.reports.maps import event_image
 from polarnet.reports.overview import OFF, ON
+from polarnet.reports.png import png
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.motion import MotionConfig, Trajectory, random_trajectory, sensor_to_scene
 from polarnet.simulation.moving_sensor import emulate_motion

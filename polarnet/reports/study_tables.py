@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any
 
-from polarnet.evaluation.methods import GAIN, INTENSITY_METHODS
+from polarnet.methods import METHODS
 from polarnet.reports.provenance import cores, measured_with, origin
 from polarnet.reports.studies import PAPER_EVENTS_PER_PIXEL
-from polarnet.reports.tables import METHODS, SET_TITLES, in_order
+from polarnet.reports.tables import LABELS, SET_TITLES, in_order
 
 
 def seeds_of(results: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -35,11 +35,11 @@ def study_block(results: Mapping[str, Any]) -> str:
         lines += [f"**{SET_TITLES[name]}**", "", "| | " + " | ".join(label for _, label, _ in STUDY_COLUMNS) + " |"]
         lines.append("|---" + "|---:" * len(STUDY_COLUMNS) + "|")
         for row in ("oracle_mean", best_reconstruction(first["rows"][name])):
-            lines.append(_row(METHODS[row], [first["rows"][name][row]]))
+            lines.append(_row(LABELS[row], [first["rows"][name][row]]))
         for row in ("paper", "ours"):
-            lines += [_row(f"{METHODS[row]}, seed {n}", [found["rows"][name][row]]) for n, found in seeds.items()]
+            lines += [_row(f"{LABELS[row]}, seed {n}", [found["rows"][name][row]]) for n, found in seeds.items()]
             if len(seeds) > 1:
-                label = f"{METHODS[row]}, mean of {len(seeds)} seeds ± standard deviation"
+                label = f"{LABELS[row]}, mean of {len(seeds)} seeds ± standard deviation"
                 lines.append(_row(label, [found["rows"][name][row] for found in seeds.values()]))
         if "shipped" in results:
             lines.append(_row("ours, shipped weights", [results["shipped"]["rows"][name]["ours"]]))
@@ -95,7 +95,7 @@ def headline_block(results: Mapping[str, Any]) -> str:
         row: [value for found in seeds if (value := found["minutes_trained"].get(row)) is not None]
         for row in ("ours", "paper")
     }
-    taken = ", ".join(f"{METHODS[row]} {fmean(values):.0f}" for row, values in minutes.items() if values)
+    taken = ", ".join(f"{LABELS[row]} {fmean(values):.0f}" for row, values in minutes.items() if values)
     lines += ["", f"Means of {len(seeds)} training(s); minutes that one took: {taken}."]
     if speed := results.get("throughput"):
         windows, record = results["ours"]["infer_windows_per_s"], results["records"]["throughput"]
@@ -136,7 +136,7 @@ def _row(label: str, scores: Sequence[Mapping[str, float | None]]) -> str:
 
 def best_reconstruction(rows: Mapping[str, Mapping[str, Any]]) -> str:
     """The intensity reconstruction with the smallest MSE."""
-    intensity = [row for row in rows if row.removesuffix(GAIN) in INTENSITY_METHODS]
+    intensity = [row for row in rows if row in METHODS and METHODS[row].reconstructs]
     return min(intensity, key=lambda row: rows[row]["mse"])
 
 
@@ -249,7 +249,7 @@ def event_budget_block(results: Mapping[str, Any]) -> str:
     rows = budget["since_start"]
     methods = in_order(rows)
     lines = [
-        "| events per pixel | scenes | " + " | ".join(f"{METHODS[m]}: PSNR | corr." for m in methods) + " |",
+        "| events per pixel | scenes | " + " | ".join(f"{LABELS[m]}: PSNR | corr." for m in methods) + " |",
         "|---" + "|---:" * (1 + 2 * len(methods)) + "|",
     ]
     for entries in zip(*(rows[method] for method in methods), strict=True):

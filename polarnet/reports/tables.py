@@ -5,6 +5,9 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
+from polarnet.evaluation.references import REFERENCES
+from polarnet.evaluation.rows import ROWS
+
 Scores = Mapping[str, Mapping[str, Any]]
 """Method, then metric: data/benchmark/metrics.json. None where there is no value; `<metric>_ci` holds an interval."""
 
@@ -56,37 +59,11 @@ COSTS = {
 }
 """What a method costs on the machine of the run."""
 
-METHODS = {
-    "zeros": "zeros",
-    "train_mean": "training mean",
-    "oracle_mean": "oracle mean",
-    "cf": "CF",
-    "highpass": "high-pass",
-    "cf+gain": "CF, gains solved",
-    "highpass+gain": "high-pass, gains solved",
-    "e2v": "E2V",
-    "e2v+gain": "E2V, gains solved",
-    "e2vid": "E2VID",
-    "e2vid+gain": "E2VID, gains solved",
-    "e2vid_published": "E2VID, published weights",
-    "e2vid_published+gain": "E2VID, published weights, gains solved",
-    "firenet": "FireNet",
-    "firenet+gain": "FireNet, gains solved",
-    "firenet_published": "FireNet, published weights",
-    "firenet_published+gain": "FireNet, published weights, gains solved",
-    "firenetplus_published": "FireNet+, published weights",
-    "firenetplus_published+gain": "FireNet+, published weights, gains solved",
-    "e2p": "E2P",
-    "paper": "the paper's network",
-    "ours": "ours",
-}
-"""Readable names, in the order of every table: first what needs no events, then the peers, then the network."""
+LABELS: Mapping[str, str] = MappingProxyType({name: row.label for name, row in ROWS.items()})
+"""Names of the rows where nothing says which networks are behind them, in the order of every table."""
 
 BACKBONES = {"squeeze": "SqueezeNet 1.1", "alex": "AlexNet", "vgg": "VGG16, like the paper's"}
 """Readable names of those of LPIPS."""
-
-TRIVIAL = ("zeros", "train_mean", "oracle_mean")
-"""Methods whose answer is one value everywhere."""
 
 SET_TITLES = {
     "simulated": "Simulated",
@@ -97,7 +74,7 @@ SET_TITLES = {
 """Test sets, in the order of every page."""
 
 PAPER_SOURCE = "Yan et al., Photonics 2024, 11(5), 481, Table 2"
-PAPER_LABELS = METHODS | {"e2v": "E2V, default parameters", "cf": "CF, default parameters"}
+PAPER_LABELS = {**LABELS, "e2v": "E2V, default parameters", "cf": "CF, default parameters"}
 PAPER_TABLE_2: Mapping[str, Scores] = {
     "simulated": {
         "cf": {"mse": 0.1371, "psnr": 10.60, "ssim": 0.1667, "lpips": 0.5890},
@@ -150,16 +127,21 @@ class Table(NamedTuple):
     notes: tuple[str, ...]
 
 
-def in_order(methods: Iterable[str]) -> list[str]:
-    """Methods in the order of every table and figure; those that METHODS does not name come last."""
-    given = list(methods)
-    return [m for m in METHODS if m in given] + [m for m in given if m not in METHODS]
+def in_order(rows: Iterable[str]) -> list[str]:
+    """Rows in the order of every table and figure; unknown ones, of older results, come last."""
+    given = list(rows)
+    return [name for name in ROWS if name in given] + [name for name in given if name not in ROWS]
+
+
+def with_structure(rows: Iterable[str]) -> list[str]:
+    """Rows in order, without the references, whose prediction is one value everywhere."""
+    return [name for name in in_order(rows) if name not in REFERENCES]
 
 
 def score_table(
     scores: Scores,
     columns: Mapping[str, Column] = MappingProxyType(COLUMNS),
-    labels: Mapping[str, str] = MappingProxyType(METHODS),
+    labels: Mapping[str, str] = LABELS,
 ) -> Table:
     """Scores of the methods in the fixed order; a metric that no method has gets no column.
 
@@ -220,7 +202,7 @@ def as_plain(table: Table) -> str:
     return "\n".join([*(line.rstrip() for line in lines), *table.notes])
 
 
-def standing(scores: Scores, labels: Mapping[str, str] = MappingProxyType(METHODS)) -> list[str]:
+def standing(scores: Scores, labels: Mapping[str, str] = LABELS) -> list[str]:
     """How `ours` compares with every other method: one sentence each, with the differences; none without `ours`."""
     if "ours" not in scores:
         return []
@@ -234,7 +216,7 @@ def standing(scores: Scores, labels: Mapping[str, str] = MappingProxyType(METHOD
 def paired_lines(
     paired: Mapping[str, Mapping[str, Mapping[str, Any]]],
     metric: str = "mse",
-    labels: Mapping[str, str] = MappingProxyType(METHODS),
+    labels: Mapping[str, str] = LABELS,
 ) -> list[str]:
     """How `ours` does scene by scene against each other method, from details.json's `paired`; a sentence each."""
     return [

@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
 
 from polarnet.reports.artefacts import Panel
-from polarnet.reports.figures import DARK, LIGHT, Theme, png, reliability_figure, score_distribution, score_line
+from polarnet.reports.figures import DARK, LIGHT, Theme, reliability_figure, score_distribution, score_line
 from polarnet.reports.legend import Legend
 from polarnet.reports.maps import (
     dolp_image,
@@ -21,7 +21,8 @@ from polarnet.reports.maps import (
     intensity_image,
     polarization_hsv,
 )
-from polarnet.reports.tables import TRIVIAL, in_order
+from polarnet.reports.png import png
+from polarnet.reports.tables import in_order, with_structure
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 DISTRIBUTION_METRICS = ("mse", "psnr", "ssim", "corr")
@@ -59,7 +60,7 @@ def panel_tiles(panel: Panel, legend: Legend) -> list[Tile]:
         tile(event_image(panel.events[0], full_scale), "events, 0°", f"{panel.t_us / 1000:.0f} ms"),
         tile(dolp_image(panel.truth_dolp), "truth"),
     ]
-    methods = [method for method in in_order(panel.dolp) if method not in TRIVIAL]
+    methods = with_structure(panel.dolp)
     return tiles + [
         tile(
             dolp_image(panel.dolp[method]),

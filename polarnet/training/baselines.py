@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 USERS: Mapping[str, tuple[str, ...]] = {"e2v": ("e2v", "firenet", "e2vid"), "e2p": ("e2p",)}
 """A section of `baselines` that is a training: the rows of the benchmark that use its weights."""
@@ -11,13 +12,14 @@ USERS: Mapping[str, tuple[str, ...]] = {"e2v": ("e2v", "firenet", "e2vid"), "e2p
 NOT_TRAINED = "not_trained.json"
 
 
-def is_used(baseline: str, methods: Sequence[str], files: Mapping[str, str | None]) -> bool:
-    """Whether one of `methods`, with or without solved gains, uses the weights that the training of `baseline` leaves.
+def is_used(baseline: str, rows: Sequence[str], methods: Any) -> bool:
+    """Whether one of `rows`, with or without solved gains, uses the weights that the training of `baseline` leaves.
 
-    A row whose weights are a file of their own (`baselines.weights`, here by row) does not.
+    A row whose weights are a file of their own does not: `methods.ROW.weights`, `methods` being that section of the
+    configuration.
     """
-    rows = {method.removesuffix("+gain") for method in methods}
-    return any(row in rows and files[row] is None for row in USERS[baseline])
+    used = {row.removesuffix("+gain") for row in rows}
+    return any(row in used and getattr(methods, row).weights is None for row in USERS[baseline])
 
 
 def leave_untrained(baseline: str, folder: Path) -> str:

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from polarnet.baselines.e2p import BRANCHES, E2p, coded_aolp, interleaved
 from polarnet.events.representations import voxel_grid
 from polarnet.events.stream import Events
+from polarnet.networks.e2p import BRANCHES, E2p, coded_aolp, interleaved
 from polarnet.ranges import allowed
 from polarnet.similarity import Lpips
 from polarnet.training.loop import LoopConfig

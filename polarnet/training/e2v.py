@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
-from polarnet.baselines.e2vid import E2vid
-from polarnet.baselines.firenet import FireNet
 from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.stream import Events
+from polarnet.networks.e2vid import E2vid
+from polarnet.networks.firenet import FireNet
 from polarnet.ranges import allowed
 from polarnet.similarity import Lpips
 from polarnet.training.loop import LoopConfig

@@ -30,13 +30,15 @@ from typing import Any
 import torch
 from skimage import data
 
-from polarnet.benchmarking import context_of
+from polarnet.benchmarking import setup_of
 from polarnet.config import Config, load
-from polarnet.evaluation.recoverer import Recoverer, Stream, stream_of
 from polarnet.events.representations import REPRESENTATIONS, channels_of
 from polarnet.events.stream import Events
 from polarnet.events.streaming import WindowRule
 from polarnet.measure import machine_record, uncommitted
+from polarnet.methods import METHODS
+from polarnet.methods.dolp_network import dolp_recoverer
+from polarnet.methods.method import Recoverer
 from polarnet.networks.checkpoint import load_network
 from polarnet.networks.registry import NETWORKS
 from polarnet.recordings.arrangements import write_store
@@ -67,7 +69,7 @@ def stream_of_events(config: Config, seconds: float) -> list[Events]:
     return [replace(e, **{c: getattr(e, c)[e.t < seconds * 1e6] for c in "txyp"}) for e in stretched]
 
 
-def network_of(config: Config, weights: Path | None, precision: str) -> tuple[Stream, str]:
+def network_of(config: Config, weights: Path | None, precision: str) -> tuple[Recoverer, str]:
     """The network to measure, and what it is."""
     try:
         weights = weights or shipped_weights()
@@ -76,16 +78,15 @@ def network_of(config: Config, weights: Path | None, precision: str) -> tuple[St
         representation = config.train.representation or build.representation
         torch.manual_seed(config.seed)
         module = build(config.network_config, 4 * channels_of(REPRESENTATIONS[representation]))
-        return Recoverer((module, {"representation": representation}), CPU, precision), config.network + UNTRAINED
+        return dolp_recoverer(module, {"representation": representation}, CPU, precision), config.network + UNTRAINED
     network, metadata = load_network(weights)
-    return Recoverer((network, metadata), CPU, precision), metadata["network"]
+    return dolp_recoverer(network, metadata, CPU, precision), metadata["network"]
 
 
-def latency_ms(channels: Sequence[Events], stream: Stream) -> float:
+def latency_ms(channels: Sequence[Events], recoverer: Recoverer) -> float:
     """The median of a step when windows come one by one."""
-    stream.reset()
     source = Input("stream", channels[0].height, channels[0].width, [piece_of(channels)], None)
-    return 1000 * statistics.median(frame.step_s for frame in frames_of(source, WINDOWS, stream, pixels_at_once=1))
+    return 1000 * statistics.median(frame.step_s for frame in frames_of(source, WINDOWS, recoverer, pixels_at_once=1))
 
 
 def piece_of(channels: Sequence[Events]) -> Piece:
@@ -93,24 +94,24 @@ def piece_of(channels: Sequence[Events]) -> Piece:
     return Piece(channels, max(int(events.t[-1]) for events in channels) + 1, time.perf_counter())
 
 
-def measured(channels: Sequence[Events], stream: Stream, out: Path) -> tuple[Summary, Path]:
+def measured(channels: Sequence[Events], recoverer: Recoverer, out: Path) -> tuple[Summary, Path]:
     """A run of the command's own loop over events in memory, and the pictures it left."""
     piece = piece_of(channels)
     source = Input("stream", channels[0].height, channels[0].width, [piece], piece.until_us)
     writer = RecoveryWriter(out, WRITTEN, 30.0)
-    summary = recover(source, WINDOWS, stream, writer)
+    summary = recover(source, WINDOWS, recoverer, writer)
     writer.write_page("stream", {}, [])
     return summary, out / "recovered.png"
 
 
-def measured_live(store: Path, stream: Stream, out: Path) -> Summary:
+def measured_live(store: Path, recoverer: Recoverer, out: Path) -> Summary:
     """The same, as lines come through a pipe from another process at their own pace."""
     command = [sys.executable, "-m", "polarnet.cli", "replay", str(store), "stream"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as camera:
         assert camera.stdout is not None
         lines = LiveLines(camera.stdout, "pipe", None, idle_s=0.0)
         source = Input("pipe", lines.height, lines.width, lines, None)
-        return recover(source, WINDOWS, stream, RecoveryWriter(out, ("zarr", "mp4"), 30.0))
+        return recover(source, WINDOWS, recoverer, RecoveryWriter(out, ("zarr", "mp4"), 30.0))
 
 
 def figures_of(summary: Summary, step_ms: float) -> dict[str, float]:
@@ -135,23 +136,24 @@ def main() -> None:
     channels = stream_of_events(config, arguments.seconds)
     precision = precision_on(CPU, arguments.precision)
     network, name = network_of(config, arguments.weights, precision)
-    context = replace(context_of(config, 0.0), device=CPU)
+    recoverers = {"network": network}
+    for name_of_filter in FILTERS:
+        method = METHODS[name_of_filter]
+        recoverers[name_of_filter] = method.open(replace(setup_of(config, method), device=CPU))
     count = sum(map(len, channels))
     figures |= {"network": name, "precision": precision, "events": count, "seconds": arguments.seconds, "methods": {}}
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         pictures = {}
-        for method in ("network", *FILTERS):
-            stream = network if method == "network" else stream_of(method, context)
-            summary, pictures[method] = measured(channels, stream, folder / method)
-            figures["methods"][method] = figures_of(summary, latency_ms(channels, stream))
-            print(method, asdict(summary), flush=True)
+        for key, recoverer in recoverers.items():
+            summary, pictures[key] = measured(channels, recoverer, folder / key)
+            figures["methods"][key] = figures_of(summary, latency_ms(channels, recoverer))
+            print(key, asdict(summary), flush=True)
         write_store(folder / "events.zarr", {"stream": channels})
-        for method, stream in (("network", network), ("highpass", stream_of("highpass", context))):
-            stream.reset()
-            summary = measured_live(folder / "events.zarr", stream, folder / f"{method}_live")
-            figures["methods"][method]["live_latency_ms"] = round(summary.latency_ms or 0.0, 1)
-            print(f"{method}, live", asdict(summary), flush=True)
+        for key in ("network", "highpass"):
+            summary = measured_live(folder / "events.zarr", recoverers[key], folder / f"{key}_live")
+            figures["methods"][key]["live_latency_ms"] = round(summary.latency_ms or 0.0, 1)
+            print(f"{key}, live", asdict(summary), flush=True)
         if arguments.picture:
             shutil.copy(pictures["highpass" if name.endswith(UNTRAINED) else "network"], arguments.picture)
     figures |= figures["methods"]["network"]

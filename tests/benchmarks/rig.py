@@ -29,7 +29,7 @@ from skimage import data
 from polarnet.benchmarking import context_of, made_set
 from polarnet.config import Config, load
 from polarnet.evaluation.benchmark import run_benchmark
-from polarnet.evaluation.methods import available
+from polarnet.evaluation.rows import available
 from polarnet.evaluation.score import summary
 from polarnet.events.exchange import write_hdf5
 from polarnet.events.frames import FrameStore
@@ -126,11 +126,8 @@ def clock_zero_us(truth: RigTruth, found: Calibrated) -> float:
 
 def benchmarked(folder: Path, names: list[str], config: Config) -> dict[str, dict[str, Any]]:
     """The benchmark's scores over all targets, each in a store of its own, printed as a table."""
-    context = context_of(config, train_mean=0.0)
-    wanted = [
-        method for method in config.benchmark.methods if method != "train_mean"
-    ]  # there is no training split here
-    methods, absent = available(wanted, context)
+    context = context_of(config, train_mean=None)
+    methods, absent = available(config.benchmark.methods, context)
     benchmark = replace(config.benchmark, methods=methods, panel_scenes=0)
     rows, costs = [], {}
     for name in names:

@@ -25,7 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.measure import ABLATION_KEYS, machine_record, measure_benchmark, read_results, uncommitted, write_section
-from polarnet.reports.figures import LIGHT, png
+from polarnet.reports.figures import LIGHT
+from polarnet.reports.png import png
 from polarnet.reports.studies import expected_errors_figure
 from polarnet.reports.study_tables import best_reconstruction, over_seeds, seeds_of
 
@@ -141,9 +142,9 @@ def main() -> None:
     best = {row: folder / "best.safetensors" for row, folder in folders.items()}
     if arguments.ours:
         best["ours"] = stand_in(arguments)
-    weights = [f"baselines.weights.{row}={file}" for row, file in best.items() if row != "ours"]
+    weights = [f"methods.{row}.weights={file}" for row, file in best.items() if row != "ours"]
     if arguments.firenet:
-        weights.append(f"baselines.weights.firenet_published={arguments.firenet}")
+        weights.append(f"methods.firenet_published.weights={arguments.firenet}")
     scored = [row for row in METHODS if row.removesuffix("+gain") not in set(TRAININGS) - set(arguments.rows)]
     methods = f"benchmark.methods=[{','.join(scored)}]"
     paths = (f"paths.train={best['ours'].parent}", f"paths.benchmark={results}")

@@ -35,10 +35,10 @@ from torch.utils.flop_counter import FlopCounterMode
 from polarnet.config import load
 from polarnet.events.representations import REPRESENTATIONS, channels_of
 from polarnet.measure import machine_record, uncommitted, write_section
-from polarnet.networks.blocks import Prediction
 from polarnet.networks.registry import NETWORKS
 from polarnet.recover import PIXELS_AT_ONCE
 from polarnet.runtime import configure, device_of, limit_threads, precision_on, usable_cores
+from polarnet.stokes import Prediction
 from polarnet.training.loop import autocast
 
 ROOT = Path(__file__).resolve().parents[2]

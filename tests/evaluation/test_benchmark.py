@@ -9,36 +9,17 @@ import torch
 
 from polarnet.cluster import pmap
 from polarnet.evaluation.benchmark import BenchmarkSet, run_benchmark, train_mean_dolp, write_benchmark
-from polarnet.evaluation.methods import METHODS, Polarization, recover
+from polarnet.evaluation.references import REFERENCES, Reference
+from polarnet.evaluation.rows import ROWS, predictions_of
 from polarnet.evaluation.score import BenchmarkConfig
 from polarnet.events.frames import FrameStore
-from polarnet.events.store import EventStore
 from polarnet.similarity import Lpips
-from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
-
-SCENES = {"t1": "photo", "a1": "lake", "a2": "lake", "b1": "wood", "c1": "town"}
-
-
-@pytest.fixture
-def five_scenes(make_recording, tmp_path):
-    splits = {name: "train" if name.startswith("t") else "test" for name in SCENES}
-    frames = FrameStore.create(tmp_path / "frames.zarr", list(SCENES), splits, 5, 18, 20, {"scenes": SCENES})
-    events = EventStore.create(tmp_path / "events.zarr", list(SCENES), 18, 20, {})
-    for seed, name in enumerate(SCENES):
-        made = make_recording(name, seed=seed)
-        dolp, aolp, s0 = (torch.cat([x[:1], x]) for x in (made.dolp, made.aolp, made.s0))
-        frames.write(name, made.t_us, intensities_from_stokes(stokes_from_polarization(s0, dolp, aolp)), dolp, aolp)
-        events.write(name, made.events, 4000)
-    for store in (frames, events):
-        store.finish()
-    return BenchmarkSet(
-        "simulated", EventStore.open(tmp_path / "events.zarr"), FrameStore.open(tmp_path / "frames.zarr")
-    )
+from polarnet.stokes import Prediction
 
 
 def config(**changes):
     values = {
-        "methods": list(METHODS),
+        "methods": list(ROWS),
         "sets": ["simulated"],
         "warmup_windows": 1,
         "precision": "fp32",
@@ -49,17 +30,17 @@ def config(**changes):
     return BenchmarkConfig(**{**values, "panel_scenes": 2, **changes})
 
 
-def test_a_recording_is_a_test_sequence_with_the_truth_at_the_end_of_each_window(five_scenes, make_recording):
-    recordings = list(five_scenes.recordings())
-    assert [(r.name, r.scene) for r in recordings] == [("a1", "lake"), ("a2", "lake"), ("b1", "wood"), ("c1", "town")]
-    made = make_recording("a1", seed=1)
-    torch.testing.assert_close(recordings[0].dolp, made.dolp, atol=1e-5, rtol=0)
-    torch.testing.assert_close(recordings[0].s0, made.s0, atol=2e-5, rtol=0)
-    assert torch.equal(recordings[0].events[3].t, made.events[3].t)
+def test_a_test_sequence_has_the_truth_at_the_end_of_each_window(five_scenes, make_sequence):
+    sequences = [five_scenes.sequence(name) for name in five_scenes.sequences]
+    assert [(r.name, r.scene) for r in sequences] == [("a1", "lake"), ("a2", "lake"), ("b1", "wood"), ("c1", "town")]
+    made = make_sequence("a1", seed=1)
+    torch.testing.assert_close(sequences[0].dolp, made.dolp, atol=1e-5, rtol=0)
+    torch.testing.assert_close(sequences[0].s0, made.s0, atol=2e-5, rtol=0)
+    assert torch.equal(sequences[0].events[3].t, made.events[3].t)
 
 
-def test_the_training_mean_counts_training_frames_after_the_warm_up(five_scenes, make_recording):
-    expected = make_recording("t1", seed=0).dolp[1:].mean().item()
+def test_the_training_mean_counts_training_frames_after_the_warm_up(five_scenes, make_sequence):
+    expected = make_sequence("t1", seed=0).dolp[1:].mean().item()
     assert train_mean_dolp(five_scenes.frames, 1) == pytest.approx(expected, abs=1e-5)
 
 
@@ -69,7 +50,7 @@ def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
     returned = write_benchmark(folder, benchmark, config(), 1, {"lpips": {"backbone": None}, "train_mean": 0.25})
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics == returned
-    assert list(metrics) == list(METHODS)
+    assert list(metrics) == list(ROWS)
     for scores in metrics.values():
         assert scores["ms_per_window"] > 0
         assert scores["lpips"] is None
@@ -84,35 +65,35 @@ def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
     assert metrics["cf"]["gflop"] is None
     assert metrics["zeros"]["corr"] == metrics["oracle_mean"]["corr"] == 0
     assert metrics["oracle_mean"]["mse"] < min(metrics["zeros"]["mse"], metrics["train_mean"]["mse"])
-    assert len((folder / "frames.csv").read_text().splitlines()) == 1 + len(METHODS) * 4 * 3
+    assert len((folder / "frames.csv").read_text().splitlines()) == 1 + len(ROWS) * 4 * 3
     details = json.loads((folder / "details.json").read_text())
     assert details["lpips"] == {"backbone": None}
     assert details["scenes"] == ["lake", "town", "wood"]
     assert details["frames"] == 12
     assert "lpips" not in details["scene_means"]
     assert details["paired"]["cf"]["mse"]["scenes"] == 3
-    assert set(details["paired"]) == set(METHODS) - {"ours"}
+    assert set(details["paired"]) == set(ROWS) - {"ours"}
     assert set(details["scene_means"]["ssim"]["cf"]) == {"lake", "town", "wood"}
 
 
 def test_expected_errors_are_held_against_measured_ones_in_the_scored_windows(
     five_scenes, context, tmp_path, monkeypatch
 ):
-    def sure(recording, context):
+    def sure(sequence, train_mean):
         """Off by 0.1 everywhere and knows it, but in the warm-up."""
-        log_variance = torch.full_like(recording.dolp, math.log(0.01))
+        log_variance = torch.full_like(sequence.dolp, math.log(0.01))
         log_variance[0] = 0.0
-        off = torch.where(recording.dolp < 0.5, 0.1, -0.1)
-        return Polarization(recording.dolp + off, None, log_variance)
+        off = torch.where(sequence.dolp < 0.5, 0.1, -0.1)
+        return Prediction(sequence.dolp + off, None, log_variance)
 
-    monkeypatch.setitem(METHODS, "highpass", sure)
+    monkeypatch.setitem(REFERENCES, "train_mean", Reference("train_mean", "sure", "#000000", "Knows its error.", sure))
     for _ in range(2):  # made, and from the cache
-        found = run_benchmark(five_scenes, context, config(methods=["zeros", "highpass"]), None, tmp_path / "cache")
-        assert set(found.reliability) == {"highpass"}
-        assert found.reliability["highpass"].pixels.sum() == 4 * 3 * 18 * 20
-        assert found.reliability["highpass"].log_error() < 0.01
-    write_benchmark(tmp_path / "out", found, config(methods=["zeros", "highpass"]), 1, {})
-    written = json.loads((tmp_path / "out" / "details.json").read_text())["reliability"]["highpass"]
+        found = run_benchmark(five_scenes, context, config(methods=["zeros", "train_mean"]), None, tmp_path / "cache")
+        assert set(found.reliability) == {"train_mean"}
+        assert found.reliability["train_mean"].pixels.sum() == 4 * 3 * 18 * 20
+        assert found.reliability["train_mean"].log_error() < 0.01
+    write_benchmark(tmp_path / "out", found, config(methods=["zeros", "train_mean"]), 1, {})
+    written = json.loads((tmp_path / "out" / "details.json").read_text())["reliability"]["train_mean"]
     ((predicted, measured, pixels),) = written["curve"]
     assert (predicted, measured, pixels) == (pytest.approx(0.01, rel=0.01), pytest.approx(0.01, rel=0.01), 4320)
 
@@ -160,11 +141,11 @@ def ran(monkeypatch):
     """The methods that ran on whole sequences, with the sequence, in order."""
     ran = []
 
-    def noting(method, recording, context):
-        ran.append((method, recording.name))
-        return recover(method, recording, context)
+    def noting(rows, sequence, context):
+        ran.extend((row, sequence.name) for row in rows)
+        return predictions_of(rows, sequence, context)
 
-    monkeypatch.setattr("polarnet.evaluation.benchmark.recover", noting)
+    monkeypatch.setattr("polarnet.evaluation.benchmark.predictions_of", noting)
     return ran
 
 
@@ -181,11 +162,12 @@ def test_a_second_run_recovers_nothing_and_a_new_method_recovers_itself_alone(fi
     assert [row for row in more.rows if row.method != "highpass"] == list(first.rows)
 
 
-def test_a_changed_parameter_recovers_the_methods_that_use_it(five_scenes, context, tmp_path, ran):
+def test_a_changed_parameter_recovers_the_methods_that_use_it(five_scenes, context, make_context, tmp_path, ran):
     chosen = config(methods=["zeros", "cf", "highpass"])
     run_benchmark(five_scenes, context, chosen, None, tmp_path / "cache")
     ran.clear()
-    other = dataclasses.replace(context, cf=dataclasses.replace(context.cf, cutoff_hz=1.0))
+    slower = dataclasses.replace(context.setups["cf"].config, cutoff_hz=1.0)
+    other = make_context(cf={"config": slower})
     run_benchmark(five_scenes, other, chosen, None, tmp_path / "cache")
     assert {method for method, _ in ran} == {"cf"}
 

@@ -9,32 +9,32 @@ from polarnet.evaluation.event_budget import (
     since_start,
     sliding_recovery,
 )
-from polarnet.evaluation.resimulate import recording_at
+from polarnet.evaluation.resimulate import sequence_at
 from polarnet.events.store import EventStore
 from polarnet.simulation.scenes import SceneStore
 
 
-def test_events_per_pixel_is_the_mean_over_channels_before_each_time(recording):
-    t_us = recording.t_us
-    found = events_per_pixel(recording.events, t_us)
+def test_events_per_pixel_is_the_mean_over_channels_before_each_time(sequence):
+    t_us = sequence.t_us
+    found = events_per_pixel(sequence.events, t_us)
     assert found[-1].item() == pytest.approx(300 / (18 * 20))
-    half = sum(int((e.t < 2000).sum()) for e in recording.events) / (4 * 18 * 20)
+    half = sum(int((e.t < 2000).sum()) for e in sequence.events) / (4 * 18 * 20)
     assert found[2].item() == pytest.approx(half)
 
 
-def test_frames_of_overlapping_windows_stand_alone_unless_the_state_is_carried(recording, context):
+def test_frames_of_overlapping_windows_stand_alone_unless_the_state_is_carried(sequence, context):
     times = list(range(2000, 2400, 100))
-    alone = sliding_recovery(recording, 50, times, False, context)
+    alone = sliding_recovery(sequence, 50, times, False, "ours", context)
     assert alone.shape == (4, 18, 20)
-    torch.testing.assert_close(alone[-1], sliding_recovery(recording, 50, times[-1:], False, context)[0])
-    carried = sliding_recovery(recording, 50, times, True, context)
+    torch.testing.assert_close(alone[-1], sliding_recovery(sequence, 50, times[-1:], False, "ours", context)[0])
+    carried = sliding_recovery(sequence, 50, times, True, "ours", context)
     torch.testing.assert_close(carried[0], alone[0])
     assert not torch.equal(carried[-1], alone[-1])
 
 
-def test_every_frame_falls_into_one_bin_of_events_per_pixel(make_recording, context):
-    recordings = [make_recording(name, seed=k) for k, name in enumerate("ab")]
-    table = since_start(recordings, ["zeros", "oracle_mean"], context)
+def test_every_frame_falls_into_one_bin_of_events_per_pixel(make_sequence, context):
+    sequences = [make_sequence(name, seed=k) for k, name in enumerate("ab")]
+    table = since_start(sequences, ["zeros", "oracle_mean"], context)
     assert sum(entry["frames"] for entry in table["zeros"]) == 2 * 4
     for entry in table["zeros"]:
         assert entry["from"] <= entry["events_per_pixel"] <= entry["to"]
@@ -62,7 +62,7 @@ def test_windows_twice_as_long_are_half_as_many_with_twice_the_events(scenes_and
 def test_the_truth_is_that_of_each_windows_own_end(scenes_and_events, context):
     scenes, events = scenes_and_events
     (entry,) = by_window_length(scenes, events, ["a-0"], [50_000], 100_000, ["zeros"], context)["zeros"]
-    ends = recording_at(scenes, "a-0", events.read("a-0"), torch.tensor([100_000, 150_000, 200_000]))
+    ends = sequence_at(scenes, "a-0", events.read("a-0"), torch.tensor([100_000, 150_000, 200_000]))
     assert entry["frames"] == 2  # the windows that end after the first 100 ms
     assert entry["mse"] == pytest.approx(float(ends.dolp.square().mean()), rel=1e-5)
 
@@ -75,7 +75,7 @@ def test_a_window_length_that_leaves_no_window_is_refused(scenes_and_events, con
 
 def test_overlapping_windows_of_more_events_reach_further_back_and_meet_the_same_truth(scenes_and_events, context):
     scenes, events = scenes_and_events
-    table = by_sliding_window(scenes, events, ["a-0"], (150_000, 152_000), 1_000, context)
+    table = by_sliding_window(scenes, events, ["a-0"], (150_000, 152_000), 1_000, "ours", context)
     assert [(e["events_per_pixel"], e["carry"]) for e in table] == [
         (size, carry) for size in EVENTS_PER_PIXEL for carry in (False, True)
     ]
@@ -84,16 +84,16 @@ def test_overlapping_windows_of_more_events_reach_further_back_and_meet_the_same
     lengths = [e["window_ms"] for e in alone]
     assert lengths == sorted(lengths)
     assert lengths[0] < lengths[-1]
-    truth = recording_at(scenes, "a-0", events.read("a-0"), torch.tensor([149_000, 150_000, 151_000, 152_000])).dolp
+    truth = sequence_at(scenes, "a-0", events.read("a-0"), torch.tensor([149_000, 150_000, 151_000, 152_000])).dolp
     expected = pytest.approx(float(truth.diff(dim=0).abs().mean()), rel=1e-5)
     assert all(e["true_change"] == expected for e in table)
 
 
 def test_overlapping_windows_are_scored_as_they_are_recovered(scenes_and_events, context):
     scenes, events = scenes_and_events
-    entry = by_sliding_window(scenes, events, ["b-0"], (150_000, 152_000), 1_000, context)[0]
+    entry = by_sliding_window(scenes, events, ["b-0"], (150_000, 152_000), 1_000, "ours", context)[0]
     times = [150_000, 151_000, 152_000]
-    recording = recording_at(scenes, "b-0", events.read("b-0"), torch.tensor([149_000, *times]))
-    frames = sliding_recovery(recording, round(0.25 * 18 * 24), times, False, context)
-    assert entry["mse"] == pytest.approx(float((frames - recording.dolp).square().mean()), rel=1e-5)
+    sequence = sequence_at(scenes, "b-0", events.read("b-0"), torch.tensor([149_000, *times]))
+    frames = sliding_recovery(sequence, round(0.25 * 18 * 24), times, False, "ours", context)
+    assert entry["mse"] == pytest.approx(float((frames - sequence.dolp).square().mean()), rel=1e-5)
     assert entry["change"] == pytest.approx(float(frames.diff(dim=0).abs().mean()), rel=1e-5)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from polarnet.config import load
-from polarnet.evaluation.resimulate import recording_at, resimulated
+from polarnet.evaluation.resimulate import resimulated, sequence_at
 from polarnet.evaluation.sensitivity import CHANNEL_SIGNS, SETTINGS, sensitivity, sensors
 from polarnet.events.frames import FrameStore
 from polarnet.events.store import EventStore
@@ -57,9 +57,9 @@ def test_the_same_sensor_and_speed_give_the_stored_sequence_again(stores, config
 def test_truth_at_any_time_lies_between_that_of_the_frames(stores):
     scenes, frames, events = stores
     t_us = frames.t_us("leaf-00")
-    found = recording_at(scenes, "leaf-00", events.read("leaf-00"), t_us)
+    found = sequence_at(scenes, "leaf-00", events.read("leaf-00"), t_us)
     torch.testing.assert_close(found.dolp, frames.dolp("leaf-00")[1:], atol=1e-5, rtol=0)
-    finer = recording_at(scenes, "leaf-00", events.read("leaf-00"), torch.arange(0, int(t_us[-1]) + 1, 5000))
+    finer = sequence_at(scenes, "leaf-00", events.read("leaf-00"), torch.arange(0, int(t_us[-1]) + 1, 5000))
     assert len(finer.dolp) == int(t_us[-1]) // 5000
 
 

@@ -3,9 +3,9 @@ import itertools
 import pytest
 import torch
 
-from polarnet.events.representations import event_tensor
-from polarnet.events.stream import Events, slice_count, slice_time
-from polarnet.events.streaming import SlidingEventTensor, WindowCutter, WindowRule, parse_window
+from polarnet.events.stream import Events, slice_time
+from polarnet.events.streaming import WindowCutter, WindowRule, parse_window
+from polarnet.events.windows import cut_windows
 
 HEIGHT, WIDTH, DURATION_US = 6, 8, 20_000
 
@@ -39,7 +39,7 @@ def windows(rule, pieces=1):
 @pytest.mark.parametrize("pieces", [1, 7, 501])
 def test_windows_do_not_depend_on_the_pieces_in_which_a_stream_comes(rule, pieces):
     whole, cut = windows(rule), windows(rule, pieces)
-    assert [(w.start_us, w.stop_us, w.first) for w in whole] == [(w.start_us, w.stop_us, w.first) for w in cut]
+    assert [(w.start_us, w.stop_us) for w in whole] == [(w.start_us, w.stop_us) for w in cut]
     for a, b in zip(whole, cut, strict=True):
         for ours, theirs, all_of_them in zip(a.channels, b.channels, CHANNELS, strict=True):
             assert torch.equal(ours.t, theirs.t)
@@ -92,40 +92,12 @@ def test_rules_that_make_no_windows_are_refused(rule, reason):
         WindowRule(*rule)
 
 
-@pytest.mark.parametrize("rule", [
-    WindowRule(3000, None, 100), WindowRule(3000, None, 2900), WindowRule(3000, None, None), WindowRule(None, 50, 300),
-])  # fmt: skip
-def test_the_tensor_kept_up_to_date_is_that_of_the_window_cut_out_anew(rule):
-    sliding = SlidingEventTensor(HEIGHT, WIDTH)
-    for window in windows(rule):
-        sliding.move_to(window.first[1], window.channels[1])
-        expected = event_tensor(window.channels[1], window.length_us)
-        torch.testing.assert_close(sliding.tensor(window.length_us), expected, atol=1e-5, rtol=1e-5)
-
-
-def test_an_event_that_comes_and_goes_leaves_nothing():
-    events, sliding, anew = CHANNELS[0], SlidingEventTensor(HEIGHT, WIDTH), SlidingEventTensor(HEIGHT, WIDTH)
-    for first in range(296):
-        sliding.move_to(first, slice_count(events, first, first + 5))
-    anew.move_to(295, slice_count(events, 295, 300))
-    assert torch.equal(sliding.tensor(1000), anew.tensor(1000))
-
-
-def test_a_step_touches_the_events_of_the_step_alone(monkeypatch):
-    events, sliding, touched = CHANNELS[0], SlidingEventTensor(HEIGHT, WIDTH), []
-    sliding.move_to(0, slice_count(events, 0, 100))
-    add = sliding._add
-    monkeypatch.setattr(sliding, "_add", lambda part, sign: touched.append(len(part)) or add(part, sign))
-    sliding.move_to(7, slice_count(events, 7, 104))
-    assert touched == [7, 4]
-
-
-def test_a_window_only_goes_forward():
-    sliding = SlidingEventTensor(HEIGHT, WIDTH)
-    sliding.move_to(10, slice_count(CHANNELS[0], 10, 20))
-    with pytest.raises(ValueError, match="a window only goes forward"):
-        sliding.move_to(9, slice_count(CHANNELS[0], 9, 30))
-
-
-def test_before_any_event_there_is_nothing_to_see():
-    assert not SlidingEventTensor(HEIGHT, WIDTH).tensor(1000).any()
+def test_an_event_at_a_windows_end_belongs_to_the_next_window_in_batches_and_streams_alike():
+    t = torch.tensor([0, 400, 999, 1000, 1500, 2000, 3000])
+    zeros, ones = torch.zeros_like(t), torch.ones_like(t)
+    channel = Events.from_columns(t, zeros, zeros, ones, HEIGHT, WIDTH)
+    batch = cut_windows(channel, torch.tensor([0, 1000, 2000, 3000]))
+    streamed = list(WindowCutter(WindowRule(1000, None, None), HEIGHT, WIDTH).add([channel] * 4, 3001))
+    expected = [[0, 400, 999], [1000, 1500], [2000]]
+    assert [window.t.tolist() for window in batch] == expected
+    assert [window.channels[0].t.tolist() for window in streamed] == expected

@@ -45,7 +45,9 @@ def test_the_committed_values_pass(project_root):
     [
         ("emulate.contrast_threshold_on=-0.2", r"emulate\.contrast_threshold_on: expected >= 0\.01"),
         ("train.epochs=0", r"train\.epochs: expected"),
-        ("baselines.cf.cutoff_hz=-1.0", r"baselines\.cf\.cutoff_hz: expected"),
+        ("methods.cf.cutoff_hz=-1.0", r"methods\.cf\.cutoff_hz: expected"),
+        ("methods.e2p.weights=' '", r"methods\.e2p\.weights: expected the path of a file or null"),
+        ("benchmark.methods=[magic]", r"benchmark\.methods: expected some of zeros, .*, ours, got magic"),
         ("ingest.source=camera", r"ingest\.source: expected one of"),
         ("network=resnet", r"network: expected one of paper"),
         ("lpips.backbone=resnet", r"lpips\.backbone: expected one of"),

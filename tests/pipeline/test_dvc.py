@@ -25,6 +25,8 @@ def modules_behind(stage: str, imports: grimp.ImportGraph) -> set[str]:
         module = waiting.pop()
         if module not in found | PLUMBING:
             found.add(module)
+            if module == "polarnet.methods":  # assembles its modules by name
+                waiting += imports.find_children(module)
             waiting += imports.find_modules_directly_imported_by(module)
     return found
 
@@ -46,7 +48,7 @@ def test_every_module_that_a_stage_imports_is_among_its_dependencies_and_nothing
 def test_a_change_of_network_loss_metric_or_figure_never_reruns_the_simulation(project_root, imports):
     for stage in ("ingest", "synthesize", "emulate"):
         behind = modules_behind(stage, imports)
-        for package in ("networks", "training", "similarity", "lpips", "evaluation", "reports", "baselines"):
+        for package in ("networks", "training", "similarity", "lpips", "evaluation", "reports", "methods"):
             assert not any(module.startswith(f"polarnet.{package}") for module in behind), (stage, package)
 
 
@@ -57,7 +59,8 @@ def test_another_row_of_the_benchmark_trains_a_baseline_only_if_it_uses_one(proj
         training = stages[f"train_{baseline}"]
         assert f"data/baselines/{baseline}.json" in training["deps"]
         assert f"data/baselines/{baseline}.json" in stages["baselines"]["outs"]
-        assert not any(param.startswith(("benchmark", "baselines.weights")) for param in training["params"])
+        assert not any(param.startswith(("benchmark", "methods")) for param in training["params"])
+        assert {f"methods.{row}.weights" for row in USERS[baseline]} <= {*stages["baselines"]["params"]}
         assert not [dep for dep in training["deps"] if dep.startswith("data/baselines") and baseline not in dep]
 
 

@@ -11,7 +11,7 @@ import math
 import pytest
 import torch
 
-from polarnet.baselines.complementary_filter import ComplementaryFilterConfig, reconstruct_cf
+from polarnet.methods.complementary_filter import ComplementaryFilterConfig, filter_at_rest, step_cf
 from polarnet.simulation.emulator import emulate
 from polarnet.simulation.presets import SENSORS
 from polarnet.stokes import aolp, dolp, intensities_from_stokes, stokes_from_intensities, stokes_from_polarization
@@ -49,8 +49,7 @@ def recovered(request, stokes) -> torch.Tensor:
     share = torch.linspace(0, 1, 31)[:, None, None, None]
     frames = 255 * (REST + share * (intensities - REST))
     events, _ = emulate(frames, torch.linspace(0, APPEARS_US, 31, dtype=torch.float64), config, key=1)
-    stop = torch.tensor([APPEARS_US + 1])  # windows are half-open, and v2e's last events lie on the last frame's time
-    found = reconstruct_cf(events, stop, FILTER)[0]
+    found, _ = step_cf(filter_at_rest(4, HEIGHT, WIDTH, FILTER), events, APPEARS_US, FILTER)
     assert ((found / intensities).log().abs() < 1.01 * C).all()
     return stokes_from_intensities(found)
 

@@ -9,7 +9,6 @@ import torch
 
 from polarnet.evaluation.benchmark import Benchmark, BenchmarkSet, Panel, write_benchmark
 from polarnet.evaluation.cost import Cost
-from polarnet.evaluation.methods import Polarization
 from polarnet.evaluation.score import BenchmarkConfig, score_sequence
 from polarnet.events.frames import FrameStore
 from polarnet.events.store import EventStore
@@ -19,6 +18,7 @@ from polarnet.simulation.motion import MotionConfig
 from polarnet.simulation.pictures.images import write_png
 from polarnet.simulation.pictures.manifest import Manifest, ManifestEntry, Skipped, write_manifest
 from polarnet.simulation.truth import synthesize
+from polarnet.stokes import Prediction
 from polarnet.training.baselines import leave_untrained
 
 SPLITS = {"park": "train", "lake": "val", "tree": "test", "leaf": "test"}
@@ -83,19 +83,20 @@ def run_methods(events, frames, folder):
         bootstrap_samples=20, panel_scenes=2,
     )  # fmt: skip
     rows, panels = [], []
-    for recording in BenchmarkSet("simulated", events, frames).recordings():
-        truth = recording.dolp
+    test_set = BenchmarkSet("simulated", events, frames)
+    for sequence in map(test_set.sequence, test_set.sequences):
+        truth = sequence.dolp
         mean = truth.mean(dim=(-2, -1), keepdim=True)
         dolp = {"zeros": 0 * truth, "oracle_mean": 0 * truth + mean, "e2v": (truth + mean) / 2, "ours": 0.9 * truth}
-        answers = {method: Polarization(frames) for method, frames in dolp.items()}
-        answers["e2v"] = Polarization(dolp["e2v"], recording.aolp)
-        rows += score_sequence(recording, answers, 1, None, torch.device("cpu"))
+        answers = {method: Prediction(frames) for method, frames in dolp.items()}
+        answers["e2v"] = Prediction(dolp["e2v"], sequence.aolp)
+        rows += score_sequence(sequence, answers, 1, None, torch.device("cpu"))
         k = 3
         panels.append(
             Panel(
-                recording.name, recording.scene, k, int(recording.t_us[k + 1]), torch.randn(4, 24, 36), truth[k],
-                recording.aolp[k], recording.s0[k], {m: frames[k] for m, frames in dolp.items()},
-                {"e2v": recording.aolp[k]},
+                sequence.name, sequence.scene, k, int(sequence.t_us[k + 1]), torch.randn(4, 24, 36), truth[k],
+                sequence.aolp[k], sequence.s0[k], {m: frames[k] for m, frames in dolp.items()},
+                {"e2v": sequence.aolp[k]},
             )
         )  # fmt: skip
     about = {

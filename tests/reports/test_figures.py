@@ -10,12 +10,12 @@ from polarnet.reports.figures import (
     PanelScene,
     comparison_panel,
     dolp_bar,
-    png,
     reliability_figure,
     score_distribution,
     score_line,
     training_curves,
 )
+from polarnet.reports.png import png
 
 TRUTH = torch.linspace(0, 1, 24 * 36).view(24, 36)
 CURVE = Curve("mse", [0, 1, 2], [0.3, 0.2, 0.1])

@@ -1,6 +1,8 @@
 import pytest
 
-from polarnet.reports.legend import GENERAL, NETWORK_COLOURS, glossary, legend_of, lpips_about
+from polarnet.evaluation.rows import ROWS
+from polarnet.methods import METHODS
+from polarnet.reports.legend import GENERAL, NETWORKS, glossary, legend_of, lpips_about
 
 
 def weights(**networks):
@@ -13,14 +15,14 @@ def weights(**networks):
 def test_ours_is_named_and_coloured_after_the_network_behind_it(network, label):
     legend = legend_of(weights(ours=network))
     assert legend.label("ours") == label
-    assert legend.colour("ours") == NETWORK_COLOURS[network]
+    assert legend.colour("ours") == NETWORKS[network].colour
 
 
 def test_e2v_is_named_after_its_network_with_and_without_solved_gains():
     legend = legend_of(weights(e2v="e2vid"))
     assert legend.label("e2v") == "E2V: E2VID"
     assert legend.label("e2v+gain") == "E2V: E2VID, gains solved"
-    assert legend.colour("e2v+gain") == legend.colour("e2vid") == NETWORK_COLOURS["e2vid"]
+    assert legend.colour("e2v+gain") == legend.colour("e2vid") == NETWORKS["e2vid"].colour
 
 
 def test_a_second_network_that_is_not_the_papers_is_not_called_the_papers():
@@ -47,6 +49,23 @@ def test_weights_of_other_authors_are_told_from_those_trained_here():
         "as its authors published them"
         in dict(glossary(["firenet_published"], published))["FireNet, published weights"]
     )
+
+
+def test_every_method_is_explained_with_the_weights_that_it_takes():
+    files = {
+        name: {"file": "weights.pth.tar", "sha256": "0" * 64, "network": method.weights.networks[0]}
+        for name, method in METHODS.items()
+        if method.weights is not None and method.wraps is None
+    }
+    entries = dict(glossary(ROWS, files))
+    assert len(entries) == len([name for name in ROWS if not name.endswith("+gain")]) + 1  # and the solved gains
+    assert all(len(about) > 30 for about in entries.values())
+    assert entries["CISTA-TC, published weights"].startswith("CISTA-TC (Liu and Dragotti 2022), a recurrent network")
+    assert entries["E2V: FireNet"].startswith("Events to video. FireNet (Scheerlinck et al. 2020)")
+
+
+def test_a_row_without_the_network_that_it_needs_is_not_explained():
+    assert glossary(["cf", "ours"], {}) == glossary(["cf"], {})
 
 
 @pytest.mark.parametrize(("backbone", "name"), [("vgg", "VGG16"), ("alex", "AlexNet"), ("squeeze", "SqueezeNet 1.1")])

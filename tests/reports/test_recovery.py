@@ -7,9 +7,9 @@ import zarr
 
 from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
-from polarnet.networks.blocks import Prediction
 from polarnet.reports import recovery
 from polarnet.reports.recovery import FRAMES_PER_CHUNK, RecoveryWriter, signed_events
+from polarnet.stokes import Prediction
 
 HEIGHT, WIDTH = 15, 21
 FRAMES = 40
@@ -19,7 +19,7 @@ assert FRAMES > FRAMES_PER_CHUNK
 def window(k):
     one = Events(torch.tensor([1000 * k]), torch.tensor([k]).short(), torch.tensor([3]).short(),
                  torch.tensor([1]).to(torch.int8), HEIGHT, WIDTH)  # fmt: skip
-    return EventWindow([one] * 4, 1000 * k, 1000 * (k + 1), [k] * 4)
+    return EventWindow([one] * 4, 1000 * k, 1000 * (k + 1))
 
 
 def frame(k, *, angle=True):

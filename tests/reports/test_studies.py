@@ -3,7 +3,8 @@ import io
 import matplotlib.image
 import pytest
 
-from polarnet.reports.figures import DARK, LIGHT, png
+from polarnet.reports.figures import DARK, LIGHT
+from polarnet.reports.png import png
 from polarnet.reports.studies import event_budget_figure, expected_errors_figure, loss_sweep_figure, sensitivity_figure
 
 

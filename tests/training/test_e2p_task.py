@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 import torch
 
-from polarnet.baselines.e2p import coded_aolp
 from polarnet.events.store import EventStore
 from polarnet.lpips import Lpips
 from polarnet.networks.checkpoint import load_checkpoint
+from polarnet.networks.e2p import coded_aolp
 from polarnet.similarity import ssim
 from polarnet.training.e2p import BranchLoss, E2pConfig, e2p_task
 from polarnet.training.loop import train, train_batch, validate

@@ -39,7 +39,11 @@ class PostprocessingConfig:
 
 def postprocessed(images: Float[Tensor, "t c h w"], config: PostprocessingConfig) -> Float[Tensor, "t c h w"]:
     """Sharpened, brought to [0, 1] by the automatic range if wanted, and clipped to it."""
-    sharp = unsharp_masked(images, config.unsharp_amount, config.unsharp_sigma)
+    return stretched(unsharp_masked(images, config.unsharp_amount, config.unsharp_sigma), config)
+
+
+def stretched(sharp: Float[Tensor, "t c h w"], config: PostprocessingConfig) -> Float[Tensor, "t c h w"]:
+    """Sharpened images, brought to [0, 1] by the automatic range if wanted, and clipped to it."""
     if config.auto_hdr:
         low, high = _range(sharp, config.auto_hdr_frames, per_channel=config.auto_hdr_per_polarizer)
         sharp = (sharp - low) / (high - low)

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from polarnet.baselines.e2p import E2p, MosaicHead, coded_aolp, decoded_aolp, interleaved, own_names
+from polarnet.networks.e2p import E2p, MosaicHead, coded_aolp, decoded_aolp, interleaved, own_names
 
 
 @pytest.fixture(scope="module")

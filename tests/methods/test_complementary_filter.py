@@ -4,18 +4,19 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.baselines.complementary_filter import (
+from polarnet.events.stream import Events, slice_count, slice_time
+from polarnet.methods.complementary_filter import (
     ComplementaryFilterConfig,
     Decay,
     HighPassConfig,
     at_rest,
+    filter_at_rest,
     followed_range,
     integrate,
     log_intensity_at,
-    reconstruct_cf,
-    reconstruct_highpass,
+    step_cf,
+    step_highpass,
 )
-from polarnet.events.stream import Events, slice_count
 
 LN2 = math.log(2)
 HALVING_PER_MS_HZ = LN2 / (2 * math.pi * 1e-3)  # the cut-off at which log intensity halves every millisecond
@@ -46,6 +47,25 @@ def hand_list():
 
 def times(*t_us):
     return torch.tensor(t_us)
+
+
+def reconstructed(step, channels, t_us, config):
+    """Images at rising times, each from the events up to it."""
+    state = filter_at_rest(len(channels), channels[0].height, channels[0].width, config)
+    images, before = [], 0
+    for t in t_us.tolist():
+        image, state = step(state, [slice_time(events, before, t + 1) for events in channels], t, config)
+        images.append(image)
+        before = t + 1
+    return torch.stack(images)
+
+
+def reconstruct_cf(channels, t_us, config):
+    return reconstructed(step_cf, channels, t_us, config)
+
+
+def reconstruct_highpass(channels, t_us, config):
+    return reconstructed(step_highpass, channels, t_us, config)
 
 
 def test_cf_of_a_hand_worked_event_list(hand_list):

@@ -38,15 +38,18 @@ class GainConfig:
         check_ranges(self)
 
 
-def consistent(intensities: Float[Tensor, "n 4 h w"], config: GainConfig) -> Float[Tensor, "n 4 h w"]:
-    """Intensities behind polarizers at 0, 45, 90 and 135 degrees, each times the gain that `gains` finds."""
-    return intensities * gains(intensities, config).to(intensities.dtype)[:, :, None, None]
+def consistent(intensities: Float[Tensor, "n 4 h w"], config: GainConfig, known: int = 0) -> Float[Tensor, "m 4 h w"]:
+    """Intensities behind polarizers at 0, 45, 90 and 135 degrees, each times the gain that `gains` finds.
+
+    m = n - `known`: the first `known` frames only contribute to the gains of those after them.
+    """
+    return intensities[known:] * gains(intensities, config, known).to(intensities.dtype)[:, :, None, None]
 
 
-def gains(intensities: Float[Tensor, "n 4 h w"], config: GainConfig) -> Float[Tensor, "n 4"]:
-    """Of each frame, from it and those before it alone; their geometric mean is 1."""
-    starts = [max(0, last + 1 - config.window_frames) for last in range(len(intensities))]
-    return torch.stack([last_gains(intensities[start : last + 1], config) for last, start in enumerate(starts)])
+def gains(intensities: Float[Tensor, "n 4 h w"], config: GainConfig, known: int = 0) -> Float[Tensor, "m 4"]:
+    """Gains of each frame after the first `known`, from it and the ones before it; their geometric mean is 1."""
+    ends = range(known + 1, len(intensities) + 1)
+    return torch.stack([last_gains(intensities[max(0, end - config.window_frames) : end], config) for end in ends])
 
 
 def last_gains(intensities: Float[Tensor, "n 4 h w"], config: GainConfig) -> Float[Tensor, "4"]:

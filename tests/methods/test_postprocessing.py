@@ -2,7 +2,7 @@ import dataclasses
 
 import torch
 
-from polarnet.baselines.postprocessing import PostprocessingConfig, blur_kernel, postprocessed, unsharp_masked
+from polarnet.methods.postprocessing import PostprocessingConfig, blur_kernel, postprocessed, unsharp_masked
 
 OFF = PostprocessingConfig(0.0, 1.0, False, 10, False)
 HDR = dataclasses.replace(OFF, auto_hdr=True)

@@ -15,8 +15,12 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from polarnet.events.stream import Events, slice_count
+from polarnet.events.stream import Events, slice_time
+from polarnet.events.streaming import EventWindow
+from polarnet.methods.intensities import from_intensities, with_gain
+from polarnet.methods.method import Method, Recoverer, Setup, State
 from polarnet.ranges import allowed, check_ranges
+from polarnet.stokes import Prediction
 
 HIGHPASS_GAIN = 1.5  # of the high-pass filter's output, I = 1.5 exp(L) - 1: the package's source
 ROBUST = (0.0025, 0.9975)  # quantiles that the package takes for an image's darkest and brightest
@@ -29,7 +33,7 @@ Step = Callable[..., tuple[Tensor, "FilterState"]]
 
 @dataclass(frozen=True)
 class ComplementaryFilterConfig:
-    """Section `baselines.cf` of params.yaml; the published defaults."""
+    """Section `methods.cf` of params.yaml; the published defaults."""
 
     cutoff_hz: float = field(metadata=allowed(low=0))
     """Below it the scene fades to grey; 0: never."""
@@ -49,7 +53,7 @@ class ComplementaryFilterConfig:
 
 @dataclass(frozen=True)
 class HighPassConfig:
-    """Section `baselines.highpass` of params.yaml; the package's defaults, but for the range, automatic there."""
+    """Section `methods.highpass` of params.yaml; the package's defaults, but for the range, automatic there."""
 
     cutoff_hz: float = field(metadata=allowed(low=0))
     decay_per_event: float = field(metadata=allowed(low=0))
@@ -143,41 +147,12 @@ def step_highpass(
     return _shown(HIGHPASS_GAIN * np.exp(logs) - 1, state._replace(pixels=pixels), t_us, config.range_rule)
 
 
-def reconstruct_cf(
-    channels: Sequence[Events], t_us: Int64[Tensor, " t"], config: ComplementaryFilterConfig
-) -> Float64[Tensor, "t c h w"]:
-    """`step_cf` at rising times, each from the events before it (t < time).
-
-    Times count from the start of the recording, when nothing is known.
-    """
-    return _reconstructed(step_cf, channels, t_us, config)
-
-
-def reconstruct_highpass(
-    channels: Sequence[Events], t_us: Int64[Tensor, " t"], config: HighPassConfig
-) -> Float64[Tensor, "t c h w"]:
-    """`step_highpass` at rising times, like `reconstruct_cf`."""
-    return _reconstructed(step_highpass, channels, t_us, config)
-
-
 def followed_range(
     shown: Float64[np.ndarray, "2 c"], image: Float64[np.ndarray, "2 c"], elapsed_us: int
 ) -> Float64[np.ndarray, "2 c"]:
     """The range shown, which follows that of the images (darkest, brightest) as a low-pass filter: 95 % in 2 s."""
     kept = (1 - FOLLOWED) ** (elapsed_us * 1e-6 / FOLLOWED_S)
     return kept * shown + (1 - kept) * image
-
-
-def _reconstructed(step: Step, channels: Sequence[Events], t_us: Int64[Tensor, " t"], config) -> Tensor:
-    state = filter_at_rest(len(channels), channels[0].height, channels[0].width, config)
-    stops = [torch.searchsorted(events.t, t_us).tolist() for events in channels]
-    images, starts = [], [0] * len(channels)
-    for k, t in enumerate(t_us.tolist()):
-        since = [slice_count(e, start, stop[k]) for e, start, stop in zip(channels, starts, stops, strict=True)]
-        image, state = step(state, since, t, config)
-        images.append(image)
-        starts = [stop[k] for stop in stops]
-    return torch.stack(images)
 
 
 def _log_intensities(
@@ -223,3 +198,53 @@ def _rate_per_us(cutoff_hz: float) -> float:
 def _check_intensity_range(intensity_range: Sequence[float]) -> None:
     if len(intensity_range) != 2 or not intensity_range[0] < intensity_range[1]:
         raise ValueError(f"intensity_range: expected [low, high] with low < high, got {intensity_range}")
+
+
+def filtered(step: Step, config: ComplementaryFilterConfig | HighPassConfig) -> Recoverer:
+    """A filter as a method: `step` once for each window, from the events that no window before has held."""
+
+    def start(height: int, width: int) -> State:
+        return filter_at_rest(4, height, width, config)
+
+    def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
+        images = []
+        for window in windows:
+            new = [slice_time(events, state.t_us, window.stop_us) for events in window.channels]
+            image, state = step(state, new, window.stop_us, config)
+            images.append(image)
+        return state, from_intensities(torch.stack(images))
+
+    return Recoverer(start, predict, takes_events_once=True)
+
+
+def open_cf(setup: Setup) -> Recoverer:
+    """The complementary filter, events only."""
+    return filtered(step_cf, setup.config)
+
+
+def open_highpass(setup: Setup) -> Recoverer:
+    """The high-pass filter."""
+    return filtered(step_highpass, setup.config)
+
+
+CF = Method(
+    name="cf",
+    label="CF",
+    colour="#e08a1e",
+    open=open_cf,
+    config=ComplementaryFilterConfig,
+    reconstructs=True,
+    about="The complementary filter without frames (Scheerlinck et al. 2018): intensity from events, one polarizer at "
+    "a time, then DoLP by the Stokes formula.",
+)
+HIGHPASS = Method(
+    name="highpass",
+    label="high-pass",
+    colour="#b0851f",
+    open=open_highpass,
+    config=HighPassConfig,
+    reconstructs=True,
+    about="The high-pass filter (Scheerlinck et al. 2018): intensity from events, one polarizer at a time, then DoLP "
+    "by the Stokes formula.",
+)
+METHODS = (CF, HIGHPASS, with_gain(CF), with_gain(HIGHPASS))

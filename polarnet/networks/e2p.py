@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.baselines.firenet import ConvGRU, ResidualBlock
+from polarnet.networks.firenet import ConvGRU, ResidualBlock
 
 CHANNELS = 32
 BRANCHES = ("intensity", "aolp", "dolp")

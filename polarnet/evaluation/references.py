@@ -1,0 +1,94 @@
+"""Reference rows: constants and the oracle mean. They see the truth or no event, so they are not methods."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from polarnet.evaluation.sequences import TestSequence
+from polarnet.stokes import Prediction
+
+COLOUR = "#98a2b3"
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A row that every table shows beside the methods; its DoLP is one value everywhere in a frame."""
+
+    name: str
+    label: str
+    colour: str
+    about: str
+    """Sentence of the glossary of pages."""
+    predict: Callable[[TestSequence, float | None], Prediction]
+    """The sequence and the mean DoLP of the training split -> a frame a window."""
+    needs_train_mean: bool = False
+
+
+def zeros(sequence: TestSequence, train_mean: float | None) -> Prediction:
+    """No polarization anywhere."""
+    return Prediction(torch.zeros_like(sequence.dolp))
+
+
+def train_mean(sequence: TestSequence, train_mean: float | None) -> Prediction:
+    """The mean DoLP of the training split everywhere; ValueError where it is not known."""
+    if train_mean is None:
+        raise ValueError(
+            "the row train_mean needs the mean DoLP of a training split, got none; run `dvc repro synthesize`"
+        )
+    return Prediction(torch.full_like(sequence.dolp, train_mean))
+
+
+def own_mean(sequence: TestSequence, train_mean: float | None) -> Prediction:
+    """The best of all constants for each frame, known only from the truth."""
+    return Prediction(oracle_mean(sequence.dolp, sequence.valid))
+
+
+REFERENCES = {
+    row.name: row
+    for row in (
+        Reference("zeros", "zeros", COLOUR, "A constant: no polarization anywhere.", zeros),
+        Reference(
+            "train_mean",
+            "training mean",
+            COLOUR,
+            "A constant: the mean DoLP of the training split.",
+            train_mean,
+            needs_train_mean=True,
+        ),
+        Reference(
+            "oracle_mean",
+            "oracle mean",
+            COLOUR,
+            "Each true frame's own mean, the best constant there is. It looks at the truth, so it is no method; what "
+            "does not beat it shows little spatial skill in MSE.",
+            own_mean,
+        ),
+    )
+}
+"""Reference row by name, in the order of every table."""
+
+
+def oracle_mean(truth: Float[Tensor, "n h w"], valid: Bool[Tensor, "n h w"] | None = None) -> Float[Tensor, "n h w"]:
+    """Each frame's own mean: no constant can have a smaller squared error.
+
+    Only valid pixels count, since no others are scored; a frame without any gets 0.
+    """
+    if valid is None:
+        mean = truth.mean(dim=(-2, -1), keepdim=True)
+    else:
+        count = valid.sum(dim=(-2, -1), keepdim=True).clamp(min=1)
+        mean = torch.where(valid, truth, 0.0).sum(dim=(-2, -1), keepdim=True) / count
+    return mean.expand_as(truth).contiguous()
+
+
+def mean_dolp(sequences: Iterable[Float[Tensor, "*pixels"]]) -> float:
+    """Mean over all pixels of all sequences; ValueError where there are none."""
+    total, count = 0.0, 0
+    for frames in sequences:
+        total, count = total + frames.double().sum().item(), count + frames.numel()
+    if count == 0:
+        raise ValueError("the mean DoLP needs at least one frame, got none: is the training split empty?")
+    return total / count

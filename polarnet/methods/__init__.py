@@ -1,0 +1,23 @@
+"""Ways from events to DoLP: one record each, assembled from the modules of this folder."""
+
+import importlib
+import pkgutil
+
+from polarnet.methods.method import Method
+
+
+def _assembled() -> dict[str, Method]:
+    """The records that the modules name in their `METHODS`, module by module in alphabetical order.
+
+    Filters come first, then networks that reconstruct intensities, then networks that predict DoLP.
+    """
+    modules = [importlib.import_module(f"{__name__}.{name}") for _, name, _ in pkgutil.iter_modules(__path__)]
+    records = [method for module in modules for method in getattr(module, "METHODS", ())]
+    records.sort(key=lambda method: (method.weights is not None, not method.reconstructs))
+    by_name = {method.name: method for method in records}
+    assert len(by_name) == len(records), f"two methods have one name: {[method.name for method in records]}"
+    return by_name
+
+
+METHODS = _assembled()
+"""Method by name, in the order of every table and figure."""

@@ -1,0 +1,61 @@
+"""DoLP from reconstructed intensities, and the wrapper NAME+gain, which first solves the gains of the polarizers."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from polarnet.events.streaming import EventWindow
+from polarnet.methods.method import Method, Recoverer, Setup, State
+from polarnet.methods.stokes_gain import consistent
+from polarnet.stokes import Prediction, aolp, dolp, stokes_from_intensities
+
+GAIN = "+gain"
+
+
+def from_intensities(intensities: Float[Tensor, "n 4 h w"]) -> Prediction:
+    """DoLP and AoLP (Eq. 1-3) of intensities behind the four polarizers, on a scale common to the four."""
+    stokes = stokes_from_intensities(intensities)
+    return Prediction(dolp(stokes), aolp(stokes), intensities=intensities)
+
+
+def with_gain(method: Method) -> Method:
+    """The method NAME+gain: the intensities of `method`, brought to a common scale by I0 + I90 = I45 + I135.
+
+    Where both rows are wanted, `convert` makes this one of the predictions of the other, whose run it shares.
+    """
+
+    def convert(setup: Setup, before: State, prediction: Prediction) -> tuple[State, Prediction]:
+        intensities = prediction.intensities
+        if intensities is None:
+            raise ValueError(f"{method.name} reconstructs no intensities, so that it has no gains to solve")
+        kept = intensities[:0] if before is None else before
+        seen = torch.cat([kept, intensities])
+        solved = from_intensities(consistent(seen, setup.gain, len(kept)))
+        return seen[max(0, len(seen) + 1 - setup.gain.window_frames) :], solved
+
+    def open_both(setup: Setup) -> Recoverer:
+        inner = method.open(setup)
+
+        def start(height: int, width: int) -> State:
+            return inner.start(height, width), None
+
+        def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
+            state, images = state
+            state, prediction = inner.step(state, windows)
+            images, prediction = convert(setup, images, prediction)
+            return (state, images), prediction
+
+        return Recoverer(start, predict, inner.takes_events_once, inner.network)
+
+    return dataclasses.replace(
+        method,
+        name=method.name + GAIN,
+        label=f"{method.label}, gains solved",
+        open=open_both,
+        config=None,
+        wraps=method,
+        convert=convert,
+    )

@@ -1,0 +1,73 @@
+"""Networks that reconstruct intensity from events: the four polarizers are four streams of one batch."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from polarnet.events.representations import normalise_nonzero, voxel_grid
+from polarnet.events.streaming import EventWindow
+from polarnet.methods.intensities import from_intensities
+from polarnet.methods.method import Recoverer, Setup, State, weights_file
+from polarnet.methods.postprocessing import PostprocessingConfig, stretched, unsharp_masked
+from polarnet.networks.checkpoint import load_checkpoint, load_tensors
+from polarnet.stokes import Prediction
+
+
+def load_baseline(build: Any, name: str, path: Path) -> Any:
+    """The network `name` of a checkpoint of polarnet or of a published file; ValueError for another network."""
+    if path.suffix != ".safetensors":
+        return build.load(path)
+    tensors, metadata = load_checkpoint(path)
+    if metadata["network"] != name:
+        raise ValueError(f"{path} holds a {metadata['network']}, expected a {name}")
+    network = build(**metadata["config"])
+    load_tensors(network, tensors, path)
+    return network.eval()
+
+
+def intensity_network(
+    load: Callable[[Path], Any], setup: Setup, *, normalised: bool = True, published: bool = False
+) -> Recoverer:
+    """The network that `load` makes of the setup's weights, as a method that reconstructs intensities.
+
+    `normalised`: whether voxel grids are brought to mean 0 and deviation 1, as E2VID's. `published`: intensities go
+    through the post-processing of published weights; otherwise they are on their true scale and only clipped.
+    """
+    network = load(weights_file(setup)).to(setup.device)
+    postprocessing = setup.postprocessing if published else None
+
+    def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
+        inner, sharp = state
+        images = []
+        for window in windows:
+            grids = voxel_grids(window, network.bins).to(setup.device)
+            with setup.autocast():
+                intensity, inner = network(normalise_nonzero(grids) if normalised else grids, inner)
+            images.append(intensity.float())
+        intensities, sharp = _displayed(torch.stack(images), sharp, postprocessing)
+        return (inner, sharp), from_intensities(intensities)
+
+    def start(height: int, width: int) -> State:
+        return None, torch.zeros(0, 4, height, width, device=setup.device)
+
+    return Recoverer(start, predict, network=network)
+
+
+def voxel_grids(window: EventWindow, bins: int) -> Float[Tensor, "4 bins h w"]:
+    """The voxel grid of each polarizer."""
+    return torch.stack([voxel_grid(events, bins) for events in window.channels])
+
+
+def _displayed(
+    images: Float[Tensor, "n 4 h w"], before: Float[Tensor, "m 4 h w"], config: PostprocessingConfig | None
+) -> tuple[Float[Tensor, "n 4 h w"], Float[Tensor, "k 4 h w"]]:
+    """Intensities in [0, 1] of n images that follow m, and the images that the range of the next ones depends on."""
+    if config is None:
+        return images.clamp(0, 1), before
+    sharp = torch.cat([before, unsharp_masked(images, config.unsharp_amount, config.unsharp_sigma)])
+    kept = config.auto_hdr_frames - 1 if config.auto_hdr else 0
+    return stretched(sharp, config)[len(before) :], sharp[len(sharp) - min(kept, len(sharp)) :]

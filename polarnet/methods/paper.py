@@ -1,0 +1,17 @@
+"""The paper's network, or any other DoLP network to compare with the one in use."""
+
+from polarnet.methods.dolp_network import DOLP_NETWORKS, open_dolp_network
+from polarnet.methods.method import Method, Weights, WeightsConfig
+
+METHODS = (
+    Method(
+        name="paper",
+        label="the paper's network",
+        colour="#0ca678",
+        open=open_dolp_network,
+        config=WeightsConfig,
+        weights=Weights(DOLP_NETWORKS),
+        about="The network of the paper (its Fig. 6), in polarnet's implementation: events of the four polarizers in, "
+        "DoLP out.",
+    ),
+)

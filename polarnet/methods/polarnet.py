@@ -1,0 +1,16 @@
+"""The DoLP network that the pipeline trained: polarnet's own, unless `network` names another."""
+
+from polarnet.methods.dolp_network import DOLP_NETWORKS, open_dolp_network
+from polarnet.methods.method import Method, Weights, WeightsConfig
+
+METHODS = (
+    Method(
+        name="ours",
+        label="ours",
+        colour="#d6336c",
+        open=open_dolp_network,
+        config=WeightsConfig,
+        weights=Weights(DOLP_NETWORKS, trained_by="train"),
+        about="The DoLP network in use.",
+    ),
+)

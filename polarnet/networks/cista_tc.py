@@ -1,0 +1,138 @@
+"""CISTA-TC: events to intensity by unrolled sparse coding (Liu, Dragotti, ICASSP 2022).
+
+The published file cista_tc.pth.tar loads with `CistaTc.load`.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from polarnet.networks.e2vid import ConvLstm, reflected
+
+CHANNELS = 64  # features at half the size
+ATOMS = 128  # of the sparse code
+ITERATIONS = 5
+
+
+class CistaState(NamedTuple):
+    """What the network carries from one window to the next."""
+
+    image: Float[Tensor, "b 1 h w"]
+    """The image before, at the padded size."""
+    code: Float[Tensor, "b 128 i j"]
+    """The sparse code before, at half the size."""
+    memory: tuple[Tensor, Tensor] | None
+    """State of the ConvLSTM; None at the start."""
+
+
+class CistaTc(nn.Module):
+    """Iterative soft thresholding with a learned dictionary, drawn towards the code of the window before.
+
+    The input is a voxel grid of one polarizer, normalised by `normalise_nonzero`. Layers have the names of the
+    published file, which holds the one block of all iterations five times.
+    """
+
+    def __init__(self, bins: int):
+        super().__init__()
+        self.bins = bins
+        self.We = Convolution(bins, CHANNELS // 2)
+        self.Wi = Convolution(1, CHANNELS // 2)
+        self.W0 = Convolution(CHANNELS, CHANNELS, stride=2)
+        self.P0 = Convolution(CHANNELS, ATOMS)
+        self.one_conv_for_prev = Convolution(ATOMS, 1)
+        self.one_conv_for_cur = Convolution(ATOMS, 1)
+        self.alpha = nn.ParameterList(torch.ones(1, ATOMS, 1, 1) for _ in range(ITERATIONS))
+        block = Iteration()
+        self.lista_blocks = nn.ModuleList(block for _ in range(ITERATIONS))
+        self.Dg = Decoder()
+        self.upsamp_conv = Convolution(CHANNELS, CHANNELS)
+        self.final_conv = Convolution(CHANNELS, 1)
+
+    def forward(
+        self, voxels: Float[Tensor, "b bins h w"], state: CistaState | None = None
+    ) -> tuple[Float[Tensor, "b h w"], CistaState]:
+        """Intensity in [0, 1] at the end of one window, and the state for the next; None at the start.
+
+        Height and width are reflected up to multiples of 8, and the result cut back.
+        """
+        if voxels.shape[1] != self.bins:
+            raise ValueError(f"this CISTA-TC takes {self.bins} bins, got {voxels.shape[1]}")
+        top, left, padded = reflected(voxels)
+        image = torch.zeros_like(padded[:, :1]) if state is None else state.image
+        features = self.W0(torch.cat([self.We(padded), self.Wi(image.to(padded.dtype))], dim=1))
+        code = self.P0(features)
+        before = torch.zeros_like(code) if state is None else state.code.to(code.dtype)
+        attended = self.one_conv_for_prev(before)
+        for alpha, block in zip(self.alpha, self.lista_blocks, strict=True):
+            weight = torch.sigmoid(attended * self.one_conv_for_cur(code))
+            code = block(code, features, weight * alpha * (before - code))
+        decoded, memory = self.Dg(code, None if state is None else state.memory)
+        upsampled = F.interpolate(decoded, scale_factor=2, mode="bilinear", align_corners=False)
+        image = torch.sigmoid(self.final_conv(self.upsamp_conv(upsampled)).float())
+        height, width = voxels.shape[-2:]
+        return image[:, 0, top : top + height, left : left + width], CistaState(image, code, memory)
+
+    @classmethod
+    def load(cls, path: Path) -> "CistaTc":
+        """The published file, read without running code from it; ValueError for one of another network."""
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        tensors = content.get("state_dict", content)
+        first = tensors.get("We.conv2d.weight")
+        if first is None:
+            raise ValueError(f"{path} holds no CISTA-TC: expected a tensor We.conv2d.weight")
+        network = cls(bins=first.shape[1])
+        try:
+            network.load_state_dict(tensors)
+        except RuntimeError as error:
+            raise ValueError(f"{path} holds no CISTA-TC: {error}") from None
+        return network.eval()
+
+
+class Convolution(nn.Module):
+    """A 3x3 convolution with reflection padding."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int = 1):
+        super().__init__()
+        self.conv2d = nn.Conv2d(inputs, outputs, 3, stride, padding=1, padding_mode="reflect")
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d i j"]:
+        """d channels, at the size that the stride leaves."""
+        return self.conv2d(x)
+
+
+class Iteration(nn.Module):
+    """One step of soft thresholding: code <- shrink(code + P(features - D(code)) + pull, Lambda)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.D = Convolution(ATOMS, CHANNELS)
+        self.P = Convolution(CHANNELS, ATOMS)
+        self.Lambda = nn.Parameter(torch.full((1, ATOMS, 1, 1), 1e-3))
+
+    def forward(
+        self, code: Float[Tensor, "b 128 h w"], features: Float[Tensor, "b 64 h w"], pull: Float[Tensor, "b 128 h w"]
+    ) -> Float[Tensor, "b 128 h w"]:
+        """The next code."""
+        x = self.P(features - self.D(code)) + code + pull
+        return F.relu(x - self.Lambda) - F.relu(-x - self.Lambda)  # Lambda may be negative, as trained
+
+
+class Decoder(nn.Module):
+    """Code to features: convolution, ReLU, ConvLSTM."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv = Convolution(ATOMS, CHANNELS)
+        self.recurrent_block = ConvLstm(CHANNELS)
+        self.recurrent_block.Gates = nn.Conv2d(2 * CHANNELS, 4 * CHANNELS, 3, padding=1, padding_mode="reflect")
+
+    def forward(
+        self, code: Float[Tensor, "b 128 h w"], state: tuple[Tensor, Tensor] | None
+    ) -> tuple[Float[Tensor, "b 64 h w"], tuple[Tensor, Tensor]]:
+        """Features, and the state for the next window."""
+        state = self.recurrent_block(F.relu(self.conv(code)), state)
+        return state[0], state

@@ -1,0 +1,123 @@
+"""A short test sequence, and every method with networks that nobody trained."""
+
+import pytest
+import torch
+
+from polarnet.evaluation.rows import Context
+from polarnet.evaluation.sequences import TestSequence
+from polarnet.events.stream import Events
+from polarnet.methods import METHODS
+from polarnet.methods.complementary_filter import ComplementaryFilterConfig, HighPassConfig
+from polarnet.methods.method import Setup
+from polarnet.methods.postprocessing import PostprocessingConfig
+from polarnet.methods.stokes_gain import GainConfig
+from polarnet.networks.checkpoint import save_checkpoint
+from polarnet.networks.cista_tc import CistaTc
+from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.networks.e2p import E2p
+from polarnet.networks.e2vid import E2vid
+from polarnet.networks.firenet import FireNet
+
+HEIGHT, WIDTH = 18, 20
+WINDOW_US = 1000
+NETWORK = {
+    "channels": [4, 8, 8],
+    "swin_depth": 2,
+    "swin_window": 4,
+    "swin_heads": [2, 2],
+    "residual_blocks": 1,
+    "input_mixing": "contrasts",
+}
+SECTIONS = {
+    "cf": ComplementaryFilterConfig(0.5, 0.1, -0.1, [-0.1, 1.2], "fixed"),
+    "highpass": HighPassConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5], "fixed"),
+}
+
+
+def random_events(generator, windows=4, count=300):
+    """Events of one polarizer over the whole sensor."""
+    t = torch.randint(windows * WINDOW_US, (count,), generator=generator).sort().values
+    x = torch.randint(WIDTH, (count,), generator=generator).to(torch.int16)
+    y = torch.randint(HEIGHT, (count,), generator=generator).to(torch.int16)
+    p = (2 * torch.randint(2, (count,), generator=generator) - 1).to(torch.int8)
+    return Events(t, x, y, p, HEIGHT, WIDTH)
+
+
+@pytest.fixture
+def make_sequence():
+    def make(name="a", scene=None, windows=4, seed=0):
+        generator = torch.Generator().manual_seed(seed)
+        dolp, s0 = torch.rand(2, windows, HEIGHT, WIDTH, generator=generator)
+        return TestSequence(
+            name,
+            scene or name,
+            [random_events(generator, windows) for _ in range(4)],
+            WINDOW_US * torch.arange(windows + 1),
+            dolp,
+            3.1 * torch.rand(windows, HEIGHT, WIDTH, generator=generator),
+            s0,
+        )
+
+    return make
+
+
+@pytest.fixture
+def sequence(make_sequence):
+    return make_sequence()
+
+
+@pytest.fixture(scope="session")
+def checkpoints(tmp_path_factory):
+    """Networks that nobody trained, by section, in files as the training stages write them and as their authors did."""
+    folder = tmp_path_factory.mktemp("checkpoints")
+    torch.manual_seed(0)
+    metadata = {"network": "paper", "config": NETWORK, "in_channels": 4, "representation": "event_tensor"}
+    files = {}
+    for name in ("ours", "paper"):
+        files[name] = folder / f"{name}.safetensors"
+        save_checkpoint(files[name], DolpUNet(DolpUNetConfig(**NETWORK)).state_dict(), metadata)
+    for name, build in {"firenet": FireNet, "e2vid": E2vid, "e2p": E2p}.items():
+        files[name] = folder / f"{name}.safetensors"
+        save_checkpoint(files[name], build(5).state_dict(), {"network": name, "config": {"bins": 5}, "in_channels": 5})
+    files["e2v"] = files["firenet"]
+    for name, build in {"firenet": FireNet, "firenetplus": FireNet, "e2vid": E2vid}.items():
+        files[f"{name}_published"] = folder / f"{name}.pth.tar"
+        torch.save({"state_dict": build(5).state_dict()}, files[f"{name}_published"])
+    files["cista_tc"] = folder / "cista_tc.pth.tar"
+    torch.save({"state_dict": CistaTc(5).state_dict()}, files["cista_tc"])
+    return files
+
+
+@pytest.fixture
+def make_setup(checkpoints):
+    """The setup of a section, with changes."""
+
+    def make(section, **changes):
+        values = {
+            "config": SECTIONS.get(section),
+            "weights": checkpoints.get(section),
+            "postprocessing": PostprocessingConfig(0.3, 1.0, False, 10, False),
+            "gain": GainConfig(10, 5, 20_000, 0.1, 0.0),
+            "device": torch.device("cpu"),
+            "precision": "fp32",
+        }
+        return Setup(**{**values, **changes})
+
+    return make
+
+
+@pytest.fixture
+def make_context(make_setup):
+    """All methods; `changes` are those of the setups of some sections."""
+
+    def make(train_mean=0.25, **changes):
+        sections = [method.section for method in METHODS.values()]
+        setups = {section: make_setup(section, **changes.get(section, {})) for section in sections}
+        return Context(train_mean, setups, torch.device("cpu"))
+
+    return make
+
+
+@pytest.fixture
+def context(make_context):
+    return make_context()

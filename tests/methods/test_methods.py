@@ -1,0 +1,283 @@
+"""Every record: what it gives, what it needs, and that state goes in and comes out."""
+
+import dataclasses
+import hashlib
+import math
+
+import pytest
+import torch
+
+from polarnet.events.representations import event_tensor, voxel_grid
+from polarnet.events.stream import Events
+from polarnet.events.streaming import EventWindow
+from polarnet.events.windows import encode_windows
+from polarnet.methods import METHODS
+from polarnet.methods.dolp_network import dolp_recoverer
+from polarnet.methods.intensities import from_intensities, with_gain
+from polarnet.methods.intensity_network import intensity_network, load_baseline
+from polarnet.methods.method import Method, Recoverer, WeightsConfig, weights_record, why_absent
+from polarnet.methods.postprocessing import postprocessed
+from polarnet.networks.checkpoint import load_network
+from polarnet.networks.e2p import E2p, interleaved
+from polarnet.networks.firenet import FireNet
+from polarnet.stokes import Prediction, intensities_from_stokes, stokes_from_polarization
+
+RECONSTRUCTING = [name for name, method in METHODS.items() if method.reconstructs and method.wraps is None]
+
+
+def recovered(recoverer, windows):
+    """All windows in one step from the start."""
+    first = windows[0].channels[0]
+    return recoverer.step(recoverer.start(first.height, first.width), windows)[1]
+
+
+def assert_same(prediction, other):
+    torch.testing.assert_close(prediction.dolp, other.dolp, atol=2e-5, rtol=1e-4)
+    assert (prediction.aolp is None) == (other.aolp is None)
+    if prediction.aolp is not None:
+        angle = prediction.aolp - other.aolp
+        assert (torch.sin(angle).abs() * other.dolp).max() < 1e-3  # of period pi, and undefined without polarization
+
+
+@pytest.fixture
+def open_method(make_setup):
+    def opened(name, **changes):
+        method = METHODS[name]
+        return method.open(make_setup(method.section, **changes))
+
+    return opened
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_gives_a_frame_a_window_between_0_and_1(name, sequence, open_method):
+    prediction = recovered(open_method(name), sequence.windows)
+    assert prediction.dolp.shape == sequence.dolp.shape
+    assert prediction.dolp.dtype == torch.float32
+    assert 0 <= prediction.dolp.min() <= prediction.dolp.max() <= 1
+    if prediction.aolp is not None:
+        assert prediction.aolp.shape == sequence.dolp.shape
+        assert 0 <= prediction.aolp.min() <= prediction.aolp.max() < math.pi
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_windows_at_once_give_what_they_give_one_by_one(name, sequence, open_method):
+    recoverer, windows = open_method(name), sequence.windows
+    together = recovered(recoverer, windows)
+    state = recoverer.start(sequence.events[0].height, sequence.events[0].width)
+    for k, window in enumerate(windows):
+        state, one = recoverer.step(state, [window])
+        assert_same(one, Prediction(together.dolp[k : k + 1], None if one.aolp is None else together.aolp[k : k + 1]))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_step_changes_neither_the_method_nor_the_state_it_was_given(name, sequence, open_method):
+    recoverer, (first, second, *_) = open_method(name), sequence.windows
+    state, _ = recoverer.step(recoverer.start(sequence.events[0].height, sequence.events[0].width), [first])
+    _, once = recoverer.step(state, [second])
+    _, again = recoverer.step(state, [second])
+    assert torch.equal(once.dolp, again.dolp)
+
+
+def test_filters_come_first_then_reconstructions_then_networks_of_dolp():
+    kinds = [(method.weights is not None, not method.reconstructs) for method in METHODS.values()]
+    assert kinds == sorted(kinds)
+    assert list(METHODS)[:4] == ["cf", "highpass", "cf+gain", "highpass+gain"]
+    assert list(METHODS)[-3:] == ["e2p", "paper", "ours"]
+
+
+def test_dolp_outside_0_and_1_is_clamped_for_every_method(sequence):
+    wild = torch.linspace(-1, 2, sequence.dolp.numel()).view_as(sequence.dolp)
+    recoverer = Recoverer(lambda height, width: None, lambda state, windows: (state, Prediction(wild)))
+    assert torch.equal(recovered(recoverer, sequence.windows).dolp, wild.clamp(0, 1))
+
+
+def test_intensities_become_dolp_and_aolp_by_the_stokes_formula():
+    prediction = from_intensities(torch.tensor([0.8, 0.5, 0.2, 0.5]).view(1, 4, 1, 1))
+    torch.testing.assert_close(prediction.dolp, torch.full((1, 1, 1), 0.6))
+    torch.testing.assert_close(prediction.aolp, torch.zeros(1, 1, 1))
+
+
+def test_cf_of_one_event_behind_one_polarizer_which_counts_from_the_window_that_it_opens(sequence, open_method):
+    row, column = torch.tensor([2], dtype=torch.int16), torch.tensor([3], dtype=torch.int16)
+    one = Events(torch.tensor([1000]), column, row, torch.ones(1, dtype=torch.int8), 18, 20)
+    silent = Events.empty(18, 20)
+    lit = dataclasses.replace(sequence, events=[one, silent, silent, silent])
+    dolp = recovered(open_method("cf"), lit.windows).dolp
+    dark = 0.1 / 1.3  # what a pixel without events shows: exp(0) - 1 = 0, and -0.1 ... 1.2 is shown as 0 ... 1
+    bright = [(math.expm1(0.1 * math.exp(-math.pi * t)) + 0.1) / 1.3 for t in (1e-3, 2e-3, 3e-3)]
+    expected = [0.0, *((b - dark) / (b + dark) for b in bright)]  # at 1000 us it lies in [1000, 2000), not in [0, 1000)
+    torch.testing.assert_close(dolp[:, 2, 3], torch.tensor(expected))
+    dolp[:, 2, 3] = 0
+    assert not dolp.any()
+
+
+def test_ours_carries_its_state_from_window_to_window(sequence, open_method, checkpoints):
+    network, _ = load_network(checkpoints["ours"])
+    inputs = encode_windows(sequence.events, sequence.t_us, event_tensor)
+    with torch.no_grad():
+        at_once, _ = network.unroll(inputs[:, None])
+    expected = at_once.dolp[:, 0].clamp(0, 1)
+    torch.testing.assert_close(recovered(open_method("ours"), sequence.windows).dolp, expected)
+
+
+@pytest.mark.parametrize("name", RECONSTRUCTING)
+def test_reconstructions_treat_the_four_polarizers_alike(name, sequence, open_method):
+    turned = dataclasses.replace(sequence, events=[*sequence.events[1:], sequence.events[0]])
+    straight, shifted = (recovered(open_method(name), one.windows).intensities for one in (sequence, turned))
+    assert straight.shape == (4, 4, 18, 20)
+    assert 0 <= straight.min() < straight.max() <= 1
+    torch.testing.assert_close(shifted, straight.roll(-1, dims=1))
+
+
+@pytest.mark.parametrize("name", RECONSTRUCTING)
+def test_every_reconstruction_has_a_row_with_its_gains_solved_that_shares_its_run(name, sequence, make_setup):
+    method, solved = METHODS[name], METHODS[f"{name}+gain"]
+    assert (solved.wraps, solved.section, solved.label) == (method, name, f"{method.label}, gains solved")
+    setup = make_setup(name)
+    _, shared = solved.convert(setup, None, recovered(method.open(setup), sequence.windows))
+    alone = recovered(solved.open(setup), sequence.windows)
+    assert torch.equal(shared.dolp.float().clamp(0, 1), alone.dolp)
+
+
+def reconstructing(intensities):
+    """A method that reconstructs these, whatever it sees."""
+
+    def predict(state, windows):
+        return state + len(windows), from_intensities(intensities[state : state + len(windows)])
+
+    return Method("known", "known", "#000000", lambda setup: Recoverer(lambda *_: 0, predict), reconstructs=True)
+
+
+def test_solved_gains_undo_what_a_method_left_unknown(sequence, make_setup):
+    s0, dolp, aolp = 0.5 + 0.5 * sequence.s0, 0.9 * sequence.dolp, sequence.aolp
+    true = intensities_from_stokes(stokes_from_polarization(s0, dolp, aolp))
+    method = reconstructing(true * torch.tensor([1.5, 0.7, 1.0, 0.8]).view(4, 1, 1))
+    setup = make_setup("cf")
+    solved = recovered(with_gain(method).open(setup), sequence.windows)
+    torch.testing.assert_close(solved.dolp, dolp, atol=1e-3, rtol=0)
+    assert not torch.allclose(recovered(method.open(setup), sequence.windows).dolp, dolp, atol=0.1)
+
+
+def test_gains_need_intensities(sequence, make_setup):
+    with pytest.raises(ValueError, match="e2p reconstructs no intensities"):
+        recovered(with_gain(METHODS["e2p"]).open(make_setup("e2p")), sequence.windows)
+
+
+def test_published_networks_are_post_processed_and_firenet_plus_sees_voxels_as_they_are(
+    sequence, make_setup, open_method
+):
+    setup = make_setup("firenetplus_published")
+    network = load_baseline(FireNet, "firenet", setup.weights)
+    grids = encode_windows(sequence.events, sequence.t_us, lambda events, _: voxel_grid(events, 5)).unflatten(1, (4, 5))
+    with torch.no_grad():
+        raw, _ = network.unroll(grids)
+    shown = recovered(open_method("firenetplus_published"), sequence.windows).intensities
+    torch.testing.assert_close(shown, postprocessed(raw, setup.postprocessing))
+    normalised = intensity_network(lambda path: network, setup, published=True)
+    assert not torch.allclose(shown, recovered(normalised, sequence.windows).intensities)
+
+
+def test_an_automatic_range_follows_the_images_from_step_to_step(sequence, make_setup):
+    setup = make_setup("firenet_published")
+    setup = dataclasses.replace(
+        setup, postprocessing=dataclasses.replace(setup.postprocessing, auto_hdr=True, auto_hdr_frames=3)
+    )
+    recoverer = METHODS["firenet_published"].open(setup)
+    together = recovered(recoverer, sequence.windows).intensities
+    state = recoverer.start(18, 20)
+    for window, expected in zip(sequence.windows, together, strict=True):
+        state, one = recoverer.step(state, [window])
+        torch.testing.assert_close(one.intensities[0], expected)
+
+
+def test_e2p_sees_the_channels_as_a_mosaic_and_carries_its_state_on(sequence, open_method, checkpoints):
+    grids = encode_windows(sequence.events, sequence.t_us, lambda events, _: voxel_grid(events, 5))
+    network = load_baseline(E2p, "e2p", checkpoints["e2p"])
+    with torch.no_grad():
+        maps, _ = network.unroll(interleaved(grids.unflatten(1, (4, 5)))[:, None])
+    prediction = recovered(open_method("e2p"), sequence.windows)
+    torch.testing.assert_close(prediction.dolp, maps[:, 0, 2].clamp(0, 1))
+    assert prediction.aolp is not None
+
+
+def test_bf16_is_near_fp32(sequence, open_method):
+    for name in ("firenet", "e2p", "ours"):
+        a, b = (recovered(open_method(name, precision=p), sequence.windows).dolp for p in ("fp32", "bf16"))
+        assert 0 < (a - b).abs().mean() < 0.02
+
+
+def test_more_than_dolp_is_handed_on_where_the_network_says_more(sequence):
+    class Sure(torch.nn.Module):
+        def unroll(self, inputs, state):
+            maps = inputs[:, :, 0]
+            return Prediction(3 + maps, 0.5 + 0 * maps, maps), [maps]
+
+    prediction = recovered(dolp_recoverer(Sure(), {"representation": "voxel_grid"}), sequence.windows[:1])
+    assert prediction.dolp.max() <= 1
+    assert prediction.aolp.unique().tolist() == [0.5]
+    assert prediction.log_variance.shape == (1, 18, 20)
+
+
+def test_a_method_without_weights_says_what_to_do(make_setup, checkpoints, tmp_path):
+    absent = {
+        name: why_absent(METHODS[name], make_setup(METHODS[name].section, weights=weights))
+        for name, weights in {
+            "cf+gain": None,
+            "firenet": checkpoints["firenet"],
+            "firenet_published": None,
+            "firenet_published+gain": None,
+            "paper": tmp_path / "none.safetensors",
+            "e2vid": checkpoints["firenet"],
+        }.items()
+    }
+    assert absent["cf+gain"] is absent["firenet"] is None
+    assert absent["firenet_published+gain"] == absent["firenet_published"]
+    assert "set methods.firenet_published.weights to their file" in absent["firenet_published"]
+    assert absent["paper"] == f"{tmp_path / 'none.safetensors'} is not there"
+    assert absent["e2vid"].endswith(
+        "a firenet, expected e2vid: set methods.e2vid.weights to such a file, or train "
+        "one with baselines.e2v.arch=e2vid"
+    )
+
+
+def test_weights_that_are_missing_or_of_another_network_are_refused(open_method, checkpoints, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none.safetensors is missing"):
+        open_method("ours", weights=tmp_path / "none.safetensors")
+    with pytest.raises(ValueError, match="holds a firenet, expected a e2p"):
+        open_method("e2p", weights=checkpoints["firenet"])
+    with pytest.raises(ValueError, match="holds a e2p, expected a firenet or e2vid"):
+        open_method("e2v", weights=checkpoints["e2p"])
+
+
+def test_a_blank_file_name_is_refused():
+    with pytest.raises(ValueError, match="weights: expected the path of a file or null, got ' '"):
+        WeightsConfig(" ")
+
+
+def test_weights_are_named_by_their_hash_and_network(make_setup, checkpoints):
+    content = checkpoints["firenet"].read_bytes()
+    assert weights_record(METHODS["firenet"], make_setup("firenet")) == {
+        "file": "firenet.safetensors", "sha256": hashlib.sha256(content).hexdigest(), "network": "firenet"
+    }  # fmt: skip
+
+
+def test_weights_name_the_network_behind_a_row_whose_key_does_not(make_setup):
+    for name, network in {"ours": "paper", "e2v": "firenet", "cista_tc": "cista_tc"}.items():
+        assert weights_record(METHODS[name], make_setup(name))["network"] == network
+
+
+@pytest.mark.shared
+def test_the_published_weights_of_firenet_make_rows(sequence, open_method, shared):
+    files = {
+        "firenet_published": shared / "weights" / "firenet_1000.pth.tar",
+        "firenet_published+gain": shared / "weights" / "firenet_1000.pth.tar",
+        "firenetplus_published": shared / "weights" / "firenetplus_state_dict.pth",
+    }
+    for name, file in files.items():
+        assert recovered(open_method(name, weights=file), sequence.windows).dolp.std() > 0.01
+
+
+def test_a_window_without_events_is_a_window(open_method):
+    nothing = EventWindow([Events.empty(18, 20)] * 4, 0, 1000)
+    for name in METHODS:
+        assert recovered(open_method(name), [nothing]).dolp.isfinite().all()

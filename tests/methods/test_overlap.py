@@ -1,0 +1,82 @@
+import pytest
+import torch
+
+from polarnet.events.stream import slice_time
+from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
+from polarnet.methods import METHODS
+from polarnet.methods.method import Recoverer
+from polarnet.methods.overlap import advance, begin, warm_up
+from polarnet.stokes import Prediction
+
+WINDOW_US = 1000
+
+
+def windows_of(sequence, rule):
+    first = sequence.events[0]
+    cutter = WindowCutter(rule, first.height, first.width)
+    return list(cutter.add(sequence.events, int(sequence.t_us[-1])))
+
+
+@pytest.fixture
+def ours(make_setup):
+    return METHODS["ours"].open(make_setup("ours"))
+
+
+def test_windows_at_once_must_follow_each_other(sequence, ours):
+    windows = sequence.windows
+    with pytest.raises(ValueError, match=r"follow each other, got \[\(0, 1000\), \(2000, 3000\)\] us"):
+        advance(ours, begin(ours, 18, 20), [windows[0], windows[2]])
+
+
+def test_overlapping_windows_continue_those_that_ended_where_they_begin(sequence, ours):
+    """Every quarter of a window: the fourth part of the frames is what windows one after the other give."""
+    history, frames = begin(ours, 18, 20), {}
+    for window in windows_of(sequence, WindowRule(WINDOW_US, None, 250)):
+        history, prediction = advance(ours, history, [window])
+        frames[window.stop_us] = prediction.dolp
+    for shift_us in (0, 250, 500, 750):
+        state = ours.start(18, 20)
+        for stop_us in range(shift_us + WINDOW_US, 4001, WINDOW_US):
+            channels = [slice_time(one, stop_us - WINDOW_US, stop_us) for one in sequence.events]
+            state, expected = ours.step(state, [EventWindow(channels, stop_us - WINDOW_US, stop_us)])
+            torch.testing.assert_close(frames[stop_us], expected.dolp, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["cf", "highpass"])
+@pytest.mark.parametrize("step_us", [250, 300])
+def test_a_filter_counts_each_event_once_however_windows_overlap(name, step_us, sequence, make_setup):
+    recoverer = METHODS[name].open(make_setup(name))
+    last = []
+    for rule in (WindowRule(WINDOW_US, None, None), WindowRule(WINDOW_US, None, step_us)):
+        history, prediction = begin(recoverer, 18, 20), None
+        for window in windows_of(sequence, rule):
+            history, prediction = advance(recoverer, history, [window])
+        last.append(prediction.intensities)
+    torch.testing.assert_close(*last)
+
+
+def test_a_bounded_number_of_states_is_kept_however_fine_the_steps():
+    """A method whose state is the end of the last window that it saw."""
+    length, begun = 33_300, []
+
+    def predict(state, windows):
+        begun.append(state)
+        return windows[-1].stop_us, Prediction(torch.zeros(1, 1, 1))
+
+    recoverer = Recoverer(lambda height, width: None, predict)
+    history = begin(recoverer, 1, 1)
+    for stop in range(length, 20 * length, 100):
+        history, _ = advance(recoverer, history, [EventWindow([], stop - length, stop)])
+        assert (begun[-1] is None) == (stop < 2 * length)
+        if begun[-1] is not None:
+            assert 0 <= stop - length - begun[-1] < length / 64 + 100
+    assert len(history) <= 67
+
+
+@pytest.mark.parametrize("name", ["cf", "ours"])
+def test_a_warm_up_leaves_no_trace(name, sequence, make_setup):
+    recoverer = METHODS[name].open(make_setup(name))
+    _, before = advance(recoverer, begin(recoverer, 18, 20), sequence.windows)
+    warm_up(recoverer, 18, 20)
+    _, after = advance(recoverer, begin(recoverer, 18, 20), sequence.windows)
+    assert torch.equal(before.dolp, after.dolp)
