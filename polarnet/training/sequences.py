@@ -150,7 +150,7 @@ def stack(sequences: Sequence[WindowSequence]) -> Batch:
     if len(lengths) > 1:
         raise ValueError(f"a batch needs sequences with equally many windows, got {sorted(lengths)}; use batch_size=1")
     names, *columns, masks = zip(*sequences, strict=True)
-    valid = None if masks[0] is None else torch.stack(masks, dim=1)  # all sequences come from one store, which has masks for all or for none
+    valid = None if masks[0] is None else torch.stack(masks, dim=1)  # one store: masks for all or none
     inputs, dolp, aolp, intensity = (torch.stack(column, dim=1) for column in columns)
     return Batch(list(names), inputs, dolp, aolp, intensity, valid)
 

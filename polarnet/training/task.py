@@ -134,7 +134,7 @@ def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, de
 
 
 def content_hash(path: str) -> str:
-    """Return the sha256 of all file names and contents at `path`, or of the path itself if it is not on this machine."""
+    """Return the sha256 of all file names and contents at `path`, or of the path string if nothing is there."""
     digest = hashlib.sha256()
     if not Path(path).exists():
         digest.update(path.encode())
