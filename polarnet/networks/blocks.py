@@ -70,7 +70,7 @@ class ConvGRU(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Residual block relu(x + conv(relu(conv(x)))) of 3x3 convolutions, without normalisation (He et al., CVPR 2016)."""
+    """relu(x + conv(relu(conv(x)))) with 3x3 convolutions, stride 1, no normalisation (He et al., CVPR 2016)."""
 
     def __init__(self, channels: int):
         super().__init__()

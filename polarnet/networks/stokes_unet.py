@@ -232,7 +232,7 @@ class StokesUNet(nn.Module):
 
     @torch.no_grad()
     def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:
-        """Set the log-variance to weight @ x + bias, where x is the input of `expected`; other outputs stay the same."""
+        """Set the log-variance to weight @ x + bias, where x is the input of `expected`; keep other outputs."""
         assert self.add.bias is not None
         self.add.weight[OF_LOG_VARIANCE] = 0
         self.add.bias[OF_LOG_VARIANCE] = 0
