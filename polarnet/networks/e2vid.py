@@ -186,7 +186,7 @@ class Decoder(nn.Module):
 
 
 def reflected(images: Float[Tensor, "b c h w"]) -> tuple[int, int, Float[Tensor, "b c i j"]]:
-    """Pad images by reflection to multiples of 8; return the rows added above, the columns added left, and the images."""
+    """Pad images by reflection to multiples of 8; return the rows added above, columns added left, and images."""
     rows, columns = (-side % SIZE_MULTIPLE for side in images.shape[-2:])
     top, left = math.ceil(rows / 2), math.ceil(columns / 2)
     return top, left, F.pad(images, (left, columns - left, top, rows - top), mode="reflect")
