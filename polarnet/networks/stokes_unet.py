@@ -36,7 +36,7 @@ from polarnet.networks.redundancy import (
 from polarnet.ranges import allowed, check_ranges
 from polarnet.stokes import Prediction
 
-STRIDE = 4  # of the largest recurrent layer; height and width are padded to multiples of it
+STRIDE = 4  # stride of the largest recurrent layer; height and width are padded to multiples of it
 IMAGES = 2  # input images per channel: sum of polarities and number of events (representation `event_counts`)
 PARTS = ("redundancy", "slopes", "sums", "recurrence", "mosaic")
 MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate

@@ -20,7 +20,7 @@ from torch import Tensor
 RIDGES = (0.01, 0.1, 1.0, 10.0, 100.0)  # penalties on coefficients of unit-variance features; the largest removes them
 FOLDS = 5
 LEAST_SPREAD = 1e-6  # features with a smaller standard deviation are ignored
-TOLERANCE = 1e-9  # of L-BFGS-B: relative change of the mean log-likelihood, and its gradient
+TOLERANCE = 1e-9  # L-BFGS-B stops at this relative change of the mean log-likelihood, or at this gradient
 
 
 class Scene(NamedTuple):
