@@ -1,6 +1,6 @@
-"""Checkpoints: tensors in NAME.safetensors, everything else that is needed to use them in NAME.json beside it.
+"""Checkpoints: tensors in NAME.safetensors, and all metadata needed to use them in NAME.json beside it.
 
-Loading runs no code from either file. Neither holds a date, so equal trainings give equal bytes.
+Loading runs no code from either file. Neither file contains a date, so equal trainings give equal bytes.
 """
 
 import hashlib
@@ -21,9 +21,10 @@ FORMAT = "polarnet-checkpoint-1"
 
 
 def save_checkpoint(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
-    """Write `path` (.safetensors) and the .json beside it. `metadata` says at least "network", "config", "in_channels".
+    """Write `path` (.safetensors) and the .json beside it.
 
-    The JSON is written last and names the hash of the tensors, so a pair from two saves is never taken for one.
+    `metadata` contains at least "network", "config" and "in_channels". The JSON is written last and contains the hash
+    of the tensors, so that loading rejects a pair of files from two different saves.
     """
     path = Path(path)
     _check_suffix(path)
@@ -34,7 +35,7 @@ def save_checkpoint(path: str | os.PathLike[str], tensors: Mapping[str, Tensor],
 
 
 def load_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors (on the CPU) and metadata; ValueError or FileNotFoundError for anything but an intact pair of files."""
+    """Load tensors (on the CPU) and metadata; ValueError or FileNotFoundError if the pair of files is not intact."""
     path = Path(path)
     _check_suffix(path)
     for file in (path, path.with_suffix(".json")):
@@ -56,7 +57,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], di
 
 
 def load_network(path: str | os.PathLike[str]) -> tuple[nn.Module, dict[str, Any]]:
-    """The DoLP network of a checkpoint, ready to evaluate, and its metadata (representation, training, versions)."""
+    """Load a DoLP network in evaluation mode, and its metadata (representation, training, versions)."""
     tensors, metadata = load_checkpoint(path)
     if metadata["network"] not in NETWORKS:
         raise ValueError(
@@ -76,7 +77,7 @@ def load_network(path: str | os.PathLike[str]) -> tuple[nn.Module, dict[str, Any
 
 
 def load_tensors(network: nn.Module, tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> None:
-    """Give `network` the tensors of a file; ValueError that names what is missing, left over or of another shape."""
+    """Copy the tensors of a file into `network`; ValueError names a missing, surplus or differently shaped tensor."""
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
     wrong = sorted(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))

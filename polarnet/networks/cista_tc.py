@@ -1,6 +1,6 @@
-"""CISTA-TC: events to intensity by unrolled sparse coding (Liu, Dragotti, ICASSP 2022).
+"""CISTA-TC: intensity from events by unrolled sparse coding (Liu, Dragotti, ICASSP 2022).
 
-The published file cista_tc.pth.tar loads with `CistaTc.load`.
+`CistaTc.load` reads the published file cista_tc.pth.tar.
 """
 
 from pathlib import Path
@@ -13,27 +13,27 @@ from torch.nn import functional as F
 
 from polarnet.networks.e2vid import ConvLstm, reflected
 
-CHANNELS = 64  # features at half the size
-ATOMS = 128  # of the sparse code
+CHANNELS = 64  # features at half resolution
+ATOMS = 128  # channels of the sparse code
 ITERATIONS = 5
 
 
 class CistaState(NamedTuple):
-    """What the network carries from one window to the next."""
+    """Recurrent state, passed from one window to the next."""
 
     image: Float[Tensor, "b 1 h w"]
-    """The image before, at the padded size."""
+    """Image of the previous window, at the padded size."""
     code: Float[Tensor, "b 128 i j"]
-    """The sparse code before, at half the size."""
+    """Sparse code of the previous window, at half resolution."""
     memory: tuple[Tensor, Tensor] | None
     """State of the ConvLSTM; None at the start."""
 
 
 class CistaTc(nn.Module):
-    """Iterative soft thresholding with a learned dictionary, drawn towards the code of the window before.
+    """Iterative soft thresholding with a learned dictionary and a pull towards the previous window's code.
 
-    The input is a voxel grid of one polarizer, normalised by `normalise_nonzero`. Layers have the names of the
-    published file, which holds the one block of all iterations five times.
+    The input is a voxel grid of one channel, normalised by `normalise_nonzero`. Layers have the names of the published
+    file. All five iterations share one block, which the published file stores five times.
     """
 
     def __init__(self, bins: int):
@@ -55,9 +55,9 @@ class CistaTc(nn.Module):
     def forward(
         self, voxels: Float[Tensor, "b bins h w"], state: CistaState | None = None
     ) -> tuple[Float[Tensor, "b h w"], CistaState]:
-        """Intensity in [0, 1] at the end of one window, and the state for the next; None at the start.
+        """Return the intensity in [0, 1] at the end of one window, and the next state; `state` is None at the start.
 
-        Height and width are reflected up to multiples of 8, and the result cut back.
+        The input is padded by reflection to multiples of 8, and the result is cropped to the original size.
         """
         if voxels.shape[1] != self.bins:
             raise ValueError(f"this CISTA-TC takes {self.bins} bins, got {voxels.shape[1]}")
@@ -78,7 +78,7 @@ class CistaTc(nn.Module):
 
     @classmethod
     def load(cls, path: Path) -> "CistaTc":
-        """The published file, read without running code from it; ValueError for one of another network."""
+        """Load the published file without running code from it; ValueError if it belongs to another network."""
         content = torch.load(path, map_location="cpu", weights_only=True)
         tensors = content.get("state_dict", content)
         first = tensors.get("We.conv2d.weight")
@@ -100,7 +100,7 @@ class Convolution(nn.Module):
         self.conv2d = nn.Conv2d(inputs, outputs, 3, stride, padding=1, padding_mode="reflect")
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d i j"]:
-        """d channels, at the size that the stride leaves."""
+        """Return d channels, downsampled by the stride."""
         return self.conv2d(x)
 
 
@@ -116,13 +116,13 @@ class Iteration(nn.Module):
     def forward(
         self, code: Float[Tensor, "b 128 h w"], features: Float[Tensor, "b 64 h w"], pull: Float[Tensor, "b 128 h w"]
     ) -> Float[Tensor, "b 128 h w"]:
-        """The next code."""
+        """Return the next code."""
         x = self.P(features - self.D(code)) + code + pull
-        return F.relu(x - self.Lambda) - F.relu(-x - self.Lambda)  # Lambda may be negative, as trained
+        return F.relu(x - self.Lambda) - F.relu(-x - self.Lambda)  # trained values of Lambda can be negative
 
 
 class Decoder(nn.Module):
-    """Code to features: convolution, ReLU, ConvLSTM."""
+    """Decoder from the code to features: convolution, ReLU, ConvLSTM."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -133,6 +133,6 @@ class Decoder(nn.Module):
     def forward(
         self, code: Float[Tensor, "b 128 h w"], state: tuple[Tensor, Tensor] | None
     ) -> tuple[Float[Tensor, "b 64 h w"], tuple[Tensor, Tensor]]:
-        """Features, and the state for the next window."""
+        """Return the features and the state for the next window."""
         state = self.recurrent_block(F.relu(self.conv(code)), state)
         return state[0], state

@@ -13,8 +13,8 @@ from polarnet.networks.swin import SwinStage
 from polarnet.ranges import allowed, check_ranges
 from polarnet.stokes import Prediction
 
-STRIDE = 4  # two stages that halve the size
-MIDDLE_DOLP = 0.5  # the output's bias at the start: DoLP lies in [0, 1]
+STRIDE = 4  # two stages halve the resolution; height and width are padded to multiples of 4
+MIDDLE_DOLP = 0.5  # initial bias of the output; DoLP lies in [0, 1]
 
 
 @dataclass(frozen=True)
@@ -22,17 +22,17 @@ class DolpUNetConfig:
     """Section `networks.paper` of params.yaml."""
 
     channels: list[int] = field(metadata=allowed(low=1))
-    """Of C1, of S1 and G1, of S2, G2, R1 and R2; the paper has 32, 64, 128."""
+    """Channels of C1; of S1 and G1; of S2, G2, R1 and R2. The paper has 32, 64, 128."""
     swin_depth: int = field(metadata=allowed(low=1))
-    """Blocks a stage; every second one has shifted windows."""
+    """Blocks per stage; every second block has shifted tiles."""
     swin_window: int = field(metadata=allowed(low=2))
-    """Pixels."""
+    """Side of an attention tile in pixels."""
     swin_heads: list[int] = field(metadata=allowed(low=1))
     """Attention heads of S1 and S2."""
     residual_blocks: int = field(metadata=allowed(low=0))
-    """The paper has two, R1 and R2."""
+    """Number of residual blocks; the paper has two, R1 and R2."""
     input_mixing: str = field(metadata=allowed(choices=("polarizers", "contrasts")))
-    """What C1 sees: the four channels as they are (the paper), or their sum and differences, see `contrasts`."""
+    """Input of C1. polarizers: the four channels, as in the paper; contrasts: their sum and differences."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -44,10 +44,10 @@ class DolpUNetConfig:
 
 
 class DolpUNet(nn.Module):
-    """Event tensors of the four polarizers to DoLP, window by window, with a recurrent state.
+    """The paper's recurrent network from event tensors of four channels to DoLP, window by window.
 
-    C1 sees the four tensors, mixed as `input_mixing` says and `compressed`. The output is linear, so that no pixel's
-    gradient vanishes near 0 or 1: it can leave [0, 1], and whoever scores or shows it clamps it.
+    The input of C1 is the four tensors, mixed according to `input_mixing` and `compressed`. The output is linear, so
+    that gradients do not vanish near 0 or 1. It can therefore leave [0, 1]; code that scores or displays it clamps it.
     """
 
     representation = "event_tensor"
@@ -75,17 +75,17 @@ class DolpUNet(nn.Module):
     def forward(
         self, inputs: Float[Tensor, "b c h w"], state: list[Tensor] | None = None
     ) -> tuple[Prediction, list[Tensor]]:
-        """One window of b streams. `state` is what the window before handed back, None at the start."""
+        """Process one window of b streams. `state` comes from the previous window; None at the start."""
         prediction, state = self.unroll(inputs[None], state)
         return Prediction(prediction.dolp[0]), state
 
     def unroll(
         self, inputs: Float[Tensor, "t b c h w"], state: list[Tensor] | None = None
     ) -> tuple[Prediction, list[Tensor]]:
-        """t windows of b streams at once: the same numbers as `forward` window by window, in fewer operations."""
+        """Process t windows of b streams at once: same result as `forward` per window, in fewer operations."""
         t, b, _, height, width = inputs.shape
         x = compressed(self.mix(inputs)).flatten(0, 1).contiguous(memory_format=torch.channels_last)
-        x = F.pad(x, (0, -width % STRIDE, 0, -height % STRIDE))  # no events there
+        x = F.pad(x, (0, -width % STRIDE, 0, -height % STRIDE))  # the padding holds no events
         state1, state2 = state or self.initial_state(x[:b])
 
         c1 = F.relu(self.c1(x))
@@ -102,7 +102,7 @@ class DolpUNet(nn.Module):
         return Prediction(dolp), [state1, state2]
 
     def initial_state(self, x: Float[Tensor, "b c h w"]) -> list[Tensor]:
-        """Nothing seen yet: zeros at half and at a quarter of the size of x, which divides by 4."""
+        """Return zero states at half and quarter resolution of x; its height and width must be multiples of 4."""
         b, _, height, width = x.shape
         return [
             x.new_zeros(b, height // scale, width // scale, channels).permute(0, 3, 1, 2)

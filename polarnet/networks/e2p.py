@@ -1,8 +1,8 @@
-"""E2P: events to intensity, AoLP and DoLP with 512,501 parameters (Mei et al., CVPR 2023).
+"""E2P: intensity, AoLP and DoLP from events, with 512,501 parameters (Mei et al., CVPR 2023).
 
-The published network reads one sensor whose pixels carry polarizers, 90 45 / 135 0 over each 2x2 pixels. Four channels
-that each cover the whole image are laid out as such a sensor of twice the height and width (`interleaved`), so that
-the network itself, its first layer included, is the published one and its result has the channels' own size.
+The published network reads one sensor with a polarizer mosaic, 90 45 / 135 0 over each 2x2 pixels. `interleaved` lays
+out four full-size channels as such a mosaic of twice the height and width. All layers, including the first, therefore
+stay as published, and the result has the size of the channels.
 """
 
 import math
@@ -20,16 +20,16 @@ from polarnet.networks.firenet import ConvGRU, ResidualBlock
 
 CHANNELS = 32
 BRANCHES = ("intensity", "aolp", "dolp")
-MOSAIC = ((90, 45), (135, 0))  # degrees, over even and odd rows and columns
-CELLS = ((0, 0), (0, 1), (1, 0), (1, 1))  # row and column of a polarizer in its 2x2 pixels
+MOSAIC = ((90, 45), (135, 0))  # polarizer angles in degrees over even and odd rows and columns
+CELLS = ((0, 0), (0, 1), (1, 0), (1, 1))  # row and column of each polarizer in a 2x2 cell
 ATTENTION_KERNEL = 5
 GATE_POOL = 4
-SMALLEST_SIDE = 2 * GATE_POOL  # of the result: the gate halves it and pools by 4
+SMALLEST_SIDE = 2 * GATE_POOL  # smallest height and width of the result: the gate halves the resolution and pools by 4
 PUBLISHED_NAME = re.compile(r"(head|G1|G2|R1|R2|pred)_([iad])\.(.*)")
 
 
 class E2p(nn.Module):
-    """Three branches alike, for intensity, AoLP and DoLP, that look at each other through two gates."""
+    """Three identical branches for intensity, AoLP and DoLP, coupled by two gates."""
 
     def __init__(self, bins: int):
         super().__init__()
@@ -41,9 +41,9 @@ class E2p(nn.Module):
     def forward(
         self, mosaic: Float[Tensor, "b bins h w"], state: list[Tensor] | None = None
     ) -> tuple[Float[Tensor, "b 3 h//2 w//2"], list[Tensor]]:
-        """Intensity, AoLP and DoLP at the end of one window, and the state for the next; None at the start.
+        """Return intensity, AoLP and DoLP at the end of one window, and the next state; `state` is None at the start.
 
-        The voxel grid is taken as it is. AoLP is coded as in `coded_aolp`. Nothing is clamped.
+        The input is an unnormalised voxel grid. AoLP is coded as in `coded_aolp`. The outputs are not clamped.
         """
         if mosaic.shape[1] != self.bins or mosaic.shape[-1] % 2 or mosaic.shape[-2] % 2:
             raise ValueError(f"this E2P takes {self.bins} bins of even height and width, got {tuple(mosaic.shape[1:])}")
@@ -62,7 +62,7 @@ class E2p(nn.Module):
     def unroll(
         self, mosaics: Float[Tensor, "t b bins h w"], state: list[Tensor] | None = None
     ) -> tuple[Float[Tensor, "t b 3 h//2 w//2"], list[Tensor]]:
-        """t windows of b streams, one after the other."""
+        """Process t windows of b streams, one window after the other."""
         maps = []
         for window in mosaics:
             frame, state = self(window, state)
@@ -71,9 +71,9 @@ class E2p(nn.Module):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "E2p":
-        """A checkpoint with the authors' names of the tensors, read without running code from it.
+        """Load a checkpoint with the authors' tensor names, without running code from it.
 
-        ValueError for one of another network.
+        ValueError if it belongs to another network.
         """
         content = torch.load(path, map_location="cpu", weights_only=True)
         tensors = own_names(content.get("state_dict", content))
@@ -89,7 +89,7 @@ class E2p(nn.Module):
 
 
 class Branch(nn.Module):
-    """The layers of one of the three maps; `E2p.forward` says how they follow each other."""
+    """Layers of one of the three maps; `E2p.forward` connects them."""
 
     def __init__(self, bins: int):
         super().__init__()
@@ -105,9 +105,9 @@ class Branch(nn.Module):
 
 
 class MosaicHead(nn.Module):
-    """Half the size by four 3x3 convolutions, each centred on the pixels of one polarizer; channels then weighted.
+    """Downsampling by 2 with four 3x3 convolutions, each centred on the pixels of one polarizer, and channel weights.
 
-    The weights (efficient channel attention) are a sigmoid of a convolution over the channels' means.
+    The weights (efficient channel attention) are the sigmoid of a convolution over the channel means.
     """
 
     def __init__(self, bins: int):
@@ -118,7 +118,7 @@ class MosaicHead(nn.Module):
         self.conv = nn.Conv1d(1, 1, ATTENTION_KERNEL, padding=ATTENTION_KERNEL // 2)
 
     def forward(self, mosaic: Float[Tensor, "b bins h w"]) -> Float[Tensor, "b 32 h//2 w//2"]:
-        """A quarter of the channels for each polarizer, in the order of `CELLS`."""
+        """Return the features; each polarizer has a quarter of the channels, in the order of `CELLS`."""
         patterns = (self.pattern1, self.pattern2, self.pattern3, self.pattern4)
         padded = [F.pad(mosaic, (1 - column, column, 1 - row, row)) for row, column in CELLS]
         x = torch.cat([F.relu(pattern(p)) for pattern, p in zip(patterns, padded, strict=True)], dim=1)
@@ -127,7 +127,7 @@ class MosaicHead(nn.Module):
 
 
 class CrossBranchGate(nn.Module):
-    """Weights every channel of every branch, pixel by pixel, by a number in [0, 1] that depends on all of them."""
+    """Multiplies each pixel and channel of each branch by a weight in [0, 1] that depends on all branches."""
 
     def __init__(self):
         super().__init__()
@@ -137,7 +137,7 @@ class CrossBranchGate(nn.Module):
         self.conv4 = nn.Conv2d(CHANNELS, len(BRANCHES) * CHANNELS, 1)
 
     def forward(self, branches: list[Tensor]) -> tuple[Tensor, ...]:
-        """The branches, weighted."""
+        """Return the weighted branches."""
         x = torch.cat(branches, dim=1)
         narrow = F.relu(self.conv1(x))
         coarse = F.relu(self.conv3(F.max_pool2d(F.relu(self.conv2(narrow)), GATE_POOL)))
@@ -146,25 +146,25 @@ class CrossBranchGate(nn.Module):
 
 
 def interleaved(channels: Float[Tensor, "*b 4 c h w"]) -> Float[Tensor, "*b c 2*h 2*w"]:
-    """Images behind polarizers at 0, 45, 90 and 135 degrees as one mosaic 90 45 / 135 0."""
+    """Interleave images behind polarizers at 0, 45, 90 and 135 degrees into one mosaic 90 45 / 135 0."""
     rows = [torch.stack([channels[..., angle // 45, :, :, :] for angle in row], dim=-1) for row in MOSAIC]
     cells = torch.stack(rows, dim=-3)  # c, h, 2 rows, w, 2 columns
     return cells.flatten(-2, -1).flatten(-3, -2)
 
 
 def coded_aolp(aolp: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
-    """AoLP as E2P is taught it: -90 to 90 degrees become 0 to 1."""
+    """Code AoLP as E2P's training target: -90 to 90 degrees become 0 to 1."""
     return torch.remainder(aolp / math.pi + 0.5, 1.0)
 
 
 def decoded_aolp(code: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
-    """`coded_aolp` undone: radians in [0, pi), whatever the code."""
+    """Invert `coded_aolp`: radians in [0, pi) for any code."""
     angle = math.pi * torch.remainder(code - 0.5, 1.0)
     return torch.where(angle >= math.pi, 0.0, angle)
 
 
 def own_names(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The authors' names head_d.pattern1.0.weight as ours, branches.dolp.head.pattern1.weight; ours stay."""
+    """Rename the authors' tensors, head_d.pattern1.0.weight to branches.dolp.head.pattern1.weight; keep our names."""
     branch_of = {name[0]: name for name in BRANCHES}
     renamed = {}
     for name, tensor in tensors.items():

@@ -1,6 +1,6 @@
-"""E2VID: events to intensity with 10,712,098 parameters (Rebecq et al., CVPR 2019 and TPAMI 2021).
+"""E2VID: intensity from events, with 10,712,098 parameters (Rebecq et al., CVPR 2019 and TPAMI 2021).
 
-The network of the published "lightweight" checkpoint, E2VID_lightweight.pth.tar, which `E2vid.load` reads.
+This is the network of the published "lightweight" checkpoint. `E2vid.load` reads the file E2VID_lightweight.pth.tar.
 """
 
 import itertools
@@ -31,10 +31,10 @@ PUBLISHED_SETTINGS = {
 
 
 class E2vid(nn.Module):
-    """A U-Net whose three encoders remember: convolution to half the size, then a ConvLSTM. Intensity in [0, 1].
+    """U-Net with three recurrent encoders (a stride-2 convolution, then a ConvLSTM); the intensity is in [0, 1].
 
-    The input is a voxel grid of one polarizer, normalised by `normalise_nonzero`. Skips are added. Layers have the
-    names of the published checkpoint.
+    The input is a voxel grid of one channel, normalised by `normalise_nonzero`. Skip connections are added, not
+    concatenated. Layers have the names of the published checkpoint.
     """
 
     def __init__(self, bins: int):
@@ -51,9 +51,9 @@ class E2vid(nn.Module):
     def forward(
         self, voxels: Float[Tensor, "b bins h w"], state: Sequence[Tensor] | None = None
     ) -> tuple[Float[Tensor, "b h w"], list[Tensor]]:
-        """Intensity at the end of one window, and the state for the next; None at the start.
+        """Return the intensity at the end of one window, and the next state; `state` is None at the start.
 
-        Height and width are reflected up to multiples of 8, and the result cut back.
+        The input is padded by reflection to multiples of 8, and the result is cropped to the original size.
         """
         if voxels.shape[1] != self.bins:
             raise ValueError(f"this E2VID takes {self.bins} bins, got {voxels.shape[1]}")
@@ -75,7 +75,7 @@ class E2vid(nn.Module):
     def unroll(
         self, voxels: Float[Tensor, "t b bins h w"], state: list[Tensor] | None = None
     ) -> tuple[Float[Tensor, "t b h w"], list[Tensor]]:
-        """t windows of b streams, one after the other."""
+        """Process t windows of b streams, one window after the other."""
         frames = []
         for window in voxels:
             frame, state = self(window, state)
@@ -84,7 +84,7 @@ class E2vid(nn.Module):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "E2vid":
-        """The published checkpoint, read without running code from it; ValueError for one of another network."""
+        """Load the published checkpoint without running code from it; ValueError if it belongs to another network."""
         content = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(content, dict) or "state_dict" not in content:
             raise ValueError(f"{path} holds no E2VID: expected a dictionary with arch, model and state_dict")
@@ -102,7 +102,7 @@ class E2vid(nn.Module):
 
 
 class Convolution(nn.Module):
-    """Convolution, batch normalisation if wanted (which then stands in for the bias), ReLU."""
+    """Convolution, optional batch normalisation (which replaces the bias), optional ReLU."""
 
     def __init__(
         self, inputs: int, outputs: int, kernel_size: int, *, normalised: bool, stride: int = 1, relu: bool = True
@@ -113,7 +113,7 @@ class Convolution(nn.Module):
         self.relu = relu
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d i j"]:
-        """d channels, at the size that the stride leaves."""
+        """Return d channels, downsampled by the stride."""
         x = self.conv2d(x)
         if self.norm_layer is not None:
             x = self.norm_layer(x)
@@ -121,7 +121,7 @@ class Convolution(nn.Module):
 
 
 class RecurrentEncoder(nn.Module):
-    """Half the size by a 5x5 convolution, then a ConvLSTM."""
+    """Downsampling by 2 with a 5x5 convolution, then a ConvLSTM."""
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
@@ -131,12 +131,15 @@ class RecurrentEncoder(nn.Module):
     def forward(
         self, x: Float[Tensor, "b c h w"], state: tuple[Tensor, Tensor] | None
     ) -> tuple[Float[Tensor, "b d i j"], Float[Tensor, "b d i j"]]:
-        """What the LSTM shows, and its memory."""
+        """Return the LSTM's output and its memory."""
         return self.recurrent_block(self.conv(x), state)
 
 
 class ConvLstm(nn.Module):
-    """i, f, o = sigmoid, g = tanh of conv[x, shown]; memory <- f memory + i g; shown <- o tanh(memory)."""
+    """Convolutional LSTM with the gates i, f, o = sigmoid and g = tanh of conv[x, shown].
+
+    memory <- f memory + i g;  shown <- o tanh(memory), where `shown` is the output.
+    """
 
     def __init__(self, channels: int):
         super().__init__()
@@ -145,7 +148,7 @@ class ConvLstm(nn.Module):
     def forward(
         self, x: Float[Tensor, "b c h w"], state: tuple[Tensor, Tensor] | None
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b c h w"]]:
-        """What it shows and its memory; both are None at the start, and count as zeros."""
+        """Return the output and the memory; a `state` of None (at the start) counts as zeros."""
         shown, memory = (torch.zeros_like(x), torch.zeros_like(x)) if state is None else state
         i, f, o, g = self.Gates(torch.cat([x, shown.to(x.dtype)], dim=1)).chunk(4, dim=1)
         memory = torch.sigmoid(f) * memory.to(f.dtype) + torch.sigmoid(i) * torch.tanh(g)
@@ -153,7 +156,7 @@ class ConvLstm(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """relu(x + bn(conv(relu(bn(conv(x))))))."""
+    """Residual block relu(x + bn(conv(relu(bn(conv(x))))))."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -163,12 +166,12 @@ class ResidualBlock(nn.Module):
         self.bn2 = nn.BatchNorm2d(channels)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """The same shape."""
+        """Return a tensor of the same shape."""
         return F.relu(x + self.bn2(self.conv2(F.relu(self.bn1(self.conv1(x))))))
 
 
 class Decoder(nn.Module):
-    """Twice the size by a transposed 5x5 convolution."""
+    """Upsampling by 2 with a transposed 5x5 convolution."""
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
@@ -178,19 +181,19 @@ class Decoder(nn.Module):
         self.norm_layer = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d 2*h 2*w"]:
-        """d channels."""
+        """Return d channels at twice the height and width."""
         return F.relu(self.norm_layer(self.transposed_conv2d(x)))
 
 
 def reflected(images: Float[Tensor, "b c h w"]) -> tuple[int, int, Float[Tensor, "b c i j"]]:
-    """How many rows and columns were added above and left, and the images with sides that are multiples of 8."""
+    """Pad images by reflection to multiples of 8; return the rows added above, columns added left, and images."""
     rows, columns = (-side % SIZE_MULTIPLE for side in images.shape[-2:])
     top, left = math.ceil(rows / 2), math.ceil(columns / 2)
     return top, left, F.pad(images, (left, columns - left, top, rows - top), mode="reflect")
 
 
 def _check_settings(path: str | os.PathLike[str], content: dict) -> None:
-    """The file says which network it holds; E2VID has had several, with equally named tensors."""
+    """Check the network settings in the file, because several versions of E2VID share tensor names."""
     if content.get("arch", PUBLISHED_ARCH) != PUBLISHED_ARCH:
         raise ValueError(f"{path} holds no E2VID: its arch is {content['arch']!r}, expected {PUBLISHED_ARCH!r}")
     settings = content.get("model") or content.get("config", {}).get("model", {})

@@ -1,9 +1,10 @@
-"""How large DoLP's errors are expected to be, by a few things that tell it on pictures never seen.
+"""Expected error of DoLP, from a few features that also work on new scenes.
 
-Where the redundancy's answers disagree it is badly known what the scene is like; DoLP is bounded, so errors of middle
-values can be larger; few events say little, and none nothing at all. What is expected is the exponential of a linear
-function of these, with a handful of coefficients, which are found when a training is over
-(`polarnet.training.calibration`).
+The features measure three things. The redundancy's candidates disagree where the scene is poorly known. DoLP is
+bounded, so middle values can have larger errors. Few events carry little information, and no events carry none.
+
+The expected squared error is the exponential of a linear function of these features. Its few coefficients are fitted
+after training (`polarnet.training.calibration`).
 """
 
 import torch
@@ -14,17 +15,16 @@ from torch.nn import functional as F
 from polarnet.networks.redundancy import block_means
 
 TELLING = 5
-LEAST_DISAGREEMENT = 1e-3  # squared DoLP: candidates that agree are wrong together
-LEAST_WEIGHT = 1e-6  # of all candidates together
-LEAST_ROOM = 0.05  # of dolp * (1 - dolp)
-HARDLY_ANY = 0.1  # evidence, the mean over a frame
+LEAST_DISAGREEMENT = 1e-3  # squared DoLP, added because candidates that agree may share an error
+LEAST_WEIGHT = 1e-6  # lower limit of the candidates' total weight
+LEAST_ROOM = 0.05  # added to dolp * (1 - dolp)
+HARDLY_ANY = 0.1  # a frame with this mean evidence has a silence of 1/2
 
 
 class ExpectedError(nn.Module):
-    """What the logarithm of the squared error is above the network's start, of a pixel of half the size: weight @ what
-    tells it + bias.
+    """Correction to the initial log-variance, at half resolution: weight @ features + bias.
 
-    Nothing is learnt while a network trains: all is 0 until `polarnet.training.loop.calibrate`.
+    Weight and bias are not trained by gradients. They stay 0 until `polarnet.training.loop.calibrate` sets them.
     """
 
     weight: Float[Tensor, " k"]
@@ -36,7 +36,7 @@ class ExpectedError(nn.Module):
         self.register_buffer("bias", torch.zeros(()))
 
     def forward(self, telling: Float[Tensor, "n k h w"]) -> Float[Tensor, "n 1 h w"]:
-        """Of what `telling` gives."""
+        """Return the correction for the features from `telling`."""
         return (self.weight.view(-1, 1, 1) * telling).sum(1, keepdim=True) + self.bias
 
 
@@ -47,11 +47,15 @@ def telling(
     evidence: Float[Tensor, "n c h w"],
     dolp: Float[Tensor, "n 1 4*h 4*w"],
 ) -> Float[Tensor, "n k 2*h 2*w"]:
-    """What tells how large the errors of `dolp` are, at half its size; the candidates are at a quarter of it.
+    """Compute features of the errors of `dolp` at half its resolution; the candidates are at quarter resolution.
 
-    The logarithm of how far the candidates' DoLP are apart, by their weights, and that of the evidence they rest on;
-    the mean of the first over the frame, and from 0 to 1 how little evidence there is in it; the logarithm of what room
-    errors have.
+    The five features are:
+
+    - log of the weighted variance of the candidates' DoLP,
+    - log of the candidates' evidence,
+    - mean of the first feature over the frame,
+    - silence: lack of evidence in the frame, from 0 to 1,
+    - log of the room for errors, dolp * (1 - dolp).
     """
     whole = weights.sum(1, keepdim=True).clamp(min=LEAST_WEIGHT)
     mean = (weights * candidates).sum(1, keepdim=True) / whole

@@ -1,6 +1,6 @@
-"""FireNet: events to intensity with 37,777 parameters (Scheerlinck et al., WACV 2020).
+"""FireNet: intensity from events, with 37,777 parameters (Scheerlinck et al., WACV 2020).
 
-Published checkpoints, of FireNet and of FireNet+ (Stoffregen et al., ECCV 2020), load with `FireNet.load`.
+`FireNet.load` reads the published checkpoints of FireNet and of FireNet+ (Stoffregen et al., ECCV 2020).
 """
 
 import os
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 CHANNELS = 16
-MIDDLE_INTENSITY = 0.25  # the output's bias at the start: half of S0 = 0.5 passes a polarizer
+MIDDLE_INTENSITY = 0.25  # initial bias of the output: a polarizer passes half of S0 = 0.5
 PUBLISHED_NAMES = {
     "head.conv.conv2d": "head.conv2d",
     "head.recurrent_block": "G1",
@@ -22,9 +22,9 @@ PUBLISHED_NAMES = {
 
 
 class FireNet(nn.Module):
-    """conv - ConvGRU - residual - ConvGRU - residual - 1x1 conv, all at full size; no output activation.
+    """conv - ConvGRU - residual - ConvGRU - residual - 1x1 conv at full resolution, without output activation.
 
-    The input is a voxel grid of one polarizer, normalised by `normalise_nonzero` (FireNet+: as it is).
+    The input is a voxel grid of one channel, normalised by `normalise_nonzero` for FireNet, unnormalised for FireNet+.
     """
 
     def __init__(self, bins: int):
@@ -42,7 +42,7 @@ class FireNet(nn.Module):
     def forward(
         self, voxels: Float[Tensor, "b bins h w"], state: list[Tensor] | None = None
     ) -> tuple[Float[Tensor, "b h w"], list[Tensor]]:
-        """Intensity at the end of one window (not clamped), and the state for the next; None at the start."""
+        """Return the unclamped intensity at the end of one window, and the next state; `state` is None at the start."""
         if voxels.shape[1] != self.bins:
             raise ValueError(f"this FireNet takes {self.bins} bins, got {voxels.shape[1]}")
         before1, before2 = state or (None, None)
@@ -55,7 +55,7 @@ class FireNet(nn.Module):
     def unroll(
         self, voxels: Float[Tensor, "t b bins h w"], state: list[Tensor] | None = None
     ) -> tuple[Float[Tensor, "t b h w"], list[Tensor]]:
-        """t windows of b streams, one after the other."""
+        """Process t windows of b streams, one window after the other."""
         state, frames = state or [], []
         for window in voxels:
             frame, state = self(window, state)
@@ -64,9 +64,9 @@ class FireNet(nn.Module):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "FireNet":
-        """A published checkpoint, of FireNet or FireNet+, read without running code from it.
+        """Load a published checkpoint of FireNet or FireNet+ without running code from it.
 
-        ValueError for a file that holds something else.
+        ValueError if the file belongs to another network.
         """
         content = torch.load(path, map_location="cpu", weights_only=True)
         tensors = {_own_name(name): tensor for name, tensor in content.get("state_dict", content).items()}
@@ -82,19 +82,22 @@ class FireNet(nn.Module):
 
 
 class Convolution(nn.Module):
-    """A convolution that keeps height and width."""
+    """Convolution that keeps height and width."""
 
     def __init__(self, inputs: int, outputs: int, kernel_size: int):
         super().__init__()
         self.conv2d = nn.Conv2d(inputs, outputs, kernel_size, padding=kernel_size // 2)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h w"]:
-        """d channels."""
+        """Return d channels of the same height and width."""
         return self.conv2d(x)
 
 
 class ConvGRU(nn.Module):
-    """reset, update = sigmoid(conv[x, h]); candidate = tanh(conv[x, reset * h]); h <- h + update * (candidate - h)."""
+    """Convolutional gated recurrent unit.
+
+    reset, update = sigmoid(conv[x, h]);  candidate = tanh(conv[x, reset * h]);  h <- h + update * (candidate - h).
+    """
 
     def __init__(self, channels: int):
         super().__init__()
@@ -103,7 +106,7 @@ class ConvGRU(nn.Module):
         self.out_gate = nn.Conv2d(2 * channels, channels, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "b c h w"], state: Float[Tensor, "b c h w"] | None) -> Float[Tensor, "b c h w"]:
-        """The new state; the old one is None at the start, and counts as zeros."""
+        """Return the new state; a `state` of None (at the start) counts as zeros."""
         state = torch.zeros_like(x) if state is None else state.to(x.dtype)
         both = torch.cat([x, state], dim=1)
         reset, update = torch.sigmoid(self.reset_gate(both)), torch.sigmoid(self.update_gate(both))
@@ -112,7 +115,7 @@ class ConvGRU(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """relu(x + conv(relu(conv(x))))."""
+    """Residual block relu(x + conv(relu(conv(x))))."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -120,12 +123,15 @@ class ResidualBlock(nn.Module):
         self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """The same shape."""
+        """Return a tensor of the same shape."""
         return F.relu(x + self.conv2(F.relu(self.conv1(x))))
 
 
 def _own_name(name: str) -> str:
-    """Of a published tensor: FireNet+ has our names, FireNet's say in which block of E2VID's code each layer sat."""
+    """Map the name of a published tensor to ours.
+
+    FireNet+ already uses our names. FireNet's names contain the block of E2VID's code that each layer was in.
+    """
     name = name.removeprefix("net.")
     for theirs, ours in PUBLISHED_NAMES.items():
         if name.startswith(theirs):

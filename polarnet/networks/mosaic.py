@@ -1,19 +1,20 @@
-"""Pictures of what the polarizers see and differ by, gathered along the motion of the scene, without training.
+"""Panoramas: log intensities and polarizer contrasts gathered along the motion of the scene, without training.
 
-A pixel's own sum of events tells how much its log intensity has changed since the start: without the start itself, and
-with errors that grow event by event, because thresholds differ between pixels. A scene that moves past the sensor
-shows each of its points to many pixels, so that there are two images of the same thing: `own`, what each pixel has
-summed up, and `level`, which moves along with the scene. What is at p after a displacement d was at p + d, in the
-Fourier domain a factor exp(i f d). An error of `own` stays at its pixel while that of `level` moves along, and so one
-image tells the errors of the other, wherever the scene varies along its motion.
+The sum of a pixel's events measures how much its log intensity has changed since the start. The initial value is
+unknown, and the error grows with every event, because thresholds differ between pixels. A moving scene shows each of
+its points to many pixels, which gives two images of the same scene. `own` holds each pixel's sum of events. `level`
+moves with the scene: after a displacement d, the point at p was at p + d, a factor exp(i f d) in the Fourier domain.
+An error of `own` stays at its pixel, whereas an error of `level` moves with the scene. Each image therefore reveals the
+errors of the other, wherever the scene varies along its motion.
 
-`follow` is the Kalman filter of the two, one for each spatial frequency: what is expected of a picture before anything
-was seen has a power that falls with the square of the frequency, and at the start both images are 0, with the same
-error. Infrared sensors are rid of their fixed patterns by such registration (Hardie et al., Applied Optics 2000);
-mosaicing with event cameras (Kim et al., BMVC 2014) filters pixel by pixel.
+`follow` is the Kalman filter of the two images, one filter for each spatial frequency. The prior power of the scene
+falls with the square of the frequency. At the start both images are 0, with the same error. Such registration also
+removes the fixed pattern of infrared sensors (Hardie et al., Applied Optics 2000). Mosaicing with event cameras (Kim et
+al., BMVC 2014) filters pixel by pixel instead.
 
-The motion is one displacement a window, where the events of two windows in a row correlate best (`displacements`).
-Lengths are pixels of the images given; log intensities count in steps, the contrast threshold of an event.
+The motion is one displacement per window, at the best correlation between the events of two consecutive windows
+(`displacements`). Lengths are in pixels of the input images. Log intensities are in steps, where one step is the
+contrast threshold of an event.
 """
 
 import math
@@ -24,54 +25,56 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
-MOST_EVENTS = 6.0  # of a pixel in a window that count in the search: a pixel that fires without end shall not decide
-LEAST_CORRELATION = 0.1  # of two windows that are said to show one motion
-LEAST_OVERLAP = 0.1  # of two windows, for their correlation to count in full
-ROUND = 16  # sizes are made multiples of it, for which Fourier transforms are fast
+MOST_EVENTS = 6.0  # limit per pixel and window in the motion search, so that a hot pixel cannot dominate
+LEAST_CORRELATION = 0.1  # smallest normalised correlation of two windows at which a motion counts as found
+LEAST_OVERLAP = 0.1  # lower limit of the overlap, along each axis, that the correlation is divided by
+ROUND = 16  # sizes are rounded up to multiples of this, for fast Fourier transforms
 
 
 class Memory(NamedTuple):
-    """What `follow` expects of pictures and pixels; variances are those of white noise, in squared steps."""
+    """Parameters of the Kalman filter `follow`; variances are those of white noise, in squared steps."""
 
     prior: float
-    """Variance of a picture at a frequency of 1 radian a pixel; it falls with the square of the frequency."""
+    """Prior variance of the scene at a frequency of 1 radian per pixel; it falls with the square of the frequency."""
     noise: float
-    """Variance of a pixel's sum of events by itself, anew in each window, such as that of whole steps."""
+    """Measurement noise: variance of a pixel's sum of events, independent in each window, for example from rounding to
+    whole steps."""
     drift: float
-    """Variance by which a pixel's sum of events goes astray in a window."""
+    """Variance that each window adds to the error of a pixel's sum of events."""
     renewal: float
-    """How much of the part of the image that a displacement exchanges counts as never seen, for all of the image."""
+    """Loss of certainty, over the whole image, per fraction of the image that a displacement replaces."""
     fade: float
-    """What is left one window later of what has moved out of sight, and of all certainty where no motion was found."""
+    """Factor per window for parts of the panorama that are out of sight, and for the certainty if no motion was
+    found."""
 
 
 class Motion(NamedTuple):
-    """What moved from one window to the next."""
+    """Motion of the scene from one window to the next."""
 
     displacement: Float[Tensor, "*n 2"]
-    """(x, y): what is at p now was at p + displacement one window before."""
+    """(x, y): the point now at p was at p + displacement one window earlier."""
     found: Bool[Tensor, "*n"]
-    """Whether both windows show it."""
+    """Whether the correlation of the two windows confirms the motion."""
 
 
 class Picture(NamedTuple):
-    """What `follow` carries along; all zeros when nothing has been seen.
+    """State of the filter `follow`; all zeros at the start.
 
-    `level` is larger than the sensor's image and its opposite sides meet: what moves out of sight passes the margin,
-    where it fades, before it comes in again from the other side.
+    `level` is larger than the sensor's image and wraps around. Parts of the scene that leave the sensor fade in the
+    margin before they re-enter from the opposite side.
     """
 
     level: Float[Tensor, "b c H W"]
-    """The scene, but for a constant; the sensor sees the first rows and columns."""
+    """The panorama, up to a constant; the sensor covers the first rows and columns."""
     own: Float[Tensor, "b c h w"]
-    """What each pixel says of it by itself: the sum of its events, less what is known of its error."""
+    """Each pixel's own estimate of the scene: the sum of its events minus its estimated error."""
     explained: Float[Tensor, "b 4 H F"]
-    """By how much the errors' variances are smaller than at the start, for each spatial frequency: that of `level`,
-    that of `own`, and real and imaginary part of their covariance."""
+    """Reduction of the error variances since the start, for each spatial frequency: of `level`, of `own`, and the real
+    and imaginary part of their covariance."""
 
 
 def nothing_seen(like: Float[Tensor, "b c h w"], margin: int) -> Picture:
-    """The picture at the start, for images of this size and at least so many pixels beyond them."""
+    """Return the initial state for images of the size of `like`, with a margin of at least `margin` pixels."""
     b, c, h, w = like.shape
     height, width = _round(h + margin), _round(w + margin)
     explained = like.new_zeros(b, 4, height, width // 2 + 1)
@@ -83,13 +86,14 @@ def _round(size: int) -> int:
 
 
 def displacements(images: Float[Tensor, "t1 b h w"], reach: int) -> Motion:
-    """Where the images of two windows in a row correlate best, within `reach` pixels along each axis: [t, b].
+    """Find the displacements [t, b] that maximise the correlation between consecutive windows.
 
-    Finer than a pixel by the parabola through the best place and its neighbours.
+    The search covers `reach` pixels along each axis. A parabola through the maximum and its neighbours gives subpixel
+    precision.
     """
     height, width = images.shape[-2:]
     images = images.clamp(-MOST_EVENTS, MOST_EVENTS)
-    # nothing wraps around, and all of the places looked at are there
+    # large enough to avoid wrap-around and to hold every displacement of the search
     size = (_round(max(height, reach + 2) + reach + 1), _round(max(width, reach + 2) + reach + 1))
     spectrum = torch.fft.rfft2(images, s=size)
     correlation = torch.fft.irfft2(spectrum[:-1] * spectrum[1:].conj(), s=size)
@@ -111,16 +115,17 @@ def displacements(images: Float[Tensor, "t1 b h w"], reach: int) -> Motion:
 
 
 def _vertex(left: Float[Tensor, "*n"], middle: Float[Tensor, "*n"], right: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Where between -1/2 and 1/2 the parabola through three values at -1, 0 and 1 is highest."""
+    """Return the position in [-1/2, 1/2] of the vertex of the parabola through values at -1, 0 and 1."""
     bend = (2 * middle - left - right).clamp(min=1e-12)
     return ((right - left) / (2 * bend)).clamp(-0.5, 0.5)
 
 
 def follow(changes: Float[Tensor, "b c h w"], motion: Motion, picture: Picture, memory: Memory) -> Picture:
-    """The picture one window later. Where no motion was found, all that changes is taken for the scene's.
+    """Advance the panorama by one window. If no motion was found, all changes are attributed to the scene.
 
-    With m = exp(i f d) and variances L of `level`, O of `own`, covariance C: `level` and C move by m; then, for the
-    difference r of the images, S = L + O - 2 Re C + noise, `level` gains (L - C) / S r and `own` loses (O - C*) / S r.
+    Let m = exp(i f d), let L and O be the variances of `level` and `own`, and C their covariance. First, `level` and C
+    are multiplied by m. Then, with the difference r = own - level and S = L + O - 2 Re C + noise, the update adds
+    (L - C) / S r to `level` and subtracts (O - C*) / S r from `own`.
     """
     height, width = changes.shape[-2:]
     size = (picture.level.shape[-2], picture.level.shape[-1])
@@ -138,7 +143,7 @@ def follow(changes: Float[Tensor, "b c h w"], motion: Motion, picture: Picture, 
     of_level = expected[0] + kept.square() * (of_level - expected[0])
     of_own = of_own + memory.drift
     of_both = torch.complex(real, imaginary) * move * kept
-    level_alone, own_alone = of_level - of_both, of_own - of_both  # the second is the conjugate of what corrects `own`
+    level_alone, own_alone = of_level - of_both, of_own - of_both  # `own` is corrected with the conjugate of own_alone
     spread = level_alone.real + own_alone.real + memory.noise
 
     difference = own - level[..., :height, :width]
@@ -163,14 +168,17 @@ def follow(changes: Float[Tensor, "b c h w"], motion: Motion, picture: Picture, 
 
 
 def certainty(picture: Picture, memory: Memory) -> Float[Tensor, "b 1 1 1"]:
-    """How much of what a picture can be is known, from 0 to 1: the mean over all frequencies."""
+    """Return the share of the prior variance that is explained, from 0 to 1, as a mean over all frequencies."""
     size = (picture.level.shape[-2], picture.level.shape[-1])
     share = picture.explained[:, :1] / _expected(size, memory, picture.level)[:1]
     return share.clamp(0, 1).mean((-1, -2), keepdim=True)
 
 
 def _expected(size: tuple[int, int], memory: Memory, like: Tensor) -> Float[Tensor, "4 H F"]:
-    """The four numbers of each frequency that `Picture.explained` counts from: both errors are minus the picture."""
+    """Return the initial error variances and covariance of each frequency, which `Picture.explained` is relative to.
+
+    At the start both images are 0, so both errors equal minus the scene.
+    """
     down, across = _frequencies(size, like)
     lowest = (2 * math.pi / max(size)) ** 2
     variance = memory.prior / (down.square() + across.square()).clamp(min=lowest)
@@ -178,14 +186,14 @@ def _expected(size: tuple[int, int], memory: Memory, like: Tensor) -> Float[Tens
 
 
 def _frequencies(size: tuple[int, int], like: Tensor) -> tuple[Float[Tensor, "H 1"], Float[Tensor, " F"]]:
-    """Radians a pixel, down and across, in the order of rfft2."""
+    """Return vertical and horizontal frequencies in radians per pixel, in the order of rfft2."""
     rows, columns = (torch.arange(number, device=like.device) for number in (size[0], size[1] // 2 + 1))
     down = 2 * math.pi / size[0] * torch.where(2 * rows < size[0], rows, rows - size[0])[:, None]
     return down, 2 * math.pi / size[1] * columns
 
 
 def _move(motion: Motion, size: tuple[int, int]) -> Tensor:
-    """exp(i f d) for every frequency f, complex [b, 1, H, F]; 1 where no motion was found."""
+    """Return exp(i f d) for every frequency f, complex [b, 1, H, F]; 1 if no motion was found."""
     d = torch.where(motion.found[:, None], motion.displacement, 0.0)[:, :, None, None, None]
     down, across = _frequencies(size, d)
     angle = across * d[:, 0] + down * d[:, 1]

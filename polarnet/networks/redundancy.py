@@ -1,17 +1,19 @@
-"""What the redundancy of four polarizers says about polarization from events alone, without any training.
+"""Polarization from events alone, solved from the redundancy of four polarizers.
 
 I0 + I90 = I45 + I135. In logarithms, with s1 = S1 / S0 and s2 = S2 / S0: log I0 + log I90 = 2 log(S0 / 2) +
-log(1 - s1^2) and likewise for 45, 135 and s2; also log I0 - log I90 = 2 atanh(s1). So where e_k is how much log I_k has
-changed, and changes are small,
+log(1 - s1^2) and likewise for 45, 135 and s2; also log I0 - log I90 = 2 atanh(s1). Let e_k be the change of log I_k.
+For small changes,
 
-    (e0 + e90) - (e45 + e135) = -s1 (e0 - e90) + s2 (e45 - e135):
+    (e0 + e90) - (e45 + e135) = -s1 (e0 - e90) + s2 (e45 - e135),
 
-C = -s1 A + s2 B, one linear equation a pixel, in which S0 and the unknown constants of the logarithms do not occur.
-Least squares over neighbours and past windows gives s1 and s2. Events are e_k up to noise: the pixels' thresholds
-differ and changes come in whole steps, which biases the second moments that least squares needs ("errors in
-variables"). `SecondMoments` takes the expected bias out again; what it takes, and how pixels are weighed, is learnt.
+or C = -s1 A + s2 B: one linear equation per pixel, without S0 and without the unknown constants of the logarithms.
+Least squares over neighbours and past windows gives s1 and s2.
 
-The same holds for changes from place to place where there is a picture of each log I_k: `SlopeMoments`.
+The events measure e_k with noise, because thresholds differ between pixels and changes come in whole steps. This noise
+biases the second moments in the least-squares problem ("errors in variables"). `SecondMoments` subtracts the expected
+bias. The size of the bias and the weights of the pixels are trained.
+
+The same equation holds for differences between neighbouring pixels, given an image of each log I_k: `SlopeMoments`.
 """
 
 from collections.abc import Iterable, Sequence
@@ -22,12 +24,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 MOMENTS = 6  # AA, AB, BB, AC, BC and the weighted number of steps
-LEAST_EVIDENCE = 1e-2  # of a moment, in squared events: keeps the solution finite, and 0, where nothing happened
-MOST_CORRELATED = 0.95  # A and B; corrected moments can exceed what those of any A and B could be
+LEAST_EVIDENCE = 1e-2  # squared events, added to AA and BB: without events the solution is 0, not infinite
+MOST_CORRELATED = 0.95  # limit on the correlation of A and B, which bias correction can push beyond 1
 
 
 def faded(x: Float[Tensor, "t *b"], keep: Float[Tensor, "*k"], state: Float[Tensor, "*s"]) -> Float[Tensor, "t *s"]:
-    """Running sums: after each of t windows, what came before counts `keep` times as much as a window earlier.
+    """Return running sums after each of t windows; each window multiplies earlier contributions by `keep`.
 
     `x` and `keep` are broadcast to the shape of `state`.
     """
@@ -39,10 +41,10 @@ def faded(x: Float[Tensor, "t *b"], keep: Float[Tensor, "*k"], state: Float[Tens
 
 
 class SecondMoments(nn.Module):
-    """Products of A, B and C at each pixel, free of the bias that noise of the events leaves in them.
+    """Products of A, B and C at each pixel, corrected for the bias from event noise.
 
-    For each of `memories` sums of events three numbers are learnt: how strongly a pixel's weight falls with its
-    activity, the variance of the relative mismatch of thresholds, and that of a step.
+    Three numbers are trained for each of the `memories` event sums: the decrease of a pixel's weight with its activity,
+    the variance of the relative threshold mismatch, and the variance of a step.
     """
 
     def __init__(self, memories: int):
@@ -52,9 +54,9 @@ class SecondMoments(nn.Module):
         self.log_step = nn.Parameter(torch.full((memories,), -2.0))
 
     def forward(self, events: Float[Tensor, "n m 4 h w"], pooled: int) -> Float[Tensor, "n m 6 h/{pooled} w/{pooled}"]:
-        """`MOMENTS` of the sums of events of the four polarizers, means over blocks of `pooled` x `pooled` pixels.
+        """Return the `MOMENTS` of the event sums of four channels, averaged over `pooled` x `pooled` pixels.
 
-        What is linear is left for after the pooling, when the images are small: most of the work is memory traffic.
+        Linear operations follow the pooling, when the images are small, because memory traffic dominates the cost.
         """
         activity, mismatch, step = (
             p.exp().view(-1, 1, 1, 1) for p in (self.log_activity, self.log_mismatch, self.log_step)
@@ -73,10 +75,10 @@ class SecondMoments(nn.Module):
 
 
 class SlopeMoments(nn.Module):
-    """Products of the differences between neighbouring pixels of pictures of A, B and C.
+    """Products of the differences between neighbouring pixels in images of A, B and C.
 
-    What holds for changes in time holds for changes from place to place. How strongly a place's weight falls with its
-    energy is learnt: pictures are wrong by most at edges.
+    The equation for changes in time also holds for differences in space. A trained number sets the decrease of a
+    pixel's weight with its energy, because the images have their largest errors at edges.
     """
 
     def __init__(self):
@@ -84,9 +86,9 @@ class SlopeMoments(nn.Module):
         self.log_activity = nn.Parameter(torch.tensor(-2.3))
 
     def forward(self, pictures: Float[Tensor, "n 4 h w"]) -> Float[Tensor, "n 7 h/2 w/2"]:
-        """Of a mean, A, B and C in events: `MOMENTS`, the last of them the weight, and then the weighted energy.
+        """Return the `MOMENTS` and the weighted energy, averaged over 2x2 pixels; the sixth moment is the weight.
 
-        Means over blocks of 2 x 2 pixels.
+        `pictures` holds images of the mean, A, B and C, in units of events.
         """
         right = F.pad(pictures[..., 1:] - pictures[..., :-1], (0, 1))
         down = F.pad(pictures[..., 1:, :] - pictures[..., :-1, :], (0, 0, 0, 1))
@@ -100,9 +102,9 @@ class SlopeMoments(nn.Module):
 
 
 class LeastSquares(nn.Module):
-    """s1, s2 that fit C = -s1 A + s2 B best, for summed moments of each memory, decay and scale.
+    """Least-squares solutions s1, s2 of C = -s1 A + s2 B, from the summed moments of each memory, decay and scale.
 
-    A ridge for each, learnt, pulls towards 0 where there is little evidence.
+    Each solution has its own trained ridge, which pulls it towards 0 where there is little evidence.
     """
 
     def __init__(self, memories: int, decays: int, scales: int):
@@ -112,7 +114,7 @@ class LeastSquares(nn.Module):
     def forward(
         self, moments: Float[Tensor, "n m d k 6 h w"]
     ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "n c h w"], Float[Tensor, "n c h w"]]:
-        """s1, s2 with hypot(s1, s2) <= 1, and the weighted number of steps they rest on; c = m * d * k."""
+        """Return s1 and s2, with hypot(s1, s2) <= 1, and the weighted number of steps behind them; c = m * d * k."""
         aa, ab, bb, ac, bc, steps = moments.unbind(4)
         ridge = self.log_ridge.exp()[..., None, None] * steps + LEAST_EVIDENCE
         aa, bb = F.relu(aa) + ridge, F.relu(bb) + ridge
@@ -125,12 +127,12 @@ class LeastSquares(nn.Module):
 
 
 def length(s1: Float[Tensor, "*b"], s2: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """hypot(s1, s2), with a gradient at 0."""
+    """Return hypot(s1, s2), with a finite gradient at 0."""
     return torch.sqrt(s1 * s1 + s2 * s2 + 1e-12)
 
 
 def neighbourhoods(x: Float[Tensor, "n c h w"], scales: Sequence[int]) -> Iterable[Float[Tensor, "n c h w"]]:
-    """Means over boxes of so many pixels around each one, an odd number; 0: over the whole image."""
+    """Yield box means around each pixel for each width in `scales` (odd numbers; 0: mean over the whole image)."""
     for scale in scales:
         if scale == 0:
             yield x.mean((-1, -2), keepdim=True).expand_as(x)
@@ -141,18 +143,18 @@ def neighbourhoods(x: Float[Tensor, "n c h w"], scales: Sequence[int]) -> Iterab
 
 
 def block_means(x: Float[Tensor, "*b h w"], size: int) -> Float[Tensor, "*b h/{size} w/{size}"]:
-    """Means over blocks of `size` x `size` pixels, which height and width divide into.
+    """Return means over blocks of `size` x `size` pixels; height and width must be multiples of `size`.
 
-    Rows first, whole lines at a time: avg_pool2d goes pixel by pixel.
+    Whole rows are summed first, which is faster than avg_pool2d's pixel-by-pixel loop.
     """
     rows = x.unflatten(-2, (-1, size)).sum(-2)
     return rows.unflatten(-1, (-1, size)).sum(-1) / size**2
 
 
 def box_means(x: Float[Tensor, "n c h w"], width: int) -> Float[Tensor, "n c h w"]:
-    """Means over boxes of `width` pixels around each one, without what lies outside the image.
+    """Return means over boxes of `width` pixels around each pixel; pixels outside the image do not count.
 
-    One axis after the other, as depthwise convolutions of channels_last images: fewer additions than pooling.
+    Depthwise convolutions of channels_last images, one axis after the other, need fewer additions than pooling.
     """
     channels, rows, columns = x.shape[-3:]
     ones = x.new_ones(channels, 1, 1, width)
@@ -164,6 +166,6 @@ def box_means(x: Float[Tensor, "n c h w"], width: int) -> Float[Tensor, "n c h w
 
 
 def inside(pixels: int, width: int, like: Tensor) -> Float[Tensor, " pixels"]:
-    """How many of `width` pixels around each of a row lie in it."""
+    """For each pixel of a row, count how many of the `width` pixels around it lie inside the row."""
     middle = torch.arange(pixels, device=like.device)
     return ((middle + width // 2).clamp(max=pixels - 1) - (middle - width // 2).clamp(min=0) + 1).float()

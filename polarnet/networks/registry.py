@@ -1,4 +1,4 @@
-"""The networks that recover polarization, by their names in params.yaml. Another one is one module and one entry."""
+"""DoLP networks by their names in params.yaml. A new network needs one module and one entry here."""
 
 from typing import Any
 
@@ -11,4 +11,4 @@ NETWORKS: dict[str, tuple[type[Any], type[NetworkConfig]]] = {
     "paper": (DolpUNet, DolpUNetConfig),
     "polarnet": (StokesUNet, StokesUNetConfig),
 }
-"""Each network, and the class of its section in params.yaml."""
+"""Class of each network, and class of its section in params.yaml."""

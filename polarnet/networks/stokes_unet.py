@@ -1,4 +1,4 @@
-"""polarnet's own network: the redundancy of four polarizers solved at many scales, then refined by a small U-Net."""
+"""polarnet's own network: it solves the redundancy of four polarizers at many scales and refines it with a U-Net."""
 
 import math
 from collections.abc import Sequence
@@ -36,14 +36,14 @@ from polarnet.networks.redundancy import (
 from polarnet.ranges import allowed, check_ranges
 from polarnet.stokes import Prediction
 
-STRIDE = 4  # of the largest image with a recurrent layer
-IMAGES = 2  # of a polarizer's events: the sum of polarities and their number (representation `event_counts`)
+STRIDE = 4  # stride of the largest recurrent layer; height and width are padded to multiples of it
+IMAGES = 2  # input images per channel: sum of polarities and number of events (representation `event_counts`)
 PARTS = ("redundancy", "slopes", "sums", "recurrence", "mosaic")
-MIDDLE_DOLP = 0.3  # of the constant that is one more candidate, at the start
-WIDE = (3, 9)  # pixels, of the neighbourhoods that tell fine structure beside a pixel by itself
-MOST_POLARIZED = 0.98  # of 1: keeps atanh finite
-LOG_VARIANCE = -4.0  # at the start: an error of 0.14
-OF_LOG_VARIANCE = slice(12, 16)  # outputs of the last layer: the fourth map, 2 x 2 pixels of it
+MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate
+WIDE = (3, 9)  # widths in pixels of the neighbourhoods that contribute fine structure, besides the single pixel
+MOST_POLARIZED = 0.98  # largest DoLP passed to atanh, to keep it finite
+LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
+OF_LOG_VARIANCE = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
 
 
 @dataclass(frozen=True)
@@ -51,34 +51,34 @@ class StokesUNetConfig:
     """Section `networks.polarnet` of params.yaml."""
 
     channels: list[int] = field(metadata=allowed(low=1))
-    """At a half, a quarter and an eighth of the size, and so on: at least three."""
+    """Channels at 1/2, 1/4, 1/8, ... of the resolution; at least three numbers."""
     memories: list[float] = field(metadata=allowed(low=0, high=0.999))
-    """Of each sum of events that the redundancy is solved for: the weight of an event one window later."""
+    """Decay per window of each event sum that feeds the redundancy solver (0: present window only)."""
     decays: list[float] = field(metadata=allowed(low=0, high=0.999))
-    """Of each sum of second moments: their weight one window later."""
+    """Decay per window of each sum of second moments."""
     scales: list[int] = field(metadata=allowed(low=0))
-    """Of the neighbourhoods that are solved together, in pixels of a quarter of the size, odd; 0: the whole image."""
+    """Widths of the neighbourhoods solved together, in pixels at quarter resolution, odd; 0: the whole image."""
     reach: int = field(metadata=allowed(low=1))
-    """Pixels along each axis within which the scene's motion from window to window is looked for."""
+    """Search range in pixels along each axis for the scene's motion from window to window."""
     mosaic_margin: int = field(metadata=allowed(low=1))
-    """Of the mosaic beyond the image, in pixels of half the size."""
+    """Margin of the panorama beyond the image, in pixels at half resolution."""
     mosaic_prior: float = field(metadata=allowed(above=0))
-    """These five: `polarnet.networks.mosaic.Memory`."""
+    """This field and the next four set the panorama filter: see `polarnet.networks.mosaic.Memory`."""
     mosaic_noise: float = field(metadata=allowed(above=0))
     mosaic_drift: float = field(metadata=allowed(low=0))
     mosaic_renewal: float = field(metadata=allowed(low=0, high=1))
     mosaic_fade: float = field(metadata=allowed(low=0, high=1))
     mosaic_step: float = field(metadata=allowed(above=0))
-    """Natural-log intensity of an event."""
+    """Change of natural-log intensity per event."""
     mosaic_scale: int = field(metadata=allowed(low=1))
-    """Width of the neighbourhood, in pixels of a quarter of the size, odd, whose mean is the network's and not the
-    mosaic's."""
+    """Width of the neighbourhood whose mean comes from the network instead of the panorama, in pixels at quarter
+    resolution, odd."""
     mosaic_share: float = field(metadata=allowed(low=0.01, high=0.99))
-    """What the mosaic weighs where it is certain, at the start of the training: the U-Net learns it for each place."""
+    """Initial weight of the panorama where it is certain. The U-Net learns a weight for each pixel."""
     without: list[str]
-    """Some of PARTS, to see what they bring: what the redundancy says (candidates are 0), what it says of the mosaic's
-    slopes alone, the movement of (s1, s2) by sums of events (their gains are 0), what the recurrent layers hold (they
-    begin anew in each window), the mosaic."""
+    """Parts (of PARTS) to ablate. redundancy: all candidates are 0; slopes: the panorama's candidates are 0; sums: the
+    gains that move (s1, s2) by event sums are 0; recurrence: recurrent layers restart in each window; mosaic: no
+    panorama."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -93,29 +93,30 @@ class StokesUNetConfig:
 
 
 class Candidates(NamedTuple):
-    """What least squares makes of each memory, decay and scale, and of the mosaic at each scale, at a quarter of the
-    size."""
+    """Least-squares solutions at quarter resolution: one per memory, decay and scale, and one per panorama scale."""
 
     s1: Float[Tensor, "n c h w"]
     s2: Float[Tensor, "n c h w"]
     dolp: Float[Tensor, "n c h w"]
     evidence: Float[Tensor, "n c h w"]
-    """Weighted number of events they rest on; of the mosaic, weighted energy of its slopes."""
+    """Weighted number of events behind the solution; for the panorama, weighted energy of its slopes."""
 
 
 class StokesUNet(nn.Module):
-    """Events of the four polarizers to DoLP, AoLP and DoLP's expected squared error, with a recurrent state.
+    """Recurrent network from the events of four channels to DoLP, AoLP and DoLP's expected squared error.
 
-    The redundancy's candidates for (s1, s2), from changes in time and from the mosaic's slopes, are mixed by weights
-    that the U-Net chooses at each place, together with a constant: coarse, but on the true scale. Fine structure comes
-    from the events themselves, because e0 - e90 counts how 2 atanh(s1) has changed at a pixel: (s1, s2) are moved by
-    their sums, times gains that the U-Net chooses too. What it adds last, when it has seen the result, is free. DoLP is
-    not the length of (s1, s2): where these are uncertain their mean is short, as is a mean over angles. The outputs are
-    linear, as those of the paper's network.
+    1. Mixing: the redundancy gives candidates for (s1, s2) from changes in time and from the panorama's slopes. The
+       U-Net mixes these candidates and a constant with weights for each pixel. The mixture is coarse but on the true
+       scale.
+    2. Fine structure: e0 - e90 counts the change of 2 atanh(s1) at a pixel. Sums of such differences, times gains from
+       the U-Net, therefore update (s1, s2).
+    3. Panorama: the result is averaged with the panorama (`polarnet.networks.mosaic`). The panorama's unknown constants
+       are fitted to the result around each pixel. The panorama has no trained parameters; the U-Net receives it as an
+       input and chooses its weight at each pixel.
+    4. Correction: the U-Net sees the result and adds an unconstrained correction.
 
-    Before that last addition the result is averaged with what the mosaic shows (`polarnet.networks.mosaic`), whose
-    unknown constants are chosen to suit the result around each place. The mosaic itself has nothing to learn; the U-Net
-    sees it and chooses at each place what it weighs.
+    DoLP is predicted separately from the length of (s1, s2). Where (s1, s2) are uncertain, their mean is too short,
+    like any mean over angles. The outputs are linear, as in the paper's network.
     """
 
     representation = "event_counts"
@@ -172,16 +173,16 @@ class StokesUNet(nn.Module):
     def forward(
         self, inputs: Float[Tensor, "b 8 h w"], state: list[Tensor] | None = None
     ) -> tuple[Prediction, list[Tensor]]:
-        """One window of b streams. `state` is what the window before handed back, None at the start."""
+        """Process one window of b streams. `state` comes from the previous window; None at the start."""
         prediction, state = self.unroll(inputs[None], state)
         return Prediction(*(field[0] for field in prediction if field is not None)), state
 
     def unroll(
         self, inputs: Float[Tensor, "t b 8 h w"], state: list[Tensor] | None = None
     ) -> tuple[Prediction, list[Tensor]]:
-        """t windows of b streams at once: the same numbers as `forward` window by window, in fewer operations."""
+        """Process t windows of b streams at once: same result as `forward` per window, in fewer operations."""
         t, b, _, height, width = inputs.shape
-        inputs = F.pad(inputs, (0, -width % STRIDE, 0, -height % STRIDE))  # no events there
+        inputs = F.pad(inputs, (0, -width % STRIDE, 0, -height % STRIDE))  # the padding holds no events
         polarity, count = inputs.unflatten(2, (4, IMAGES)).unbind(3)
         state = state or self.initial_state(inputs[0])
         memories, decays = len(self.memories), len(self.decays)
@@ -191,7 +192,7 @@ class StokesUNet(nn.Module):
         events = summed.flatten(0, 1)
         of_events, moments = self._candidates(events, b, state[memories : memories + decays])
 
-        mosaic = memories + decays + len(WIDE)  # where its state begins
+        mosaic = memories + decays + len(WIDE)  # index where the state of the panorama begins
         around = _around(polarity, state[memories + decays : mosaic], keep)
 
         shown, certain, carried = self._mosaic(polarity, (height, width), state[mosaic : -self.recurrent])
@@ -231,8 +232,7 @@ class StokesUNet(nn.Module):
 
     @torch.no_grad()
     def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:
-        """From now on expect the log variance weight @ x + bias, x being what `expected` is given. Nothing else
-        changes."""
+        """Set the log-variance to weight @ x + bias, where x is the input of `expected`; keep other outputs."""
         assert self.add.bias is not None
         self.add.weight[OF_LOG_VARIANCE] = 0
         self.add.bias[OF_LOG_VARIANCE] = 0
@@ -242,9 +242,12 @@ class StokesUNet(nn.Module):
     def _candidates(
         self, events: Float[Tensor, "n m 4 h w"], streams: int, state: list[Tensor]
     ) -> tuple[Candidates, list[Tensor]]:
-        """Also the sums of moments to carry on from. In float32: the equations are solved by differences."""
+        """Return the candidates from changes in time, and the sums of moments for the next window.
+
+        Computed in float32, because the solution takes differences of similar numbers.
+        """
         with torch.autocast(events.device.type, enabled=False):
-            windows = self._unless("redundancy", events).split(streams)  # one by one they fit into a core's cache
+            windows = self._unless("redundancy", events).split(streams)  # a single window fits into a core's cache
             moments = torch.stack([self.moments(window, pooled=4).flatten(1, 2) for window in windows]).unsqueeze(2)
             keep = moments.new_tensor(self.decays).view(-1, 1, 1, 1)
             sums = faded(moments, keep, torch.stack(state, dim=1))
@@ -255,7 +258,7 @@ class StokesUNet(nn.Module):
             return Candidates(s1, s2, length(s1, s2), evidence), [*sums[-1].unbind(1)]
 
     def _of_slopes(self, shown: Float[Tensor, "n 4 h w"]) -> Candidates:
-        """What the mosaic's differences from pixel to pixel say, at a quarter of the size."""
+        """Return the candidates from the panorama's differences between neighbouring pixels, at quarter resolution."""
         with torch.autocast(shown.device.type, enabled=False):
             pictures = self._unless("redundancy", self._unless("slopes", 2 / self.step * shown))
             moments = self.slopes(pictures)
@@ -267,12 +270,15 @@ class StokesUNet(nn.Module):
     def _mosaic(
         self, polarity: Float[Tensor, "t b 4 h w"], seen: tuple[int, int], state: list[Tensor]
     ) -> tuple[Float[Tensor, "n 4 h/2 w/2"], Float[Tensor, "n 1 1 1"], list[Tensor]]:
-        """The mean of the four log intensities, atanh(s1), atanh(s2) and half of (log I0 + log I90) - (log I45 + log
-        I135) after each window but for four constants, at half the size; how certain that is, from 0 to 1; and what to
-        carry on from.
+        """Follow the panorama over t windows; return its four images, its certainty from 0 to 1, and the next state.
 
-        The sensor has the first `seen` rows and columns. `state` is the window before the first, of all polarizers,
-        and a `Picture`. Where the mosaic is left out it shows nothing and is not certain at all.
+        The four images are the mean of the four log intensities, atanh(s1), atanh(s2), and
+        ((log I0 + log I90) - (log I45 + log I135)) / 2. They are given after each window at half resolution, each up to
+        an additive constant.
+
+        The sensor covers the first `seen` rows and columns. `state` holds the events of the previous window, summed
+        over channels, and the fields of a `Picture`. Without the panorama (`without`), the images and the certainty
+        are 0.
         """
         before, level, own, explained = state
         if "mosaic" in self.without:
@@ -293,25 +299,25 @@ class StokesUNet(nn.Module):
             return self.step * shown, certain, [images[-1], picture.level, own, picture.explained]
 
     def _mixed(self, candidates: Candidates, weights: Float[Tensor, "n c1 h w"]) -> Float[Tensor, "n 3 h w"]:
-        """s1, s2 and DoLP; the last weight is that of the constant, which has no angle."""
+        """Mix the candidates to s1, s2 and DoLP. The last weight belongs to the constant, which adds to DoLP only."""
         of_solved, of_constant = weights[:, :-1], weights[:, -1:]
         mixed = [(of_solved * field).sum(1, keepdim=True) for field in candidates[:3]]
         mixed[2] = mixed[2] + of_constant * self.constant
         return torch.cat(mixed, dim=1)
 
     def _unless(self, part: str, x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """`x`, or zeros that it still depends on where this part is left out."""
+        """Return `x`, or 0 * x if this part is left out (which keeps the gradient path)."""
         return 0 * x if part in self.without else x
 
     def _nothing_held(self, x4: Float[Tensor, "n c h w"]) -> list[Tensor]:
-        """What the recurrent layers hold at the start: zeros."""
+        """Initial states of the recurrent layers: zeros."""
         return [torch.zeros_like(x4), *self.smaller.initial_states(x4)]
 
     def initial_state(self, inputs: Float[Tensor, "b c h w"]) -> list[Tensor]:
-        """Nothing seen yet: sums of events and of moments, means of sums, the last window's polarities, the mosaic, and
-        what the recurrent layers hold; all zeros.
+        """Return the initial state, all zeros; height and width of `inputs` must be multiples of 4.
 
-        Height and width divide by 4.
+        The state holds sums of events and of moments, neighbourhood means of the event sums, the last window's
+        polarities, the panorama, and the states of the recurrent layers.
         """
         b, _, height, width = inputs.shape
         quarter = inputs.new_zeros(b, height // 4, width // 4, self.gru_quarter.channels).permute(0, 3, 1, 2)
@@ -326,9 +332,9 @@ class StokesUNet(nn.Module):
 def _around(
     polarity: Float[Tensor, "t b 4 h w"], before: Sequence[Tensor], keep: Float[Tensor, "m 1 1 1"]
 ) -> list[Float[Tensor, "t b m 2 h w"]]:
-    """Sums of e0 - e90 and e45 - e135 with each of the memories, means over each of `WIDE`, on from those `before`.
+    """Update the sums `before` of e0 - e90 and e45 - e135, for each memory, averaged over each width of `WIDE`.
 
-    Sums of means are means of sums: a window is averaged once, not each of the sums.
+    Averaging and summing commute, so each window is averaged once instead of once per memory.
     """
     now = _differences(polarity)
     near = (box_means(now.flatten(0, 1), width).contiguous().unflatten(0, now.shape[:2]) for width in WIDE)
@@ -336,14 +342,14 @@ def _around(
 
 
 def _differences(events: Float[Tensor, "*b 4 h w"]) -> Float[Tensor, "*b 2 h w"]:
-    """e0 - e90 and e45 - e135."""
+    """Return e0 - e90 and e45 - e135."""
     return events[..., :2, :, :] - events[..., 2:, :, :]
 
 
 def _moved(
     stokes: Float[Tensor, "n 2 h w"], sums: Sequence[Float[Tensor, "t b m 2 h w"]], gains: Float[Tensor, "n g h w"]
 ) -> Float[Tensor, "n 2 h w"]:
-    """(s1, s2) after atanh(s1) and atanh(s2) changed by gains times each of the sums of their events."""
+    """Update (s1, s2) by adding gains times event sums to atanh(s1) and atanh(s2)."""
     moves = stokes.new_zeros(())
     for gain, near in zip(gains.contiguous().chunk(len(sums), dim=1), sums, strict=True):
         moves = torch.addcmul(moves, gain.unflatten(1, (-1, 1)), near.flatten(0, 1))
@@ -357,10 +363,10 @@ def averaged(
     share: Float[Tensor, "n 1 #h #w"],
     around: int,
 ) -> tuple[Float[Tensor, "n 2 h w"], Float[Tensor, "n 1 h w"]]:
-    """(s1, s2) and DoLP, drawn by `share` towards what a mosaic shows: atanh(s1) and atanh(s2) but for constants.
+    """Interpolate (s1, s2) and DoLP towards a panorama, with weight `share`.
 
-    The constants are those that make it, averaged over `around` pixels of a quarter of the size, what (s1, s2) are
-    there.
+    The panorama `shown` holds atanh(s1) and atanh(s2) up to additive constants. The constants are chosen so that its
+    mean over `around` pixels at quarter resolution matches that of (s1, s2).
     """
     short = length(*stokes.unbind(1))[:, None]
     own = torch.atanh(stokes / short * torch.maximum(short, dolp).clamp(max=MOST_POLARIZED))
@@ -371,13 +377,13 @@ def averaged(
 
 
 def _pattern(shown: Float[Tensor, "n 4 h w"], certain: Float[Tensor, "n 1 1 1"]) -> Float[Tensor, "n 5 h w"]:
-    """What the U-Net sees of the mosaic: without its constants, and how certain it is."""
+    """Stack the U-Net's input from the panorama: the images minus their means, and the certainty."""
     images = [shown - shown.mean((-1, -2), keepdim=True), certain.expand_as(shown[:, :1])]
     return torch.cat(images, dim=1).contiguous(memory_format=torch.channels_last)
 
 
 def _images(events: Float[Tensor, "n m 4 h w"], count: Float[Tensor, "n 4 h w"]) -> Float[Tensor, "n c h w"]:
-    """What the U-Net sees: contrasts of every sum of events, and how many there were."""
-    windows = zip(events.split(1), count.split(1), strict=True)  # one by one they fit into a core's cache
+    """Stack the U-Net's input from the events: contrasts of every event sum, and the number of events."""
+    windows = zip(events.split(1), count.split(1), strict=True)  # a single window fits into a core's cache
     seen = (torch.cat([contrasts(sums).flatten(1, 2), each.sum(1, keepdim=True) / 2], dim=1) for sums, each in windows)
     return torch.cat([compressed(images).contiguous(memory_format=torch.channels_last) for images in seen])

@@ -1,4 +1,7 @@
-"""Swin transformer blocks (Liu et al., ICCV 2021) for images of any size."""
+"""Swin transformer blocks (Liu et al., ICCV 2021) for images of any size.
+
+Text here says "tile" for a square of an attention layer, which Swin and the parameter `window` call a window.
+"""
 
 import functools
 
@@ -7,12 +10,12 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-MLP_RATIO = 4  # hidden width of the blocks' perceptron, as in Swin-T
-BIAS_STD = 0.02  # of the relative position bias at the start, as in Swin-T
+MLP_RATIO = 4  # hidden width of a block's perceptron relative to its channels, as in Swin-T
+BIAS_STD = 0.02  # initial standard deviation of the relative position bias, as in Swin-T
 
 
 class PatchMerging(nn.Module):
-    """Half the size: 2x2 pixels become one, normalised afterwards as in Swin v2 (Liu et al., CVPR 2022)."""
+    """Downsampling by 2: merges 2x2 pixels into one, then normalises, as in Swin v2 (Liu et al., CVPR 2022)."""
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
@@ -20,15 +23,15 @@ class PatchMerging(nn.Module):
         self.norm = nn.LayerNorm(outputs)
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n h2 w2 d"]:
-        """h and w must be even."""
+        """Return the merged image, channels last; h and w must be even."""
         return self.norm(self.reduce(x).permute(0, 2, 3, 1))
 
 
 class WindowAttention(nn.Module):
-    """Multi-head self-attention inside square windows whose grid starts at (-shift, -shift), with position bias.
+    """Multi-head self-attention with position bias inside square tiles, on a grid that starts at (-shift, -shift).
 
-    Where the grid reaches beyond the image, the missing pixels are masked. For shift > 0 this attends over exactly the
-    neighbourhoods of Swin's cyclic shift with its mask, without wrapping the image around.
+    Pixels of the grid outside the image are masked. For shift > 0 the neighbourhoods are exactly those of Swin's masked
+    cyclic shift, without wrapping the image around.
     """
 
     def __init__(self, channels: int, heads: int, window: int, shift: int):
@@ -41,7 +44,7 @@ class WindowAttention(nn.Module):
         self.position_bias = nn.Parameter(torch.randn(heads, (2 * window - 1) ** 2) * BIAS_STD)
 
     def forward(self, x: Float[Tensor, "n h w c"]) -> Float[Tensor, "n h w c"]:
-        """The same shape."""
+        """Return the attended image, of the same shape."""
         height, width = x.shape[1:3]
         query, key, value = split_windows(self.qkv(x), self.heads, self.window, self.shift)
         bias = self.position_bias[:, relative_position(self.window, x.device)]
@@ -51,7 +54,7 @@ class WindowAttention(nn.Module):
 
 
 class SwinBlock(nn.Module):
-    """x + attention(norm(x)), then x + perceptron(norm(x))."""
+    """Transformer block: x + attention(norm(x)), then x + perceptron(norm(x))."""
 
     def __init__(self, channels: int, heads: int, window: int, shift: int):
         super().__init__()
@@ -63,13 +66,13 @@ class SwinBlock(nn.Module):
         )
 
     def forward(self, x: Float[Tensor, "n h w c"]) -> Float[Tensor, "n h w c"]:
-        """The same shape."""
+        """Return a tensor of the same shape."""
         x = x + self.attention(self.attention_norm(x))
         return x + self.mlp(self.mlp_norm(x))
 
 
 class SwinStage(nn.Module):
-    """Patch merging by 2, then `depth` blocks, every second one with windows shifted by half a window."""
+    """Patch merging by 2, then `depth` blocks; every second block shifts its tiles by half a tile."""
 
     def __init__(self, inputs: int, outputs: int, depth: int, heads: int, window: int):
         super().__init__()
@@ -79,7 +82,7 @@ class SwinStage(nn.Module):
         )
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n d h2 w2"]:
-        """h and w must be even; the result is channels_last."""
+        """Return the stage's output as channels_last; h and w must be even."""
         return self.blocks(self.merge(x)).permute(0, 3, 1, 2)
 
 
@@ -90,9 +93,10 @@ def attend(
     bias: Float[Tensor, "heads p p"],
     visible: Bool[Tensor, "g 1 1 p"] | None,
 ) -> Float[Tensor, "n g heads p d"]:
-    """softmax(query key^T / sqrt(d) + bias) value over the p pixels of each of g windows; only visible keys count.
+    """Return softmax(query key^T / sqrt(d) + bias) value over the p pixels of each of g tiles, for visible keys only.
 
-    Computed in float32: windows are far smaller than the tiles of a CPU's bfloat16 product, which is 3 times slower.
+    Computed in float32. A bfloat16 product on a CPU is 3 times slower, because its blocks are far larger than the
+    tiles.
     """
     with torch.autocast(query.device.type, enabled=False):
         similarity = query.float() * query.shape[-1] ** -0.5 @ key.float().transpose(-1, -2) + bias
@@ -104,9 +108,9 @@ def attend(
 def split_windows(
     qkv: Float[Tensor, "n h w c3"], heads: int, window: int, shift: int
 ) -> tuple[Float[Tensor, "n g heads p d"], Float[Tensor, "n g heads p d"], Float[Tensor, "n g heads p d"]]:
-    """Queries, keys and values (float32) of every window: g windows of p = window^2 pixels, row by row.
+    """Split queries, keys and values (float32) into g tiles of p = window^2 pixels, row by row.
 
-    The grid starts at (-shift, -shift) and ends where it covers the image; what lies outside is 0.
+    The grid starts at (-shift, -shift) and covers the image; pixels outside the image are 0.
     """
     n, height, width, _ = qkv.shape
     rows, columns = _grid(height, width, window, shift)
@@ -122,7 +126,7 @@ def split_windows(
 def join_windows(
     windows: Float[Tensor, "n g heads p d"], height: int, width: int, window: int, shift: int
 ) -> Float[Tensor, "n h w c"]:
-    """The image that `split_windows` cut up, c = heads * d; what lay outside is dropped."""
+    """Reassemble the image from the tiles of `split_windows`, with c = heads * d, without pixels outside the image."""
     n, _, heads, _, _ = windows.shape
     rows, columns = _grid(height, width, window, shift)
     image = windows.view(n, rows, columns, heads, window, window, -1).permute(0, 1, 4, 2, 5, 3, 6)
@@ -138,7 +142,7 @@ def _grid(height: int, width: int, window: int, shift: int) -> tuple[int, int]:
 def visible_pixels(
     height: int, width: int, window: int, shift: int, device: torch.device
 ) -> Bool[Tensor, "g 1 1 p"] | None:
-    """For every window of `split_windows`, which of its pixels lie in the image; None where all do."""
+    """Return the mask of pixels inside the image for every tile of `split_windows`; None if all are inside."""
     rows, columns = _grid(height, width, window, shift)
     if not shift and (rows * window, columns * window) == (height, width):
         return None
@@ -152,7 +156,7 @@ def visible_pixels(
 
 @functools.lru_cache(maxsize=32)
 def relative_position(window: int, device: torch.device) -> Int64[Tensor, "p p"]:
-    """Which entry of the position bias belongs to query pixel i and key pixel j of a window, by their offset."""
+    """Return the index into the position bias for query pixel i and key pixel j of a tile, from their offset."""
     with torch.inference_mode(False):
         row, column = torch.meshgrid(torch.arange(window), torch.arange(window), indexing="ij")
         position = torch.stack([row.flatten(), column.flatten()])

@@ -1,1 +1,1 @@
-"""Losses and the training loop."""
+"""Training tasks, losses, optimizers and the training loop."""

@@ -1,10 +1,11 @@
-"""Expected errors: once a network is trained, how large they are is fitted to what may tell it.
+"""Expected-error fit: a map from features to the log-variance of DoLP's error, fitted after training.
 
-While a network learns, its errors change, and a likelihood of them teaches it little more than how large they are on
-the whole. When the training is over they stay as they are. Then the logarithm of the expected squared error, as a
-linear function of what may tell it (features), is the likeliest one of normal distributions: a convex problem. Pixels
-are many and scenes are few: what tells a scene's errors from another's is believed as far as it does so for scenes that
-were left out of the fit, and where it does not, errors are expected to be the same everywhere.
+During training the variance head learns little beyond the average error, because the errors keep changing. After
+training the errors are fixed. The log of the expected squared error is then a linear function of the features, fitted
+by maximum likelihood under normal errors, which is a convex problem.
+
+There are many pixels but few scenes, so a ridge penalty guards against overfitting. Cross-validation over left-out
+scenes selects the ridge. If the features do not help on left-out scenes, the fit expects the same error everywhere.
 """
 
 from collections.abc import Sequence
@@ -16,37 +17,37 @@ from jaxtyping import Float, Float64
 from scipy.optimize import minimize
 from torch import Tensor
 
-RIDGES = (0.01, 0.1, 1.0, 10.0, 100.0)  # of coefficients of features scaled to a variance of 1; the last leaves nothing
+RIDGES = (0.01, 0.1, 1.0, 10.0, 100.0)  # penalties on coefficients of unit-variance features; the largest removes them
 FOLDS = 5
-LEAST_SPREAD = 1e-6  # of a feature that says anything
-TOLERANCE = 1e-9  # of the mean log likelihood, relative, and of its slope
+LEAST_SPREAD = 1e-6  # features with a smaller standard deviation are ignored
+TOLERANCE = 1e-9  # L-BFGS-B stops at this relative change of the mean log-likelihood, or at this gradient
 
 
 class Scene(NamedTuple):
-    """Some pixels of one scene."""
+    """Features and squared errors of some pixels of one scene."""
 
     features: Float[Tensor, "n c"]
     squared: Float[Tensor, " n"]
-    """Errors."""
+    """Squared errors."""
 
 
 class ExpectedErrors(NamedTuple):
-    """log variance = weight @ features + bias."""
+    """Fitted map: log-variance = weight @ features + bias."""
 
     weight: Float[Tensor, " c"]
     bias: float
     ridge: float
 
     def loss(self, scene: Scene) -> float:
-        """Twice the negative log likelihood of a pixel's error, but for a constant; the mean over pixels."""
+        """Return twice the negative log-likelihood of the errors, up to a constant, as a mean over pixels."""
         expected = scene.features @ self.weight + self.bias
         return float((scene.squared * torch.exp(-expected) + expected).mean())
 
 
 def fitted(scenes: Sequence[Scene]) -> ExpectedErrors:
-    """Under which the scenes' errors are likeliest, by the ridge under which those of left-out scenes are.
+    """Fit the expected errors by maximum likelihood, with the ridge that does best on left-out scenes.
 
-    ValueError where there is no error at all.
+    ValueError if all errors are 0.
     """
     if not any(scene.squared.any() for scene in scenes):
         pixels = sum(len(scene.squared) for scene in scenes)

@@ -1,4 +1,4 @@
-"""How a network that recovers polarization is trained: four channels of events in, DoLP out, and AoLP if it can."""
+"""Training task of the DoLP networks: events of four channels in; DoLP out, and AoLP if the network predicts it."""
 
 from dataclasses import asdict
 
@@ -18,10 +18,10 @@ from polarnet.training.task import State, Task, initialised
 def dolp_task(
     name: str, network_config: NetworkConfig, config: TrainConfig, loss: LossConfig, lpips: Lpips | None, seed: int
 ) -> Task:
-    """Train the network called `name` (a key of NETWORKS), new and initialised from the seed.
+    """Build the task that trains a new network `name` (a key of NETWORKS), initialised from the seed.
 
-    Its answer and the truth are stacked: DoLP, s1 and s2, and of the answer the log variance; DoLP alone where the
-    network says no more.
+    The truth is a stack of DoLP, s1 and s2. The prediction is the same stack plus the log-variance, or DoLP alone if
+    the network predicts nothing else.
     """
     build, _ = NETWORKS[name]
     representation = config.representation or build.representation
@@ -56,6 +56,6 @@ def dolp_task(
 
 
 def normalised_stokes(batch: Batch) -> Float[Tensor, "t b 3 h w"]:
-    """DoLP, S1 / S0 and S2 / S0."""
+    """Stack the truth of a batch: DoLP, s1 = S1 / S0 and s2 = S2 / S0."""
     angle = 2 * batch.aolp
     return torch.stack([batch.dolp, batch.dolp * torch.cos(angle), batch.dolp * torch.sin(angle)], dim=2)

@@ -1,4 +1,4 @@
-"""How the E2P baseline is trained: the four polarizers' events in; intensity, AoLP and DoLP out."""
+"""Training task of the E2P baseline: events of the four channels in; intensity, AoLP and DoLP out."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,20 +20,20 @@ from polarnet.training.task import Task, initialised
 
 @dataclass(frozen=True)
 class E2pConfig(LoopConfig):
-    """Section `baselines.e2p` of params.yaml; the weights of the loss are the published ones."""
+    """Section `baselines.e2p` of params.yaml; the loss weights are the published ones."""
 
     bins: int = field(metadata=allowed(low=2))
-    """Of the voxel grid."""
+    """Number of bins of the voxel grid."""
     intensity_lpips: float = field(metadata=allowed(low=0))
-    """The only term of the intensity; the next three are those of AoLP and of DoLP."""
+    """Weight of LPIPS of the intensity, its only loss term. The next three weights apply to AoLP and to DoLP."""
     lpips: float = field(metadata=allowed(low=0))
     mse: float = field(metadata=allowed(low=0))
     ssim: float = field(metadata=allowed(low=0))
-    """Of 1 - SSIM."""
+    """Weight of 1 - SSIM."""
 
 
 class BranchLoss(FrameLoss):
-    """A `FrameLoss` for each map of E2P, its terms named after the map: dolp_mse."""
+    """One `FrameLoss` for each map of E2P. Terms are named after their map, for example dolp_mse."""
 
     def __init__(self, weights: Mapping[str, Mapping[str, float]], lpips: Lpips | None):
         self._losses = {branch: FrameLoss(weights[branch], lpips) for branch in BRANCHES}
@@ -47,7 +47,7 @@ class BranchLoss(FrameLoss):
         truth: Float[Tensor, "t b 3 h w"],
         valid: Bool[Tensor, "t b h w"] | None = None,
     ) -> dict[str, Float[Tensor, ""]]:
-        """The terms by name, without their weights; of the valid pixels alone."""
+        """Return the unweighted terms by name, over valid pixels only."""
         return {
             f"{branch}_{term}": value
             for i, (branch, loss) in enumerate(self._losses.items())
@@ -56,10 +56,10 @@ class BranchLoss(FrameLoss):
 
 
 def e2p_task(config: E2pConfig, lpips: Lpips | None, seed: int) -> Task:
-    """Train a new E2P on mosaics made of the four channels.
+    """Build the task that trains a new E2P on mosaics of the four channels.
 
-    The truth is S0, AoLP from -90 to 90 degrees as 0 to 1, which the published loss compares without regard to its
-    period, and DoLP.
+    The truth is S0, AoLP and DoLP. AoLP from -90 to 90 degrees is coded as 0 to 1; the published loss ignores its
+    period.
     """
     network = initialised(lambda: E2p(config.bins), seed)
 

@@ -1,4 +1,4 @@
-"""How the E2V baseline is trained: one polarizer's events in, the intensity behind that polarizer out."""
+"""Training task of the E2V baseline: events of one channel in, intensity behind its polarizer out."""
 
 from dataclasses import dataclass, field
 
@@ -24,16 +24,17 @@ class E2vConfig(LoopConfig):
 
     arch: str = field(metadata=allowed(choices=tuple(ARCHITECTURES)))
     bins: int = field(metadata=allowed(low=2))
-    """Of the voxel grid."""
+    """Number of bins of the voxel grid."""
     ssim: float = field(metadata=allowed(low=0))
-    """Weight of 1 - SSIM; the mean absolute error weighs 1."""
+    """Weight of 1 - SSIM; the weight of the mean absolute error is 1."""
     lpips: float = field(metadata=allowed(low=0))
 
 
 def e2v_task(config: E2vConfig, lpips: Lpips | None, seed: int) -> Task:
-    """Train a new network of `config.arch`; the four polarizers of a sequence are four streams of its batch.
+    """Build the task that trains a new network `config.arch`; each channel of a sequence is one stream of the batch.
 
-    The truth is the intensity itself, in [0, 1] with I0 + I90 = S0: one scale for the four, as Stokes parameters need.
+    The truth is the intensity in [0, 1], with I0 + I90 = S0. All four channels share one scale, because Stokes
+    parameters need it.
     """
     network = initialised(lambda: ARCHITECTURES[config.arch](config.bins), seed)
 

@@ -1,4 +1,4 @@
-"""The training loop, the same for every network: see `train`."""
+"""The training loop that every trained network shares (`train`)."""
 
 import math
 from collections import Counter
@@ -25,33 +25,33 @@ from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, k
 from polarnet.training.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
-LOOKED_AT = 10_000  # blocks of 2 x 2 pixels of a sequence, whose errors tell how large they are: neighbours err alike
+LOOKED_AT = 10_000  # 2x2-pixel blocks per sequence in the expected-error fit; errors of neighbouring blocks are alike
 
 
 @dataclass(frozen=True)
 class LoopConfig(ViewConfig):
-    """How a network is trained: fields of the sections `train`, `baselines.e2v` and `baselines.e2p` of params.yaml."""
+    """Training settings shared by the sections `train`, `baselines.e2v` and `baselines.e2p` of params.yaml."""
 
     data: str = field(metadata=allowed(choices=("store", "fly")))
-    """store: events from the store on disk; fly: the same events, emulated from the scenes in memory as needed."""
+    """store: read events from the store on disk; fly: emulate the same events in memory, from the scenes, on demand."""
     epochs: int = field(metadata=allowed(low=1))
     batch_size: int = field(metadata=allowed(low=1))
-    """Visits to sequences."""
+    """Number of visits to sequences in one batch."""
     accumulate: int = field(metadata=allowed(low=1))
-    """Parts in which a batch goes through the network, to need less memory: the same steps up to rounding."""
+    """Number of parts that a batch is split into to save memory. The steps stay the same up to rounding."""
     bptt_windows: int = field(metadata=allowed(low=1))
-    """Windows of one step: gradients are not carried further back, the recurrent state is."""
+    """Windows per optimizer step. The recurrent state passes from step to step, gradients do not."""
     learning_rate: float = field(metadata=allowed(above=0))
-    """At its highest."""
+    """Peak learning rate."""
     schedule: str = field(metadata=allowed(choices=("constant", "cosine")))
-    """cosine: from the highest rate to 0 over the training."""
+    """cosine: decay from the peak rate to 0 over the training."""
     warmup: float = field(metadata=allowed(low=0, high=1))
-    """The fraction of the training over which the rate rises from 0."""
+    """Fraction of the training over which the rate rises from 0."""
     gradient_norm: float | None = field(metadata=allowed(above=0))
-    """Gradients that are longer together are shortened to this; null: never."""
+    """Largest norm of all gradients together; longer gradients are scaled down to it. null: no limit."""
     precision: str = field(metadata=allowed(choices=("auto", "fp32", "bf16")))
-    """Of autocast; weights and an optimizer's memories are float32 either way. auto: bf16 where the device has units
-    for it."""
+    """Precision of autocast; weights and optimizer state are always float32. auto: bf16 if the device has units for
+    it."""
 
 
 @dataclass(frozen=True)
@@ -59,24 +59,25 @@ class TrainConfig(LoopConfig):
     """Section `train` of params.yaml."""
 
     representation: str | None = field(metadata=allowed(choices=tuple(REPRESENTATIONS)))
-    """Of the events in a window; null: the one that the network was made for."""
+    """Representation of the events in a window; null: the network's own default."""
     optimizer: str | None = field(metadata=allowed(choices=tuple(OPTIMIZERS)))
-    """null: the one that the network was made for."""
+    """Name of the optimizer; null: the network's own default."""
 
 
 def train(
     task: Task, split: Split, config: LoopConfig, recorder: Recorder, seed: int, device: torch.device, workers: int
 ) -> None:
-    """Train the task's network; where the recorder holds a killed run of the same training, go on with that.
+    """Train the task's network, or resume a killed run of the same training that the recorder holds.
 
-    All that is random derives from the seed, the epoch and a sequence's name, so a run that was killed and resumed ends
-    with the weights of one that was not. Workers (processes that read ahead) do not change them either. Processes that
-    share a training (polarnet.training.parallel) all call this; they change the weights by rounding alone.
+    All random numbers derive from the seed, the epoch and the sequence's name. A resumed run therefore ends with the
+    same weights as an uninterrupted one. The number of workers (processes that read ahead) does not change the weights
+    either. All processes that share a training (polarnet.training.parallel) call this function; their number changes
+    the weights by rounding only.
     """
     network = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = OPTIMIZERS[task.optimizer](network, config.learning_rate)
     progress = recorder.resume(network, optimizer)
-    wait_for_all()  # before one of them writes again
+    wait_for_all()  # every process has read the running checkpoint before the first process writes it again
     sequences, workers = kept_in_memory(split.train, workers, task.wants_intensity)
     for epoch in range(progress.epoch, config.epochs):
         visits = Visits(sequences, config, seed, epoch)
@@ -100,10 +101,11 @@ def train(
 def train_batch(
     task: Task, optimizer: Stepper, batch: Batch, config: LoopConfig, device: torch.device
 ) -> list[dict[str, float]]:
-    """One step for each run of `bptt_windows` windows; the loss and its terms at each.
+    """Take one optimizer step per run of `bptt_windows` windows; return the loss and its terms at each step.
 
-    The batch goes through the network in parts, this process's own one after the other. Each part's loss is a mean over
-    its frames, so it counts by its share of the frames that any process knows something of.
+    The batch is split into parts, and this process passes its own parts through the network one after another. The loss
+    of a part is a mean over its frames. It is weighted by the part's share of all frames, over all processes, that have
+    a valid pixel.
     """
     rank, processes = place()
     parts = parts_of(batch, processes * config.accumulate)[rank::processes]
@@ -135,12 +137,12 @@ def train_batch(
 
 
 def frames_known(frames: Tensor, valid: Tensor | None) -> int:
-    """How many of t x b frames have a pixel whose truth is known."""
+    """Number of frames (of t x b) that have at least one pixel with known truth."""
     return frames.shape[0] * frames.shape[1] if valid is None else int(valid.flatten(2).any(-1).sum())
 
 
 def gradients_of(network: nn.Module, processes: int) -> list[Tensor]:
-    """The gradients to be added up over processes: zeros where this one has none but another may."""
+    """Gradients to sum over processes; zeros stand in for gradients that only other processes may have."""
     if processes == 1:
         return []
     for parameter in network.parameters():
@@ -151,7 +153,7 @@ def gradients_of(network: nn.Module, processes: int) -> list[Tensor]:
 def runs_of(
     task: Task, batch: Batch, length: int, device: torch.device
 ) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
-    """What the network gets, what it should say, and where that is known, `length` windows at a time."""
+    """Input, truth and validity mask of the network, in runs of `length` windows."""
     inputs, truth, valid = task.streams(batch)
     windows, frames = (tensor.to(device).split(length) for tensor in (inputs, truth))
     masks = [None] * len(frames) if valid is None else valid.to(device).split(length)
@@ -162,9 +164,9 @@ def runs_of(
 def validate(
     task: Task, dataset: WindowDataset, config: LoopConfig, device: torch.device, workers: int
 ) -> dict[str, float]:
-    """Mean over all frames of the loss, its terms, and mse, psnr and correlation of the frames as they are.
+    """Return means over all frames of the loss, its terms, and the MSE, PSNR and correlation of the unclamped frames.
 
-    Of the valid pixels alone, and without frames that have none. ValueError where no frame has any.
+    Only valid pixels count, and frames without any are skipped. ValueError if no frame has a valid pixel.
     """
     task.network.eval()
     sums, count = Counter[str](dict.fromkeys(("total", *task.loss.weights, *SCORES), 0.0)), 0
@@ -193,7 +195,7 @@ def validate(
 
 
 def set_learning_rate(optimizer: Stepper, config: LoopConfig, done: float) -> None:
-    """The rate once this fraction of the training is done: the warm-up's rise, times the schedule's fall."""
+    """Set the learning rate for the fraction `done` of the training: peak rate times warm-up times schedule."""
     rise = min(1.0, done / config.warmup) if config.warmup else 1.0
     fall = (1 + math.cos(math.pi * done)) / 2 if config.schedule == "cosine" else 1.0
     for group in optimizer.param_groups:
@@ -201,7 +203,7 @@ def set_learning_rate(optimizer: Stepper, config: LoopConfig, done: float) -> No
 
 
 def autocast(precision: str, device: torch.device) -> torch.autocast:
-    """Convolutions and matrix products in bfloat16 where `precision` on this device is bf16."""
+    """Run convolutions and matrix products in bfloat16 if `precision` resolves to bf16 on this device."""
     return torch.autocast(device.type, torch.bfloat16, enabled=precision_on(device, precision) == "bf16")
 
 
@@ -209,10 +211,10 @@ def autocast(precision: str, device: torch.device) -> torch.autocast:
 def calibrate(
     task: Task, dataset: WindowDataset, config: LoopConfig, device: torch.device, workers: int
 ) -> dict[str, int | float]:
-    """Make the task's network expect the errors that it has on `dataset` (polarnet.training.calibration), and those of
-    one frame of each sequence that it has seen nothing of.
+    """Fit the network's expected errors to its errors on `dataset` (polarnet.training.calibration).
 
-    What a checkpoint says of it. ValueError where it has no error at all.
+    The fit also includes one frame of each sequence predicted without any events. Returns a record of the fit for the
+    checkpoint. ValueError if the network has no error at all.
     """
     if task.expects is None:
         raise ValueError("expected a task whose network says how large its errors are")

@@ -1,4 +1,4 @@
-"""What a prediction is held against its truth by (paper Eq. 6-9)."""
+"""Training losses (paper Eq. 6-9)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -13,24 +13,25 @@ from polarnet.similarity import Lpips, mean_where, mse, ssim, with_truth_outside
 Frames = Float[Tensor, "t b h w"]
 Valid = Bool[Tensor, "t b h w"] | None
 
-LOG_VARIANCES = (-10.0, 1.0)  # of DoLP: what an error can be
+LOG_VARIANCES = (-10.0, 1.0)  # limits of DoLP's log-variance, wide enough for every possible error
 
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Section `loss` of params.yaml: the weights of Eq. 9; the paper has 1, 1, 10. A weight of 0 leaves a term out.
+    """Section `loss` of params.yaml: weights of the loss terms (Eq. 9). A weight of 0 leaves a term out.
 
-    The last two are for networks that predict more than DoLP, and are left out for others.
+    The paper uses 1, 1, 10 for the first three. `stokes` and `uncertainty` apply only to networks that predict more
+    than DoLP.
     """
 
     mse: float = field(metadata=allowed(low=0))
     ssim: float = field(metadata=allowed(low=0))
     lpips: float = field(metadata=allowed(low=0))
     stokes: float = field(metadata=allowed(low=0))
-    """Of the squared error of (S1, S2) / S0."""
+    """Weight of the squared error of (S1, S2) / S0."""
     uncertainty: float = field(metadata=allowed(low=0))
-    """Of the negative logarithm of the likelihood of DoLP's error under its predicted variance, which alone learns
-    from it."""
+    """Weight of the negative log-likelihood of DoLP's error under its predicted variance. Only the variance learns
+    from this term."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -39,7 +40,7 @@ class LossConfig:
 
 
 def known_frames(predicted: Frames, truth: Frames, valid: Valid) -> tuple[Tensor, Tensor, Tensor | None]:
-    """(predicted, truth, valid) as n frames, without those of which nothing is known."""
+    """Flatten (predicted, truth, valid) to n frames and drop frames without a valid pixel."""
     a, b = predicted.flatten(0, 1), truth.flatten(0, 1)
     if valid is None:
         return a, b, None
@@ -49,10 +50,10 @@ def known_frames(predicted: Frames, truth: Frames, valid: Valid) -> tuple[Tensor
 
 
 class FrameLoss:
-    """A weighted sum of terms, each a mean over all frames: mse, mae, ssim_loss (1 - SSIM, Eq. 7) and lpips.
+    """A weighted sum of mse, mae, ssim_loss (1 - SSIM, Eq. 7) and lpips, each a mean over all frames.
 
-    Pixels that are not valid count in no term, as `polarnet.similarity` says, nor do frames without a valid pixel.
-    ValueError where LPIPS has a weight but `lpips` is None.
+    Invalid pixels (see `polarnet.similarity`) and frames without a valid pixel count in no term.
+    ValueError if LPIPS has a weight but `lpips` is None.
     """
 
     def __init__(self, weights: Mapping[str, float], lpips: Lpips | None):
@@ -69,19 +70,19 @@ class FrameLoss:
         self._terms = {name: known[name] for name in self.weights}
 
     def __call__(self, predicted: Frames, truth: Frames, valid: Valid = None) -> dict[str, Float[Tensor, ""]]:
-        """The terms by name, without their weights; 0 where nothing is known of any frame."""
+        """Return the unweighted terms by name; all are 0 if no frame has a valid pixel."""
         a, b, known = known_frames(predicted, truth, valid)
         if not len(a):
             return {name: 0 * predicted.sum() for name in self._terms}
         return {name: term(a, b, known).mean() for name, term in self._terms.items()}
 
     def total(self, terms: Mapping[str, Float[Tensor, ""]]) -> Float[Tensor, ""]:
-        """The weighted sum of terms."""
+        """Return the weighted sum of the terms."""
         return torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
 
 
 class PolarizationLoss(FrameLoss):
-    """A `FrameLoss` of DoLP; where a network says more, also of (s1, s2) and of its uncertainty."""
+    """A `FrameLoss` of DoLP, plus terms for (s1, s2) and the log-variance if the network predicts them."""
 
     def __init__(self, config: LossConfig, lpips: Lpips | None, *, dolp_only: bool):
         super().__init__({"mse": config.mse, "ssim_loss": config.ssim, "lpips": config.lpips}, lpips)
@@ -92,7 +93,10 @@ class PolarizationLoss(FrameLoss):
     def __call__(
         self, predicted: Float[Tensor, "t b k h w"], truth: Float[Tensor, "t b m h w"], valid: Valid = None
     ) -> dict[str, Float[Tensor, ""]]:
-        """The terms by name, without their weights. Maps of both: DoLP, s1, s2; and predicted, the log variance."""
+        """Return the unweighted terms by name.
+
+        The maps of `predicted` and `truth` are DoLP, s1 and s2; `predicted` adds the log-variance.
+        """
         terms = super().__call__(predicted[:, :, 0], truth[:, :, 0], valid)
         everywhere = truth[:, :, 0].new_ones(truth[:, :, 0].shape, dtype=torch.bool) if valid is None else valid
         if "stokes" in self._more:

@@ -1,4 +1,4 @@
-"""What changes a network's weights by their gradients, by its name in params.yaml."""
+"""Optimizers by their names in params.yaml."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -8,12 +8,13 @@ from torch import Tensor, nn
 
 
 class Muon:
-    """Muon for the weights of hidden layers, Adam for all else, as Muon's author says (Jordan et al., 2024).
+    """Muon for the weights of hidden layers, Adam for everything else, as recommended by Jordan et al. (2024).
 
-    Muon steps along the gradient's momentum made orthogonal: all directions of a layer's matrix move alike, where
-    Adam's steps have a few strong ones. `torch.optim.Muon` takes matrices alone; a convolution's weight is one of
-    outputs by everything else. Its steps are about as long as Adam's (`match_rms_adamw`), so that they share one rate.
-    What a network calls its `outputs` are the layers whose results are read as numbers; those are Adam's.
+    Muon steps along the orthogonalised momentum of the gradient, so all directions of a layer's matrix move equally;
+    Adam's steps are dominated by a few directions. `torch.optim.Muon` accepts only matrices, so a convolution's weight
+    is flattened to (outputs, everything else). Muon's steps are about as long as Adam's (`match_rms_adamw`), so both
+    share one learning rate. Adam also trains the layers that the network lists in `outputs`, because their results are
+    read as numbers.
     """
 
     def __init__(self, network: nn.Module, learning_rate: float):
@@ -31,12 +32,12 @@ class Muon:
 
     @property
     def param_groups(self) -> list[dict[str, Any]]:
-        """Of both; the loop sets their learning rate `lr`."""
+        """Parameter groups of both optimizers; the loop sets their learning rate `lr`."""
         return [*self._muon.param_groups, *self._adam.param_groups]
 
     @torch.no_grad()
     def step(self) -> None:
-        """Change the weights that have gradients."""
+        """Update the weights that have gradients."""
         for matrix, weight in self._pairs():
             matrix.copy_(weight.flatten(1))
             matrix.grad = None if weight.grad is None else weight.grad.flatten(1)
@@ -46,11 +47,11 @@ class Muon:
             weight.copy_(matrix.view(weight.shape))
 
     def state_dict(self) -> dict[str, Any]:
-        """All that it remembers."""
+        """Return the state of both optimizers."""
         return {"muon": self._muon.state_dict(), "adam": self._adam.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Remember that again."""
+        """Restore the state of both optimizers."""
         self._muon.load_state_dict(state_dict["muon"])
         self._adam.load_state_dict(state_dict["adam"])
 
@@ -66,4 +67,4 @@ def _adam(network: nn.Module, learning_rate: float) -> Stepper:
 
 
 OPTIMIZERS: dict[str, Callable[[nn.Module, float], Stepper]] = {"adam": _adam, "muon": Muon}
-"""Of a network's weights at a learning rate."""
+"""Functions that build an optimizer from a network and a learning rate."""

@@ -1,7 +1,8 @@
-"""Several processes that share a training, each with a part of every batch: started by torchrun, or by `launched`.
+"""Data-parallel training: several processes share a training, and each takes a part of every batch.
 
-They do what one process does with the same batches: gradients are summed before each step, up to rounding. Without
-torchrun's environment there is one process, and nothing here does anything.
+torchrun or `launched` starts the processes. They sum their gradients before each step, so the result equals that of
+one process with the same batches, up to rounding. Without torchrun's environment there is one process, and `join`,
+`add_up` and `wait_for_all` do nothing.
 """
 
 import os
@@ -18,8 +19,8 @@ from polarnet.runtime import RuntimeConfig
 def launched(module: str, runtime: RuntimeConfig) -> bool:
     """Start `python -m module` with this command line in `runtime.devices` processes and wait for them.
 
-    False, and nothing done, where one process is enough or this is already one of several. A RuntimeError where
-    one of them fails.
+    Returns False without starting anything if one process is enough or if torchrun started this process. RuntimeError
+    if a process fails.
     """
     if "WORLD_SIZE" in os.environ or runtime.devices * runtime.nodes == 1:
         return False
@@ -34,18 +35,18 @@ def launched(module: str, runtime: RuntimeConfig) -> bool:
 
 
 def join(device: torch.device) -> None:
-    """Meet the other processes that torchrun has started, if it has."""
+    """Join the process group if torchrun has started several processes."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
 
 
 def place() -> tuple[int, int]:
-    """This process's number and how many there are; number 0 writes what a training leaves behind."""
+    """Return this process's rank and the number of processes; rank 0 writes the outputs of the training."""
     return (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
 
 
 def add_up(tensors: list[Tensor]) -> None:
-    """Put into each of these tensors, of one type and device, its sum over all processes."""
+    """Replace each tensor by its sum over all processes; all tensors share one dtype and device."""
     if not dist.is_initialized():
         return
     flat = torch.cat([tensor.flatten() for tensor in tensors])
@@ -55,6 +56,6 @@ def add_up(tensors: list[Tensor]) -> None:
 
 
 def wait_for_all() -> None:
-    """Return when every process has come here."""
+    """Wait until every process has reached this call."""
     if dist.is_initialized():
         dist.barrier()

@@ -1,6 +1,6 @@
-"""What a training leaves behind: checkpoints, curves, and the running checkpoint from which a killed one goes on.
+"""Outputs of a training: checkpoints, history and curves, and the running checkpoint for resuming a killed run.
 
-The outputs hold no date and no duration, so equal trainings leave equal bytes.
+The outputs contain no dates or durations, so equal trainings write equal bytes.
 """
 
 import hashlib
@@ -34,22 +34,22 @@ KEEP_EVERY_S = 60.0  # writing a running checkpoint of the paper's network takes
 
 @dataclass
 class Progress:
-    """How far a training has come."""
+    """Progress of a training."""
 
     epoch: int = 0
-    """Epochs that are complete."""
+    """Number of complete epochs."""
     visits: int = 0
-    """Visits of the current epoch that have been trained on."""
+    """Number of visits already trained on in the current epoch."""
     steps: int = 0
-    """Steps of the optimizer in the current epoch, over which `sums` adds up the loss and its terms."""
+    """Number of optimizer steps in the current epoch; `sums` adds up the loss and its terms over them."""
     sums: dict[str, float] = field(default_factory=dict)
     history: list[dict[str, Any]] = field(default_factory=list)
-    """One row an epoch: its number, the mean loss terms of training, and the scores on the validation split."""
+    """One row per epoch: its number, the mean loss terms of training, and the scores on the validation split."""
     best: dict[str, Tensor] = field(default_factory=dict)
-    """The weights of the epoch with the smallest validation MSE."""
+    """Weights of the epoch with the smallest validation MSE."""
 
     def add(self, losses: Sequence[Mapping[str, float]], visits: int) -> None:
-        """Count one batch; FloatingPointError where the loss has become infinite or NaN."""
+        """Add the losses of one batch; FloatingPointError if a loss is infinite or NaN."""
         sums = Counter(self.sums)
         for terms in losses:
             if not math.isfinite(terms["total"]):
@@ -61,7 +61,7 @@ class Progress:
         self.sums, self.steps, self.visits = dict(sums), self.steps + len(losses), self.visits + visits
 
     def end_epoch(self, weights: Mapping[str, Tensor], scores: Mapping[str, float]) -> None:
-        """Add a row to the history, keep the weights if they are the best so far, and begin the next epoch."""
+        """Add a row to the history, keep the weights if they are the best, and start the next epoch."""
         means = {name: value / self.steps for name, value in self.sums.items()}
         self.history.append({"epoch": self.epoch, "train": means, "val": dict(scores)})
         if best_row(self.history) is self.history[-1]:
@@ -70,11 +70,11 @@ class Progress:
 
 
 class Recorder:
-    """Writes a training into the folder `out`, and its running checkpoint below `resume`, until `finish` deletes it.
+    """Writes the outputs of a training into the folder `out`, and its running checkpoint below `resume`.
 
-    `metadata` says all that decides the weights: it goes into the JSON of both checkpoints, and the running checkpoint
-    is found again by its hash. Anything left in `out` from before is removed. Of several processes that share a
-    training, only the first writes.
+    `metadata` records everything that determines the weights. It goes into the JSON of the best and last checkpoints,
+    and its hash names the folder of the running checkpoint. `finish` deletes the running checkpoint. Old files in `out`
+    are removed first. If several processes share a training, only the first one writes.
     """
 
     def __init__(self, out: Path, resume: Path, metadata: Mapping[str, Any], keep_every_s: float = KEEP_EVERY_S):
@@ -88,7 +88,7 @@ class Recorder:
             out.mkdir(parents=True)
 
     def resume(self, network: nn.Module, optimizer: Stepper) -> Progress:
-        """Put network and optimizer where the running checkpoint left them, if there is one; how far that is."""
+        """Restore network and optimizer from the running checkpoint, if it exists, and return the progress."""
         file = self.running / "running.pt"
         if not file.exists():
             return Progress()
@@ -98,11 +98,11 @@ class Recorder:
         progress = Progress(**content["progress"])
         tqdm.write(f"resuming in epoch {progress.epoch + 1}, from {file}")
         if self.writes and progress.history and not progress.visits:
-            self._write(progress, network)  # what the epoch before had written is gone
+            self._write(progress, network)  # __init__ emptied `out`, so the last epoch's files are written again
         return progress
 
     def keep(self, progress: Progress, network: nn.Module, optimizer: Stepper, at_once: bool = False) -> None:
-        """Write the running checkpoint if the last one is old enough."""
+        """Write the running checkpoint if `at_once`, or if `keep_every_s` have passed since the last one."""
         if not self.writes or (not at_once and time.monotonic() - self.kept_at < self.keep_every_s):
             return
         self.running.mkdir(parents=True, exist_ok=True)
@@ -116,7 +116,7 @@ class Recorder:
         self.kept_at = time.monotonic()
 
     def show(self, batches: Iterable[Batch], progress: Progress, visits: int, epochs: int) -> Iterator[Batch]:
-        """The batches, behind a progress bar that counts visits to sequences."""
+        """Yield the batches and show a progress bar that counts visits to sequences."""
         with tqdm(
             total=visits, initial=progress.visits, desc=f"epoch {progress.epoch + 1}/{epochs}", unit="visit",
             disable=not self.writes,
@@ -135,13 +135,13 @@ class Recorder:
         self._write(progress, network)
 
     def calibrated(self, progress: Progress, network: nn.Module, expected_errors: Mapping[str, int | float]) -> None:
-        """Write the best checkpoint anew: the best epoch's network, and on what the errors that it expects rest."""
+        """Rewrite the best checkpoint with the fitted expected errors of `network` and the record of the fit."""
         result = _result(best_row(progress.history))
         metadata = {**self.metadata, **result, "expected_errors": dict(expected_errors)}
         save_checkpoint(self.out / "best.safetensors", network.state_dict(), metadata)
 
     def finish(self) -> None:
-        """The training is complete: nothing is left to resume."""
+        """Delete the running checkpoint, because the training is complete."""
         if self.writes:
             shutil.rmtree(self.running, ignore_errors=True)
 
@@ -155,7 +155,7 @@ class Recorder:
 
 
 def best_row(history: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The epoch with the smallest validation MSE, the first of equals."""
+    """Return the epoch with the smallest validation MSE; the first one if several are equal."""
     return min(history, key=lambda row: row["val"]["mse"])
 
 
@@ -164,9 +164,10 @@ def _result(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_curves(folder: Path, history: Sequence[Mapping[str, Any]]) -> None:
-    """DVCLive's metrics and curves (`dvc plots show`) of every row of `history`, anew.
+    """Write DVCLive's metrics and curves (`dvc plots show`) for every row of `history`.
 
-    From the history and not from DVCLive's own resumption: DVC empties a stage's outputs before it runs it again.
+    The whole history is written again each time. DVCLive's own resumption would not work, because DVC empties the
+    outputs of a stage before it reruns the stage.
     """
     try:
         live = Live(str(folder), dvcyaml=None, save_dvc_exp=False, monitor_system=False, cache_images=False)

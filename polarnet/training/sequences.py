@@ -1,4 +1,4 @@
-"""What a training step sees: sequences, augmented and stacked into batches, the same in every run with one seed."""
+"""Training batches: sequences, augmented and stacked. The seed alone determines them."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -18,12 +18,12 @@ from polarnet.runtime import generator_for, memory_handed_back
 
 Sequences = WindowDataset | list[WindowSequence]
 
-KEPT = 0.7  # of the memory that is free when a training begins, for its sequences
-EIGHTH_TURN = math.pi / 4  # between neighbouring polarizers
+KEPT = 0.7  # largest share of the memory free at the start of a training that its sequences may take
+EIGHTH_TURN = math.pi / 4  # angle between neighbouring polarizers
 
 
 class Batch(NamedTuple):
-    """b sequences of t windows each. c counts the input's channels, polarizer by polarizer."""
+    """b sequences of t windows each. The c input channels are ordered polarizer by polarizer."""
 
     names: list[str]
     inputs: Float[Tensor, "t b c h w"]
@@ -31,14 +31,15 @@ class Batch(NamedTuple):
     aolp: Float[Tensor, "t b h w"]
     intensity: Float[Tensor, "t b 4 h w"]
     valid: Bool[Tensor, "t b h w"] | None = None
-    """Where the truth is known; None: everywhere."""
+    """Pixels whose truth is known; None: all."""
 
 
 class View(NamedTuple):
-    """Some windows, a part of the image, perhaps mirrored, through polarizers that are numbered differently.
+    """An augmented view of a sequence: a range of windows and a crop, optionally mirrored, with renumbered polarizers.
 
-    Polarizer j of the view is polarizer (turn + direction * j) mod 4 of the sequence: the sensor's polarizers turned by
-    turn * 45 degrees against the scene, and counted the other way round where direction is -1. DoLP does not change.
+    Polarizer j of the view is polarizer (turn + direction * j) mod 4 of the sequence. This rotates the sensor's
+    polarizers by turn * 45 degrees against the scene, and reverses their order if direction is -1. DoLP does not
+    change.
     """
 
     start: int
@@ -54,7 +55,7 @@ class View(NamedTuple):
 
 
 def seen(sequence: WindowSequence, view: View) -> WindowSequence:
-    """The sequence under a view: exactly what the four channels would hold, and its truth."""
+    """Apply a view to a sequence. The four channels and their truth stay exact."""
     stop, bottom, right = view.start + view.windows, view.top + view.height, view.left + view.width
     mirrored = [axis for axis, mirror in ((-1, view.mirror_x), (-2, view.mirror_y)) if mirror]
 
@@ -71,16 +72,16 @@ def seen(sequence: WindowSequence, view: View) -> WindowSequence:
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """How a training looks at its sequences; keys of `train`, `baselines.e2v` and `baselines.e2p` in params.yaml."""
+    """Augmentation settings; keys of `train`, `baselines.e2v` and `baselines.e2p` in params.yaml."""
 
     visits: int = field(metadata=allowed(low=1))
-    """To each sequence in an epoch, each with another view."""
+    """Visits to each sequence per epoch, each with a new random view."""
     windows: int | None = field(metadata=allowed(low=1))
-    """In a row that a visit sees, beginning anywhere; null: all."""
+    """Consecutive windows per visit, starting at a random window; null: all windows."""
     crop: list[int] | None = field(metadata=allowed(low=16))
-    """Height and width in pixels of the part that a visit sees, anywhere in the image; null: all of it."""
+    """Height and width in pixels of a visit's random crop; null: the whole image."""
     symmetries: bool
-    """Mirror the image and renumber the polarizers at random, which leaves DoLP as it is."""
+    """Mirror the image and renumber the polarizers at random. This does not change DoLP."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -89,7 +90,7 @@ class ViewConfig:
 
 
 def random_view(count: int, height: int, width: int, config: ViewConfig, generator: np.random.Generator) -> View:
-    """A view of a sequence of `count` windows; ValueError where the sequence is smaller than what should be seen."""
+    """Draw a view of a sequence of `count` windows; ValueError if the sequence is smaller than the view."""
     windows, (rows, columns) = config.windows or count, config.crop or (height, width)
     if windows > count or rows > height or columns > width:
         raise ValueError(
@@ -103,7 +104,7 @@ def random_view(count: int, height: int, width: int, config: ViewConfig, generat
 
 
 class Visits(Dataset[WindowSequence]):
-    """Every visit of an epoch to some sequences, each under a view drawn from the seed, the epoch and their name."""
+    """All visits of one epoch. Seed, epoch, sequence name and visit number determine the view of each visit."""
 
     def __init__(self, sequences: Sequences, config: ViewConfig, seed: int, epoch: int):
         self.sequences, self.config, self.seed, self.epoch = sequences, config, seed, epoch
@@ -120,9 +121,10 @@ class Visits(Dataset[WindowSequence]):
 
 
 def kept_in_memory(dataset: WindowDataset, workers: int, intensity: bool) -> tuple[Sequences, int]:
-    """The sequences of a dataset, read and encoded beforehand if that takes at most `KEPT` of the free memory.
+    """Load and encode a dataset's sequences in advance if they fit into `KEPT` of the free memory.
 
-    Also how many worker processes should read them: none when they are in memory. `intensity`: whether it is wanted.
+    Returns the sequences and the number of worker processes to read them, which is 0 if they are in memory.
+    `intensity` says whether to keep the intensity.
     """
     bytes_each = sum(tensor.nbytes for tensor in packed(dataset[0], intensity)[1:] if tensor is not None)
     if bytes_each * len(dataset) > KEPT * psutil.virtual_memory().available:
@@ -132,9 +134,9 @@ def kept_in_memory(dataset: WindowDataset, workers: int, intensity: bool) -> tup
 
 
 def packed(sequence: WindowSequence, intensity: bool) -> WindowSequence:
-    """The sequence with its inputs as bytes where those hold them exactly: counts of events nearly always.
+    """Store the inputs as int8 if that is exact, as it nearly always is for event counts.
 
-    Without its intensity, the largest part, where that is not wanted.
+    The intensity is the largest part of a sequence; it is dropped unless `intensity` is true.
     """
     if not intensity:
         sequence = sequence._replace(intensity=sequence.intensity[:0].clone())
@@ -143,18 +145,18 @@ def packed(sequence: WindowSequence, intensity: bool) -> WindowSequence:
 
 
 def stack(sequences: Sequence[WindowSequence]) -> Batch:
-    """A batch of sequences with equally many windows; ValueError where they differ."""
+    """Stack sequences into a batch; ValueError if their numbers of windows differ."""
     lengths = {len(sequence.dolp) for sequence in sequences}
     if len(lengths) > 1:
         raise ValueError(f"a batch needs sequences with equally many windows, got {sorted(lengths)}; use batch_size=1")
     names, *columns, masks = zip(*sequences, strict=True)
-    valid = None if masks[0] is None else torch.stack(masks, dim=1)  # all of one store, which has masks or has none
+    valid = None if masks[0] is None else torch.stack(masks, dim=1)  # one store: masks for all or none
     inputs, dolp, aolp, intensity = (torch.stack(column, dim=1) for column in columns)
     return Batch(list(names), inputs, dolp, aolp, intensity, valid)
 
 
 def parts_of(batch: Batch, parts: int) -> list[Batch]:
-    """A batch cut into as many parts of nearly equal size, or into single visits where it has fewer."""
+    """Split a batch into `parts` parts of nearly equal size, or into single visits if it has fewer visits."""
     numbers = [part.tolist() for part in torch.arange(len(batch.names)).tensor_split(parts) if len(part)]
     return [_visits_of(batch, part[0], part[-1] + 1) for part in numbers]
 
@@ -166,12 +168,12 @@ def _visits_of(batch: Batch, start: int, stop: int) -> Batch:
 
 
 def shuffled(count: int, seed: int, epoch: int) -> list[int]:
-    """The order of an epoch."""
+    """Return a random order of `count` visits for an epoch."""
     return generator_for(seed, "all sequences", f"order of epoch {epoch}").permutation(count).tolist()
 
 
 def batches_of(
     dataset: Dataset[WindowSequence], order: Sequence[int], batch_size: int, workers: int
 ) -> Iterator[Batch]:
-    """Batches of the sequences in `order`, the last one perhaps smaller, read ahead by worker processes if any."""
+    """Yield batches of the sequences in `order`; the last batch may be smaller. Workers, if any, read ahead."""
     return iter(DataLoader(dataset, batch_size, sampler=order, collate_fn=stack, num_workers=workers))

@@ -1,4 +1,4 @@
-"""What is trained on what: the parts of a training that differ from one network to another, and its data."""
+"""The network-specific parts of a training (`Task`) and its data (`Split`)."""
 
 import hashlib
 from collections.abc import Callable, Mapping
@@ -32,33 +32,35 @@ Network = TypeVar("Network", bound=nn.Module)
 
 @dataclass(frozen=True)
 class Task:
-    """What differs between one network's training and another's."""
+    """The network-specific parts of a training."""
 
     network: nn.Module
     encode: Encode
-    """One polarizer's events in a window, as the network wants them."""
+    """Function that turns one channel's events in a window into the network's input."""
     streams: Callable[
         [Batch], tuple[Float[Tensor, "t b c h w"], Float[Tensor, "t b *k h w"], Bool[Tensor, "t b h w"] | None]
     ]
-    """What the network gets of a batch, what it should say, and where that is known (None: everywhere)."""
+    """Function from a batch to the network's input, the truth, and the mask of known truth (None: all known)."""
     unroll: Callable[[Tensor, State], tuple[Float[Tensor, "t b *k h w"], State]]
-    """What it says for windows in a row, k maps or one alone, and its state after them."""
+    """Function from consecutive windows and a state to the predicted maps (k of them, or a single one without the axis
+    k) and the next state."""
     loss: FrameLoss
     description: Mapping[str, Any]
-    """What a checkpoint says of the network and its input: at least "network", "config" and "in_channels"."""
+    """Metadata of the network and its input for checkpoints: at least "network", "config" and "in_channels"."""
     wants_intensity: bool = True
-    """Whether `streams` looks at the intensity; where it does not, sequences in memory are without."""
+    """Whether `streams` reads the intensity. If not, sequences kept in memory leave it out."""
     optimizer: str = "adam"
     """A key of OPTIMIZERS."""
     scored: Callable[[Tensor], Float[Tensor, "t b h w"]] = lambda frames: frames
-    """Of what it says and should say, the frames that validation scores, and by which the best epoch is chosen."""
+    """Function that picks the map to score from the predicted or true maps; its validation MSE selects the best
+    epoch."""
     expects: nn.Module | None = None
-    """The part of the network that says how large it expects the errors of `scored` to be, whose input has a pixel for
-    2 x 2 of the image; None: there is none. A network that has one can `expect(weight, bias)`."""
+    """Module that predicts the expected error of the `scored` map at half resolution; None: the network has none. A
+    network with this module has a method `expect(weight, bias)`."""
 
 
 class Split(NamedTuple):
-    """Sequences to learn from, and others to see how well it goes."""
+    """Training and validation sequences."""
 
     train: WindowDataset
     val: WindowDataset
@@ -67,14 +69,14 @@ class Split(NamedTuple):
 def open_events(
     data: str, events: str, scenes: str, emulate: EmulatorConfig, seed: int, threads: int
 ) -> EventStore | EmulatedEvents:
-    """Events as `data` says: `store` reads them, `fly` emulates the scenes in memory; the same to the last bit."""
+    """Open the events: `store` reads them from disk, `fly` emulates them in memory. Both give identical events."""
     if data == "store":
         return EventStore.open(events)
     return EmulatedEvents(SceneStore.open(scenes), emulate, seed, threads)
 
 
 def open_split(events: EventSource, frames: str, encode: Encode) -> Split:
-    """The training and the validation sequences of the stores; ValueError where either split is empty."""
+    """Open the training and validation sequences; ValueError if either split is empty."""
     frame_store = FrameStore.open(frames)
     names = {split: frame_store.of_split(split) for split in Split._fields}
     for split, sequences in names.items():
@@ -86,24 +88,25 @@ def open_split(events: EventSource, frames: str, encode: Encode) -> Split:
 
 
 def initialised(build: Callable[[], Network], seed: int) -> Network:
-    """A new network whose weights depend on the seed alone, not on what else has drawn random numbers."""
+    """Build a network whose initial weights depend only on the seed, not on torch's global random state."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed_for(seed, "network", "initial weights"))
         return build()
 
 
 def lpips_of(folder: str, backbone: str, weight: float) -> Lpips | None:
-    """The LPIPS network of a loss, from what stage `weights` left in `folder`; None where its weight is 0.
+    """Load the LPIPS network of a loss from the outputs of stage `weights` in `folder`; None if its weight is 0.
 
-    ValueError where the stage left none of this backbone.
+    ValueError if the folder has no weights for this backbone.
     """
     return Lpips.load(folder, "loss", backbone) if weight > 0 else None
 
 
 def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, device: torch.device) -> dict[str, Any]:
-    """All that decides the weights: what the JSON of a checkpoint says, and what the running checkpoint is keyed by.
+    """Collect everything that determines the weights, for a checkpoint's JSON and the running checkpoint's key.
 
-    `training.precision` is the one that is used on `device`, `training.optimizer` the one that the network gets.
+    `training.precision` and `training.optimizer` are the resolved values: the precision used on `device` and the
+    optimizer used for the network.
     """
     events, frames = split.train.events, split.train.frames
     lpips = stored_record(weights, "loss") if any("lpips" in term for term in task.loss.weights) else NO_RECORD
@@ -123,7 +126,7 @@ def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, de
             "height": events.height,
             "width": events.width,
             "events_from": events.attributes,
-            "events_sha256": content_hash(events.path),  # on the fly: of the scenes that they are made from
+            "events_sha256": content_hash(events.path),  # with data=fly: hash of the scenes
             "frames_sha256": content_hash(frames.path),
         },
         "versions": {"polarnet": __version__, "torch": torch.__version__},
@@ -131,7 +134,7 @@ def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, de
 
 
 def content_hash(path: str) -> str:
-    """sha256 over the names and bytes of everything at `path`; of the address alone where it is not on this machine."""
+    """Return the sha256 of all file names and contents at `path`, or of the path string if nothing is there."""
     digest = hashlib.sha256()
     if not Path(path).exists():
         digest.update(path.encode())
