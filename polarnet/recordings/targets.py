@@ -1,6 +1,6 @@
-"""Imported division-of-time captures on one clock, in the stores that every later stage reads.
+"""Put imported division-of-time captures on one clock, in the stores that every later stage reads.
 
-They are the same as those of simulated sequences, `events.zarr` and `frames.zarr`; all targets are in the split `test`.
+The stores `events.zarr` and `frames.zarr` have the layout of simulated sequences; all targets are in the split `test`.
 """
 
 import itertools
@@ -33,25 +33,25 @@ from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.status import start_over
 
-WHITE = 255.0  # of reduced pictures
+WHITE = 255.0  # maximum of reduced pictures
 
 
 class Calibrated(NamedTuple):
-    """What was found of a target, for a report and a picture."""
+    """Calibration result of one target, for a report and a picture."""
 
     name: str
     landmark_us: Mapping[str, int]
     """Start times by the landmark, by each capture's own clock."""
     start_us: Mapping[str, int]
-    """Those that were used."""
+    """Start times used."""
     alignment: Alignment | None
-    """None where the landmark's start times were used as they are."""
+    """None where the landmark's start times were used unchanged."""
     hot: Mapping[str, int]
-    """How many pixels of each event capture were left out."""
+    """Number of pixels left out of each event capture."""
     region_events_us: Mapping[str, Int64[np.ndarray, " n"]]
-    """Of negative events in the landmark's region."""
+    """Times of the negative events in the landmark's region."""
     region_pictures: Mapping[str, tuple[Int64[np.ndarray, " n"], np.ndarray]]
-    """Times of pictures, and their mean in the region."""
+    """Times of the pictures, and their mean in the region."""
     duration_us: int
 
 
