@@ -44,7 +44,7 @@ LEAST_DEVIATION = 1e-6  # a tenth of a step: a frame with a smaller deviation co
 SOBEL_SMOOTH, SOBEL_SLOPE = (
     (0.25, 0.5, 0.25),
     (-0.5, 0.0, 0.5),
-)  # across and along the derivative; a ramp gives its slope per pixel
+)  # across and along the derivative; gives a ramp's slope per pixel
 CHANCE_AOLP_DEG = 45.0  # mean error of a random angle: the mean of |d| over -90 ... 90 degrees
 
 
