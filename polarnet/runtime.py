@@ -148,8 +148,6 @@ def configure(config: RuntimeConfig, seed: int) -> torch.device:
     tune()
     torch.manual_seed(seed)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
-    torch.set_deterministic_debug_mode(
-        "warn"
-    )  # use_deterministic_algorithms would import the compiler, which takes a second
+    torch.set_deterministic_debug_mode("warn")  # use_deterministic_algorithms imports the compiler: one second
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]  # a debugging aid
     return device_of(config)
