@@ -68,10 +68,10 @@ def parse_window(text: str) -> tuple[int | None, int | None]:
 class WindowCutter:
     """Cuts a stream that arrives in pieces into windows, each as soon as all of its events are known.
 
-    Windows by time end after one whole length, and then every step (or length). Windows by number end with their last
-    event. With a step, a window by number holds the last `events` events before each multiple of the step. A window
-    starts at the end of the window that lies that number of events or microseconds earlier. Events that no later window
-    needs are dropped. Times count from 0.
+    Windows by time end after one whole length, and then every step (or length); each starts one length before its end.
+    Windows by number end with their last event and start at the previous window's end. With a step, a window by number
+    holds the last `events` events before each multiple of the step, and starts with the first of them. Events that no
+    later window needs are dropped. Times count from 0.
     """
 
     def __init__(self, rule: WindowRule, height: int, width: int):
