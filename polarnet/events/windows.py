@@ -58,7 +58,7 @@ class WindowSequence(NamedTuple):
     dolp: Float[Tensor, "t h w"]
     aolp: Float[Tensor, "t h w"]
     intensity: Float[Tensor, "t 4 h w"]
-    """No windows while a training that does not need intensities keeps sequences in memory."""
+    """Has no windows while a training that does not need intensities keeps sequences in memory."""
     valid: Bool[Tensor, "t h w"] | None = None
     """Where the truth is known; None: everywhere."""
 
