@@ -86,7 +86,7 @@ def read_text(path: str | os.PathLike[str], height: int | None = None, width: in
 
 
 class Form(NamedTuple):
-    """How to write one channel's events to a file and read them back."""
+    """Suffix, writer and reader of one file format."""
 
     suffix: str
     write: Callable[[Path, Events, int], None]
