@@ -41,7 +41,7 @@ MASK_CONVENTION = "whether the truth of a pixel is known, 8 pixels of a row a by
 
 
 class Frames(NamedTuple):
-    """The frames of one sequence."""
+    """Frames of one sequence."""
 
     t_us: Int64[Tensor, " n"]
     intensity: Float[Tensor, "n 4 h w"]
@@ -62,8 +62,9 @@ def dequantise_fraction(steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*
 
 
 def quantise_angle(angle: Float[Array, "*shape"], name: str = "angle") -> UInt16[np.ndarray, "*shape"]:
-    """Quantise radians of [0, pi) to 65536 steps round the circle (a value that rounds up to pi becomes 0); ValueError
-    outside.
+    """Quantise radians of [0, pi) to 65536 steps round the circle; ValueError outside.
+
+    A value that rounds up to pi becomes 0.
     """
     checked = floats(name, angle, "...")
     check_range(name, checked, 0, math.pi, "radians", "fold them into [0, pi), degrees after torch.deg2rad")
@@ -187,7 +188,7 @@ class FrameStore:
         return torch.from_numpy(t_us[t_us >= 0])
 
     def intensity(self, sequence: str) -> Float[Tensor, "n 4 h w"]:
-        """Intensities behind the four polarizers."""
+        """Intensities behind the polarizers at 0, 45, 90 and 135 degrees."""
         return dequantise_fraction(self._read("intensity", sequence))
 
     def dolp(self, sequence: str) -> Float[Tensor, "n h w"]:
