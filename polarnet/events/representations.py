@@ -79,8 +79,9 @@ def time_surface(events: Events, window_us: int) -> Float[Tensor, "h w"]:
 
 
 def event_counts(events: Events, window_us: int) -> Float[Tensor, "2 h w"]:
-    """Per pixel, the sum of polarities (the change of log intensity in contrast thresholds) and the number of
-    events.
+    """Per pixel, the sum of polarities and the number of events.
+
+    The sum is the change of log intensity in contrast thresholds.
     """
     pixel = _pixel(events)
     images = torch.zeros(2, events.height * events.width, device=events.t.device)
