@@ -139,10 +139,10 @@ class EventStore:
         return tuple(np.diff(self._offsets(sequence)).tolist())
 
     def read(self, sequence: str, start_us: int | None = None, stop_us: int | None = None) -> list[Events]:
-        """The four channels of a sequence, whole or limited to events with start <= t < stop; times still count from
-        its start.
+        """The four channels of a sequence, whole or limited to events with start <= t < stop.
 
-        Reads only the chunks that overlap the window. ValueError names sequence and column of unreadable data.
+        Times always count from the start of the sequence. Reads only the chunks that overlap the window. ValueError
+        names sequence and column of unreadable data.
         """
         offsets = self._offsets(sequence)
         if start_us is None and stop_us is None:
