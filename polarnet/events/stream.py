@@ -184,8 +184,9 @@ def concatenate(parts: Sequence[Events]) -> Events:
 
 
 def merge(streams: Sequence[Events]) -> Events:
-    """Merge streams of one sensor, which may overlap in time; at equal times, the earlier stream's events
-    come first.
+    """Merge streams of one sensor, which may overlap in time.
+
+    At equal times, the earlier stream's events come first.
     """
     height, width = _common_size(streams)
     t, x, y, p = (torch.cat([getattr(stream, name) for stream in streams]) for name in _COLUMNS)
