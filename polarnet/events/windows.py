@@ -52,8 +52,9 @@ class WindowSequence(NamedTuple):
 
     name: str
     inputs: Float[Tensor, "t c h w"] | Int8[Tensor, "t c h w"]
-    """Channel by channel (0, 45, 90, 135 degrees); c is 4 times the images per channel of the representation. Bytes
-    only while a training keeps them in memory.
+    """Channel by channel (0, 45, 90, 135 degrees); c is 4 times the images per channel of the representation.
+
+    Bytes only while a training keeps them in memory.
     """
     dolp: Float[Tensor, "t h w"]
     aolp: Float[Tensor, "t h w"]
