@@ -1,8 +1,8 @@
 """Turn files of any polarizer arrangement into four channels on one clock, in an event store.
 
-Supported are four files, one per angle (four cameras, or one camera four times), in any order, and one file of a camera
-with a mosaic of polarizers on its pixels (division of focal plane). `polarnet.recordings.targets` handles
-division-of-time captures.
+An arrangement is either four files, one per angle and in any order (four cameras, or one camera four times), or one
+file of a camera with a mosaic of polarizers on its pixels (division of focal plane). `polarnet.recordings.targets`
+handles division-of-time captures.
 """
 
 import hashlib
@@ -28,13 +28,13 @@ def read_four(
     homographies: Mapping[int, Float64[np.ndarray, "3 3"]] | None = None,
     read: Callable[[Path], Recording] = read_recording,
 ) -> list[Events]:
-    """The four channels, in the order 0, 45, 90, 135 degrees, from files keyed by polarizer angle (degrees, any half
-    turn).
+    """The four channels, in the order 0, 45, 90, 135 degrees, from files keyed by polarizer angle.
 
-    `start_us` gives the start of the common clock in each file's own clock; earlier events are left out. Without it the
-    files share one clock, which starts with the first event of all. `homographies` map cameras to the reference
-    (`polarnet.recordings.registration`). `read` replaces `read_recording` where a file needs options. RecordingError
-    where an angle is missing or duplicated, or where the sensor sizes differ.
+    Angles are in degrees, of any half turn. `start_us` gives the start of the common clock in each file's own clock;
+    earlier events are left out. Without it the files share one clock, which starts with the first event of all.
+    `homographies` map cameras to the reference (`polarnet.recordings.registration`). `read` replaces `read_recording`
+    where a file needs options. RecordingError where an angle is missing or duplicated, or where the sensor sizes
+    differ.
     """
     by_angle = {angle % 180: angle for angle in files}
     if sorted(by_angle) != list(POLARIZER_ANGLES_DEG) or len(by_angle) != len(files):
