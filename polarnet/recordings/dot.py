@@ -44,7 +44,7 @@ class RecordingsConfig:
     region: list[int] = field(metadata=allowed(low=1, high=1280))
     """Size of the landmark's region, in the upper right corner of the part in use."""
     dark_level: float = field(metadata=allowed(above=0, high=255))
-    """An intensity capture starts with the first picture whose mean in the region is lower, of 255."""
+    """An intensity capture starts with the first picture whose mean in the region is below this level, of 255."""
     negative_events: int = field(metadata=allowed(low=1))
     """Number of negative events in the region at which an event capture starts."""
     crop: list[int] = field(metadata=allowed(low=2, high=1280))
@@ -52,15 +52,11 @@ class RecordingsConfig:
     size: list[int] = field(metadata=allowed(low=2, high=1280))
     """Size to which the crop is reduced."""
     keep_event_rate: bool
-    """true: a reduced pixel fires as often as one sensor pixel; false: as often as all the pixels it covers
-    together.
-    """
+    """true: a reduced pixel fires as often as one sensor pixel; false: as often as all those it covers together."""
     picture_rate_hz: float | None = field(metadata=allowed(above=0))
     """Rate of the pictures in intensity captures whose files have no times."""
     hot_pixel_factor: float | None = field(metadata=allowed(above=1))
-    """A pixel is left out if it fires more than this many times as often as the third busiest of the 5 x 5 pixels
-    around it; null: none is.
-    """
+    """A pixel is hot, and left out, above this multiple of the third busiest of the 5 x 5 around it; null: none is."""
     alignment: str = field(metadata=allowed(choices=("landmark", "refined")))
     """landmark: start times by the landmark alone (the paper); refined: refined over the whole picture."""
     refine_within_ms: float = field(metadata=allowed(above=0))
@@ -233,9 +229,7 @@ def landmark_starts(
     config: RecordingsConfig,
     given: Mapping[str, int],
 ) -> dict[str, int]:
-    """Start time of each capture by its own clock: set by hand where `given`, else the time the landmark enters the
-    region.
-    """
+    """Start time of each capture by its own clock: `given` by hand, or when the landmark enters the region."""
     starts = {}
     for name, capture in events.items():
         starts[name] = given[name] if name in given else event_start_us(name, capture, config)
