@@ -119,8 +119,8 @@ def _write(table, separator, out):
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _parse(buffer, start, shift, rows):
-    """Fill `rows` from the lines at `start`; returns the filled rows, the next line's offset and the
-    unreadable lines.
+    """Fill `rows` from the lines at `start`; returns the number filled, the next line's offset, the
+    unreadable number.
     """
     place, filled, unreadable = start, 0, 0
     size, columns = len(buffer), len(shift)
