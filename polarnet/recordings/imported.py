@@ -1,6 +1,4 @@
-"""Division-of-time captures, decoded once into arrays that later steps can read repeatedly, whatever the file
-format.
-"""
+"""Decode division-of-time captures once, for later steps that read them repeatedly, whatever the file format."""
 
 import hashlib
 import json
