@@ -43,10 +43,10 @@ class Inspection:
 
 
 def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) -> Inspection:
-    """Read a recording once, in constant memory; RecordingError if reading fails or the stated sensor size is
-    implausible.
+    """Read a recording once, in constant memory.
 
-    `hot_pixel_factor` is the `factor` of `polarnet.recordings.pixels.hot_pixels`.
+    `hot_pixel_factor` is the `factor` of `polarnet.recordings.pixels.hot_pixels`. RecordingError if reading fails, or
+    if no sensor is as large as the stated size.
     """
     pixels = reader.height * reader.width
     if pixels > MOST_PIXELS:
