@@ -154,8 +154,9 @@ class _Clock:
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _judge(t, keep, newest, started, floor):
-    """Mark the events with credible times in `keep`; return the newest time, the counts of glitches, late events and
-    pauses, and the index of the refused event or -1.
+    """Mark the events with credible times in `keep`.
+
+    Returns the newest time, the counts of glitches, late events and pauses, and the index of the refused event or -1.
     """
     glitches, unsorted, pauses = 0, 0, 0
     for i in range(len(keep)):
