@@ -142,7 +142,7 @@ def read_artefacts(paths: ReportPaths) -> Artefacts:
     )
     manifest = read_manifest(paths.images)
     seen = set(scenes.picture_of.values())
-    pictures = [entry for entry in manifest.pictures if entry.name in seen]  # others are smaller than the sensor
+    pictures = [entry for entry in manifest.pictures if entry.name in seen]  # others are too small for the sensor
     pictures.sort(key=lambda entry: entry.source == "dead_leaves")  # photographs first
     generated = {entry.name for entry in pictures if entry.source == "dead_leaves"}
     files = sorted((paths.benchmark / "panels").glob("*.npz"))
@@ -250,9 +250,7 @@ def _telling(panels: Sequence[Panel]) -> list[Panel]:
 
 
 def _outline(pose: Pose, height: int, width: int) -> Float[np.ndarray, "2 corners"]:
-    """Corners of the sensor at the first pose, in pixels of the scene; the first corner is repeated to close
-    the line.
-    """
+    """Corners of the sensor at the first pose, in pixels of the scene; the first is repeated to close the line."""
     left, top, along, across = sensor_to_scene(*(float(column[0]) for column in pose), height, width)
     columns, rows = np.array([[0, width, width, 0, 0], [0, 0, height, height, 0]])
     return np.stack([left + columns * along - rows * across, top + columns * across + rows * along])
