@@ -47,8 +47,8 @@ def draw_registration(
     after: Float32[np.ndarray, "h w"],
     path: Path,
 ) -> None:
-    """Write two cameras' event images overlaid, before and after registration: one red, one cyan, grey where they
-    agree.
+    """Write two cameras' event images overlaid (one red, one cyan, grey where they agree), before and after
+    registration.
     """
     figure = Figure(figsize=(11, 4), layout="constrained")
     for axes, moving, title in zip(figure.subplots(1, 2), (before, after), ("before", "after"), strict=True):
