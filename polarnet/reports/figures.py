@@ -1,6 +1,6 @@
 """Figures drawn with matplotlib: comparison panels, training curves, distributions of scores over scenes.
 
-Most functions return a figure, which `polarnet.reports.png` writes.
+Figures are returned, not shown; `polarnet.reports.png` writes them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -72,9 +72,7 @@ class Curve(NamedTuple):
 
 
 class ReliabilityLine(NamedTuple):
-    """One line of a reliability plot; `curve` holds predicted error, measured error and number of pixels of
-    each bin.
-    """
+    """One line of a reliability plot; `curve` holds predicted error, measured error and pixels of each bin."""
 
     label: str
     colour: str
@@ -82,10 +80,10 @@ class ReliabilityLine(NamedTuple):
 
 
 def comparison_panel(rows: Sequence[PanelScene], path: Path, legend: Legend = GENERAL, theme: Theme = LIGHT) -> None:
-    """Write a picture like the paper's Fig. 10, a row per scene: events, truth and each method, with MSE and PSNR
-    below.
+    """Write a picture like the paper's Fig. 10, with a row per scene.
 
-    Methods that predict one value everywhere are left out.
+    A row shows events, truth and each method, with MSE and PSNR below. Methods that predict one value everywhere are
+    left out.
     """
     if not rows:
         raise ValueError("a comparison panel needs at least one scene, got none")
