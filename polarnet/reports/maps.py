@@ -31,9 +31,7 @@ def event_full_scale(events: Float[Tensor, "*b h w"]) -> float:
 
 
 def event_image(events: Float[Tensor, "h w"], full_scale: float) -> UInt8[np.ndarray, "h w 3"]:
-    """Colour signed event counts or an event tensor (paper Eq. 5): ON red, OFF blue, zero white; saturates at
-    +-full_scale.
-    """
+    """Colour event counts or an event tensor (paper Eq. 5): ON red, OFF blue, zero white; saturates at +-full_scale."""
     unit = (events.numpy(force=True) / full_scale).clip(-1, 1)
     return _coloured((unit + 1) / 2, EVENT_TABLE)
 
