@@ -1,6 +1,4 @@
-"""Figures of the event budget (paper, Fig. 11), of the sensitivity to sensor and motion, of expected errors
-and losses.
-"""
+"""Figures of the event budget (paper, Fig. 11), the sensitivity to sensor and motion, expected errors, and losses."""
 
 import itertools
 from collections.abc import Mapping, Sequence
