@@ -9,9 +9,7 @@ from polarnet.evaluation.references import REFERENCES
 from polarnet.evaluation.rows import ROWS
 
 Scores = Mapping[str, Mapping[str, Any]]
-"""Method, then metric, as in data/benchmark/metrics.json. None marks a missing value; `<metric>_ci` holds an
-interval.
-"""
+"""Method, then metric (data/benchmark/metrics.json). None marks a missing value; `<metric>_ci` holds an interval."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,7 @@ class Cell(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One method of a table."""
+    """One row of a table: a method and its values."""
 
     method: str
     label: str
