@@ -123,8 +123,7 @@ def keep_freed_memory() -> None:
 
 @contextmanager
 def memory_handed_back() -> Iterator[None]:
-    """Inside this context glibc returns the memory of large tensors at once; afterwards it keeps it
-    (`keep_freed_memory`).
+    """Make glibc return the memory of large tensors at once; on leaving, keep it again (`keep_freed_memory`).
 
     Use it while allocating many long-lived tensors, which would otherwise leave unusable holes in memory.
     """
