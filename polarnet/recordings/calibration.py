@@ -31,7 +31,7 @@ POLARIZER_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # I0 - I45 + I90 - I135 = 0
 
 
 class Alignment(NamedTuple):
-    """Start times of the captures of a target, each by its own clock."""
+    """Start times of a target's captures, each by its own clock."""
 
     start_us: Mapping[str, int]
     lags: Sequence[Lag]
