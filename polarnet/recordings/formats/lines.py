@@ -119,9 +119,7 @@ def _write(table, separator, out):
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _parse(buffer, start, shift, rows):
-    """Fill `rows` from the lines at `start`; returns the number filled, the next line's offset, the
-    unreadable number.
-    """
+    """Fill `rows` from the lines at `start`; returns the number filled, the next offset and the number unreadable."""
     place, filled, unreadable = start, 0, 0
     size, columns = len(buffer), len(shift)
     while place < size and filled < len(rows):
