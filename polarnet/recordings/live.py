@@ -169,9 +169,7 @@ class LiveLines:
 
 
 def live_lines(channels: Sequence[Events]) -> tuple[bytes, Int64[np.ndarray, " n"], bytes]:
-    """Four channels in the format of `LiveLines`: the first line, the sorted event times, and the lines in
-    that order.
-    """
+    """Four channels in the format of `LiveLines`: the first line, the sorted times, and the lines in that order."""
     tables = [
         np.stack([*(getattr(events, name).numpy().astype(np.int64) for name in "txyp"), np.full(len(events), angle)], 1)
         for events, angle in zip(channels, POLARIZER_ANGLES_DEG, strict=True)
