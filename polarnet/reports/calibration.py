@@ -47,9 +47,7 @@ def draw_registration(
     after: Float32[np.ndarray, "h w"],
     path: Path,
 ) -> None:
-    """Write two cameras' event images overlaid (one red, one cyan, grey where they agree), before and after
-    registration.
-    """
+    """Write two cameras' event images overlaid before and after registration: one red, one cyan, grey where equal."""
     figure = Figure(figsize=(11, 4), layout="constrained")
     for axes, moving, title in zip(figure.subplots(1, 2), (before, after), ("before", "after"), strict=True):
         scale = max(float(reference.max()), float(moving.max()), 1e-6)
