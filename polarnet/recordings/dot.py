@@ -25,9 +25,7 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG
 EVENT_CAPTURES = tuple(f"events_{angle}" for angle in POLARIZER_ANGLES_DEG)
 INTENSITY_CAPTURES = tuple(f"intensity_{angle}" for angle in POLARIZER_ANGLES_DEG)
 STARTS_FILE = "starts.json"
-STEPS_OF_8_BITS = (
-    16.0  # 12-bit converter steps per 8-bit level, as in the vendor's programs; the paper's 30 is on 8 bits
-)
+STEPS_OF_8_BITS = 16.0  # 12-bit steps per level of 8 bits, the scale of the vendor's programs and the paper's 30
 STAMP_US = 1000  # resolution of the computer's picture times, which are rounded down
 IRREGULAR_US = 3000.0  # larger deviations from a regular clock mean that the pictures were not taken by one
 
