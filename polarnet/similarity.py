@@ -41,10 +41,7 @@ SSIM_RADIUS = 5  # pixels: an 11 x 11 kernel
 SSIM_K1, SSIM_K2 = 0.01, 0.03
 LEAST_MSE = 1e-10  # half a step of the stored truth (1/65535) squared is 6e-11: nothing finer is known
 LEAST_DEVIATION = 1e-6  # a tenth of a step: a frame with a smaller deviation counts as constant
-SOBEL_SMOOTH, SOBEL_SLOPE = (
-    (0.25, 0.5, 0.25),
-    (-0.5, 0.0, 0.5),
-)  # across and along the derivative; gives a ramp's slope per pixel
+SOBEL_SMOOTH, SOBEL_SLOPE = (0.25, 0.5, 0.25), (-0.5, 0.0, 0.5)  # across and along; a ramp gives its slope
 CHANCE_AOLP_DEG = 45.0  # mean error of a random angle: the mean of |d| over -90 ... 90 degrees
 
 
