@@ -1,4 +1,4 @@
-"""One map over many sequences: in this process, over processes of this machine, or over a Dask cluster."""
+"""Map a function over many sequences: in this process, in processes of this machine, or on a Dask cluster."""
 
 import functools
 import multiprocessing
@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from polarnet.runtime import limit_threads, tune, usable_cores
 
-ATTEMPTS = 4  # as many as Dask gives a task whose workers die (allowed-failures 3)
+ATTEMPTS = 4  # Dask's own limit for a task whose workers die (allowed-failures 3)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -27,10 +27,10 @@ def pmap(
 ) -> list[Result]:
     """`[function(item) for item in items]`, in that order, with a progress bar called `label`.
 
-    `address` names a Dask scheduler (extra `cluster`); without it, `workers` processes share the items, and one worker
-    means this process. A worker that dies loses only what it had in hand: its items are given out again, and
-    a RuntimeError names those that were still undone after workers had died `ATTEMPTS` times without one result.
-    An exception that `function` raises ends the map and comes through as it is.
+    `address` names a Dask scheduler (extra `cluster`). Without it, `workers` processes share the items; one worker
+    means this process. If a worker dies, only its current items are lost and handed out again. RuntimeError names the
+    unfinished items after workers have died `ATTEMPTS` times without one result. An exception raised by `function` ends
+    the map and propagates unchanged.
     """
     with tqdm(total=len(items), desc=label, unit="", disable=None if len(items) > 1 else True) as bar:
         if address is not None:
@@ -73,8 +73,8 @@ def _start_worker(threads: int) -> None:
 def _collect(
     function: Callable[[Item], Result], items: Sequence[Item], workers: int, results: dict[int, Result], bar: tqdm
 ) -> None:
-    """Fill `results` with what is missing of it, until all is there or the pool breaks."""
-    spawn = multiprocessing.get_context("spawn")  # a fork of a process with running OpenMP threads can hang
+    """Add the missing entries of `results`, until all are there or the pool breaks."""
+    spawn = multiprocessing.get_context("spawn")  # forking a process with running OpenMP threads can hang
     threads = max(1, usable_cores() // workers)
     with ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(threads,)) as pool:
         futures = {pool.submit(function, items[i]): i for i in range(len(items)) if i not in results}
@@ -106,7 +106,7 @@ def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], addres
 
 
 def _guarded(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
-    """`function` on one thread, as Dask runs several tasks of one worker side by side."""
+    """`function` on one thread, since Dask runs several tasks of one worker side by side."""
     return functools.partial(_on_one_thread, function)
 
 

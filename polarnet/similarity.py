@@ -1,10 +1,11 @@
 """Similarity of two images, per frame: one definition for the loss and for the table.
 
-Every function takes frames in [0, 1], numpy or torch, with any leading axes, gives one number per frame, and is
-differentiable. TypeError for what is no array; ValueError for integers, frames or masks of different shapes, and where
-the data range enters (`psnr`, `ssim`) for a second frame, the truth, outside [0, 1].
-Where a mask `valid` is given, what the frames hold at other pixels does not matter, and a frame without any valid pixel
-gives NaN.
+Every function takes frames in [0, 1], numpy or torch, with any leading axes, returns one number per frame, and is
+differentiable. TypeError for anything but an array; ValueError for integers, and for frames or masks of different
+shapes. Where the data range matters (`psnr`, `ssim`), ValueError also for a second frame, the truth, outside [0, 1].
+
+With a mask `valid`, values at other pixels do not matter, and a frame without any valid pixel gives NaN.
+
 The perceptual distance, `Lpips`, is a network and lives in polarnet/lpips.py; its name is public here too.
 """
 
@@ -36,12 +37,12 @@ __all__ = [
 Valid = Bool[Array, "*b h w"] | None
 
 SSIM_SIGMA = 1.5  # pixels; this and the next three: Wang et al., IEEE TIP 2004
-SSIM_RADIUS = 5  # pixels: an 11 x 11 window
+SSIM_RADIUS = 5  # pixels: an 11 x 11 kernel
 SSIM_K1, SSIM_K2 = 0.01, 0.03
 LEAST_MSE = 1e-10  # half a step of the stored truth (1/65535) squared is 6e-11: nothing finer is known
-LEAST_DEVIATION = 1e-6  # a tenth of a step: a frame that varies less is constant
-SOBEL_SMOOTH, SOBEL_SLOPE = (0.25, 0.5, 0.25), (-0.5, 0.0, 0.5)  # across and along; a ramp has its slope per pixel
-CHANCE_AOLP_DEG = 45.0  # mean error of an angle that knows nothing: the mean of |d| over -90 ... 90 degrees
+LEAST_DEVIATION = 1e-6  # a tenth of a step: a frame with a smaller deviation counts as constant
+SOBEL_SMOOTH, SOBEL_SLOPE = (0.25, 0.5, 0.25), (-0.5, 0.0, 0.5)  # across and along; a ramp gives its slope
+CHANCE_AOLP_DEG = 45.0  # mean error of a random angle: the mean of |d| over -90 ... 90 degrees
 
 
 def mean_where(values: Float[Tensor, "*b h w"], valid: Bool[Tensor, "*b h w"] | None) -> Float[Tensor, "*b"]:
@@ -54,9 +55,9 @@ def mean_where(values: Float[Tensor, "*b h w"], valid: Bool[Tensor, "*b h w"] | 
 def with_truth_outside(
     predicted: Float[Tensor, "*b h w"], truth: Float[Tensor, "*b h w"], valid: Bool[Tensor, "*b h w"] | None
 ) -> Float[Tensor, "*b h w"]:
-    """`predicted` at valid pixels and `truth` at the others, where nothing is to be said against it then.
+    """`predicted` at valid pixels and `truth` at the others, so that those add no error.
 
-    For what looks at whole neighbourhoods: SSIM, and LPIPS, whose average includes the pixels that are not valid.
+    Used by the measures over neighbourhoods: SSIM, and LPIPS, whose average includes the invalid pixels.
     """
     return predicted if valid is None else torch.where(valid, predicted, truth)
 
@@ -76,21 +77,21 @@ def level_mse(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid
 
 
 def pattern_mse(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
-    """What remains of `mse` once both frames have the same mean: mse = level_mse + pattern_mse."""
+    """Remainder of `mse` after both frames get the same mean: mse = level_mse + pattern_mse."""
     a, b = _frames(a=a, b=b)
     valid = None if valid is None else mask_of("valid", valid, a.shape)
     return mse(_centred(a, valid), _centred(b, valid), valid)
 
 
 def spread_mse(truth: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
-    """`mse` of the best constant, the frame's own mean: its variance over the pixels, against which skill counts."""
+    """`mse` of the best constant, the frame's own mean: the variance over its pixels, and the reference for skill."""
     (truth,) = _frames(truth=truth)
     valid = None if valid is None else mask_of("valid", valid, truth.shape)
     return mean_where(_centred(truth, valid).square(), valid)
 
 
 def psnr(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
-    """Peak signal-to-noise ratio in dB for the data range 1; 100 dB, not infinity, where the frames agree."""
+    """Peak signal-to-noise ratio in dB for the data range 1; 100 dB, not infinity, for equal frames."""
     a, b = _frames(a=a, b=b)
     valid = None if valid is None else mask_of("valid", valid, a.shape)
     _check_unit(b, valid)
@@ -100,7 +101,7 @@ def psnr(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = No
 def correlation(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Pearson's correlation over the pixels of a frame, in [-1, 1]; 0 where either frame is constant.
 
-    A constant frame shows nothing of the other's pattern, so 0 is its score and no frame is left out.
+    A constant frame shows nothing of the other's pattern, so its score is 0 and no frame is left out.
     """
     a, b = _frames(a=a, b=b)
     valid = None if valid is None else mask_of("valid", valid, a.shape)
@@ -118,13 +119,16 @@ def correlation(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Val
 def gradient_agreement(
     a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None
 ) -> Float[Tensor, "*b"]:
-    """How well edges agree in place, direction and height: 2 sum(grad a . grad b) / sum(|grad a|^2 + |grad b|^2).
+    """Agreement of edges in place, direction and height: 2 sum(grad a . grad b) / sum(|grad a|^2 + |grad b|^2).
 
-    In [-1, 1]: 1 for the same gradients, 0 where either frame has none, -1 for the negative. An edge half as high
-    as it should be costs, which `correlation` forgives. The gradients are Sobel's (smoothed central differences) at
-    the interior pixels; with a mask, at those whose eight neighbours are valid as well (0 where there is none).
-    The ratio is that of gradient similarity (Liu, Lin & Narwaria, IEEE TIP 2012), here of vectors instead of
-    magnitudes, and pooled over the frame before the division, so that it needs no constant.
+    The range is [-1, 1]: 1 for the same gradients, 0 where either frame has none, -1 for opposite gradients. An edge of
+    half the true height lowers the score, unlike in `correlation`. The gradients are Sobel's (smoothed central
+    differences) at the interior pixels. With a mask, they are taken at pixels whose eight neighbours are valid as well;
+    the score is 0 if there are none.
+
+    The ratio is that of gradient similarity (Liu, Lin & Narwaria, IEEE TIP 2012), but of vectors instead of magnitudes.
+    It is pooled over the frame before the division, so it needs no constant.
+
     ValueError for a frame smaller than 3 pixels.
     """
     a, b = _frames(a=a, b=b)
@@ -147,10 +151,10 @@ def gradient_agreement(
 def aolp_error_deg(
     a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], weight: Float[Array, "*b h w"], valid: Valid = None
 ) -> Float[Tensor, "*b"]:
-    """Mean of the angle between two AoLP in radians, in degrees [0, 90]: the shorter way round the half circle.
+    """Mean angle between two AoLP (radians), in degrees [0, 90], the shorter way round the half circle.
 
-    `weight` is the true DoLP, as an angle matters as much as light is polarized. A frame without any polarization
-    has no angle and nobody can be right or wrong: it counts as chance, 45 degrees, so that no frame is left out.
+    `weight` is the true DoLP: an angle matters in proportion to it. A frame without any polarization has no angle; it
+    scores as chance, 45 degrees, so that no frame is left out.
     """
     a, b, weight = _frames(a=a, b=b, weight=weight)
     valid = None if valid is None else mask_of("valid", valid, a.shape)
@@ -163,14 +167,15 @@ def aolp_error_deg(
 
 
 def ssim(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
-    """Structural similarity (Wang et al. 2004) for the data range 1, Gaussian window of 11 pixels and sigma 1.5.
+    """Structural similarity (Wang et al. 2004) for the data range 1, with a Gaussian kernel of 11 pixels and sigma 1.5.
 
-    The mean over the whole frame, which is mirrored at its borders (the edge pixel is not repeated): torchmetrics'
-    `structural_similarity_index_measure`. scikit-image averages the interior alone, where both agree.
-    With a mask: the mean of the map over the valid pixels. Windows of some of them reach other pixels, where `a` is
-    taken to be like `b`, the truth.
-    Computed in float32 at least, whatever autocast says: variances are small differences of large means.
-    ValueError for a frame smaller than 6 pixels.
+    The mean covers the whole frame, which is mirrored at its borders (the edge pixel is not repeated), as in
+    torchmetrics' `structural_similarity_index_measure`. scikit-image averages the interior alone, where both agree.
+
+    With a mask, the mean covers the valid pixels. Kernels that reach invalid pixels use the truth `b` for `a` there.
+
+    Computed in float32 at least, even under autocast: variances are small differences of large means. ValueError for a
+    frame smaller than 6 pixels.
     """
     a, b = _frames(a=a, b=b)
     valid = None if valid is None else mask_of("valid", valid, a.shape)
@@ -189,7 +194,7 @@ def ssim(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = No
 
 
 def _frames(**frames: Array) -> tuple[Tensor, ...]:
-    """The frames as tensors, once they are known to be of one shape and floating-point."""
+    """The frames as tensors, checked to be floating-point and of one shape."""
     tensors = {name: as_tensor(name, values) for name, values in frames.items()}
     for name, values in tensors.items():
         check_shape(name, values, "... height width")
@@ -212,7 +217,7 @@ def _deviation(centred: Tensor, valid: Tensor | None) -> Tensor:
 
 
 def _sobel(frames: Float[Tensor, "*b h w"]) -> tuple[Float[Tensor, "*b i j"], Float[Tensor, "*b i j"]]:
-    """(along rows, along columns), per pixel, at the interior pixels."""
+    """Gradients (along rows, along columns) per pixel, at the interior pixels."""
 
     def filtered(x: Tensor, dim: int, taps: tuple[float, ...]) -> Tensor:
         n = x.shape[dim] - len(taps) + 1
@@ -225,14 +230,14 @@ def _sobel(frames: Float[Tensor, "*b h w"]) -> tuple[Float[Tensor, "*b i j"], Fl
 
 
 def _eroded(valid: Bool[Tensor, "*b h w"]) -> Bool[Tensor, "*b i j"]:
-    """Interior pixels that are valid with all eight neighbours."""
+    """Interior pixels that are valid and have eight valid neighbours."""
     height, width = valid.shape[-2] - 2, valid.shape[-1] - 2
     shifts = [valid[..., i : i + height, j : j + width] for i in range(3) for j in range(3)]
     return torch.stack(shifts).all(dim=0)
 
 
 def _gaussian_means(frames: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
-    # As two matrix products this is 8 (forward) to 18 times (with backward) faster on a CPU than two convolutions.
+    # On a CPU two matrix products are 8 (forward) to 18 times (with backward) faster than two convolutions.
     h, w = frames.shape[-2:]
     rows = _gaussian_matrix(h, frames.dtype, frames.device)
     columns = _gaussian_matrix(w, frames.dtype, frames.device)
@@ -241,7 +246,7 @@ def _gaussian_means(frames: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
 
 @functools.lru_cache(maxsize=16)
 def _gaussian_matrix(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "n n"]:
-    """Row i holds the window around pixel i; weights that fall off the border are mirrored back."""
+    """Row i holds the kernel around pixel i; weights beyond the border are mirrored back."""
     with torch.inference_mode(False):
         offset = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1)
         weight = torch.exp(-(offset.double() ** 2) / (2 * SSIM_SIGMA**2))

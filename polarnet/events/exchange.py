@@ -1,4 +1,4 @@
-"""Events to and from the files of other tools: HDF5 as DSEC lays it out, and text lines `t x y p`."""
+"""Convert events to and from other tools' files: HDF5 in DSEC's layout, and text lines `t x y p`."""
 
 import json
 import os
@@ -18,9 +18,9 @@ HDF5_CHUNK = 2**16  # events
 
 
 def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:
-    """One polarizer as DSEC (Gehrig et al. 2021) stores a camera: events/{x,y,t,p}, ms_to_idx and t_offset.
+    """Write one channel in DSEC's layout of a camera (Gehrig et al. 2021): events/{x,y,t,p}, ms_to_idx and t_offset.
 
-    Polarity is 1 or 0 there. The sensor's size is added as the attributes height and width. Needs h5py.
+    Polarity is 1 or 0 there. The attributes height and width add the sensor's size. Needs h5py.
     """
     columns: dict[str, np.ndarray] = {
         "x": events.x.numpy().astype(np.uint16),
@@ -38,7 +38,7 @@ def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -
 
 
 def read_hdf5(path: str | os.PathLike[str], height: int | None = None, width: int | None = None) -> Events:
-    """The events of a DSEC file, at times t + t_offset; the sensor's size from the file where it says so.
+    """Read the events of a DSEC file, at times t + t_offset; the sensor's size comes from the file where stated.
 
     ValueError that names the file where it has no events, no size (give one; DSEC is 480x640) or broken events.
     """
@@ -54,9 +54,9 @@ def read_hdf5(path: str | os.PathLike[str], height: int | None = None, width: in
 
 
 def write_text(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:
-    """One polarizer as a line `width height`, then a line `t x y p` for each event: what E2VID's tools read.
+    """Write one channel as a line `width height`, then a line `t x y p` per event, the format of E2VID's tools.
 
-    t in seconds, six decimals; p is 1 or 0. The duration has no place in such a file.
+    t is in seconds with six decimals; p is 1 or 0. Such a file cannot hold the duration.
     """
     with Path(path).open("w", encoding="ascii") as file:
         file.write(f"{events.width} {events.height}\n")
@@ -65,10 +65,10 @@ def write_text(path: str | os.PathLike[str], events: Events, duration_us: int) -
 
 
 def read_text(path: str | os.PathLike[str], height: int | None = None, width: int | None = None) -> Events:
-    """Events from lines `t x y p`, under a line `width height` or with the size given; # starts a comment.
+    """Read events from lines `t x y p`, after a line `width height` or with the given size; # starts a comment.
 
     t is in seconds where the first event's t has a decimal point, else in microseconds; p is 1 or 0, or 1 or -1.
-    ValueError that names the file where it is anything else.
+    ValueError that names the file where it has any other content.
     """
     lines = [text for line in Path(path).read_text(encoding="ascii", errors="replace").splitlines()
              if (text := line.split("#")[0].strip())]  # fmt: skip
@@ -86,7 +86,7 @@ def read_text(path: str | os.PathLike[str], height: int | None = None, width: in
 
 
 class Form(NamedTuple):
-    """How one polarizer's events become a file, and come back."""
+    """Suffix, writer and reader of one file format."""
 
     suffix: str
     write: Callable[[Path, Events, int], None]
@@ -99,7 +99,7 @@ FORMS = {"hdf5": Form(".h5", write_hdf5, read_hdf5), "text": Form(".txt", write_
 def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -> None:
     """Write FOLDER/SEQUENCE/polarizer_{000,045,090,135}.{h5,txt} for every sequence, then FOLDER/store.json.
 
-    `form` is hdf5 or text. store.json holds what these files have no place for; `import_store` reads it.
+    `form` is hdf5 or text. store.json holds the data that these files cannot; `import_store` reads it.
     """
     folder = Path(folder)
     suffix, write, _ = _form(form)
@@ -122,7 +122,7 @@ def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -
 
 
 def import_store(folder: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
-    """Make an event store of a folder that `export_store` wrote: the same bytes as the store it came from.
+    """Rebuild an event store, byte for byte, from a folder that `export_store` wrote.
 
     Other files are recordings: `polarnet.recordings` reads, checks and repairs them.
     """
@@ -158,7 +158,7 @@ def _events(
     height: int | None,
     width: int | None,
 ) -> Events:
-    """Columns of a file as events, darker being 0 or -1 there."""
+    """Convert a file's columns to events; darker may be 0 or -1 there."""
     if height is None or width is None:
         raise ValueError(f"{path}: the file does not say how large the sensor is; give height and width")
     if not (np.isin(p, (0, 1)).all() or np.isin(p, (-1, 1)).all()):

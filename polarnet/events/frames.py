@@ -41,7 +41,7 @@ MASK_CONVENTION = "whether the truth of a pixel is known, 8 pixels of a row a by
 
 
 class Frames(NamedTuple):
-    """The frames of one sequence."""
+    """Frames of one sequence."""
 
     t_us: Int64[Tensor, " n"]
     intensity: Float[Tensor, "n 4 h w"]
@@ -52,39 +52,42 @@ class Frames(NamedTuple):
 
 
 def quantise_fraction(fraction: Float[Array, "*shape"], name: str = "fraction") -> UInt16[np.ndarray, "*shape"]:
-    """A quantity of [0, 1] in 65535 steps; ValueError outside, beyond float32's own error."""
+    """Quantise a quantity of [0, 1] to 65535 steps; ValueError outside, beyond float32 rounding error."""
     return (fractions(name, fraction, "...") * FRACTION_STEPS).round().numpy().astype(np.uint16)
 
 
 def dequantise_fraction(steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
-    """The quantity of [0, 1] that `quantise_fraction` stored."""
+    """Invert `quantise_fraction`."""
     return torch.from_numpy(steps.astype(np.float32)).div_(FRACTION_STEPS)
 
 
 def quantise_angle(angle: Float[Array, "*shape"], name: str = "angle") -> UInt16[np.ndarray, "*shape"]:
-    """Radians of [0, pi) in 65536 steps round the circle (what rounds up to pi is 0); ValueError outside."""
+    """Quantise radians of [0, pi) to 65536 steps round the circle; ValueError outside.
+
+    A value that rounds up to pi becomes 0.
+    """
     checked = floats(name, angle, "...")
     check_range(name, checked, 0, math.pi, "radians", "fold them into [0, pi), degrees after torch.deg2rad")
     return ((checked * (ANGLE_STEPS / math.pi)).round().numpy().astype(np.int64) % ANGLE_STEPS).astype(np.uint16)
 
 
 def dequantise_angle(steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
-    """The radians that `quantise_angle` stored."""
+    """Invert `quantise_angle`."""
     return torch.from_numpy(steps.astype(np.float32)).mul_(math.pi / ANGLE_STEPS)
 
 
 def pack_mask(valid: Bool[Tensor, "*b h w"]) -> UInt8[np.ndarray, "*b h bytes"]:
-    """8 pixels of a row in a byte."""
+    """Pack 8 pixels of a row into a byte."""
     return np.packbits(valid.numpy(), axis=-1)
 
 
 def unpack_mask(packed: UInt8[np.ndarray, "*b h bytes"], width: int) -> Bool[Tensor, "*b h w"]:
-    """What `pack_mask` packed."""
+    """Invert `pack_mask`."""
     return torch.from_numpy(np.unpackbits(packed, axis=-1, count=width).astype(bool))
 
 
 class FrameStore:
-    """Frames of sequences, and which sequences are for training, validation and test; see `create` and `open`."""
+    """Frames of sequences, each in the split train, val or test; see `create` and `open`."""
 
     def __init__(self, table: Table):
         self._table = table
@@ -94,9 +97,9 @@ class FrameStore:
         self.height: int = table.attributes["height"]
         self.width: int = table.attributes["width"]
         self.masked: bool = "valid" in table.columns
-        """Whether there may be pixels whose truth is not known."""
+        """Whether the store marks pixels whose truth is unknown."""
         self.attributes: dict[str, Any] = table.attributes["attributes"]
-        """What whoever created the store said about it."""
+        """Metadata given by the store's creator."""
 
     @classmethod
     def create(
@@ -110,10 +113,10 @@ class FrameStore:
         attributes: Mapping[str, Any],
         masked: bool = False,
     ) -> "FrameStore":
-        """A store to write, at PATH.tmp until it is finished, for at most `n_frames` a sequence.
+        """Create a store for up to `n_frames` per sequence; it lies at PATH.tmp until it is finished.
 
-        `splits` maps each sequence to train, val or test. A `masked` store says of every pixel whether its truth is
-        known; one that is not holds nothing about it. Resumes as `EventStore.create` does.
+        `splits` maps each sequence to train, val or test. A `masked` store records for every pixel whether its truth is
+        known; other stores have no mask. Resumes as `EventStore.create` does.
         """
         check_names(sequences)
         check_splits(sequences, splits)
@@ -132,7 +135,7 @@ class FrameStore:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> "FrameStore":
-        """A finished store: a local folder, a zip, or an fsspec URL. See `polarnet.events.table.open_table`."""
+        """Open a finished store: a local folder, a zip, or an fsspec URL. See `polarnet.events.table.open_table`."""
         return cls(open_table(path, FORMAT, VERSION, _columns))
 
     def write(
@@ -144,11 +147,11 @@ class FrameStore:
         aolp: Float[Array, "n h w"],
         valid: Bool[Array, "n h w"] | None = None,
     ) -> None:
-        """Put the frames of a sequence in its row; a sequence that is there already stays as it is.
+        """Write the frames of a sequence; a sequence that is already written stays unchanged.
 
-        Arrays may be numpy or torch. Raises TypeError for what is no array, and ValueError for values out of range or
-        not finite, integers as intensities, other shapes, times that do not increase, or a mask (None: all pixels are
-        valid) in a store that has none.
+        Arrays may be numpy or torch. TypeError for anything but an array. ValueError for values out of range or not
+        finite, integer intensities, wrong shapes, times that do not increase, or a mask in a store without one. A mask
+        of None marks all pixels valid.
         """
         t_us = self._checked_times(t_us)
         self._check_shapes(len(t_us), intensity, dolp, aolp)
@@ -167,7 +170,7 @@ class FrameStore:
         self._table.write("t_us", sequence, t_us.numpy())
 
     def missing(self) -> list[str]:
-        """Sequences that are not written yet."""
+        """Sequences not written yet."""
         return [sequence for sequence in self.sequences if not self._table.is_written("t_us", sequence)]
 
     def finish(self) -> None:
@@ -180,12 +183,12 @@ class FrameStore:
         return names_of_split(self.splits, split)
 
     def t_us(self, sequence: str) -> Int64[Tensor, " n"]:
-        """Times of a sequence's frames, from its start."""
+        """Times of a sequence's frames, in microseconds from its start."""
         t_us = self._table.read("t_us", sequence)
         return torch.from_numpy(t_us[t_us >= 0])
 
     def intensity(self, sequence: str) -> Float[Tensor, "n 4 h w"]:
-        """Intensities behind the four polarizers."""
+        """Intensities behind the polarizers at 0, 45, 90 and 135 degrees."""
         return dequantise_fraction(self._read("intensity", sequence))
 
     def dolp(self, sequence: str) -> Float[Tensor, "n h w"]:
@@ -201,7 +204,7 @@ class FrameStore:
         return unpack_mask(self._read("valid", sequence), self.width) if self.masked else None
 
     def frames(self, sequence: str) -> Frames:
-        """All of a sequence."""
+        """All frames of a sequence."""
         t_us = self.t_us(sequence)
         window = (slice(len(t_us)),)
         names = ["intensity", "dolp", "aolp", *(["valid"] if self.masked else [])]
@@ -215,7 +218,7 @@ class FrameStore:
         )
 
     def problems(self, sequence: str) -> list[str]:
-        """Damaged or missing data of a sequence."""
+        """Messages about damaged or missing data of a sequence."""
         problems = []
         for read in (self.t_us, self.intensity, self.dolp, self.aolp, self.valid):
             try:
@@ -253,14 +256,14 @@ def check_splits(names: Sequence[str], splits: Mapping[str, str]) -> None:
 
 
 def names_of_split(splits: Mapping[str, str], split: str) -> list[str]:
-    """The names that are in `split`, in their order; ValueError unless it is train, val or test."""
+    """The names in `split`, in their order; ValueError unless `split` is train, val or test."""
     if split not in SPLITS:
         raise ValueError(f"expected a split of {', '.join(SPLITS)}, got {split!r}")
     return [name for name, its_split in splits.items() if its_split == split]
 
 
 def verify_frames(path: str | os.PathLike[str]) -> list[str]:
-    """Everything that is wrong with a frame store, each with its sequence and column; empty when it is whole."""
+    """All problems of a frame store, each with its sequence and column; empty when it is intact."""
     try:
         store = FrameStore.open(path)
     except (FileNotFoundError, ValueError) as error:

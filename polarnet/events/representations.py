@@ -1,4 +1,4 @@
-"""Events to dense network input. Every function says where in its time axis the first and the last event lie."""
+"""Encode events as dense network input. Every function states where the first and last event lie on its time axis."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from polarnet.events.stream import Events
 
-VOXEL_BINS = 5  # of E2VID (Rebecq et al. 2019) and FireNet
+VOXEL_BINS = 5  # as in E2VID (Rebecq et al. 2019) and FireNet
 
 Encode = Callable[[Events, int], Tensor]
 
@@ -16,9 +16,9 @@ Encode = Callable[[Events, int], Tensor]
 def event_tensor(events: Events, window_us: int) -> Float[Tensor, "h w"]:
     """Polarities summed per pixel, each weighted by its time since the first event (paper Eq. 5).
 
-    Time counts from the first event of this channel in the window, in window lengths: that event weighs 0, one at the
-    very end of the window less than 1 (1, when the first came as the window opened).
-    ValueError for a window without a length.
+    Time counts from the first event of this channel in the window, in window lengths. The first event weighs 0. An
+    event at the very end weighs less than 1, or 1 if the first came as the window opened. ValueError for a window
+    without a length.
     """
     _check_length(window_us)
     elapsed = (events.t - events.t[:1]) / window_us
@@ -27,10 +27,10 @@ def event_tensor(events: Events, window_us: int) -> Float[Tensor, "h w"]:
 
 
 def voxel_grid(events: Events, bins: int) -> Float[Tensor, "bins h w"]:
-    """Polarities shared out between the two nearest of `bins` instants (E2VID, Rebecq et al. 2019).
+    """Each polarity split between the two nearest of `bins` instants (E2VID, Rebecq et al. 2019).
 
-    t* = (bins - 1) (t - first) / (last - first): the first event is in bin 0, the last in bin n-1, however long the
-    window is. Bilinear in time only. Events that all have one time are in bin 0. ValueError for no bins.
+    t* = (bins - 1) (t - first) / (last - first): the first event is in bin 0 and the last in bin n-1, whatever the
+    window's length. Bilinear in time only. If all events have the same time, they are in bin 0. ValueError for no bins.
     """
     if bins < 1:
         raise ValueError(f"voxel_grid: expected at least one bin, got {bins}")
@@ -39,7 +39,7 @@ def voxel_grid(events: Events, bins: int) -> Float[Tensor, "bins h w"]:
     if len(events):
         elapsed = events.t - events.t[0]
         position = (bins - 1) * elapsed / elapsed[-1].clamp(min=1)
-        bin_before = position.long().clamp(max=max(bins - 2, 0))  # the last event belongs wholly to the bin after
+        bin_before = position.long().clamp(max=max(bins - 2, 0))  # the last event belongs wholly to the later bin
         share_after = position - bin_before
         place = bin_before * size + _pixel(events)
         grid.index_add_(0, place, events.p * (1 - share_after))
@@ -49,7 +49,7 @@ def voxel_grid(events: Events, bins: int) -> Float[Tensor, "bins h w"]:
 
 
 def normalise_nonzero(grids: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b c h w"]:
-    """Entries other than 0 shifted and scaled to mean 0 and standard deviation 1, grid by grid, as E2VID does.
+    """Nonzero entries normalised to mean 0 and standard deviation 1, grid by grid, as in E2VID.
 
     Zeros stay zero. Entries that are all equal become 0, not infinite.
     """
@@ -62,7 +62,7 @@ def normalise_nonzero(grids: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b c h
 
 
 def time_surface(events: Events, window_us: int) -> Float[Tensor, "h w"]:
-    """Polarity of each pixel's last event, faded by its age: p exp(-(t_last - t) / window) (Lagorce et al. 2017).
+    """Polarity of each pixel's last event, decayed by its age: p exp(-(t_last - t) / window) (Lagorce et al. 2017).
 
     Ages count back from the last event of the channel, which therefore weighs 1. Pixels without an event are 0.
     ValueError for a window without a length.
@@ -79,7 +79,10 @@ def time_surface(events: Events, window_us: int) -> Float[Tensor, "h w"]:
 
 
 def event_counts(events: Events, window_us: int) -> Float[Tensor, "2 h w"]:
-    """Per pixel the sum of polarities, that is, the change of log intensity in contrast thresholds; and the events."""
+    """Per pixel, the sum of polarities and the number of events.
+
+    The sum is the change of log intensity in contrast thresholds.
+    """
     pixel = _pixel(events)
     images = torch.zeros(2, events.height * events.width, device=events.t.device)
     images[0].index_add_(0, pixel, events.p.float())
@@ -88,7 +91,7 @@ def event_counts(events: Events, window_us: int) -> Float[Tensor, "2 h w"]:
 
 
 def voxel_grid_of_window(events: Events, window_us: int) -> Float[Tensor, "bins h w"]:
-    """`voxel_grid` in E2VID's 5 bins, which stretch over the events whatever the window's length."""
+    """`voxel_grid` with E2VID's 5 bins, which span the events whatever the window's length."""
     return voxel_grid(events, VOXEL_BINS)
 
 
@@ -98,11 +101,11 @@ REPRESENTATIONS: dict[str, Encode] = {
     "voxel_grid": voxel_grid_of_window,
     "time_surface": time_surface,
 }
-"""Events of one polarizer in a window of so many microseconds -> an image, or a stack of them."""
+"""Encoders by name: (events of one channel, window length in microseconds) -> one image or a stack."""
 
 
 def channels_of(encode: Encode) -> int:
-    """How many images a representation makes of one polarizer's events."""
+    """Number of images that a representation makes of one channel's events."""
     shape = encode(Events.empty(1, 1), 1).shape
     return shape[0] if len(shape) == 3 else 1
 

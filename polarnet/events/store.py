@@ -1,9 +1,9 @@
-"""The one format of events on disk, for simulated and real data alike: a Zarr v3 group.
+"""The event store, the one on-disk format of simulated and real events: a Zarr v3 group.
 
-Each sequence is a row. Its four polarizer channels lie one after the other in the columns `events/x`, `events/y`,
-`events/t` (microseconds from the start of the sequence) and `events/p` (+1 or -1). `offsets` holds where each channel
-starts, and where the last one ends; it is written last. `duration_us` is the length of the sequence. `ms_to_idx`
-(DSEC's name) holds, for each channel and millisecond, the place of the first event at or after it.
+Each sequence is a row. Its four channels follow each other in the columns `events/x`, `events/y`, `events/t`
+(microseconds from the start of the sequence) and `events/p` (+1 or -1). `offsets` holds the start of each channel and
+the end of the last; it is written last. `duration_us` is the length of the sequence. `ms_to_idx` (DSEC's name) holds,
+for each channel and millisecond, the index of the first event at or after it.
 """
 
 import itertools
@@ -32,9 +32,9 @@ FORMAT = "polarnet.events"
 VERSION = 1
 
 CHANNELS = len(POLARIZER_ANGLES_DEG)
-LONGEST_US = 2**32 - 2  # 71 minutes: t is uint32, its largest value stands for "nothing here"
-MOST_EVENTS = 2**32  # of the four channels of a sequence
-CHUNK = 2**18  # events; smaller ones cost Zarr more time than they save, for a window as well as for a whole sequence
+LONGEST_US = 2**32 - 2  # 71 minutes: t is uint32, and its largest value is the fill value
+MOST_EVENTS = 2**32  # in the four channels of a sequence
+CHUNK = 2**18  # events; smaller chunks make Zarr slower, for a window as well as for a whole sequence
 SHARD = 2**22
 MILLISECOND_CHUNK = 2**12
 MILLISECOND_SHARD = 2**16
@@ -51,7 +51,7 @@ CONVENTIONS = {
 
 
 class EventStore:
-    """Sequences of events behind four polarizers; see `create` and `open`."""
+    """Sequences of events in four channels; see `create` and `open`."""
 
     def __init__(self, table: Table):
         self._table = table
@@ -60,7 +60,7 @@ class EventStore:
         self.height: int = table.attributes["height"]
         self.width: int = table.attributes["width"]
         self.attributes: dict[str, Any] = table.attributes["attributes"]
-        """What whoever created the store said about it."""
+        """Metadata given by the store's creator."""
 
     @classmethod
     def create(
@@ -71,11 +71,11 @@ class EventStore:
         width: int,
         attributes: Mapping[str, Any],
     ) -> "EventStore":
-        """A store to write, at PATH.tmp until it is finished.
+        """Create a store to write; it lies at PATH.tmp until it is finished.
 
-        `attributes` (plain JSON) must hold all that the events depend on, since an unfinished store with equal metadata
-        is taken up where it was left; one with other metadata is removed. One process creates the store; it can be
-        pickled and handed to others, which may write different sequences at the same time.
+        `attributes` (plain JSON) must hold everything that the events depend on: an unfinished store with equal
+        metadata is resumed, one with other metadata is removed. One process creates the store. It can be pickled and
+        sent to other processes, which may write different sequences at the same time.
         """
         check_names(sequences)
         if not (0 < height <= LARGEST_SIDE and 0 < width <= LARGEST_SIDE):
@@ -92,14 +92,14 @@ class EventStore:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> "EventStore":
-        """A finished store: a local folder, a zip, or an fsspec URL. See `polarnet.events.table.open_table`."""
+        """Open a finished store: a local folder, a zip, or an fsspec URL. See `polarnet.events.table.open_table`."""
         return cls(open_table(path, FORMAT, VERSION, _columns))
 
     def write(self, sequence: str, channels: Sequence[Events], duration_us: int) -> None:
-        """Put the four channels (0, 45, 90, 135 degrees) of a sequence in its row.
+        """Write the four channels (0, 45, 90, 135 degrees) of a sequence.
 
-        A sequence that is there already stays as it is: the store's attributes determine its events. ValueError, before
-        anything is written, for events out of order, off the sensor or outside [0, duration_us].
+        A sequence that is already written stays unchanged, since the store's attributes determine its events.
+        ValueError, before anything is written, for events out of order, off the sensor or outside [0, duration_us].
         """
         self._check(channels, duration_us)
         if self._table.is_written("offsets", sequence):
@@ -111,14 +111,14 @@ class EventStore:
         for name in "xytp":
             column = f"events/{name}"
             pieces, dtype = [getattr(channel, name).numpy() for channel in channels], self._table.columns[column].dtype
-            # checked above: nothing is lost in the narrower types of the disk
+            # checked above: the narrower types on disk hold every value
             self._table.write(column, sequence, np.concatenate(pieces, dtype=dtype, casting="unsafe"))
         self._table.write("ms_to_idx", sequence, np.stack(index))
         self._table.write("duration_us", sequence, np.array(duration_us))
         self._table.write("offsets", sequence, offsets)
 
     def missing(self) -> list[str]:
-        """Sequences that are not written yet."""
+        """Sequences not written yet."""
         return [sequence for sequence in self.sequences if not self._table.is_written("offsets", sequence)]
 
     def finish(self) -> None:
@@ -135,13 +135,14 @@ class EventStore:
         return int(self._table.read("duration_us", sequence))
 
     def count(self, sequence: str) -> tuple[int, ...]:
-        """How many events each channel of a sequence has."""
+        """Number of events in each channel of a sequence."""
         return tuple(np.diff(self._offsets(sequence)).tolist())
 
     def read(self, sequence: str, start_us: int | None = None, stop_us: int | None = None) -> list[Events]:
-        """The four channels of a sequence, or of its events with start <= t < stop; times stay those of the sequence.
+        """The four channels of a sequence, whole or limited to events with start <= t < stop.
 
-        Reads only the chunks that the window touches. ValueError names sequence and column of unreadable data.
+        Times always count from the start of the sequence. Reads only the chunks that overlap the window. ValueError
+        names sequence and column of unreadable data.
         """
         offsets = self._offsets(sequence)
         if start_us is None and stop_us is None:
@@ -157,7 +158,7 @@ class EventStore:
         return [slice_time(events, start_us, stop_us) for events in self._events(sequence, spans)]
 
     def problems(self, sequence: str) -> list[str]:
-        """What is wrong with a sequence: unreadable or missing data, or events that break the format's rules."""
+        """Problems of a sequence: unreadable or missing data, or events that break the format's rules."""
         try:
             offsets, duration_us = self._offsets(sequence), self.duration_us(sequence)
             index = self._table.read("ms_to_idx", sequence, slice(CHANNELS), slice(_milliseconds(duration_us)))
@@ -194,7 +195,7 @@ class EventStore:
         return offsets
 
     def _events(self, sequence: str, spans: Sequence[tuple[int, int]]) -> list[Events]:
-        """The events between places of a sequence's row, for each of the spans (start, stop)."""
+        """The events in each of the spans (start, stop) of a sequence's row."""
         requests = [(f"events/{name}", sequence, (slice(*span),)) for span in spans for name in "txyp"]
         columns = self._table.read_together(requests)
         return [
@@ -227,7 +228,7 @@ class EventStore:
 
 
 def verify(path: str | os.PathLike[str]) -> list[str]:
-    """Everything that is wrong with an event store, each with its sequence and column; empty when it is whole."""
+    """All problems of an event store, each with its sequence and column; empty when it is intact."""
     try:
         store = EventStore.open(path)
     except (FileNotFoundError, ValueError) as error:
@@ -263,12 +264,12 @@ def _columns(metadata: Mapping[str, Any]) -> Columns:
 
 
 def _milliseconds(duration_us: int) -> int:
-    """Entries of the time index: every full millisecond from 0 up to the first at or after the end."""
+    """Length of the time index: every full millisecond from 0 up to the first at or after the end."""
     return -(-duration_us // 1000) + 1
 
 
 def first_at_millisecond(t: Tensor, duration_us: int) -> np.ndarray:
-    """For each entry of the time index, how many events are earlier."""
+    """Number of events before each millisecond of the time index."""
     return torch.searchsorted(t, 1000 * torch.arange(_milliseconds(duration_us))).numpy()
 
 

@@ -1,4 +1,4 @@
-"""Events of one polarizer channel as columns, and what can be done to them without knowing where they came from."""
+"""The events of one channel as columns, and operations on them that do not depend on their origin."""
 
 import itertools
 from collections.abc import Sequence
@@ -20,15 +20,15 @@ _COLUMNS = {"t": torch.int64, "x": torch.int16, "y": torch.int16, "p": torch.int
 
 @dataclass(frozen=True)
 class Events:
-    """What the pixels behind one polarizer reported, in time order.
+    """Events of one channel, in time order.
 
-    Making one checks shapes and types alone, so that a slice costs nothing; `validate` checks every event.
+    The constructor checks only shapes and types, so that slices are cheap; `validate` checks every event.
     """
 
     t: Int64[Tensor, " n"]  # microseconds
     x: Int16[Tensor, " n"]  # column
     y: Int16[Tensor, " n"]  # row
-    p: Int8[Tensor, " n"]  # +1 brighter, -1 darker; never 0, so a sum needs no conversion
+    p: Int8[Tensor, " n"]  # +1 brighter, -1 darker; never 0, so sums need no conversion
     height: int
     width: int
 
@@ -58,8 +58,8 @@ class Events:
     ) -> "Events":
         """Events from numpy or torch columns of any integer type: microseconds, column, row, and +1 or -1.
 
-        Every event is checked. Raises TypeError for what is no array, and ValueError for floats, columns of different
-        lengths, and as `validate` does.
+        Every event is checked. TypeError for anything but an array; ValueError for floats, columns of different
+        lengths, and invalid events (see `validate`).
         """
         columns = {}
         for (name, dtype), values in zip(_COLUMNS.items(), (t, x, y, p), strict=True):
@@ -73,15 +73,15 @@ class Events:
 
     @classmethod
     def empty(cls, height: int, width: int) -> "Events":
-        """No events on a sensor of this size."""
+        """An empty set of events on a sensor of this size."""
         t, x, y, p = (torch.empty(0, dtype=dtype) for dtype in _COLUMNS.values())
         return cls(t, x, y, p, height, width)
 
 
 def validate(events: Events) -> Events:
-    """`events`, unchanged, once every event is known to be in time order, on the sensor and of polarity +1 or -1.
+    """Return `events` unchanged if all are in time order, on the sensor and of polarity +1 or -1.
 
-    ValueError names the first event that is not.
+    ValueError names the first invalid event.
     """
     if _all_valid(*(getattr(events, name).numpy() for name in _COLUMNS), events.height, events.width):
         return events
@@ -103,7 +103,7 @@ def validate(events: Events) -> Events:
 @no_type_check
 @numba.njit(cache=True, nogil=True)
 def _all_valid(t, x, y, p, height, width) -> bool:
-    """What `validate` demands, in one pass and without a branch on any event."""
+    """The check of `validate` in one pass, without a branch per event."""
     wrong, before = False, t[0] if t.size else 0
     for i in range(t.size):
         wrong |= (t[i] < before) | (x[i] < 0) | (x[i] >= width) | (y[i] < 0) | (y[i] >= height)
@@ -119,7 +119,7 @@ def slice_time(events: Events, start_us: int, stop_us: int) -> Events:
 
 
 def slice_count(events: Events, start: int, stop: int) -> Events:
-    """Events number `start` up to, not including, `stop`; views, not copies."""
+    """Events `start` to `stop` (exclusive) by index; views, not copies."""
     return Events(
         events.t[start:stop],
         events.x[start:stop],
@@ -131,7 +131,7 @@ def slice_count(events: Events, start: int, stop: int) -> Events:
 
 
 def crop(events: Events, top: int, left: int, height: int, width: int) -> Events:
-    """Events of a part of the sensor, counted from the part's own corner; ValueError where it is not on the sensor."""
+    """Events of a part of the sensor, with coordinates from its own corner; ValueError if it exceeds the sensor."""
     if not (0 <= top <= top + height <= events.height and 0 <= left <= left + width <= events.width):
         raise ValueError(
             f"crop: rows {top} to {top + height} and columns {left} to {left + width} are not on a sensor of "
@@ -151,11 +151,11 @@ def crop(events: Events, top: int, left: int, height: int, width: int) -> Events
 def downscale(events: Events, height: int, width: int, *, keep_rate: bool) -> Events:
     """The events as a sensor of fewer pixels sees them: pixel (y, x) falls into (y * height // H, x * width // W).
 
-    The event-rate rule is `keep_rate`. False: every event is kept, so a coarse pixel fires as often as all the fine
-    pixels under it together, as if its contrast threshold were smaller by their number. True: a coarse pixel reports
-    what one pixel with the same threshold would, an event each time its fine pixels, weighing +1 and -1, have moved by
-    as many as they are on average (H W / (height width)), since that is one threshold of their mean log intensity.
-    ValueError where the new size is larger than the old.
+    `keep_rate` is the event-rate rule. False keeps every event: a coarse pixel fires as often as all its fine pixels
+    together, as if its contrast threshold were divided by their number. True gives the events of one pixel with the
+    same threshold. A coarse pixel then fires each time the polarity sum of its fine pixels moves by their mean number,
+    H W / (height width), which is one threshold of their mean log intensity. ValueError where the new size is larger
+    than the old.
     """
     if not (0 < height <= events.height and 0 < width <= events.width):
         raise ValueError(f"downscale: expected a size within {events.height}x{events.width} px, got {height}x{width}")
@@ -170,7 +170,7 @@ def downscale(events: Events, height: int, width: int, *, keep_rate: bool) -> Ev
 
 
 def concatenate(parts: Sequence[Events]) -> Events:
-    """Consecutive pieces of one stream as one; ValueError where a piece starts before the one ahead of it ended."""
+    """Join consecutive pieces of one stream; ValueError if a piece starts before the previous one ended."""
     height, width = _common_size(parts)
     filled = [part for part in parts if len(part)]
     for i, (before, after) in enumerate(itertools.pairwise(filled), start=1):
@@ -184,7 +184,10 @@ def concatenate(parts: Sequence[Events]) -> Events:
 
 
 def merge(streams: Sequence[Events]) -> Events:
-    """Streams of one sensor, which may overlap in time, as one; of equal times, the earlier stream's events first."""
+    """Merge streams of one sensor, which may overlap in time.
+
+    At equal times, the earlier stream's events come first.
+    """
     height, width = _common_size(streams)
     t, x, y, p = (torch.cat([getattr(stream, name) for stream in streams]) for name in _COLUMNS)
     t, order = torch.sort(t, stable=True)
@@ -201,7 +204,7 @@ def _common_size(streams: Sequence[Events]) -> tuple[int, int]:
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _fires(y, x, p, height, width, threshold):
-    """Which events carry the sum of their pixel's polarities across a multiple of `threshold`."""
+    """Which events move their pixel's polarity sum across a multiple of `threshold`."""
     sums = np.zeros((height, width))
     fired = np.zeros(len(p), dtype=np.bool_)
     for i in range(len(p)):

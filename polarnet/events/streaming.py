@@ -1,6 +1,6 @@
-"""A stream of events cut into windows as it comes: by time or by number of events, one after the other or overlapping.
+"""Cut a stream of events into windows as it arrives: by time or by number of events, consecutive or overlapping.
 
-Whoever has events, all at once or little by little, hands them to a `WindowCutter`.
+`WindowCutter` accepts events all at once or in pieces.
 """
 
 import re
@@ -16,7 +16,7 @@ SHORTEST_STEP_US = 100
 
 
 class EventWindow(NamedTuple):
-    """What the four polarizers (0, 45, 90, 135 degrees) reported with start_us <= t < stop_us."""
+    """Events of the four channels (0, 45, 90, 135 degrees) with start_us <= t < stop_us."""
 
     channels: Sequence[Events]
     start_us: int
@@ -24,19 +24,19 @@ class EventWindow(NamedTuple):
 
     @property
     def length_us(self) -> int:
-        """Never 0."""
+        """Length of the window, at least 1."""
         return max(1, self.stop_us - self.start_us)
 
 
 @dataclass(frozen=True)
 class WindowRule:
-    """How long windows are, and how far apart they end. Exactly one of `length_us` and `events` is given."""
+    """Length of the windows, and the step between their ends. Exactly one of `length_us` and `events` is given."""
 
     length_us: int | None
     events: int | None
-    """Of the four polarizers together."""
+    """Number of events in the four channels together."""
     step_us: int | None
-    """From one window's end to the next; None: each begins where the one before it ended."""
+    """Time from one window's end to the next; None: each window begins at the end of the previous window."""
 
     def __post_init__(self):
         if (self.length_us is None) == (self.events is None):
@@ -56,7 +56,7 @@ class WindowRule:
 
 
 def parse_window(text: str) -> tuple[int | None, int | None]:
-    """(microseconds, None) of "33.3ms", (None, number) of "20000ev"; ValueError for anything else."""
+    """Parse "33.3ms" to (microseconds, None), or "20000ev" to (None, number); ValueError for anything else."""
     match = re.fullmatch(r"(?P<number>\d+(\.\d*)?|\.\d+)\s*(?P<unit>us|ms|s|ev|events)", text.strip())
     if match is None or (match["unit"] in ("ev", "events") and not match["number"].isdigit()):
         raise ValueError(f"expected a time such as 33.3ms or a number of events such as 20000ev, got {text!r}")
@@ -66,12 +66,12 @@ def parse_window(text: str) -> tuple[int | None, int | None]:
 
 
 class WindowCutter:
-    """Cuts a stream that comes in pieces into windows, each as soon as all of its events are known.
+    """Cuts a stream that arrives in pieces into windows, each as soon as all of its events are known.
 
-    Windows by time end after one whole length, and then every step (or length). Windows by
-    number end with their last event; with a step, they are the last so many events before each multiple of it. A
-    window's time starts where the window that many events or microseconds before it ended. What no later window needs
-    is forgotten. Times count from 0.
+    Windows by time end after one whole length, and then every step (or length); each starts one length before its end.
+    Windows by number end with their last event and start at the previous window's end. With a step, a window by number
+    holds the last `events` events before each multiple of the step, and starts with the first of them. Events that no
+    later window needs are dropped. Times count from 0.
     """
 
     def __init__(self, rule: WindowRule, height: int, width: int):
@@ -81,9 +81,10 @@ class WindowCutter:
         self._start_us = 0
 
     def add(self, channels: Sequence[Events], until_us: int) -> Iterator[EventWindow]:
-        """The windows that are complete once every event before `until_us` has come; `channels` are the new ones.
+        """Add new events; yields the windows that are complete once every event before `until_us` has arrived.
 
-        ValueError for other than four channels, of another size than before, or with events before those of the last.
+        ValueError unless there are four channels of the same size as before, with no event earlier than those already
+        added.
         """
         if len(channels) != 4:
             raise ValueError(f"expected the events of four polarizers, got {len(channels)} channels")
@@ -108,7 +109,7 @@ class WindowCutter:
         times = torch.cat([held.t[:n] for held, n in zip(self._held, known, strict=True)]).sort().values
         used = 0
         while used + count <= len(times):
-            stop_us = int(times[used + count - 1]) + 1  # events of the same time all belong to it
+            stop_us = int(times[used + count - 1]) + 1  # all events at this time belong to the window
             stops = self._places(stop_us)
             window = self._window(self._start_us, stop_us, stops)
             used += sum(stops)

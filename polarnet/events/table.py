@@ -1,9 +1,9 @@
-"""How every store on disk is made, resumed, finished and opened: a Zarr v3 group whose arrays have a row per name.
+"""Create, resume, finish and open the Zarr v3 groups behind every store; their arrays have one row per name.
 
-A store is written as PATH.tmp. Each row has files of its own, so processes may write different rows at the same time,
-and whoever uses a table writes one column of a row last: a row without it is missing. Zarr's local store writes a file
-beside its place and renames it, so a process that is killed leaves a row missing, never damaged. `finish` sets the
-attribute `complete` last and renames PATH.tmp to PATH. The same rows give the same bytes, in whatever order they came.
+A store is written as PATH.tmp. Each row has its own files, so processes may write different rows at the same time. The
+user of a table writes one column of a row last; a row without it counts as missing. Zarr's local store writes a
+temporary file and renames it, so a killed process leaves a row missing, never damaged. `finish` sets the attribute
+`complete` last and renames PATH.tmp to PATH. The same rows give the same bytes, in any order of writing.
 """
 
 import asyncio
@@ -25,7 +25,7 @@ from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
 from zarr.core.sync import sync
 from zarr.storage import FsspecStore, LocalStore, ZipStore
 
-COMPRESSION_LEVEL = 1  # of zstd; higher levels cost 10-100 times the time for 6 % fewer bytes
+COMPRESSION_LEVEL = 1  # for zstd; higher levels cost 10-100 times the time for 6 % fewer bytes
 REPAIR = "write this store again, or copy it again from where it is whole"
 
 
@@ -35,18 +35,18 @@ class Column:
 
     rows: Sequence[str]
     shape: tuple[int, ...]
-    """The most a row can hold; what it leaves out takes no space."""
+    """Maximum size of a row; unused space takes no disk."""
     chunk: tuple[int, ...]
-    """What is compressed together, and read at the least."""
+    """Unit of compression, and the smallest unit of reading."""
     shard: tuple[int, ...]
-    """What is one file: a multiple of `chunk`."""
+    """Unit of a file: a multiple of `chunk`."""
     dtype: str
     fill: int | float
-    """Stands where nothing was written."""
+    """Value wherever nothing was written."""
     fill_is_data: bool
-    """Whether `fill` can also be written; a chunk of nothing else is then not left out."""
+    """Whether `fill` is also a valid value; chunks that hold nothing else are then written too."""
     shuffle: str
-    """Of Blosc: shuffle (bytes) or bitshuffle."""
+    """Shuffle of Blosc: shuffle (bytes) or bitshuffle."""
 
 
 Columns = Mapping[str, Column]
@@ -54,7 +54,7 @@ Attributes = dict[str, Any]
 
 
 class Table:
-    """A group with its columns; `create_table` and `open_table` make one. It can be sent to other processes."""
+    """A group with its columns, made by `create_table` or `open_table`. It can be sent to other processes."""
 
     def __init__(self, path: str, group: zarr.Group, columns: Columns):
         self.path = path
@@ -64,10 +64,10 @@ class Table:
         self._numbers = {name: {row: i for i, row in enumerate(c.rows)} for name, c in columns.items()}
 
     def write(self, name: str, row: str, values: np.ndarray) -> None:
-        """Put `values` at the start of a row, and nothing after them.
+        """Write `values` at the start of a row, and clear the rest of the row.
 
-        Whole files are replaced, so what a killed process left does not matter, nor does another process that writes
-        the same values at the same time.
+        Whole files are replaced. Leftovers of a killed process are therefore harmless, and so is another process that
+        writes the same values at the same time.
         """
         array, number = self._arrays[name], self._number(name, row)
         sides = (array.shards or array.chunks)[1:]
@@ -85,15 +85,15 @@ class Table:
                 file.unlink(missing_ok=True)
 
     def is_written(self, name: str, row: str) -> bool:
-        """Whether a row of a local column of single files is there."""
+        """Whether a row exists in a local column with one file per row."""
         return all((Path(self.path, name) / key).exists() for key in self._files(name, row, ()))
 
     def read(self, name: str, row: str, *window: slice) -> np.ndarray:
-        """A row, or the `window` of it; ValueError that names row and column where it cannot be read."""
+        """Read a row or a `window` of it; ValueError that names row and column where it cannot be read."""
         return self.read_together([(name, row, window)])[0]
 
     def read_together(self, requests: Sequence[tuple[str, str, tuple[slice, ...]]]) -> list[np.ndarray]:
-        """`read` for several (column, row, window) at the same time."""
+        """`read` several (column, row, window) concurrently."""
 
         async def gather() -> list[np.ndarray]:
             return await asyncio.gather(*(self._fetch(*request) for request in requests))
@@ -110,15 +110,15 @@ class Table:
                 if not first_byte:  # Zarr would read fill values
                     raise FileNotFoundError(f"there is no {key}, or nothing in it")
             return np.asarray(await array.async_array.getitem((number, *window)))
-        except Exception as error:  # each codec has exceptions of its own
+        except Exception as error:  # each codec raises its own exceptions
             raise ValueError(f"{self.path}: {row}, column {name} is unreadable: {error}; {REPAIR}") from error
 
     def finish(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Cut columns to the row `shapes` in use, mark the table complete and put it in its place."""
+        """Cut columns to the used row `shapes`, mark the table complete and move it to its final path."""
         for name, shape in shapes.items():
             _resize(self._arrays[name], shape)
         folder = Path(self.path)
-        for leftover in folder.rglob("*.partial"):  # of a process killed while it wrote a file
+        for leftover in folder.rglob("*.partial"):  # left by a process killed while writing a file
             leftover.unlink()
         header = {**self.attributes, "metadata_sha256": self._metadata_digests(), "complete": True}
         zarr.open_group(folder, mode="r+").attrs.put({**header, "checksum": _checksum(header)})
@@ -131,7 +131,7 @@ class Table:
         shutil.rmtree(replaced, ignore_errors=True)
 
     def metadata_problems(self) -> list[str]:
-        """Which zarr.json of the columns are not those that `finish` saw."""
+        """Messages about each column's zarr.json that changed since `finish`."""
         digests = self._metadata_digests()
         return [
             f"{self.path}: {name}/zarr.json is not as it was written; {REPAIR}"
@@ -140,7 +140,7 @@ class Table:
         ]
 
     def _metadata_digests(self) -> dict[str, str]:
-        """SHA-256 of the zarr.json of each column and of each group on the way to one."""
+        """SHA-256 of the zarr.json of each column and of its parent groups."""
         group = open_group(self.path)
         names = {*self.columns, *(name.rpartition("/")[0] for name in self.columns)} - {""}
         texts = {name: sync((group.store_path / name / "zarr.json").get()) for name in sorted(names)}
@@ -152,7 +152,7 @@ class Table:
         return self._numbers[name][row]
 
     def _files(self, name: str, row: str, window: Sequence[slice]) -> list[str]:
-        """Keys, below the column, of the files that hold a window of a row."""
+        """Keys, relative to the column, of the files that hold a window of a row."""
         array = self._arrays[name]
         spans = [s.indices(size)[:2] for s, size in zip(window, array.shape[1:], strict=False)]
         spans += [(0, size) for size in array.shape[1 + len(spans) :]]
@@ -163,7 +163,7 @@ class Table:
 
 
 def check_names(names: Sequence[str]) -> None:
-    """ValueError unless there is at least one name and none comes twice."""
+    """ValueError unless there is at least one name and all are distinct."""
     if not names:
         raise ValueError("expected at least one name, got none")
     repeated = [name for name, times in Counter(names).items() if times > 1]
@@ -172,7 +172,7 @@ def check_names(names: Sequence[str]) -> None:
 
 
 def refuse_missing(path: str, missing: Sequence[str]) -> None:
-    """ValueError that says how much of a store is missing, and names the first few."""
+    """ValueError that states the number of missing sequences and names the first few."""
     if missing:
         raise ValueError(f"{path}: {len(missing)} not written yet: {', '.join(missing[:8])}; write them, then finish")
 
@@ -180,9 +180,9 @@ def refuse_missing(path: str, missing: Sequence[str]) -> None:
 def create_table(
     path: str | os.PathLike[str], form: str, version: int, attributes: Mapping[str, Any], columns: Columns
 ) -> Table:
-    """A table to write at PATH.tmp: the unfinished one that lies there, if its attributes are equal, else a new one.
+    """Create a table to write at PATH.tmp, or resume the unfinished one there if its attributes are equal.
 
-    One process creates, and hands the table to the others that write.
+    One process creates the table and sends it to the others that write.
     """
     folder = Path(path).with_name(Path(path).name + ".tmp")
     header = _header(form, version, attributes)
@@ -190,7 +190,7 @@ def create_table(
         shutil.rmtree(folder, ignore_errors=True)
         _lay_out(folder, header, columns)
     group = zarr.open_group(folder, mode="r+")
-    group.attrs.put(header)  # not complete, whatever a process killed in `finish` left
+    group.attrs.put(header)  # resets `complete`, which a process killed in `finish` may have set
     table = Table(str(folder), group, columns)
     for name, column in columns.items():
         _resize(table._arrays[name], column.shape)
@@ -200,11 +200,11 @@ def create_table(
 def open_table(
     path: str | os.PathLike[str], form: str, version: int, columns_of: Callable[[Attributes], Columns]
 ) -> Table:
-    """A finished table to read; `columns_of(attributes)` says which columns it has.
+    """Open a finished table to read; `columns_of(attributes)` returns its columns.
 
     `path` is a local folder, a zip of one (its zarr.json at the top, as `cd STORE; zip -r0 ../STORE.zip .` makes it),
-    or an fsspec URL. FileNotFoundError where there is nothing; ValueError where there is something else, another
-    version, or a table that was never finished.
+    or an fsspec URL. FileNotFoundError where there is nothing; ValueError for other content, another version, or an
+    unfinished table.
     """
     group = open_group(path)
     header = dict(group.attrs)
@@ -223,7 +223,7 @@ def open_table(
 
 
 def open_group(path: str | os.PathLike[str]) -> zarr.Group:
-    """The Zarr group in a local folder, a zip or at an fsspec URL, to read; FileNotFoundError where there is none."""
+    """Open the Zarr group in a local folder, a zip or at an fsspec URL; FileNotFoundError if there is none."""
     name = os.fspath(path)
     store: FsspecStore | ZipStore | LocalStore
     try:
@@ -239,14 +239,14 @@ def open_group(path: str | os.PathLike[str]) -> zarr.Group:
         raise FileNotFoundError(
             f"{name}: there is no Zarr v3 group{unfinished}; run the stage that writes it"
         ) from None
-    except ImportError:  # of what reads a URL
+    except ImportError:  # a package for reading URLs is missing
         raise
-    except Exception as error:  # a damaged zarr.json makes Zarr raise many kinds
+    except Exception as error:  # Zarr raises many kinds of exceptions for a damaged zarr.json
         raise ValueError(f"{name} is unreadable: {error}; {REPAIR}") from error
 
 
 def _header(form: str, version: int, attributes: Mapping[str, Any]) -> Attributes:
-    """The attributes of an unfinished group, as they come back from disk."""
+    """The attributes of an unfinished group, as read back from disk."""
     try:
         header = json.loads(json.dumps({"format": form, "version": version, **attributes}, allow_nan=False))
     except (TypeError, ValueError) as error:
@@ -261,7 +261,7 @@ def _checksum(header: Attributes) -> str:
 
 
 def _header_on_disk(folder: Path) -> Attributes | None:
-    """The header of a table as it was before `finish`; None where there is none."""
+    """The header of a table as it was before `finish`; None if there is no table."""
     try:
         header = json.loads((folder / "zarr.json").read_text())["attributes"]
     except (OSError, ValueError, KeyError):
@@ -272,7 +272,7 @@ def _header_on_disk(folder: Path) -> Attributes | None:
 
 
 def _lay_out(folder: Path, header: Attributes, columns: Columns) -> None:
-    """Make the empty arrays, then the group's header: a folder without it is no table."""
+    """Create the empty arrays, then the group's header: a folder without a header is no table."""
     group = zarr.open_group(folder, mode="w", zarr_format=3)
     for name, column in columns.items():
         _create_array(group, name, column)
@@ -308,4 +308,4 @@ def _array(path: str, group: zarr.Group, name: str, column: Column) -> zarr.Arra
 def _resize(array: zarr.Array, row_shape: tuple[int, ...]) -> None:
     shape = (array.shape[0], *row_shape)
     if array.shape != shape:
-        sync(array.async_array.resize(shape, delete_outside_chunks=False))  # looking for them takes minutes
+        sync(array.async_array.resize(shape, delete_outside_chunks=False))  # searching for outside chunks takes minutes

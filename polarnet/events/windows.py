@@ -1,4 +1,4 @@
-"""A sequence cut into timed windows, and the torch `Dataset` of such sequences."""
+"""Cut a sequence into timed windows, and provide such sequences as a torch `Dataset`."""
 
 import itertools
 from collections.abc import Sequence
@@ -17,18 +17,19 @@ from polarnet.events.stream import Events, slice_count
 
 @runtime_checkable
 class EventSource(Protocol):
-    """Where the events of named sequences come from, by time window: a store on disk, or an emulator.
+    """A source of named sequences' events, read by time window: a store on disk, or an emulator.
 
-    `polarnet.events.store.EventStore` reads them, `polarnet.simulation.fly.EmulatedEvents` makes them when asked.
+    `polarnet.events.store.EventStore` reads stored events; `polarnet.simulation.fly.EmulatedEvents` makes them on
+    request.
     """
 
     @property
     def path(self) -> str:
-        """Of what is read: the store of events, or the scenes that they are made from."""
+        """Path of the event store, or of the scenes that the events are made from."""
 
     @property
     def sequences(self) -> list[str]:
-        """Their names."""
+        """Names of the sequences."""
 
     @property
     def height(self) -> int:
@@ -40,7 +41,7 @@ class EventSource(Protocol):
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """What the events depend on, beside what lies at `path`."""
+        """All settings that the events depend on, besides the data at `path`."""
 
     def read(self, sequence: str, start_us: int | None = None, stop_us: int | None = None) -> list[Events]:
         """The four channels of a sequence, or their events with start <= t < stop."""
@@ -51,12 +52,14 @@ class WindowSequence(NamedTuple):
 
     name: str
     inputs: Float[Tensor, "t c h w"] | Int8[Tensor, "t c h w"]
-    """Polarizer by polarizer (0, 45, 90, 135 degrees); c is 4 times the channels of the representation. Bytes only
-    while a training keeps them in memory."""
+    """Channel by channel (0, 45, 90, 135 degrees); c is 4 times the images per channel of the representation.
+
+    Bytes only while a training keeps them in memory.
+    """
     dolp: Float[Tensor, "t h w"]
     aolp: Float[Tensor, "t h w"]
     intensity: Float[Tensor, "t 4 h w"]
-    """Of no window while a training that does not want it keeps sequences in memory."""
+    """Has no windows while a training that does not need intensities keeps sequences in memory."""
     valid: Bool[Tensor, "t h w"] | None = None
     """Where the truth is known; None: everywhere."""
 
@@ -72,9 +75,9 @@ def cut_windows(events: Events, t_us: Int64[Tensor, " n"]) -> list[Events]:
 
 
 def encode_windows(channels: Sequence[Events], t_us: Integer[Array, " n"], encode: Encode) -> Float[Tensor, "t c h w"]:
-    """Every window of every channel through `encode`, polarizer by polarizer along the second axis.
+    """Encode every window of every channel, channel by channel along the second axis.
 
-    ValueError where there is no window, that is, fewer than two frame times, and for times that do not increase.
+    ValueError for fewer than two frame times, which leave no window, and for times that do not increase.
     """
     t_us = whole_numbers("t_us", t_us)
     if t_us.ndim != 1 or len(t_us) < 2 or (t_us.diff() <= 0).any():
@@ -91,7 +94,7 @@ def encode_windows(channels: Sequence[Events], t_us: Integer[Array, " n"], encod
 
 
 class WindowDataset(Dataset[WindowSequence]):
-    """Item i: all windows of sequence i, encoded as it is asked for. Frames give the windows' ends and the truth."""
+    """Item i holds all windows of sequence i, encoded on access. Frames give the windows' ends and the truth."""
 
     def __init__(self, events: EventSource, frames: FrameStore, sequences: list[str], encode: Encode):
         absent = [name for name in sequences if name not in set(events.sequences) & set(frames.sequences)]

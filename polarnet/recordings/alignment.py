@@ -1,10 +1,10 @@
-"""Start times of eight captures, finer than a picture: events and intensity changes must agree over the whole picture.
+"""Start times of eight captures, finer than the frame interval: events and intensity changes must agree everywhere.
 
-Between two events of a pixel its log intensity has changed by one contrast threshold, in the direction of the second
-event, whatever the light did in between. So where the clocks of an event capture and an intensity capture behind the
-same polarizer agree, the change that the pictures show between two events, counted in the direction of the second, is
-the same over the whole picture, and is the threshold. Sums of events per picture would not do: an event comes after its
-change, which makes them late by milliseconds.
+Between two events of a pixel the log intensity changes by one contrast threshold, in the direction of the second event.
+How the light varied in between does not matter. An event capture and an intensity capture behind the same polarizer are
+aligned when the change between two events, signed by the second, is the same at all pixels. That change is the
+threshold. Event sums per picture are unsuitable: each event comes after its change, so the sums are late by
+milliseconds.
 """
 
 from typing import NamedTuple, no_type_check
@@ -15,48 +15,48 @@ from jaxtyping import Float32, Float64, Int8, Int64, UInt16
 
 from polarnet.events.stream import Events
 
-DARKEST = 64.0  # of 4095: the logarithm of less is mostly noise
-BRIGHT = 400.0  # of 4095: in darker pixels a sensor answers less than the logarithm, so its threshold is another
-LARGEST_CHANGE = 1.0  # natural-log intensity; more between two events is no step of one threshold
+DARKEST = 64.0  # of 4095; below it the logarithm is mostly noise
+BRIGHT = 400.0  # of 4095; darker pixels respond less than logarithmically and have a different threshold
+LARGEST_CHANGE = 1.0  # natural-log intensity; a larger change between two events is not one threshold step
 MOST_STEPS = 300_000
-STEP_US = 2_000  # of the first search
+STEP_US = 2_000  # of the first, coarse search
 FINEST_US = 20.0
 GOLDEN = (5**0.5 - 1) / 2
 
 
 class Steps(NamedTuple):
-    """Pairs of consecutive events of a pixel of the crop."""
+    """Pairs of consecutive events of the same pixel within the crop."""
 
     before_us: Int64[np.ndarray, " n"]
     after_us: Int64[np.ndarray, " n"]
     pixel: Int64[np.ndarray, " n"]
-    """Row by row."""
+    """Index in row-major order."""
     polarity: Int8[np.ndarray, " n"]
-    """Of the second."""
+    """Polarity of the second event."""
 
 
 class Thresholds(NamedTuple):
-    """Contrast thresholds of a channel in its bright pixels, steps of natural-log intensity; NaN without any event."""
+    """Contrast thresholds of a channel in its bright pixels, in natural-log intensity; NaN without events."""
 
     on: float
     off: float
 
 
 class Lag(NamedTuple):
-    """How much later one capture runs than was thought, against another."""
+    """Additional delay of one capture relative to another, beyond the assumed one."""
 
     lag_us: float
     agreement: float
-    """Correlation of polarities and changes there, -1 to 1."""
+    """Correlation of polarities and changes at `lag_us`, -1 to 1."""
     searched_us: Float64[np.ndarray, " n"]
-    """The lags of the first search ..."""
+    """Lags tried by the coarse search."""
     agreements: Float64[np.ndarray, " n"]
-    """... and the agreement at each."""
+    """Agreement at each lag in `searched_us`."""
     thresholds: Thresholds
 
 
 def steps(events: Events, corner: tuple[int, int], crop: tuple[int, int], start_us: int, stop_us: int) -> Steps:
-    """All pairs between two times, or every so many of them that 300,000 remain."""
+    """All pairs between two times, thinned evenly to at most 300,000."""
     found = _steps(events.t.numpy(), events.x.numpy(), events.y.numpy(), events.p.numpy(), *corner, *crop)
     inside = (found[0] >= start_us) & (found[1] < stop_us)
     sample = np.flatnonzero(inside)
@@ -65,7 +65,7 @@ def steps(events: Events, corner: tuple[int, int], crop: tuple[int, int], start_
 
 
 def logarithms(pictures: UInt16[np.ndarray, "n h w"]) -> Float32[np.ndarray, "n hw"]:
-    """Log intensity of each pixel, a row for each picture; NaN where it is too dark."""
+    """Log intensity, one row per picture and one column per pixel; NaN where it is too dark."""
     values = pictures.reshape(len(pictures), -1).astype(np.float32)
     values[values < DARKEST] = np.nan
     return np.log(values, out=values)
@@ -74,16 +74,19 @@ def logarithms(pictures: UInt16[np.ndarray, "n h w"]) -> Float32[np.ndarray, "n 
 def changes(
     found: Steps, lag_us: float | int, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"]
 ) -> Float64[np.ndarray, " m"]:
-    """Change of log intensity over each step as the pictures taken at `t_us` show it `lag_us` later.
+    """Change of log intensity over each step, read from the pictures taken at `t_us` with a delay of `lag_us`.
 
-    Between pictures it is interpolated. NaN where a step is not between the pictures, or too dark.
+    Intensities between pictures are interpolated. The change is NaN where a step is not between the pictures, or too
+    dark.
     """
     return _changes(found.before_us, found.after_us, found.pixel, float(lag_us), t_us.astype(np.float64), logs)
 
 
 def agreement(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) -> float:
-    """Correlation of polarities with changes: 1 if every change is one and the same threshold. Large changes count as
-    less, NaN not at all; 0 where nothing is left."""
+    """Correlation of polarities with changes: 1 if every change equals the same threshold.
+
+    Large changes are clipped and NaN is ignored; the result is 0 without any known change.
+    """
     known = np.isfinite(change)
     clipped = np.clip(change[known], -LARGEST_CHANGE, LARGEST_CHANGE)
     norm = np.sqrt(np.dot(clipped, clipped) * len(clipped))
@@ -91,14 +94,17 @@ def agreement(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"
 
 
 def spread(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) -> float:
-    """Variance of the changes in the direction of the polarities, large ones clipped: only noise is left of it where
-    every change is one threshold. Unlike `agreement`, noise in the pictures does not move its extremum."""
+    """Variance of the changes signed by their polarities, with large ones clipped.
+
+    Only noise contributes where every change is one threshold. Unlike with `agreement`, noise in the pictures does not
+    move the extremum.
+    """
     known = np.isfinite(change)
     return float(np.var(np.clip(polarity[known] * change[known], -LARGEST_CHANGE, LARGEST_CHANGE)))
 
 
 def thresholds(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) -> Thresholds:
-    """The medians of the changes between events, for each polarity of the second."""
+    """Median change between events, for each polarity of the second event."""
     on, off = (change[np.isfinite(change) & (polarity == sign)] * sign for sign in (1, -1))
     return Thresholds(*(float(np.median(values)) if len(values) else np.nan for values in (on, off)))
 
@@ -106,9 +112,9 @@ def thresholds(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n
 def best_lag(
     found: Steps, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"], within_us: float | int
 ) -> Lag:
-    """How much later the pictures' clock runs than the events': the lag at which they agree best.
+    """Delay of the pictures' clock relative to the events' clock: the lag at which they agree best.
 
-    A regular search every 2 ms for the largest agreement, then golden sections for the smallest spread, to 20 us.
+    A coarse search every 2 ms maximises the agreement; a golden-section search then minimises the spread, to 20 us.
     """
 
     def spread_at(lag_us: float) -> float:
@@ -132,7 +138,7 @@ def best_lag(
     lag_us = (low + high) / 2
     change = changes(found, lag_us, t_us, logs)
     of_bright = changes(found, lag_us, t_us, np.where(logs < np.log(np.float32(BRIGHT)), np.float32(np.nan), logs))
-    # of quicker steps the pictures show too little: between two of them the light did not change evenly
+    # steps shorter than the frame interval are left out: the light did not change evenly between two pictures
     of_bright[found.after_us - found.before_us < np.median(np.diff(t_us))] = np.nan
     return Lag(lag_us, agreement(found.polarity, change), searched, agreements, thresholds(found.polarity, of_bright))
 

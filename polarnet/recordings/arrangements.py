@@ -1,7 +1,8 @@
-"""How polarizers stand before a sensor, and what that makes of files: four channels on one clock, in an event store.
+"""Turn files of any polarizer arrangement into four channels on one clock, in an event store.
 
-Four files, one an angle (four cameras, or one camera four times), in any order; one file of a camera with a mosaic of
-polarizers on its pixels (division of focal plane). Division-of-time captures: `polarnet.recordings.targets`.
+An arrangement is either four files, one per angle and in any order (four cameras, or one camera four times), or one
+file of a camera with a mosaic of polarizers on its pixels (division of focal plane). `polarnet.recordings.targets`
+handles division-of-time captures.
 """
 
 import hashlib
@@ -27,12 +28,13 @@ def read_four(
     homographies: Mapping[int, Float64[np.ndarray, "3 3"]] | None = None,
     read: Callable[[Path], Recording] = read_recording,
 ) -> list[Events]:
-    """The four channels, in the order 0, 45, 90, 135 degrees, of files by polarizer angle (degrees, of any half turn).
+    """The four channels, in the order 0, 45, 90, 135 degrees, from files keyed by polarizer angle.
 
-    `start_us` says when the common clock starts, by each file's own clock (none given: the clocks are one, and start
-    with the first event of all); what comes earlier is left out. `homographies` lay cameras on the reference
-    (`polarnet.recordings.registration`). `read` reads a file, for what `read_recording` has to be told. RecordingError
-    where an angle is missing, there twice, or of another sensor.
+    Angles are in degrees, of any half turn. `start_us` gives the start of the common clock in each file's own clock;
+    earlier events are left out. Without it the files share one clock, which starts with the first event of all.
+    `homographies` map cameras to the reference (`polarnet.recordings.registration`). `read` replaces `read_recording`
+    where a file needs options. RecordingError where an angle is missing or duplicated, or where the sensor sizes
+    differ.
     """
     by_angle = {angle % 180: angle for angle in files}
     if sorted(by_angle) != list(POLARIZER_ANGLES_DEG) or len(by_angle) != len(files):
@@ -58,9 +60,9 @@ def read_four(
 def split_mosaic(events: Events, mosaic: Mosaic) -> list[Events]:
     """The four channels, in the order 0, 45, 90, 135 degrees, of a sensor with polarizers on its pixels.
 
-    Each has half of the sensor's rows and columns: a pixel for every 2x2 cell, which fires when that angle's pixel in
-    the cell does. No event is added, moved in time or left out but those of an odd last row or column. The four pixels
-    of a cell look at places half a cell apart, so an edge crosses them one after the other.
+    Each channel has half of the sensor's rows and columns. Its pixel for a 2x2 cell fires when that angle's pixel in
+    the cell does. Events keep their times, and none is added; only those of an odd last row or column are left out. The
+    four pixels of a cell look at places half a cell apart, so an edge crosses them one after the other.
     """
     height, width = events.height // 2, events.width // 2
     if not (height and width):
@@ -89,12 +91,12 @@ def read_mosaic(
 
 
 def first_time_us(channels: Sequence[Events]) -> int:
-    """Of all events; 0 where there are none."""
+    """Time of the first event in any channel; 0 without events."""
     return min((int(channel.t[0]) for channel in channels if len(channel)), default=0)
 
 
 def since(events: Events, start_us: int) -> Events:
-    """Events from a time on, which is their time 0."""
+    """The events from `start_us` on, with `start_us` as their time 0."""
     first = int(torch.searchsorted(events.t, torch.tensor(start_us)))
     return Events(
         events.t[first:] - start_us,
@@ -107,7 +109,7 @@ def since(events: Events, start_us: int) -> Events:
 
 
 def write_store(path: str | os.PathLike[str], sequences: Mapping[str, Sequence[Events]]) -> None:
-    """Sequences of four channels from time 0 on as an event store; each lasts until its last event."""
+    """Write sequences of four channels, starting at time 0, as an event store; each lasts until its last event."""
     sizes = {(channel.height, channel.width) for channels in sequences.values() for channel in channels}
     if len(sizes) != 1:
         raise RecordingError(f"expected sequences of one size of sensor, got {sorted(sizes)} (height, width)")
@@ -119,7 +121,7 @@ def write_store(path: str | os.PathLike[str], sequences: Mapping[str, Sequence[E
 
 
 def _digest(channels: Sequence[Events]) -> str:
-    """Of all columns: an interrupted store of other events must not be gone on with."""
+    """Digest of all columns; it keeps an interrupted store of other events from being resumed."""
     digest = hashlib.sha256()
     for channel in channels:
         for column in (channel.t, channel.x, channel.y, channel.p):

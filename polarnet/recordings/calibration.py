@@ -1,9 +1,9 @@
-"""Eight captures of a target on one clock: start times refined, and by how much they agree.
+"""Refine the start times of a target's eight captures on one clock, and measure how well they agree.
 
-Two relations hold whatever the scene is. Behind one polarizer, events and pictures see the same light
-(`polarnet.recordings.alignment`): that ties the event capture to the intensity capture of each polarizer. Behind the
-four, I0 + I90 = I45 + I135 at every time: that ties the four to each other where the scene is polarized, and where it
-is not, the landmark's times by the events, which no polarizer changes, do.
+Two relations hold for any scene. Behind one polarizer, events and pictures see the same light
+(`polarnet.recordings.alignment`), which ties the event capture to the intensity capture of each polarizer. Behind all
+four, I0 + I90 = I45 + I135 at every time, which ties the four to each other where the scene is polarized. Elsewhere the
+four are tied by the landmark's times from the events, which no polarizer changes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,21 +23,21 @@ from polarnet.recordings.dot import (
 )
 from polarnet.recordings.source import RecordingError
 
-MOST_PICTURES = 64  # of a capture, from the landmark on: bounds the memory of the refinement
-LANDMARK_ERROR_US = 500.0  # of the landmark's times by the events of two captures, against each other
-REDUNDANCY_SHARE = 1e-3  # of its places are taken to be independent: neighbours in space and time are not
+MOST_PICTURES = 64  # per capture, from the landmark on; bounds the memory of the refinement
+LANDMARK_ERROR_US = 500.0  # difference between the landmark's times in the events of two captures
+REDUNDANCY_SHARE = 1e-3  # share of the samples assumed independent: neighbours in space and time are not
 ITERATIONS = 6
 POLARIZER_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # I0 - I45 + I90 - I135 = 0
 
 
 class Alignment(NamedTuple):
-    """Start times of the captures of a target, each by its own clock."""
+    """Start times of a target's captures, each by its own clock."""
 
     start_us: Mapping[str, int]
     lags: Sequence[Lag]
-    """Of the pictures against the events, for each polarizer, from the landmark's starts."""
+    """Delay of the pictures relative to the events, for each polarizer, from the landmark's starts."""
     residual: float
-    """Root mean square of I0 - I45 + I90 - I135 over that of their mean, with these starts."""
+    """Root mean square of I0 - I45 + I90 - I135 divided by that of the mean intensity, with these starts."""
 
 
 def refined_starts(
@@ -47,9 +47,9 @@ def refined_starts(
     config: RecordingsConfig,
     given: Mapping[str, int],
 ) -> Alignment:
-    """Starts finer than a picture, from those of the landmark; those `given` by hand stay as they are.
+    """Refine the landmark's starts to less than a frame interval; starts `given` by hand stay unchanged.
 
-    Time 0 of the common clock stays where the events of the four captures have it on average.
+    Time 0 of the common clock is the mean of the four event captures' time 0, as before.
     """
     lags = [
         _lag(events[e], starts[e], intensities[i], starts[i], config)
@@ -68,10 +68,10 @@ def refined_starts(
 def redundancy_shifts(
     captures: Sequence[IntensityCapture], start_us: Float64[np.ndarray, " 4"], config: RecordingsConfig
 ) -> tuple[Float64[np.ndarray, " 4"], float]:
-    """What to add to the starts of four intensity captures so that I0 + I90 = I45 + I135, and what is left of that.
+    """Shifts of four intensity captures that best satisfy I0 + I90 = I45 + I135, and the remaining residual.
 
-    Least squares, linearised in the shifts (Gauss-Newton), with mean 0; shifts that the scene does not determine,
-    because all four see the same, stay near 0.
+    The shifts come from linearised least squares (Gauss-Newton) and have mean 0. Shifts that the scene does not
+    determine, because all four captures see the same, stay near 0.
     """
     stacks = [_Stack(capture, start, config) for capture, start in zip(captures, start_us.tolist(), strict=True)]
     first, last = max(stack.t_us[0] for stack in stacks), min(stack.t_us[-1] for stack in stacks)
@@ -96,7 +96,7 @@ def redundancy_shifts(
 
 
 class _Stack:
-    """Reduced pictures of a capture from its start on, at any time between them, by the common clock."""
+    """Reduced pictures of a capture from its start on, interpolated to any time of the common clock."""
 
     def __init__(self, capture: IntensityCapture, start_us: float, config: RecordingsConfig):
         chosen = pictures_after(capture, start_us)
@@ -114,7 +114,7 @@ class _Stack:
 
 
 def pictures_after(capture: IntensityCapture, start_us: float | int) -> slice:
-    """Up to 64 pictures, from the last one before a start on."""
+    """Up to 64 pictures, starting with the last one before `start_us`."""
     first = max(0, int(np.searchsorted(capture.t_us, start_us)) - 1)
     return slice(first, first + MOST_PICTURES)
 
@@ -122,7 +122,7 @@ def pictures_after(capture: IntensityCapture, start_us: float | int) -> slice:
 def _lag(
     events: Events, event_start_us: int, capture: IntensityCapture, picture_start_us: int, config: RecordingsConfig
 ) -> Lag:
-    """By how much the pictures run later than the events, from these starts."""
+    """Delay of the pictures relative to the events, from these starts."""
     chosen = pictures_after(capture, picture_start_us)
     t_us = capture.t_us[chosen] - picture_start_us + event_start_us
     found = steps(events, config.crop_corner, (config.crop[0], config.crop[1]), int(t_us[0]), int(t_us[-1]))

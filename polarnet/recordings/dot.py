@@ -1,7 +1,7 @@
 """Division-of-time captures of one target (paper, section 4): four of events, four of intensity, each with its clock.
 
 A target moves in the same way eight times, behind a polarizer at 0, 45, 90 and 135 degrees. In each capture a dark
-landmark enters a region of the picture; the moment when it does is time 0 of the clock that all eight share.
+landmark enters a region of the picture. That moment is time 0 of the clock that all eight share.
 """
 
 import json
@@ -25,9 +25,9 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG
 EVENT_CAPTURES = tuple(f"events_{angle}" for angle in POLARIZER_ANGLES_DEG)
 INTENSITY_CAPTURES = tuple(f"intensity_{angle}" for angle in POLARIZER_ANGLES_DEG)
 STARTS_FILE = "starts.json"
-STEPS_OF_8_BITS = 16.0  # of the converter's 12 bits; the vendor's programs show the upper 8, the paper's 30 is of those
-STAMP_US = 1000  # the computer's time of a picture, rounded down to this
-IRREGULAR_US = 3000.0  # pictures that came further from a regular clock than this were not taken by one
+STEPS_OF_8_BITS = 16.0  # 12-bit steps per level of 8 bits, the scale of the vendor's programs and the paper's 30
+STAMP_US = 1000  # resolution of the computer's picture times, which are rounded down
+IRREGULAR_US = 3000.0  # larger deviations from a regular clock mean that the pictures were not taken by one
 
 
 @dataclass(frozen=True)
@@ -40,29 +40,29 @@ class RecordingsConfig:
     sensor: list[int] = field(metadata=allowed(low=8, high=1280))
     """The part of the sensor in use, from its upper left corner."""
     region: list[int] = field(metadata=allowed(low=1, high=1280))
-    """Of the landmark, in the upper right corner of that part."""
+    """Size of the landmark's region, in the upper right corner of the part in use."""
     dark_level: float = field(metadata=allowed(above=0, high=255))
-    """An intensity capture starts with the first picture whose mean in the region is lower, of 255."""
+    """An intensity capture starts with the first picture whose mean in the region is below this level, of 255."""
     negative_events: int = field(metadata=allowed(low=1))
-    """An event capture starts when as many have come in the region."""
+    """Number of negative events in the region at which an event capture starts."""
     crop: list[int] = field(metadata=allowed(low=2, high=1280))
-    """Of the centre."""
+    """Size of the central crop."""
     size: list[int] = field(metadata=allowed(low=2, high=1280))
-    """To which the crop is reduced."""
+    """Size to which the crop is reduced."""
     keep_event_rate: bool
-    """Whether a reduced pixel fires as often as one of the sensor's, or as often as all that it covers together."""
+    """true: a reduced pixel fires as often as one sensor pixel; false: as often as all those it covers together."""
     picture_rate_hz: float | None = field(metadata=allowed(above=0))
-    """Of intensity captures whose files have no times."""
+    """Rate of the pictures in intensity captures whose files have no times."""
     hot_pixel_factor: float | None = field(metadata=allowed(above=1))
-    """A pixel that fires more than so often as the third busiest of the 5 x 5 around it is left out; null: none is."""
+    """A pixel is hot, and left out, above this multiple of the third busiest of the 5 x 5 around it; null: none is."""
     alignment: str = field(metadata=allowed(choices=("landmark", "refined")))
-    """Start times by the landmark alone (the paper), or refined over the whole picture."""
+    """landmark: start times by the landmark alone (the paper); refined: refined over the whole picture."""
     refine_within_ms: float = field(metadata=allowed(above=0))
-    """How far from the landmark's start times the refined ones are looked for."""
+    """Search range of the refined start times around the landmark's."""
     frame_rate_hz: float = field(metadata=allowed(above=0))
-    """Of the ground truth of the sequence."""
+    """Frame rate of the sequence's ground truth."""
     duration_s: float | None = field(metadata=allowed(above=0))
-    """Of the sequence, from the landmark on; null: as long as all captures last."""
+    """Length of the sequence, from the landmark on; null: as long as all captures last."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -83,12 +83,12 @@ class RecordingsConfig:
 
 
 class IntensityCapture(NamedTuple):
-    """The pictures of one capture, as far as anything needs them."""
+    """The pictures of one intensity capture, cropped, with their times."""
 
     t_us: Int64[np.ndarray, " n"]
-    """Of the pictures, by the capture's own clock."""
+    """Times of the pictures, by the capture's own clock."""
     pictures: UInt16[np.ndarray, "n h w"]
-    """The crop, 0 to 4095, linear in light."""
+    """Values within the crop, 0 to 4095, linear in light."""
     region: Float64[np.ndarray, " n"]
     """Mean in the landmark's region, 0 to 255."""
 
@@ -96,7 +96,7 @@ class IntensityCapture(NamedTuple):
 def find_captures(folder: Path) -> dict[str, Path]:
     """The eight files of a target: events_0.*, ..., events_135.*, intensity_0.*, ..., intensity_135.*.
 
-    RecordingError where one is missing, or two are there for the same.
+    RecordingError where a capture has no file or more than one.
     """
     found = {}
     for name in (*EVENT_CAPTURES, *INTENSITY_CAPTURES):
@@ -112,7 +112,7 @@ def find_captures(folder: Path) -> dict[str, Path]:
 
 
 def given_starts(folder: Path) -> dict[str, int]:
-    """Start times that the user set by hand: starts.json, {"events_45": microseconds, ...}; empty without the file."""
+    """Start times set by hand in starts.json, {"events_45": microseconds, ...}; empty without the file."""
     path = folder / STARTS_FILE
     if not path.exists():
         return {}
@@ -132,7 +132,7 @@ def given_starts(folder: Path) -> dict[str, int]:
 
 
 def read_event_capture(path: Path, config: RecordingsConfig) -> Events:
-    """The events of the part of the sensor in use, by the capture's own clock."""
+    """Events from the part of the sensor in use, by the capture's own clock."""
     height, width = config.sensor
     reader = open_recording(path)
     if reader.height < height or reader.width < width:
@@ -159,7 +159,7 @@ def read_intensity_capture(path: Path, config: RecordingsConfig) -> IntensityCap
 
 
 def reduced(crop: UInt16[np.ndarray, "h w"], config: RecordingsConfig) -> Float32[np.ndarray, "h2 w2"]:
-    """The crop of a picture averaged over areas to the final size, 0 to 255."""
+    """The crop of a picture, averaged over areas to the final size, 0 to 255."""
     small = cv2.resize(crop.astype(np.float32), tuple(config.size[::-1]), interpolation=cv2.INTER_AREA)
     return small / np.float32(STEPS_OF_8_BITS)
 
@@ -171,9 +171,9 @@ def region_of(picture: UInt16[np.ndarray, "h w"], config: RecordingsConfig) -> U
 
 
 def regular_times_us(name: str, stamps_us: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-    """Times of pictures whose stamps were rounded down to milliseconds, by the regular clock that fits them best.
+    """Times of pictures from stamps rounded down to milliseconds, by the best-fitting regular clock.
 
-    Lost pictures leave gaps in it. Where no regular clock fits, the middles of the milliseconds.
+    Lost pictures leave gaps. Where no regular clock fits, the times are the middles of the milliseconds.
     """
     middles = stamps_us + STAMP_US // 2
     steps = np.diff(stamps_us)
@@ -205,7 +205,7 @@ def intensity_start_us(name: str, capture: IntensityCapture, config: RecordingsC
 
 
 def event_start_us(name: str, events: Events, config: RecordingsConfig) -> int:
-    """Time of the negative event in the region that is number `negative_events` (paper, section 4)."""
+    """Time of negative event number `negative_events` in the region (paper, section 4)."""
     times = region_negative_times_us(events, config)
     if len(times) < config.negative_events:
         raise RecordingError(
@@ -227,7 +227,7 @@ def landmark_starts(
     config: RecordingsConfig,
     given: Mapping[str, int],
 ) -> dict[str, int]:
-    """Start time of each capture by its own clock: by hand where `given`, else when the landmark enters the region."""
+    """Start time of each capture by its own clock: `given` by hand, or when the landmark enters the region."""
     starts = {}
     for name, capture in events.items():
         starts[name] = given[name] if name in given else event_start_us(name, capture, config)
@@ -248,7 +248,7 @@ def _stamp_us(path: Path, k: int, picture: Picture, config: RecordingsConfig) ->
 
 
 def targets_of(root: Path) -> list[str]:
-    """The names of the folders in `root`, in order; RecordingError where there is none."""
+    """Sorted names of the folders in `root`; RecordingError if there are none."""
     names = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
     if not names:
         raise RecordingError(f"{root}: expected a folder for each target with its eight captures, there is none")

@@ -1,4 +1,4 @@
-"""Division-of-time captures decoded once: what later steps read again and again, whatever the files were."""
+"""Decode division-of-time captures once, for later steps that read them repeatedly, whatever the file format."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ from polarnet.recordings.status import start_over
 
 
 class Target(NamedTuple):
-    """The eight captures of one target as `import_targets` left them."""
+    """The eight captures of one target, as stored by `import_targets`."""
 
     name: str
     events: Mapping[str, Events]
@@ -35,10 +35,11 @@ class Target(NamedTuple):
 
 
 def import_targets(root: Path, out: Path, config: RecordingsConfig) -> list[str]:
-    """Decode every target of `root` into `out`; their names.
+    """Decode every target of `root` into `out` and return the targets' names.
 
-    `out` gets events.zarr (the four event captures of a target as its channels, each by its own clock from its first
-    event on), a folder of pictures for each target, and status.json. RecordingError where a file is missing or damaged.
+    `out` gets events.zarr, a folder of pictures for each target, and status.json. In events.zarr the four event
+    captures of a target are its channels, each by its own clock from its first event on. RecordingError where a file is
+    missing or damaged.
     """
     names = targets_of(root)
     start_over(out, enabled=True)
@@ -68,7 +69,7 @@ def import_targets(root: Path, out: Path, config: RecordingsConfig) -> list[str]
 
 
 def open_target(imported: Path, name: str) -> Target:
-    """A target again, its events by the clocks of their files; pictures are mapped into memory, not read."""
+    """Open an imported target, its events by the clocks of their files; pictures are memory-mapped."""
     folder = imported / name
     clocks = json.loads((folder / "clocks.json").read_text())
     channels = EventStore.open(imported / "events.zarr").read(name)

@@ -1,4 +1,4 @@
-"""What is in a recording: how much of what, for how long, which pixels are hot, and how it looks when it is busiest."""
+"""Summarise a recording: event counts and rates, duration, hot pixels, and an image of its busiest part."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from polarnet.recordings.recording import FORMATS, RecordingReader
 from polarnet.recordings.source import REPAIRS, RecordingError
 
 MOST_PIXELS = 2**25
-SHORTEST_US = 1000  # that a rate is taken over
-EVENTS_PER_PIXEL = 0.15  # of the part that is shown: enough to see edges, little enough that they do not smear
+SHORTEST_US = 1000  # shortest time over which a rate is taken
+EVENTS_PER_PIXEL = 0.15  # in the part shown: enough to see edges, few enough not to smear them
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a recording holds."""
+    """Summary of a recording's content."""
 
     format: str
     height: int
@@ -27,25 +27,26 @@ class Inspection:
     on: int
     off: int
     start_us: int | None
-    """Time of the first event; None where there is none."""
+    """Time of the first event; None without events."""
     stop_us: int | None
     counts: Int64[np.ndarray, "h w"]
     """Events of each pixel."""
     hot: Bool[np.ndarray, "h w"]
     busiest: Int64[np.ndarray, "h w"]
-    """Signed counts of the busiest part: the consecutive events, 0.15 a pixel, that took the least time."""
+    """Signed counts of the busiest part: the consecutive events, 0.15 per pixel, that took the least time."""
     busiest_rate_hz: float
-    """Events per second in it."""
+    """Events per second in the busiest part."""
     repairs: Mapping[str, int]
     pictures: int
-    """Full pictures between or instead of events."""
+    """Number of full pictures between events, or in a file without events."""
     first_picture: UInt16[np.ndarray, "h w"] | None
 
 
 def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) -> Inspection:
-    """Read a recording once, in constant memory; RecordingError where it fails, or no sensor is as large as it says.
+    """Read a recording once, in constant memory.
 
-    `hot_pixel_factor` is that of `polarnet.recordings.pixels.hot_pixels`.
+    `hot_pixel_factor` is the `factor` of `polarnet.recordings.pixels.hot_pixels`. RecordingError if reading fails, or
+    if no sensor is as large as the stated size.
     """
     pixels = reader.height * reader.width
     if pixels > MOST_PIXELS:
@@ -91,7 +92,7 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
 
 
 def findings(inspection: Inspection) -> Iterator[str]:
-    """Lines for a person."""
+    """The summary as lines of text."""
     events = inspection.on + inspection.off
     yield f"format      {inspection.format}: {FORMATS[inspection.format].words}"
     yield f"sensor      {inspection.width} x {inspection.height} px"
@@ -134,7 +135,7 @@ def _hot(inspection: Inspection) -> str:
 
 
 class _Busiest:
-    """Finds the consecutive events that took the least time, among parts that follow each other."""
+    """Finds the busiest of the consecutive parts of a recording, each with the same number of events."""
 
     def __init__(self, pixels: int):
         self._size = max(1, round(EVENTS_PER_PIXEL * pixels))
@@ -162,7 +163,7 @@ class _Busiest:
                 self._count = 0
 
     def found(self) -> tuple[np.ndarray, float]:
-        """The signed image, and events per second; of all events where there were too few for one part."""
+        """The signed image and the events per second; both cover all events if there were too few for one part."""
         if self._best is not None:
             return self._best, self._size / max(SHORTEST_US, self._best_us) * 1e6
         return self._image, self._count / max(SHORTEST_US, self._stop_us - self._start_us) * 1e6

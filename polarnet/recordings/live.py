@@ -1,4 +1,4 @@
-"""Events as a camera gives them: lines of text from standard input or from a file that grows.
+"""Read events as a camera delivers them: lines of text from standard input or from a file that grows.
 
 The first line is `width height` of the sensor. Each other line is an event: `t x y p angle`, separated by blanks or
 commas; t in whole microseconds, p 1 or 0 (or -1), angle the polarizer's, 0, 45, 90 or 135. A camera with a mosaic of
@@ -26,7 +26,7 @@ from polarnet.recordings.source import RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 
 READ_BYTES = 2**20
-MOST_READ_AHEAD = 64  # times READ_BYTES, of a file; a camera does not wait
+MOST_READ_AHEAD = 64  # blocks of READ_BYTES, for a file; a camera does not wait, so its queue is unbounded
 POLL_S = 0.001
 DAMAGE = {
     "unreadable_lines": "lines that are not {columns}",
@@ -38,21 +38,21 @@ DAMAGE = {
 
 
 class Piece(NamedTuple):
-    """What came since the piece before."""
+    """The events that arrived since the previous piece."""
 
     channels: Sequence[Events]
-    """Of the four polarizers; times count from the first event of the stream."""
+    """Four channels; times count from the first event of the stream."""
     until_us: int
-    """No event before it will come any more."""
+    """Every later piece holds only events at or after this time."""
     read_at: float
-    """When the first of it came, by `time.perf_counter`."""
+    """When its first data arrived, by `time.perf_counter`."""
 
 
 class LiveLines:
-    """Lines as they come, in pieces; iterating ends with the input, or after `idle_s` in which a file did not grow.
+    """Read lines as they arrive, in pieces; ends with the input, or once a file has not grown for `idle_s`.
 
-    Lines that cannot be used are left out and counted in `counts`; late ones are those behind an event that came in a
-    piece before. RecordingError where more than 1 % (and 8) are of one kind, or the first line is no size.
+    Unusable lines are left out and counted in `counts`; late lines are those older than an event of an earlier piece.
+    RecordingError where more than 1 % (and 8) are of one kind, or where the first line is not a size.
     """
 
     def __init__(self, source: BinaryIO, name: str, mosaic: Mosaic | None, idle_s: float):
@@ -63,7 +63,7 @@ class LiveLines:
         self._grows = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
         self._rest, self._started_with, self._read_at = b"", b"", 0.0
         self._queue: Queue[tuple[bytes, float] | None] = Queue(MOST_READ_AHEAD if self._grows else 0)
-        own = os.dup(source.fileno())  # whose number no file that is opened later can get
+        own = os.dup(source.fileno())  # a duplicate, so that a file opened later cannot get its number
         Thread(target=self._read, args=[own], daemon=True).start()
         self._sensor = self._first_line()
         self.height, self.width = (side // 2 if mosaic else side for side in self._sensor)
@@ -101,13 +101,13 @@ class LiveLines:
         raise RecordingError(f"{self.name}: expected a first line `width height` of the sensor, such as `346 260`")
 
     def _whole_lines(self) -> Iterator[tuple[bytes, float]]:
-        """What has come up to a line end, and when it came; at the end of the input, what is left."""
+        """Complete lines with their time of arrival; at the end of the input, also an incomplete last line."""
         if self._started_with:
             data, self._started_with = self._started_with, b""
             yield data, self._read_at
         while (come := self._queue.get()) is not None:
             data, self._read_at = come
-            while len(data) < READ_BYTES and not self._queue.empty():  # what waits already is one piece
+            while len(data) < READ_BYTES and not self._queue.empty():  # data already waiting joins this piece
                 if (more := self._queue.get()) is None:
                     self._queue.put(None)
                     break
@@ -117,17 +117,17 @@ class LiveLines:
             self._rest = data[end:]
             if end:
                 yield data[:end], self._read_at
-        self._queue.put(None)  # for whoever asks again
+        self._queue.put(None)  # for any later caller
         if self._rest.strip():
             data, self._rest = self._rest + b"\n", b""
             yield data, self._read_at
 
     def _read(self, descriptor: int) -> None:
-        """What comes into the queue with its time, in a thread of its own: whoever recovers may be busy as it comes."""
+        """Queue incoming data with its time of arrival, in a separate thread, since recovery may be busy meanwhile."""
         quiet_since = time.monotonic()
         try:
             while not self._source.closed:
-                data = os.read(descriptor, READ_BYTES)  # what is there, without waiting for more
+                data = os.read(descriptor, READ_BYTES)  # returns the data available, without waiting for more
                 if data:
                     self._queue.put((data, time.perf_counter()))
                     quiet_since = time.monotonic()
@@ -135,7 +135,7 @@ class LiveLines:
                     return
                 else:
                     time.sleep(POLL_S)
-        except OSError:  # the other end is gone
+        except OSError:  # the other end was closed
             return
         finally:
             os.close(descriptor)
@@ -169,7 +169,7 @@ class LiveLines:
 
 
 def live_lines(channels: Sequence[Events]) -> tuple[bytes, Int64[np.ndarray, " n"], bytes]:
-    """Four channels as `LiveLines` reads them: the first line; the events' times, and their lines in that order."""
+    """Four channels in the format of `LiveLines`: the first line, the sorted times, and the lines in that order."""
     tables = [
         np.stack([*(getattr(events, name).numpy().astype(np.int64) for name in "txyp"), np.full(len(events), angle)], 1)
         for events, angle in zip(channels, POLARIZER_ANGLES_DEG, strict=True)

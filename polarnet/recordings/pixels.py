@@ -1,4 +1,4 @@
-"""Hot pixels of a recording: found by how much more they fire than those around them, and left out."""
+"""Find and remove the hot pixels of a recording: those that fire far more often than their neighbours."""
 
 import numpy as np
 import torch
@@ -6,13 +6,13 @@ from jaxtyping import Bool, Int
 
 from polarnet.events.stream import Events
 
-NEIGHBOURHOOD = 5  # pixels, square
-SLOWEST_HOT_HZ = 20.0  # a pixel that fires less does no harm
-FEWEST_EVENTS = 8  # of fewer nothing can be said
+NEIGHBOURHOOD = 5  # side of a square, in pixels
+SLOWEST_HOT_HZ = 20.0  # slower pixels are harmless
+FEWEST_EVENTS = 8  # fewer events are no evidence
 
 
 def event_counts(events: Events) -> Int[np.ndarray, "h w"]:
-    """How often each pixel fired."""
+    """Number of events of each pixel."""
     pixel = events.y.long() * events.width + events.x.long()
     counts = torch.bincount(pixel, minlength=events.height * events.width)
     return counts.view(events.height, events.width).numpy()
@@ -21,8 +21,8 @@ def event_counts(events: Events) -> Int[np.ndarray, "h w"]:
 def hot_pixels(counts: Int[np.ndarray, "h w"], duration_s: float, factor: float | int) -> Bool[np.ndarray, "h w"]:
     """Pixels that fired more than `factor` times as often as the third busiest of the 5x5 pixels around them.
 
-    `counts` are the events of each pixel in `duration_s`. The third: thin lines and their ends are not hot, two hot
-    neighbours are. Pixels of less than 20 Hz, or 8 events, never are.
+    `counts` are the events of each pixel in `duration_s`. The third busiest is the reference so that thin lines and
+    their ends are not hot, but two hot neighbours are. Pixels with less than 20 Hz, or 8 events, never are.
     """
     border = NEIGHBOURHOOD // 2
     around = np.lib.stride_tricks.sliding_window_view(np.pad(counts, border), (NEIGHBOURHOOD, NEIGHBOURHOOD))
@@ -33,7 +33,7 @@ def hot_pixels(counts: Int[np.ndarray, "h w"], duration_s: float, factor: float 
 
 
 def without_pixels(events: Events, bad: Bool[np.ndarray, "h w"]) -> Events:
-    """The events of the other pixels."""
+    """The events of all pixels outside `bad`."""
     if not bad.any():
         return events
     keep = ~torch.from_numpy(bad)[events.y.long(), events.x.long()]

@@ -1,9 +1,9 @@
-"""Whether four channels look like one scene behind polarizers at 0, 45, 90 and 135 degrees.
+"""Check whether four channels look like one scene behind polarizers at 0, 45, 90 and 135 degrees.
 
 Behind ideal polarizers I0 + I90 = I45 + I135. To first order, events obey it too: summed over a small area and a short
-time, ON minus OFF events of 0 and 90 degrees equal those of 45 and 135. The two other ways to pair the four channels
-differ by the polarization. So the pairs that fit best are at right angles, and channels that differ neither in counts
-nor between pairs saw no polarization.
+time, ON minus OFF events of 0 and 90 degrees equal those of 45 and 135. The two other pairings of the four channels
+differ by the polarization. The pairs that fit best are therefore at right angles. Channels that differ neither in
+counts nor between pairings saw no polarization.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,43 +20,43 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 WINDOW_US = 33_333
 WINDOWS = 30  # the first second
-BLOCK = 4  # pixels, square; events of single pixels are too few to compare
+BLOCK = 4  # pixels, square; single pixels have too few events to compare
 MIN_BLOCKS = 1000  # with events in a window: the ratio of two misfits is then known to about 1 / sqrt(1000), 3 %
 HOT_PIXEL_FACTOR = 4.0
 
 # Limits of misfits and counts: measured by tests/benchmarks/polarizers.py (docs/recover.md, section Checks).
-BETTER_FIT = 0.9  # misfit of other pairs over that of the pairs at right angles: less only where the order is wrong
-EQUAL_COUNTS = 1.1  # events of the busiest channel over those of the quietest: less without polarization
-EQUAL_MISFITS = 1.1  # misfit of other pairs over that of the pairs at right angles: less without polarization ...
+BETTER_FIT = 0.9  # misfit of other pairs over that of the pairs at right angles: lower only where the order is wrong
+EQUAL_COUNTS = 1.1  # events of the busiest channel over those of the quietest: lower without polarization
+EQUAL_MISFITS = 1.1  # misfit of other pairs over that of the pairs at right angles: lower without polarization ...
 EQUAL_MISFITS_MOSAIC = 3.5  # ... and in a mosaic, whose four pixels look at places half a cell apart
 
 PAIRS = (((0, 90), (45, 135)), ((0, 45), (90, 135)), ((0, 135), (45, 90)))
-"""The ways to pair the four angles; the first is that of polarizers at right angles."""
+"""The three pairings of the four angles; the first pairs polarizers at right angles."""
 EXCHANGED = ((45, 90), (90, 135))
 """Angles to exchange where the second or the third of `PAIRS` fits best, so that the first does."""
 
 
 class Misfits(NamedTuple):
-    """How the sums of two pairs of channels differ."""
+    """Differences between the sums of two pairs of channels."""
 
     rms: Float64[np.ndarray, " 3"]
-    """Of ON minus OFF events of a block in a window, for each of `PAIRS`."""
+    """Difference in ON minus OFF events per block and window, for each of `PAIRS`."""
     blocks: int
-    """Blocks with events, of all windows."""
+    """Number of blocks with events, over all windows."""
 
 
 class ChannelCheck:
-    """Looks at the pieces of a recording as they pass through `watch`; then `findings` says what is wrong with them."""
+    """Examines a recording's pieces as they pass through `watch`, and reports problems in `findings`."""
 
     def __init__(self, height: int, width: int, *, mosaic: bool):
         self.counts = [0, 0, 0, 0]
-        """Events of each channel."""
+        """Number of events in each channel."""
         self._mosaic = mosaic
         self._cutter = WindowCutter(WindowRule(WINDOW_US, None, None), height, width)
         self._windows: list[EventWindow] = []
 
     def watch(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
-        """The pieces, unchanged; events of the first second are kept."""
+        """Pass the pieces on unchanged, keeping the events of the first second."""
         for piece in pieces:
             self.counts = [n + len(events) for n, events in zip(self.counts, piece.channels, strict=True)]
             if len(self._windows) < WINDOWS:
@@ -66,12 +66,12 @@ class ChannelCheck:
             yield piece
 
     def findings(self) -> list[str]:
-        """A sentence on what is wrong; none where nothing is, or where there are too few events to say."""
+        """Problems found, a sentence each; empty if there are none, or too few events to judge."""
         return channel_findings(pair_misfits(self._windows), self.counts, mosaic=self._mosaic)
 
 
 def channel_findings(misfits: Misfits, counts: Sequence[int], *, mosaic: bool) -> list[str]:
-    """A sentence on what misfits and the counts of the four channels show; none where there is too little evidence."""
+    """Problems shown by the misfits and counts of the four channels, a sentence each; empty without enough evidence."""
     silent = [f"{angle}" for angle, count in zip(POLARIZER_ANGLES_DEG, counts, strict=True) if count == 0]
     if silent:
         return [f"There are no events behind the polarizer at {' and '.join(silent)} degrees. DoLP and AoLP are wrong."]
@@ -103,9 +103,9 @@ def channel_findings(misfits: Misfits, counts: Sequence[int], *, mosaic: bool) -
 
 
 def pair_misfits(windows: Sequence[EventWindow]) -> Misfits:
-    """How far the sums of each two pairs of channels are apart, without hot pixels.
+    """Differences between the sums of each pairing of the channels, without hot pixels.
 
-    OFF events weigh as much as makes all ON and OFF events of the recording cancel: thresholds may differ.
+    OFF events are weighted so that all ON and OFF events of the recording cancel, since the two thresholds may differ.
     """
     if not windows:
         return Misfits(np.zeros(3), 0)

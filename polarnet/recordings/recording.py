@@ -1,4 +1,4 @@
-"""Files of event cameras as events: whole with `read_recording`, in chunks of constant memory with `open_recording`."""
+"""Read event-camera files: whole with `read_recording`, in chunks of constant memory with `open_recording`."""
 
 import os
 from collections import Counter
@@ -20,11 +20,11 @@ CHUNK_EVENTS = 2**20
 
 
 class Format(NamedTuple):
-    """How files of one format are known, and opened."""
+    """How to recognise and open files of one format."""
 
     words: str
     matches: Callable[[Path, bytes], bool]
-    """Whether a file that starts with these bytes is of this format."""
+    """Whether a file that starts with these bytes has this format."""
     open: Callable[[Path, Choices], Source]
 
 
@@ -41,24 +41,24 @@ FORMATS = {
     "celex5_csv": Format("CSV of a CeleX-5", celex5_csv.matches, celex5_csv.open_celex5_csv),
     "celex5_bin": Format("BIN of a CeleX-5", celex5_bin.matches, celex5_bin.open_celex5_bin),
 }
-"""In the order in which a file of unknown format is tried."""
+"""Ordered as they are tried on a file of unknown format."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A whole file."""
+    """The content of a whole file."""
 
     events: Events
     format: str
     repairs: Mapping[str, int]
-    """How often each repair of `polarnet.recordings.source.REPAIRS` was needed; without those that were not."""
+    """Count of each repair in `polarnet.recordings.source.REPAIRS` that was needed."""
 
 
 class RecordingReader:
-    """A file as consecutive chunks of events, each but the last of `chunk_events`; `open_recording` makes one.
+    """Yields a file's events in chunks of `chunk_events` (the last may be shorter); made by `open_recording`.
 
-    Iterating reads the file from its start, in memory that does not grow with it, and may raise RecordingError where
-    the file turns out to be damaged. `repairs` counts what was repaired up to the chunk that came last.
+    Iterating reads the file from its start in constant memory, and raises RecordingError where the file turns out to be
+    damaged. `repairs` counts the repairs up to the latest chunk.
     """
 
     def __init__(self, path: Path, form: str, source: Source, chunk_events: int):
@@ -89,14 +89,13 @@ def open_recording(
     assume_polarity: int | None = None,
     chunk_events: int = CHUNK_EVENTS,
 ) -> RecordingReader:
-    """A file to read chunk by chunk.
+    """Open a file to read it chunk by chunk.
 
-    `format` is a key of FORMATS; None tells it by the content. `height` and `width` are needed where the file does not
-    say them. `part` is SEQUENCE/ANGLE of an event store, `clock_mhz` the clock of a CeleX-5 whose BIN file counts its
-    ticks, `assume_polarity` (+1 or -1) the polarity of all events of a file that has none and is refused without it.
-
-    RecordingError where the file is of no known format or cannot be events; RuntimeError that says what to install
-    where an optional package is missing.
+    `format` is a key of FORMATS; None detects it from the content. `height` and `width` are needed where the file does
+    not state them. `part` is SEQUENCE/ANGLE of an event store. `clock_mhz` is the clock of a CeleX-5 whose BIN file
+    counts its ticks. `assume_polarity` (+1 or -1) sets the polarity of all events in a file without polarity, which is
+    refused otherwise. RecordingError where the format is unknown or the content cannot be events; RuntimeError naming
+    the package to install where an optional one is missing.
     """
     path = Path(path)
     if not path.exists():
@@ -127,7 +126,7 @@ def read_recording(
     clock_mhz: float | int | None = None,
     assume_polarity: int | None = None,
 ) -> Recording:
-    """All of a file; the arguments and errors are those of `open_recording`."""
+    """Read a whole file, with the arguments and errors of `open_recording`."""
     reader = open_recording(
         path,
         format,
@@ -143,7 +142,7 @@ def read_recording(
 
 
 def detect_format(path: str | os.PathLike[str]) -> str:
-    """The key of FORMATS that a file's first bytes show; RecordingError where it is none of them."""
+    """Detect the format, a key of FORMATS, from a file's first bytes; RecordingError where none matches."""
     path, head = Path(path), b""
     if path.is_file():
         with path.open("rb") as file:
@@ -159,7 +158,7 @@ def detect_format(path: str | os.PathLike[str]) -> str:
 
 
 def _cut(blocks: Iterator[Block], size: int) -> Iterator[Block]:
-    """The same events in blocks of `size`, the last one of what is left."""
+    """The same events in blocks of `size`; the last block holds the remainder."""
     waiting: list[Block] = []
     count = 0
     for block in blocks:

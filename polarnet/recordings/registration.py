@@ -1,8 +1,8 @@
-"""Four separate cameras laid on one another: a homography between two event images, and events moved by it.
+"""Register four separate cameras: find a homography between two event images, and move events by it.
 
-The cameras look at the same scene from nearly the same place, so that one homography holds for scenes that are flat or
-far away. It is found where the two event images correlate best (Evangelidis and Psarakis 2008, in OpenCV), from coarse
-to fine: images of different polarizers differ in brightness, but their edges lie at the same places.
+The cameras look at the same scene from nearly the same place, so one homography suffices for scenes that are flat or
+far away. It maximises the correlation of the two event images (Evangelidis and Psarakis 2008, in OpenCV), from coarse
+to fine. Images behind different polarizers differ in brightness, but their edges lie at the same places.
 """
 
 from typing import NamedTuple
@@ -17,33 +17,33 @@ from polarnet.recordings.pixels import event_counts
 from polarnet.recordings.source import RecordingError
 
 SCALES = (4, 2, 1)
-SMALLEST_SIDE = 48  # pixels; coarser images show too little
-BLUR = 5  # pixels, of the images while they are compared
+SMALLEST_SIDE = 48  # pixels; smaller images show too little
+BLUR = 5  # pixels; smoothing of the images during the comparison
 ITERATIONS, CHANGE = 200, 1e-6
-FINE, COARSE = 1.0, 4.0  # pixels, standard deviations between which edges lie
-UNRELATED = 0.25  # of simulated recordings of other scenes at most 0.18 (docs/recordings.md)
+FINE, COARSE = 1.0, 4.0  # pixels; standard deviations of the band that contains the edges
+UNRELATED = 0.25  # simulated recordings of different scenes reach at most 0.18 (docs/recordings.md)
 
 
 class Registration(NamedTuple):
-    """How pixels of one camera (x, y, 1) are found in another's picture."""
+    """Map from pixels (x, y, 1) of one camera to those of another, with its quality."""
 
     homography: Float64[np.ndarray, "3 3"]
     correlation: float
-    """Of the two event images where they overlap, after."""
+    """Correlation of the registered event images where they overlap."""
     edge_correlation: float
-    """Of their fine detail where they overlap, after: below `UNRELATED`, the homography means nothing."""
+    """Correlation of their fine detail where they overlap; below `UNRELATED`, the homography means nothing."""
 
 
 def event_image(events: Events) -> Float32[np.ndarray, "h w"]:
-    """log(1 + events) of each pixel, so that busy edges do not outshine the others; 0 to 1."""
+    """log(1 + events) of each pixel, scaled to 0 to 1, so that busy edges do not outshine the others."""
     image = np.log1p(event_counts(events).astype(np.float32))
     return image / max(float(image.max()), 1e-6)
 
 
 def register(reference: Float32[np.ndarray, "h w"], moving: Float32[np.ndarray, "h2 w2"]) -> Registration:
-    """The homography that takes pixels of `moving` to those of `reference`.
+    """The homography from pixels of `moving` to pixels of `reference`.
 
-    RecordingError where the images do not show the same: no shift of one correlates with the other.
+    RecordingError where the images show different things, that is, no shift of one correlates with the other.
     """
     if reference.shape != moving.shape:
         raise RecordingError(f"expected two event images of one size, got {reference.shape} and {moving.shape}")
@@ -69,7 +69,7 @@ def register(reference: Float32[np.ndarray, "h w"], moving: Float32[np.ndarray, 
             )
         except cv2.error:
             correlation = 0.0
-        if not correlation > 0:  # false for NaN too
+        if not correlation > 0:  # refuses NaN too
             raise RecordingError(
                 "the two event images show too little in common to lay them on each other; record something with many "
                 "edges that moves in front of both cameras"
@@ -85,7 +85,7 @@ def _edge_correlation(
     moving: Float32[np.ndarray, "h w"],
     homography: Float64[np.ndarray, "3 3"],
 ) -> float:
-    """Correlation of fine detail; a homography that lays broad shapes on one another does not raise it."""
+    """Correlation of fine detail, which aligning broad shapes alone does not raise."""
     both = warped(np.ones_like(moving), homography) > 1 - 1e-3
     a, b = (_edges(image)[both] for image in (reference, warped(moving, homography)))
     spread = float(a.std() * b.std()) if both.any() else 0.0
@@ -97,12 +97,12 @@ def _edges(image: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
 
 
 def warped(image: Float32[np.ndarray, "h w"], homography: Float64[np.ndarray, "3 3"]) -> Float32[np.ndarray, "h w"]:
-    """An event image as the reference camera would see it; 0 where it sees nothing of it."""
+    """An event image as the reference camera would see it; 0 outside its overlap."""
     return cv2.warpPerspective(image, homography, image.shape[::-1])
 
 
 def warp_events(events: Events, homography: Float64[np.ndarray, "3 3"]) -> Events:
-    """Events at the nearest pixel of the reference camera; those that it does not see are left out."""
+    """Move events to the nearest pixel of the reference camera; those outside its view are left out."""
     xy = np.stack([events.x.numpy(), events.y.numpy(), np.ones(len(events))])
     x, y, w = homography @ xy
     column, row = np.rint(x / w), np.rint(y / w)

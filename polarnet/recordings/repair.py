@@ -1,6 +1,6 @@
-"""Blocks of a file as events in time order, on the sensor and of polarity +1 or -1: repaired, counted or refused.
+"""Repair a file's blocks: events end up in time order, on the sensor and of polarity +1 or -1, or the file is refused.
 
-The outcome depends on the file alone, not on how many events are asked for at a time.
+Every repair is counted. The outcome depends on the file alone, not on the block size.
 """
 
 from collections import Counter
@@ -13,22 +13,22 @@ import numpy as np
 from polarnet.recordings.source import REPAIRS, SAFE, Block, RecordingError, Source
 
 LATE_US = 10_000
-"""Events that come later than their time by up to this are put in order: packets overtake each other, clocks do not."""
-PAUSE_US = 1_000_000  # a longer one is counted
-LOOKAHEAD = 8  # events that tell a wrong time from a clock that was set anew
-MOST_HELD = 2**22  # events kept back for late ones
-TOLERATED_SHARE = 0.01  # of the events of a file, of each kind of damage
-TOLERATED_COUNT = 8  # in files too short for a share
+"""Events late by at most this are put in order: packets overtake each other, clocks do not."""
+PAUSE_US = 1_000_000  # longer pauses are counted
+LOOKAHEAD = 8  # following events that distinguish a wrong time from a clock that was reset
+MOST_HELD = 2**22  # events held back to wait for late ones
+TOLERATED_SHARE = 0.01  # accepted share of a file's events, per kind of damage
+TOLERATED_COUNT = 8  # accepted count in files too short for a share
 HARMLESS = ("no_change", "unsorted", "pauses")
-FIRST_PAUSE_US = 3_600_000_000  # after one event at the start: it is the time of that event that is wrong
+FIRST_PAUSE_US = 3_600_000_000  # a longer pause right after the first event means that the first event's time is wrong
 LARGEST_TIME = 2**60  # microseconds; differences still fit into int64
 
 
 def repaired(name: str, source: Source, counts: Counter[str]) -> Iterator[Block]:
-    """The events of a source, t as int64, x and y as int16, p as int8; what was repaired is added to `counts`.
+    """The events of a source, t as int64, x and y as int16, p as int8; repairs are added to `counts`.
 
-    RecordingError, beginning with `name`, where damage is not safe to repair: more than 1 % of the events (and 8) of a
-    kind, or a time that goes back by more than 10 ms and stays there.
+    RecordingError, beginning with `name`, where damage is not safe to repair: more than 1 % of the events (and 8) of
+    one kind, or a time that goes back by more than 10 ms and stays there.
     """
     clock = _Clock(name)
     darker: int | None = None
@@ -54,7 +54,7 @@ def _filled(block: Block) -> Iterator[Block]:
 
 
 def _darker(p: np.ndarray) -> int | None:
-    """Which value stands for darker, 0 or -1: the more frequent one; None where there is neither."""
+    """The value that stands for darker, 0 or -1: the more frequent one; None where neither occurs."""
     zeros, minus_ones = np.count_nonzero(p == 0), np.count_nonzero(p == -1)
     return None if zeros == minus_ones == 0 else -1 if minus_ones > zeros else 0
 
@@ -100,7 +100,7 @@ def _select(block: Block, which: np.ndarray) -> Block:
 
 
 class _Clock:
-    """Keeps back the newest events until late ones have come; keeps the last few until what follows is known."""
+    """Sorts late events into place, and holds back the last few events until their times can be judged."""
 
     def __init__(self, name: str):
         self.name = name
@@ -111,7 +111,7 @@ class _Clock:
         self.held: Block | None = None
 
     def ordered(self, block: Block, counts: Counter[str], *, last: bool) -> Block:
-        """Events in time order that nothing that follows can come before."""
+        """Events in time order that no later event can precede."""
         if self.unjudged is not None:
             block = Block(*map(np.concatenate, zip(self.unjudged, block, strict=True)))
         count = len(block.t) if last else max(0, len(block.t) - LOOKAHEAD)
@@ -154,7 +154,10 @@ class _Clock:
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _judge(t, keep, newest, started, floor):
-    """Which times are believed; the newest, how many glitches, late events and pauses, and which event is refused."""
+    """Mark the events with credible times in `keep`.
+
+    Returns the newest time, the counts of glitches, late events and pauses, and the index of the refused event or -1.
+    """
     glitches, unsorted, pauses = 0, 0, 0
     for i in range(len(keep)):
         now = t[i]

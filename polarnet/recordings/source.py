@@ -1,4 +1,4 @@
-"""What a format's module hands over: an opened file as blocks of columns, just as they stand in it."""
+"""The interface of a file format's module: an opened file that yields its columns in blocks, unchanged."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -10,9 +10,9 @@ import numpy as np
 
 from polarnet.events.stream import LARGEST_SIDE
 
-BLOCK_EVENTS = 2**18  # what a format decodes at a time; what a reader's user gets is cut anew
+BLOCK_EVENTS = 2**18  # events that a format decodes at a time; chunks handed to a user are cut anew
 
-WRAP_US = 2**32  # of time stamps of 32 bits
+WRAP_US = 2**32  # range of 32-bit time stamps
 
 REPAIRS = {
     "unreadable_lines": "lines that are not the numbers they should be: left out",
@@ -26,18 +26,18 @@ REPAIRS = {
     "unsorted": "events a little earlier than the one before: put in order",
     "pauses": "pauses of a second or more between events: kept",
 }
-"""What readers count. No event is ever given another time, pixel or polarity."""
+"""Kinds of damage that readers count. No event is ever given another time, pixel or polarity."""
 
 SAFE = ("cut_tail", "no_change", "unsorted", "pauses")
-"""Repairs that may concern any number of events; of the others a file with too many is refused."""
+"""Repairs allowed any number of times; too many of any other kind make the file refused."""
 
 
 class RecordingError(ValueError):
-    """A file that is not read, with the reason and what to do."""
+    """A file cannot be read; the message gives the reason and a remedy."""
 
 
 class Block(NamedTuple):
-    """Some events, as they stand in the file: columns of one length and any number type."""
+    """Events as stored in the file: columns of equal length and any number type."""
 
     t: np.ndarray
     x: np.ndarray
@@ -47,21 +47,21 @@ class Block(NamedTuple):
 
 @dataclass(frozen=True)
 class Choices:
-    """What the user says about a file beyond its name; None where the file should say it."""
+    """Properties of a file stated by the user; None where the file should state them."""
 
     height: int | None = None
     width: int | None = None
     part: str | None = None
     """SEQUENCE/ANGLE of an event store."""
     clock_mhz: float | int | None = None
-    """Of a CeleX-5 that did not run at its usual clock."""
+    """Clock of a CeleX-5 that did not run at its usual rate."""
     assume_polarity: int | None = None
-    """+1 or -1 for all events of a file that does not say which, None to refuse such a file."""
+    """Polarity, +1 or -1, of all events in a file that does not store it; None refuses such a file."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """An opened file. `blocks(counts)` reads it from the start, and counts what it had to leave out."""
+    """An opened file. `blocks(counts)` reads it from the start and counts the data it had to leave out."""
 
     height: int
     width: int
@@ -69,9 +69,9 @@ class Source:
 
 
 def running_on(t: np.ndarray, turns: int, before: int) -> tuple[np.ndarray, int, int]:
-    """Microseconds of 32 bits made to run on where they wrap; how often they have by then, and the last of them.
+    """Unwrap 32-bit microseconds; returns the times, the number of wraps so far, and the last raw time.
 
-    `turns` and `before` are those of the block that came before, 0 at the start.
+    `turns` and `before` are the last two values returned for the previous block, 0 at the start.
     """
     t = t.astype(np.int64)
     wrapped = np.cumsum(np.diff(t, prepend=before) < -WRAP_US // 2)
@@ -81,7 +81,7 @@ def running_on(t: np.ndarray, turns: int, before: int) -> tuple[np.ndarray, int,
 def sensor_size(path: Path, choices: Choices, height: int | None = None, width: int | None = None) -> tuple[int, int]:
     """Height and width: those the file states, else those the user gave.
 
-    RecordingError where nobody states them, where both do and differ, or where no sensor is of that size.
+    RecordingError where neither states them, where both do and differ, or where the size is implausible.
     """
     for name, stated, given in (("height", height, choices.height), ("width", width, choices.width)):
         if stated is not None and given is not None and stated != given:

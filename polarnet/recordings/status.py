@@ -1,4 +1,4 @@
-"""The folder that a stage writes for real recordings, which says whether they are in use."""
+"""The output folder of a stage for real recordings, with a file that says whether recordings are in use."""
 
 import json
 import shutil
@@ -8,7 +8,7 @@ STATUS_FILE = "status.json"
 
 
 def start_over(out: Path, *, enabled: bool) -> None:
-    """An empty folder but for what it says."""
+    """Empty the folder and write its status file."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     (out / STATUS_FILE).write_text(json.dumps({"enabled": enabled}) + "\n")

@@ -1,6 +1,6 @@
-"""Imported division-of-time captures on one clock, in the stores that every later stage reads.
+"""Put imported division-of-time captures on one clock, in the stores that every later stage reads.
 
-They are the same as those of simulated sequences, `events.zarr` and `frames.zarr`; all targets are in the split `test`.
+The stores `events.zarr` and `frames.zarr` have the layout of simulated sequences; all targets are in the split `test`.
 """
 
 import itertools
@@ -33,25 +33,25 @@ from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.status import start_over
 
-WHITE = 255.0  # of reduced pictures
+WHITE = 255.0  # maximum of reduced pictures
 
 
 class Calibrated(NamedTuple):
-    """What was found of a target, for a report and a picture."""
+    """Calibration result of one target, for a report and a picture."""
 
     name: str
     landmark_us: Mapping[str, int]
     """Start times by the landmark, by each capture's own clock."""
     start_us: Mapping[str, int]
-    """Those that were used."""
+    """Start times used."""
     alignment: Alignment | None
-    """None where the landmark's start times were used as they are."""
+    """None where the landmark's start times were used unchanged."""
     hot: Mapping[str, int]
-    """How many pixels of each event capture were left out."""
+    """Number of pixels left out of each event capture."""
     region_events_us: Mapping[str, Int64[np.ndarray, " n"]]
-    """Of negative events in the landmark's region."""
+    """Times of the negative events in the landmark's region."""
     region_pictures: Mapping[str, tuple[Int64[np.ndarray, " n"], np.ndarray]]
-    """Times of pictures, and their mean in the region."""
+    """Times of the pictures, and their mean in the region."""
     duration_us: int
 
 
@@ -137,8 +137,8 @@ def aligned(
 ) -> tuple[list[Events], Int64[Tensor, " n"], Float32[Tensor, "n 4 h w"]]:
     """The sequence of a target without hot pixels: events of its four channels, frame times, intensities in [0, 1].
 
-    Events: those of the crop from the common start on, reduced by `downscale` with the rule `keep_event_rate`.
-    Intensities: reduced pictures, interpolated between those taken before and after the frame's time.
+    The events are those of the crop from the common start on, reduced by `downscale` with the rule `keep_event_rate`.
+    The intensities come from the reduced pictures before and after each frame's time, interpolated.
     """
     t_us = frame_times_us(found.duration_us, config)
     channels = []
@@ -154,7 +154,7 @@ def aligned(
 def interpolated(
     capture: IntensityCapture, t_us: Int64[np.ndarray, " n"], config: RecordingsConfig
 ) -> Float32[Tensor, "n h w"]:
-    """Reduced pictures at times between those they were taken at, 0 to 1."""
+    """Reduced pictures, 0 to 1, interpolated to the times `t_us`."""
     k = np.clip(np.searchsorted(capture.t_us, t_us, side="right") - 1, 0, len(capture.t_us) - 2)
     share = (t_us - capture.t_us[k]) / (capture.t_us[k + 1] - capture.t_us[k])
     frames = []
@@ -165,7 +165,7 @@ def interpolated(
 
 
 def frame_times_us(duration_us: int, config: RecordingsConfig) -> Int64[np.ndarray, " n"]:
-    """Times of ground-truth frames, from the start on."""
+    """Times of the ground-truth frames, starting at 0."""
     count = int(duration_us * 1e-6 * config.frame_rate_hz) + 1
     return np.rint(np.arange(count) * 1e6 / config.frame_rate_hz).astype(np.int64)
 
@@ -186,6 +186,6 @@ def _record(found: Calibrated) -> dict[str, Any]:
 
 
 def spread_us(starts: Mapping[str, int], others: Mapping[str, int]) -> Sequence[float]:
-    """Differences of two sets of start times, but for what all have in common: a clock's zero is a convention."""
+    """Differences between two sets of start times, minus their mean: the zero of the clock is a convention."""
     differences = np.array([starts[c] - others[c] for c in itertools.chain(EVENT_CAPTURES, INTENSITY_CAPTURES)], float)
     return (differences - differences.mean()).tolist()

@@ -1,1 +1,1 @@
-"""What a person looks at: figures, tables, the page."""
+"""Output for readers: figures, tables and pages."""

@@ -1,4 +1,4 @@
-"""What the pipeline left behind, read for the report."""
+"""Read the pipeline's outputs for the report."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -22,13 +22,13 @@ from polarnet.simulation.pictures.manifest import SPLITS, Manifest, read_manifes
 from polarnet.simulation.scenes import SceneStore
 from polarnet.training.baselines import NOT_TRAINED
 
-THUMBNAIL_WIDTH = 208  # pixels, twice the size shown
-MOST_THUMBNAILS = 24  # of a split
+THUMBNAIL_WIDTH = 208  # pixels, twice the displayed size
+MOST_THUMBNAILS = 24  # per split
 
 
 @dataclass(frozen=True)
 class ReportPaths:
-    """Where the artefacts lie that the report reads, named like the stages' outputs."""
+    """Paths of the artefacts that the report reads, named like the stages' outputs."""
 
     images: Path
     scenes: Path
@@ -40,7 +40,7 @@ class ReportPaths:
     benchmark: Path
 
     def check(self) -> None:
-        """FileNotFoundError that names everything missing and the stage that makes it."""
+        """FileNotFoundError that names each missing artefact and the stage that makes it."""
         needed = {
             self.images / "manifest.json": "ingest",
             self.scenes: "synthesize",
@@ -58,11 +58,11 @@ class ReportPaths:
 
 
 class Panel(NamedTuple):
-    """One window of one test sequence, as the benchmark kept it; `dolp` and `aolp` by method."""
+    """One window of one test sequence, as stored by the benchmark; `dolp` and `aolp` by method."""
 
     sequence: str
     generated: bool
-    """Whether its picture is one of the dead leaves."""
+    """Whether its picture is a generated dead-leaves image."""
     window: int
     t_us: int
     events: Float[Tensor, "4 h w"]
@@ -74,35 +74,35 @@ class Panel(NamedTuple):
 
 
 class Thumbnail(NamedTuple):
-    """A picture of data/images, small; one of measured polarization as hue, saturation and value."""
+    """A small picture from data/images; measured polarization appears as hue, saturation and value."""
 
     name: str
     picture: UInt8[np.ndarray, "h w 3"]
 
 
 class EventRate(NamedTuple):
-    """How many events a split has, all four polarizers together."""
+    """Number of events in a split, summed over the four channels."""
 
     split: str
     sequences: int
     seconds: float
     events: int
     per_pixel_second: float
-    """Of one polarizer."""
+    """Rate of one channel."""
 
 
 class History(NamedTuple):
     """Training curves of one network; epochs count from 0."""
 
     network: str
-    """As the checkpoint names it."""
+    """Name of the network in its checkpoint."""
     loss: Sequence[Curve]
     validation: Mapping[str, Curve]
     best_epoch: int
 
 
 class SetResults(NamedTuple):
-    """What the benchmark gave on a test set."""
+    """Benchmark results on a test set."""
 
     name: str
     metrics: Mapping[str, Mapping[str, Any]]
@@ -112,28 +112,28 @@ class SetResults(NamedTuple):
 
 @dataclass(frozen=True)
 class Artefacts:
-    """Everything the page shows."""
+    """All data shown on the page."""
 
     manifest: Manifest
     metrics: Mapping[str, Mapping[str, Any]]
     details: Mapping[str, Any]
-    """data/benchmark/details.json: what was scored, and each scene's mean."""
+    """Content of data/benchmark/details.json: the test data scored, and each scene's mean."""
     panels: Sequence[Panel]
     sets: Sequence[SetResults]
-    """Test sets beyond the simulated one."""
+    """Test sets besides the simulated one."""
     ours: History
     e2v: History | None
-    """None where no row of the benchmark uses it, so that it was not trained; so is the next."""
+    """`e2v` and `e2p` are None if no row of the benchmark uses the network, so that it was not trained."""
     e2p: History | None
     rates: Sequence[EventRate]
     overview: Overview | None
-    """None where the benchmark kept no panel of the network."""
+    """None if the benchmark stored no panel of the network."""
     thumbnails: Mapping[str, Sequence[Thumbnail]]
-    """By split; photographs first, the first `MOST_THUMBNAILS` of them."""
+    """The first `MOST_THUMBNAILS` of each split, photographs first."""
 
 
 def read_artefacts(paths: ReportPaths) -> Artefacts:
-    """Everything under `paths`; FileNotFoundError that says which stage to run."""
+    """Read everything under `paths`; FileNotFoundError names the stage to run."""
     paths.check()
     scenes, frames, events = (
         SceneStore.open(paths.scenes),
@@ -142,7 +142,7 @@ def read_artefacts(paths: ReportPaths) -> Artefacts:
     )
     manifest = read_manifest(paths.images)
     seen = set(scenes.picture_of.values())
-    pictures = [entry for entry in manifest.pictures if entry.name in seen]  # others are too small for the window
+    pictures = [entry for entry in manifest.pictures if entry.name in seen]  # others are too small for the sensor
     pictures.sort(key=lambda entry: entry.source == "dead_leaves")  # photographs first
     generated = {entry.name for entry in pictures if entry.source == "dead_leaves"}
     files = sorted((paths.benchmark / "panels").glob("*.npz"))
@@ -166,7 +166,7 @@ def read_artefacts(paths: ReportPaths) -> Artefacts:
 
 
 def read_set(folder: Path) -> SetResults:
-    """What `write_benchmark` left in a folder; its name is that of details.json, or the folder's."""
+    """Read a folder written by `write_benchmark`; the set's name comes from details.json, or from the folder."""
     for name in ("metrics.json", "details.json"):
         if not (folder / name).exists():
             raise FileNotFoundError(f"{folder / name} is missing; run the benchmark of this test set again")
@@ -176,7 +176,7 @@ def read_set(folder: Path) -> SetResults:
 
 
 def read_history(path: Path) -> History:
-    """Curves of a history.json, a row an epoch with mean loss terms and validation scores, and whose they are."""
+    """Read a history.json, with mean loss terms and validation scores per epoch, and the name of its network."""
     rows = _json(path)
     if not rows:
         raise ValueError(f"{path}: expected a row for each epoch, got none; train again")
@@ -191,12 +191,12 @@ def read_history(path: Path) -> History:
 
 
 def _history_of(folder: Path) -> History | None:
-    """Curves of a baseline's training; None where its stage left the reason why it did not train."""
+    """Curves of a baseline's training; None if its stage recorded a reason for not training."""
     return None if (folder / NOT_TRAINED).exists() else read_history(folder / "history.json")
 
 
 def event_rates(events: EventStore, frames: FrameStore) -> list[EventRate]:
-    """How many events each split has; a split without sequences is left out."""
+    """Number and rate of events in each split; a split without sequences is left out."""
     rates = []
     for split in SPLITS:
         names = [name for name in frames.of_split(split) if name in set(events.sequences)]
@@ -209,7 +209,7 @@ def event_rates(events: EventStore, frames: FrameStore) -> list[EventRate]:
 
 
 def overview_of(panel: Panel, scenes: SceneStore, frames: FrameStore, events: EventStore) -> Overview:
-    """A panel's sequence from picture to the DoLP recovered from the events of its window."""
+    """Data of a panel's sequence, from its picture to the DoLP recovered from the events of its window."""
     record = scenes.read(panel.sequence)
     start_us = int(frames.t_us(panel.sequence)[panel.window])
     trajectory = Trajectory.from_vector(record.trajectory.numpy())
@@ -232,7 +232,7 @@ def overview_of(panel: Panel, scenes: SceneStore, frames: FrameStore, events: Ev
 
 
 def thumbnails(pictures: Sequence[str], scenes: SceneStore) -> list[Thumbnail]:
-    """The first `MOST_THUMBNAILS` of these pictures, from the scenes that they became."""
+    """Thumbnails of the first `MOST_THUMBNAILS` pictures, from the scenes made of them."""
     sequence_of = {picture: sequence for sequence, picture in reversed(scenes.picture_of.items())}
     found = []
     for picture in pictures[:MOST_THUMBNAILS]:
@@ -244,13 +244,13 @@ def thumbnails(pictures: Sequence[str], scenes: SceneStore) -> list[Thumbnail]:
 
 
 def _telling(panels: Sequence[Panel]) -> list[Panel]:
-    """Panels of the network, those whose true DoLP varies most first; dead leaves come after photographs."""
+    """Panels with the network's prediction: photographs before dead leaves, then by variation of the true DoLP."""
     shown = [panel for panel in panels if "ours" in panel.dolp]
     return sorted(shown, key=lambda panel: (panel.generated, -float(panel.truth_dolp.std())))
 
 
 def _outline(pose: Pose, height: int, width: int) -> Float[np.ndarray, "2 corners"]:
-    """Corners of the window at the first pose, in pixels of the scene; one of them twice, to close the line."""
+    """Corners of the sensor at the first pose, in pixels of the scene; the first is repeated to close the line."""
     left, top, along, across = sensor_to_scene(*(float(column[0]) for column in pose), height, width)
     columns, rows = np.array([[0, width, width, 0, 0], [0, 0, height, height, 0]])
     return np.stack([left + columns * along - rows * across, top + columns * across + rows * along])

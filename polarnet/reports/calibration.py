@@ -1,4 +1,4 @@
-"""Pictures of calibrations: what start times were found by, thresholds, hot pixels, and cameras laid on each other."""
+"""Pictures of calibrations: evidence for the start times, thresholds, hot pixels, and registered cameras."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from polarnet.recordings.targets import Calibrated
 from polarnet.reports.png import png
 
 COLOURS = ("#d6336c", "#e08a1e", "#3d8fd9", "#4aa37c")
-SHOWN_MS = 60.0  # around the start
+SHOWN_MS = 60.0  # on each side of the start
 
 
 def draw_calibration(found: Calibrated, config: RecordingsConfig, path: Path) -> None:
@@ -30,7 +30,7 @@ def draw_calibration(found: Calibrated, config: RecordingsConfig, path: Path) ->
 
 
 def draw_hot_pixels(counts: np.ndarray, hot: Bool[np.ndarray, "h w"], path: Path) -> None:
-    """Write a picture of how often each pixel fired, with the hot ones ringed."""
+    """Write a picture of each pixel's event count, with the hot pixels circled."""
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
     shown = axes.imshow(np.log1p(counts), cmap="gray")
@@ -47,7 +47,7 @@ def draw_registration(
     after: Float32[np.ndarray, "h w"],
     path: Path,
 ) -> None:
-    """Write event images of two cameras over each other, before and after: one red, one cyan, grey where they agree."""
+    """Write two cameras' event images overlaid before and after registration: one red, one cyan, grey where equal."""
     figure = Figure(figsize=(11, 4), layout="constrained")
     for axes, moving, title in zip(figure.subplots(1, 2), (before, after), ("before", "after"), strict=True):
         scale = max(float(reference.max()), float(moving.max()), 1e-6)

@@ -1,6 +1,6 @@
-"""Figures drawn with matplotlib: comparison panels, training curves, how scores spread over scenes.
+"""Figures drawn with matplotlib: comparison panels, training curves, distributions of scores over scenes.
 
-A figure is returned, not shown; `polarnet.reports.png` writes it.
+Figures are returned, not shown; `polarnet.reports.png` writes them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ class Theme:
     quiet: str
     grid: str
     face: str
-    """Of the page, for what must hide lines behind it; "none" leaves it open."""
+    """Colour of the page, for markers that must hide lines behind them; "none" is transparent."""
 
 
 LIGHT = Theme(text="#1c2330", quiet="#667085", grid="#e4e7ec", face="#ffffff")
@@ -48,14 +48,14 @@ TERMS = {
     "stokes": "S1/S0, S2/S0",
     "uncertainty": "likelihood of the error",
 }
-"""Terms of a loss as a legend shows them."""
+"""Legend labels of loss terms."""
 
 BRANCHES = {"intensity": "intensity", "aolp": "AoLP", "dolp": "DoLP"}
-"""Maps of a network that has a loss for each, whose terms are BRANCH_TERM."""
+"""Outputs of a network with one loss per output; their terms are named BRANCH_TERM."""
 
 
 class PanelScene(NamedTuple):
-    """One row of a comparison: a window of one test scene and what each method made of it."""
+    """One row of a comparison: a window of one test scene, its truth and each method's prediction."""
 
     name: str
     events: Float[Tensor, "4 h w"]
@@ -64,7 +64,7 @@ class PanelScene(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """One line of a training figure; `values` holds NaN where an epoch has none."""
+    """One line of a training figure; `values` holds NaN for epochs without a value."""
 
     label: str
     epochs: Sequence[int]
@@ -80,9 +80,10 @@ class ReliabilityLine(NamedTuple):
 
 
 def comparison_panel(rows: Sequence[PanelScene], path: Path, legend: Legend = GENERAL, theme: Theme = LIGHT) -> None:
-    """Write a picture like the paper's Fig. 10: a row a scene; events, truth and each method; MSE and PSNR below.
+    """Write a picture like the paper's Fig. 10, with a row per scene.
 
-    Methods that answer with one value everywhere are left out.
+    A row shows events, truth and each method, with MSE and PSNR below. Methods that predict one value everywhere are
+    left out.
     """
     if not rows:
         raise ValueError("a comparison panel needs at least one scene, got none")
@@ -143,7 +144,7 @@ def _term(name: str) -> str:
 def score_distribution(
     per_scene: Mapping[str, Mapping[str, Sequence[float]]], theme: Theme, legend: Legend = GENERAL
 ) -> Figure:
-    """Every test scene as a dot over each method's box, one plot a metric.
+    """One plot per metric, with a box per method and a dot per test scene.
 
     `per_scene` is metric, then method, then the scenes' means. Boxes span the quartiles, whiskers all scenes.
     """
@@ -168,7 +169,7 @@ def score_distribution(
 def reliability_figure(
     curves: Mapping[str, Sequence[tuple[float, float, int]]], theme: Theme, legend: Legend = GENERAL
 ) -> Figure:
-    """Measured against predicted squared error of DoLP, a line a method; on the diagonal its uncertainty is right.
+    """Measured against predicted squared error of DoLP, a line per method; calibrated errors lie on the diagonal.
 
     `curves` are those of `polarnet.evaluation.reliability`: predicted, measured, pixels. Dots grow with the pixels.
     """
@@ -183,7 +184,7 @@ def reliability_figure(
 
 
 def draw_reliability(axes: Axes, lines: Sequence[ReliabilityLine], theme: Theme) -> None:
-    """Measured against predicted squared error, and the diagonal; dots grow with the pixels."""
+    """Draw measured against predicted squared error, and the diagonal; dots grow with the number of pixels."""
     ends = [value for line in lines for predicted, measured, _ in line.curve for value in (predicted, measured)]
     diagonal = [min(value for value in ends if value > 0), max(ends)]
     axes.plot(diagonal, diagonal, color=theme.quiet, linewidth=0.8)
@@ -198,13 +199,13 @@ def draw_reliability(axes: Axes, lines: Sequence[ReliabilityLine], theme: Theme)
 
 
 def score_line(recovered: Float[Tensor, "h w"], truth: Float[Tensor, "h w"]) -> str:
-    """MSE and PSNR of one frame, for below its picture."""
+    """MSE and PSNR of one frame, as the text below its picture."""
     error, ratio = (float(score(recovered[None], truth[None])) for score in (mse, psnr))
     return f"{error:.4f} · {ratio:.2f} dB"
 
 
 def dolp_bar(theme: Theme) -> Figure:
-    """The legend of `maps.dolp_image`."""
+    """Colour bar of `maps.dolp_image`."""
     figure = _figure((2.1, 0.32), theme)
     axes = figure.add_axes((0.06, 0.6, 0.88, 0.38))
     _colour_bar(figure, axes, theme, "horizontal", label_size=8.0)
@@ -213,7 +214,7 @@ def dolp_bar(theme: Theme) -> Figure:
 
 @dataclass(frozen=True)
 class _TileGrid:
-    """Where the pictures of a panel lie, in inches, so that every tile keeps its aspect."""
+    """Layout of a panel's pictures in inches; every tile keeps its aspect ratio."""
 
     rows: int
     columns: int
@@ -251,7 +252,7 @@ def _figure(size: tuple[float, float], theme: Theme) -> Figure:
 
 
 def chart_style(theme: Theme) -> dict[Any, Any]:
-    """matplotlib settings of every figure."""
+    """matplotlib settings shared by all figures."""
     return {
         "font.family": "DejaVu Sans",  # comes with matplotlib, so that text looks the same everywhere
         "font.size": 8,
@@ -276,7 +277,7 @@ def chart_style(theme: Theme) -> dict[Any, Any]:
 
 
 def show_picture(axes: Axes, picture: np.ndarray, theme: Theme) -> None:
-    """A picture without ticks, in a thin frame."""
+    """Show a picture without ticks, in a thin frame."""
     axes.imshow(picture)
     axes.set_xticks([])
     axes.set_yticks([])
@@ -292,7 +293,7 @@ def _colour_bar(figure: Figure, axes: Axes, theme: Theme, orientation: str, labe
 
 
 def _plain_log_ticks(axis: Axis) -> None:
-    """1, 2 and 5 of each decade, written out: 0.05, not 5 x 10^-2."""
+    """Label 1, 2 and 5 of each decade in plain notation: 0.05, not 5 x 10^-2."""
     axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.set_minor_locator(NullLocator())
@@ -308,7 +309,7 @@ def _strip(axes: Axes, position: int, values: Sequence[float], colour: str, them
         boxprops={"facecolor": colour, "alpha": 0.28, "linewidth": 0}, medianprops={"color": theme.text},
         whiskerprops={"color": colour, "linewidth": 0.8}, capprops={"linewidth": 0},
     )  # fmt: skip
-    offset = (np.arange(len(known)) % 5 - 2) * 0.08  # spreads dots that would cover each other; no randomness
+    offset = (np.arange(len(known)) % 5 - 2) * 0.08  # spreads overlapping dots without randomness
     axes.scatter(known, position + offset, s=6, color=colour, alpha=0.8, linewidths=0, zorder=3)
 
 

@@ -1,4 +1,4 @@
-"""Names, colours and explanations of a benchmark's rows; what `ours` and `E2V` are depends on the weights."""
+"""Names, colours and explanations of a benchmark's rows; the networks of `ours` and `E2V` depend on the weights."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from polarnet.reports.tables import LABELS, in_order
 
 
 class Network(NamedTuple):
-    """A network as tables, figures and the glossary present it."""
+    """Label, colour and description of a network in tables, figures and the glossary."""
 
     label: str
     colour: str
@@ -30,13 +30,13 @@ NETWORKS = {"polarnet": POLARNET} | {
     for name in method.weights.networks
     if name in METHODS
 }
-"""Networks by the name in a checkpoint; but for polarnet's, each is presented as the method of its name is."""
+"""Networks by their name in a checkpoint; all but polarnet's use the label of the method of that name."""
 
 NAMED_BY_NETWORK = ("e2v", "paper", "ours")
-"""Rows whose key does not say which network they are."""
+"""Rows whose key does not name their network."""
 
 OTHER_COLOUR = "#4aa37c"
-"""Colour of rows of older results that polarnet no longer has."""
+"""Colour of rows in older results that polarnet no longer has."""
 
 GAINS = (
     "The same intensities, each polarizer's scale solved from I0 + I90 = I45 + I135 before the Stokes formula. Nothing "
@@ -46,26 +46,26 @@ LPIPS_BACKBONES = {"vgg": "VGG16", "alex": "AlexNet", "squeeze": "SqueezeNet 1.1
 
 
 class Legend(NamedTuple):
-    """What tables and figures call the rows of one benchmark, and their colours; by row, gains solved or not."""
+    """Labels and colours of the rows of one benchmark, with and without solved gains."""
 
     labels: Mapping[str, str]
     colours: Mapping[str, str]
 
     def label(self, method: str) -> str:
-        """The readable name; a row that polarnet does not know keeps its key."""
+        """The label of a row; an unknown row keeps its key."""
         return self.labels.get(method, method)
 
     def colour(self, method: str) -> str:
-        """The colour of lines and dots; solved gains do not change it."""
+        """The colour of a row's lines and dots, the same with solved gains."""
         return self.colours.get(method.removesuffix(GAIN), OTHER_COLOUR)
 
 
 GENERAL = Legend(LABELS, {name: row.colour for name, row in ROWS.items()})
-"""Where nothing says which networks are behind the rows."""
+"""Legend for results that do not name the networks behind the rows."""
 
 
 def legend_of(weights: Mapping[str, Mapping[str, Any]]) -> Legend:
-    """The legend of a benchmark from details.json's `weights`, which names the network behind each row."""
+    """The legend of a benchmark, from details.json's `weights`, which name the network behind each row."""
     networks = {row: file["network"] for row, file in weights.items()}
     labels, colours = dict(GENERAL.labels), dict(GENERAL.colours)
     colours |= {row: NETWORKS[network].colour for row, network in networks.items() if network in NETWORKS}
@@ -81,12 +81,12 @@ def legend_of(weights: Mapping[str, Mapping[str, Any]]) -> Legend:
 
 
 def network_label(network: str) -> str:
-    """The readable name of a network; one that polarnet does not know keeps the name in its checkpoint."""
+    """The label of a network; an unknown network keeps its name in the checkpoint."""
     return NETWORKS[network].label if network in NETWORKS else network
 
 
 def glossary(methods: Iterable[str], weights: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """Term and explanation of each row of a benchmark, in the order of its table; all solved gains have one."""
+    """Term and explanation of each row of a benchmark, in table order; all rows with solved gains share one entry."""
     rows, legend = in_order(methods), legend_of(weights)
     entries = [
         (legend.label(row), _about(row, weights.get(row)))
@@ -97,7 +97,7 @@ def glossary(methods: Iterable[str], weights: Mapping[str, Mapping[str, Any]]) -
 
 
 def lpips_about(lpips: Mapping[str, Any]) -> str | None:
-    """What LPIPS is, with the backbone that details.json's `lpips` names; None where the table has no such column."""
+    """Explanation of LPIPS with the backbone named by details.json's `lpips`; None if the table has no such column."""
     if lpips["backbone"] is None:
         return None
     backbone = LPIPS_BACKBONES.get(lpips["backbone"], lpips["backbone"])
@@ -108,7 +108,7 @@ def lpips_about(lpips: Mapping[str, Any]) -> str | None:
 
 
 def _about(row: str, file: Mapping[str, Any] | None) -> str:
-    """Description of a row: its network's where it has one, after what the row itself stands for."""
+    """Description of a row, followed by that of its network if it has one."""
     about = ROWS[row].about if row in ROWS else ""
     if file is None:
         return about

@@ -1,4 +1,4 @@
-"""Tensors to colour pictures: events, DoLP, and polarization as hue, saturation and value."""
+"""Convert tensors to colour pictures: events, DoLP, and polarization as hue, saturation and value."""
 
 import math
 
@@ -15,13 +15,13 @@ EVENT_COLOURS = LinearSegmentedColormap.from_list(
     ["#0b3c8c", "#3f83d6", "#ffffff", "#e8604c", "#9c0f1b"],
     N=257,  # odd, so that the middle is white
 )
-FULL_SCALE_QUANTILE = 0.99  # of the pixels that saw events: a few hot pixels must not bleach a picture
+FULL_SCALE_QUANTILE = 0.99  # of the pixels with events, so that a few hot pixels do not bleach a picture
 
 
 def event_full_scale(events: Float[Tensor, "*b h w"]) -> float:
-    """The magnitude that most pixels with events stay below; 1 where no pixel saw any.
+    """The `FULL_SCALE_QUANTILE` of the magnitudes at pixels with events; 1 if there are none.
 
-    Pass the four polarizers together so that their pictures share one scale.
+    Pass the four channels together, so that their pictures share one scale.
     """
     magnitude = events.abs().flatten()
     seen = magnitude[magnitude > 0]
@@ -31,18 +31,18 @@ def event_full_scale(events: Float[Tensor, "*b h w"]) -> float:
 
 
 def event_image(events: Float[Tensor, "h w"], full_scale: float) -> UInt8[np.ndarray, "h w 3"]:
-    """Signed event counts or an event tensor (paper Eq. 5): ON red, OFF blue, nothing white; +-full_scale saturate."""
+    """Colour event counts or an event tensor (paper Eq. 5): ON red, OFF blue, zero white; saturates at +-full_scale."""
     unit = (events.numpy(force=True) / full_scale).clip(-1, 1)
     return _coloured((unit + 1) / 2, EVENT_TABLE)
 
 
 def dolp_image(dolp: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """DoLP from 0 (dark violet) to 1 (yellow); values outside are clamped."""
+    """Colour DoLP from 0 (dark violet) to 1 (yellow); values outside are clamped."""
     return _coloured(dolp.numpy(force=True).clip(0, 1), DOLP_TABLE)
 
 
 def intensity_image(intensity: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Light from 0 (black) to 1 (white); values outside are clamped."""
+    """Show intensity from 0 (black) to 1 (white); values outside are clamped."""
     return np.repeat(_bytes(intensity.numpy(force=True).clip(0, 1))[..., None], 3, axis=-1)
 
 
@@ -51,7 +51,7 @@ def polarization_hsv(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Hue is AoLP (radians, period pi: 0 red, 60 degrees green, 120 blue), saturation DoLP, value S0 (paper Fig. 3).
 
-    The inverse of how the simulation reads a photograph, so that a simulated scene comes out as its photograph.
+    This inverts the simulation's reading of photographs, so a simulated scene looks like its photograph.
     """
     hue_deg = 360 * (aolp / math.pi).remainder(1.0)
     hsv = np.stack([hue_deg.numpy(force=True), *(x.clamp(0, 1).numpy(force=True) for x in (dolp, s0))], axis=-1)
@@ -61,20 +61,20 @@ def polarization_hsv(
 def hue_wheel(size: int) -> UInt8[np.ndarray, "size size 4"]:
     """The legend of `polarization_hsv`: direction is AoLP, radius is DoLP, value 1. RGBA, transparent outside.
 
-    The two directions of a line are one angle of polarization, so opposite points agree. Angles count anticlockwise
-    from the right, as on paper; the first row is the top.
+    Opposite points have the same colour, since both directions of a line are one angle of polarization. Angles count
+    anticlockwise from the right, as on paper; the first row is the top.
     """
     axis = (np.arange(size) + 0.5) / size * 2 - 1
     x, y = np.meshgrid(axis, -axis)
     radius = np.hypot(x, y)
     hue = np.arctan2(y, x) / math.pi % 1.0
     rgb = hsv_to_rgb(np.stack([hue, radius.clip(0, 1), np.ones_like(hue)], axis=-1))
-    edge = ((1 - radius) * size / 2).clip(0, 1)  # one pixel of soft rim
+    edge = ((1 - radius) * size / 2).clip(0, 1)  # soft rim, one pixel wide
     return np.concatenate([_bytes(rgb), _bytes(edge)[..., None]], axis=-1)
 
 
 def encode_png(picture: UInt8[np.ndarray, "h w channels"]) -> bytes:
-    """RGB or RGBA bytes as a PNG without any metadata: the same picture gives the same bytes."""
+    """Encode RGB or RGBA bytes as a PNG without metadata: the same picture gives the same bytes."""
     order = [2, 1, 0, 3][: picture.shape[-1]]
     done, data = cv2.imencode(".png", picture[..., order], [cv2.IMWRITE_PNG_COMPRESSION, 9])
     assert done, f"OpenCV could not encode a picture of {picture.shape}"
@@ -82,7 +82,7 @@ def encode_png(picture: UInt8[np.ndarray, "h w channels"]) -> bytes:
 
 
 def encode_jpeg(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """RGB bytes as a small JPEG, for thumbnails of photographs."""
+    """Encode RGB bytes as a small JPEG, for thumbnails of photographs."""
     done, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
     assert done, f"OpenCV could not encode a picture of {picture.shape}"
     return data.tobytes()
@@ -93,12 +93,12 @@ def _bytes(unit: np.ndarray) -> np.ndarray:
 
 
 def _table(colours: Colormap) -> UInt8[np.ndarray, "n 3"]:
-    """The steps of a colour map."""
+    """The colours of a colour map as bytes."""
     return _bytes(colours(np.arange(colours.N))[:, :3])
 
 
 def _coloured(unit: np.ndarray, table: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """What matplotlib shows for numbers in [0, 1]: no copies, no checks for what is outside or missing."""
+    """Colour numbers in [0, 1] as matplotlib does, without its copies and its checks for values outside or missing."""
     return table.take(np.minimum((unit * len(table)).astype(np.intp), len(table) - 1), axis=0)
 
 

@@ -1,4 +1,4 @@
-"""The whole method in one figure: photograph, polarization, four polarizers, four event streams, recovered DoLP."""
+"""The whole pipeline in one figure: photograph, polarization, four polarizers, four event streams, recovered DoLP."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from polarnet.reports.maps import dolp_image, hue_wheel, intensity_image, polari
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 ON, OFF = "#d0312d", "#1f5fb8"
-MOST_EVENTS = 25_000  # drawn per stream; beyond, every k-th event
+MOST_EVENTS = 25_000  # drawn per stream; above this number, every k-th event is drawn
 # The sheet, in inches. README pages show it about 900 pixels wide: hence few columns and large letters.
 HEIGHT = 4.45
 TOP, BOTTOM = 4.0, 0.2
@@ -31,26 +31,26 @@ STREAM_WIDTH = 2.1
 
 
 class Overview(NamedTuple):
-    """One test sequence, from the picture it moved over to what the network made of one of its windows."""
+    """One test sequence, from the picture that the sensor moved over to the DoLP recovered from one window."""
 
     name: str
     picture: UInt8[np.ndarray, "height width 3"]
     path: Float[np.ndarray, "2 times"]
-    """Of the window's centre over the whole sequence: x and y in fractions of the picture's width and height."""
+    """Path of the sensor's centre over the sequence: x and y in fractions of the picture's width and height."""
     outline: Float[np.ndarray, "2 corners"]
-    """Of the window at the end, in the same fractions."""
+    """Outline of the sensor at the end, in the same fractions."""
     intensity: Float[Tensor, "4 h w"]
     dolp: Float[Tensor, "h w"]
     aolp: Float[Tensor, "h w"]
     streams: Sequence[Events]
-    """Of the four polarizers, from `start_us` on."""
+    """Events of the four channels, from `start_us` on."""
     start_us: int
     duration_us: int
     recovered: Float[Tensor, "h w"]
 
 
 def overview_figure(overview: Overview) -> Figure:
-    """The method from left to right, drawn from the data of one sequence."""
+    """Draw the pipeline from left to right, with the data of one sequence."""
     height, width = overview.dolp.shape
     with matplotlib.rc_context(chart_style(LIGHT)):
         pictures = (LARGE + MEDIUM + SMALL) * width / height + PICTURE_WIDTH + STREAM_WIDTH
@@ -79,7 +79,7 @@ def overview_figure(overview: Overview) -> Figure:
 
 
 def _row(index: int, height: float) -> float:
-    """Lower edge of a row of pictures."""
+    """Lower edge of a picture row."""
     return TOP - height - index * (height + GAP)
 
 
@@ -108,7 +108,7 @@ def _picture(figure: Figure, x: float, y: float, height: float, picture: np.ndar
 
 
 def _source(figure: Figure, x: float, overview: Overview) -> None:
-    """The picture with the window's way over it, and below how its colours are read."""
+    """Draw the picture with the sensor's path over it, and the key to its colours below."""
     rows, columns = overview.picture.shape[:2]
     height = PICTURE_WIDTH * rows / columns
     _heading(figure, x, "picture")
@@ -132,7 +132,7 @@ def _source(figure: Figure, x: float, overview: Overview) -> None:
 
 
 def _arrow(figure: Figure, x: float, text: str) -> float:
-    """An arrow to the next column and what happens on the way; where that column starts."""
+    """Draw an arrow to the next column, labelled with the processing step; returns the column's left edge."""
     middle = (TOP + BOTTOM) / 2
     ends = [((x + inset) / figure.get_figwidth(), middle / HEIGHT) for inset in (0.1, ARROW - 0.1)]
     figure.add_artist(FancyArrowPatch(*ends, transform=figure.transFigure, arrowstyle="-|>", mutation_scale=14,
@@ -142,7 +142,7 @@ def _arrow(figure: Figure, x: float, text: str) -> float:
 
 
 def _cloud(axes: Axes, events: Events, overview: Overview) -> None:
-    """Events in space and time: the sensor seen from the side, time running to the right."""
+    """Draw events in space and time: the sensor seen from the side, time running to the right."""
     step = max(1, -(-len(events) // MOST_EVENTS))
     t, x, y, p = (column.numpy(force=True)[::step] for column in (events.t, events.x, events.y, events.p))
     across, up = _oblique((t - overview.start_us) / overview.duration_us, x / events.width, y / events.height)
@@ -157,5 +157,5 @@ def _cloud(axes: Axes, events: Events, overview: Overview) -> None:
 
 
 def _oblique(time: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where a point of the space-time box (all coordinates 0 to 1, y down) lies on the page."""
+    """Position on the page of a point in the space-time box (all coordinates 0 to 1, y down)."""
     return 0.72 * time + 0.28 * x, 0.72 * (1 - y) + 0.28 * x

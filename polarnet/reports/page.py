@@ -1,4 +1,4 @@
-"""data/report/index.html: one self-contained page with everything that a run showed."""
+"""data/report/index.html: one self-contained page with all results of a run."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -74,9 +74,9 @@ class Card(NamedTuple):
 
 
 def write_report(paths: ReportPaths, run: Run, folder: Path) -> Path:
-    """Write index.html, and beside it the pictures worth keeping on their own: overview.png and comparison.png.
+    """Write index.html and, beside it, overview.png and comparison.png.
 
-    The page needs no other file and no network. FileNotFoundError that names what is missing and the stage to run.
+    The page needs no other file and no network. FileNotFoundError names missing artefacts and the stage to run.
     """
     artefacts = read_artefacts(paths)
     legend = legend_of(artefacts.details["weights"])
@@ -148,7 +148,7 @@ def _context(artefacts: Artefacts, run: Run, overview: bytes | None, legend: Leg
 
 
 def _set(one: SetResults, legend: Legend) -> dict[str, Any]:
-    """A test set beyond the simulated one."""
+    """Template values of a test set other than the simulated one."""
     return {
         "title": SET_TITLES.get(one.name, one.name),
         "about": SET_ABOUT.get(one.name, ""),
@@ -159,7 +159,7 @@ def _set(one: SetResults, legend: Legend) -> dict[str, Any]:
 
 
 def _cards(metrics: Scores, legend: Legend) -> list[Card]:
-    """The network's scores, each with what it has to beat."""
+    """The network's scores, each with those of its rivals."""
     if "ours" not in metrics:
         return []
     cards = []
@@ -193,7 +193,7 @@ def _training(history: History, of: str) -> dict[str, Any]:
 
 
 def _sections(parameters: Mapping[str, Any]) -> dict[str, list[tuple[str, Any]]]:
-    """Dotted keys and values by the top-level section they belong to; single values together, under general."""
+    """Dotted keys and values by top-level section; single values are under general."""
     sections: dict[str, list[tuple[str, Any]]] = {"general": []}
     for name, value in parameters.items():
         if isinstance(value, Mapping):

@@ -9,7 +9,7 @@ DOTS_PER_INCH = 160
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as PNG bytes that depend on nothing but what is drawn."""
+    """Encode a figure as PNG bytes that depend only on its content."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure)
     compression = {"compress_level": 9}

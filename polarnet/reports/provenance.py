@@ -1,4 +1,4 @@
-"""Where a report comes from: the code, the machine and the versions that made it."""
+"""Provenance of a report: the code, machine and package versions behind it."""
 
 import importlib.metadata
 import platform
@@ -15,18 +15,18 @@ PACKAGES = ("polarnet", "torch", "numpy", "numba", "zarr", "opencv-contrib-pytho
 
 @dataclass(frozen=True)
 class Run:
-    """What the page says about how its results came to be."""
+    """Provenance of a run's results, as shown on the page."""
 
     command: str
-    """What a person types to get them again."""
+    """Command that reproduces the results."""
     parameters: Mapping[str, Any]
-    """params.yaml as it was in use: sections and single values."""
+    """The params.yaml in use: sections and single values."""
     facts: Mapping[str, str]
     """Seed, commit, machine, versions."""
 
 
 def facts(root: Path) -> dict[str, str]:
-    """Commit of the project at `root` where it has one, and machine and versions of this process."""
+    """Commit of the project at `root`, if any, and machine and versions of this process."""
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
     return {
         "commit": _commit(root),
@@ -36,19 +36,19 @@ def facts(root: Path) -> dict[str, str]:
 
 
 def measured_with(record: Mapping[str, Any]) -> str:
-    """Machine, load, versions and commit of a record of docs/results (`polarnet.measure.machine_record`), in words."""
+    """Machine, load, versions and commit of a record in docs/results (`polarnet.measure.machine_record`), as text."""
     versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
     where = f"{record['machine']}, load {record['load']:.1f} before the start"
     return f"{where}; {versions}; commit `{record['commit'][:10]}`"
 
 
 def origin(record: Mapping[str, Any]) -> str:
-    """The sentence below a table of docs/results: on how many cores, and with what, it was measured."""
+    """The sentence below a table of docs/results: number of cores, machine and versions of the measurement."""
     return f"On {cores(record)} ({measured_with(record)})."
 
 
 def cores(record: Mapping[str, Any]) -> str:
-    """How many were used, in words."""
+    """Number of cores used, in words."""
     return "one core" if record["cores"] == 1 else f"{record['cores']} cores"
 
 
@@ -56,22 +56,22 @@ def _commit(root: Path) -> str:
     commit = git(root, "rev-parse", "HEAD")
     if not commit:
         return "none: not a git repository with a commit"
-    # what the pipeline itself writes is no change of the code
+    # the pipeline's own outputs do not count as changes of the code
     changed = git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!dvc.lock", ":!data")
     return f"{commit}, with uncommitted changes" if changed else commit
 
 
 def git(root: Path, *arguments: str) -> str:
-    """What a git command prints, empty where it fails."""
+    """Output of a git command; empty if it fails."""
     try:
         done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True)
-    except FileNotFoundError:  # a machine without git
+    except FileNotFoundError:  # git is not installed
         return ""
     return done.stdout.strip() if done.returncode == 0 else ""
 
 
 def processor() -> str:
-    """The processor's name, as the system has it."""
+    """The processor's name, as reported by the system."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]

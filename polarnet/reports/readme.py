@@ -1,7 +1,7 @@
-"""Blocks of README.md and docs/*.md that are written from docs/results/NAME.json, so that no measured number is typed.
+"""Write result blocks of README.md and docs/*.md from docs/results/NAME.json, so that no measured number is typed.
 
-A block lies between `<!-- results:NAME -->` and `<!-- /results:NAME -->`; NAME-SECTION needs
-that section of NAME.json alone.
+A block lies between `<!-- results:NAME -->` and `<!-- /results:NAME -->`; NAME-SECTION needs that section of NAME.json
+alone.
 """
 
 import json
@@ -38,10 +38,10 @@ MARKER = re.compile(r"<!-- (?P<end>/?)results:(?P<name>[\w-]+) -->")
 
 
 def update_results_blocks(root: Path, check: bool) -> list[Path]:
-    """Rewrite every block from its committed results; the files that changed.
+    """Rewrite every block from its committed results, and return the changed files.
 
-    With `check` nothing is written and the list names the files that are out of date. Raises ValueError for a block
-    that is not closed or that nothing renders, FileNotFoundError where its results have not been measured.
+    With `check` nothing is written, and the list names the outdated files. ValueError for a block that is not closed or
+    has no renderer; FileNotFoundError where its results have not been measured.
     """
     changed = []
     for path in [root / "README.md", *sorted((root / "docs").glob("*.md"))]:
@@ -57,7 +57,7 @@ def update_results_blocks(root: Path, check: bool) -> list[Path]:
 
 
 def pipeline_block(results: Mapping[str, Any]) -> str:
-    """The benchmark table of one measured run of the whole pipeline, and what the run took.
+    """The benchmark table of one measured run of the whole pipeline, and the run's duration.
 
     `results` is docs/results/pipeline.json as `polarnet.measure` writes it; `metrics` is data/benchmark/metrics.json.
     """
@@ -78,7 +78,7 @@ def pipeline_block(results: Mapping[str, Any]) -> str:
 
 
 def benchmark_block(results: Mapping[str, Any]) -> str:
-    """A table for each test set of docs/results/benchmark.json, and how `ours` does scene by scene."""
+    """A table for each test set of docs/results/benchmark.json, and scene-by-scene comparisons of `ours`."""
     lines = []
     for name, title in SET_TITLES.items():
         if name not in results:
@@ -101,7 +101,7 @@ def benchmark_block(results: Mapping[str, Any]) -> str:
 def emulation_block(results: Mapping[str, Any]) -> str:
     """The pixel models' seconds and timing errors, golden cases and the paper set.
 
-    `results` is docs/results/emulation.json as tests/benchmarks/emulation.py writes it; what it lacks is left out.
+    `results` is docs/results/emulation.json as tests/benchmarks/emulation.py writes it; missing entries are left out.
     """
     models = [name for name, figures in results.items() if "seconds_1_thread" in _mapping(figures)]
     columns = [
@@ -131,12 +131,12 @@ def emulation_block(results: Mapping[str, Any]) -> str:
 
 
 def inspection_block(results: Mapping[str, Any]) -> str:
-    """What `polarnet inspect` says of a capture of the simulated rig."""
+    """Output of `polarnet inspect` for a capture of the simulated rig."""
     return "\n".join(["```", *results["lines"], "```"])
 
 
 def throughput_block(results: Mapping[str, Any]) -> str:
-    """How fast each network trains and runs under each setting, and where torch spends the time.
+    """Training and inference speed of each network under each setting, and the distribution of torch's time.
 
     `results` is docs/results/network.json as tests/benchmarks/training.py writes it.
     """
@@ -177,7 +177,7 @@ def throughput_block(results: Mapping[str, Any]) -> str:
     ])  # fmt: skip
 
 
-TRAINING_FLOPS = 3  # of a forward pass: backward multiplies once for the inputs and once for the weights
+TRAINING_FLOPS = 3  # relative to a forward pass: backward multiplies once for the inputs and once for the weights
 
 GOLDEN_CASES = 23  # 15 of v2e, 8 of ESIM
 EMULATION_COLUMNS = (
@@ -209,7 +209,7 @@ RENDERERS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "sweep": loss_sweep_block,
     "lpips-cost": lpips_block,
 }
-"""What writes the block of each name."""
+"""Renderer of each block by name."""
 
 UNMEASURED = {
     "benchmark": "Not measured yet: `python tests/benchmarks/study.py --write` does it.",
@@ -227,7 +227,7 @@ UNMEASURED = {
     "network-throughput": "Not measured yet: `python tests/benchmarks/training.py --write` does it.",
     "lpips-cost": "Not measured yet: `python tests/benchmarks/lpips.py --write` does it.",
 }
-"""Blocks that may stand in a document before their results do, and what they say until then."""
+"""Placeholder text of blocks that may appear in a document before their results exist."""
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

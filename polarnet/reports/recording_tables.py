@@ -1,4 +1,4 @@
-"""The blocks of the docs that show what docs/results/recordings.json holds; what it lacks is left out."""
+"""Docs blocks from docs/results/recordings.json; missing sections are left out."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -8,11 +8,11 @@ from polarnet.reports.tables import as_markdown, score_table
 
 Figures = Mapping[str, Any]
 ENDINGS = ("read", "repaired", "refused")
-"""How reading a damaged file may end."""
+"""Possible outcomes of reading a damaged file."""
 
 
 def recordings_block(results: Figures) -> str:
-    """Speed and memory of the readers, how they take damage, and the simulated rig; each with where it was measured."""
+    """Speed and memory of the readers, their handling of damage, and the simulated rig, each with its machine."""
     sections = {"readers": readers_lines, "fuzz": fuzz_lines, "rig": rig_lines, "rig_full": rig_lines}
     lines: list[str] = []
     for name, lines_of in sections.items():
@@ -22,7 +22,7 @@ def recordings_block(results: Figures) -> str:
 
 
 def readers_lines(readers: Figures) -> Iterator[str]:
-    """A row for each format: millions of events a second of each reader, and the memory of ours."""
+    """A row per format: millions of events a second for each reader, and the memory of polarnet's."""
     own = [name for name in readers if not any(name.endswith(f"_{other}") for other in readers)]
     libraries = sorted({name.removesuffix(f"_{form}") for form in own for name in readers if name.endswith(f"_{form}")})
     sizes = list(dict.fromkeys(size for form in own for size in readers[form]["peak_mib"]))
@@ -42,7 +42,7 @@ def readers_lines(readers: Figures) -> Iterator[str]:
 
 
 def fuzz_lines(fuzz: Figures) -> Iterator[str]:
-    """A row for each reader: how many damaged files it was given, and how they ended."""
+    """A row per reader: the number of damaged files, and of each outcome."""
     yield f"Damaged files, at least {fuzz['cases_per_reader']:,} for each reader, none of which ended otherwise:"
     yield ""
     yield from table(
@@ -69,7 +69,7 @@ def rig_lines(rig: Figures) -> Iterator[str]:
 
 
 def recover_block(results: Figures) -> str:
-    """How fast `polarnet recover` is with each method, from a file and live."""
+    """Speed of `polarnet recover` with each method, from a file and live."""
     found = results["recover"]
     names = {"network": f"network `{found['network']}`, {found['precision']}"}
     rows = (
@@ -89,7 +89,7 @@ def recover_block(results: Figures) -> str:
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    """Lines of a GitHub table, its first column of words and the others of numbers."""
+    """Lines of a GitHub table with text in the first column and numbers in the others."""
     yield f"| {' | '.join(headings)} |"
     yield "|---|" + "---:|" * (len(headings) - 1)
     for row in rows:

@@ -9,7 +9,7 @@ from polarnet.reports.maps import encode_png, event_full_scale, event_image, int
 
 
 def recording_picture(inspection: Inspection) -> bytes:
-    """A PNG of the busiest events, hot pixels left out: ON red, OFF blue; of the first picture where there are none."""
+    """A PNG of the busiest events without hot pixels, ON red and OFF blue; without events, the first full picture."""
     if inspection.on + inspection.off == 0 and inspection.first_picture is not None:
         return encode_png(intensity_image(torch.from_numpy(inspection.first_picture / np.float32(WHITE))))
     signed = torch.from_numpy(np.where(inspection.hot, 0, inspection.busiest)).float()

@@ -1,7 +1,7 @@
-"""What `polarnet recover` leaves behind: numbers (Zarr, EXR), pictures (PNG), a video, and a page to look at.
+"""Write the results of `polarnet recover`: numbers (Zarr, EXR), pictures (PNG), a video, and a page.
 
-A picture shows DoLP, AoLP and the events of the window side by side. All is written as frames come, in memory that does
-not grow with their number.
+A picture shows DoLP, AoLP and the events of the window side by side. Everything is written as frames arrive, in
+constant memory.
 """
 
 from collections import deque
@@ -37,15 +37,15 @@ from polarnet.stokes import Prediction
 
 VIDEO, CODEC = "recovered.mp4", "mp4v"  # MPEG-4, which players show and browsers do not
 FILM_FRAMES = 24
-"""At least so many pictures, evenly spread, run on the page."""
-PNG_STORED, NO_FILTER = 0, 8  # not compressed, libpng's PNG_FILTER_NONE: larger, but quick to write
+"""Minimum number of pictures in the page's animation, evenly spread (fewer if there are fewer frames)."""
+PNG_STORED, NO_FILTER = 0, 8  # no compression, libpng's PNG_FILTER_NONE: larger files, but fast to write
 FRAMES_PER_CHUNK = 32
 ZARR_CODEC = BloscCodec(cname="lz4", shuffle="shuffle")
-MOST_WAITING = 64  # frames that are not written yet
-FEW_CORES = 2  # all are the network's: a thread that writes meanwhile holds up the others at every operation
+MOST_WAITING = 64  # frames queued for writing
+FEW_CORES = 2  # up to this number, the network needs all cores: a concurrent writing thread delays every operation
 SHOWN_ON_PAGE = 6
 GAP = 4  # pixels between the maps of a picture
-SCALE_KEPT = 0.9  # of the events' full scale, from one picture to the next: it must not flicker
+SCALE_KEPT = 0.9  # share of the previous picture's full scale of events, which prevents flicker
 ZARR_CONVENTIONS = {
     "t_us": "time, microseconds from the first event: the end of the window that a frame was recovered from",
     "dolp": "degree of linear polarization, divided by 65535",
@@ -55,7 +55,7 @@ ZARR_CONVENTIONS = {
 
 
 class Film(NamedTuple):
-    """Pictures below each other as one, which the page's style moves through."""
+    """Pictures stacked into one image, through which the page's style moves."""
 
     source: str
     frames: int
@@ -72,7 +72,7 @@ class Shown(NamedTuple):
 
 @dataclass
 class _Kept:
-    """Some of the pictures, evenly spread over however many come."""
+    """A sample of the pictures, evenly spread over a stream of unknown length."""
 
     pictures: list[Shown]
     every: int = 1
@@ -85,10 +85,10 @@ class _Kept:
 
 
 class RecoveryWriter:
-    """Writes frames into a folder as they come; use it in a `with`, which waits for the last and closes the files.
+    """Writes frames into a folder as they arrive; as a context manager it waits for the last and closes the files.
 
-    `outputs` are some of zarr, png, exr and mp4. The folder gets recovered.zarr, png/*.png, exr/*.exr and recovered.mp4
-    (`video_rate_hz` frames a second, whatever the time between them), and with `write_page` index.html and
+    `outputs` is a subset of zarr, png, exr and mp4. The folder gets recovered.zarr, png/*.png, exr/*.exr and
+    recovered.mp4 (`video_rate_hz` frames a second, whatever the time between them). `write_page` adds index.html and
     recovered.png.
     """
 
@@ -121,13 +121,13 @@ class RecoveryWriter:
                 self._video.release()
 
     def add(self, window: EventWindow, found: Prediction) -> None:
-        """A frame, on the CPU; returns before it is written, unless many wait already or cores are few."""
+        """Add a frame on the CPU; returns before it is written, unless the queue is long or cores are few."""
         self._waiting.append(self._thread.submit(self._write, self.frames, window, found))
         self._wait(MOST_WAITING if usable_cores() > FEW_CORES else 0)
         self.frames += 1
 
     def write_page(self, title: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:
-        """index.html and recovered.png; call it after the `with`."""
+        """Write index.html and recovered.png; call it after the `with` block."""
         some = _spread(self._kept.pictures, SHOWN_ON_PAGE)
         if some:
             sheet = np.concatenate([_with_margin(shown.picture) for shown in some[1::2] or some])
@@ -208,7 +208,7 @@ class RecoveryWriter:
 
 
 def signed_events(window: EventWindow) -> Float[Tensor, "h w"]:
-    """ON minus OFF events of all four polarizers, pixel by pixel."""
+    """ON minus OFF events of the four channels, summed per pixel."""
     first = window.channels[0]
     image = torch.zeros(first.height * first.width)
     for events in window.channels:
@@ -245,13 +245,13 @@ def _with_margin(picture: np.ndarray) -> np.ndarray:
 
 def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
     spec = oiio.ImageSpec(picture.shape[1], picture.shape[0], 3, oiio.UINT8)
-    spec["png:compressionLevel"] = PNG_STORED  # thousands of them are written while a camera runs
+    spec["png:compressionLevel"] = PNG_STORED  # thousands of files are written while a camera runs
     spec["png:filter"] = NO_FILTER
     _write_picture(path, spec, picture)
 
 
 def _write_exr(path: Path, found: Prediction) -> None:
-    """Channels DoLP and, where there are any, AoLP (radians) and log_variance, as half floats."""
+    """Write the channels DoLP and, if present, AoLP (radians) and log_variance, as half floats."""
     maps = {"DoLP": found.dolp, "AoLP": found.aolp, "log_variance": found.log_variance}
     known: dict[str, Any] = {name: values for name, values in maps.items() if values is not None}
     height, width = found.dolp.shape

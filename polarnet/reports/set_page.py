@@ -1,4 +1,4 @@
-"""The page of one test set, as `polarnet benchmark --scenes` writes it: table, scenes, what each method makes of it."""
+"""The page of one test set, written by `polarnet benchmark --scenes`: table, scenes and each method's predictions."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,9 +30,9 @@ from polarnet.reports.tiles import (
 
 
 def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str]) -> Path:
-    """Write index.html and comparison.png beside the metrics.json, details.json and panels that lie in `folder`.
+    """Write index.html and comparison.png beside the metrics.json, details.json and panels in `folder`.
 
-    `notes` are sentences that a reader of the table has to know, such as which methods did not run and why.
+    `notes` are sentences for the reader of the table, such as the methods that did not run and the reasons.
     """
     results = read_set(folder)
     legend = legend_of(results.details["weights"])

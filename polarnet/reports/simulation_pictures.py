@@ -35,16 +35,16 @@ from polarnet.simulation.scene import scene_from_rgb
 FOLDER = Path("docs") / "pictures"
 PHOTO = "coffee.png"
 DURATION_MS = 500
-RATE_HZ = 2000.0  # at which the light of the pixel is given
-PIXELS = 12  # side by side under the same light, to show how they differ
+RATE_HZ = 2000.0  # sampling rate of the light on the pixel
+PIXELS = 12  # number of pixels side by side under the same light, to show their differences
 QUIET = replace(SENSORS["clean"], contrast_threshold_sigma=0.0)
 WINDOW_US = (200_000, 233_333)
-COLOURS = 96  # of a picture on disk
+COLOURS = 96  # palette size of a picture on disk
 LINE: dict[str, Any] = {"color": LIGHT.quiet, "linewidth": 1.3}
 
 
 class Variation(NamedTuple):
-    """A parameter of the pixel, and what it is set to in a picture."""
+    """A parameter of the pixel, and its values in a picture."""
 
     title: str
     name: str
@@ -81,11 +81,11 @@ SETTINGS: Mapping[str, dict[str, Any]] = {
     "esim": {"model": "esim"},
     "dvs_voltmeter": {"model": "dvs_voltmeter"},
 }
-"""Tiles of the window picture: what each changes in a noiseless `exact` pixel."""
+"""Tiles of the window picture: the changes of each to a noiseless `exact` pixel."""
 
 
 def light_of_one_pixel(t_ms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Digital numbers: a slow swell, a quick flash, then steady dim light."""
+    """Light on one pixel in digital numbers: a slow swell, a quick flash, then steady dim light."""
     swell = 0.7 * (1 - np.cos(2 * math.pi * t_ms.clip(0, 180) / 180)) / 2
     flash = (_edge(t_ms, 230.0) - _edge(t_ms, 290.0)) * 1.3
     return 69 * np.exp(swell + flash - 0.6 * _edge(t_ms, 340.0))
@@ -96,7 +96,7 @@ def _edge(t_ms: Float64[np.ndarray, " n"], at_ms: float) -> Float64[np.ndarray, 
 
 
 def pixel_events(config: EmulatorConfig, rate_hz: float = RATE_HZ, pixels: int = 1) -> Events:
-    """What neighbouring pixels under the light above report."""
+    """Events of neighbouring pixels under the light of `light_of_one_pixel`."""
     t_us = np.rint(np.arange(1 + DURATION_MS * 1e-3 * rate_hz) * 1e6 / rate_hz)
     frames = torch.from_numpy(light_of_one_pixel(t_us / 1000).astype(np.float32))
     (events,), _ = emulate(frames[:, None, None, None].expand(-1, 1, 1, pixels), torch.from_numpy(t_us), config, key=3)
@@ -104,7 +104,7 @@ def pixel_events(config: EmulatorConfig, rate_hz: float = RATE_HZ, pixels: int =
 
 
 def parameters_figure() -> Figure:
-    """Events of one pixel as each parameter of its physics varies."""
+    """Draw one pixel's events for several values of each physical parameter."""
     t_ms = np.linspace(0, DURATION_MS, 2001)
     with matplotlib.rc_context(chart_style(LIGHT)):
         figure = Figure(figsize=(9.0, 5.2), layout="constrained", facecolor=LIGHT.face)
@@ -126,7 +126,7 @@ def parameters_figure() -> Figure:
 
 
 def crossings_figure() -> Figure:
-    """Where log intensity meets thresholds, and when `exact` and `v2e` say it did, from frames of 60 Hz."""
+    """Draw the threshold crossings of log intensity, and their times by `exact` and `v2e`, from frames at 60 Hz."""
     rate_hz, threshold = 60.0, QUIET.contrast_threshold_on
     frames_ms = np.arange(0, 200, 1000 / rate_hz)
     t_ms = np.linspace(0, frames_ms[-1], 2001)
@@ -156,7 +156,7 @@ def crossings_figure() -> Figure:
 
 
 def window_figure() -> Figure:
-    """One thirtieth of a second of the coffee photograph's events, behind the polarizer at 0 degrees."""
+    """Draw one thirtieth of a second of the coffee photograph's events, behind the polarizer at 0 degrees."""
     scene = scene_from_rgb(read_rgb(_photo()))
     motion = replace(MOTIONS["default"], window_height=100, window_width=150, speed_min_px_s=150.0)
     trajectory = random_trajectory(motion, scene.height, scene.width, np.random.default_rng(4))
@@ -175,7 +175,7 @@ def window_figure() -> Figure:
 
 
 def motion_figure() -> Figure:
-    """Ways of the window over a picture as the parameters of the motion vary."""
+    """Draw the sensor's path over a picture for several values of the motion parameters."""
     picture = read_rgb(_photo()).permute(1, 2, 0).numpy()
     default = MOTIONS["default"]
     slow = replace(default, speed_min_px_s=40.0, speed_max_px_s=50.0)
@@ -198,7 +198,7 @@ def motion_figure() -> Figure:
 
 
 def _way(axes: Axes, trajectory: Trajectory, motion: MotionConfig) -> None:
-    """The window's centre over a second, and its outline at five times, the last one strongest."""
+    """Draw the path of the sensor's centre over a second, and its outline at five times, the last one strongest."""
     pose = trajectory.pose(np.linspace(0, motion.duration_s, 200))
     axes.plot(pose.x, pose.y, color="white", linewidth=1.6)
     height, width = motion.window_height, motion.window_width
@@ -210,7 +210,7 @@ def _way(axes: Axes, trajectory: Trajectory, motion: MotionConfig) -> None:
 
 
 def _light(axes: Axes, t_ms: Float64[np.ndarray, " n"], title: str) -> None:
-    """Log light on the upper half of a panel; rows of events come below."""
+    """Draw log light on the upper half of a panel; rows of events come below."""
     log = np.log(light_of_one_pixel(t_ms))
     axes.plot(t_ms, -0.3 - 2.2 * (log - log.min()) / np.ptp(log), **LINE)
     axes.set_title(title, loc="left", fontsize=9)
@@ -251,7 +251,7 @@ def _photo() -> Path:
 
 
 def few_colours(content: bytes) -> bytes:
-    """The same picture with a palette: a third of the bytes, and no difference that an eye finds."""
+    """Reduce the picture to a palette: a third of the bytes, without a visible difference."""
     buffer = io.BytesIO()
     picture = Image.open(io.BytesIO(content)).convert("RGB")
     picture.quantize(COLOURS, dither=Image.Dither.NONE).save(buffer, format="png", optimize=True)
@@ -267,7 +267,7 @@ FIGURES = {
 
 
 def main() -> None:
-    """Write them all."""
+    """Write all pictures."""
     parser = argparse.ArgumentParser(description="Draw the pictures of docs/simulation.md.")
     parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help=f"default: {FOLDER}")
     folder = parser.parse_args().folder

@@ -1,4 +1,4 @@
-"""Figures of the event budget (paper, Fig. 11), the sensitivity to sensor and motion, and what trainings expect."""
+"""Figures of the event budget (paper, Fig. 11), the sensitivity to sensor and motion, expected errors, and losses."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from polarnet.reports.figures import (
 from polarnet.reports.legend import GENERAL
 from polarnet.reports.tables import SET_TITLES, in_order
 
-PAPER_EVENTS_PER_PIXEL = 1.04  # at which the paper's recovery is good (section 5)
+PAPER_EVENTS_PER_PIXEL = 1.04  # events per pixel at which the paper's recovery is good (section 5)
 SETTING_LABELS = {
     "threshold_mismatch": "threshold mismatch between pixels, log intensity",
     "noise_rate_hz": "shot noise, events per pixel and second",
@@ -33,7 +33,7 @@ SWEEP_SCORES = {
     "ssim": ("SSIM ↑", 1, 3),
     "lpips": ("LPIPS ↓", -1, 3),
 }
-"""Heading, 1 where more is better and -1 where less is, decimals."""
+"""Heading, 1 if higher is better and -1 if lower is, decimals."""
 
 
 def event_budget_figure(results: Mapping[str, Any], theme: Theme) -> Figure:
@@ -74,7 +74,7 @@ def event_budget_figure(results: Mapping[str, Any], theme: Theme) -> Figure:
 
 
 def sensitivity_figure(results: Mapping[str, Sequence[Mapping[str, Any]]], theme: Theme) -> Figure:
-    """PSNR and correlation against each setting, a column a setting."""
+    """PSNR and correlation against each setting, one column per setting."""
     with matplotlib.rc_context(chart_style(theme)):
         figure = Figure(figsize=(2.7 * len(results) + 0.4, 4.6), layout="constrained", facecolor="none")
         axes = figure.subplots(2, len(results), sharey="row", squeeze=False)
@@ -98,9 +98,9 @@ def sensitivity_figure(results: Mapping[str, Sequence[Mapping[str, Any]]], theme
 
 
 def expected_errors_figure(seeds: Mapping[str, Mapping[str, Any]], theme: Theme) -> Figure:
-    """Measured against expected squared error of DoLP, a column a set of scenes, a line a seed.
+    """Measured against expected squared error of DoLP, a column per set of scenes and a line per seed.
 
-    `seeds` are those of docs/results/expected_errors.json by number.
+    `seeds` are the entries of docs/results/expected_errors.json by seed number.
     """
     sets = list(dict.fromkeys(name for found in seeds.values() for name in found["sets"]))
     with matplotlib.rc_context(chart_style(theme)):
@@ -117,7 +117,7 @@ def expected_errors_figure(seeds: Mapping[str, Mapping[str, Any]], theme: Theme)
 
 
 def loss_sweep_figure(points: Sequence[Mapping[str, Any]], theme: Theme) -> Figure:
-    """Test scores by the weights of Eq. 9: a row a score, a column a weight of the MSE, SSIM against LPIPS inside.
+    """Test scores by the weights of Eq. 9: a row per score, a column per MSE weight, SSIM against LPIPS weights inside.
 
     `points` are those of docs/results/sweep.json. Lighter is better, the best of a score is bold, and the frame marks
     the point with the smallest validation MSE. Combinations that were not trained stay empty.
@@ -175,7 +175,7 @@ def _lines(
 
 
 def _log_ticks(axes: Axes, values: Sequence[float]) -> None:
-    """A logarithmic axis with ticks where the points are, as far as there is room."""
+    """Make the axis logarithmic, with ticks at the points where there is room."""
     axes.set_xscale("log")
     shown = [value for value in values if value > 0]
     kept: list[float] = []

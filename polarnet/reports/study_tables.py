@@ -1,4 +1,4 @@
-"""Tables of what tests/benchmarks/study.py, scenes.py and lpips.py measure: networks, scenes, events, LPIPS."""
+"""Tables of the results of tests/benchmarks/study.py, scenes.py and lpips.py: networks, scenes, events, LPIPS."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,19 +12,19 @@ from polarnet.reports.tables import LABELS, SET_TITLES, in_order
 
 
 def seeds_of(results: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """What docs/results/network.json holds of each seed of the trainings, by its number."""
+    """The entries of docs/results/network.json by training seed."""
     return {name.removeprefix("seed_"): found for name, found in results.items() if name.startswith("seed_")}
 
 
 def over_seeds(seeds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The means of what the seeds say of the two DoLP networks."""
+    """Means over the seeds of the comparisons of the two DoLP networks."""
     means = {key: fmean(found[key] for found in seeds) for key in _OF_NETWORKS}
     measured = fmean(found["measured"]["mse_over_best_baseline"] for found in seeds)
     return means | {"measured": {"mse_over_best_baseline": measured}}
 
 
 def study_block(results: Mapping[str, Any]) -> str:
-    """The two DoLP networks over all seeds, beside the rows that they must beat, by tests/benchmarks/study.py.
+    """The two DoLP networks over all seeds, with the rows that they must beat, from tests/benchmarks/study.py.
 
     `results` is docs/results/network.json; every method is in the tables of benchmark.json.
     """
@@ -59,9 +59,9 @@ def study_block(results: Mapping[str, Any]) -> str:
 
 
 def expected_errors_block(results: Mapping[str, Any]) -> str:
-    """How far the errors that trainings of ours expect are from those that are measured.
+    """Differences between the errors that our trained networks expect and the measured errors.
 
-    `results` is docs/results/expected_errors.json, by tests/benchmarks/study.py.
+    `results` is docs/results/expected_errors.json, written by tests/benchmarks/study.py.
     """
     seeds = seeds_of(results)
     names = next(iter(seeds.values()))["sets"]
@@ -77,7 +77,7 @@ def expected_errors_block(results: Mapping[str, Any]) -> str:
 
 
 def headline_block(results: Mapping[str, Any]) -> str:
-    """Means over the seeds alone, of the DoLP networks and of what they must beat, and how fast ours runs.
+    """Means over the seeds for the DoLP networks and the rows they must beat, and the speed of ours.
 
     `results` is docs/results/network.json.
     """
@@ -125,7 +125,7 @@ def _said(found: Mapping[str, Any]) -> str:
 
 
 def _row(label: str, scores: Sequence[Mapping[str, float | None]]) -> str:
-    """One line of a table; of several seeds the mean and what they scatter by."""
+    """One line of a table; for several seeds, the mean and standard deviation."""
     cells = []
     for key, _, decimals in STUDY_COLUMNS:
         values = [value for one in scores if (value := one[key]) is not None]
@@ -154,7 +154,7 @@ _OF_NETWORKS = ("gain_over_paper_db", "mse_over_paper", "mse_over_oracle_mean")
 
 
 def ablation_block(results: Mapping[str, Any]) -> str:
-    """What each part of the network and its training brings: the worst loss first, below the whole.
+    """The contribution of each part of the network and its training: below the whole, the worst loss first.
 
     `results` is docs/results/network.json; `polarnet measure ablation` writes the section.
     """
@@ -170,7 +170,7 @@ def ablation_block(results: Mapping[str, Any]) -> str:
 def loss_sweep_block(results: Mapping[str, Any]) -> str:
     """Scores by the weights of Eq. 9, the smallest validation MSE first.
 
-    `results` is docs/results/sweep.json; `polarnet measure sweep` writes it.
+    `results` is docs/results/sweep.json, written by `polarnet measure sweep`.
     """
     about, record = results["loss_weights"], results["records"]["loss_weights"]
     lines = [
@@ -210,9 +210,9 @@ SWEEP_COLUMNS = (
 
 
 def designs_block(results: Mapping[str, Any]) -> str:
-    """What was tried before today's network, in the order it was, each against the oracle mean.
+    """Designs tried before the present network, in chronological order, each compared with the oracle mean.
 
-    `results` is docs/results/designs.json; tests/benchmarks/designs.py collects it.
+    `results` is docs/results/designs.json, collected by tests/benchmarks/designs.py.
     """
     lines = ["| | trainings | over the oracle mean ↓ | " + " | ".join(label for _, label, _ in STUDY_COLUMNS)]
     lines[0] += " | measured MSE ↓ | commit |"
@@ -225,7 +225,7 @@ def designs_block(results: Mapping[str, Any]) -> str:
 
 
 def choices_block(results: Mapping[str, Any]) -> str:
-    """Scenes to train on, compared without the test split by tests/benchmarks/scenes.py.
+    """Choices of training scenes, compared without the test split by tests/benchmarks/scenes.py.
 
     `results` is docs/results/scenes.json.
     """
@@ -241,7 +241,7 @@ def choices_block(results: Mapping[str, Any]) -> str:
 
 
 def event_budget_block(results: Mapping[str, Any]) -> str:
-    """Ours and its rivals by events per pixel since the start, and what that says of the paper's claim.
+    """Scores of ours and its rivals by events per pixel since the start, and a comparison with the paper's claim.
 
     `results` is docs/results/event_budget.json.
     """
@@ -270,7 +270,7 @@ def event_budget_block(results: Mapping[str, Any]) -> str:
 
 
 def lpips_block(results: Mapping[str, Any]) -> str:
-    """How exact LPIPS is on each backbone, and its cost in scoring and in training.
+    """Error of LPIPS for each backbone, and its cost in scoring and in training.
 
     `results` is docs/results/lpips.json as tests/benchmarks/lpips.py writes it.
     """

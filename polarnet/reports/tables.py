@@ -1,4 +1,4 @@
-"""Benchmark scores as tables: chosen, rounded and ranked once, then written as Markdown, plain text or HTML."""
+"""Benchmark scores as tables: selected, rounded and ranked once, then written as Markdown, plain text or HTML."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,27 +9,27 @@ from polarnet.evaluation.references import REFERENCES
 from polarnet.evaluation.rows import ROWS
 
 Scores = Mapping[str, Mapping[str, Any]]
-"""Method, then metric: data/benchmark/metrics.json. None where there is no value; `<metric>_ci` holds an interval."""
+"""Method, then metric (data/benchmark/metrics.json). None marks a missing value; `<metric>_ci` holds an interval."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A metric as tables show it."""
+    """Presentation of a metric in tables."""
 
     label: str
     decimals: int
     better: Literal["low", "high"]
     ranked: bool
-    """Whether the best value is set in bold; a speed is no score."""
+    """Whether the best value is set in bold; speeds are not ranked."""
     unit: str
 
     @property
     def heading(self) -> str:
-        """Label with the direction in which the metric improves."""
+        """Label with an arrow in the direction of improvement."""
         return f"{self.label} {'↓' if self.better == 'low' else '↑'}"
 
     def printed(self, value: float | int) -> str:
-        """A value with the decimals of its column; what rounds to 0 has no sign."""
+        """A value with the decimals of its column; a value that rounds to 0 has no sign."""
         text = f"{value:.{self.decimals}f}"
         return text.removeprefix("-") if float(text) == 0 else text
 
@@ -50,20 +50,20 @@ ERROR_PARTS = {
     "level_mse": Column("level", 4, "low", True, ""),
     "pattern_mse": Column("pattern", 4, "low", True, ""),
 }
-"""MSE split in two: level, the squared error of the frame's mean, and pattern, what is left without it."""
+"""MSE split in two: level, the squared error of the frame's mean, and pattern, the remainder."""
 COSTS = {
     "ms_per_window": COLUMNS["ms_per_window"],
     "gflop": Column("GFLOP / window", 2, "low", False, " GFLOP"),
     "params": Column("parameters", 0, "low", False, ""),
     "peak_mib": Column("peak MiB", 1, "low", False, " MiB"),
 }
-"""What a method costs on the machine of the run."""
+"""Costs of a method on the machine of the run."""
 
 LABELS: Mapping[str, str] = MappingProxyType({name: row.label for name, row in ROWS.items()})
-"""Names of the rows where nothing says which networks are behind them, in the order of every table."""
+"""Default labels of the rows, in table order, for results that do not name the networks."""
 
 BACKBONES = {"squeeze": "SqueezeNet 1.1", "alex": "AlexNet", "vgg": "VGG16, like the paper's"}
-"""Readable names of those of LPIPS."""
+"""Readable names of the LPIPS backbones."""
 
 SET_TITLES = {
     "simulated": "Simulated",
@@ -106,13 +106,13 @@ class Cell(NamedTuple):
 
     text: str
     interval: str
-    """95 % interval, or nothing."""
+    """95 % interval; empty if there is none."""
     best: bool
-    """Whether no row of its column shows a better value; ties are all best."""
+    """Whether no row has a better value in this column; all ties are best."""
 
 
 class Row(NamedTuple):
-    """One method of a table."""
+    """One row of a table: a method and its values."""
 
     method: str
     label: str
@@ -120,7 +120,7 @@ class Row(NamedTuple):
 
 
 class Table(NamedTuple):
-    """What there is to show, before any markup."""
+    """The content of a table, without markup."""
 
     headings: tuple[str, ...]
     rows: tuple[Row, ...]
@@ -128,13 +128,13 @@ class Table(NamedTuple):
 
 
 def in_order(rows: Iterable[str]) -> list[str]:
-    """Rows in the order of every table and figure; unknown ones, of older results, come last."""
+    """Rows in the order of every table and figure; unknown rows, from older results, come last."""
     given = list(rows)
     return [name for name in ROWS if name in given] + [name for name in given if name not in ROWS]
 
 
 def with_structure(rows: Iterable[str]) -> list[str]:
-    """Rows in order, without the references, whose prediction is one value everywhere."""
+    """Rows in order, without the references, which predict one value everywhere."""
     return [name for name in in_order(rows) if name not in REFERENCES]
 
 
@@ -143,9 +143,9 @@ def score_table(
     columns: Mapping[str, Column] = MappingProxyType(COLUMNS),
     labels: Mapping[str, str] = LABELS,
 ) -> Table:
-    """Scores of the methods in the fixed order; a metric that no method has gets no column.
+    """Scores of the methods in the fixed order; a metric without any value gets no column.
 
-    LPIPS names the backbone that its rows have as `lpips_backbone`. Methods that `labels` has no name for follow under
+    The LPIPS heading names the backbone from the rows' `lpips_backbone`. Methods missing in `labels` come last, under
     their own key.
     """
     if not scores:
@@ -172,12 +172,12 @@ def score_table(
 
 
 def paper_table(experiment: Literal["simulated", "real"]) -> Table:
-    """Published figures: the paper's Table 2, one of its two experiments."""
+    """Published figures: one of the two experiments in the paper's Table 2."""
     return score_table(PAPER_TABLE_2[experiment], labels=PAPER_LABELS)
 
 
 def as_markdown(table: Table) -> str:
-    """A GitHub table: best values in bold, intervals small below their values, notes after it."""
+    """A GitHub table: best values in bold, intervals small below their values, notes at the end."""
     lines = ["| | " + " | ".join(table.headings) + " |", "|---|" + "---:|" * len(table.headings)]
     for row in table.rows:
         cells = (
@@ -203,7 +203,7 @@ def as_plain(table: Table) -> str:
 
 
 def standing(scores: Scores, labels: Mapping[str, str] = LABELS) -> list[str]:
-    """How `ours` compares with every other method: one sentence each, with the differences; none without `ours`."""
+    """Comparisons of `ours` with every other method, a sentence each, with the differences; empty without `ours`."""
     if "ours" not in scores:
         return []
     return [
@@ -218,7 +218,7 @@ def paired_lines(
     metric: str = "mse",
     labels: Mapping[str, str] = LABELS,
 ) -> list[str]:
-    """How `ours` does scene by scene against each other method, from details.json's `paired`; a sentence each."""
+    """Scene-by-scene comparisons of `ours` with every other method, a sentence each, from details.json's `paired`."""
     return [
         f"{labels.get(rival, rival)}: ours is better in {one['better']} of {one['scenes']} scenes "
         f"(effect {one['effect']:+.2f}, p = {one['p_holm']:.2g})."
@@ -239,7 +239,7 @@ def _differences(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> list[str]
 
 
 def _best(column: Column, values: Sequence[float | int | None]) -> str | None:
-    """The best value as it is printed, so that rows which read the same are bold together."""
+    """The best value as printed, so that rows with equal text are bold together."""
     known = [value for value in values if value is not None]
     if not column.ranked or not known:
         return None

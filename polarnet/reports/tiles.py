@@ -1,4 +1,4 @@
-"""Pictures of a page: panels of the benchmark as rows of tiles, and figures drawn for light and dark."""
+"""Pictures of a page: benchmark panels as rows of tiles, and figures for light and dark themes."""
 
 import base64
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +29,7 @@ DISTRIBUTION_METRICS = ("mse", "psnr", "ssim", "corr")
 
 
 class Tile(NamedTuple):
-    """A picture with what stands below it."""
+    """A picture with the text below it."""
 
     source: str
     label: str
@@ -37,7 +37,7 @@ class Tile(NamedTuple):
 
 
 class Chart(NamedTuple):
-    """A figure drawn for a light and for a dark page."""
+    """A figure in two versions, for a light and a dark page."""
 
     light: str
     dark: str
@@ -50,11 +50,11 @@ class TileRow(NamedTuple):
     name: str
     tiles: Sequence[Tile]
     more: int = 0
-    """Pictures that are left out."""
+    """Number of pictures left out."""
 
 
 def panel_tiles(panel: Panel, legend: Legend) -> list[Tile]:
-    """Events, truth, and every method that is not a constant."""
+    """Tiles of the events, the truth, and every method that is not a constant."""
     full_scale = event_full_scale(panel.events)
     tiles = [
         tile(event_image(panel.events[0], full_scale), "events, 0°", f"{panel.t_us / 1000:.0f} ms"),
@@ -72,7 +72,7 @@ def panel_tiles(panel: Panel, legend: Legend) -> list[Tile]:
 
 
 def polarization_tiles(panel: Panel, legend: Legend) -> list[Tile]:
-    """The truth's S0, DoLP and AoLP, alone and as one colour picture; then every method that has AoLP, lit by S0."""
+    """Tiles of the true S0, DoLP and AoLP, alone and combined in colour; then each method with AoLP, at the true S0."""
     ones, s0 = torch.ones_like(panel.truth_s0), panel.truth_s0
     tiles = [
         tile(intensity_image(s0), "true S0"),
@@ -87,7 +87,7 @@ def polarization_tiles(panel: Panel, legend: Legend) -> list[Tile]:
 
 
 def event_tiles(panel: Panel) -> list[Tile]:
-    """The window's events behind each polarizer, on one scale."""
+    """Tiles of the window's events in each channel, on one scale."""
     full_scale = event_full_scale(panel.events)
     return [
         tile(event_image(events, full_scale), f"{angle}°")
@@ -96,7 +96,7 @@ def event_tiles(panel: Panel) -> list[Tile]:
 
 
 def reliability_chart(details: Mapping[str, Any], legend: Legend) -> Chart | None:
-    """Of the methods in details.json that expect an error; None where there is none."""
+    """Reliability of the methods in details.json that predict their error; None if there are none."""
     curves = {
         method: [(predicted, measured, pixels) for predicted, measured, pixels in found["curve"]]
         for method, found in details.get("reliability", {}).items()
@@ -109,7 +109,7 @@ def reliability_chart(details: Mapping[str, Any], legend: Legend) -> Chart | Non
 
 
 def distribution(scene_means: Mapping[str, Mapping[str, Mapping[str, float]]], legend: Legend) -> Chart:
-    """Every scene of a test set, from metric, then method, then scene."""
+    """Scores of every scene in a test set; `scene_means` is metric, then method, then scene."""
     shown = {
         metric: {method: list(scenes.values()) for method, scenes in scene_means[metric].items()}
         for metric in DISTRIBUTION_METRICS
@@ -119,23 +119,23 @@ def distribution(scene_means: Mapping[str, Mapping[str, Mapping[str, float]]], l
 
 
 def chart(draw: Callable[[Theme], Figure], alt: str) -> Chart:
-    """A figure for either theme, inside the page."""
+    """Draw a figure for both themes, embedded in the page."""
     light, dark = (data_uri(png(draw(theme)), "png") for theme in (LIGHT, DARK))
     return Chart(light, dark, alt)
 
 
 def tile(picture: UInt8[np.ndarray, "h w 3"], label: str, detail: str = "") -> Tile:
-    """A picture, inside the page."""
+    """A tile with its picture embedded in the page."""
     return Tile(data_uri(encode_png(picture), "png"), label, detail)
 
 
 def data_uri(content: bytes, kind: str) -> str:
-    """A picture file's content as an address."""
+    """Encode a picture file's content as a data URI."""
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def template(name: str) -> Template:
-    """A page's template of this package: every value escaped, and one that is missing an error."""
+    """Load a page template of this package: every value is escaped, and a missing value is an error."""
     environment = Environment(
         loader=PackageLoader("polarnet.reports", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )

@@ -1,1 +1,1 @@
-"""The file formats of cameras and tools: one module each, which turns a file into blocks of columns."""
+"""File formats of cameras and tools: each module turns one format into blocks of columns."""

@@ -1,8 +1,8 @@
-"""AEDAT-2 files of jAER, of a DAVIS (the PDAVIS is one): a header of # lines, then 8 bytes an event, big endian.
+"""AEDAT-2 files of jAER from a DAVIS (such as the PDAVIS): a header of # lines, then 8 bytes per event, big endian.
 
-The first four are an address: y from the bottom in bits 22 to 30, x in bits 12 to 21, the polarity in bit 11. Where bit
-31 (a picture's sample) or bit 10 (of the IMU, or from outside) is set, it is no event of a pixel. The others are
-microseconds.
+The first four bytes are an address: y from the bottom in bits 22 to 30, x in bits 12 to 21, the polarity in bit 11.
+Entries with bit 31 (a picture's sample) or bit 10 (from the IMU or outside) set are not pixel events. The other four
+bytes are microseconds.
 """
 
 import re
@@ -15,21 +15,21 @@ import numpy as np
 from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, running_on, sensor_size
 
 MAGIC = b"#!AER-DAT2"
-LAST_LINE = b"#End Of ASCII Header"  # of newer files; an event can begin with # too
-MOST_HEADER_BYTES = 2**20  # jAER writes its settings there
+LAST_LINE = b"#End Of ASCII Header"  # only in newer files; an event can begin with # too
+MOST_HEADER_BYTES = 2**20  # jAER writes its settings into the header
 EVENT_BYTES = 8
 NO_EVENT = 1 << 31 | 1 << 10
 SENSORS = {b"346": (260, 346), b"240": (180, 240), b"128": None}
-"""Height and width by the number in the name of the camera's class in the header; the DVS128 has other addresses."""
+"""Height and width by the number in the camera's class name in the header; the DVS128 uses another address layout."""
 
 
 def matches(path: Path, head: bytes) -> bool:
-    """By its first bytes."""
+    """Whether the file starts with the format's signature."""
     return head.startswith(MAGIC)
 
 
 def open_aedat2(path: Path, choices: Choices) -> Source:
-    """The events of a DAVIS; times that wrap after 71 minutes are made to run on."""
+    """Open the events of a DAVIS; times that wrap after 71 minutes are unwrapped."""
     with path.open("rb") as file:
         data = file.read(MOST_HEADER_BYTES)
     start, ended = 0, False

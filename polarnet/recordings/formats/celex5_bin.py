@@ -1,11 +1,11 @@
 """Raw files of a CeleX-5 (BIN, little endian): packages of events or of a full picture, as the sensor sends them.
 
-A header (data type: bit 0 loop mode, bit 1 IMU; the modes of the sensor; the event format; the time of day; how many
-packages), then packages: a length, that many bytes, and with an IMU also the computer's time in milliseconds and the
-IMU's samples. The last byte of a package is 0 for a full picture.
+A header gives the data type (bit 0 loop mode, bit 1 IMU), the modes of the sensor, the event format, the time of day
+and the number of packages. Each package is a length and that many bytes. With an IMU, the computer's time in
+milliseconds and the IMU's samples follow. The last byte of a package is 0 for a full picture.
 
-The sensor sends 14 bit words, four in 7 bytes: the high 8 bits of each, then the low 6 of all. Event format 2 has one
-item a word, format 1 one in two words. The two lowest bits of an item tell what it is. Time stamps wrap around.
+The sensor sends 14-bit words, four in 7 bytes: the high 8 bits of each, then the low 6 of all. An item is one word in
+event format 2, and two words in format 1. Its two lowest bits give its kind. Time stamps wrap around.
 """
 
 import struct
@@ -23,7 +23,7 @@ from polarnet.recordings.source import Block, Choices, RecordingError, Source, s
 
 HEADER = struct.Struct("<8B I")
 LENGTH = struct.Struct("<I")
-STAMP = struct.Struct("<q I")  # the computer's time in milliseconds, how many samples of the IMU follow
+STAMP = struct.Struct("<q I")  # the computer's time in milliseconds, and the number of IMU samples that follow
 IMU_SAMPLE_BYTES = 32
 LOOP, IMU = 1, 2  # bits of the data type
 
@@ -31,12 +31,12 @@ OFF_PIXEL, IN_PIXEL, INTENSITY, FULL_PICTURE = range(4)
 MODES = ("Event Off-Pixel Timestamp", "Event In-Pixel Timestamp", "Event Intensity", "Full Picture",
          "Optical Flow", "Optical Flow FPN", "Multi-Read Optical Flow")  # fmt: skip
 STAMP_BITS = {1: 16, 2: 12}
-"""Of a time stamp, by event format."""
+"""Bits of a time stamp, by event format."""
 
 PICTURE_BYTES = HEIGHT * WIDTH * 3 // 2 + 1
-LARGEST_PACKAGE = 2_048_000  # bytes; what the vendor's library has room for
+LARGEST_PACKAGE = 2_048_000  # bytes; the limit of the vendor's library
 
-ROW, COLUMN, TIME = 2, 1, 3  # what an item is
+ROW, COLUMN, TIME = 2, 1, 3  # kinds of items
 
 
 class Header(NamedTuple):
@@ -44,7 +44,7 @@ class Header(NamedTuple):
 
     data_type: int
     loop_a: int
-    """The mode, where the sensor was not in loop mode."""
+    """Mode of the sensor outside loop mode."""
     loop_b: int
     loop_c: int
     event_format: int
@@ -58,13 +58,13 @@ class Picture(NamedTuple):
     """A full picture."""
 
     t_us: int | None
-    """The computer's time when it came, to the millisecond; None in files without it."""
+    """The computer's time on arrival, to the millisecond; None in files without it."""
     intensity: UInt16[np.ndarray, "800 1280"]
-    """0 to 4095, brighter is larger."""
+    """0 to 4095; brighter is larger."""
 
 
 def matches(path: Path, head: bytes) -> bool:
-    """Whether header and first length can be those of a BIN file."""
+    """Whether the header and the first length are plausible for a BIN file."""
     if len(head) < HEADER.size:
         return False
     header = Header(*HEADER.unpack_from(head))
@@ -73,10 +73,10 @@ def matches(path: Path, head: bytes) -> bool:
 
 
 def open_celex5_bin(path: Path, choices: Choices) -> Source:
-    """The events of a BIN file of event format 1 or 2. Format 2 and some modes have no polarity and are refused.
+    """Open the events of a BIN file of event format 1 or 2; format 2 and some modes have no polarity and are refused.
 
-    A pixel's polarity is the sign of the change of its intensity; its first event compares with 0, so is brighter.
-    Time 0 is the first time stamp. What full pictures are between the events is left out; `celex5_pictures` reads them.
+    A pixel's polarity is the sign of its intensity change. Its first event is compared with 0 and therefore brighter.
+    Time 0 is the first time stamp. Full pictures between the events are left out; `celex5_pictures` reads them.
     """
     header = _header(path)
     if header.event_format not in STAMP_BITS:
@@ -109,7 +109,7 @@ def open_celex5_bin(path: Path, choices: Choices) -> Source:
 
 
 def celex5_pictures(path: Path) -> Iterator[Picture]:
-    """The full pictures of a BIN file, in order; RecordingError where it is none, or damaged."""
+    """The full pictures of a BIN file, in order; RecordingError for other or damaged files."""
     counts: Counter[str] = Counter()
     for t_ms, package in _packages(path, counts):
         if package[-1] == 0:
@@ -122,10 +122,9 @@ def celex5_pictures(path: Path) -> Iterator[Picture]:
 
 
 def _unpacked(data: np.ndarray) -> np.ndarray:
-    """Two 12 bit pixels from 3 bytes: their high 8 bits, then the low 4 of the first, then those of the second.
+    """Unpack two 12-bit pixels from 3 bytes: their high 8 bits, then the low 4 of the first, then those of the second.
 
-    The sensor counts darkness. Its mode stands in place of the high bits of pixel (0, 0), which gets the next one's
-    value.
+    The sensor counts darkness. Its mode replaces the high bits of pixel (0, 0), which gets the value of the next pixel.
     """
     first, second, low = data.reshape(-1, 3).T.astype(np.uint16)
     pixels = np.stack([first << 4 | low & 15, second << 4 | low >> 4], axis=1)
@@ -157,7 +156,7 @@ def _plausible(header: Header) -> bool:
 
 
 def _packages(path: Path, counts: Counter[str]) -> Iterator[tuple[int | None, UInt8[np.ndarray, " bytes"]]]:
-    """The computer's time in milliseconds and the bytes of each package."""
+    """The computer's time in milliseconds, and the bytes, of each package."""
     header = _header(path)
     with path.open("rb") as file:
         file.seek(HEADER.size)
@@ -181,7 +180,7 @@ def _packages(path: Path, counts: Counter[str]) -> Iterator[tuple[int | None, UI
 
 
 def _skip_imu(path: Path, file: BinaryIO) -> int | None:
-    """The computer's time in milliseconds, past it and the IMU's samples; None where the file ends before."""
+    """Skip the time and the IMU's samples; returns the time in milliseconds, or None if the file ends early."""
     stamp = file.read(STAMP.size)
     if len(stamp) < STAMP.size:
         return None
@@ -193,7 +192,7 @@ def _skip_imu(path: Path, file: BinaryIO) -> int | None:
 
 
 class _Decoder:
-    """What must be known from earlier packages: row and time, and the intensity of each pixel."""
+    """Decoder state kept between packages: row, time, and the intensity of each pixel."""
 
     def __init__(self, event_format: int, polarity: int):
         self._format = event_format
@@ -202,11 +201,11 @@ class _Decoder:
         self._last_adc = np.zeros((HEIGHT, WIDTH), np.uint16)
 
     def forget_row(self) -> None:
-        """After something else than events."""
+        """Call this after a package without events."""
         self._state[0] = -1
 
     def events(self, data: np.ndarray, counts: Counter[str]) -> tuple[np.ndarray, ...]:
-        """Ticks, columns, rows and polarities of the events of a package."""
+        """Ticks, columns, rows and polarities of the events in a package."""
         groups = len(data) // 7
         counts["unreadable_packages"] += len(data) % 7 != 0
         most = groups * (4 if self._format == 2 else 2)
@@ -222,7 +221,7 @@ class _Decoder:
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _decode_1(data, groups, state, last_adc, polarity, t, x, y, p):
-    """Items of 28 bits: row and time stamp, or intensity and column."""
+    """Decode items of 28 bits: row and time stamp, or intensity and column."""
     row, stamp, now = state
     found, orphans, unchanged = 0, 0, 0
     height, width = last_adc.shape
@@ -264,7 +263,7 @@ def _decode_1(data, groups, state, last_adc, polarity, t, x, y, p):
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _decode_2(data, groups, state, polarity, t, x, y, p):
-    """Items of 14 bits: row, column or time stamp."""
+    """Decode items of 14 bits: row, column or time stamp."""
     row, stamp, now = state
     found, orphans = 0, 0
     for i in range(groups):

@@ -1,4 +1,4 @@
-"""BIN files of a CeleX-5, written: for simulated cameras, and for tests of the reader in `celex5_bin`."""
+"""Write BIN files of a CeleX-5, for simulated cameras and for tests of the reader in `celex5_bin`."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -24,18 +24,17 @@ from polarnet.recordings.formats.celex5_bin import (
     TIME,
 )
 
-PACKAGE_GROUPS = 51_000  # of 7 bytes; the sensor sends packages of this length only
+PACKAGE_GROUPS = 51_000  # 7 bytes each; the sensor sends only packages of this length
 NO_MODE = 255
 
 
 def write_celex5_bin(path: Path, events: Events, event_format: int = 1, clock_mhz: float | int = CLOCK_MHZ) -> Events:
-    """Events as the sensor sends them, and what a reader finds in the file: the same but for what it cannot hold.
+    """Write events as the sensor sends them, and return the events that a reader gets from the file.
 
-    Times become the first time stamp of the sensor at or after them (every 10.24 us at 100 MHz), from 0 on. In format
-    1 polarity is a change of intensity, which starts from 0: a pixel that first becomes darker gets a brighter event
-    at the start. Format 2 has no polarity; what is returned is +1 everywhere, as `assume_polarity=1` reads it.
-
-    ValueError for events that are out of order, before 0, off a sensor of 800 x 1280 or more than 4095 of one polarity
+    Each time becomes the sensor's first time stamp at or after it (every 10.24 us at 100 MHz), from 0 on. In format 1
+    polarity is a change of intensity, which starts from 0, so a pixel that first becomes darker gets a brighter event
+    at the start. Format 2 has no polarity; the returned polarity is +1 everywhere, as with `assume_polarity=1`.
+    ValueError for events that are out of order, before 0, off a sensor of 800 x 1280, or more than 4095 of one polarity
     in a row in a pixel.
     """
     if event_format not in STAMP_BITS:
@@ -72,9 +71,9 @@ def write_celex5_bin(path: Path, events: Events, event_format: int = 1, clock_mh
 def write_celex5_pictures(
     path: Path, pictures: Iterable[UInt16[np.ndarray, "800 1280"]], t_us: Iterable[int] | None = None
 ) -> None:
-    """Full pictures of 0 to 4095, brighter is larger; with the computer's time, to the millisecond, where it is given.
+    """Write full pictures of 0 to 4095 (brighter is larger), with the computer's time to the millisecond where given.
 
-    Pixel (0, 0) is lost: the sensor's mode takes its place.
+    Pixel (0, 0) is lost, since the sensor stores its mode there.
     """
     stamps = None if t_us is None else iter(t_us)
     packages = 0
@@ -112,7 +111,7 @@ def _first_is_darker(pixel: Int64[np.ndarray, " n"], p: np.ndarray) -> np.ndarra
 
 
 def _intensities(pixel: Int64[np.ndarray, " n"], p: np.ndarray) -> Int64[np.ndarray, " n"]:
-    """For each event an intensity above or below that of the pixel's event before, from 1 to 4095."""
+    """An intensity from 1 to 4095 for each event, above or below that of the pixel's previous event."""
     order = np.argsort(pixel, kind="stable")
     level = np.cumsum(p[order], dtype=np.int64)
     starts = np.flatnonzero(np.diff(pixel[order], prepend=-1))
@@ -127,9 +126,10 @@ def _intensities(pixel: Int64[np.ndarray, " n"], p: np.ndarray) -> Int64[np.ndar
 
 
 def _stamps(stamp: np.ndarray, announced: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:
-    """Time stamps to send, so close that they can be told apart when they wrap, and before which event each comes.
+    """Time stamps to send, and the index of the event that each precedes.
 
-    The first is 0; one comes before each of the `announced` events.
+    The stamps are close enough to stay unambiguous when they wrap. The first is 0; one comes before each of the
+    `announced` events.
     """
     step = 2 ** (bits - 1)
     sent = stamp[announced]
@@ -162,7 +162,7 @@ def _items_2(stamp: np.ndarray, row: np.ndarray, column: np.ndarray) -> Int64[np
 
 
 def _packed(words: Int64[np.ndarray, " words"], event_format: int) -> UInt8[np.ndarray, "groups 7"]:
-    """14 bit words as the sensor sends them, in full packages; what is left of the last one states the mode."""
+    """Pack 14-bit words as the sensor sends them, in full packages; padding in the last one states the mode."""
     padding = [INTENSITY << 14 & 0x3FFF, INTENSITY << 14 >> 14] if event_format == 1 else [0]
     missing = -len(words) % (4 * PACKAGE_GROUPS)
     words = np.concatenate([words, np.resize(np.array(padding, np.int64), missing)]).reshape(-1, 4)

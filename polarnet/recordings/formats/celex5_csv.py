@@ -1,4 +1,4 @@
-"""Event lists of a CeleX-5 as the vendor's converter writes them: lines of whole numbers with commas, the row first."""
+"""Event lists from the CeleX-5 vendor's converter: comma-separated whole numbers, the row first."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ MODES = {
 
 
 def matches(path: Path, head: bytes) -> bool:
-    """Whether the lines are those of one of the modes; of four columns, those that are not `t,x,y,p`."""
+    """Whether the lines match one of the modes; four columns must not be `t,x,y,p`."""
     lines = [line.words for line in numbers_of(head)]
     if not lines or b"," not in head or len(lines[0]) not in MODES:
         return False
@@ -37,10 +37,10 @@ def _polarities(words: tuple[str, ...]) -> bool:
 
 
 def open_celex5_csv(path: Path, choices: Choices) -> Source:
-    """A CSV file of any of the three modes; two of them have no polarity and are refused.
+    """Open a CSV file of any of the three modes; two of them have no polarity and are refused.
 
-    Times are microseconds. Converters older than SDK 2.0 (December 2019) wrote the sensor's time stamps: where
-    `clock_mhz` is given, they are taken for that.
+    Times are microseconds. Converters older than SDK 2.0 (December 2019) wrote the sensor's time stamps; `clock_mhz`
+    selects this interpretation.
     """
     with path.open("rb") as file:
         lines = numbers_of(file.read(HEAD_BYTES))
@@ -69,10 +69,10 @@ def open_celex5_csv(path: Path, choices: Choices) -> Source:
 
 
 def write_celex5_csv(path: Path, events: Events, intensity: Int[np.ndarray, " n"] | None = None) -> None:
-    """Events as the vendor's converter writes Event Intensity mode: lines row,col,adc,polarity,t in microseconds.
+    """Write events in the converter's Event Intensity format: lines row,col,adc,polarity,t in microseconds.
 
-    `intensity` is what the pixel measured, 0 to 4095; None takes half of that. ValueError where events are not on the
-    sensor of 800 x 1280.
+    `intensity` is the pixel's measurement, 0 to 4095; None writes half of the maximum. ValueError where events are not
+    on the sensor of 800 x 1280.
     """
     if events.height > HEIGHT or events.width > WIDTH:
         raise ValueError(f"expected events of a sensor of {HEIGHT}x{WIDTH}, got {events.height}x{events.width}")

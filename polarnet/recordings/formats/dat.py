@@ -1,4 +1,4 @@
-"""Prophesee's DAT files: a header of lines that start with %, then 8 bytes an event, little endian."""
+"""Prophesee's DAT files: a header of lines that start with %, then 8 bytes per event, little endian."""
 
 import re
 from collections import Counter
@@ -16,22 +16,22 @@ CHANGE_DETECTION = (0, 12)  # event types: 2D of the first sensors, CD of the la
 
 
 class Header(NamedTuple):
-    """What comes before the events."""
+    """Content of the header."""
 
     version: int
     height: int | None
     width: int | None
     start: int
-    """Where the events start."""
+    """Byte offset of the events."""
 
 
 def matches(path: Path, head: bytes) -> bool:
-    """Whether there is a header of % lines that says nothing of EVT, and the type of the events after it."""
+    """Whether there is a header of % lines without a mention of EVT."""
     return head.startswith(b"% ") and b"% evt " not in head and b"% format EVT" not in head
 
 
 def open_dat(path: Path, choices: Choices) -> Source:
-    """Change detection events of version 1 or 2; of version 2, times that wrap after 71 minutes are made to run on."""
+    """Open change detection events of version 1 or 2; in version 2, times that wrap after 71 minutes are unwrapped."""
     header = _header(path)
     height, width = sensor_size(path, choices, header.height, header.width)
 

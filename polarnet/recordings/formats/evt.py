@@ -1,7 +1,7 @@
 """Raw files of Prophesee's cameras, EVT2 and EVT3: a header of lines that start with %, then words, little endian.
 
-Both send the high bits of the time now and then, and the low ones in between. The clock of a sensor steps back by some
-microseconds at times, within the same high bits; times are what the words say, whatever came before.
+Both formats send the high bits of the time occasionally, and the low bits in between. A sensor's clock sometimes steps
+back by some microseconds within the same high bits. Times are those of the words, regardless of earlier ones.
 """
 
 import re
@@ -17,36 +17,36 @@ from polarnet.recordings.source import Block, Choices, RecordingError, Source, s
 
 LONGEST_HEADER = 2**16
 BLOCK_WORDS = 2**17
-MOST_PER_WORD = 12  # events of an EVT3 word
+MOST_PER_WORD = 12  # events per EVT3 word
 SENSORS = {b"gen31": (480, 640), b"gen3": (480, 640), b"gen4": (720, 1280), b"imx636": (720, 1280),
            b"genx320": (320, 320)}  # fmt: skip
-"""Height and width by the name of the sensor in the header; files of 2020 say nothing else."""
+"""Height and width by the sensor's name in the header; files of 2020 state nothing else."""
 
 
 class Header(NamedTuple):
-    """What comes before the words."""
+    """Content of the header."""
 
     version: str
     height: int | None
     width: int | None
     start: int
-    """Where the words start."""
+    """Byte offset of the words."""
 
 
 def matches(path: Path, head: bytes) -> bool:
-    """By the lines of its header."""
+    """Whether the header names an EVT format."""
     return head.startswith(b"% ") and (b"% evt " in head or b"% format EVT" in head)
 
 
 def open_evt(path: Path, choices: Choices) -> Source:
-    """The events of EVT2 or EVT3; the sensor's size from the header, or from the sensor's name there."""
+    """Open the events of EVT2 or EVT3; the sensor's size comes from the header, or from the sensor's name there."""
     header = _header(path)
     height, width = sensor_size(path, choices, header.height, header.width)
     word, decode = {"2": ("<u4", _decode_2), "3": ("<u2", _decode_3)}[header.version]
     size = np.dtype(word).itemsize
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        state = np.array([-1, 0, 0, -1, 0, 0])  # high bits of the time, their turns, low bits, y, base x, its polarity
+        state = np.array([-1, 0, 0, -1, 0, 0])  # high bits of the time, their wraps, low bits, y, base x, its polarity
         with path.open("rb") as file:
             file.seek(header.start)
             while data := file.read(BLOCK_WORDS * size):
@@ -91,7 +91,7 @@ def _size(header: bytes) -> tuple[int | None, int | None]:
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _decode_2(words, state, t, x, y, p):
-    """The upper 4 bits of a word tell what it is: 0 OFF, 1 ON, 8 the upper 28 bits of the time."""
+    """Decode words by their upper 4 bits: 0 OFF, 1 ON, 8 the upper 28 bits of the time."""
     high, turns = state[0], state[1]
     found, orphans = 0, 0
     for i in range(len(words)):
@@ -114,7 +114,7 @@ def _decode_2(words, state, t, x, y, p):
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _decode_3(words, state, t, x, y, p):
-    """The upper 4 bits of a word tell what it is: 0 y, 2 x, 3 base x, 4 and 5 pixels after it, 6 and 8 the time."""
+    """Decode words by their upper 4 bits: 0 y, 2 x, 3 base x, 4 and 5 pixels after it, 6 and 8 the time."""
     high, turns, low, row, base, polarity = state
     found, orphans = 0, 0
     for i in range(len(words)):
@@ -144,6 +144,6 @@ def _decode_3(words, state, t, x, y, p):
                 if value >> k & 1:
                     t[found], x[found], y[found], p[found] = now, base + k, row, polarity
                     found += 1
-            base = min(base + pixels, 2048)  # off every sensor; more would not fit into int16
+            base = min(base + pixels, 2048)  # outside every sensor; larger values would not fit into int16
     state[:] = high, turns, low, row, base, polarity
     return found, orphans

@@ -1,6 +1,6 @@
-"""Formats that the package faery reads: AEDAT4 of iniVation, and Event Stream.
+"""Formats read by the package faery: AEDAT4 of iniVation, and Event Stream.
 
-Its decoder of EVT3 holds times back where the sensor's clock steps back, so EVT2 and EVT3 are read in `evt`.
+Its EVT3 decoder holds times back where the sensor's clock steps back, so `evt` reads EVT2 and EVT3.
 """
 
 import contextlib
@@ -24,22 +24,22 @@ _readers = itertools.count()
 
 
 def matches_aedat4(path: Path, head: bytes) -> bool:
-    """By its first bytes."""
+    """Whether the file starts with the signature of AEDAT4."""
     return head.startswith(AEDAT4)
 
 
 def matches_event_stream(path: Path, head: bytes) -> bool:
-    """By its first bytes."""
+    """Whether the file starts with the signature of Event Stream."""
     return head.startswith(EVENT_STREAM)
 
 
 def open_aedat4(path: Path, choices: Choices) -> Source:
-    """The first stream of events of the file; its times are microseconds since 1970."""
+    """Open the first event stream of the file; its times are microseconds since 1970."""
     return _source(path, choices, "aedat")
 
 
 def open_event_stream(path: Path, choices: Choices) -> Source:
-    """The changes of a DVS or ATIS."""
+    """Open the change events of a DVS or ATIS."""
     return _source(path, choices, "es")
 
 

@@ -1,4 +1,4 @@
-"""What the process of faery does; see `isolated_worker`."""
+"""Tasks of the faery process; see `isolated_worker`."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -6,10 +6,10 @@ from typing import Any
 import faery
 import numpy as np
 
-GATHERED_EVENTS = 2**16  # of an answer; the packets of a file are small
+GATHERED_EVENTS = 2**16  # per answer; the packets of a file are small
 
 streams: dict[int, tuple[int, Iterator[np.ndarray]]] = {}
-"""Files that are being read, by the number of the reader: blocks that were handed out, and the packets that follow."""
+"""Open files by reader number: the number of blocks returned so far, and the remaining packets."""
 
 
 def size(path: str, file_type: str) -> tuple[int, int]:
@@ -21,7 +21,7 @@ def size(path: str, file_type: str) -> tuple[int, int]:
 def block(path: str, file_type: str, reader: int, number: int) -> list[np.ndarray] | None:
     """Columns t, x, y, on of a reader's next block; None after the last.
 
-    `number` is how many came before: where the process crashed on another file in between, they are read once more.
+    `number` counts the blocks already returned. If the process crashed on another file in between, they are read again.
     """
     done, packets = streams.get(reader, (-1, iter(())))
     if done != number:
@@ -36,7 +36,7 @@ def block(path: str, file_type: str, reader: int, number: int) -> list[np.ndarra
 
 
 def gathered(packets: Iterator[np.ndarray]) -> list[np.ndarray]:
-    """Packets of about as many events as an answer has; none at the end."""
+    """Packets with about as many events as an answer holds; empty at the end."""
     found, count = [], 0
     while count < GATHERED_EVENTS and (packet := next(packets, None)) is not None:
         found.append(packet)
@@ -45,7 +45,7 @@ def gathered(packets: Iterator[np.ndarray]) -> list[np.ndarray]:
 
 
 def close(path: str, reader: int) -> None:
-    """Let go of the file."""
+    """Release the file."""
     streams.pop(reader, None)
 
 

@@ -1,4 +1,4 @@
-"""HDF5 files of two kinds: events as DSEC stores them, and the recordings of a polarization camera of E2P (PDAVIS)."""
+"""HDF5 files of two kinds: events in DSEC's layout, and recordings of E2P's polarization camera (PDAVIS)."""
 
 import contextlib
 from collections import Counter
@@ -13,8 +13,8 @@ from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingEr
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 DSEC_COLUMNS = ("events/t", "events/x", "events/y", "events/p")
-LARGEST = 2**53  # whole number
-E2P_COLUMNS = 4  # of /events: t in microseconds, x, y, p of 0 or 1
+LARGEST = 2**53  # largest whole number that a float holds exactly
+E2P_COLUMNS = 4  # columns of /events: t in microseconds, x, y, p of 0 or 1
 
 Description = dict[str, Any]
 
@@ -34,18 +34,18 @@ def matches_e2p(path: Path, head: bytes) -> bool:
     try:
         return "events" in _described(path)["tables"]
     except (RecordingError, RuntimeError):
-        return False  # `open_dsec` says why
+        return False  # `open_dsec` reports the reason
 
 
 def matches_dsec(path: Path, head: bytes) -> bool:
-    """Whether it is an HDF5 file, of whatever else."""
+    """Whether it is an HDF5 file, whatever its content."""
     return head.startswith(MAGIC)
 
 
 def open_dsec(path: Path, choices: Choices) -> Source:
-    """Columns events/{t,x,y,p} (Gehrig et al. 2021), at times t + t_offset; p is 1 or 0.
+    """Open columns events/{t,x,y,p} (Gehrig et al. 2021), at times t + t_offset; p is 1 or 0.
 
-    DSEC itself does not state the size of its sensors, 480 x 640; files that polarnet writes do.
+    DSEC does not state the size of its sensors, 480 x 640; files that polarnet writes do.
     """
     description = _described(path)
     absent = [name for name in DSEC_COLUMNS if name not in description["tables"]]
@@ -65,9 +65,10 @@ def open_dsec(path: Path, choices: Choices) -> Source:
 
 
 def open_e2p(path: Path, choices: Choices) -> Source:
-    """The table /events of E2P (Mei et al. 2023): rows t, x, y, p; the attribute sensor_resolution is width, height.
+    """Open the table /events of E2P (Mei et al. 2023): rows t, x, y, p.
 
-    The pixels lie behind polarizers, rows 90 45 / 135 0 degrees from the upper left; the events are those of all.
+    The attribute sensor_resolution is width, height. The pixels lie behind polarizers, rows 90 45 / 135 0 degrees from
+    the upper left; the events cover all four angles.
     """
     description = _described(path)
     if "events" not in description["tables"]:

@@ -1,4 +1,4 @@
-"""What the process of HDF5 does; see `isolated_worker`."""
+"""Tasks of the HDF5 process; see `isolated_worker`."""
 
 import contextlib
 from collections.abc import Callable
@@ -12,24 +12,24 @@ with contextlib.suppress(ImportError):
 
 
 files: dict[str, h5py.File] = {}
-"""Files that are being read."""
+"""Open files by name."""
 
 
 def describe(name: str, tables: list[str], attributes: list[str]) -> dict[str, Any]:
-    """Shape and kind of number of each table that is there; scalars and attributes that are there."""
+    """Shape and number kind of each existing table, and values of existing scalars and attributes."""
     with h5py.File(name, "r") as file:
         return described(file, tables, attributes)
 
 
 def read(name: str, tables: list[str], start: int, stop: int) -> list[np.ndarray]:
-    """The rows from start to stop of each table; the file stays open."""
+    """Rows from start to stop of each table; the file stays open."""
     if name not in files:
         files[name] = h5py.File(name, "r")
     return [files[name][table][start:stop] for table in tables]
 
 
 def close(name: str) -> None:
-    """Let go of the file."""
+    """Close the file."""
     if name in files:
         files.pop(name).close()
 
@@ -38,7 +38,7 @@ TASKS: dict[str, Callable[..., Any]] = {"describe": describe, "read": read, "clo
 
 
 def described(file: h5py.File, tables: list[str], attributes: list[str]) -> dict[str, Any]:
-    """What `describe` answers, of an open file."""
+    """The answer of `describe` for an open file."""
     shapes, values = {}, {}
     for name in tables:
         if name in file:
@@ -54,5 +54,5 @@ def described(file: h5py.File, tables: list[str], attributes: list[str]) -> dict
 
 
 def plain(value: np.ndarray) -> Any:
-    """Numbers as Python's, whatever else as text."""
+    """Python numbers for short numeric arrays, text for anything else."""
     return value.tolist() if value.dtype.kind in "iuf" and value.size <= 8 else str(value)[:80]

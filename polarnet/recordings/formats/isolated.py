@@ -1,4 +1,4 @@
-"""Libraries that read a format in a process of their own: one that crashes on a damaged file must not end ours."""
+"""Run format libraries in separate processes, so that a crash on a damaged file does not end the main process."""
 
 import contextlib
 import importlib.util
@@ -12,16 +12,16 @@ from typing import Any
 
 from polarnet.recordings.source import RecordingError
 
-PATIENCE_S = 60  # for an answer; a damaged file can send a library round in circles
-LARGEST_MIB = 8192  # that a process may address; a damaged file can state any size
+PATIENCE_S = 60  # limit for an answer; a damaged file can put a library into an endless loop
+LARGEST_MIB = 8192  # address space of the process; a damaged file can state any size
 WORKER = Path(__file__).with_name("isolated_worker.py")
 
 
 class IsolatedLibrary:
-    """A library and the process that runs it, started when it is first needed and again after a crash.
+    """A library and its process, which starts on first use and again after a crash.
 
-    `tasks` is the file whose TASKS the process answers, one request at a time; `package` what they
-    import, `extra` the option of polarnet that installs it; `advice` ends the message about a file it cannot read.
+    The process answers the TASKS of the file `tasks`, one request at a time. `package` is the package they import, and
+    `extra` is polarnet's extra that installs it. `advice` ends the message about an unreadable file.
     """
 
     def __init__(self, name: str, package: str, extra: str, tasks: Path, advice: str):
@@ -35,9 +35,9 @@ class IsolatedLibrary:
         self._lock = threading.Lock()
 
     def ask(self, path: Path, task: str, *arguments: Any) -> Any:
-        """The answer; RecordingError with what the library said, or where it crashed or took too long.
+        """The answer to a task; RecordingError with the library's message, or if it crashed or took too long.
 
-        RuntimeError that says what to install where the library is missing.
+        RuntimeError names the package to install where the library is missing.
         """
         if sys.modules.get(self._package, True) is None or importlib.util.find_spec(self._package) is None:
             raise RuntimeError(f"{path.name}: this format needs {self._package}: pip install 'polarnet[{self._extra}]'")
@@ -57,7 +57,7 @@ class IsolatedLibrary:
                     f"{path.name}: {self._name} cannot read it: the library crashed or took over {PATIENCE_S} s; the "
                     f"file is damaged"
                 ) from None
-            except BaseException:  # interrupted before the answer, which the next request must not get
+            except BaseException:  # interrupted before the answer, which must not reach the next request
                 self._stop(process)
                 raise
             finally:
@@ -68,7 +68,7 @@ class IsolatedLibrary:
 
     def _running(self) -> "subprocess.Popen[bytes]":
         if self._owner != os.getpid() or self._process is None or self._process.poll() is not None:
-            self._owner = os.getpid()  # a fork must not share its parent's
+            self._owner = os.getpid()  # a forked process must not share its parent's worker
             self._process = subprocess.Popen(
                 [sys.executable, "-P", str(WORKER), str(self._tasks), str(LARGEST_MIB)],
                 stdin=subprocess.PIPE,

@@ -1,7 +1,7 @@
-"""The process of an `IsolatedLibrary`: answers requests with the TASKS of the file that it is started with.
+"""The process of an `IsolatedLibrary`: answers requests with the TASKS of the file given at its start.
 
-Requests come on standard input and answers go to standard output, both pickled. Imports nothing of polarnet, so that it
-starts quickly.
+Requests arrive pickled on standard input, and pickled answers go to standard output. It imports nothing of polarnet, so
+that it starts quickly.
 """
 
 import contextlib
@@ -12,7 +12,7 @@ from typing import Any
 
 
 def serve(tasks: dict[str, Any]) -> None:
-    """Answer until the input ends."""
+    """Answer requests until the input ends."""
     requests, answers = sys.stdin.buffer, sys.stdout.buffer
     reply: tuple[str, Any]
     while True:
@@ -22,14 +22,14 @@ def serve(tasks: dict[str, Any]) -> None:
             return
         try:
             reply = ("answer", tasks[task](*arguments))
-        except BaseException as error:  # HDF5 has many, and a panic of Rust code is no Exception
+        except BaseException as error:  # HDF5 raises many kinds, and a panic in Rust code is not an Exception
             reply = ("error", f"{type(error).__name__}: {error}"[:500])
         pickle.dump(reply, answers, protocol=5)
         answers.flush()
 
 
 def limit_memory(mib: int) -> None:
-    """Let an allocation beyond it fail, where the system can."""
+    """Make allocations beyond the limit fail, where the system supports it."""
     with contextlib.suppress(ImportError, ValueError):
         import resource
 

@@ -1,4 +1,4 @@
-"""Lines of decimal numbers to columns of whole numbers, at the speed of the disk and in blocks."""
+"""Convert lines of decimal numbers to columns of whole numbers, at disk speed and in blocks."""
 
 import re
 from collections import Counter
@@ -12,13 +12,13 @@ from jaxtyping import Int64
 
 from polarnet.recordings.source import BLOCK_EVENTS, RecordingError
 
-HEAD_BYTES = 4096  # of a file; enough for every format to know its own
+HEAD_BYTES = 4096  # bytes at the start of a file; enough for every format to recognise its own
 BLOCK_BYTES = 2**22
 LONGEST_LINE = 2**12  # bytes
 
 _SEPARATORS = re.compile(rb"[,;]")
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-_DIGITS = 18  # that int64 holds whatever they are; further ones are less than a microsecond
+_DIGITS = 18  # decimal digits that always fit into int64; further ones are less than a microsecond
 _LARGEST = 2**60
 _END, _COMMENT = 10, 35  # line feed, #
 
@@ -26,11 +26,11 @@ _END, _COMMENT = 10, 35  # line feed, #
 def number_blocks(
     path: Path, decimals: tuple[int, ...], skip_bytes: int, counts: Counter[str]
 ) -> Iterator[Int64[np.ndarray, "n columns"]]:
-    """The lines of a file from byte `skip_bytes` as rows of len(decimals) whole numbers.
+    """Read the lines of a file from byte `skip_bytes` as rows of len(decimals) whole numbers.
 
-    Column i is multiplied by 10**decimals[i]; where decimals[i] > 0 the rest is rounded, else a fraction makes the line
-    unreadable. Numbers are separated by blanks, commas or semicolons; # starts a comment. What is not such a line is
-    left out and counted as `unreadable_lines`; an unreadable rest after the last line end, as `cut_tail`.
+    Column i is multiplied by 10**decimals[i]. Where decimals[i] > 0 the rest is rounded; elsewhere a fraction makes the
+    line unreadable. Numbers are separated by blanks, commas or semicolons; # starts a comment. Other lines are left out
+    and counted as `unreadable_lines`, or as `cut_tail` after the last line end.
     """
     shift = np.array(decimals, np.int64)
     with path.open("rb") as file:
@@ -53,17 +53,17 @@ class Line(NamedTuple):
 
     words: list[str]
     end: int
-    """Where the next line starts, bytes from the start of the file."""
+    """Byte offset of the next line in the file."""
 
 
 def numbers_of(head: bytes) -> list[Line]:
-    """The lines of numbers among the first bytes of a file; none where most of its lines are something else."""
+    """The lines of numbers among the first bytes of a file; empty if most lines are something else."""
     found: list[Line] = []
     others, place = 0, 0
     for line in head.splitlines(keepends=True):
         place += len(line)
         if len(line) == len(head) > LONGEST_LINE // 2 or (place == len(head) and found and not line.endswith(b"\n")):
-            break  # cut off by the size of the head
+            break  # cut off at the end of the head
         words = _SEPARATORS.sub(b" ", line.split(b"#")[0]).split()
         if words and all(map(_NUMBER.fullmatch, words)):
             found.append(Line([word.decode() for word in words], place))
@@ -75,7 +75,7 @@ def numbers_of(head: bytes) -> list[Line]:
 def rows_of(
     data: bytes, shift: Int64[np.ndarray, " columns"], counts: Counter[str], damage: str
 ) -> Iterator[Int64[np.ndarray, "n columns"]]:
-    """Whole lines as rows of numbers, as `number_blocks` has them; what is not such a line is counted as `damage`."""
+    """Parse complete lines to rows of numbers, as in `number_blocks`; other lines are counted as `damage`."""
     buffer = np.frombuffer(data, np.uint8)
     start = 0
     while start < len(buffer):
@@ -87,7 +87,7 @@ def rows_of(
 
 
 def lines_of(table: Int64[np.ndarray, "n columns"], separator: str) -> bytes:
-    """Whole numbers as lines of text."""
+    """Format whole numbers as lines of text."""
     out = np.empty(table.size * (_DIGITS + 3), np.uint8)
     return out[: _write(np.ascontiguousarray(table), ord(separator), out)].tobytes()
 
@@ -119,7 +119,7 @@ def _write(table, separator, out):
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _parse(buffer, start, shift, rows):
-    """Fill `rows` from the lines at `start`; how many were filled, where the next line starts, how many were not."""
+    """Fill `rows` from the lines at `start`; returns the number filled, the next offset and the number unreadable."""
     place, filled, unreadable = start, 0, 0
     size, columns = len(buffer), len(shift)
     while place < size and filled < len(rows):
@@ -148,7 +148,7 @@ def _parse(buffer, start, shift, rows):
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _number(buffer, place, shift):
-    """The number at `place`, times 10**shift; where it ends, and whether it is one."""
+    """Parse the number at `place`, times 10**shift; returns it, its end, and whether it is valid."""
     size, start = len(buffer), place
     negative = buffer[place] == 45
     place += negative

@@ -1,4 +1,4 @@
-"""One polarizer channel of one sequence of our own event store."""
+"""Read one channel of one sequence from polarnet's own event store."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -12,12 +12,12 @@ ZIP = b"PK\x03\x04"
 
 
 def matches(path: Path, head: bytes) -> bool:
-    """Whether it is a folder with Zarr's metadata, or a zip."""
+    """Whether it is a folder with Zarr metadata, or a zip."""
     return (path / "zarr.json").exists() if path.is_dir() else head.startswith(ZIP)
 
 
 def open_store(path: Path, choices: Choices) -> Source:
-    """The channel that `part` names as SEQUENCE/ANGLE, degrees; SEQUENCE may be left out where there is only one."""
+    """Open the channel that `part` names as SEQUENCE/ANGLE (degrees); SEQUENCE is optional if there is only one."""
     try:
         store = EventStore.open(path)
     except (FileNotFoundError, ValueError, KeyError, TypeError) as error:

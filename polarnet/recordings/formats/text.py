@@ -1,4 +1,4 @@
-"""Lines `t x y p`: what E2VID, ESIM and numpy write; also with commas."""
+"""Lines `t x y p`, as written by E2VID, ESIM and numpy; commas are accepted too."""
 
 import re
 from collections import Counter
@@ -28,9 +28,9 @@ def matches(path: Path, head: bytes) -> bool:
 
 
 def open_text(path: Path, choices: Choices) -> Source:
-    """Lines `t x y p`, under a line `width height` or with the size given; # starts a comment.
+    """Open lines `t x y p`, after a line `width height` or with the given size; # starts a comment.
 
-    A first line of names tells another order of the columns. t is in seconds where the first event's t has a decimal
+    A first line of names may give another order of the columns. t is in seconds where the first event's t has a decimal
     point, else in microseconds; p is 1 or 0, or 1 or -1.
     """
     with path.open("rb") as file:
@@ -57,7 +57,7 @@ def open_text(path: Path, choices: Choices) -> Source:
 
 
 def _names(head: bytes) -> tuple[tuple[str, ...], int]:
-    """The order of the columns by the names in the first line, and where the next starts; t x y p where it has none."""
+    """Column order from the names in the first line, and the next line's offset; t x y p if there are no names."""
     line = head.split(b"\n", 1)[0]
     words = re.split(r"[,;\s]+", line.decode("ascii", "replace").lower().strip(" #\r\t\ufeff"))
     order = tuple(NAMES.get(word, word) for word in words)
