@@ -50,13 +50,13 @@ def times(*t_us):
 
 
 def reconstructed(step, channels, t_us, config):
-    """Images at rising times, each from the events up to it."""
+    """Images at rising times, each from the events before it: windows are half-open."""
     state = filter_at_rest(len(channels), channels[0].height, channels[0].width, config)
     images, before = [], 0
     for t in t_us.tolist():
-        image, state = step(state, [slice_time(events, before, t + 1) for events in channels], t, config)
+        image, state = step(state, [slice_time(events, before, t) for events in channels], t, config)
         images.append(image)
-        before = t + 1
+        before = t
     return torch.stack(images)
 
 
