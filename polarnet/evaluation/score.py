@@ -240,7 +240,7 @@ def write_frames(path: Path, rows: Iterable[FrameScore]) -> None:
 
 
 def _skill(error: Any, oracle: Any) -> Any:
-    """1 for no error, 0 for the error of the oracle mean, which is bounded below for a truth without any pattern."""
+    """1 for no error, 0 for the error of the oracle mean, which is at least `LEAST_MSE`, the resolution of PSNR."""
     return 1 - error / np.maximum(oracle, LEAST_MSE)
 
 
