@@ -1,4 +1,4 @@
-"""Reference rows: constants and the oracle mean. They use no events, so they are not methods."""
+"""Reference rows: constants, which see no events, and the oracle mean, which sees the truth. None is a method."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
