@@ -1,4 +1,4 @@
-"""Cost of a method on this machine: time, arithmetic and memory for each window, and parameters."""
+"""Cost of a method on this machine: time, arithmetic and memory of a window, and number of parameters."""
 
 import statistics
 import time
@@ -33,7 +33,7 @@ CPU_ATTENTION = {
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of a method; times and arithmetic are per window of all four polarizers."""
+    """Cost of a method; times and arithmetic are per window of all four channels."""
 
     ms_per_window: float
     """Time from events in memory to a DoLP frame in memory, including encoding the input."""
