@@ -110,8 +110,8 @@ class Method:
     reconstructs: bool = False
     """Whether DoLP is computed from reconstructed intensities, held by `Prediction.intensities`."""
     about: str = ""
-    """Glossary sentence of the HTML pages. For a row with several possible networks or published weights, it says what
-    the row adds to the network's own sentence; empty if that sentence suffices."""
+    """Glossary sentence of the HTML pages. For a row with several possible networks or published weights, it states
+    the difference from the network's own sentence; empty if that sentence suffices."""
     wraps: "Method | None" = None
     """Wrapped method, whose predictions `convert` turns into those of this method."""
     convert: Callable[[Setup, State, Prediction], tuple[State, Prediction]] | None = None
