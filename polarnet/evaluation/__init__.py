@@ -1,1 +1,1 @@
-"""Every method behind one signature, and how it is scored."""
+"""Evaluation of methods: running, scoring and comparing them."""

@@ -1,4 +1,4 @@
-"""The benchmark: every method on every sequence of a test set, scored, its cost measured, a few windows to look at."""
+"""The benchmark: runs every method on every sequence of a test set, scores it, measures its cost and saves panels."""
 
 import dataclasses
 import functools
@@ -44,7 +44,7 @@ from polarnet.stokes import Prediction
 
 @dataclass(frozen=True)
 class Panel:
-    """One window of one scene: what went in, the truth, and what each method made of it."""
+    """One window of one scene: its events, the truth, and the prediction of each method."""
 
     sequence: str
     scene: str
@@ -57,12 +57,12 @@ class Panel:
     truth_s0: Float[Tensor, "h w"]
     dolp: Mapping[str, Float[Tensor, "h w"]]
     aolp: Mapping[str, Float[Tensor, "h w"]]
-    """Of the methods that have it."""
+    """AoLP by method, for the methods that predict it."""
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """All that was measured on one test set."""
+    """Results of one test set."""
 
     rows: Sequence[FrameScore]
     costs: Mapping[str, Cost]
@@ -73,7 +73,7 @@ class Benchmark:
 
 @dataclass(frozen=True)
 class SequenceResult:
-    """All that was measured on one sequence, from one pass over it."""
+    """Results of one sequence, from one pass over it."""
 
     rows: Sequence[FrameScore]
     reliability: Mapping[str, Reliability]
@@ -82,7 +82,7 @@ class SequenceResult:
 
 @dataclass(frozen=True)
 class BenchmarkSet:
-    """Sequences with truth that methods are tested on."""
+    """Test sequences with their truth."""
 
     name: str
     events: EventStore
@@ -90,7 +90,7 @@ class BenchmarkSet:
 
     @property
     def sequences(self) -> list[str]:
-        """Those of the test split, in the store's order; ValueError where there is none."""
+        """Sequences of the test split, in the store's order; ValueError if there are none."""
         names = self.frames.of_split("test")
         if not names:
             raise ValueError(
@@ -99,7 +99,7 @@ class BenchmarkSet:
         return names
 
     def scene_of(self, sequence: str) -> str:
-        """The source picture of a sequence. A frame store that names no scenes has one for each sequence."""
+        """The source picture of a sequence. If the frame store names no scenes, every sequence is its own scene."""
         return self.frames.attributes.get("scenes", {}).get(sequence, sequence)
 
     def sequence(self, name: str) -> TestSequence:
@@ -113,7 +113,7 @@ class BenchmarkSet:
 
 
 def train_mean_dolp(frames: FrameStore, warmup_windows: int) -> float:
-    """Mean DoLP of the training split over the windows and pixels that a benchmark would score."""
+    """Mean DoLP of the training split, over the windows and pixels that the benchmark scores."""
 
     def scored(name: str) -> Tensor:
         dolp, valid = frames.dolp(name)[1 + warmup_windows :], frames.valid(name)
@@ -130,11 +130,11 @@ def run_benchmark(
     cache: Path,
     mapper: Callable[..., Iterable[Any]] = map,
 ) -> Benchmark:
-    """Run and score `config.methods` on a test set; ValueError where it has no sequence.
+    """Run and score `config.methods` on a test set; ValueError if it has no sequence.
 
-    What `cache` holds of the same method, sequence and code is not made again (see `Cache`), so that a new method costs
-    its own time alone. `mapper` is `polarnet.cluster.pmap` with its workers bound, or the built-in `map`; each of its
-    tasks is one sequence. Costs are measured here, one method after another, on the first sequence.
+    Results in `cache` are reused while method, sequence and code are unchanged (see `Cache`), so adding a method
+    runs only that method. `mapper` is `polarnet.cluster.pmap` with its workers bound, or the built-in `map`; each
+    task is one sequence. Costs are measured in this process, one method after another, on the first sequence.
     """
     names = test_set.sequences
     if lpips is not None:
@@ -177,7 +177,7 @@ def _measured(
     cache: Cache,
     shown: Collection[str],
 ) -> SequenceResult:
-    """Every row on one sequence, which is read once; predictions and scores come from the cache where it has them."""
+    """Run and score every row on one sequence, which is read once; cached predictions and scores are reused."""
     sequence = test_set.sequence(name)
     keys = _prediction_keys(sequence, digests)
     predictions = {row: known for row, key in keys.items() if (known := cache.prediction(row, name, key)) is not None}
@@ -218,7 +218,7 @@ def _lpips_digest(lpips: Lpips | None) -> str:
 
 
 def _costs(sequence: TestSequence, context: Context, digests: Mapping[str, str], cache: Cache) -> dict[str, Cost]:
-    """Each method's, from the cache where this machine has measured it with as many threads."""
+    """Cost of each method; cached costs are reused on the same machine with the same number of threads."""
     device = torch.cuda.get_device_name(context.device) if context.device.type == "cuda" else "cpu"
     here = digest(platform.node(), platform.machine(), device, str(torch.get_num_threads()))
     costs = {}
@@ -234,8 +234,8 @@ def _costs(sequence: TestSequence, context: Context, digests: Mapping[str, str],
 def write_benchmark(
     folder: Path, benchmark: Benchmark, config: BenchmarkConfig, seed: int, about: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """Write metrics.json, details.json (`about` and the settings), frames.csv, panels/<sequence>.npz; the metrics."""
-    shutil.rmtree(folder / "panels", ignore_errors=True)  # a run before may have shown other scenes
+    """Write metrics.json, details.json (`about`, settings), frames.csv, panels/<sequence>.npz; return the metrics."""
+    shutil.rmtree(folder / "panels", ignore_errors=True)  # an earlier run may have saved other scenes
     (folder / "panels").mkdir(parents=True)
     backbone = {"lpips_backbone": config.lpips_backbone} if config.lpips else {}
     metrics: dict[str, dict[str, Any]] = {
@@ -267,7 +267,7 @@ def write_benchmark(
 
 
 def _spread(names: Sequence[str], count: int, scenes: Mapping[str, str]) -> set[str]:
-    """The first sequences of `count` scenes, evenly spread over the split, from its first to its last."""
+    """First sequence of each of `count` scenes, spread evenly over the split, both ends included."""
     first = list({scenes.get(name, name): name for name in reversed(names)}.values())[::-1]
     count = min(count, len(first))
     return {first[round(i * (len(first) - 1) / max(count - 1, 1))] for i in range(count)}
@@ -276,7 +276,7 @@ def _spread(names: Sequence[str], count: int, scenes: Mapping[str, str]) -> set[
 def _reliability(
     sequence: TestSequence, predictions: Mapping[str, Prediction], warmup_windows: int
 ) -> dict[str, Reliability]:
-    """Over the scored windows, of each method that expects an error."""
+    """Reliability over the scored windows, for each method that predicts its error."""
     windows = slice(scored_windows(sequence, warmup_windows).start, None)
     valid = None if sequence.valid is None else sequence.valid[windows]
     truth = sequence.dolp[windows]
@@ -288,7 +288,7 @@ def _reliability(
 
 
 def _panel(sequence: TestSequence, predictions: Mapping[str, Prediction], warmup_windows: int) -> Panel:
-    """The middle one of the scored windows."""
+    """Panel of the middle scored window."""
     windows = scored_windows(sequence, warmup_windows)
     k = windows[len(windows) // 2]
     return Panel(

@@ -1,7 +1,7 @@
-"""What methods made of sequences and how it scored, kept on disk: a file of each for a method and a sequence.
+"""Cache of predictions and scores on disk: one file of each per method and sequence.
 
-An entry carries the hash of all that it was made from and counts only while that hash is the same. There is never
-more than one entry for a method and a sequence of a set, so that the folder does not grow with every change.
+Each entry stores a hash of its inputs and is valid only while that hash matches. A new entry overwrites the old one
+of the same method and sequence, so the folder does not grow with every change.
 """
 
 import dataclasses
@@ -24,11 +24,11 @@ from polarnet.events.frames import dequantise_angle, dequantise_fraction, quanti
 from polarnet.fingerprint import digest
 from polarnet.stokes import Prediction
 
-FORMAT = "3"  # part of every hash: raise it when what is stored, or `rows.predictions_of`, changes
+FORMAT = "3"  # part of every hash: raise it when the stored format or `rows.predictions_of` changes
 
 
 def sequence_digest(sequence: TestSequence) -> str:
-    """A hash of events, times and truth."""
+    """Hash of a sequence's events, times and truth."""
     parts = [sequence.name, sequence.scene]
     columns = [column for e in sequence.events for column in (e.t, e.x, e.y, e.p)]
     arrays = [*columns, sequence.t_us, sequence.dolp, sequence.aolp, sequence.s0]
@@ -38,30 +38,30 @@ def sequence_digest(sequence: TestSequence) -> str:
 
 
 class Cache:
-    """The entries of one test set under `folder`, which may not exist yet.
+    """Cache entries of one test set under `folder`, which may not exist yet.
 
-    Predictions are kept in the steps of the stored truth (DoLP in 1/65535, AoLP in pi/65536; the expected error as
-    float16), and scored as kept, so that a run that finds them and one that makes them give the same scores.
+    Predictions are quantised like the stored truth (DoLP in steps of 1/65535, AoLP in steps of pi/65536); the
+    expected error is float16. Scores use the quantised values, so cached and fresh predictions score the same.
     """
 
     def __init__(self, folder: Path):
         self.folder = folder
 
     def prediction(self, method: str, sequence: str, key: str) -> Prediction | None:
-        """What `write_prediction` was given under this key, in its steps; None where there is nothing of the kind."""
+        """The quantised prediction stored under this key; None if there is none."""
         path = self._path(method, sequence, "npz")
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 if str(arrays["key"]) != key:
                     return None
                 return _kept(arrays)
-        except (FileNotFoundError, KeyError, ValueError, EOFError, zipfile.BadZipFile):  # absent, or cut short
+        except (FileNotFoundError, KeyError, ValueError, EOFError, zipfile.BadZipFile):  # missing or truncated
             return None
 
     def write_prediction(self, method: str, sequence: str, key: str, prediction: Prediction) -> Prediction:
-        """Keep DoLP in [0, 1] and AoLP in radians; what they are in the steps of the store.
+        """Store a prediction (DoLP in [0, 1], AoLP in radians) and return it quantised.
 
-        ValueError that names the method and window where a value is not a number.
+        ValueError, naming the method and the window, if a value is not finite.
         """
         for frames in (prediction.dolp, prediction.aolp, prediction.log_variance):
             if frames is not None and not (finite := frames.isfinite().flatten(1).all(dim=1)).all():
@@ -83,25 +83,25 @@ class Cache:
         return _kept(arrays)
 
     def scores(self, method: str, sequence: str, key: str) -> list[FrameScore] | None:
-        """The rows that `write_scores` was given under this key."""
+        """The scores stored under this key; None if there are none."""
         rows = self._json(self._path(method, sequence, "scores.json"), key)
         return None if rows is None else [FrameScore(*row) for row in rows]
 
     def write_scores(self, method: str, sequence: str, key: str, rows: Sequence[FrameScore]) -> None:
-        """Keep rows; floats are written to the last bit."""
+        """Store scores; floats keep every bit."""
         self._write_json(self._path(method, sequence, "scores.json"), key, rows)
 
     def cost(self, method: str, key: str) -> Cost | None:
-        """What `write_cost` was given under this key."""
+        """The cost stored under this key; None if there is none."""
         values = self._json(self._path(method, "cost", "json"), key)
         return None if values is None else Cost(**values)
 
     def write_cost(self, method: str, key: str, cost: Cost) -> None:
-        """Keep a cost."""
+        """Store a cost."""
         self._write_json(self._path(method, "cost", "json"), key, dataclasses.asdict(cost))
 
     def forget(self, keep: Sequence[str]) -> None:
-        """Remove the entries of sequences that the set no longer has."""
+        """Remove the entries of sequences that are not in `keep`."""
         names = {f"{sequence}.{end}" for sequence in keep for end in ("npz", "scores.json")} | {"cost.json"}
         for path in self.folder.glob("*/*"):
             if path.name not in names and not path.name.endswith(".tmp"):
@@ -125,12 +125,12 @@ class Cache:
 
 
 def _kept(arrays: Mapping[str, np.ndarray]) -> Prediction:
-    """What an entry holds, in its steps."""
+    """Prediction from the quantised arrays of an entry."""
     aolp = dequantise_angle(arrays["aolp"]) if "aolp" in arrays else None
     log_variance = torch.from_numpy(arrays["log_variance"].astype(np.float32)) if "log_variance" in arrays else None
     return Prediction(dequantise_fraction(arrays["dolp"]), aolp, log_variance)
 
 
 def _wrapped(aolp: Tensor) -> Tensor:
-    """An angle in [0, pi), whichever of its names it came by."""
+    """AoLP wrapped to [0, pi)."""
     return aolp.remainder(torch.pi)

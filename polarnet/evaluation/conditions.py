@@ -1,4 +1,4 @@
-"""Size, duration, motion and sensor of sequences, and how they differ from those that a network was trained on."""
+"""Size, duration, motion and sensor of sequences, compared with those of a network's training."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -9,18 +9,18 @@ from polarnet.simulation.motion import MotionConfig
 
 NOT_COMPARED = ("synthesize.sequences_per_picture",)
 MODEL_ALONE = {"esim_log_eps": ("esim", "esim_gpu"), "voltmeter_camera": ("dvs_voltmeter",)}
-"""Parameters that only these pixel models have."""
+"""Parameters that exist only in the pixel models listed."""
 
 
 class Conditions(NamedTuple):
-    """The sections `synthesize` and `emulate` that sequences were made with; a key that is unknown is not there."""
+    """The sections `synthesize` and `emulate` that sequences were made with; unknown keys are absent."""
 
     synthesize: Mapping[str, Any]
     emulate: Mapping[str, Any]
 
     @property
     def values(self) -> dict[str, Any]:
-        """By the full keys of params.yaml; without those that change nothing that a network sees."""
+        """Values by full params.yaml key, without the keys that do not affect a network's input."""
         emulate = {
             key: value
             for key, value in self.emulate.items()
@@ -33,18 +33,18 @@ class Conditions(NamedTuple):
 
 
 def configured(synthesize: MotionConfig, emulate: EmulatorConfig) -> Conditions:
-    """Of sequences made with these sections."""
+    """Conditions of sequences made with these sections."""
     return Conditions(dataclasses.asdict(synthesize), dataclasses.asdict(emulate))
 
 
 def stored(attributes: Mapping[str, Any], height: int, width: int) -> Conditions:
-    """From what an event store says of itself; its size alone where its events were not simulated."""
+    """Conditions from the attributes of an event store; only the size if its events were not simulated."""
     size = {"window_height": height, "window_width": width}
     return Conditions(attributes.get("scenes", {}).get("synthesize", {}) | size, attributes.get("emulate", {}))
 
 
 def trained_on(metadata: Mapping[str, Any]) -> Conditions | None:
-    """From the JSON of a checkpoint; None where it does not say what the network was trained on."""
+    """Training conditions from the JSON of a checkpoint; None if it does not record them."""
     if "data" not in metadata:
         return None
     data = metadata["data"]
@@ -76,9 +76,9 @@ def sentence(conditions: Conditions) -> str:
 
 
 def warnings(used: Conditions, checkpoints: Mapping[str, Mapping[str, Any]], advice: str) -> list[str]:
-    """A sentence for each training whose sequences differ from those used: both values of every key, and what to set.
+    """One warning per training whose sequences differ from `used`: both values of every key, and the keys to set.
 
-    `checkpoints` is the metadata of each row's weights. `advice` says where the keys are set; they follow it.
+    `checkpoints` maps each row to the metadata of its weights. `advice` introduces the list of keys to set.
     """
     rows: dict[str, list[str]] = {}
     for row, metadata in checkpoints.items():
@@ -99,7 +99,7 @@ def _warning(used: Conditions, trained: Conditions | None, advice: str) -> str:
 
 
 def _printed(value: Any) -> str:
-    """As Hydra's command line takes it."""
+    """A value in the syntax of Hydra's command line."""
     if isinstance(value, list):
         return f"[{','.join(map(_printed, value))}]"
     return {True: "true", False: "false"}[value] if isinstance(value, bool) else "null" if value is None else str(value)

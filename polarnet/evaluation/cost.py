@@ -1,4 +1,4 @@
-"""What a method costs: time, arithmetic, parameters and memory of a window, measured on the machine at hand."""
+"""Cost of a method on this machine: time, arithmetic and memory of a window, and number of parameters."""
 
 import statistics
 import time
@@ -18,12 +18,12 @@ from polarnet.evaluation.sequences import TestSequence
 from polarnet.events.stream import slice_time
 from polarnet.methods import METHODS
 
-COUNTED_WINDOWS = 3  # arithmetic and memory are counted over so many windows: enough for a state to be carried on
+COUNTED_WINDOWS = 3  # windows to count arithmetic and memory over: enough for the state to be passed on
 TIMED_WINDOWS = 10
-REPEATS = 3  # timings, of which the median counts
+REPEATS = 3  # number of timings; the median is reported
 MIB = 2**20
 
-# The fused attention of CPUs, which torch's own counter (2.13) leaves out.
+# FLOPs of fused attention on CPUs, which torch's own counter (2.13) omits.
 CPU_ATTENTION = {
     torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: lambda q, k, v, *_, out_shape=None, **__: sdpa_flop(
         q, k, v
@@ -33,20 +33,20 @@ CPU_ATTENTION = {
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one window of all four polarizers, and of the method."""
+    """Cost of a method; times and arithmetic are per window of all four channels."""
 
     ms_per_window: float
-    """From events in memory to a DoLP frame in memory, the making of the input included."""
+    """Time from events in memory to a DoLP frame in memory, including encoding the input."""
     gflop: float | None
-    """Of convolutions, matrix products and attention, a multiply-add as two; None for a method without a network."""
+    """Convolutions, matrix products and attention; a multiply-add counts as 2. None for a method without a network."""
     params: int
-    """Of the networks that it runs."""
+    """Parameters of the method's networks."""
     peak_mib: float
-    """The most memory that tensors and arrays held at once beside the sequence, over `COUNTED_WINDOWS` windows."""
+    """Peak memory of tensors and arrays over `COUNTED_WINDOWS` windows, without the sequence itself."""
 
 
 def cost_of(row: str, sequence: TestSequence, context: Context) -> Cost:
-    """Run a row on the first windows of a sequence, a few times over; the first call is not timed."""
+    """Measure a row on the first windows of a sequence, several times; the first call is not timed."""
     network = opened(METHODS[row], context).network if row in METHODS else None
 
     def run(count: int) -> Callable[[], Any]:
@@ -68,7 +68,7 @@ def cost_of(row: str, sequence: TestSequence, context: Context) -> Cost:
 
 
 def first_windows(sequence: TestSequence, count: int) -> TestSequence:
-    """A sequence cut after `count` windows, or all of it where it has no more."""
+    """The first `count` windows of a sequence; all of it if it is shorter."""
     t_us = sequence.t_us[: count + 1]
     end_us = int(t_us[-1]) + 1
     return replace(
@@ -95,7 +95,7 @@ def _peak_bytes(run: Callable[[], Any], device: torch.device) -> float:
         torch.cuda.reset_peak_memory_stats(device)
         run()
         return float(torch.cuda.max_memory_allocated(device) - before)
-    tracemalloc.start()  # numpy tells it of its arrays
+    tracemalloc.start()  # numpy reports its arrays to tracemalloc
     try:
         with _TensorMemory() as tensors:
             run()
@@ -106,7 +106,7 @@ def _peak_bytes(run: Callable[[], Any], device: torch.device) -> float:
 
 
 class _TensorMemory(TorchDispatchMode):
-    """Adds up the bytes of tensors that operations return, as long as they live; memory inside a kernel is not seen."""
+    """Tracks the bytes of live tensors that operations return; scratch memory inside kernels is not counted."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -115,10 +115,10 @@ class _TensorMemory(TorchDispatchMode):
         self._known = weakref.WeakSet[torch.UntypedStorage]()
 
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run the operation and note the storage of what it returns, unless that is a view of a known one."""
+        """Run the operation and count the storage of its result, unless that is a view of a known storage."""
         for tensor in tree_leaves((args, kwargs)):
             if isinstance(tensor, torch.Tensor):
-                self._known.add(tensor.untyped_storage())  # weights and events were there before
+                self._known.add(tensor.untyped_storage())  # weights and events existed before
         out = operation(*args, **(kwargs or {}))
         for tensor in tree_leaves(out):
             if isinstance(tensor, torch.Tensor):

@@ -1,13 +1,12 @@
-"""How many events DoLP needs (paper, section 5 and Fig. 11), and how often it can be recovered from overlapping events.
+"""How many events DoLP needs (paper, section 5 and Fig. 11), and how often overlapping windows can recover it.
 
-Three questions, each on the test sequences:
+Three studies run on the test sequences:
 
-- since the start of the motion: quality against the events per pixel that have come so far (Fig. 11a; the paper's
-  answer is about one);
-- the length of the windows that the events are cut into;
-- windows of the last N events of each polarizer, recovered every fraction of a millisecond (Fig. 11b).
+- quality against the events per pixel since the start of the motion (Fig. 11a; the paper finds about one);
+- quality against the length of the windows;
+- overlapping windows of the last N events of each channel, one every fraction of a millisecond (Fig. 11b).
 
-Events per pixel are the mean over the four polarizers, as in the paper.
+Events per pixel are the mean over the four channels, as in the paper.
 """
 
 import math
@@ -32,22 +31,22 @@ from polarnet.similarity import correlation, mse, psnr
 from polarnet.simulation.scenes import SceneStore
 
 BIN_EDGES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 13.0, 20.0, math.inf)
-"""Of events per pixel since the start; finer below 2, where the paper sees the change."""
+"""Bin edges in events per pixel since the start; finer below 2, where the paper sees the change."""
 SHOWN = ("mse", "psnr", "ssim", "corr", "skill")
 EVENTS_PER_PIXEL = (0.25, 0.5, 1.0, 2.0)
-"""Sizes of the overlapping windows."""
+"""Sizes of the overlapping windows, in events per pixel."""
 
 
 def events_per_pixel(events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Mean number of events per pixel and channel before each time (t < time)."""
+    """Mean number of events per pixel before each time (t < time), averaged over the channels."""
     counts = torch.stack([torch.searchsorted(e.t, t_us) for e in events]).double().mean(dim=0)
     return (counts / (events[0].height * events[0].width)).float()
 
 
 def since_start(sequences: Iterable[TestSequence], methods: Sequence[str], context: Context) -> dict[str, list[dict]]:
-    """Method, then bin of events per pixel since the start: frames, scenes and mean scores; no window is warm-up.
+    """Frames, scenes and mean scores by method and bin of events per pixel since the start, without warm-up.
 
-    A bin's means are over frames, then scenes; bins that no frame falls into are left out.
+    Means are taken over frames, then over scenes. Empty bins are left out.
     """
     rows: dict[int, list[FrameScore]] = {}
     rates: dict[int, list[float]] = {}
@@ -81,9 +80,9 @@ def by_window_length(
     methods: Sequence[str],
     context: Context,
 ) -> dict[str, list[dict]]:
-    """Method, then window length: mean scores of the windows that end later than `settle_us`, and events per window.
+    """Mean scores and events per window, by method and window length, over windows that end after `settle_us`.
 
-    The truth is rendered at each window's own end. ValueError where no window of a length ends after `settle_us`.
+    The truth is rendered at the end of each window. ValueError if no window of some length ends after `settle_us`.
     """
     table: dict[str, list[dict]] = {method: [] for method in methods}
     for length_us in tqdm(lengths_us, "window length", unit="length"):
@@ -118,9 +117,10 @@ def _means(rows: Sequence[FrameScore]) -> dict[str, Any]:
 def sliding_recovery(
     sequence: TestSequence, count: int, t_us: Sequence[int], carry: bool, method: str, context: Context
 ) -> Float[Tensor, "n h w"]:
-    """DoLP at times `t_us` from the last `count` events of each polarizer.
+    """DoLP at times `t_us` from the last `count` events of each channel.
 
-    `carry`: whether the method's state goes from one overlapping window to the next, or each stands alone.
+    With `carry`, the method's state passes from one overlapping window to the next; otherwise every window starts
+    from the initial state.
     """
     recoverer = opened(METHODS[method], context)
     start = recoverer.start(sequence.events[0].height, sequence.events[0].width)
@@ -141,7 +141,7 @@ def _last(channels: Sequence[Events], count: int, t_us: int) -> list[Events]:
 
 
 def _length_us(events: Events) -> int:
-    """From the first event to the last; 0 where there are none."""
+    """Time from the first event to the last; 0 if there are none."""
     return int(events.t[-1] - events.t[0]) if len(events) else 0
 
 
@@ -154,10 +154,10 @@ def by_sliding_window(
     method: str,
     context: Context,
 ) -> list[dict]:
-    """For each of `EVENTS_PER_PIXEL`, with the state carried on and without: mean scores of a frame every `spacing_us`.
+    """Mean scores of frames every `spacing_us`, for each of `EVENTS_PER_PIXEL`, with and without carried state.
 
-    `change` is the mean absolute difference of consecutive frames, which of a steady recovery is small, beside that
-    of the truth.
+    `change` is the mean absolute difference of consecutive frames, and `true_change` is that of the truth; a
+    steady method has a small `change`.
     """
     times = list(range(span_us[0], span_us[1] + 1, spacing_us))
     table = []

@@ -1,4 +1,4 @@
-"""Is one method better than another on the same scenes: Wilcoxon's signed-rank test over scenes, and by how much."""
+"""Paired comparison of two methods on the same scenes: Wilcoxon's signed-rank test and effect size."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -13,22 +13,22 @@ PAIRED_METRICS = {
     "mse": "low", "psnr": "high", "ssim": "high", "lpips": "low", "corr": "high", "grad": "high",
     "pattern_mse": "low", "aolp_deg": "low",
 }  # fmt: skip
-"""What is compared, and which way it improves."""
+"""Metrics to compare, and whether lower or higher is better."""
 
 
 def paired_comparisons(rows: Iterable[FrameScore], method: str) -> dict[str, dict[str, dict[str, Any]]]:
-    """`method` against each other method that `rows` hold, then by metric; empty where `rows` lack `method`.
+    """Compare `method` with every other method in `rows`, metric by metric; empty if `rows` lack `method`.
 
-    A scene is one pair: its mean of one method and of the other. Each comparison says
+    Each scene gives one pair: the two methods' means over its frames. A comparison holds
 
-    - `scenes`: how many there are, and `better`: in how many of them `method` is;
-    - `median_difference`: `method` minus the other, in the metric's own unit;
-    - `effect`: the rank-biserial correlation of the pairs (Kerby, Comprehensive Psychology 2014): 1 where `method` is
-      better in every scene, -1 where it is worse in every scene, 0 where neither stands out;
-    - `p`: two-sided, of Wilcoxon's signed-rank test (exact up to 50 scenes without ties), and `p_holm`: the same
-      corrected for as many comparisons as there are other methods (Holm, 1979).
+    - `scenes`: number of scenes, and `better`: number of scenes where `method` is better;
+    - `median_difference`: `method` minus the other method, in the unit of the metric;
+    - `effect`: rank-biserial correlation of the pairs (Kerby, Comprehensive Psychology 2014): 1 if `method` is better
+      in every scene, -1 if it is worse in every scene, 0 if neither stands out;
+    - `p`: two-sided p-value of Wilcoxon's signed-rank test (exact up to 50 scenes without ties), and `p_holm`: the
+      same after Holm's correction (1979) for the number of other methods.
 
-    Few scenes cannot show much: with five, the smallest possible p is 0.0625.
+    The test has little power with few scenes: with five, the smallest possible p is 0.0625.
     """
     rows = list(rows)
     means = {metric: scene_means(rows, metric) for metric in PAIRED_METRICS}
@@ -48,7 +48,7 @@ def paired_comparisons(rows: Iterable[FrameScore], method: str) -> dict[str, dic
 
 
 def compared(gains: Float64[np.ndarray, " scenes"]) -> dict[str, Any]:
-    """Scenes, better, effect and p of how much each scene gained; ties of 0 count for neither side."""
+    """Scenes, better, effect and p of the gains of the scenes; a gain of 0 counts for neither method."""
     moved = gains[gains != 0]
     effect, p = 0.0, 1.0
     if len(moved):
@@ -59,7 +59,7 @@ def compared(gains: Float64[np.ndarray, " scenes"]) -> dict[str, Any]:
 
 
 def _correct(comparisons: Sequence[dict[str, Any]]) -> None:
-    """Add `p_holm`: the smallest p times the number of tests, the next times one less, and never falling."""
+    """Add `p_holm`: the k-th smallest of n p-values times n + 1 - k, at most 1 and never decreasing in k."""
     reached = 0.0
     for i, comparison in enumerate(sorted(comparisons, key=lambda comparison: comparison["p"])):
         reached = max(reached, min(1.0, comparison["p"] * (len(comparisons) - i)))

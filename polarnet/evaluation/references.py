@@ -1,4 +1,4 @@
-"""Reference rows: constants and the oracle mean. They see the truth or no event, so they are not methods."""
+"""Reference rows: constants, which see no events, and the oracle mean, which sees the truth. None is a method."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -15,25 +15,25 @@ COLOUR = "#98a2b3"
 
 @dataclass(frozen=True)
 class Reference:
-    """A row that every table shows beside the methods; its DoLP is one value everywhere in a frame."""
+    """A row that tables show beside the methods; its DoLP is constant over a frame."""
 
     name: str
     label: str
     colour: str
     about: str
-    """Sentence of the glossary of pages."""
+    """Glossary sentence of the HTML pages."""
     predict: Callable[[TestSequence, float | None], Prediction]
-    """The sequence and the mean DoLP of the training split -> a frame a window."""
+    """Sequence and mean DoLP of the training split -> one frame per window."""
     needs_train_mean: bool = False
 
 
 def zeros(sequence: TestSequence, train_mean: float | None) -> Prediction:
-    """No polarization anywhere."""
+    """DoLP of 0 everywhere."""
     return Prediction(torch.zeros_like(sequence.dolp))
 
 
 def train_mean(sequence: TestSequence, train_mean: float | None) -> Prediction:
-    """The mean DoLP of the training split everywhere; ValueError where it is not known."""
+    """The mean DoLP of the training split everywhere; ValueError if it is unknown."""
     if train_mean is None:
         raise ValueError(
             "the row train_mean needs the mean DoLP of a training split, got none; run `dvc repro synthesize`"
@@ -42,7 +42,7 @@ def train_mean(sequence: TestSequence, train_mean: float | None) -> Prediction:
 
 
 def own_mean(sequence: TestSequence, train_mean: float | None) -> Prediction:
-    """The best of all constants for each frame, known only from the truth."""
+    """The best constant for each frame, computed from the truth."""
     return Prediction(oracle_mean(sequence.dolp, sequence.valid))
 
 
@@ -68,13 +68,13 @@ REFERENCES = {
         ),
     )
 }
-"""Reference row by name, in the order of every table."""
+"""Reference by name, in the order of all tables."""
 
 
 def oracle_mean(truth: Float[Tensor, "n h w"], valid: Bool[Tensor, "n h w"] | None = None) -> Float[Tensor, "n h w"]:
-    """Each frame's own mean: no constant can have a smaller squared error.
+    """Mean of each frame: the constant with the smallest squared error.
 
-    Only valid pixels count, since no others are scored; a frame without any gets 0.
+    Only valid pixels count, as in the scores; a frame without valid pixels gets 0.
     """
     if valid is None:
         mean = truth.mean(dim=(-2, -1), keepdim=True)
@@ -85,7 +85,7 @@ def oracle_mean(truth: Float[Tensor, "n h w"], valid: Bool[Tensor, "n h w"] | No
 
 
 def mean_dolp(sequences: Iterable[Float[Tensor, "*pixels"]]) -> float:
-    """Mean over all pixels of all sequences; ValueError where there are none."""
+    """Mean over all pixels of all sequences; ValueError if there are none."""
     total, count = 0.0, 0
     for frames in sequences:
         total, count = total + frames.double().sum().item(), count + frames.numel()

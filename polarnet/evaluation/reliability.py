@@ -1,4 +1,4 @@
-"""Whether a network's expected squared error is the one that is measured: a reliability curve."""
+"""Reliability curve: the squared error that a network expects, against the measured one."""
 
 from dataclasses import dataclass
 
@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-LOWEST, HIGHEST, BINS = -12.0, 0.0, 24  # of the log variance; what lies outside counts in the outermost bins
+LOWEST, HIGHEST, BINS = -12.0, 0.0, 24  # bins of the log variance; values outside fall into the outermost bins
 
 
 @dataclass(frozen=True)
 class Reliability:
-    """Sums over pixels whose predicted log variance falls into the same bin; those of several sequences add up."""
+    """Sums over the pixels of each bin of predicted log variance; add instances to join sequences."""
 
     pixels: Float[Tensor, " bins"]
     predicted: Float[Tensor, " bins"]
@@ -23,14 +23,14 @@ class Reliability:
         return Reliability(self.pixels + other.pixels, self.predicted + other.predicted, self.measured + other.measured)
 
     def curve(self) -> list[tuple[float, float, int]]:
-        """Mean predicted variance, mean squared error and number of pixels of each bin that has any."""
+        """Mean predicted variance, mean squared error and number of pixels of each non-empty bin."""
         rows = zip(self.predicted.tolist(), self.measured.tolist(), self.pixels.tolist(), strict=True)
         return [(predicted / count, measured / count, round(count)) for predicted, measured, count in rows if count]
 
     def log_error(self) -> float:
-        """Mean over pixels of |ln(mean squared error / mean predicted variance)| of their bin: 0 is calibrated.
+        """Mean over pixels of |ln(mean squared error / mean predicted variance)| in their bin; 0 if calibrated.
 
-        ValueError where there is no pixel.
+        ValueError if no pixel has an error.
         """
         here = (self.pixels > 0) & (self.measured > 0)
         if not here.any():
@@ -45,7 +45,7 @@ def reliability(
     truth: Float[Tensor, "n h w"],
     valid: Bool[Tensor, "n h w"] | None = None,
 ) -> Reliability:
-    """Of frames of DoLP in [0, 1] and the logarithm of the squared error that a network expects of them."""
+    """Reliability of frames of DoLP in [0, 1] with their predicted log variance."""
     everywhere = torch.ones_like(truth, dtype=torch.bool) if valid is None else valid
     predicted, squared = log_variance[everywhere].double(), (dolp - truth)[everywhere].double().square()
     width = (HIGHEST - LOWEST) / BINS

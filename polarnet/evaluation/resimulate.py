@@ -1,4 +1,4 @@
-"""Test sequences made anew from stored scenes: other window lengths, other sensors, other speeds; all in memory."""
+"""Simulate stored scenes again, in memory, with other window lengths, sensors or speeds."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from polarnet.simulation.truth import frames_of, valid_frames
 
 
 def sequence_at(scenes: SceneStore, sequence: str, events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> TestSequence:
-    """A stored sequence's events with its exact truth at the times `t_us`, which bound its windows."""
+    """Events of a stored sequence, with exact truth at the window boundaries `t_us`."""
     record = scenes.read(sequence)
     trajectory = Trajectory.from_vector(record.trajectory.numpy())
     scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
@@ -35,10 +35,10 @@ def resimulated(
     speed: float = 1.0,
     threads: int = 1,
 ) -> TestSequence:
-    """A stored sequence seen again, behind polarizers whose sensors may differ: one configuration for each of the four.
+    """Emulate a stored sequence again, with one sensor configuration for each of the four polarizers.
 
-    The noise is that of the stored sequence. `speed` other than 1 lets the window move over the same picture at so
-    many times the configured speed, along another path.
+    The noise equals that of the stored sequence. A `speed` other than 1 multiplies the configured speed and moves
+    the sensor over the same picture along another path.
     """
     record = scenes.read(sequence)
     scene = scene_from_polarization(record.s0, record.dolp, record.aolp)

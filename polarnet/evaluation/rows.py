@@ -1,4 +1,4 @@
-"""The rows of the benchmark: references, and methods run over a sequence."""
+"""Rows of the benchmark: references and methods, and running them over a sequence."""
 
 import functools
 from collections import ChainMap
@@ -28,31 +28,31 @@ from polarnet.networks.checkpoint import load_checkpoint
 from polarnet.stokes import Prediction
 
 ROWS: Mapping[str, Reference | Method] = ChainMap(METHODS, REFERENCES)  # type: ignore[arg-type]
-"""Reference or method by name, in the order of every table: references first."""
+"""Reference or method by name, in the order of all tables: references first."""
 
 MAX_OPEN = 32
-"""Methods whose weights stay in memory between sequences."""
+"""Maximum number of methods whose weights stay in memory between sequences."""
 
 
 @dataclass(frozen=True)
 class Context:
-    """What rows need besides the sequence."""
+    """Inputs of the rows besides the sequence."""
 
     train_mean: float | None
-    """Mean DoLP of the training split; None where there is no such split."""
+    """Mean DoLP of the training split; None without a training split."""
     setups: Mapping[str, Setup]
     """Setup by section of `methods` in params.yaml."""
     device: torch.device
-    """Device of the scores."""
+    """Device that computes the scores."""
 
     def setup_of(self, method: Method) -> Setup:
-        """What this method gets; NAME+gain gets what NAME gets."""
+        """Setup of a method; NAME+gain shares the setup of NAME."""
         return self.setups[method.section]
 
 
 @torch.no_grad()
 def predictions_of(names: Sequence[str], sequence: TestSequence, context: Context) -> dict[str, Prediction]:
-    """Row, then a frame for each window, on the CPU; a method and its +gain share one run over the events."""
+    """Prediction by row, one frame per window, on the CPU; NAME and NAME+gain share one run over the events."""
     windows = sequence.windows
     predictions: dict[str, Prediction] = {}
     for name in sorted(names, key=lambda name: name in METHODS and METHODS[name].wraps is not None):
@@ -69,7 +69,7 @@ def predictions_of(names: Sequence[str], sequence: TestSequence, context: Contex
 
 
 def run(recoverer: Recoverer, windows: Sequence[EventWindow]) -> Prediction:
-    """A method over consecutive windows from the start, one at a time, as events come from a camera."""
+    """Run a method over consecutive windows from its initial state, one window at a time as from a camera."""
     first = windows[0].channels[0]
     state: State = recoverer.start(first.height, first.width)
     frames: list[Prediction] = []
@@ -81,7 +81,7 @@ def run(recoverer: Recoverer, windows: Sequence[EventWindow]) -> Prediction:
 
 
 def opened(method: Method, context: Context) -> Recoverer:
-    """The method ready to run; kept while neither its settings nor its file of weights change."""
+    """The method, ready to run; cached while its settings and weights file are unchanged."""
     setup = context.setup_of(method)
     written = setup.weights.stat().st_mtime_ns if setup.weights is not None and setup.weights.exists() else None
     return _opened(method, setup, written)
@@ -93,13 +93,13 @@ def _opened(method: Method, setup: Setup, written: int | None) -> Recoverer:
 
 
 def available(names: Sequence[str], context: Context) -> tuple[list[str], dict[str, str]]:
-    """The rows that can run, in their order, and for each of the others the reason why it is left out."""
+    """The rows that can run, in the given order, and the reasons for leaving out the others."""
     reasons = {name: reason for name in names if (reason := why_left_out(name, context))}
     return [name for name in names if name not in reasons], reasons
 
 
 def why_left_out(name: str, context: Context) -> str | None:
-    """Why a row cannot run; None where it can."""
+    """Reason why a row cannot run; None if it can."""
     row = ROWS[name]
     if isinstance(row, Reference):
         missing = row.needs_train_mean and context.train_mean is None
@@ -108,15 +108,15 @@ def why_left_out(name: str, context: Context) -> str | None:
 
 
 def weights_used(names: Sequence[str], context: Context) -> dict[str, dict[str, str]]:
-    """Section of `methods`, then file name, sha256 and network of the weights, for each of these rows that needs any.
+    """File name, sha256 and network of the weights, by section of `methods`, for the rows that need weights.
 
-    ValueError or FileNotFoundError where they are missing or of another network.
+    ValueError or FileNotFoundError if weights are missing or belong to another network.
     """
     return {method.section: weights_record(method, context.setup_of(method)) for method in _with_weights(names)}
 
 
 def metadata_used(names: Sequence[str], context: Context) -> dict[str, dict[str, Any]]:
-    """Section of `methods`, then the metadata of its checkpoint, for each of these rows that has one of polarnet."""
+    """Checkpoint metadata by section of `methods`, for the rows with a checkpoint of polarnet."""
     paths = {method.section: weights_file(context.setup_of(method)) for method in _with_weights(names)}
     return {row: load_checkpoint(path)[1] for row, path in paths.items() if path.suffix == ".safetensors"}
 

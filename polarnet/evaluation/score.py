@@ -1,4 +1,4 @@
-"""Scores of recovered polarization: a row per frame, means over frames, then over scenes, with bootstrap intervals."""
+"""Scores of predictions: one row per frame, means over frames and then scenes, with bootstrap intervals."""
 
 import csv
 import math
@@ -35,10 +35,10 @@ from polarnet.stokes import Prediction
 
 METRICS = ("mse", "psnr", "ssim", "lpips", "corr", "grad", "level_mse", "pattern_mse", "aolp_deg", "skill")
 SETS = ("simulated", "complex_motion", "measured")
-"""The pipeline's own held-out sequences, the same pictures under harder motion, and measured polarization."""
+"""Test sets: the pipeline's held-out sequences, the same pictures under harder motion, measured polarization."""
 
 INTERVAL = (0.025, 0.975)  # quantiles of the bootstrap: 95 %
-FRAMES_AT_ONCE = 8  # of LPIPS: bounds the memory that its features need
+FRAMES_AT_ONCE = 8  # batch size of LPIPS, which bounds the memory of its features
 
 
 @dataclass(frozen=True)
@@ -46,20 +46,20 @@ class BenchmarkConfig:
     """Section `benchmark` of params.yaml."""
 
     methods: list[str]
-    """Rows: references and methods."""
+    """Rows of the table: references and methods."""
     sets: list[str] = field(metadata=allowed(choices=SETS))
-    """Test sets; simulated is always among them."""
+    """Test sets; must include simulated."""
     warmup_windows: int = field(metadata=allowed(low=0))
-    """First windows of a sequence that no score counts, for every method alike: nothing has moved far enough yet."""
+    """Unscored windows at the start of a sequence, the same for all methods: nothing has moved far enough yet."""
     precision: str = field(metadata=allowed(choices=("fp32", "bf16")))
-    """Of the networks; scores in fp32 do not depend on a processor's bf16 kernels."""
+    """Precision of the networks; scores in fp32 do not depend on a processor's bf16 kernels."""
     lpips: bool
-    """Whether LPIPS is a column."""
+    """Whether to compute LPIPS."""
     lpips_backbone: str = field(metadata=allowed(choices=tuple(BACKBONES)))
-    """Of that column, always in fp32; the paper's is vgg."""
+    """Backbone of LPIPS, always in fp32; the paper uses vgg."""
     bootstrap_samples: int = field(metadata=allowed(low=1))
     panel_scenes: int = field(metadata=allowed(low=0))
-    """Scenes shown as pictures."""
+    """Number of scenes shown as panels."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -72,32 +72,32 @@ class BenchmarkConfig:
 
 
 class FrameScore(NamedTuple):
-    """How one recovered frame compares with the truth; the columns of frames.csv."""
+    """Scores of one predicted frame; the columns of frames.csv."""
 
     method: str
     scene: str
     sequence: str
     window: int
-    """Counted from 0 in the sequence; the frame is the one at the window's end."""
+    """Index of the window in the sequence, from 0; the frame is at the window's end."""
     t_us: int
     mse: float
     psnr: float
     ssim: float
     lpips: float | None
-    """None where LPIPS is no column."""
+    """None unless LPIPS is computed."""
     corr: float
     grad: float
     """`similarity.gradient_agreement`."""
     level_mse: float
     pattern_mse: float
     aolp_deg: float | None
-    """`similarity.aolp_error_deg`, weighted by the true DoLP; None where the method gives no angle."""
+    """`similarity.aolp_error_deg`, weighted by the true DoLP; None if the method predicts no angle."""
     oracle_mse: float
-    """MSE of the true frame's own mean: no score, but what skill is measured against."""
+    """MSE of the true frame's mean: not a score, but the reference of the skill."""
 
 
 def scored_windows(sequence: TestSequence, warmup_windows: int) -> range:
-    """Windows that count; ValueError where the warm-up leaves none."""
+    """Indices of the scored windows; ValueError if the warm-up leaves none."""
     if len(sequence.dolp) <= warmup_windows:
         raise ValueError(
             f"{sequence.name} has {len(sequence.dolp)} windows and the first {warmup_windows} are warm-up: nothing "
@@ -114,13 +114,12 @@ def score_sequence(
     lpips: Lpips | None,
     device: torch.device,
 ) -> list[FrameScore]:
-    """A row per method and window after the warm-up; `predictions` holds a frame a window of each method.
+    """One row per method and window after the warm-up; `predictions` hold one frame per window.
 
-    Computed on `device`, where `lpips` has to be. Pixels that are not valid count in no score but LPIPS, which sees the
-    truth there in place of the prediction.
+    Scores are computed on `device`, where `lpips` must be. Invalid pixels are excluded from all scores except LPIPS,
+    which sees the truth there instead of the prediction.
 
-    ValueError, which names the frame, for a score that is not a number, or a frame without a valid pixel: no frame is
-    ever left out.
+    ValueError, naming the frame, if a score is not finite or a frame has no valid pixel: frames are never left out.
     """
     windows = scored_windows(sequence, warmup_windows)
     for method, prediction in predictions.items():
@@ -171,10 +170,10 @@ def score_sequence(
 
 
 def scene_means(rows: Iterable[FrameScore], metric: str) -> dict[str, dict[str, float]]:
-    """Method, then scene: the mean over the scene's frames, of any column or metric.
+    """Mean of a column or metric over the frames of each scene, by method and scene.
 
     The skill of a scene is 1 - its MSE / the MSE of the oracle mean. A method without the metric is left out;
-    ValueError where it has the metric for some frames alone.
+    ValueError if only some of its frames have the metric.
     """
     if metric == "skill":
         rows = list(rows)
@@ -200,12 +199,12 @@ def scene_means(rows: Iterable[FrameScore], metric: str) -> dict[str, dict[str, 
 def summary(
     rows: Sequence[FrameScore], bootstrap_samples: int, seed: int
 ) -> dict[str, dict[str, float | list[float] | None]]:
-    """Method, then metric: the mean over scenes, and as `<metric>_ci` its 95 % bootstrap interval over scenes.
+    """Mean over scenes by method and metric, and its 95 % bootstrap interval over scenes as `<metric>_ci`.
 
-    A scene is one source picture, however many sequences were made from it: those are not independent. All methods
-    and metrics see the same resampled scenes. Skill is 1 - mean MSE / mean MSE of the oracle mean, over the same
-    scenes: a ratio of means, as a scene that hardly varies would otherwise outweigh all others. A metric that was not
-    computed is None and has no interval. ValueError where a method lacks a scene.
+    All sequences of one source picture form one scene, since they are not independent. All methods and metrics use
+    the same resampled scenes. Skill is 1 - mean MSE / mean MSE of the oracle mean over the same scenes. This ratio of
+    means keeps a scene with little variation from outweighing all others. A metric that was not computed is None and
+    has no interval. ValueError if a method lacks a scene.
     """
     methods = list(dict.fromkeys(row.method for row in rows))
     scenes = sorted({row.scene for row in rows})
@@ -233,7 +232,7 @@ def summary(
 
 
 def write_frames(path: Path, rows: Iterable[FrameScore]) -> None:
-    """Write rows as CSV with a header; an empty cell is a metric that was not computed."""
+    """Write rows as CSV with a header; metrics that were not computed are empty cells."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(FrameScore._fields)
@@ -241,7 +240,7 @@ def write_frames(path: Path, rows: Iterable[FrameScore]) -> None:
 
 
 def _skill(error: Any, oracle: Any) -> Any:
-    """1 for no error, 0 for that of the oracle mean; a truth without any pattern is held to what PSNR resolves."""
+    """1 for no error, 0 for the error of the oracle mean, which is at least `LEAST_MSE`, the resolution of PSNR."""
     return 1 - error / np.maximum(oracle, LEAST_MSE)
 
 
@@ -260,7 +259,7 @@ def _lpips_of(
 
 
 def _features_of(frames: Float[Tensor, "n h w"], lpips: Lpips) -> list[Float[Tensor, "n _c _h _w"]]:
-    """LPIPS's features, computed once where every frame is the same: a constant."""
+    """LPIPS features of frames, computed only once if all frames are equal (constant predictions)."""
     if torch.equal(frames, frames[:1].expand_as(frames)):
         return [features.expand(len(frames), -1, -1, -1) for features in lpips.features(frames[:1])]
     return lpips.features(frames)

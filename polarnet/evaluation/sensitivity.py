@@ -1,4 +1,4 @@
-"""How recovery bears a sensor or a motion that differs from the one of training: one setting changed at a time."""
+"""Sensitivity to the sensor and the motion: change one setting at a time and score the methods."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from polarnet.simulation.motion import MotionConfig
 from polarnet.simulation.scenes import SceneStore
 
 CHANNEL_SIGNS = (1, -1, -1, 1)
-"""Of the threshold error behind 0, 45, 90 and 135 degrees: opposite within each pair whose difference is S1 or S2."""
+"""Signs of the threshold error behind 0, 45, 90 and 135 degrees, opposite within each pair that gives S1 or S2."""
 
 SETTINGS: Mapping[str, Sequence[float]] = {
     "threshold_mismatch": (0.0, 0.03, 0.06, 0.12),
@@ -23,15 +23,19 @@ SETTINGS: Mapping[str, Sequence[float]] = {
     "speed": (0.25, 0.5, 1.0, 2.0, 4.0),
     "channel_error": (0.0, 0.05, 0.1, 0.2, 0.4),
 }
-"""threshold_mismatch: deviation of the contrast threshold between pixels, in natural-log intensity. noise_rate_hz:
-shot-noise events a pixel and second. speed: times the configured one. channel_error: relative error of the contrast
-threshold of each polarizer's sensor, with `CHANNEL_SIGNS`; a Prophesee sensor's differ by 0.2 to 0.3 over its settings.
+"""Values of each setting.
+
+- threshold_mismatch: standard deviation of the contrast threshold between pixels, in natural-log intensity.
+- noise_rate_hz: shot-noise events per pixel and second.
+- speed: factor on the configured speed.
+- channel_error: relative error of the contrast threshold in each channel, with the signs `CHANNEL_SIGNS`. The
+  thresholds of a Prophesee sensor differ by 0.2 to 0.3 over its settings.
 """
 SHOWN = ("mse", "psnr", "corr", "skill")
 
 
 def sensors(setting: str, value: float, emulate: EmulatorConfig) -> list[EmulatorConfig]:
-    """The sensors behind the four polarizers with one setting changed; speed changes none of them."""
+    """Sensors behind the four polarizers with one setting changed; `speed` leaves them unchanged."""
     if setting == "threshold_mismatch":
         return [dataclasses.replace(emulate, contrast_threshold_sigma=value)] * 4
     if setting == "noise_rate_hz":
@@ -62,10 +66,10 @@ def sensitivity(
     settings: Mapping[str, Sequence[float]] = SETTINGS,
     threads: int = 1,
 ) -> dict[str, list[dict[str, Any]]]:
-    """Setting, then its values: events per pixel and second, and each method's mean scores over the sequences' scenes.
+    """Event rates per pixel and second and mean scores over scenes of each method, for every value of each setting.
 
-    Sequences are emulated again from their stored scenes, with the noise that they were made with. A speed that a
-    picture has no room for is left out, and the entry says how many sequences it counts.
+    Sequences are emulated again from their stored scenes with their original noise. A sequence is left out at speeds
+    that its picture has no room for; `sequences` in each entry counts the remaining ones.
     """
     table: dict[str, list[dict[str, Any]]] = {}
     points = [(setting, value) for setting, values in settings.items() for value in values]

@@ -1,4 +1,4 @@
-"""A simulated sequence with its truth, as methods are tested on it."""
+"""Simulated sequences with their truth, for testing methods."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,27 +14,27 @@ from polarnet.events.windows import windows_of
 
 @dataclass(frozen=True)
 class TestSequence:
-    """Events of the four polarizers, and the truth at the end of each window, which methods never see."""
+    """Events of the four channels, and the truth at the end of each window, which methods never see."""
 
-    __test__: ClassVar[bool] = False  # pytest takes classes of this name for its own
+    __test__: ClassVar[bool] = False  # pytest would collect a class of this name
 
     name: str
     scene: str
-    """The source picture that it shows."""
+    """Name of the source picture."""
     events: Sequence[Events]
-    """Of the four polarizers; time counts from the start of the sequence."""
+    """Events of the four channels; time starts with the sequence."""
     t_us: Int64[Tensor, " frames"]
-    """Times of the frames, one more than there are windows: window k lies between frames k and k + 1."""
+    """Times of the n + 1 frames; window k lies between frames k and k + 1."""
     dolp: Float[Tensor, "n h w"]
-    """Truth at the end of each window, like the next two."""
+    """True DoLP at the end of each window; `aolp` and `s0` likewise."""
     aolp: Float[Tensor, "n h w"]
     s0: Float[Tensor, "n h w"]
     valid: Bool[Tensor, "n h w"] | None = None
-    """Where the truth is known, and so scored; None: everywhere."""
+    """Pixels with known truth, which are scored; None: all pixels."""
 
     @property
     def windows(self) -> list[EventWindow]:
-        """The windows between its frames, each from one frame's time up to, not including, the next one's."""
+        """Windows between consecutive frames, half-open: each includes its start and excludes its end."""
         return [
             EventWindow([slice_time(events, start, stop) for events in self.events], start, stop)
             for start, stop in windows_of(self.t_us)

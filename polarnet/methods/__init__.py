@@ -1,4 +1,4 @@
-"""Ways from events to DoLP: one record each, assembled from the modules of this folder."""
+"""Methods from events to DoLP, one record each, collected from the modules of this folder."""
 
 import importlib
 import pkgutil
@@ -7,9 +7,10 @@ from polarnet.methods.method import Method
 
 
 def _assembled() -> dict[str, Method]:
-    """The records that the modules name in their `METHODS`, module by module in alphabetical order.
+    """Records from the `METHODS` of each module.
 
-    Filters come first, then networks that reconstruct intensities, then networks that predict DoLP.
+    Filters come first, then networks that reconstruct intensities, then networks that predict DoLP. Within each
+    group the modules are in alphabetical order.
     """
     modules = [importlib.import_module(f"{__name__}.{name}") for _, name, _ in pkgutil.iter_modules(__path__)]
     records = [method for module in modules for method in getattr(module, "METHODS", ())]
@@ -20,4 +21,4 @@ def _assembled() -> dict[str, Method]:
 
 
 METHODS = _assembled()
-"""Method by name, in the order of every table and figure."""
+"""Method by name, in the order of all tables and figures."""

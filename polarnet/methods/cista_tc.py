@@ -11,7 +11,7 @@ load = functools.partial(load_baseline, CistaTc, "cista_tc")
 
 
 def open_cista_tc(setup: Setup) -> Recoverer:
-    """CISTA-TC; its images are taken as they are, without E2VID's post-processing."""
+    """CISTA-TC, without E2VID's post-processing of the images."""
     return intensity_network(load, setup)
 
 

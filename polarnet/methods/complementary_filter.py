@@ -1,7 +1,7 @@
-"""Intensity from events by a leaky integrator behind every pixel (Scheerlinck, Barnes, Mahony, ACCV 2018).
+"""Intensity from events by a leaky integrator in every pixel (Scheerlinck, Barnes, Mahony, ACCV 2018).
 
-Two filters of the same authors, which "CF with default parameters" can both mean and which differ by decibels of DoLP:
-the complementary filter without frames, and the high-pass filter of their events-only package.
+The module holds two filters by these authors: the complementary filter without frames, and the high-pass filter of
+their events-only package. "CF with default parameters" can mean either, and their DoLP differs by decibels.
 """
 
 import math
@@ -22,10 +22,10 @@ from polarnet.methods.method import Method, Recoverer, Setup, State
 from polarnet.ranges import allowed, check_ranges
 from polarnet.stokes import Prediction
 
-HIGHPASS_GAIN = 1.5  # of the high-pass filter's output, I = 1.5 exp(L) - 1: the package's source
-ROBUST = (0.0025, 0.9975)  # quantiles that the package takes for an image's darkest and brightest
-FOLLOWED_S = 2.0  # after this long ...
-FOLLOWED = 0.95  # ... its automatic range has followed so much of a change
+HIGHPASS_GAIN = 1.5  # output gain of the high-pass filter, I = 1.5 exp(L) - 1, from the package's source
+ROBUST = (0.0025, 0.9975)  # the package's quantiles for the darkest and brightest intensity of an image
+FOLLOWED_S = 2.0  # time in which the automatic range ...
+FOLLOWED = 0.95  # ... follows this fraction of a change
 RANGE_RULES = ("fixed", "common", "per_polarizer")
 
 Step = Callable[..., tuple[Tensor, "FilterState"]]
@@ -36,15 +36,15 @@ class ComplementaryFilterConfig:
     """Section `methods.cf` of params.yaml; the published defaults."""
 
     cutoff_hz: float = field(metadata=allowed(low=0))
-    """Below it the scene fades to grey; 0: never."""
+    """Cutoff frequency, below which the scene fades to grey; 0: never."""
     contrast_on: float = field(metadata=allowed(above=0))
-    """Step of log intensity of an ON event."""
+    """Step in log intensity per ON event."""
     contrast_off: float = field(metadata=allowed(high=0))
     intensity_range: list[float]
-    """Intensities shown as 0 and 1; where an automatic range starts from."""
+    """Intensities mapped to 0 and 1; the initial value of an automatic range."""
     range_rule: str = field(metadata=allowed(choices=RANGE_RULES))
-    """fixed: `intensity_range`, for the four polarizers alike; common: a range that follows the images, one for the
-    four; per_polarizer: one for each, which loses the ratios between them that Stokes parameters need."""
+    """fixed: `intensity_range` for all four channels; common: one range for all channels that follows the images;
+    per_polarizer: one such range per channel, which loses the ratios that Stokes parameters need."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -53,11 +53,11 @@ class ComplementaryFilterConfig:
 
 @dataclass(frozen=True)
 class HighPassConfig:
-    """Section `methods.highpass` of params.yaml; the package's defaults, but for the range, automatic there."""
+    """Section `methods.highpass` of params.yaml; the package's defaults, except for its automatic range."""
 
     cutoff_hz: float = field(metadata=allowed(low=0))
     decay_per_event: float = field(metadata=allowed(low=0))
-    """Natural logarithm by which a pixel fades at each of its events, whatever their distance in time."""
+    """Natural logarithm of a pixel's decay at each of its events, independent of time."""
     contrast_on: float = field(metadata=allowed(above=0))
     contrast_off: float = field(metadata=allowed(high=0))
     intensity_range: list[float]
@@ -69,16 +69,16 @@ class HighPassConfig:
 
 
 class LeakyIntegrator(NamedTuple):
-    """What the pixels behind one polarizer remember."""
+    """State of the pixels of one channel."""
 
     log_intensity: Float64[np.ndarray, "h w"]
-    """At the pixel's own last event."""
+    """Log intensity at the last event of each pixel."""
     updated_us: Int64[np.ndarray, "h w"]
     """Time of that event; 0 before the first."""
 
 
 class Decay(NamedTuple):
-    """How fast a pixel forgets, and what an event adds."""
+    """Decay of a pixel and the step that each event adds."""
 
     rate_per_us: float
     per_event: float
@@ -92,7 +92,7 @@ def at_rest(height: int, width: int) -> LeakyIntegrator:
 
 
 def integrate(state: LeakyIntegrator, events: Events, decay: Decay) -> LeakyIntegrator:
-    """The state after `events`: at each, L <- exp(-omega dt - k) L + c. Earlier than the state: ValueError."""
+    """State after `events`, each of which sets L <- exp(-omega dt - k) L + c; ValueError if one precedes the state."""
     log_intensity, updated_us = state.log_intensity.copy(), state.updated_us.copy()
     t, x, y, p = (column.numpy() for column in (events.t, events.x, events.y, events.p))
     in_order = _integrate(log_intensity, updated_us, t, x, y, p, *decay)
@@ -102,25 +102,25 @@ def integrate(state: LeakyIntegrator, events: Events, decay: Decay) -> LeakyInte
 
 
 def log_intensity_at(state: LeakyIntegrator, t_us: int, decay: Decay) -> Float64[np.ndarray, "h w"]:
-    """Log intensity at a time after the last event: every pixel decayed from its own last event to `t_us`."""
+    """Log intensity at `t_us`: every pixel decays from its own last event, which must be earlier."""
     return state.log_intensity * np.exp(-decay.rate_per_us * (t_us - state.updated_us))
 
 
 class FilterState(NamedTuple):
-    """What a filter carries from one image to the next."""
+    """State of a filter between images."""
 
     pixels: Sequence[LeakyIntegrator]
-    """Behind each polarizer."""
+    """Integrator of each channel."""
     t_us: int
-    """Of the last image."""
+    """Time of the last image."""
     shown: Float64[np.ndarray, "2 c"]
-    """Intensities shown as 0 and 1, for each polarizer."""
+    """Intensities mapped to 0 and 1, for each channel."""
 
 
 def filter_at_rest(
     channels: int, height: int, width: int, config: ComplementaryFilterConfig | HighPassConfig
 ) -> FilterState:
-    """The state at time 0, when nothing is known."""
+    """State of a filter at time 0, before any event."""
     shown = np.array(config.intensity_range)[:, None] + np.zeros(channels)
     return FilterState([at_rest(height, width)] * channels, 0, shown)
 
@@ -128,10 +128,10 @@ def filter_at_rest(
 def step_cf(
     state: FilterState, channels: Sequence[Events], t_us: int, config: ComplementaryFilterConfig
 ) -> tuple[Float64[Tensor, "c h w"], FilterState]:
-    """Intensity at a time from the events since the last image: I = exp(L) - 1, brought to [0, 1].
+    """Intensity at `t_us` from the events since the last image: I = exp(L) - 1, scaled to [0, 1].
 
-    Each of the c channels, the polarizers of a recording, is filtered by itself. What `config.range_rule` says is
-    shown as 0 and 1, and what lies outside is clipped.
+    Each of the c channels is filtered independently. `config.range_rule` sets the intensities mapped to 0 and 1;
+    intensities outside are clipped.
     """
     decay = Decay(_rate_per_us(config.cutoff_hz), 0.0, config.contrast_on, config.contrast_off)
     logs, pixels = _log_intensities(state, channels, t_us, decay)
@@ -150,7 +150,7 @@ def step_highpass(
 def followed_range(
     shown: Float64[np.ndarray, "2 c"], image: Float64[np.ndarray, "2 c"], elapsed_us: int
 ) -> Float64[np.ndarray, "2 c"]:
-    """The range shown, which follows that of the images (darkest, brightest) as a low-pass filter: 95 % in 2 s."""
+    """The automatic range: a low-pass filter of each image's darkest and brightest value, 95 % in 2 s."""
     kept = (1 - FOLLOWED) ** (elapsed_us * 1e-6 / FOLLOWED_S)
     return kept * shown + (1 - kept) * image
 
@@ -171,7 +171,7 @@ def _shown(
         image = np.quantile(intensity, ROBUST, axis=over).reshape(2, -1)
         shown = followed_range(shown, np.broadcast_to(image, shown.shape), t_us - state.t_us)
     low, high = shown[..., None, None]
-    span = np.maximum(high - low, np.finfo(np.float64).tiny)  # an image of one value has none in the end
+    span = np.maximum(high - low, np.finfo(np.float64).tiny)  # the range of a constant image shrinks to 0
     unit = torch.from_numpy(((intensity - low) / span).clip(0, 1))
     return unit, state._replace(t_us=t_us, shown=shown)
 
@@ -201,7 +201,7 @@ def _check_intensity_range(intensity_range: Sequence[float]) -> None:
 
 
 def filtered(step: Step, config: ComplementaryFilterConfig | HighPassConfig) -> Recoverer:
-    """A filter as a method: `step` once for each window, from the events that no window before has held."""
+    """Wrap a filter as a method: `step` runs once per window, on the events that no earlier window held."""
 
     def start(height: int, width: int) -> State:
         return filter_at_rest(4, height, width, config)

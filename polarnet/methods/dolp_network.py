@@ -1,4 +1,4 @@
-"""Networks that predict DoLP from the events of a window, with a recurrent state."""
+"""Recurrent networks that predict DoLP from the events of a window, as methods."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,16 +18,16 @@ DOLP_NETWORKS = tuple(NETWORKS)
 
 
 def encoded(windows: Sequence[EventWindow], encode: Encode) -> Float[Tensor, "n c h w"]:
-    """Every window through `encode`, polarizer by polarizer along the second axis."""
+    """Encode every window, with the channels concatenated along the second axis."""
     return torch.stack([_encoded(window, encode) for window in windows])
 
 
 def dolp_recoverer(
     network: nn.Module, metadata: Mapping[str, Any], device: torch.device | str = "cpu", precision: str = "fp32"
 ) -> Recoverer:
-    """The network of a checkpoint and its metadata (`load_network`) as a method.
+    """Wrap a network and the metadata of its checkpoint (`load_network`) as a method.
 
-    `precision` is fp32 or bf16 (autocast). Windows should be as long as those of the training; for DoLP more often, let
+    `precision` is fp32 or bf16 (autocast). Windows should be as long as in training. For DoLP at a higher rate, let
     windows of that length overlap (`polarnet.methods.overlap`).
     """
     place = torch.device(device)
@@ -44,7 +44,7 @@ def dolp_recoverer(
 
 
 def open_dolp_network(setup: Setup) -> Recoverer:
-    """The DoLP network whose checkpoint the setup names."""
+    """Open the DoLP network from the checkpoint in the setup."""
     network, metadata = load_network(weights_file(setup))
     return dolp_recoverer(network, metadata, setup.device, setup.precision)
 

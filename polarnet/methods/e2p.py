@@ -1,4 +1,4 @@
-"""E2P, the published network from events to polarization, trained by the pipeline (Mei et al., CVPR 2023)."""
+"""E2P, a published network from events to polarization (Mei et al., CVPR 2023), trained by the pipeline."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from polarnet.stokes import Prediction
 
 
 def open_e2p(setup: Setup) -> Recoverer:
-    """E2P on the four channels laid out as a mosaic of twice the height and width."""
+    """Open E2P, which takes the four channels interleaved as a mosaic of twice the height and width."""
     network = load_baseline(E2p, "e2p", weights_file(setup)).to(setup.device)
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:

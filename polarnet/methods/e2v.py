@@ -1,4 +1,4 @@
-"""E2V: the events-to-intensity network that the pipeline trained, whichever `baselines.e2v.arch` names."""
+"""E2V: the events-to-intensity network that the pipeline trains, selected by `baselines.e2v.arch`."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ NETWORKS = {"firenet": FireNet, "e2vid": E2vid}
 
 
 def load(path: Path) -> Any:
-    """The network that a checkpoint says it holds."""
+    """Load the network named in the checkpoint; ValueError if it is not in `NETWORKS`."""
     name = load_checkpoint(path)[1]["network"]
     if name not in NETWORKS:
         raise ValueError(f"{path} holds a {name}, expected a {' or '.join(NETWORKS)}")
@@ -22,7 +22,7 @@ def load(path: Path) -> Any:
 
 
 def open_e2v(setup: Setup) -> Recoverer:
-    """The network of the checkpoint, with intensities on their true scale."""
+    """Open the network of the checkpoint, with intensities on their true scale."""
     return intensity_network(load, setup)
 
 

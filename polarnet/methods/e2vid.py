@@ -1,4 +1,4 @@
-"""E2VID, trained by the pipeline or with its authors' weights (Rebecq et al., CVPR 2019 and TPAMI 2021)."""
+"""E2VID (Rebecq et al., CVPR 2019 and TPAMI 2021), trained by the pipeline or with its authors' weights."""
 
 import functools
 
@@ -11,12 +11,12 @@ load = functools.partial(load_baseline, E2vid, "e2vid")
 
 
 def open_e2vid(setup: Setup) -> Recoverer:
-    """E2VID as the pipeline trained it."""
+    """Open E2VID with weights trained by the pipeline."""
     return intensity_network(load, setup)
 
 
 def open_e2vid_published(setup: Setup) -> Recoverer:
-    """E2VID with its authors' weights."""
+    """Open E2VID with its authors' weights."""
     return intensity_network(load, setup, published=True)
 
 

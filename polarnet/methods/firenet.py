@@ -1,4 +1,4 @@
-"""FireNet and FireNet+, trained by the pipeline or with their authors' weights (Scheerlinck et al., WACV 2020)."""
+"""FireNet (Scheerlinck et al., WACV 2020) and FireNet+, trained by the pipeline or with their authors' weights."""
 
 import functools
 
@@ -11,17 +11,17 @@ load = functools.partial(load_baseline, FireNet, "firenet")
 
 
 def open_firenet(setup: Setup) -> Recoverer:
-    """FireNet as the pipeline trained it."""
+    """Open FireNet with weights trained by the pipeline."""
     return intensity_network(load, setup)
 
 
 def open_firenet_published(setup: Setup) -> Recoverer:
-    """FireNet with its authors' weights."""
+    """Open FireNet with its authors' weights."""
     return intensity_network(load, setup, published=True)
 
 
 def open_firenetplus_published(setup: Setup) -> Recoverer:
-    """FireNet+ with its authors' weights; it takes voxel grids without normalisation (Stoffregen et al., ECCV 2020)."""
+    """Open FireNet+ with its authors' weights, without normalised voxel grids (Stoffregen et al., ECCV 2020)."""
     return intensity_network(load, setup, normalised=False, published=True)
 
 

@@ -1,4 +1,4 @@
-"""DoLP from reconstructed intensities, and the wrapper NAME+gain, which first solves the gains of the polarizers."""
+"""DoLP from reconstructed intensities, and the wrapper NAME+gain, which first solves the gains of the channels."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ GAIN = "+gain"
 
 
 def from_intensities(intensities: Float[Tensor, "n 4 h w"]) -> Prediction:
-    """DoLP and AoLP (Eq. 1-3) of intensities behind the four polarizers, on a scale common to the four."""
+    """DoLP and AoLP (Eq. 1-3) from the intensities of the four channels, which must share one scale."""
     stokes = stokes_from_intensities(intensities)
     return Prediction(dolp(stokes), aolp(stokes), intensities=intensities)
 
 
 def with_gain(method: Method) -> Method:
-    """The method NAME+gain: the intensities of `method`, brought to a common scale by I0 + I90 = I45 + I135.
+    """The method NAME+gain, which scales the intensities of `method` so that I0 + I90 = I45 + I135.
 
-    Where both rows are wanted, `convert` makes this one of the predictions of the other, whose run it shares.
+    If both rows are wanted, they share one run: `convert` turns the predictions of `method` into those of NAME+gain.
     """
 
     def convert(setup: Setup, before: State, prediction: Prediction) -> tuple[State, Prediction]:

@@ -1,4 +1,4 @@
-"""Networks that reconstruct intensity from events: the four polarizers are four streams of one batch."""
+"""Networks that reconstruct intensity from events, as methods; the four channels form one batch."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ from polarnet.stokes import Prediction
 
 
 def load_baseline(build: Any, name: str, path: Path) -> Any:
-    """The network `name` of a checkpoint of polarnet or of a published file; ValueError for another network."""
+    """Load the network `name` from a checkpoint of polarnet or a published file; ValueError for another network."""
     if path.suffix != ".safetensors":
         return build.load(path)
     tensors, metadata = load_checkpoint(path)
@@ -32,10 +32,10 @@ def load_baseline(build: Any, name: str, path: Path) -> Any:
 def intensity_network(
     load: Callable[[Path], Any], setup: Setup, *, normalised: bool = True, published: bool = False
 ) -> Recoverer:
-    """The network that `load` makes of the setup's weights, as a method that reconstructs intensities.
+    """Load a network from the setup's weights and wrap it as a method that reconstructs intensities.
 
-    `normalised`: whether voxel grids are brought to mean 0 and deviation 1, as E2VID's. `published`: intensities go
-    through the post-processing of published weights; otherwise they are on their true scale and only clipped.
+    `normalised` scales voxel grids to mean 0 and standard deviation 1, as in E2VID. `published` applies the
+    post-processing of published weights; otherwise intensities are on their true scale and only clipped.
     """
     network = load(weights_file(setup)).to(setup.device)
     postprocessing = setup.postprocessing if published else None
@@ -58,14 +58,14 @@ def intensity_network(
 
 
 def voxel_grids(window: EventWindow, bins: int) -> Float[Tensor, "4 bins h w"]:
-    """The voxel grid of each polarizer."""
+    """Voxel grid of each channel."""
     return torch.stack([voxel_grid(events, bins) for events in window.channels])
 
 
 def _displayed(
     images: Float[Tensor, "n 4 h w"], before: Float[Tensor, "m 4 h w"], config: PostprocessingConfig | None
 ) -> tuple[Float[Tensor, "n 4 h w"], Float[Tensor, "k 4 h w"]]:
-    """Intensities in [0, 1] of n images that follow m, and the images that the range of the next ones depends on."""
+    """Intensities in [0, 1] of n images after m earlier ones, and the images that set the range of later ones."""
     if config is None:
         return images.clamp(0, 1), before
     sharp = torch.cat([before, unsharp_masked(images, config.unsharp_amount, config.unsharp_sigma)])

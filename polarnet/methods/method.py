@@ -1,4 +1,4 @@
-"""The record of a method: its name, what it needs, and how it goes from window to window with its state in hand."""
+"""The record of a method: its name, settings and weights, and its step from window to window."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from polarnet.networks.checkpoint import load_checkpoint
 from polarnet.stokes import Prediction
 
 State = Any
-"""What a method remembers of the events before a window: tensors, or nothing yet."""
+"""State of a method before a window: tensors, or None at the start."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class WeightsConfig:
     """Section `methods.NAME` of params.yaml for a method whose only setting is its weights."""
 
     weights: str | None
-    """A .safetensors checkpoint of polarnet, or a file as its authors published it; null: the record says which."""
+    """A .safetensors checkpoint of polarnet or a published weights file; null: the default in the method's record."""
 
     def __post_init__(self):
         if self.weights is not None and not self.weights.strip():
@@ -33,12 +33,12 @@ class WeightsConfig:
 
 @dataclass(frozen=True)
 class Setup:
-    """Everything that a method gets besides events."""
+    """Inputs of a method besides events."""
 
     config: Any
     """Section `methods.NAME` of params.yaml."""
     weights: Path | None
-    """File of its weights; None where it needs none, or where none is configured."""
+    """Weights file; None if the method needs none or none is configured."""
     postprocessing: PostprocessingConfig
     gain: GainConfig
     device: torch.device
@@ -49,12 +49,12 @@ class Setup:
         return hash((self.weights, self.device, self.precision))  # settings may be lists, which have no hash
 
     def autocast(self) -> torch.autocast:
-        """The precision of networks, for a `with`."""
+        """Context manager that sets the precision of networks."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bf16")
 
 
 class Recoverer(NamedTuple):
-    """A method with its settings and weights, ready for events. It keeps nothing: state goes in and comes out.
+    """A method with its settings and weights, ready for events. It is stateless: the caller passes the state.
 
     state = recoverer.start(height, width)
     state, prediction = recoverer.step(state, windows)
@@ -63,17 +63,17 @@ class Recoverer(NamedTuple):
     start: Callable[[int, int], State]
     """Height and width of a channel -> the state before the first event."""
     predict: Callable[[State, Sequence[EventWindow]], tuple[State, Prediction]]
-    """`step` of this method before DoLP is clamped."""
+    """Same as `step`, but DoLP is not clamped."""
     takes_events_once: bool = False
-    """Whether a window's events that an earlier window held are left out, so that windows may overlap freely."""
+    """Whether the method skips events that an earlier window held, so that windows may overlap freely."""
     network: nn.Module | None = None
-    """The network that it runs; None for a filter."""
+    """The method's network; None for a filter."""
 
     @torch.no_grad()
     def step(self, state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        """The state after n consecutive windows, each of which begins where the one before ends, and n frames.
+        """State and prediction after n windows, each of which starts at the end of the previous one.
 
-        Maps are n h w, on the method's device; DoLP is float32 in [0, 1]: clamped here, for every method alike.
+        Maps are n h w, on the method's device. DoLP is float32, clamped to [0, 1] for all methods.
         """
         state, prediction = self.predict(state, windows)
         return state, clamped(prediction)
@@ -81,50 +81,50 @@ class Recoverer(NamedTuple):
 
 @dataclass(frozen=True)
 class Weights:
-    """The weights that a method needs."""
+    """Weights that a method needs."""
 
     networks: tuple[str, ...]
-    """Networks that a checkpoint of polarnet may hold, by their names in its JSON."""
+    """Names of the networks that a checkpoint of polarnet may hold, as in its JSON."""
     trained_by: str | None = None
-    """Training stage whose best.safetensors is used where `methods.NAME.weights` is null; None: no stage."""
+    """Training stage that provides best.safetensors if `methods.NAME.weights` is null; None: no stage."""
     remedy: str = ""
-    """How else to get them, beside a file."""
+    """Advice on obtaining weights other than from a file."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way from events to DoLP."""
+    """Record of a way from events to DoLP."""
 
     name: str
-    """Row of the benchmark, `--method` of recover, section of `methods` in params.yaml."""
+    """Key of the method: benchmark row, `--method` of recover, section of `methods` in params.yaml."""
     label: str
     """Name in tables and figures."""
     colour: str
-    """Colour in figures, #rrggbb, of NAME+gain too."""
+    """Colour in figures, #rrggbb, shared by NAME+gain."""
     open: Callable[[Setup], Recoverer]
-    """Loads what is needed. FileNotFoundError or ValueError where the weights are missing or of another network."""
+    """Load the method. FileNotFoundError or ValueError if the weights are missing or of another network."""
     config: type | None = None
-    """Class of the section `methods.NAME`; None: it has none."""
+    """Class of the section `methods.NAME`; None: no section."""
     weights: Weights | None = None
-    """None: it needs none."""
+    """Weights that the method needs; None: no weights."""
     reconstructs: bool = False
-    """Whether DoLP comes from reconstructed intensities, which `Prediction.intensities` then holds."""
+    """Whether DoLP is computed from reconstructed intensities, held by `Prediction.intensities`."""
     about: str = ""
-    """Sentence of the glossary of pages. Of a row that may hold several networks, or published weights: what it stands
-    for beside its network; empty where the network's own sentence says all."""
+    """Glossary sentence of the HTML pages. For a row with several possible networks or published weights, it states
+    the difference from the network's own sentence; empty if that sentence suffices."""
     wraps: "Method | None" = None
-    """The method whose predictions `convert` turns into this one's."""
+    """Wrapped method, whose predictions `convert` turns into those of this method."""
     convert: Callable[[Setup, State, Prediction], tuple[State, Prediction]] | None = None
-    """State (None at the start) and the wrapped method's prediction -> state, prediction."""
+    """Setup, state (None at the start) and prediction of the wrapped method -> state, prediction."""
 
     @property
     def section(self) -> str:
-        """Key of its section in `methods` of params.yaml: its own name, or that of the method that it wraps."""
+        """Key in section `methods` of params.yaml: the name of the method, or of the method it wraps."""
         return self.wraps.section if self.wraps else self.name
 
 
 def weights_file(setup: Setup) -> Path:
-    """The file of a method's weights; FileNotFoundError where there is none."""
+    """Path of a method's weights; FileNotFoundError if there is no file."""
     if setup.weights is None or not setup.weights.exists():
         reason = "no weights are given" if setup.weights is None else f"{setup.weights} is missing"
         raise FileNotFoundError(reason)
@@ -132,7 +132,7 @@ def weights_file(setup: Setup) -> Path:
 
 
 def why_absent(method: Method, setup: Setup) -> str | None:
-    """Why a method cannot run; None where it can."""
+    """Reason why a method cannot run; None if it can."""
     if method.weights is None:
         return None
     key, path = f"methods.{method.section}.weights", setup.weights
@@ -148,7 +148,7 @@ def why_absent(method: Method, setup: Setup) -> str | None:
 
 
 def weights_record(method: Method, setup: Setup) -> dict[str, str]:
-    """File name, sha256 and network of a method's weights; FileNotFoundError or ValueError where it has none."""
+    """File name, sha256 and network of a method's weights; FileNotFoundError or ValueError if it has none."""
     if method.weights is None:
         raise ValueError(f"{method.name} needs no weights, so there is no record of them")
     path = weights_file(setup)
@@ -161,11 +161,11 @@ def weights_record(method: Method, setup: Setup) -> dict[str, str]:
 
 
 def clamped(prediction: Prediction) -> Prediction:
-    """A prediction with DoLP in [0, 1], and its maps in float32."""
+    """Prediction with DoLP clamped to [0, 1] and DoLP, AoLP and log variance in float32."""
     aolp, log_variance = (None if x is None else x.float() for x in (prediction.aolp, prediction.log_variance))
     return prediction._replace(dolp=prediction.dolp.float().clamp(0, 1), aolp=aolp, log_variance=log_variance)
 
 
 def each_map(prediction: Prediction, change: Callable[[Tensor], Tensor]) -> Prediction:
-    """A prediction with each of its maps changed alike."""
+    """Apply `change` to every map of a prediction."""
     return Prediction(*(None if field is None else change(field) for field in prediction))  # type: ignore[arg-type]

@@ -1,13 +1,13 @@
-"""Windows of a stream, overlapping or not, through a method.
+"""Run a method over the windows of a stream, whether they overlap or not.
 
-Networks learn on windows that follow each other, 1/30 s long in the paper, and their state summarises all that came
-before the present window. For DoLP more often than that, windows must not be shorter: they would hold another kind
-of input. Neither may each hand its state to the next while they overlap: most events would count many times. A
-window therefore begins with the newest state whose window ended no later than it begins.
+Networks are trained on consecutive windows, 1/30 s long in the paper; their state summarises all earlier windows.
+For DoLP at a higher rate, shorter windows would change the kind of input. Passing the state between overlapping
+windows would count most events many times. A window therefore starts from the newest state whose window ended no
+later than this window starts.
 
-Windows one after the other so have their state handed on. Of windows that overlap, every S-th of a length of n S, each
-continues the one n before it, as if n cameras ran with shifted windows: no event counts twice, none is missed. A step
-that does not divide the length leaves a gap before the window, whose events are missed.
+Consecutive windows pass their state on directly. If windows of length n S start every S, each window continues the
+window n steps earlier, as if n cameras ran with shifted windows. Every event then counts exactly once in each of
+these n series. If the step does not divide the length, events in the gap before a window are missed.
 """
 
 import itertools
@@ -19,22 +19,22 @@ from polarnet.methods.method import Recoverer, State
 from polarnet.stokes import Prediction
 
 STATES_PER_WINDOW = 64
-"""At most this many states are kept for the length of a window: where steps are finer, up to a 64th is missed."""
+"""Maximum number of states per window length; with finer steps, up to 1/64 of a window is missed."""
 BEFORE_ALL_US = -(2**63)
 
 History = tuple[tuple[int, State], ...]
-"""The end of a window (microseconds) and the state after it, oldest first."""
+"""Pairs of a window's end (microseconds) and the state after that window, oldest first."""
 
 
 def begin(recoverer: Recoverer, height: int, width: int) -> History:
-    """The history before the first event."""
+    """History before the first event."""
     return ((BEFORE_ALL_US, recoverer.start(height, width)),)
 
 
 def advance(recoverer: Recoverer, history: History, windows: Sequence[EventWindow]) -> tuple[History, Prediction]:
-    """The history after n consecutive windows, which may overlap those of calls before, and n frames.
+    """History and n predicted frames after n consecutive windows, which may overlap windows of earlier calls.
 
-    ValueError where one of them does not begin where the one before ends.
+    ValueError unless each window starts at the end of the previous one.
     """
     spans = [(window.start_us, window.stop_us) for window in windows]
     if any(stop != start for (_, stop), (start, _) in itertools.pairwise(spans)):
@@ -52,8 +52,8 @@ def advance(recoverer: Recoverer, history: History, windows: Sequence[EventWindo
 
 
 def warm_up(recoverer: Recoverer, height: int, width: int) -> None:
-    """Run two windows without events, so that the first real one does not wait for kernels to load."""
+    """Run two empty windows, so that kernels are loaded before the first real window."""
     nothing = [Events.empty(height, width)] * 4
     state = recoverer.start(height, width)
-    for k in range(2):  # with and without a state
+    for k in range(2):  # without and with a state
         state, _ = recoverer.step(state, [EventWindow(nothing, 1000 * k, 1000 * (k + 1))])

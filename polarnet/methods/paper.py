@@ -1,4 +1,4 @@
-"""The paper's network, or any other DoLP network to compare with the one in use."""
+"""The paper's network, or another DoLP network to compare with polarnet's."""
 
 from polarnet.methods.dolp_network import DOLP_NETWORKS, open_dolp_network
 from polarnet.methods.method import Method, Weights, WeightsConfig

@@ -1,4 +1,4 @@
-"""The DoLP network that the pipeline trained: polarnet's own, unless `network` names another."""
+"""The DoLP network that the pipeline trains: polarnet's own unless `network` selects another."""
 
 from polarnet.methods.dolp_network import DOLP_NETWORKS, open_dolp_network
 from polarnet.methods.method import Method, Weights, WeightsConfig

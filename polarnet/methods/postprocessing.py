@@ -1,6 +1,7 @@
-"""What E2VID's authors do to reconstructed images before they show them (their public code): switchable, and recorded.
+"""Post-processing of reconstructed images from the public code of E2VID's authors.
 
-Their images are then rounded to 8 bits; these are not.
+Each step can be switched off, and the settings are recorded. The authors then round images to 8 bits; polarnet does
+not.
 """
 
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ from torch.nn import functional as F
 
 from polarnet.ranges import allowed, check_ranges
 
-KERNEL_SIZE = 5  # pixels of the blur behind the unsharp mask
+KERNEL_SIZE = 5  # blur kernel of the unsharp mask, pixels
 DARKEST_AT_MOST = 0.45  # bounds of the automatic range, so that it spans at least 0.1
 BRIGHTEST_AT_LEAST = 0.55
 
@@ -23,27 +24,27 @@ class PostprocessingConfig:
     """Section `baselines.postprocessing` of params.yaml; the published defaults."""
 
     unsharp_amount: float = field(metadata=allowed(low=0))
-    """Of what a blurred copy lacks, added to the image; 0: nothing."""
+    """Factor on the difference between image and blurred copy, which is added to the image; 0: off."""
     unsharp_sigma: float = field(metadata=allowed(above=0))
-    """Of the blur, in the published kernel's units."""
+    """Width of the blur, in the units of the published kernel."""
     auto_hdr: bool
     """Stretch the range of the images to [0, 1]."""
     auto_hdr_frames: int = field(metadata=allowed(low=1))
-    """The range is the median over so many frames, the present one the last."""
+    """Number of frames for the median of the range, up to and including the present frame."""
     auto_hdr_per_polarizer: bool
-    """A range for each polarizer, which loses the ratios that Stokes parameters need; false: one for the four."""
+    """One range per channel, which loses the ratios that Stokes parameters need; false: one range for all four."""
 
     def __post_init__(self):
         check_ranges(self)
 
 
 def postprocessed(images: Float[Tensor, "t c h w"], config: PostprocessingConfig) -> Float[Tensor, "t c h w"]:
-    """Sharpened, brought to [0, 1] by the automatic range if wanted, and clipped to it."""
+    """Sharpen images, stretch them to [0, 1] if `auto_hdr` is set, and clip them."""
     return stretched(unsharp_masked(images, config.unsharp_amount, config.unsharp_sigma), config)
 
 
 def stretched(sharp: Float[Tensor, "t c h w"], config: PostprocessingConfig) -> Float[Tensor, "t c h w"]:
-    """Sharpened images, brought to [0, 1] by the automatic range if wanted, and clipped to it."""
+    """Stretch sharpened images to [0, 1] if `auto_hdr` is set, and clip them."""
     if config.auto_hdr:
         low, high = _range(sharp, config.auto_hdr_frames, per_channel=config.auto_hdr_per_polarizer)
         sharp = (sharp - low) / (high - low)
@@ -51,7 +52,7 @@ def stretched(sharp: Float[Tensor, "t c h w"], config: PostprocessingConfig) -> 
 
 
 def unsharp_masked(images: Float[Tensor, "t c h w"], amount: float, sigma: float) -> Float[Tensor, "t c h w"]:
-    """(1 + amount) image - amount blurred; beyond the border the image is mirrored."""
+    """Unsharp mask: (1 + amount) image - amount blurred, with the image mirrored at its border."""
     if amount == 0:
         return images
     kernel = blur_kernel(sigma).to(images)[None, None]
@@ -61,7 +62,7 @@ def unsharp_masked(images: Float[Tensor, "t c h w"], amount: float, sigma: float
 
 
 def blur_kernel(sigma: float) -> Float[Tensor, "5 5"]:
-    """The published kernel: the root of the outer product of a normal distribution's shares of 5 bins, sum 1.
+    """The published kernel: square root of the outer product of 5 normal bin probabilities, with sum 1.
 
     The bins lie in [-sigma - step / 2, sigma + step / 2] of the standard normal, step = (2 sigma + 1) / 5.
     """

@@ -1,7 +1,8 @@
-"""The factors that four reconstructed intensities lack, from the redundancy of four polarizers.
+"""Gains that bring four reconstructed intensities to one scale, from the redundancy of four polarizers.
 
-Events fix the intensity behind a polarizer up to a factor. With the true factors g, every pixel of every frame obeys
-g0 I0 + g90 I90 = g45 I45 + g135 I135, so that many pixels give the four up to a common one, which DoLP does not need.
+Events determine the intensity of a channel only up to a factor. With the true factors g, every pixel of every frame
+obeys g0 I0 + g90 I90 = g45 I45 + g135 I135. Many pixels therefore determine the four factors up to a common one,
+which cancels in DoLP.
 """
 
 import itertools
@@ -13,10 +14,10 @@ from torch import Tensor
 
 from polarnet.ranges import allowed, check_ranges
 
-SIGNS = (1.0, -1.0, 1.0, -1.0)  # of 0, 45, 90 and 135 degrees in I0 + I90 - I45 - I135
-DARK = 0.05  # pixels this dark against the mean pixel weigh half: their relative noise is larger
-TO_DEVIATION = 1.4826  # median of absolute values to standard deviation, of a normal distribution
-RIDGE = 1e-9  # keeps the system solvable where every channel is the same picture
+SIGNS = (1.0, -1.0, 1.0, -1.0)  # signs of I0, I45, I90 and I135 in I0 + I90 - I45 - I135
+DARK = 0.05  # brightness relative to the mean at which a pixel has half weight: dark pixels are noisier
+TO_DEVIATION = 1.4826  # from median absolute value to standard deviation, for a normal distribution
+RIDGE = 1e-9  # keeps the system solvable if all channels are equal
 
 
 @dataclass(frozen=True)
@@ -24,36 +25,36 @@ class GainConfig:
     """Section `baselines.gain` of params.yaml."""
 
     window_frames: int = field(metadata=allowed(low=1))
-    """Gains of a frame come from it and the ones before it, this many in all."""
+    """Number of frames that determine the gains of a frame: the frame and those before it."""
     rounds: int = field(metadata=allowed(low=0))
-    """How often pixels are weighted anew by how well they fit; 0: all alike."""
+    """Number of reweighting rounds by how well pixels fit; 0: equal weights."""
     pixels: int = field(metadata=allowed(low=4))
-    """At most this many of the window's pixels are looked at, evenly spread."""
+    """Maximum number of pixels used from these frames, evenly spread."""
     smallest: float = field(metadata=allowed(above=0, high=1))
-    """No gain may fall below this fraction of what would make all four channels equally bright."""
+    """Lower bound of a gain, as a fraction of the gain that makes all four channels equally bright."""
     pull: float = field(metadata=allowed(low=0))
-    """Towards equal brightness, against the pixels' mean square: holds gains that the pixels hardly determine."""
+    """Regularisation towards equal brightness, relative to the pixels' mean square, for poorly determined gains."""
 
     def __post_init__(self):
         check_ranges(self)
 
 
 def consistent(intensities: Float[Tensor, "n 4 h w"], config: GainConfig, known: int = 0) -> Float[Tensor, "m 4 h w"]:
-    """Intensities behind polarizers at 0, 45, 90 and 135 degrees, each times the gain that `gains` finds.
+    """Intensities at 0, 45, 90 and 135 degrees, multiplied by their `gains`.
 
-    m = n - `known`: the first `known` frames only contribute to the gains of those after them.
+    m = n - `known`: the first `known` frames only contribute to the gains of later frames.
     """
     return intensities[known:] * gains(intensities, config, known).to(intensities.dtype)[:, :, None, None]
 
 
 def gains(intensities: Float[Tensor, "n 4 h w"], config: GainConfig, known: int = 0) -> Float[Tensor, "m 4"]:
-    """Gains of each frame after the first `known`, from it and the ones before it; their geometric mean is 1."""
+    """Gains of each frame after the first `known`, from it and earlier frames; their geometric mean is 1."""
     ends = range(known + 1, len(intensities) + 1)
     return torch.stack([last_gains(intensities[max(0, end - config.window_frames) : end], config) for end in ends])
 
 
 def last_gains(intensities: Float[Tensor, "n 4 h w"], config: GainConfig) -> Float[Tensor, "4"]:
-    """Of the last frame, from all that are given."""
+    """Gains of the last frame, from all given frames."""
     frames, _, height, width = intensities.shape
     size = height * width
     looked_at = torch.arange(0, frames * size, max(1, -(-frames * size // config.pixels)), device=intensities.device)
@@ -62,12 +63,12 @@ def last_gains(intensities: Float[Tensor, "n 4 h w"], config: GainConfig) -> Flo
 
 
 def solved(residuals: Float[Tensor, "n 4"], config: GainConfig) -> Float[Tensor, "4"]:
-    """The positive gains g that bring `residuals` @ g nearest to 0, n pixels of I0, -I45, I90, -I135.
+    """Positive gains g that minimise `residuals` @ g for n pixels of I0, -I45, I90, -I135.
 
-    Least squares under the condition that the gains, in units of what makes the channels equally bright, sum to 1.
-    Noise therefore draws them towards equal brightness, not towards an arbitrary vector as in the plain null vector
-    (the smallest singular one). Every pixel is divided by its own length, as its noise is proportional to it, and
-    weighs the less the worse it fits (Cauchy's weights, their scale the median misfit).
+    The fit is least squares. Gains are in units of the gains that make the channels equally bright, and must sum to
+    1. Noise therefore draws them towards equal brightness; it would draw the plain null vector (the smallest singular
+    vector) towards an arbitrary one. Every pixel is divided by its norm, since its noise is proportional to it.
+    Pixels that fit badly get less weight (Cauchy weights, scaled by the median misfit).
     """
     brightness = residuals.square().mean(0).sqrt()
     brightness = torch.where(brightness > 0, brightness, 1.0)
@@ -83,9 +84,9 @@ def solved(residuals: Float[Tensor, "n 4"], config: GainConfig) -> Float[Tensor,
 
 
 def _smallest(form: Float[Tensor, "4 4"], floor: float, pull: float) -> Float[Tensor, "4"]:
-    """The x with x >= floor / 4 and sum 1 that makes x @ form @ x + pull trace(form) x @ x smallest.
+    """The x with x >= floor / 4 and sum 1 that minimises x @ form @ x + pull trace(form) x @ x.
 
-    Exact: the best of the solutions with each choice of entries held at the floor, where they are allowed.
+    The minimum is exact: the best feasible solution over all choices of entries held at the floor.
     """
     size = len(form)
     form = form / form.trace().clamp(min=torch.finfo(form.dtype).tiny)
@@ -97,7 +98,7 @@ def _smallest(form: Float[Tensor, "4 4"], floor: float, pull: float) -> Float[Te
         if not free.any():
             continue
         x = torch.full_like(form[0], lowest)
-        pulled = form[free][:, ~free].sum(1) * lowest  # by the entries that are held
+        pulled = form[free][:, ~free].sum(1) * lowest  # contribution of the entries held at the floor
         both = torch.linalg.solve(form[free][:, free], torch.stack([torch.ones_like(pulled), -pulled], dim=1))
         left = 1 - lowest * (~free).sum()
         x[free] = both[:, 1] + both[:, 0] * (left - both[:, 1].sum()) / both[:, 0].sum()
