@@ -161,7 +161,7 @@ def rig_scene(
 def true_intensity(
     truth: RigTruth, t_us: Int64[np.ndarray, " n"], recordings: RecordingsConfig
 ) -> Float32[Tensor, "n 4 h w"]:
-    """Noiseless intensities in [0, 1] of the reduced crop behind each polarizer, at times after the landmark."""
+    """Noiseless intensities in [0, 1] of the reduced crop behind each polarizer; times count from the landmark."""
     (height, width), (top, left) = recordings.crop, recordings.crop_corner
     # offset from the centre of the sensor to the centre of the crop
     right, down = left + (width - recordings.sensor[1]) / 2, top + (height - recordings.sensor[0]) / 2
