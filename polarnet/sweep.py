@@ -148,7 +148,7 @@ def _point(job: Path) -> dict[str, Any]:
 
 
 def _dropped_terms(weights: Any, terms: Mapping[str, float]) -> list[str]:
-    """Note on loss terms that have a weight above 0 but were missing from the training."""
+    """Note on loss terms that have a nonzero weight but were missing from the training."""
     names = [name for name, weight in weights.items() if weight and name not in terms]
     return [f"not in this training's loss: {', '.join(names)}"] if names else []
 
