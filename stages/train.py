@@ -1,4 +1,4 @@
-"""Events (data/events.zarr, or emulated from data/scenes.zarr), data/frames.zarr -> data/train: the DoLP network."""
+"""Events (data/events.zarr or emulated from data/scenes.zarr), data/frames.zarr -> data/train: the DoLP network."""
 
 from pathlib import Path
 
