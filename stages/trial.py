@@ -22,7 +22,7 @@ from omegaconf import DictConfig
 from polarnet.config import hydra_command
 from polarnet.sweep import FAILURE
 
-# Methods to compare a training with; no other benchmark method depends on the training.
+# The trained network and the references for it; no other method of the benchmark depends on the training.
 REFERENCE_METHODS = "benchmark.methods=[zeros,train_mean,oracle_mean,ours]"
 HYDRAS_HINT = "Set the environment variable HYDRA_FULL_ERROR"  # last line after each traceback
 
