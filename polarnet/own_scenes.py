@@ -42,7 +42,7 @@ def benchmark_folder(
         raise ValueError(
             f"--weights {weights}: expected a checkpoint of the DoLP network (.safetensors), there is none"
         )
-    lpips_weights = with_lpips(config, "benchmark", find_weights)  # the pipeline may not have searched for them
+    lpips_weights = with_lpips(config, "benchmark", find_weights)  # the pipeline need not have found them before
     lpips = None if lpips_weights is None else Lpips.of(lpips_weights.backbone, lpips_weights.tensors)
     train_mean = _train_mean(config)
     wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
