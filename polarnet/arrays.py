@@ -49,7 +49,7 @@ def whole_numbers(name: str, values: Any) -> Int64[Tensor, "*shape"]:
 
 
 def mask_of(name: str, values: Any, shape: Sequence[int]) -> Bool[Tensor, "*shape"]:
-    """Convert booleans of the given shape.
+    """Convert a boolean array of the given shape to a tensor.
 
     Raises TypeError as `as_tensor`, and ValueError for numbers or another shape.
     """

@@ -90,7 +90,7 @@ def dolp(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
 
 
 def aolp(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
-    """Angle of linear polarization in radians, [0, pi) (paper Eq. 3, over the whole circle); 0 where unpolarized."""
+    """Angle of linear polarization in radians, [0, pi) (paper Eq. 3, over the whole circle); 0 if unpolarized."""
     _, s1, s2 = _planes("stokes", stokes, "... 3 height width").unbind(-3)
     angle = torch.atan2(s2, s1) / 2
     folded = torch.where(angle < 0, angle + math.pi, angle)
