@@ -1,6 +1,6 @@
-"""Arrays of a caller's program, numpy or torch: checked once, where a public function takes them.
+"""Checks of a caller's arrays, numpy or torch, at the entry of public functions.
 
-Behind that door everything is a torch tensor of known shape and range, so that kernels need no checks.
+Inside the package all arrays are torch tensors of known shape and range, so kernels need no checks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,20 +13,20 @@ from torch import Tensor
 
 Array = Tensor | np.ndarray
 
-TOLERANCE = 1e-4  # float32 arithmetic may leave [0, 1] by some of its steps; more is a mistake of the caller's
+TOLERANCE = 1e-4  # float32 rounding may exceed [0, 1] slightly; a larger excess is the caller's error
 WHITE = {torch.uint8: 2**8 - 1, torch.uint16: 2**16 - 1}
-LARGEST_OVERSHOOT = 2.0  # floats up to here exceed white, as interpolation does; larger ones have another unit
+LARGEST_OVERSHOOT = 2.0  # floats up to this are overshoot, as from interpolation; larger ones have another unit
 
 
 def as_tensor(name: str, values: Any) -> Shaped[Tensor, "*shape"]:
-    """A numpy array or torch tensor of real numbers as a tensor, which shares its memory where it can.
+    """Convert a numpy array or torch tensor of real numbers to a tensor that shares its memory if possible.
 
-    TypeError for anything else: lists, text, pictures of other packages, complex numbers.
+    Raises TypeError for anything else, such as lists, text, image objects of other packages and complex numbers.
     """
     if isinstance(values, np.ndarray) and values.dtype.kind in "biuf":
         too_wide = values.dtype.kind == "f" and values.dtype.itemsize > 8  # long double, which torch lacks
         native = np.asarray(values, np.float64 if too_wide else values.dtype.newbyteorder("="), order="C")
-        # torch warns of arrays that are read-only, and refuses those that run backwards
+        # torch warns about read-only arrays and refuses negative strides
         unfit = not native.flags.writeable or min(native.strides, default=0) < 0
         return torch.from_numpy(native.copy() if unfit else native)
     if isinstance(values, Tensor) and values.layout == torch.strided and not _exotic(values):
@@ -38,7 +38,10 @@ def as_tensor(name: str, values: Any) -> Shaped[Tensor, "*shape"]:
 
 
 def whole_numbers(name: str, values: Any) -> Int64[Tensor, "*shape"]:
-    """Integers of any type as int64 on the CPU. TypeError as `as_tensor`; ValueError for floats and truth values."""
+    """Convert integers of any type to int64 on the CPU.
+
+    Raises TypeError as `as_tensor`, and ValueError for floats and booleans.
+    """
     tensor = as_tensor(name, values)
     if tensor.is_floating_point() or tensor.dtype == torch.bool:
         raise ValueError(f"{name}: expected whole numbers, got {tensor.dtype}; round and convert them to int64")
@@ -46,7 +49,10 @@ def whole_numbers(name: str, values: Any) -> Int64[Tensor, "*shape"]:
 
 
 def mask_of(name: str, values: Any, shape: Sequence[int]) -> Bool[Tensor, "*shape"]:
-    """Truth values of this shape. TypeError as `as_tensor`; ValueError for numbers or another shape."""
+    """Convert a boolean array of the given shape to a tensor.
+
+    Raises TypeError as `as_tensor`, and ValueError for numbers or another shape.
+    """
     tensor = as_tensor(name, values)
     if tensor.dtype != torch.bool or tuple(tensor.shape) != tuple(shape):
         raise ValueError(
@@ -56,9 +62,9 @@ def mask_of(name: str, values: Any, shape: Sequence[int]) -> Bool[Tensor, "*shap
 
 
 def check_shape(name: str, values: Array, axes: str) -> None:
-    """ValueError unless `values` has these axes, such as "3 height width" or "... 4 height width", none of them empty.
+    """Raise ValueError unless `values` has the given axes, such as "3 height width", and none of them is empty.
 
-    "..." stands for any leading axes, or none.
+    "..." stands for any number of leading axes, as in "... 4 height width".
     """
     shape, wanted = tuple(values.shape), axes.split()
     named = [axis for axis in wanted if axis != "..."]
@@ -75,7 +81,7 @@ def check_shape(name: str, values: Array, axes: str) -> None:
 
 
 def check_same_shape(arrays: Mapping[str, Tensor]) -> None:
-    """ValueError that names the arrays unless all have one shape: none is stretched to fit another."""
+    """Raise ValueError with the names of the arrays unless all have the same shape; there is no broadcasting."""
     shapes = {name: tuple(values.shape) for name, values in arrays.items()}
     if len(set(shapes.values())) > 1:
         listed = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
@@ -83,13 +89,13 @@ def check_same_shape(arrays: Mapping[str, Tensor]) -> None:
 
 
 def check_floating(name: str, values: Tensor) -> None:
-    """ValueError for integers: their unit is not that of [0, 1], and their differences wrap round."""
+    """Raise ValueError for integers, which are not scaled to [0, 1] and whose differences wrap around."""
     if not values.is_floating_point():
         raise ValueError(f"{name}: expected floating-point numbers, got {values.dtype}; {_scaling(values.dtype, 0)}")
 
 
 def check_finite(name: str, values: Tensor) -> None:
-    """ValueError that counts the values that are NaN or infinite, and says where the first is."""
+    """Raise ValueError with the count of NaN and infinite values and the position of the first."""
     wrong = values.isfinite().logical_not()
     if wrong.any():
         first = tuple(wrong.nonzero()[0].tolist())
@@ -102,7 +108,10 @@ def check_finite(name: str, values: Tensor) -> None:
 def check_range(
     name: str, values: Tensor, low: float | int, high: float | int, quantity: str = "values", advice: str | None = None
 ) -> None:
-    """ValueError where values leave [low, high] by more than `TOLERANCE`. `advice` None: how to scale a picture."""
+    """Raise ValueError if values exceed [low, high] by more than `TOLERANCE`.
+
+    The message ends with `advice`; None gives advice on scaling an image.
+    """
     if not values.numel():
         return
     compared = values.detach() if values.is_floating_point() else values.double()  # torch compares few integer types
@@ -116,9 +125,9 @@ def check_range(
 
 
 def floats(name: str, values: Any, axes: str) -> Float[Tensor, "*shape"]:
-    """Finite floating-point values as a tensor of float32 or float64 on the CPU, without a gradient.
+    """Convert finite floating-point values to float32 or float64 on the CPU, without gradient.
 
-    TypeError as `as_tensor`; ValueError for other axes (see `check_shape`), integers, NaN and infinity.
+    Raises TypeError as `as_tensor`, and ValueError for other axes (see `check_shape`), integers, NaN and infinity.
     """
     tensor = as_tensor(name, values).detach().cpu()
     check_shape(name, values, axes)
@@ -129,10 +138,10 @@ def floats(name: str, values: Any, axes: str) -> Float[Tensor, "*shape"]:
 
 
 def fractions(name: str, values: Any, axes: str, quantity: str = "values") -> Float[Tensor, "*shape"]:
-    """Values in [0, 1], as `floats`; what float32 arithmetic leaves outside is clipped.
+    """Convert values in [0, 1] as `floats` does, clipping float32 rounding errors.
 
-    ValueError also for values out of range, with the number to divide by. Integers are refused even where they would
-    be in range: an array does not say which of them is white.
+    Raises ValueError also for values out of range, with the number to divide by. Integers are refused even within the
+    range, because an array does not say which integer is white.
     """
     tensor = as_tensor(name, values).detach().cpu()
     check_shape(name, values, axes)
@@ -148,14 +157,14 @@ def _exotic(values: Tensor) -> bool:
 
 
 def _fits(shape: tuple[int, ...], named: list[str]) -> bool:
-    """Whether each axis has the length that its name says, or is not empty where the name is a word."""
+    """Whether each axis has the length in `named`, or is non-empty if `named` gives a word."""
     return len(shape) == len(named) and all(
         length == int(name) if name.isdigit() else length > 0 for length, name in zip(shape, named, strict=True)
     )
 
 
 def _scaling(dtype: torch.dtype, highest: float | int) -> str:
-    """How pictures of this type and with this highest value come to be in [0, 1]."""
+    """Advice on scaling an image of this type and maximum to [0, 1]."""
     white = WHITE.get(dtype) or next((white for white in WHITE.values() if highest <= white), None)
     if white is None or (dtype not in WHITE and highest <= LARGEST_OVERSHOOT):
         return "scale them to [0, 1] as float32"

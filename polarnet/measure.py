@@ -1,4 +1,4 @@
-"""The figures that say whether the README's two commands keep their word, measured in a fresh clone."""
+"""Measurements behind the figures in README and docs, written to docs/results."""
 
 import importlib.metadata
 import itertools
@@ -22,11 +22,11 @@ from polarnet.runtime import usable_cores
 from polarnet.sweep import COLUMNS, mean_scores, sweep_points
 
 VERSIONS_OF = ("torch", "numpy", "numba", "zarr", "dvc", "hydra-core")
-STAGE_STARTS = re.compile(r"Running stage '([\w@]+)'")  # what dvc repro prints
+STAGE_STARTS = re.compile(r"Running stage '([\w@]+)'")  # printed by dvc repro
 
 
 def machine_record(root: Path) -> dict[str, Any]:
-    """Where and with what a figure was measured: the keys that every file of docs/results carries."""
+    """Machine, versions and commit of a measurement: the keys common to all files in docs/results."""
     return {
         "machine": processor(),
         "cores": usable_cores(),
@@ -37,14 +37,16 @@ def machine_record(root: Path) -> dict[str, Any]:
 
 
 def uncommitted(root: Path, *allowed: str) -> str:
-    """Changed files of the project at `root` but for what is measured and what is `allowed`; empty where a figure may
-    name its commit."""
+    """Changed files of the project at `root`, except measured files and `allowed` ones.
+
+    The result is empty if a figure may name its commit.
+    """
     but_for = [f":!{path}" for path in ("docs/results", "docs/pictures", *allowed)]
     return git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", *but_for)
 
 
 def read_results(root: Path, name: str) -> dict[str, Any]:
-    """What docs/results/NAME.json holds; empty where it is not there yet."""
+    """Content of docs/results/NAME.json; empty if the file does not exist yet."""
     path = root / "docs" / "results" / f"{name}.json"
     return json.loads(path.read_text()) if path.exists() else {}
 
@@ -57,10 +59,10 @@ def write_section(
     record: Mapping[str, Any],
     headlines: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write `figures` as one section of docs/results/NAME.json and the machine's record beside it; the rest stays.
+    """Write `figures` and the machine's record as one section of docs/results/NAME.json; other sections stay.
 
-    The record (`machine_record`, taken before measuring) becomes `records.SECTION`: sections may be of different days.
-    `headlines` are figures that stand above the sections; one that is a mapping joins what is there.
+    The record (`machine_record`, taken before measuring) becomes `records.SECTION`, because sections may be measured
+    on different days. `headlines` are figures above the sections; a mapping is merged into the existing one.
     """
     path, known = root / "docs" / "results" / f"{name}.json", read_results(root, name)
     known["records"] = dict(sorted({**known.get("records", {}), section: dict(record)}.items()))
@@ -75,10 +77,10 @@ def write_section(
 def measure_pipeline(root: Path) -> Path:
     """Clone HEAD of the project at `root`, time `make repro` and `make test` there; write docs/results/pipeline.json.
 
-    The picture of the README comes from the same run. Where the tests fail, the file holds all but their minutes.
+    The overview picture of the README comes from the same run. If the tests fail, the file lacks only their minutes.
 
-    Raises RuntimeError when a command fails, when the tree has uncommitted changes (the figures would not belong to
-    the commit they name), or when a second `make repro` runs a stage.
+    Raises RuntimeError if a command fails or a second `make repro` runs a stage. Uncommitted changes raise it too,
+    because the figures would not belong to the commit they name.
     """
     if git(root, "status", "--porcelain", "--untracked-files=no"):
         raise RuntimeError("the tree has uncommitted changes; commit them first, the figures name a commit")
@@ -95,7 +97,7 @@ def measure_pipeline(root: Path) -> Path:
         record["lpips"] = json.loads((clone / "data" / "benchmark" / "details.json").read_text())["lpips"]
         shutil.copy(clone / "data" / "report" / "overview.png", root / "docs" / "pictures" / "overview.png")
         path = root / "docs" / "results" / "pipeline.json"
-        path.write_text(json.dumps(record, indent=2) + "\n")  # a test that fails does not lose what was measured
+        path.write_text(json.dumps(record, indent=2) + "\n")  # keeps the measurements if a test fails
         record["test_minutes"], _ = _timed("test", clone)
     path.write_text(json.dumps(record, indent=2) + "\n")
     return path
@@ -105,17 +107,17 @@ BENCHMARK_KEYS = (
     "mse", "psnr", "ssim", "lpips", "lpips_backbone", "level_mse", "pattern_mse", "corr", "grad", "skill", "aolp_deg",
     "ms_per_window", "gflop", "params", "peak_mib",
 )  # fmt: skip
-"""Of each method in docs/results/benchmark.json; intervals stay in metrics.json."""
+"""Scores of each method in docs/results/benchmark.json; the intervals stay in metrics.json."""
 
 
 def measure_benchmark(root: Path, benchmark: Path, record: Mapping[str, Any] | None = None) -> Path:
-    """Write docs/results/benchmark.json from what the benchmark left in the folder `benchmark`.
+    """Write docs/results/benchmark.json from the results in the folder `benchmark`.
 
-    `record` is the machine's from before the run, where the caller started it; None: as it is now.
+    `record` is the machine's record from before the run; None takes it now.
 
-    Its keys are the test sets, then the methods, then `BENCHMARK_KEYS`, beside the machine's record and each set's
-    pairs of `ours` with the others. Raises RuntimeError where the simulated or the measured set was not run, and when
-    the tree has uncommitted changes.
+    The keys of the file are the test sets, then the methods, then `BENCHMARK_KEYS`. The file also has the machine's
+    record and each set's comparisons of `ours` with the other methods. Raises RuntimeError if the simulated or the
+    measured set was not run, or if the tree has uncommitted changes.
     """
     if uncommitted(root, "dvc.lock", "data", "params.yaml"):
         raise RuntimeError("the tree has uncommitted changes; commit them first, the figures name a commit")
@@ -142,15 +144,15 @@ def measure_benchmark(root: Path, benchmark: Path, record: Mapping[str, Any] | N
 
 
 ABLATION_KEYS = ("mse", "level_mse", "pattern_mse", "psnr", "ssim", "corr", "aolp_deg")
-"""Of each ablation in docs/results/network.json."""
+"""Scores of each ablation in docs/results/network.json."""
 
 
 def measure_ablation(root: Path, sweep: Path) -> Path:
-    """Write section `ablation` of docs/results/network.json from a sweep's folder: jobs that name conf/ablation/NAME.
+    """Write section `ablation` of docs/results/network.json from a sweep over the files of conf/ablation.
 
-    What each leaves out is the comment of its file. RuntimeError where a job has no `ablation=NAME`, where there is
-    none with `ablation=nothing` to compare with, where an ablation has two jobs, or where the tree has uncommitted
-    changes. Jobs that failed are left out.
+    The comment in conf/ablation/NAME says which part the ablation removes. Raises RuntimeError if a job has no
+    `ablation=NAME`, if the baseline `ablation=nothing` is missing, if an ablation has two jobs, or if the tree has
+    uncommitted changes. Failed jobs are left out.
     """
     if uncommitted(root):
         raise RuntimeError("the tree has uncommitted changes; commit them first, the figures name a commit")
@@ -179,9 +181,10 @@ EQ9_WEIGHTS = ("mse", "ssim", "lpips")
 def measure_sweep(root: Path, sweeps: Sequence[Path]) -> list[Path]:
     """Write docs/results/sweep.json and docs/pictures/loss_sweep.png from sweeps over the weights of Eq. 9.
 
-    `points` has the weights, seeds, and means and standard deviations over seeds of each combination; smallest
-    validation MSE first. The sweeps may differ in `loss.mse`, `loss.ssim`, `loss.lpips` and `seed` alone. RuntimeError
-    where they differ in more, where a job failed or none is there, or where the tree has uncommitted changes.
+    `points` has the weights, the seeds, and the means and standard deviations over seeds of each combination, sorted by
+    validation MSE with the smallest first. The sweeps may differ only in `loss.mse`, `loss.ssim`, `loss.lpips` and
+    `seed`. Raises RuntimeError if other settings differ, if a job failed or none exists, or if the tree has uncommitted
+    changes.
     """
     if uncommitted(root):
         raise RuntimeError("the tree has uncommitted changes; commit them first, the figures name a commit")
@@ -225,7 +228,7 @@ def measure_sweep(root: Path, sweeps: Sequence[Path]) -> list[Path]:
 
 
 def _timed(target: str, folder: Path) -> tuple[float, dict[str, float]]:
-    """Minutes that `make target` took, and the minutes of each DVC stage that it ran."""
+    """Run `make target`; return its minutes and those of each DVC stage that it ran."""
     started = time.monotonic()
     marks: list[tuple[str, float]] = []
     with subprocess.Popen(

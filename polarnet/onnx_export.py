@@ -1,6 +1,6 @@
-"""A DoLP network as an ONNX file: one window of one stream, with the state as named inputs and outputs.
+"""Export of a DoLP network to ONNX: one window of one stream, with the state as named inputs and outputs.
 
-The file says in its own metadata, as JSON, what it takes and gives, so whoever has ONNX Runtime needs no polarnet.
+The metadata of the file describes its inputs and outputs as JSON, so ONNX Runtime can run it without polarnet.
 """
 
 import contextlib
@@ -24,13 +24,13 @@ from polarnet.events.windows import encode_windows
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
 
 FORMAT = "polarnet-onnx-1"
-KEY = "polarnet"  # of the JSON among the file's metadata_props
-OPSET = 20  # the first with GELU as one operator
+KEY = "polarnet"  # key of the JSON in the file's metadata_props
+OPSET = 20  # the first opset with GELU as one operator
 TOLERANCE = 1e-4
-"""Of `largest_differences`: far above what sums of float32 in another order leave, which `polarnet onnx` prints."""
-CHECKED_WINDOWS = 5  # with events; one without any follows
-CHECKED_WINDOW_US = 33_333  # where the checkpoint does not say how long its windows are
-MOST_EVENTS = 10  # a pixel and polarizer in all checked windows together
+"""Limit of `largest_differences`, far above the float32 rounding differences that `polarnet onnx` prints."""
+CHECKED_WINDOWS = 5  # windows with events; one empty window follows
+CHECKED_WINDOW_US = 33_333  # used if the checkpoint does not give the length of its windows
+MOST_EVENTS = 10  # per pixel and channel, over all checked windows
 SEED = 0
 MEANINGS = {
     "dolp": "degree of linear polarization, not clamped to [0, 1]",
@@ -38,23 +38,23 @@ MEANINGS = {
     "log_variance": "logarithm of the expected squared error of dolp",
     "stokes": "S1 / S0 and S2 / S0, of which aolp is the angle",
 }
-"""What the file says of the fields of `Prediction`."""
+"""Descriptions in the file of the fields of `Prediction`."""
 
 
 class OneWindow(nn.Module):
-    """A network whose state comes and goes tensor by tensor, as in a graph."""
+    """Wrapper that passes the state of a network as separate tensors, as an ONNX graph requires."""
 
     def __init__(self, network: nn.Module):
         super().__init__()
         self.network = network
 
     def forward(self, events: Float[Tensor, "1 c h w"], *state: Tensor) -> tuple[Tensor, ...]:
-        """The values of `outputs_by_name`."""
+        """Return the values of `outputs_by_name`."""
         return tuple(outputs_by_name(*self.network(events, list(state))).values())
 
 
 def outputs_by_name(prediction: Prediction, state: Sequence[Tensor]) -> dict[str, Tensor]:
-    """What is predicted, under its name, then the new state: new_state_0, new_state_1, ..."""
+    """Predicted maps under their names, then the new state: new_state_0, new_state_1, ..."""
     predicted = {name: field for name, field in prediction._asdict().items() if field is not None}
     return predicted | {f"new_state_{number}": tensor for number, tensor in enumerate(state)}
 
@@ -62,11 +62,11 @@ def outputs_by_name(prediction: Prediction, state: Sequence[Tensor]) -> dict[str
 def export_network(
     network: nn.Module, metadata: Mapping[str, Any], path: str | os.PathLike[str], height: int, width: int
 ) -> dict[str, float]:
-    """Write what `load_network` gave to `path` (.onnx), for images of one size; its `largest_differences` from torch.
+    """Write the result of `load_network` to `path` (.onnx) for one image size; return its `largest_differences`.
 
-    The weights are in the file, and the same network gives the same bytes. ValueError or FileNotFoundError where `path`
-    cannot be written; RuntimeError where packages are missing, or where an output of ONNX Runtime differs by more than
-    `TOLERANCE`: then there is no file, or still the one that was there before.
+    The file contains the weights, and the same network gives the same bytes. Raises ValueError or FileNotFoundError if
+    `path` cannot be written, and RuntimeError if packages are missing or an output of ONNX Runtime differs from torch
+    by more than `TOLERANCE`. After an error an existing file is unchanged and no new file is left.
     """
     onnx, _ = _packages()
     path = Path(path)
@@ -91,11 +91,11 @@ def export_network(
 def largest_differences(
     path: str | os.PathLike[str], network: nn.Module, windows: Float[Tensor, "t 1 c h w"]
 ) -> dict[str, float]:
-    """How far each output of the file is from torch's, at any pixel of consecutive windows.
+    """Largest difference of each output from torch, over all pixels of consecutive windows.
 
-    Both sides carry their own state, and begin with none. Where a map exceeds 1, relative to its largest value. Of the
-    angle, the circular difference times the length of (s1, s2): light that is not polarized has no angle. RuntimeError
-    for a file that ONNX Runtime does not take.
+    ONNX Runtime and torch each carry their own state, starting without one. Differences of a map that exceeds 1 are
+    relative to its maximum. The circular difference of angles is multiplied by the length of (s1, s2), because
+    unpolarized light has no angle. Raises RuntimeError for a file that ONNX Runtime cannot load.
     """
     session = _session(Path(path))
     states = json.loads(session.get_modelmeta().custom_metadata_map[KEY])["state"]
@@ -112,9 +112,9 @@ def largest_differences(
 
 
 def random_windows(metadata: Mapping[str, Any], height: int, width: int) -> Float[Tensor, "t 1 c h w"]:
-    """Consecutive windows in the representation of a checkpoint: always the same random events, at last none at all.
+    """Consecutive windows of random events in the representation of a checkpoint; the last window is empty.
 
-    Their number differs from polarizer to polarizer and falls from window to window.
+    The events are the same in every call. Their number differs between channels and falls from window to window.
     """
     generator = torch.Generator().manual_seed(SEED)
     window_us = _window_us(metadata) or CHECKED_WINDOW_US
@@ -134,10 +134,9 @@ def _random_events(height: int, width: int, duration_us: int, generator: torch.G
 def _traced(
     network: nn.Module, metadata: Mapping[str, Any], events: Float[Tensor, "1 c h w"]
 ) -> tuple[Any, dict[str, Any]]:
-    """The model, without what tracing notes about it (such as this machine's paths), and what is to be said of it."""
+    """ONNX model without the metadata of tracing (such as paths on this machine), and its description."""
     with torch.no_grad():
-        # Before it is traced the network must have run at this size: it keeps masks, and would keep those of tracing,
-        # which hold no numbers.
+        # Run the network at this size before tracing: it caches masks, and masks cached during tracing hold no values.
         prediction, state = network(events)
     shapes = [list(tensor.shape) for tensor in state]
     description = _description(metadata, prediction, list(events.shape), shapes)
@@ -162,7 +161,7 @@ def _traced(
 def _description(
     metadata: Mapping[str, Any], prediction: Prediction, shape: list[int], states: list[list[int]]
 ) -> dict[str, Any]:
-    """What somebody without polarnet has to know of the file."""
+    """Description of the file for users without polarnet."""
     encode = REPRESENTATIONS[metadata["representation"]]
     return {
         "format": FORMAT,
@@ -186,7 +185,7 @@ def _description(
 
 
 def _window_us(metadata: Mapping[str, Any]) -> int | None:
-    """How long the windows of the training were, where their events were simulated; else None."""
+    """Window length of the training in microseconds; None unless its events were simulated."""
     made_with = metadata.get("data", {}).get("events_from", {}).get("scenes", {}).get("synthesize")
     return round(1e6 / made_with["frame_rate_hz"]) if made_with else None
 
@@ -197,7 +196,7 @@ def _session(path: Path) -> Any:
     options.intra_op_num_threads = torch.get_num_threads()
     try:
         return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # its own errors have no other class in common
+    except Exception as error:  # ONNX Runtime's errors share no other base class
         raise RuntimeError(f"ONNX Runtime {onnxruntime.__version__} does not take {path.name}: {error}") from None
 
 
@@ -230,7 +229,7 @@ def _check_path(path: Path) -> None:
 
 
 def _packages() -> tuple[Any, Any]:
-    """The modules onnx and onnxruntime, once onnxscript is known to be there too."""
+    """Import onnx and onnxruntime; RuntimeError if one of them or onnxscript is missing."""
     try:
         import onnx
         import onnxruntime
@@ -242,7 +241,7 @@ def _packages() -> tuple[Any, Any]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without torch's warnings that torchvision, which polarnet does not use, is missing, and of its own old names."""
+    """Silence torch's warnings about missing torchvision, which polarnet does not use, and about deprecated names."""
     logger = logging.getLogger("torch.onnx._internal.exporter._registration")
     before = logger.level
     logger.setLevel(logging.ERROR)

@@ -1,4 +1,4 @@
-"""The benchmark on a folder of a user's own: photographs or measured polarization, scored without training."""
+"""The benchmark on a user's own folder of photographs or measured polarization, without training."""
 
 import dataclasses
 import functools
@@ -29,20 +29,20 @@ SET_THEM = "To score on sequences like those of the training, add to the command
 def benchmark_folder(
     config: Config, root: Path, kind: str, out: Path, work: Path, weights: Path | None, command: str
 ) -> tuple[dict[str, dict[str, Any]], list[str]]:
-    """Run the benchmark on a folder of photographs or measured scenes, without training; (metrics, notes).
+    """Run the benchmark on a folder of photographs or measured scenes, without training; return (metrics, notes).
 
-    `out` gets metrics.json, details.json, frames.csv, panels and index.html, and `work` what they were made from,
-    so that a run that was stopped goes on and a second one with other weights makes only what is new. Methods
-    whose weights are not there are left out, files that cannot be used are skipped, and `notes` says so. Size, duration
-    and sensor are printed first, with a warning where those of a network's training differ. `weights` is a checkpoint
-    of the DoLP network; None: the shipped one. ValueError where nothing in the folder can be used, and where the table
-    is to have LPIPS but there are no weights for it.
+    `out` receives metrics.json, details.json, frames.csv, panels and index.html. `work` receives the intermediate
+    files, so a stopped run resumes and a second run with other weights computes only the new results. Methods without
+    weights are left out and unusable files are skipped; `notes` lists both. Size, duration and sensor are printed
+    first, with a warning if a network was trained with others. `weights` is a checkpoint of the DoLP network; None
+    uses the shipped one. Raises ValueError if the folder has no usable file, or if the weights for an LPIPS column are
+    missing.
     """
     if weights is not None and not weights.is_file():
         raise ValueError(
             f"--weights {weights}: expected a checkpoint of the DoLP network (.safetensors), there is none"
         )
-    lpips_weights = with_lpips(config, "benchmark", find_weights)  # which need not have been found by the pipeline
+    lpips_weights = with_lpips(config, "benchmark", find_weights)  # the pipeline need not have found them before
     lpips = None if lpips_weights is None else Lpips.of(lpips_weights.backbone, lpips_weights.tensors)
     train_mean = _train_mean(config)
     wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
@@ -74,7 +74,7 @@ def benchmark_folder(
 
 
 def _skipped(config: Config, work: Path) -> list[str]:
-    """A line for each file of the folder that is not tested on."""
+    """One line for each file of the folder that was skipped."""
     manifest = read_manifest(work / "images")
     seen = set(SceneStore.open(work / "scenes.zarr").picture_of.values())
     unseen = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name not in seen))
@@ -83,13 +83,13 @@ def _skipped(config: Config, work: Path) -> list[str]:
 
 
 def _train_mean(config: Config) -> float | None:
-    """Of the pipeline's training split; None where the pipeline has not made it."""
+    """Mean DoLP of the pipeline's training split; None if the pipeline has not made the split."""
     frames = Path(config.paths.frames)
     return train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None
 
 
 def _left_out(row: str, reason: str) -> str:
-    """A line for a row that cannot run."""
+    """One line for a method that cannot run."""
     weights = METHODS[row].weights if row in METHODS else None
     trained = weights is not None and weights.trained_by is not None
     advice = "; name it in benchmark.methods of params.yaml and run `dvc repro`" if trained else ""

@@ -1,4 +1,4 @@
-"""`polarnet recover`: files of event cameras, or a camera that runs, to frames of DoLP and AoLP."""
+"""`polarnet recover`: frames of DoLP and AoLP from event-camera files or a running camera."""
 
 import dataclasses
 import itertools
@@ -37,64 +37,64 @@ from polarnet.stokes import Mosaic, Prediction
 from polarnet.weights import shipped_weights
 
 STANDARD_INPUT = "-"
-PIXELS_AT_ONCE = 4 * 120 * 180  # of windows that go through a network together; bounds its memory
+PIXELS_AT_ONCE = 4 * 120 * 180  # total over the windows of one batch; bounds the memory of a network
 BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}{postfix}]"
 LIVE_BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
 TRAINED_WINDOW_US = 33_333
-"""Networks are trained on 1/30 s."""
+"""Window length in the training of the networks, 1/30 s."""
 
 
 @dataclass(frozen=True)
 class Arrangement:
-    """How polarizers stand before the sensor, as far as the user says it."""
+    """Arrangement of the polarizers in front of the sensor, as given by the user."""
 
     angles: Sequence[int] | None
-    """Degrees, of four files, in their order."""
+    """Polarizer angle of each of four files, in degrees and in the order of the files."""
     mosaic: Mosaic | None
     sequence: str | None
-    """Of an event store with several."""
+    """Sequence to read from an event store that holds several."""
 
 
 class Input(NamedTuple):
-    """Four channels of one size, all at once or piece by piece."""
+    """Events of four channels of equal size, read whole or piece by piece."""
 
     name: str
     height: int
     width: int
     pieces: Iterable[Piece]
     duration_us: int | None
-    """None: not known before the end."""
+    """None for live input, whose duration is unknown."""
 
 
 class Frame(NamedTuple):
-    """The prediction for a window, on the CPU, and how long it took."""
+    """Prediction for one window, on the CPU, with its timing."""
 
     window: EventWindow
     prediction: Prediction
     step_s: float
-    """From the window's events in memory to the frame in memory; of windows that went together, a share of it."""
+    """Time from the window's events in memory to the frame in memory; for a batch of windows, an equal share."""
     latency_s: float
-    """From the arrival of the last of the window's events to the frame in memory."""
+    """Time from the arrival of the window's last event to the frame in memory."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Of a run."""
+    """Number of frames and timing of one run."""
 
     frames: int
     stream_s: float
-    """Up to the end of the last window."""
+    """Time in the recording at the end of the last window."""
     run_s: float
     step_ms: float
-    """Median."""
+    """Median of `Frame.step_s`, in ms."""
     latency_ms: float | None
-    """Median; None where all events were there from the start."""
+    """Median of `Frame.latency_s`, in ms; None if all events were available from the start."""
     latency_ms_95: float | None
-    """95 % of the frames came faster."""
+    """95th percentile of the latency, in ms; None as for `latency_ms`."""
 
     @property
     def realtime_factor(self) -> float:
-        """Seconds of the recording in a second of work."""
+        """Seconds of recording processed per second of computation."""
         return self.stream_s / self.run_s
 
 
@@ -106,11 +106,11 @@ def open_files(
     work: Path,
     config: Callable[[], Config],
 ) -> Input:
-    """What the files hold, as four channels from time 0 on, reduced to `size` (height, width) if given.
+    """Read four channels from files, starting at time 0 and reduced to `size` (height, width) if given.
 
-    Four files are one for each of `arrangement.angles`, read by `read`; one file is a camera with a mosaic, an event
-    store, or a folder of division-of-time captures, which is calibrated as `config` says, in `work`. ValueError or
-    FileNotFoundError that says what is missing.
+    Four files hold one channel each, in the order of `arrangement.angles`, and are read by `read`. A single path is a
+    recording of a camera with a mosaic, an event store, or a folder of division-of-time captures. Captures are
+    calibrated in `work` with the settings of `config`. A ValueError or FileNotFoundError says what is missing.
     """
     missing = [str(path) for path in paths if not path.exists()]
     if missing:
@@ -173,7 +173,7 @@ def _captures(folder: Path, work: Path, config: Config) -> Sequence[Events]:
 
 
 def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> tuple[Input, LiveLines]:
-    """Lines as they come: from standard input (-), or from a file that grows, until it has not for `idle_s`."""
+    """Read lines live from standard input (-) or from a growing file, until it has not grown for `idle_s` seconds."""
     if path != STANDARD_INPUT and not Path(path).is_file():
         raise FileNotFoundError(f"{path}: there is no such file; - reads standard input")
     source = sys.stdin.buffer if path == STANDARD_INPUT else open(path, "rb")  # noqa: SIM115 - read until the end
@@ -185,11 +185,11 @@ def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> tuple[Input, L
 def open_method(
     name: str | None, weights: Path | None, device: str, precision: str, config: Callable[[], Config]
 ) -> tuple[Recoverer, str]:
-    """The method that recovers, and words for it.
+    """Open a method for `recover` and describe it in words.
 
-    A network: of `weights`, else the shipped one, else what the pipeline trained. Another method, by its `name`: as
-    `config` says. `precision` is that of networks: fp32, bf16, or auto: bf16 where the device has units for it.
-    ValueError or FileNotFoundError that says what is missing.
+    Without a `name` the method is the DoLP network with `weights`, else the shipped weights, else the weights that the
+    pipeline trained. Any other method runs with the settings of `config`. `precision` applies to networks: fp32, bf16,
+    or auto, which selects bf16 if the device has units for it. A ValueError or FileNotFoundError says what is missing.
     """
     tune()
     place = device_of(RuntimeConfig(device, threads=0, workers=1, devices=1, nodes=1, rendezvous=""))
@@ -230,9 +230,10 @@ def _default_weights(config: Callable[[], Config]) -> Path:
 def frames_of(
     source: Input, rule: WindowRule, recoverer: Recoverer, pixels_at_once: int = PIXELS_AT_ONCE
 ) -> Iterator[Frame]:
-    """A frame for each window, as soon as the window's last event has come.
+    """Yield a frame for each window as soon as the window's last event has arrived.
 
-    Windows that wait already, as all of a file do, go through a method together, up to `pixels_at_once`.
+    Windows that are already available, such as those of a file, are processed in batches of up to `pixels_at_once`
+    pixels.
     """
     warm_up(recoverer, source.height, source.width)
     cutter = WindowCutter(rule, source.height, source.width)
@@ -250,7 +251,7 @@ def frames_of(
 
 
 def _runs(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWindow]]:
-    """Windows, up to `most` together of those that follow each other without overlap."""
+    """Group adjacent windows, which neither overlap nor leave gaps, into batches of up to `most`."""
     run: list[EventWindow] = []
     for window in windows:
         if run and (len(run) == most or run[-1].stop_us != window.start_us):
@@ -262,7 +263,7 @@ def _runs(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWindo
 
 
 def recover(source: Input, rule: WindowRule, recoverer: Recoverer, writer: RecoveryWriter) -> Summary:
-    """Recover and write every frame, behind a progress bar; ValueError where there is not one window."""
+    """Recover and write every frame, with a progress bar; ValueError if the input is shorter than one window."""
     live = source.duration_us is None
     steps: list[float] = []
     latencies: list[float] = []
@@ -292,7 +293,7 @@ def recover(source: Input, rule: WindowRule, recoverer: Recoverer, writer: Recov
 
 
 def _too_short(source: Input, rule: WindowRule) -> str:
-    """Why there is no frame, and what to do."""
+    """Error message for an input shorter than one window, with advice."""
     if rule.length_us is None:
         return f"{source.name} ends before {rule.events:,} events, one window: record for longer, or give fewer events"
     length = f"one window of {rule.length_us / 1000:g} ms"
@@ -310,7 +311,7 @@ def _too_short(source: Input, rule: WindowRule) -> str:
 
 
 def facts_of(source: Input, rule: WindowRule, words: str, summary: Summary) -> dict[str, str]:
-    """What the page and the terminal say about a run."""
+    """Facts about a run for the HTML page and the terminal."""
     length = f"{rule.length_us / 1000:g} ms" if rule.length_us is not None else f"{rule.events:,} events"
     step = "one after the other" if rule.step_us is None else f"one every {rule.step_us / 1000:g} ms"
     facts = {
@@ -327,7 +328,7 @@ def facts_of(source: Input, rule: WindowRule, words: str, summary: Summary) -> d
 
 
 def replay(store: EventStore, sequence: str, speed: float, write: Callable[[bytes], object]) -> None:
-    """Write a sequence as `LiveLines` reads it, at the pace at which it was recorded, times `speed`."""
+    """Write a sequence in the line format of `LiveLines`, at `speed` times the original pace."""
     head, times, lines = live_lines(store.read(sequence))
     write(head)
     ends = [0, *itertools.accumulate(map(len, lines.splitlines(keepends=True)))]
@@ -338,7 +339,7 @@ def replay(store: EventStore, sequence: str, speed: float, write: Callable[[byte
         if come > sent:
             asked = time.perf_counter()
             write(lines[ends[sent] : ends[come]])
-            started += time.perf_counter() - asked  # the clock stands while nobody takes the lines
+            started += time.perf_counter() - asked  # time spent waiting for the reader does not count
             sent = come
         else:
             time.sleep(0.001)

@@ -1,10 +1,11 @@
-"""A simulated rig (paper, section 4): a scene moves across a CeleX-5 eight times; eight files, and what is true.
+"""A simulated rig (paper, section 4): a scene moves across a CeleX-5 eight times, giving eight files with their truth.
 
-It stands above `simulation`, which makes the light and the events, and above `recordings`, which knows the files: those
-two never import each other. What reads the files again sees nothing of this module.
+The module imports `simulation`, which makes the light and the events, and `recordings`, which knows the file formats.
+Those two packages never import each other. The readers of the files know nothing of this module.
 
-The scene drifts from right to left at constant speed. Above it runs a bright stripe, on which a dark landmark comes in
-from the right: the region in the upper right corner is bright until then. Each capture starts at a random time before.
+The scene drifts from right to left at constant speed. A bright stripe runs above it, and a dark landmark enters on the
+stripe from the right. Until then the region in the upper right corner is bright. Each capture starts at a random time
+before the landmark.
 """
 
 import dataclasses
@@ -35,55 +36,55 @@ from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene
 
 STRIPE_S0, LANDMARK_S0 = 0.8, 0.04  # unpolarized
-SHORTEST_DELAY_S = 0.08  # between the start of a capture and the landmark
+SHORTEST_DELAY_S = 0.08  # from the start of a capture to the landmark
 HOT_HZ = (1500.0, 3000.0)
-BORDER = 2  # pixels of scene around what is seen
+BORDER = 2  # margin of the scene around the area that the sensor sees, in pixels
 _STILL = Sine(0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class RigConfig:
-    """How the rig moves and what its camera adds; sensor, region, crop and size are those of RecordingsConfig."""
+    """Motion of the rig and noise of its camera; RecordingsConfig gives sensor, region, crop and size."""
 
     speed_px_s: float = field(metadata=allowed(above=0))
-    """Of the picture on the sensor, in its pixels."""
+    """Speed of the image on the sensor, in sensor pixels per second."""
     longest_delay_s: float = field(metadata=allowed(above=SHORTEST_DELAY_S))
-    """Captures start at a random time, up to this before the landmark."""
+    """Maximum time from the random start of a capture to the landmark."""
     duration_s: float = field(metadata=allowed(above=0))
-    """Of a capture after the landmark."""
+    """Duration of a capture after the landmark."""
     picture_rate_hz: float = field(metadata=allowed(above=0))
     full_well_electrons: float = field(metadata=allowed(above=0))
-    """That a white pixel of an intensity capture collects: the noise of light."""
+    """Electrons collected by a white pixel of an intensity capture; sets the shot noise."""
     read_noise: float = field(metadata=allowed(low=0))
-    """Of a picture, in steps of 12 bits."""
+    """Read noise of an intensity image, in steps of 12 bits."""
     hot_pixels: int = field(metadata=allowed(low=0))
-    """In event captures, each firing a few thousand times a second; the same ones in all four."""
+    """Number of hot pixels, the same in all four event captures; each fires a few thousand times a second."""
     file_type: str = field(metadata=allowed(choices=("bin", "csv")))
-    """Of event captures; pictures are BIN always."""
+    """File type of the event captures; intensity captures are always BIN."""
 
     def __post_init__(self):
         check_ranges(self)
 
 
 class RigTruth(NamedTuple):
-    """What is true of a target's eight files."""
+    """Truth for the eight files of a target."""
 
     start_us: Mapping[str, int]
-    """When the mean in the landmark's region falls below the dark level, by each capture's own clock."""
+    """Time on each capture's own clock at which the mean of the landmark's region falls below the dark level."""
     hot: frozenset[tuple[int, int]]
-    """Rows and columns of hot pixels."""
+    """(row, column) of each hot pixel."""
     scene: PolarizationScene
-    """What the sensor moves over, with stripe and landmark."""
+    """Scene that the sensor moves over, including stripe and landmark."""
     path: "Drift"
     landmark_us: int
-    """By the clock of the motion."""
+    """Time of the landmark on the clock of the motion."""
 
 
 class Drift(Trajectory):
-    """A window that moves right at constant speed; x is where it is at time 0."""
+    """Motion of the sensor to the right at constant speed; x is its position at time 0."""
 
     def pose(self, t_s: Float64[np.ndarray, "*n"]) -> Pose:
-        """The window at times in seconds."""
+        """Pose of the sensor at times in seconds."""
         still = np.zeros_like(t_s)
         return Pose(self.x + self.speed_px_s * t_s, self.y + still, still, still + 1)
 
@@ -99,7 +100,8 @@ def write_rig(
 ) -> RigTruth:
     """Write the eight captures of a target into `folder`, with truth.json and truth.npz, and return the truth.
 
-    `picture` is enlarged to what the moving sensor sees. Everything random depends on the seed and the folder's name.
+    `picture` is enlarged to the area that the moving sensor sees. All random values depend on the seed and the folder's
+    name only.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -139,7 +141,7 @@ def write_rig(
 def rig_scene(
     picture: PolarizationScene, config: RigConfig, recordings: RecordingsConfig
 ) -> tuple[PolarizationScene, Drift]:
-    """The scene that the sensor moves over, with stripe and landmark, and the motion."""
+    """Scene that the sensor moves over, including stripe and landmark, and the motion."""
     height, width = recordings.sensor
     before = config.speed_px_s * config.longest_delay_s
     total = BORDER + width + int(before + config.speed_px_s * config.duration_s) + BORDER
@@ -147,7 +149,7 @@ def rig_scene(
     scene = cv2.resize(planes, (total, height + 2 * BORDER), interpolation=cv2.INTER_LINEAR).transpose(2, 0, 1).copy()
     stripe = BORDER + recordings.region[0] + BORDER
     scene[:, :stripe] = np.array([STRIPE_S0, 0, 0], np.float32)[:, None, None]
-    entry = round(BORDER + width + before)  # of the landmark: its edge reaches the right border after longest_delay_s
+    entry = round(BORDER + width + before)  # the landmark's edge reaches the right border after longest_delay_s
     scene[:, :stripe, entry:] = np.array([LANDMARK_S0, 0, 0], np.float32)[:, None, None]
     path = Drift(
         BORDER + (width - 1) / 2, BORDER + (height - 1) / 2,
@@ -159,9 +161,9 @@ def rig_scene(
 def true_intensity(
     truth: RigTruth, t_us: Int64[np.ndarray, " n"], recordings: RecordingsConfig
 ) -> Float32[Tensor, "n 4 h w"]:
-    """What the reduced crop sees behind the polarizers at times from the landmark on, without any noise, 0 to 1."""
+    """Noiseless intensities in [0, 1] of the reduced crop behind each polarizer; times count from the landmark."""
     (height, width), (top, left) = recordings.crop, recordings.crop_corner
-    # the centre of the crop, seen from that of the sensor
+    # offset from the centre of the sensor to the centre of the crop
     right, down = left + (width - recordings.sensor[1]) / 2, top + (height - recordings.sensor[0]) / 2
     path = dataclasses.replace(truth.path, x=truth.path.x + right, y=truth.path.y + down)
     frames = []
@@ -174,12 +176,12 @@ def true_intensity(
 
 
 def true_dolp(truth: RigTruth, t_us: Int64[np.ndarray, " n"], recordings: RecordingsConfig) -> Float32[Tensor, "n h w"]:
-    """Of these intensities."""
+    """DoLP of `true_intensity`."""
     return stokes.dolp(stokes.stokes_from_intensities(true_intensity(truth, t_us, recordings))).clamp(0, 1)
 
 
 def _landmark_us(scene: PolarizationScene, path: Drift, recordings: RecordingsConfig) -> int:
-    """When the noiseless mean in the region falls below the dark level, by the clock of the motion."""
+    """Time on the clock of the motion at which the noiseless mean of the region falls below the dark level."""
     height, width = recordings.region
     profile = scene.stokes[0, BORDER : BORDER + height].double().mean(0).numpy() / 2 * 255
     right = path.x + (recordings.sensor[1] - 1) / 2

@@ -1,7 +1,8 @@
-"""Polarization optics: Stokes vectors, DoLP, AoLP and what a polarizer lets through (paper Eq. 1-4).
+"""Polarization optics: Stokes vectors, DoLP, AoLP and the intensity behind a polarizer (paper Eq. 1-4).
 
-Functions take numpy or torch and give torch. They raise TypeError for what is no array of real numbers, and ValueError
-for other axes or integers, whose differences wrap round. Values may be any, NaN included.
+Functions take numpy arrays or torch tensors and return tensors. They raise TypeError for anything but an array of real
+numbers, and ValueError for other axes or for integers, whose differences wrap around. All values are allowed,
+including NaN.
 """
 
 import math
@@ -18,22 +19,22 @@ from polarnet.arrays import Array, as_tensor, check_floating, check_same_shape, 
 POLARIZER_ANGLES_DEG = (0, 45, 90, 135)
 
 Mosaic = tuple[tuple[int, int], tuple[int, int]]
-"""Polarizer angles over 2x2 pixels: of the even row, then of the odd one."""
+"""Polarizer angles of a 2x2 mosaic: the even row, then the odd row."""
 
 
 class Prediction(NamedTuple):
-    """Polarization as a network or any other method predicts it; a map that the method does not give is None."""
+    """Polarization predicted by a network or any other method; maps that the method lacks are None."""
 
     dolp: Float[Tensor, "*b h w"]
-    """In [0, 1] once a method has returned it; the output of a network is not clamped."""
+    """In [0, 1] when returned by a method; the raw output of a network is not clamped."""
     aolp: Float[Tensor, "*b h w"] | None = None
     """Radians in [0, pi)."""
     log_variance: Float[Tensor, "*b h w"] | None = None
     """Natural logarithm of the expected squared error of DoLP."""
     stokes: Float[Tensor, "*b 2 h w"] | None = None
-    """s1 = S1 / S0 and s2 = S2 / S0, whose angle is `aolp`."""
+    """s1 = S1 / S0 and s2 = S2 / S0, from which `aolp` is computed."""
     intensities: Float[Tensor, "*b 4 h w"] | None = None
-    """Intensities behind the polarizers at 0, 45, 90 and 135 degrees that DoLP was computed from."""
+    """Intensities behind the polarizers at 0, 45, 90 and 135 degrees from which DoLP was computed."""
 
 
 def stokes_from_intensities(intensities: Float[Array, "*b 4 h w"]) -> Float[Tensor, "*b 3 h w"]:
@@ -66,7 +67,7 @@ def behind_polarizer(s0: Plane, s1: Plane, s2: Plane, angle: float) -> Plane:
 
 
 def intensity_behind_polarizer(stokes: Float[Array, "*b 3 h w"], angle: float) -> Float[Tensor, "*b h w"]:
-    """As `behind_polarizer`, of Stokes vectors."""
+    """Intensity behind an ideal linear polarizer at `angle` radians, from Stokes vectors."""
     s0, s1, s2 = _planes("stokes", stokes, "... 3 height width").unbind(-3)
     return behind_polarizer(s0, s1, s2, angle)
 
@@ -79,9 +80,9 @@ def intensities_from_stokes(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "
 
 
 def dolp(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
-    """Degree of linear polarization (paper Eq. 2); 0 where there is no light.
+    """Degree of linear polarization (paper Eq. 2); 0 without light.
 
-    Not clamped: intensities reconstructed from events can be unphysical and exceed 1.
+    Not clamped: intensities reconstructed from events can be unphysical, with a DoLP above 1.
     """
     s0, s1, s2 = _planes("stokes", stokes, "... 3 height width").unbind(-3)
     lit = s0 > 0
@@ -89,7 +90,7 @@ def dolp(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
 
 
 def aolp(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
-    """Angle of linear polarization in radians, [0, pi) (paper Eq. 3, over the whole circle); 0 where unpolarized."""
+    """Angle of linear polarization in radians, [0, pi) (paper Eq. 3, over the whole circle); 0 if unpolarized."""
     _, s1, s2 = _planes("stokes", stokes, "... 3 height width").unbind(-3)
     angle = torch.atan2(s2, s1) / 2
     folded = torch.where(angle < 0, angle + math.pi, angle)
@@ -97,7 +98,7 @@ def aolp(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
 
 
 def parse_mosaic(order: str) -> Mosaic:
-    """Angles of a 2x2 mosaic from text like "90 45 / 135 0": the even row, then the odd; ValueError otherwise."""
+    """Angles of a 2x2 mosaic from text like "90 45 / 135 0": even row, then odd row; ValueError for other text."""
     match = re.fullmatch(r"\s*(\d+)\s+(\d+)\s*/\s*(\d+)\s+(\d+)\s*", order)
     angles = [int(angle) for angle in match.groups()] if match else []
     if sorted(angles) != sorted(POLARIZER_ANGLES_DEG):

@@ -1,4 +1,4 @@
-"""The event budget and the sensitivity, on the pipeline's test sequences: JSON and a figure each."""
+"""Studies of event budget and sensitivity on the pipeline's test sequences; each writes JSON and a figure."""
 
 import dataclasses
 import json
@@ -29,7 +29,7 @@ STUDIED = ("oracle_mean", "cf", "highpass", "ours")
 def run_event_budget(
     config: Config, out: Path, methods: Sequence[str], limit: int | None, weights: Path | None
 ) -> dict[str, Any]:
-    """Write event_budget.json and event_budget.png to `out`; ValueError where `ours` has no weights."""
+    """Write event_budget.json and event_budget.png to `out`; ValueError if `ours` has no weights."""
     sequences, context, tests, scenes = _prepared(config, methods, limit, weights)
     if reason := why_left_out("ours", context):
         raise ValueError(f"the event budget needs the DoLP network: {reason}; give --weights FILE")
@@ -57,7 +57,7 @@ def run_sensitivity(
     """Write sensitivity.json and sensitivity.png to `out`."""
     sequences, context, _, scenes = _prepared(config, methods, limit, weights)
     size = {"window_height": scenes.sensor_height, "window_width": scenes.sensor_width}
-    motion = dataclasses.replace(config.synthesize, **size)  # sequences are emulated again at the size of their scenes
+    motion = dataclasses.replace(config.synthesize, **size)  # emulated again at the scenes' sensor size
     conditions = _announced(configured(motion, config.emulate), methods, context)
     table = sensitivity(
         scenes, sequences, config.synthesize, config.emulate, config.seed, config.benchmark.warmup_windows, methods,
@@ -78,7 +78,7 @@ def _prepared(config: Config, methods: Sequence[str], limit: int | None, weights
 
 
 def _announced(used: Conditions, methods: Sequence[str], context: Context) -> dict[str, Any]:
-    """Print size, duration and sensor, and where those of a network's training differ; what the results say of it."""
+    """Print size, duration and sensor, with warnings if a network was trained with others; return them for the JSON."""
     differences = warnings(used, metadata_used(methods, context), SET_THEM)
     print("\n".join([sentence(used), *(f"WARNING: {line}" for line in differences)]), flush=True)
     return {"sentence": sentence(used), "warnings": differences, **used._asdict()}

@@ -1,4 +1,4 @@
-"""One table at the end of a Hydra multirun of trials: points ranked by validation scores, seeds averaged."""
+"""Table at the end of a Hydra multirun of trials: points ranked by validation MSE, seeds averaged."""
 
 import csv
 import json
@@ -12,7 +12,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 FAILURE = "failure.txt"
-"""In the folder of a job that failed: the reason in one line."""
+"""File in the folder of a failed job with the reason in one line."""
 COLUMNS = {
     "validation": {"mse": "validation MSE ↓", "psnr": "validation PSNR ↑"},
     "test": {
@@ -23,7 +23,7 @@ COLUMNS = {
         "corr": "test corr. ↑",
     },
 }
-"""Scores of the table by split, and their headings."""
+"""Scores in the table by split, with their headings."""
 ABOUT = (
     "Ranked by validation MSE; test scores rank nothing. Of several seeds: mean ± standard deviation, over the seeds "
     "that finished."
@@ -36,9 +36,9 @@ class SweepTable(Callback):
     """Writes comparison.md, .json and .csv into the sweep's folder and prints the table (conf/config.yaml)."""
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Gather the trials; a sweep of another entry point has none and gets no table.
+        """Collect the trials and write the table; a sweep of another entry point has no trials and gets no table.
 
-        Raises SystemExit where a point failed: the only exception that Hydra lets a callback end the sweep with.
+        Raises SystemExit if a point failed, the only exception of a callback with which Hydra ends the sweep.
         """
         folder = Path(config.hydra.sweep.dir)
         points = sweep_points(folder)
@@ -55,9 +55,9 @@ class SweepTable(Callback):
 
 
 def sweep_points(folder: Path) -> list[dict[str, Any]]:
-    """Each trial of a sweep in the order of the jobs: overrides, seed, loss weights, scores, notes, reason of failure.
+    """Trials of a sweep in the order of the jobs: overrides, seed, loss weights, scores, notes and reason of failure.
 
-    `validation` holds the scores of the epoch that was kept, `test` those of `ours`; null where a trial has none.
+    `validation` holds the scores of the best epoch, and `test` holds those of `ours`; null if a trial has none.
     """
     jobs = [path.parent.parent for path in folder.glob("*/.hydra/overrides.yaml")]
     trials = [job for job in jobs if (job / "train").exists() or (job / FAILURE).exists()]
@@ -65,9 +65,10 @@ def sweep_points(folder: Path) -> list[dict[str, Any]]:
 
 
 def sweep_rows(points: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The points, those that differ in the seed alone as one row; smallest validation MSE first, rows without it last.
+    """Merge points that differ only in the seed into one row, and sort the rows by validation MSE.
 
-    Scores become `mean` and `std`, the standard deviation over seeds (null for one seed).
+    The smallest MSE comes first, and rows without MSE come last. Each score becomes `mean` and `std`, the standard
+    deviation over seeds (null for one seed).
     """
     groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
     for point in points:
@@ -88,7 +89,7 @@ def sweep_rows(points: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def mean_scores(scores: Sequence[Mapping[str, float | None]], names: Mapping[str, str]) -> dict[str, Any]:
-    """Mean and standard deviation of each of the scores `names` over trainings; without a score that one lacks."""
+    """Mean and standard deviation over trainings of the scores `names`; a score missing from a training is omitted."""
     means = {}
     for name in names:
         values = [value for one in scores if (value := one.get(name)) is not None]
@@ -98,7 +99,7 @@ def mean_scores(scores: Sequence[Mapping[str, float | None]], names: Mapping[str
 
 
 def sweep_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """A markdown table of `sweep_rows`."""
+    """Format `sweep_rows` as a Markdown table."""
     headings = [heading for names in COLUMNS.values() for heading in names.values()]
     lines = [f"| jobs | overrides | seeds | {' | '.join(headings)} | notes |", "|" + "---|" * (4 + len(headings))]
     for row in rows:
@@ -113,7 +114,7 @@ def sweep_table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """`sweep_rows` as one line each: columns SPLIT_SCORE and SPLIT_SCORE_std."""
+    """Write `sweep_rows` as one line each, with columns SPLIT_SCORE and SPLIT_SCORE_std."""
     with path.open("w", newline="") as file:
         names = [f"{split}_{name}{end}" for split in COLUMNS for name in COLUMNS[split] for end in ("", "_std")]
         writer = csv.DictWriter(file, ["jobs", "overrides", "seeds", "failed_seeds", *names, "notes"])
@@ -147,13 +148,13 @@ def _point(job: Path) -> dict[str, Any]:
 
 
 def _dropped_terms(weights: Any, terms: Mapping[str, float]) -> list[str]:
-    """A note where the loss lacks terms whose weight is not 0."""
+    """Note on loss terms that have a nonzero weight but were missing from the training."""
     names = [name for name, weight in weights.items() if weight and name not in terms]
     return [f"not in this training's loss: {', '.join(names)}"] if names else []
 
 
 def _warnings(logs: Path) -> list[str]:
-    """What training and benchmark logged as warnings or worse, one line each."""
+    """Warnings and errors in the logs of training and benchmark, one line each."""
     notes = []
     for log in sorted(logs.glob("*/*.log")):
         _, *records = LOG_RECORD.split(log.read_text())

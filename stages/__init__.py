@@ -1,1 +1,1 @@
-"""One thin Hydra entry point per DVC stage."""
+"""Hydra entry points, one for each DVC stage."""

@@ -1,4 +1,4 @@
-"""benchmark.methods, methods.NAME.weights -> data/baselines: whether each baseline is trained, for DVC to act on."""
+"""benchmark.methods, methods.NAME.weights -> data/baselines: tells DVC whether to train each baseline."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ from polarnet.training.baselines import USERS, is_used
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Write a file for each baseline that changes only when its training becomes needed or is needed no more."""
+    """Write one file per baseline; the file changes only if the need to train the baseline changes."""
     folder = Path(config.paths.baselines)
     folder.mkdir(parents=True, exist_ok=True)
     for baseline in USERS:

@@ -1,4 +1,4 @@
-"""Test sequences, every method -> data/benchmark: the tables, a row per frame, and windows to look at."""
+"""Test sequences, all methods -> data/benchmark: tables, scores of each frame, and example windows."""
 
 from polarnet.benchmarking import lpips_of, run_pipeline_benchmark
 from polarnet.config import Config, hydra_stage, or_exit
@@ -7,7 +7,7 @@ from polarnet.reports.tables import as_plain, score_table
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Recover, score, print."""
+    """Run every method, score its predictions and print the table."""
     lpips = or_exit(lambda: lpips_of(config))
     for name, metrics in run_pipeline_benchmark(config, lpips).items():
         print(f"\ntest set {name}\n" + as_plain(score_table(metrics)))

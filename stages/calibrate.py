@@ -1,4 +1,4 @@
-"""data/imported -> data/calibrated: real targets on one clock, in the stores that simulated sequences lie in."""
+"""data/imported -> data/calibrated: real targets on one clock, in the same stores as simulated sequences."""
 
 import dataclasses
 from pathlib import Path
@@ -11,7 +11,7 @@ from polarnet.reports.calibration import draw_calibration
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Find start times, write both stores, and draw what they were found by."""
+    """Find the start times, write both stores, and plot the evidence for the start times."""
     out = Path(config.paths.calibrated)
     if not config.recordings.enabled:
         start_over(out, enabled=False)

@@ -1,4 +1,4 @@
-"""data/scenes.zarr -> data/events.zarr: what an event camera behind each of the four polarizers reports."""
+"""data/scenes.zarr -> data/events.zarr: events of a camera behind each of the four polarizers."""
 
 import functools
 from pathlib import Path
@@ -11,7 +11,7 @@ from polarnet.simulation.dataset import emulate_scenes
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Emulate every sequence that the event store does not hold yet."""
+    """Emulate every sequence that is missing from the event store."""
     mapper = functools.partial(pmap, workers=config.runtime.workers, label="emulate", address=config.cluster.address)
     scenes, events = Path(config.paths.scenes), Path(config.paths.events)
     threads = threads_of(config.runtime)

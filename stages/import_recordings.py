@@ -1,4 +1,4 @@
-"""data/recordings -> data/imported: the eight captures of every real target, decoded; nothing while switched off."""
+"""data/recordings -> data/imported: the eight decoded captures of every real target, if recordings are enabled."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from polarnet.recordings.status import start_over
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Decode every target, or say that recordings are switched off."""
+    """Decode every target, or report that recordings are switched off."""
     out = Path(config.paths.imported)
     if not config.recordings.enabled:
         start_over(out, enabled=False)

@@ -1,4 +1,4 @@
-"""Photographs and generated pictures -> data/images: RGB pictures of one size, each with its split."""
+"""Photographs and generated pictures -> data/images: RGB pictures of one size, assigned to splits."""
 
 import functools
 from pathlib import Path
@@ -10,7 +10,7 @@ from polarnet.simulation.pictures.ingest import ingest
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Fill data/images and say what lies there."""
+    """Fill data/images and print a summary of its content."""
     mapper = functools.partial(pmap, workers=config.runtime.workers, label="ingest", address=config.cluster.address)
     if config.ingest.source != "builtin":
         input_folder("ingest.root", config.ingest.root)

@@ -1,4 +1,4 @@
-"""Everything that was made and measured -> data/report: the page that a person looks at."""
+"""Results of all stages -> data/report: the HTML report."""
 
 import dataclasses
 import os
@@ -10,12 +10,12 @@ from polarnet.reports.artefacts import ReportPaths
 from polarnet.reports.page import write_report
 from polarnet.reports.provenance import Run, facts
 
-PLUMBING = ("paths", "runtime", "cluster")  # sections that change no result
+PLUMBING = ("paths", "runtime", "cluster")  # sections that do not affect results
 
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Write the page; says where it is."""
+    """Write the report and print its location."""
     paths = ReportPaths(**{f.name: Path(getattr(config.paths, f.name)) for f in dataclasses.fields(ReportPaths)})
     parameters = {name: value for name, value in dataclasses.asdict(config).items() if name not in PLUMBING}
     overrides = [override for override in sys.argv[1:] if not override.startswith("hydra.")]

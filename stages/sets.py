@@ -1,4 +1,4 @@
-"""data/images and measured polarization -> data/sets: the test sets of benchmark.sets beyond the simulated one."""
+"""data/images and measured polarization -> data/sets: all test sets of benchmark.sets except the simulated one."""
 
 import functools
 from pathlib import Path
@@ -11,7 +11,7 @@ from polarnet.simulation.sets import Recipe, make_complex_motion, make_folder_se
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Make what is asked for and not there yet."""
+    """Make every requested set that does not exist yet."""
     folder = Path(config.paths.sets)
     folder.mkdir(parents=True, exist_ok=True)
     threads = threads_of(config.runtime)

@@ -1,4 +1,4 @@
-"""data/images -> data/scenes.zarr, data/frames.zarr: scenes of polarized light, motions over them, exact frames."""
+"""data/images -> data/scenes.zarr, data/frames.zarr: polarized scenes, sensor motions and exact frames."""
 
 import functools
 from pathlib import Path
@@ -10,7 +10,7 @@ from polarnet.simulation.truth import synthesize
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Make a scene of every picture and let windows move over it."""
+    """Make a scene from every picture and move the sensor over it."""
     mapper = functools.partial(pmap, workers=config.runtime.workers, label="synthesize", address=config.cluster.address)
     images, scenes, frames = (Path(path) for path in (config.paths.images, config.paths.scenes, config.paths.frames))
     count = synthesize(images, scenes, frames, config.synthesize, config.seed, mapper, config.variation)

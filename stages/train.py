@@ -1,4 +1,4 @@
-"""Events (data/events.zarr or made of data/scenes.zarr), data/frames.zarr -> data/train: the DoLP network."""
+"""Events (data/events.zarr or emulated from data/scenes.zarr), data/frames.zarr -> data/train: the DoLP network."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from polarnet.training.task import describe, lpips_of, open_events, open_split
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Train `network` on the training split; a killed run of the same training goes on where it stopped."""
+    """Train `network` on the training split; a killed run of the same training resumes."""
     if launched("stages.train", config.runtime):
         return
     device = device_of(config.runtime)

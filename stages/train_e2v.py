@@ -1,4 +1,4 @@
-"""Events (data/events.zarr or made of data/scenes.zarr), data/frames.zarr -> data/train_e2v: the E2V baseline."""
+"""Events (data/events.zarr or emulated from data/scenes.zarr), data/frames.zarr -> data/train_e2v: the E2V baseline."""
 
 from pathlib import Path
 
@@ -14,9 +14,9 @@ from polarnet.training.task import describe, lpips_of, open_events, open_split
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Train `baselines.e2v.arch` on the training split; a killed run of the same training goes on where it stopped.
+    """Train `baselines.e2v.arch` on the training split; a killed run of the same training resumes.
 
-    Train nothing, and say so, where no row of `benchmark.methods` uses the weights.
+    If no method of `benchmark.methods` uses the weights, the stage says so and trains nothing.
     """
     if not is_used("e2v", config.benchmark.methods, config.methods):
         print(leave_untrained("e2v", Path(config.paths.train_e2v)))

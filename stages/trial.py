@@ -1,10 +1,10 @@
-"""One point of a sweep: train and benchmark in the job's own folder, leaving what DVC tracks alone.
+"""One point of a sweep: train and benchmark in the job's own folder, without touching the files that DVC tracks.
 
-`python -m stages.trial -m loss.mse=1.0 loss.ssim=0.0,1.0 seed=1,2,3` runs every combination on the sequences that the
-pipeline has made, and ends with one table (polarnet.sweep). Jobs may run side by side: what a method made of a sequence
-is kept once, and so each job keeps its own until it is scored.
+`python -m stages.trial -m loss.mse=1.0 loss.ssim=0.0,1.0 seed=1,2,3` runs every combination on the pipeline's existing
+sequences and ends with one table (polarnet.sweep). Jobs may run in parallel: each keeps its own predictions until they
+are scored, because a cache holds only one prediction per method and sequence.
 
-A point that fails leaves its reason in `failure.txt` and stops no other.
+A failed point writes the reason to `failure.txt`; the other points continue.
 """
 
 import io
@@ -22,16 +22,16 @@ from omegaconf import DictConfig
 from polarnet.config import hydra_command
 from polarnet.sweep import FAILURE
 
-# What a training run is held against; the other rows of the benchmark do not depend on it.
+# The trained network and the references for it; no other method of the benchmark depends on the training.
 REFERENCE_METHODS = "benchmark.methods=[zeros,train_mean,oracle_mean,ours]"
-HYDRAS_HINT = "Set the environment variable HYDRA_FULL_ERROR"  # the last line below each traceback
+HYDRAS_HINT = "Set the environment variable HYDRA_FULL_ERROR"  # last line after each traceback
 
 
 @hydra_command
 def main(node: DictConfig) -> None:
     """Run the train and benchmark stages as child processes with this job's overrides and folder.
 
-    The children check the configuration, so that a point with a refused value is a failed point of the sweep.
+    The child processes check the configuration, so a refused value makes the point a failed point of the sweep.
     """
     hydra = HydraConfig.get()
     job = Path(hydra.runtime.output_dir)
@@ -47,12 +47,12 @@ def main(node: DictConfig) -> None:
             (job / FAILURE).write_text(f"{stage}: {failure}\n")
             break
     shutil.rmtree(job / "cache", ignore_errors=True)
-    if failure and hydra.mode == RunMode.RUN:  # in a multirun the table says it, and sets the exit status at the end
+    if failure and hydra.mode == RunMode.RUN:  # in a multirun the sweep table reports it and sets the exit status
         raise SystemExit(1)
 
 
 def _failure(command: Sequence[str]) -> str | None:
-    """The last line that a failing command prints; None where it succeeds. Its errors are shown as they come."""
+    """Run a command, passing its errors on as they arrive; return the last line if it fails, None if it succeeds."""
     lines: deque[str] = deque(maxlen=20)
     with subprocess.Popen(command, stderr=subprocess.PIPE) as child:
         assert child.stderr is not None

@@ -1,4 +1,4 @@
-"""Finds LPIPS weights -> data/weights: those that the losses and the benchmark's table ask for, or an error."""
+"""LPIPS weights -> data/weights: those that the losses and the benchmark table require; an error if missing."""
 
 import functools
 
@@ -9,8 +9,8 @@ from polarnet.lpips_weights import find_weights, write_weights
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Search, refuse where there are none, and write down which were found."""
-    find = functools.cache(find_weights)  # both purposes may have one backbone
+    """Search for the weights, refuse if they are missing, and record their source."""
+    find = functools.cache(find_weights)  # both purposes may share a backbone
     searched = or_exit(lambda: {purpose: with_lpips(config, purpose, find) for purpose in PURPOSES})
     found = {purpose: weights for purpose, weights in searched.items() if weights is not None}
     write_weights(config.paths.weights, found)
