@@ -1,7 +1,7 @@
 """Every network trained on the same photographs, then every method on held-out photographs and on measured scenes.
 
 python tests/benchmarks/study.py --photographs FOLDER --measured FOLDER --work FOLDER
-    [--ours FILE] [--firenet FILE] [--override ROW:KEY=VALUE ...] [--only ROW]
+    [--ours FILE] [--published ROW=FILE ...] [--override ROW:KEY=VALUE ...] [--only ROW]
     [--seed N] [--rows ROW ...] [--write]
 
 Runs the pipeline's stages with experiment=photographs in the folder --work, where a killed run goes on and nothing is
@@ -39,7 +39,8 @@ TRAININGS: dict[str, tuple[str, ...]] = {
     "e2p": ("train_e2p",),
 }
 """Row of the table: the stage that trains its network, and what makes the stage train this one."""
-SOLVED = [f"{row}{gain}" for row in ("cf", "highpass", "firenet_published", "firenet") for gain in ("", "+gain")]
+PUBLISHED = ("firenet_published", "cista_tc")
+SOLVED = [f"{row}{gain}" for row in ("cf", "highpass", *PUBLISHED, "firenet") for gain in ("", "+gain")]
 METHODS = ["zeros", "train_mean", "oracle_mean", *SOLVED, "e2vid", "e2p", "paper", "ours"]
 BUDGET_SEQUENCES = 6
 BUDGET_METHODS = ("oracle_mean", "highpass+gain", "ours")
@@ -104,7 +105,13 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--measured", type=Path, required=True, help="scenes as ingest.source=polarization takes them")
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--ours", type=Path, help="weights of `ours`, such as the shipped ones, instead of training it")
-    parser.add_argument("--firenet", type=Path, help="FireNet's published weights; without them its rows are left out")
+    parser.add_argument(
+        "--published",
+        action="append",
+        default=[],
+        metavar="ROW=FILE",
+        help=f"published weights of {' or '.join(PUBLISHED)}; a row without them is left out",
+    )
     parser.add_argument("--override", action="append", default=[], metavar="ROW:KEY=VALUE", help="of a row's training")
     parser.add_argument("--only", choices=tuple(TRAININGS), help="train this one and stop")
     parser.add_argument("--rows", nargs="+", choices=tuple(TRAININGS), default=[*TRAININGS], help="to train and score")
@@ -117,7 +124,11 @@ def parsed() -> argparse.Namespace:
         parser.error("the tree has uncommitted changes; commit them first, the figures name a commit")
     if "ours" not in arguments.rows and not arguments.ours and not arguments.only:
         parser.error(f"--rows {' '.join(arguments.rows)}: expected ours among them, or --ours FILE")
-    for name in ("photographs", "measured", "work", "ours", "firenet"):
+    pairs = [given.split("=", 1) for given in arguments.published]
+    if unknown := [pair for pair in pairs if len(pair) != 2 or pair[0] not in PUBLISHED]:
+        parser.error(f"--published {'='.join(unknown[0])}: expected ROW=FILE with ROW one of {', '.join(PUBLISHED)}")
+    arguments.published = {row: Path(file).resolve() for row, file in pairs}
+    for name in ("photographs", "measured", "work", "ours"):
         if path := getattr(arguments, name):
             setattr(arguments, name, path.resolve())
     return arguments
@@ -143,8 +154,7 @@ def main() -> None:
     if arguments.ours:
         best["ours"] = stand_in(arguments)
     weights = [f"methods.{row}.weights={file}" for row, file in best.items() if row != "ours"]
-    if arguments.firenet:
-        weights.append(f"methods.firenet_published.weights={arguments.firenet}")
+    weights += [f"methods.{row}.weights={file}" for row, file in arguments.published.items()]
     scored = [row for row in METHODS if row.removesuffix("+gain") not in set(TRAININGS) - set(arguments.rows)]
     methods = f"benchmark.methods=[{','.join(scored)}]"
     paths = (f"paths.train={best['ours'].parent}", f"paths.benchmark={results}")
