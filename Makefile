@@ -31,7 +31,7 @@ lint: setup
 	ruff format --check .
 	mypy
 	lint-imports
-	polarnet docs --check
+	python -m studies.docs --check
 
 smoke: setup
 	polarnet run experiment=smoke

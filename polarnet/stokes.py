@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from polarnet.arrays import Array, as_tensor, check_floating, check_same_shape, check_shape
+from polarnet.runtime.arrays import Array, as_tensor, check_floating, check_same_shape, check_shape
 
 POLARIZER_ANGLES_DEG = (0, 45, 90, 135)
 

@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from polarnet.config import Config, hydra_stage
+from polarnet.config.tree import Config, hydra_stage
 from polarnet.training.baselines import USERS, is_used
 
 

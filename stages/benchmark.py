@@ -1,7 +1,7 @@
 """Test sequences, all methods -> data/benchmark: tables, scores of each frame, and example windows."""
 
-from polarnet.benchmarking import lpips_of, run_pipeline_benchmark
-from polarnet.config import Config, hydra_stage, or_exit
+from polarnet.config.pipeline import lpips_of, run_pipeline_benchmark
+from polarnet.config.tree import Config, hydra_stage, or_exit
 from polarnet.reports.tables import as_plain, score_table
 
 

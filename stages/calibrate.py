@@ -3,9 +3,9 @@
 import dataclasses
 from pathlib import Path
 
-from polarnet.config import Config, hydra_stage
-from polarnet.recordings.status import start_over
-from polarnet.recordings.targets import calibrate_targets
+from polarnet.captures.status import start_over
+from polarnet.captures.targets import calibrate_targets
+from polarnet.config.tree import Config, hydra_stage
 from polarnet.reports.calibration import draw_calibration
 
 

@@ -3,9 +3,9 @@
 import functools
 from pathlib import Path
 
-from polarnet.cluster import pmap
-from polarnet.config import Config, hydra_stage
-from polarnet.runtime import threads_of
+from polarnet.config.tree import Config, hydra_stage
+from polarnet.runtime.cluster import pmap
+from polarnet.runtime.machine import threads_of
 from polarnet.simulation.dataset import emulate_scenes
 
 

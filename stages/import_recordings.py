@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from polarnet.config import Config, hydra_stage, input_folder
-from polarnet.recordings.imported import import_targets
-from polarnet.recordings.status import start_over
+from polarnet.captures.imported import import_targets
+from polarnet.captures.status import start_over
+from polarnet.config.tree import Config, hydra_stage, input_folder
 
 
 @hydra_stage

@@ -3,9 +3,9 @@
 import functools
 from pathlib import Path
 
-from polarnet.cluster import pmap
-from polarnet.config import Config, hydra_stage, input_folder
-from polarnet.simulation.pictures.ingest import ingest
+from polarnet.config.tree import Config, hydra_stage, input_folder
+from polarnet.pictures.ingest import ingest
+from polarnet.runtime.cluster import pmap
 
 
 @hydra_stage

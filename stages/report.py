@@ -5,7 +5,7 @@ import os
 import sys
 from pathlib import Path
 
-from polarnet.config import Config, hydra_stage
+from polarnet.config.tree import Config, hydra_stage
 from polarnet.reports.artefacts import ReportPaths
 from polarnet.reports.page import write_report
 from polarnet.reports.provenance import Run, facts

@@ -3,9 +3,9 @@
 import functools
 from pathlib import Path
 
-from polarnet.cluster import pmap
-from polarnet.config import Config, hydra_stage, input_folder
-from polarnet.runtime import threads_of
+from polarnet.config.tree import Config, hydra_stage, input_folder
+from polarnet.runtime.cluster import pmap
+from polarnet.runtime.machine import threads_of
 from polarnet.simulation.sets import Recipe, make_complex_motion, make_folder_set
 
 

@@ -3,8 +3,8 @@
 import functools
 from pathlib import Path
 
-from polarnet.cluster import pmap
-from polarnet.config import Config, hydra_stage
+from polarnet.config.tree import Config, hydra_stage
+from polarnet.runtime.cluster import pmap
 from polarnet.simulation.truth import synthesize
 
 

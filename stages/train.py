@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from polarnet.config import Config, hydra_stage, or_exit
-from polarnet.runtime import device_of, threads_of
+from polarnet.config.tree import Config, hydra_stage, or_exit
+from polarnet.runtime.machine import device_of, threads_of
 from polarnet.training.dolp import dolp_task
 from polarnet.training.loop import train
 from polarnet.training.parallel import join, launched

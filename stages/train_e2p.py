@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from polarnet.config import Config, hydra_stage, or_exit
-from polarnet.runtime import device_of, threads_of
+from polarnet.config.tree import Config, hydra_stage, or_exit
+from polarnet.runtime.machine import device_of, threads_of
 from polarnet.training.baselines import is_used, leave_untrained
 from polarnet.training.e2p import e2p_task
 from polarnet.training.loop import train

@@ -1,8 +1,8 @@
 """One point of a sweep: train and benchmark in the job's own folder, without touching the files that DVC tracks.
 
 `python -m stages.trial -m loss.mse=1.0 loss.ssim=0.0,1.0 seed=1,2,3` runs every combination on the pipeline's existing
-sequences and ends with one table (polarnet.sweep). Jobs may run in parallel: each keeps its own predictions until they
-are scored, because a cache holds only one prediction per method and sequence.
+sequences and ends with one table (polarnet.config.sweep). Jobs may run in parallel: each keeps its own predictions
+until they are scored, because a cache holds only one prediction per method and sequence.
 
 A failed point writes the reason to `failure.txt`; the other points continue.
 """
@@ -19,8 +19,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from polarnet.config import hydra_command
-from polarnet.sweep import FAILURE
+from polarnet.config.sweep import FAILURE
+from polarnet.config.tree import hydra_command
 
 # The trained network and the references for it; no other method of the benchmark depends on the training.
 REFERENCE_METHODS = "benchmark.methods=[zeros,train_mean,oracle_mean,ours]"

@@ -2,9 +2,9 @@
 
 import functools
 
-from polarnet.config import Config, hydra_stage, or_exit, with_lpips
-from polarnet.lpips import PURPOSES
-from polarnet.lpips_weights import find_weights, write_weights
+from polarnet.config.tree import Config, hydra_stage, or_exit, with_lpips
+from polarnet.metrics.lpips import PURPOSES
+from polarnet.metrics.lpips_weights import find_weights, write_weights
 
 
 @hydra_stage

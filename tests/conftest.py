@@ -13,12 +13,12 @@ import pytest
 HERE = Path(__file__).parent
 SLOWEST_FIRST = (
     "pipeline/test_stages.py",
-    "test_onnx_export.py",
+    "networks/test_onnx_export.py",
     "pipeline/test_interruptions.py",
-    "test_rig.py",
+    "captures/test_rig.py",
     "reference/test_golden.py",
     "recordings/test_fuzz.py",
-    "pipeline/test_config.py",
+    "config/test_config.py",
     "simulation/test_emulator.py",
 )
 """Files that take longest; the others follow, so no worker is left with a long one when the rest is done."""
@@ -52,7 +52,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_runtest_setup() -> None:
-    """Undo what a stage that an earlier test ran in this process has set (`polarnet.runtime.configure`).
+    """Undo what a stage that an earlier test ran in this process has set (`polarnet.runtime.machine.configure`).
 
     Tests run side by side, so each has one thread; hypothesis wants numbers below 1e-38.
     """
@@ -103,13 +103,13 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     import numpy as np
     import torch
 
-    from polarnet.config import load
-    from polarnet.events.frames import FrameStore
+    from polarnet.config.tree import load
     from polarnet.simulation.dataset import emulate_scenes
     from polarnet.simulation.motion import Trajectory, frame_times_us, random_trajectory
     from polarnet.simulation.scene import scene_from_polarization
-    from polarnet.simulation.scenes import SceneStore
     from polarnet.simulation.truth import frames_of
+    from polarnet.storage.frames import FrameStore
+    from polarnet.storage.scenes import SceneStore
 
     folder = tmp_path_factory.mktemp("simulated")
     config = load(project_root)

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from polarnet.evaluation.rows import Context
-from polarnet.evaluation.sequences import TestSequence
+from polarnet.benchmark.rows import Context
+from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import Events
 from polarnet.methods import METHODS
 from polarnet.methods.complementary_filter import ComplementaryFilterConfig, HighPassConfig

@@ -10,7 +10,7 @@ from polarnet.cli.parsers import Commands
 from polarnet.cli.project import project_root
 
 if TYPE_CHECKING:
-    from polarnet.config import Config
+    from polarnet.config.tree import Config
 
 
 def add_to(commands: Commands) -> None:
@@ -41,8 +41,8 @@ def add_to(commands: Commands) -> None:
 
 
 def _benchmark(options: argparse.Namespace) -> int:
-    from polarnet.config import check_keys, load
-    from polarnet.runtime import configure
+    from polarnet.config.tree import check_keys, load
+    from polarnet.runtime.machine import configure
 
     if options.scenes and options.limit is not None:
         raise ValueError("--limit is for --event-budget and --sensitivity; --scenes scores all that lies in its folder")
@@ -62,7 +62,7 @@ def _benchmark(options: argparse.Namespace) -> int:
 
 
 def _own_scenes(options: argparse.Namespace, config: "Config", scenes: Path, out: Path, weights: Path | None) -> int:
-    from polarnet.own_scenes import benchmark_folder
+    from polarnet.cli.own_scenes import benchmark_folder
     from polarnet.reports.tables import as_plain, score_table
 
     command = f"polarnet benchmark --scenes {options.scenes}"
@@ -76,7 +76,7 @@ def _own_scenes(options: argparse.Namespace, config: "Config", scenes: Path, out
 
 
 def _study(options: argparse.Namespace, config: "Config", out: Path, weights: Path | None) -> int:
-    from polarnet.studies import STUDIED, run_event_budget, run_sensitivity
+    from polarnet.cli.studies import STUDIED, run_event_budget, run_sensitivity
 
     run = run_event_budget if options.event_budget else run_sensitivity
     methods = options.methods.split(",") if options.methods else STUDIED

@@ -156,12 +156,13 @@ def _register(options: argparse.Namespace) -> int:
 
 
 def _recover(options: argparse.Namespace) -> int:
-    from polarnet.config import load
+    from polarnet.config.pipeline import setup_of
+    from polarnet.config.tree import load
     from polarnet.events.streaming import WindowRule, parse_window
     from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recordings.recording import read_recording
-    from polarnet.recover import Arrangement, facts_of, open_files, open_live, open_method, recover
-    from polarnet.reports.recovery import RecoveryWriter
+    from polarnet.recovery.recover import Arrangement, facts_of, open_files, open_live, open_method, recover
+    from polarnet.recovery.writer import RecoveryWriter
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
     _check_taken(options)
@@ -171,7 +172,9 @@ def _recover(options: argparse.Namespace) -> int:
     if step_events is not None:
         raise ValueError(f"--step: expected a time such as 0.1ms, got {options.step}")
     rule = WindowRule(length_us, events, step_us)
-    recoverer, words = open_method(options.method, options.weights, options.device, options.precision, config)
+    recoverer, words = open_method(
+        options.method, options.weights, options.device, options.precision, lambda method: setup_of(config(), method)
+    )
     name = "live" if options.live else Path(options.input[0]).stem
     out = options.out or Path("outputs") / "recover" / name
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
@@ -184,7 +187,8 @@ def _recover(options: argparse.Namespace) -> int:
             read = functools.partial(read_recording, **_reading(options))
             arrangement = Arrangement(options.angles, mosaic, options.sequence)
             size = (options.size[0], options.size[1]) if options.size else None
-            source = open_files([Path(path) for path in options.input], arrangement, read, size, folder / WORK, config)
+            files, captures = [Path(path) for path in options.input], lambda: config().recordings
+            source = open_files(files, arrangement, read, size, folder / WORK, captures)
         check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
         source = source._replace(pieces=check.watch(source.pieces))
         writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
@@ -224,8 +228,8 @@ def _check_taken(options: argparse.Namespace) -> None:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    from polarnet.events.store import EventStore
-    from polarnet.recover import replay
+    from polarnet.recovery.recover import replay
+    from polarnet.storage.events import EventStore
 
     def write(data: bytes) -> None:
         sys.stdout.buffer.write(data)

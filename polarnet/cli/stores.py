@@ -26,9 +26,9 @@ def add_to(commands: Commands) -> None:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from polarnet.events import frames, store
-    from polarnet.events.table import open_group
-    from polarnet.simulation import scenes
+    from polarnet.storage import events as store
+    from polarnet.storage import frames, scenes
+    from polarnet.storage.table import open_group
 
     checks = {store.FORMAT: store.verify, frames.FORMAT: frames.verify_frames, scenes.FORMAT: scenes.verify_scenes}
     form = open_group(options.store).attrs.get("format")
@@ -43,8 +43,8 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from polarnet.events.exchange import export_store
-    from polarnet.events.store import EventStore
+    from polarnet.storage.events import EventStore
+    from polarnet.storage.exchange import export_store
 
     store = EventStore.open(options.store)
     with run_folder(options.folder, "export") as folder:
@@ -54,7 +54,7 @@ def _export(options: argparse.Namespace) -> int:
 
 
 def _import(options: argparse.Namespace) -> int:
-    from polarnet.events.exchange import import_store
+    from polarnet.storage.exchange import import_store
 
     import_store(options.folder, options.store)
     print(f"{options.folder} -> {options.store}")

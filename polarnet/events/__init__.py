@@ -1,1 +1,1 @@
-"""Events of polarizer channels and their ground truth: the contract between producers and consumers."""
+"""Events of one polarizer channel: columns, windows of time, dense representations, streaming."""

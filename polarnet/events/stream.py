@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Int8, Int16, Int64, Integer
 from torch import Tensor
 
-from polarnet.arrays import Array, whole_numbers
+from polarnet.runtime.arrays import Array, whole_numbers
 
 LARGEST_SIDE = 2**15 - 1  # pixels; coordinates are int16
 

@@ -1,67 +1,15 @@
-"""Cut a sequence into timed windows, and provide such sequences as a torch `Dataset`."""
+"""Cut the events of a sequence into windows of time and encode them."""
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int8, Int64, Integer
+from jaxtyping import Float, Int64, Integer
 from torch import Tensor
-from torch.utils.data import Dataset
 
-from polarnet.arrays import Array, whole_numbers
-from polarnet.events.frames import FrameStore
 from polarnet.events.representations import Encode
 from polarnet.events.stream import Events, slice_count
-
-
-@runtime_checkable
-class EventSource(Protocol):
-    """A source of named sequences' events, read by time window: a store on disk, or an emulator.
-
-    `polarnet.events.store.EventStore` reads stored events; `polarnet.simulation.fly.EmulatedEvents` makes them on
-    request.
-    """
-
-    @property
-    def path(self) -> str:
-        """Path of the event store, or of the scenes that the events are made from."""
-
-    @property
-    def sequences(self) -> list[str]:
-        """Names of the sequences."""
-
-    @property
-    def height(self) -> int:
-        """Rows of the sensor."""
-
-    @property
-    def width(self) -> int:
-        """Columns of the sensor."""
-
-    @property
-    def attributes(self) -> dict[str, Any]:
-        """All settings that the events depend on, besides the data at `path`."""
-
-    def read(self, sequence: str, start_us: int | None = None, stop_us: int | None = None) -> list[Events]:
-        """The four channels of a sequence, or their events with start <= t < stop."""
-
-
-class WindowSequence(NamedTuple):
-    """All windows of a sequence, with the truth at the end of each."""
-
-    name: str
-    inputs: Float[Tensor, "t c h w"] | Int8[Tensor, "t c h w"]
-    """Channel by channel (0, 45, 90, 135 degrees); c is 4 times the images per channel of the representation.
-
-    Bytes only while a training keeps them in memory.
-    """
-    dolp: Float[Tensor, "t h w"]
-    aolp: Float[Tensor, "t h w"]
-    intensity: Float[Tensor, "t 4 h w"]
-    """Has no windows while a training that does not need intensities keeps sequences in memory."""
-    valid: Bool[Tensor, "t h w"] | None = None
-    """Where the truth is known; None: everywhere."""
+from polarnet.runtime.arrays import Array, whole_numbers
 
 
 def windows_of(t_us: Int64[Tensor, " n"]) -> list[tuple[int, int]]:
@@ -91,31 +39,3 @@ def encode_windows(channels: Sequence[Events], t_us: Integer[Array, " n"], encod
     ]
     height, width = per_channel[0].shape[-2:]
     return torch.cat([images.view(len(lengths), -1, height, width) for images in per_channel], dim=1)
-
-
-class WindowDataset(Dataset[WindowSequence]):
-    """Item i holds all windows of sequence i, encoded on access. Frames give the windows' ends and the truth."""
-
-    def __init__(self, events: EventSource, frames: FrameStore, sequences: list[str], encode: Encode):
-        absent = [name for name in sequences if name not in set(events.sequences) & set(frames.sequences)]
-        if absent:
-            raise ValueError(f"{', '.join(absent[:8])}: not both in {events.path} and in {frames.path}")
-        if (events.height, events.width) != (frames.height, frames.width):
-            raise ValueError(
-                f"events are {events.height}x{events.width} px ({events.path}), "
-                f"frames {frames.height}x{frames.width} ({frames.path}); write both from the same scenes"
-            )
-        self.events = events
-        self.frames = frames
-        self.sequences = sequences
-        self.encode = encode
-
-    def __len__(self) -> int:
-        return len(self.sequences)
-
-    def __getitem__(self, i: int) -> WindowSequence:
-        name = self.sequences[i]
-        t_us, intensity, dolp, aolp, valid = self.frames.frames(name)
-        inputs = encode_windows(self.events.read(name), t_us, self.encode)
-        known = None if valid is None else valid[1:]
-        return WindowSequence(name, inputs, dolp[1:], aolp[1:], intensity[1:], known)

@@ -19,7 +19,7 @@ from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.intensities import from_intensities, with_gain
 from polarnet.methods.method import Method, Recoverer, Setup, State
-from polarnet.ranges import allowed, check_ranges
+from polarnet.runtime.ranges import allowed, check_ranges
 from polarnet.stokes import Prediction
 
 HIGHPASS_GAIN = 1.5  # output gain of the high-pass filter, I = 1.5 exp(L) - 1, from the package's source

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from polarnet.ranges import allowed, check_ranges
+from polarnet.runtime.ranges import allowed, check_ranges
 
 KERNEL_SIZE = 5  # blur kernel of the unsharp mask, pixels
 DARKEST_AT_MOST = 0.45  # bounds of the automatic range, so that it spans at least 0.1

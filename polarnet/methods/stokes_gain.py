@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from polarnet.ranges import allowed, check_ranges
+from polarnet.runtime.ranges import allowed, check_ranges
 
 SIGNS = (1.0, -1.0, 1.0, -1.0)  # signs of I0, I45, I90 and I135 in I0 + I90 - I45 - I135
 DARK = 0.05  # brightness relative to the mean at which a pixel has half weight: dark pixels are noisier

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from polarnet.networks.blocks import ConvGRU, ResidualBlock, UpBlock, compressed, contrasts, conv3x3
 from polarnet.networks.swin import SwinStage
-from polarnet.ranges import allowed, check_ranges
+from polarnet.runtime.ranges import allowed, check_ranges
 from polarnet.stokes import Prediction
 
 STRIDE = 4  # two stages halve the resolution; height and width are padded to multiples of 4

@@ -33,7 +33,7 @@ from polarnet.networks.redundancy import (
     length,
     neighbourhoods,
 )
-from polarnet.ranges import allowed, check_ranges
+from polarnet.runtime.ranges import allowed, check_ranges
 from polarnet.stokes import Prediction
 
 STRIDE = 4  # stride of the largest recurrent layer; height and width are padded to multiples of it

@@ -1,7 +1,7 @@
 """Turn files of any polarizer arrangement into four channels on one clock, in an event store.
 
 An arrangement is either four files, one per angle and in any order (four cameras, or one camera four times), or one
-file of a camera with a mosaic of polarizers on its pixels (division of focal plane). `polarnet.recordings.targets`
+file of a camera with a mosaic of polarizers on its pixels (division of focal plane). `polarnet.captures.targets`
 handles division-of-time captures.
 """
 
@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
 from polarnet.recordings.recording import Recording, read_recording
 from polarnet.recordings.registration import warp_events
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
+from polarnet.storage.events import EventStore
 
 
 def read_four(

@@ -24,7 +24,7 @@ BLOCK = 4  # pixels, square; single pixels have too few events to compare
 MIN_BLOCKS = 1000  # with events in a window: the ratio of two misfits is then known to about 1 / sqrt(1000), 3 %
 HOT_PIXEL_FACTOR = 4.0
 
-# Limits of misfits and counts: measured by tests/benchmarks/polarizers.py (docs/recover.md, section Checks).
+# Limits of misfits and counts: measured by studies/polarizers.py (docs/recover.md, section Checks).
 BETTER_FIT = 0.9  # misfit of other pairs over that of the pairs at right angles: lower only where the order is wrong
 EQUAL_COUNTS = 1.1  # events of the busiest channel over those of the quietest: lower without polarization
 EQUAL_MISFITS = 1.1  # misfit of other pairs over that of the pairs at right angles: lower without polarization ...

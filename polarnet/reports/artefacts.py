@@ -12,14 +12,14 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from polarnet.events.frames import FrameStore
-from polarnet.events.store import EventStore
+from polarnet.pictures.manifest import SPLITS, Manifest, read_manifest
 from polarnet.reports.figures import Curve
 from polarnet.reports.maps import polarization_hsv
 from polarnet.reports.overview import Overview
 from polarnet.simulation.motion import Pose, Trajectory, sensor_to_scene
-from polarnet.simulation.pictures.manifest import SPLITS, Manifest, read_manifest
-from polarnet.simulation.scenes import SceneStore
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
+from polarnet.storage.scenes import SceneStore
 from polarnet.training.baselines import NOT_TRAINED
 
 THUMBNAIL_WIDTH = 208  # pixels, twice the displayed size

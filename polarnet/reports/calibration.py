@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float32
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from polarnet.recordings.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
-from polarnet.recordings.targets import Calibrated
+from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
+from polarnet.captures.targets import Calibrated
 from polarnet.reports.png import png
 
 COLOURS = ("#d6336c", "#e08a1e", "#3d8fd9", "#4aa37c")

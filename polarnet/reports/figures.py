@@ -19,11 +19,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from torch import Tensor
 
+from polarnet.metrics.similarity import mse, psnr
 from polarnet.reports.legend import GENERAL, Legend
 from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image
 from polarnet.reports.png import png
 from polarnet.reports.tables import COLUMNS, in_order, with_structure
-from polarnet.similarity import mse, psnr
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ def reliability_figure(
 ) -> Figure:
     """Measured against predicted squared error of DoLP, a line per method; calibrated errors lie on the diagonal.
 
-    `curves` are those of `polarnet.evaluation.reliability`: predicted, measured, pixels. Dots grow with the pixels.
+    `curves` are those of `polarnet.metrics.reliability`: predicted, measured, pixels. Dots grow with the pixels.
     """
     figure = _figure((3.4, 3.2), theme)
     with matplotlib.rc_context(chart_style(theme)):

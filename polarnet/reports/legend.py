@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-from polarnet.evaluation.rows import ROWS
 from polarnet.methods import METHODS
 from polarnet.methods.intensities import GAIN
+from polarnet.reports.rows import ROWS
 from polarnet.reports.tables import LABELS, in_order
 
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from polarnet.pictures.manifest import SPLITS
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, SetResults, read_artefacts
 from polarnet.reports.figures import PanelScene, comparison_panel, dolp_bar, training_curves
 from polarnet.reports.legend import Legend, glossary, legend_of, lpips_about, network_label
@@ -41,7 +42,6 @@ from polarnet.reports.tiles import (
     reliability_chart,
     template,
 )
-from polarnet.simulation.pictures.manifest import SPLITS
 
 CARDS = {
     "psnr": "PSNR",

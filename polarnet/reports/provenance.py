@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from polarnet.runtime import usable_cores
+from polarnet.runtime.machine import usable_cores
 
 PACKAGES = ("polarnet", "torch", "numpy", "numba", "zarr", "opencv-contrib-python-headless", "dvc", "hydra-core")
 
@@ -36,7 +36,7 @@ def facts(root: Path) -> dict[str, str]:
 
 
 def measured_with(record: Mapping[str, Any]) -> str:
-    """Machine, load, versions and commit of a record in docs/results (`polarnet.measure.machine_record`), as text."""
+    """Machine, load, versions and commit of a record in docs/results (`studies.measure.machine_record`), as text."""
     versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
     where = f"{record['machine']}, load {record['load']:.1f} before the start"
     return f"{where}; {versions}; commit `{record['commit'][:10]}`"

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
-from polarnet.evaluation.references import REFERENCES
-from polarnet.evaluation.rows import ROWS
+from polarnet.reports.rows import REFERENCES, ROWS
 
 Scores = Mapping[str, Mapping[str, Any]]
 """Method, then metric (data/benchmark/metrics.json). None marks a missing value; `<metric>_ci` holds an interval."""

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from polarnet import __version__
-from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
-from polarnet.runtime import generator_for, seed_for
+from polarnet.runtime.machine import generator_for, seed_for
 from polarnet.simulation.emulator import EmulatorConfig, randomised
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import scene_from_polarization
-from polarnet.simulation.scenes import SceneStore
+from polarnet.storage.events import EventStore
+from polarnet.storage.scenes import SceneStore
 
 
 def emulate_scenes(
@@ -22,9 +22,9 @@ def emulate_scenes(
 ) -> int:
     """Emulate all sequences of a scene store into an event store; returns their number.
 
-    `mapper` is `polarnet.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks emulates one
-    sequence on `threads` threads. An interrupted run of the same scenes, configuration and seed resumes where it
-    stopped.
+    `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks
+    emulates one sequence on `threads` threads. An interrupted run of the same scenes, configuration and seed resumes
+    where it stopped.
     """
     source = SceneStore.open(scenes)
     attributes = origin_of(source, config, seed)

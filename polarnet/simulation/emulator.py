@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float64, Int64, Shaped
 from torch import Tensor
 
-from polarnet.arrays import Array, as_tensor, check_range, check_shape
 from polarnet.events.stream import Events
-from polarnet.ranges import allowed, check_ranges
+from polarnet.runtime.arrays import Array, as_tensor, check_range, check_shape
+from polarnet.runtime.ranges import allowed, check_ranges
 from polarnet.simulation.compilation import forget_stale_code
 from polarnet.simulation.pixels import esim, esim_gpu, exact, v2e, voltmeter
 from polarnet.simulation.pixels.columns import Columns, empty_columns, trimmed

@@ -6,7 +6,7 @@ from typing import Any
 from polarnet.events.stream import Events, slice_time
 from polarnet.simulation.dataset import emulate_sequence, origin_of
 from polarnet.simulation.emulator import EmulatorConfig
-from polarnet.simulation.scenes import SceneStore
+from polarnet.storage.scenes import SceneStore
 
 KEPT_SEQUENCES = 8  # about 25 MB each at 120x180 px and 2 million events
 

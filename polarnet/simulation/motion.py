@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from polarnet.ranges import allowed, check_ranges
+from polarnet.runtime.ranges import allowed, check_ranges
 from polarnet.simulation.scene import PolarizationScene
 
 HARMONICS = 3  # of the motion along each axis

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from polarnet.arrays import (
+from polarnet.runtime.arrays import (
     TOLERANCE,
     Array,
     as_tensor,

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int64
 from torch import Tensor, tensor
 
-from polarnet.arrays import Array
 from polarnet.events.stream import Events
-from polarnet.runtime import generator_for, seed_for
+from polarnet.runtime.arrays import Array
+from polarnet.runtime.machine import generator_for, seed_for
 from polarnet.simulation.emulator import EmulatorConfig, randomised
 from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory
 from polarnet.simulation.moving_sensor import emulate_motion

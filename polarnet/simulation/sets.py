@@ -12,21 +12,21 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from polarnet.fingerprint import code_digest, digest, value_digest
-from polarnet.ranges import allowed, check_ranges
+from polarnet.pictures.images import picture_extensions
+from polarnet.pictures.ingest import IngestConfig, ingest
+from polarnet.pictures.manifest import read_manifest, write_manifest
+from polarnet.pictures.polarimetry import group_by_measurement
+from polarnet.runtime.fingerprint import code_digest, digest, value_digest
+from polarnet.runtime.ranges import allowed, check_ranges
 from polarnet.simulation.dataset import emulate_scenes
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import MotionConfig
-from polarnet.simulation.pictures.images import picture_extensions
-from polarnet.simulation.pictures.ingest import IngestConfig, ingest
-from polarnet.simulation.pictures.manifest import read_manifest, write_manifest
-from polarnet.simulation.pictures.polarimetry import group_by_measurement
 from polarnet.simulation.truth import synthesize
 
 MADE = "made.json"
 
 MakeMapper = Callable[[str], Callable[..., Iterable[Any]]]
-"""`polarnet.cluster.pmap` with its workers bound, for a label; or one that gives the built-in `map`."""
+"""`polarnet.runtime.cluster.pmap` with its workers bound, for a label; or one that gives the built-in `map`."""
 
 
 @dataclass(frozen=True)

@@ -15,20 +15,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from polarnet import stokes
-from polarnet.events.frames import FrameStore
-from polarnet.runtime import generator_for, one_thread
+from polarnet.pictures.images import read_rgb
+from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, listed, read_manifest
+from polarnet.pictures.polarimetry import read_intensities
+from polarnet.runtime.machine import generator_for, one_thread
 from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory, render
-from polarnet.simulation.pictures.images import read_rgb
-from polarnet.simulation.pictures.manifest import Manifest, ManifestEntry, Skipped, listed, read_manifest
-from polarnet.simulation.pictures.polarimetry import read_intensities
 from polarnet.simulation.scene import (
     PolarizationScene,
     polarization_from_rgb,
     scene_from_intensities,
     scene_from_polarization,
 )
-from polarnet.simulation.scenes import SceneStore, made_from, variant_name
 from polarnet.simulation.variation import VariationConfig, varied
+from polarnet.storage.frames import FrameStore
+from polarnet.storage.scenes import SceneStore, made_from, variant_name
 
 logger = logging.getLogger(__name__)
 
@@ -73,8 +73,8 @@ def synthesize(
 
     A scene is a picture of `images`, or a variant of one of the training split (`variation` None: there are none).
 
-    `mapper` is `polarnet.cluster.pmap` with its workers bound, or the built-in `map`. Every trajectory depends on
-    the seed and the sequence's name alone. An interrupted run goes on where it stopped.
+    `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`. Every trajectory depends
+    on the seed and the sequence's name alone. An interrupted run goes on where it stopped.
 
     Warns about every picture too small for the sensor and its motion, and makes no scene of it; ValueError where none
     is left.

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from polarnet import stokes
-from polarnet.ranges import allowed, check_ranges
+from polarnet.runtime.ranges import allowed, check_ranges
 
 GREATEST_DOLP = 0.99
 

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from polarnet.events.representations import REPRESENTATIONS, channels_of
+from polarnet.metrics.similarity import Lpips
 from polarnet.networks.registry import NETWORKS, NetworkConfig
-from polarnet.similarity import Lpips
 from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig, PolarizationLoss
 from polarnet.training.sequences import Batch

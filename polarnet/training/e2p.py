@@ -9,9 +9,9 @@ from torch import Tensor
 
 from polarnet.events.representations import voxel_grid
 from polarnet.events.stream import Events
+from polarnet.metrics.similarity import Lpips
 from polarnet.networks.e2p import BRANCHES, E2p, coded_aolp, interleaved
-from polarnet.ranges import allowed
-from polarnet.similarity import Lpips
+from polarnet.runtime.ranges import allowed
 from polarnet.training.loop import LoopConfig
 from polarnet.training.losses import FrameLoss
 from polarnet.training.sequences import Batch

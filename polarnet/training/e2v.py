@@ -6,10 +6,10 @@ from torch import Tensor
 
 from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.stream import Events
+from polarnet.metrics.similarity import Lpips
 from polarnet.networks.e2vid import E2vid
 from polarnet.networks.firenet import FireNet
-from polarnet.ranges import allowed
-from polarnet.similarity import Lpips
+from polarnet.runtime.ranges import allowed
 from polarnet.training.loop import LoopConfig
 from polarnet.training.losses import FrameLoss
 from polarnet.training.sequences import Batch

@@ -11,11 +11,11 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from polarnet.events.representations import REPRESENTATIONS
-from polarnet.events.windows import WindowDataset
-from polarnet.ranges import allowed
-from polarnet.runtime import precision_on
-from polarnet.similarity import correlation, mse, psnr
-from polarnet.simulation.scenes import without_variants
+from polarnet.metrics.similarity import correlation, mse, psnr
+from polarnet.runtime.machine import precision_on
+from polarnet.runtime.ranges import allowed
+from polarnet.storage.scenes import without_variants
+from polarnet.storage.windows import WindowDataset
 from polarnet.training.calibration import Scene, fitted
 from polarnet.training.losses import known_frames
 from polarnet.training.optimizers import OPTIMIZERS, Stepper

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from polarnet.ranges import allowed, check_ranges
-from polarnet.similarity import Lpips, mean_where, mse, ssim, with_truth_outside
+from polarnet.metrics.similarity import Lpips, mean_where, mse, ssim, with_truth_outside
+from polarnet.runtime.ranges import allowed, check_ranges
 
 Frames = Float[Tensor, "t b h w"]
 Valid = Bool[Tensor, "t b h w"] | None
@@ -52,7 +52,7 @@ def known_frames(predicted: Frames, truth: Frames, valid: Valid) -> tuple[Tensor
 class FrameLoss:
     """A weighted sum of mse, mae, ssim_loss (1 - SSIM, Eq. 7) and lpips, each a mean over all frames.
 
-    Invalid pixels (see `polarnet.similarity`) and frames without a valid pixel count in no term.
+    Invalid pixels (see `polarnet.metrics.similarity`) and frames without a valid pixel count in no term.
     ValueError if LPIPS has a weight but `lpips` is None.
     """
 

@@ -13,7 +13,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from polarnet.runtime import RuntimeConfig
+from polarnet.runtime.machine import RuntimeConfig
 
 
 def launched(module: str, runtime: RuntimeConfig) -> bool:

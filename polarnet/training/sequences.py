@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from polarnet.events.windows import WindowDataset, WindowSequence
-from polarnet.ranges import allowed, check_ranges
-from polarnet.runtime import generator_for, memory_handed_back
+from polarnet.runtime.machine import generator_for, memory_handed_back
+from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.storage.windows import WindowDataset, WindowSequence
 
 Sequences = WindowDataset | list[WindowSequence]
 

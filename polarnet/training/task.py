@@ -11,16 +11,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from polarnet import __version__
-from polarnet.events.frames import FrameStore
 from polarnet.events.representations import Encode
-from polarnet.events.store import EventStore
-from polarnet.events.windows import EventSource, WindowDataset
-from polarnet.lpips import NO_RECORD, stored_record
-from polarnet.runtime import precision_on, seed_for
-from polarnet.similarity import Lpips
+from polarnet.metrics.lpips import NO_RECORD, stored_record
+from polarnet.metrics.similarity import Lpips
+from polarnet.runtime.machine import precision_on, seed_for
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.fly import EmulatedEvents
-from polarnet.simulation.scenes import SceneStore
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
+from polarnet.storage.scenes import SceneStore
+from polarnet.storage.windows import EventSource, WindowDataset
 from polarnet.training.losses import FrameLoss
 from polarnet.training.sequences import Batch
 

@@ -6,8 +6,8 @@ import pytest
 
 from polarnet.cli import main
 from polarnet.cli.outputs import MARKER, WORK, run_folder
-from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
+from polarnet.storage.events import EventStore
 
 
 def names(folder):

@@ -6,11 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.utils.data import DataLoader
 
-from polarnet.events.frames import FrameStore
 from polarnet.events.representations import event_tensor, voxel_grid_of_window
-from polarnet.events.store import EventStore
 from polarnet.events.stream import Events, slice_time
-from polarnet.events.windows import WindowDataset, cut_windows, encode_windows, windows_of
+from polarnet.events.windows import cut_windows, encode_windows, windows_of
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
+from polarnet.storage.windows import WindowDataset
 
 HEIGHT, WIDTH = 4, 6
 T_US = torch.tensor([0, 33_333, 66_667, 100_000])

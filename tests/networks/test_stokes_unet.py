@@ -8,7 +8,7 @@ import torch
 from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
-from polarnet.config import load
+from polarnet.config.tree import load
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
 from polarnet.networks.stokes_unet import PARTS, StokesUNet, averaged
 from polarnet.stokes import intensities_from_stokes, stokes_from_polarization

@@ -6,11 +6,11 @@ import grimp
 import pytest
 from ruamel.yaml import YAML
 
-from polarnet.experiments import stage_names
+from polarnet.config.experiments import stage_names
 from polarnet.training.baselines import USERS
 
 # What starts a stage and checks its values decides no output; listing it would re-run everything at each new setting.
-PLUMBING = {"polarnet", "polarnet.config", "polarnet.cluster"}
+PLUMBING = {"polarnet", "polarnet.config.tree", "polarnet.runtime.cluster"}
 
 
 @pytest.fixture(scope="module")

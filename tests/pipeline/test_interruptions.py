@@ -41,10 +41,10 @@ class Running(NamedTuple):
 @pytest.fixture(scope="module")
 def folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data folder whose scenes are ten motions of a window over the coffee photograph."""
-    from polarnet.config import load
+    from polarnet.config.tree import load
     from polarnet.simulation.motion import MotionConfig, Trajectory, random_trajectory
     from polarnet.simulation.scene import polarization_from_rgb
-    from polarnet.simulation.scenes import SceneStore
+    from polarnet.storage.scenes import SceneStore
 
     motion: MotionConfig = load(
         project_root, ["synthesize.window_height=60", "synthesize.window_width=90", "synthesize.duration_s=0.5"]
@@ -208,8 +208,8 @@ def cluster() -> Iterator:
 
 def over_dask(folder: Path, events: Path, cluster) -> None:
     """The emulate stage, in this process, on the workers of a cluster."""
-    from polarnet.cluster import pmap
-    from polarnet.config import load
+    from polarnet.config.tree import load
+    from polarnet.runtime.cluster import pmap
     from polarnet.simulation.dataset import emulate_scenes
 
     config = load(Path(__file__).resolve().parents[2])

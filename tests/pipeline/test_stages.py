@@ -8,8 +8,8 @@ from pathlib import Path
 import preloaded
 import pytest
 
-from polarnet.experiments import stage_names
-from polarnet.lpips import PURPOSES
+from polarnet.config.experiments import stage_names
+from polarnet.metrics.lpips import PURPOSES
 
 TINY = [
     "ingest.dead_leaves=4",

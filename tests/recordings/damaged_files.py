@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from polarnet.events.exchange import write_hdf5, write_text
-from polarnet.events.store import EventStore
 from polarnet.events.stream import Events, slice_count, validate
 from polarnet.recordings.formats.celex5_bin import celex5_pictures
-from polarnet.recordings.formats.celex5_bin_writer import write_celex5_bin
 from polarnet.recordings.formats.celex5_csv import write_celex5_csv
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import REPAIRS, RecordingError
+from polarnet.storage.events import EventStore
+from polarnet.storage.exchange import write_hdf5, write_text
+from studies.celex5_bin_writer import write_celex5_bin
 
 EVENTS = 60
 PLACES = st.one_of(st.integers(0, 200), st.integers(0, 2**20))

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
 from polarnet.recordings.arrangements import read_four, read_mosaic, split_mosaic, write_store
 from polarnet.recordings.formats.celex5_csv import write_celex5_csv
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import parse_mosaic
+from polarnet.storage.events import EventStore
 
 ANGLES = (0, 45, 90, 135)
 

@@ -4,11 +4,11 @@ import pytest
 
 from polarnet.cli import main
 from polarnet.events.stream import merge
-from polarnet.recordings.formats.celex5_bin_writer import write_celex5_pictures
 from polarnet.recordings.formats.celex5_csv import write_celex5_csv
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
+from studies.celex5_bin_writer import write_celex5_pictures
 
 FACTOR = 4
 

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.evaluation.benchmark import Benchmark, BenchmarkSet, Panel, write_benchmark
-from polarnet.evaluation.cost import Cost
-from polarnet.evaluation.score import BenchmarkConfig, score_sequence
-from polarnet.events.frames import FrameStore
-from polarnet.events.store import EventStore
+from polarnet.benchmark.cost import Cost
+from polarnet.benchmark.run import Benchmark, BenchmarkSet, Panel, write_benchmark
+from polarnet.benchmark.score import BenchmarkConfig, score_sequence
 from polarnet.events.stream import Events
+from polarnet.pictures.images import write_png
+from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, write_manifest
 from polarnet.reports.artefacts import ReportPaths
 from polarnet.simulation.motion import MotionConfig
-from polarnet.simulation.pictures.images import write_png
-from polarnet.simulation.pictures.manifest import Manifest, ManifestEntry, Skipped, write_manifest
 from polarnet.simulation.truth import synthesize
 from polarnet.stokes import Prediction
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
 from polarnet.training.baselines import leave_untrained
 
 SPLITS = {"park": "train", "lake": "val", "tree": "test", "leaf": "test"}

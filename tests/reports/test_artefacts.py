@@ -5,9 +5,9 @@ import pytest
 import torch
 from matplotlib.colors import rgb_to_hsv
 
-from polarnet.events.frames import FrameStore
-from polarnet.events.store import EventStore
 from polarnet.reports.artefacts import event_rates, read_artefacts, read_history
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
 
 
 @pytest.fixture(scope="module")

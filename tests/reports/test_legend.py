@@ -1,8 +1,8 @@
 import pytest
 
-from polarnet.evaluation.rows import ROWS
 from polarnet.methods import METHODS
 from polarnet.reports.legend import GENERAL, NETWORKS, glossary, legend_of, lpips_about
+from polarnet.reports.rows import ROWS
 
 
 def weights(**networks):

@@ -6,11 +6,11 @@ import pickle
 import pytest
 import torch
 
-from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
 from polarnet.simulation import fly
 from polarnet.simulation.fly import EmulatedEvents
-from polarnet.simulation.scenes import SceneStore
+from polarnet.storage.events import EventStore
+from polarnet.storage.scenes import SceneStore
 
 
 @pytest.fixture

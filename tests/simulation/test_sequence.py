@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import polarnet.simulation
-from polarnet.config import load
+from polarnet.config.tree import load
 from polarnet.events.stream import validate
 from polarnet.simulation import MOTIONS, SENSORS, PolarizationScene, Simulation, scene_from_rgb, simulate
 from polarnet.stokes import dolp, stokes_from_intensities

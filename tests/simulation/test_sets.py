@@ -3,16 +3,16 @@ import json
 import numpy as np
 import pytest
 
-from polarnet.config import load
-from polarnet.events.frames import FrameStore
-from polarnet.events.store import EventStore
-from polarnet.runtime import generator_for
+from polarnet.config.tree import load
+from polarnet.pictures.dead_leaves import dead_leaves
+from polarnet.pictures.images import write_png
+from polarnet.pictures.manifest import Manifest, ManifestEntry, write_manifest
+from polarnet.runtime.machine import generator_for
 from polarnet.simulation.motion import Trajectory
-from polarnet.simulation.pictures.dead_leaves import dead_leaves
-from polarnet.simulation.pictures.images import write_png
-from polarnet.simulation.pictures.manifest import Manifest, ManifestEntry, write_manifest
-from polarnet.simulation.scenes import SceneStore
 from polarnet.simulation.sets import MADE, Recipe, SetsConfig, kind_of, make_complex_motion, make_folder_set
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
+from polarnet.storage.scenes import SceneStore
 
 SMALL = [
     "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.1", "synthesize.window_height=60",

@@ -11,7 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
-from polarnet.events.frames import FrameStore
+from polarnet.pictures.ingest import IngestConfig, ingest
+from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.simulation.motion import (
     HARMONICS,
     MotionConfig,
@@ -21,12 +22,11 @@ from polarnet.simulation.motion import (
     random_trajectory,
     render,
 )
-from polarnet.simulation.pictures.ingest import IngestConfig, ingest
-from polarnet.simulation.pictures.manifest import read_manifest, write_manifest
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
-from polarnet.simulation.scenes import SceneStore
 from polarnet.simulation.truth import frames_of, synthesize, valid_frames
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
+from polarnet.storage.frames import FrameStore
+from polarnet.storage.scenes import SceneStore
 
 CONFIG = MotionConfig(
     sequences_per_picture=2,

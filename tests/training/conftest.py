@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.events.frames import FrameStore
-from polarnet.events.store import EventStore
 from polarnet.events.stream import Events
-from polarnet.runtime import generator_for
+from polarnet.runtime.machine import generator_for
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
 
 HEIGHT, WIDTH, WINDOWS, WINDOW_US = 16, 24, 6, 10_000
 SPLITS = {"a": "train", "b": "train", "c": "train", "d": "val", "e": "test"}

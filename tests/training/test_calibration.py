@@ -6,11 +6,11 @@ import pytest
 import torch
 from test_loop import CPU, LOOP, SEED, Killed, bytes_of, run
 
-from polarnet.config import load
+from polarnet.config.tree import load
 from polarnet.events.representations import event_tensor
-from polarnet.events.store import EventStore
 from polarnet.networks.checkpoint import load_network
-from polarnet.simulation.scenes import without_variants
+from polarnet.storage.events import EventStore
+from polarnet.storage.scenes import without_variants
 from polarnet.training.calibration import RIDGES, Scene, fitted
 from polarnet.training.dolp import dolp_task
 from polarnet.training.loop import TrainConfig, calibrate

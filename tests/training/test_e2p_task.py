@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 import torch
 
-from polarnet.events.store import EventStore
-from polarnet.lpips import Lpips
+from polarnet.metrics.lpips import Lpips
+from polarnet.metrics.similarity import ssim
 from polarnet.networks.checkpoint import load_checkpoint
 from polarnet.networks.e2p import coded_aolp
-from polarnet.similarity import ssim
+from polarnet.storage.events import EventStore
 from polarnet.training.e2p import BranchLoss, E2pConfig, e2p_task
 from polarnet.training.loop import train, train_batch, validate
 from polarnet.training.recorder import Recorder

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import torch
 
-from polarnet.events.store import EventStore
 from polarnet.networks.checkpoint import load_checkpoint, load_network
 from polarnet.networks.dolp_unet import DolpUNetConfig
 from polarnet.networks.e2vid import E2vid
-from polarnet.runtime import precision_on
+from polarnet.runtime.machine import precision_on
+from polarnet.storage.events import EventStore
 from polarnet.training.dolp import dolp_task
 from polarnet.training.e2v import E2vConfig, e2v_task
 from polarnet.training.loop import TrainConfig, set_learning_rate, train, validate

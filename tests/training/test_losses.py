@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-from polarnet.lpips import Lpips
-from polarnet.similarity import ssim
+from polarnet.metrics.lpips import Lpips
+from polarnet.metrics.similarity import ssim
 from polarnet.training.losses import FrameLoss, LossConfig, PolarizationLoss
 
 

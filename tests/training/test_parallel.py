@@ -65,7 +65,7 @@ def test_parts_are_the_batch_in_its_order():
 
 
 def test_one_process_starts_no_others_and_adds_nothing_up(project_root, monkeypatch):
-    from polarnet.config import load
+    from polarnet.config.tree import load
 
     runtime = load(project_root).runtime
     assert not launched("stages.train", runtime)
@@ -78,7 +78,7 @@ def test_one_process_starts_no_others_and_adds_nothing_up(project_root, monkeypa
 
 
 def test_a_stage_that_cannot_start_is_an_error(project_root):
-    from polarnet.config import load
+    from polarnet.config.tree import load
 
     runtime = dataclasses.replace(load(project_root).runtime, devices=2)
     with pytest.raises(RuntimeError, match=r"stages\.missing: a process of 2 on this machine failed"):

@@ -5,11 +5,11 @@ import torch
 from torch.utils.data import Dataset
 
 from polarnet import stokes
-from polarnet.events.frames import FrameStore
 from polarnet.events.representations import event_tensor
-from polarnet.events.store import EventStore
-from polarnet.events.windows import WindowDataset, WindowSequence
-from polarnet.runtime import generator_for
+from polarnet.runtime.machine import generator_for
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
+from polarnet.storage.windows import WindowDataset, WindowSequence
 from polarnet.training.sequences import (
     View,
     ViewConfig,

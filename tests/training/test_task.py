@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import torch
 
-from polarnet.events.frames import FrameStore
 from polarnet.networks.dolp_unet import DolpUNetConfig
+from polarnet.storage.frames import FrameStore
 from polarnet.training.dolp import dolp_task
 from polarnet.training.e2v import E2vConfig, e2v_task
 from polarnet.training.loop import TrainConfig, train_batch, validate

@@ -4,9 +4,9 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from polarnet.events.store import EventStore
 from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, sensor_size
 from polarnet.stokes import POLARIZER_ANGLES_DEG
+from polarnet.storage.events import EventStore
 
 ZIP = b"PK\x03\x04"
 

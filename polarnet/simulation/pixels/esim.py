@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.ranges import allowed
+from polarnet.runtime.ranges import allowed
 from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels.columns import SIGNAL
 from polarnet.simulation.pixels.light import FULL_SCALE, intensity_rows, ln

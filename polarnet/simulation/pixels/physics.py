@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.ranges import allowed
+from polarnet.runtime.ranges import allowed
 from polarnet.simulation.compilation import inlined
 from polarnet.simulation.pixels import randomness
 

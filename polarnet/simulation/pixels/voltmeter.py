@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.ranges import allowed
+from polarnet.runtime.ranges import allowed
 from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.columns import SIGNAL

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from polarnet.recordings.formats.celex5_bin import celex5_pictures
-from polarnet.recordings.formats.celex5_bin_writer import write_celex5_bin, write_celex5_pictures
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
+from studies.celex5_bin_writer import write_celex5_bin, write_celex5_pictures
 
 
 def header(data_type=0, loop_a=2, event_format=1, packages=1):

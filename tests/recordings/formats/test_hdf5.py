@@ -3,9 +3,9 @@ import sys
 import numpy as np
 import pytest
 
-from polarnet.events.exchange import write_hdf5
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
+from polarnet.storage.exchange import write_hdf5
 
 h5py = pytest.importorskip("h5py")
 

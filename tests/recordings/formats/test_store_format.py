@@ -1,9 +1,9 @@
 import pytest
 
-from polarnet.events.store import EventStore
 from polarnet.recordings.formats import store as store_format
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
+from polarnet.storage.events import EventStore
 
 
 @pytest.fixture

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from polarnet.events.exchange import read_text, write_text
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
+from polarnet.storage.exchange import read_text, write_text
 
 
 def columns(path, **arguments):

@@ -1,0 +1,134 @@
+"""Cost of a method on this machine: time, arithmetic and memory of a window, and number of parameters."""
+
+import statistics
+import time
+import tracemalloc
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from torch.utils.flop_counter import FlopCounterMode, sdpa_flop
+
+from polarnet.benchmark.rows import Context, opened, predictions_of
+from polarnet.benchmark.sequences import TestSequence
+from polarnet.events.stream import slice_time
+from polarnet.methods import METHODS
+
+COUNTED_WINDOWS = 3  # windows to count arithmetic and memory over: enough for the state to be passed on
+TIMED_WINDOWS = 10
+REPEATS = 3  # number of timings; the median is reported
+MIB = 2**20
+
+# FLOPs of fused attention on CPUs, which torch's own counter (2.13) omits.
+CPU_ATTENTION = {
+    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: lambda q, k, v, *_, out_shape=None, **__: sdpa_flop(
+        q, k, v
+    )
+}
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of a method; times and arithmetic are per window of all four channels."""
+
+    ms_per_window: float
+    """Time from events in memory to a DoLP frame in memory, including encoding the input."""
+    gflop: float | None
+    """Convolutions, matrix products and attention; a multiply-add counts as 2. None for a method without a network."""
+    params: int
+    """Parameters of the method's networks."""
+    peak_mib: float
+    """Peak memory of tensors and arrays over `COUNTED_WINDOWS` windows, without the sequence itself."""
+
+
+def cost_of(row: str, sequence: TestSequence, context: Context) -> Cost:
+    """Measure a row on the first windows of a sequence, several times; the first call is not timed."""
+    network = opened(METHODS[row], context).network if row in METHODS else None
+
+    def run(count: int) -> Callable[[], Any]:
+        part = first_windows(sequence, count)
+        return lambda: predictions_of([row], part, context)
+
+    counted, timed = run(COUNTED_WINDOWS), run(TIMED_WINDOWS)
+    counted()  # compiles and allocates
+    with FlopCounterMode(display=False, custom_mapping=CPU_ATTENTION) as counter:
+        counted()
+    peak = _peak_bytes(counted, context.device)
+    windows = len(sequence.dolp)
+    return Cost(
+        ms_per_window=1000 * statistics.median(_seconds(timed) for _ in range(REPEATS)) / min(TIMED_WINDOWS, windows),
+        gflop=counter.get_total_flops() / min(COUNTED_WINDOWS, windows) / 1e9 if network is not None else None,
+        params=sum(p.numel() for p in network.parameters()) if network is not None else 0,
+        peak_mib=peak / MIB,
+    )
+
+
+def first_windows(sequence: TestSequence, count: int) -> TestSequence:
+    """The first `count` windows of a sequence; all of it if it is shorter."""
+    t_us = sequence.t_us[: count + 1]
+    end_us = int(t_us[-1]) + 1
+    return replace(
+        sequence,
+        events=[slice_time(events, 0, end_us) for events in sequence.events],
+        t_us=t_us,
+        dolp=sequence.dolp[:count],
+        aolp=sequence.aolp[:count],
+        s0=sequence.s0[:count],
+        valid=None if sequence.valid is None else sequence.valid[:count],
+    )
+
+
+def _seconds(run: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start
+
+
+def _peak_bytes(run: Callable[[], Any], device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+        before = torch.cuda.memory_allocated(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        run()
+        return float(torch.cuda.max_memory_allocated(device) - before)
+    tracemalloc.start()  # numpy reports its arrays to tracemalloc
+    try:
+        with _TensorMemory() as tensors:
+            run()
+        arrays = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    return float(arrays + tensors.highest)
+
+
+class _TensorMemory(TorchDispatchMode):
+    """Tracks the bytes of live tensors that operations return; scratch memory inside kernels is not counted."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.held = 0
+        self.highest = 0
+        self._known = weakref.WeakSet[torch.UntypedStorage]()
+
+    def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run the operation and count the storage of its result, unless that is a view of a known storage."""
+        for tensor in tree_leaves((args, kwargs)):
+            if isinstance(tensor, torch.Tensor):
+                self._known.add(tensor.untyped_storage())  # weights and events existed before
+        out = operation(*args, **(kwargs or {}))
+        for tensor in tree_leaves(out):
+            if isinstance(tensor, torch.Tensor):
+                storage = tensor.untyped_storage()
+                if storage not in self._known:
+                    self._known.add(storage)
+                    self.held += storage.nbytes()
+                    weakref.finalize(storage, self._freed, storage.nbytes())
+        self.highest = max(self.highest, self.held)
+        return out
+
+    def _freed(self, count: int) -> None:
+        self.held -= count

@@ -1,0 +1,194 @@
+"""How many events DoLP needs (paper, section 5 and Fig. 11), and how often overlapping windows can recover it.
+
+Three studies run on the test sequences:
+
+- quality against the events per pixel since the start of the motion (Fig. 11a; the paper finds about one);
+- quality against the length of the windows;
+- overlapping windows of the last N events of each channel, one every fraction of a millisecond (Fig. 11b).
+
+Events per pixel are the mean over the four channels, as in the paper.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+from tqdm import tqdm
+
+from polarnet.benchmark.resimulate import sequence_at
+from polarnet.benchmark.rows import Context, opened, predictions_of
+from polarnet.benchmark.score import FrameScore, scene_means, score_sequence
+from polarnet.benchmark.sequences import TestSequence
+from polarnet.events.stream import Events, slice_count
+from polarnet.events.streaming import EventWindow
+from polarnet.methods import METHODS
+from polarnet.metrics.similarity import correlation, mse, psnr
+from polarnet.storage.events import EventStore
+from polarnet.storage.scenes import SceneStore
+
+BIN_EDGES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 13.0, 20.0, math.inf)
+"""Bin edges in events per pixel since the start; finer below 2, where the paper sees the change."""
+SHOWN = ("mse", "psnr", "ssim", "corr", "skill")
+EVENTS_PER_PIXEL = (0.25, 0.5, 1.0, 2.0)
+"""Sizes of the overlapping windows, in events per pixel."""
+
+
+def events_per_pixel(events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Mean number of events per pixel before each time (t < time), averaged over the channels."""
+    counts = torch.stack([torch.searchsorted(e.t, t_us) for e in events]).double().mean(dim=0)
+    return (counts / (events[0].height * events[0].width)).float()
+
+
+def since_start(sequences: Iterable[TestSequence], methods: Sequence[str], context: Context) -> dict[str, list[dict]]:
+    """Frames, scenes and mean scores by method and bin of events per pixel since the start, without warm-up.
+
+    Means are taken over frames, then over scenes. Empty bins are left out.
+    """
+    rows: dict[int, list[FrameScore]] = {}
+    rates: dict[int, list[float]] = {}
+    for sequence in tqdm(list(sequences), "events since the start", unit="sequence"):
+        predictions = predictions_of(methods, sequence, context)
+        per_pixel = events_per_pixel(sequence.events, sequence.t_us[1:]).tolist()
+        for row in score_sequence(sequence, predictions, 0, None, context.device):
+            k = int(np.searchsorted(BIN_EDGES, per_pixel[row.window], side="right")) - 1
+            rows.setdefault(k, []).append(row)
+            rates.setdefault(k, []).append(per_pixel[row.window])
+    return {
+        method: [
+            {
+                "from": BIN_EDGES[k],
+                "to": BIN_EDGES[k + 1] if math.isfinite(BIN_EDGES[k + 1]) else None,
+                "events_per_pixel": float(np.mean(rates[k])),
+                **_means([row for row in rows[k] if row.method == method]),
+            }
+            for k in sorted(rows)
+        ]
+        for method in methods
+    }
+
+
+def by_window_length(
+    scenes: SceneStore,
+    events: EventStore,
+    sequences: Sequence[str],
+    lengths_us: Sequence[int],
+    settle_us: int,
+    methods: Sequence[str],
+    context: Context,
+) -> dict[str, list[dict]]:
+    """Mean scores and events per window, by method and window length, over windows that end after `settle_us`.
+
+    The truth is rendered at the end of each window. ValueError if no window of some length ends after `settle_us`.
+    """
+    table: dict[str, list[dict]] = {method: [] for method in methods}
+    for length_us in tqdm(lengths_us, "window length", unit="length"):
+        rows: list[FrameScore] = []
+        per_window: list[float] = []
+        for sequence in sequences:
+            end_us = scenes.duration_us(sequence)
+            t_us = torch.arange(0, end_us + 1, length_us)
+            warmup = int((t_us[1:] <= settle_us).sum())
+            if len(t_us) < 2 or warmup >= len(t_us) - 1:
+                raise ValueError(
+                    f"{sequence}: windows of {length_us} us leave none after the first {settle_us} us of {end_us} us"
+                )
+            test = sequence_at(scenes, sequence, events.read(sequence), t_us)
+            predictions = predictions_of(methods, test, context)
+            rows += score_sequence(test, predictions, warmup, None, context.device)
+            per_window.append(float(events_per_pixel(test.events, t_us).diff().mean()))
+        for method in methods:
+            of_method = [row for row in rows if row.method == method]
+            entry = {"window_us": length_us, "events_per_pixel": float(np.mean(per_window)), **_means(of_method)}
+            table[method].append(entry)
+    return table
+
+
+def _means(rows: Sequence[FrameScore]) -> dict[str, Any]:
+    means = {metric: scene_means(rows, metric) for metric in SHOWN}
+    scores = {metric: float(np.mean([*next(iter(of.values())).values()])) for metric, of in means.items() if of}
+    return {"frames": len(rows), "scenes": len({row.scene for row in rows}), **scores}
+
+
+@torch.no_grad()
+def sliding_recovery(
+    sequence: TestSequence, count: int, t_us: Sequence[int], carry: bool, method: str, context: Context
+) -> Float[Tensor, "n h w"]:
+    """DoLP at times `t_us` from the last `count` events of each channel.
+
+    With `carry`, the method's state passes from one overlapping window to the next; otherwise every window starts
+    from the initial state.
+    """
+    recoverer = opened(METHODS[method], context)
+    start = recoverer.start(sequence.events[0].height, sequence.events[0].width)
+    state, frames = start, []
+    for t in t_us:
+        channels = _last(sequence.events, count, t)
+        first_us = min((int(events.t[0]) for events in channels if len(events)), default=t)
+        after, prediction = recoverer.step(state, [EventWindow(channels, first_us, t)])
+        state = after if carry else start
+        frames.append(prediction.dolp[0].cpu())
+    return torch.stack(frames)
+
+
+def _last(channels: Sequence[Events], count: int, t_us: int) -> list[Events]:
+    """The last `count` events of each channel before a time."""
+    stops = [int(torch.searchsorted(events.t, t_us)) for events in channels]
+    return [slice_count(events, max(0, stop - count), stop) for events, stop in zip(channels, stops, strict=True)]
+
+
+def _length_us(events: Events) -> int:
+    """Time from the first event to the last; 0 if there are none."""
+    return int(events.t[-1] - events.t[0]) if len(events) else 0
+
+
+def by_sliding_window(
+    scenes: SceneStore,
+    events: EventStore,
+    sequences: Sequence[str],
+    span_us: tuple[int, int],
+    spacing_us: int,
+    method: str,
+    context: Context,
+) -> list[dict]:
+    """Mean scores of frames every `spacing_us`, for each of `EVENTS_PER_PIXEL`, with and without carried state.
+
+    `change` is the mean absolute difference of consecutive frames, and `true_change` is that of the truth; a
+    steady method has a small `change`.
+    """
+    times = list(range(span_us[0], span_us[1] + 1, spacing_us))
+    table = []
+    tests = [
+        sequence_at(scenes, name, events.read(name), torch.tensor([times[0] - spacing_us, *times]))
+        for name in tqdm(sequences, "truth", unit="sequence")
+    ]
+    for per_pixel in tqdm(EVENTS_PER_PIXEL, "overlapping windows", unit="size"):
+        for carry in (False, True):
+            of_sequences = [_sliding_scores(one, per_pixel, times, carry, method, context) for one in tests]
+            means = {name: float(np.mean([scores[name] for scores in of_sequences])) for name in of_sequences[0]}
+            table.append({"events_per_pixel": per_pixel, "carry": carry, "spacing_us": spacing_us, **means})
+    return table
+
+
+def _sliding_scores(
+    sequence: TestSequence, per_pixel: float, times: Sequence[int], carry: bool, method: str, context: Context
+) -> Mapping[str, float]:
+    first = sequence.events[0]
+    count = max(2, round(per_pixel * first.height * first.width))
+    frames = sliding_recovery(sequence, count, times, carry, method, context)
+    truth, valid = sequence.dolp, sequence.valid
+    spans = [_length_us(last) for last in _last(sequence.events, count, times[len(times) // 2])]
+    scores = {
+        "mse": mse(frames, truth, valid),
+        "psnr": psnr(frames, truth, valid),
+        "corr": correlation(frames, truth, valid),
+    }
+    return {
+        **{name: float(values.mean()) for name, values in scores.items()},
+        "change": float(frames.diff(dim=0).abs().mean()),
+        "true_change": float(truth.diff(dim=0).abs().mean()),
+        "window_ms": float(np.mean(spans)) / 1000,
+    }

@@ -1,0 +1,125 @@
+"""Rows of the benchmark: references and methods, and running them over a sequence."""
+
+import functools
+from collections import ChainMap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from polarnet.benchmark.references import REFERENCES, Reference
+from polarnet.benchmark.sequences import TestSequence
+from polarnet.events.streaming import EventWindow
+from polarnet.methods import METHODS
+from polarnet.methods.method import (
+    Method,
+    Recoverer,
+    Setup,
+    State,
+    clamped,
+    each_map,
+    weights_file,
+    weights_record,
+    why_absent,
+)
+from polarnet.networks.checkpoint import load_checkpoint
+from polarnet.stokes import Prediction
+
+ROWS: Mapping[str, Reference | Method] = ChainMap(METHODS, REFERENCES)  # type: ignore[arg-type]
+"""Reference or method by name, in the order of all tables: references first."""
+
+MAX_OPEN = 32
+"""Maximum number of methods whose weights stay in memory between sequences."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """Inputs of the rows besides the sequence."""
+
+    train_mean: float | None
+    """Mean DoLP of the training split; None without a training split."""
+    setups: Mapping[str, Setup]
+    """Setup by section of `methods` in params.yaml."""
+    device: torch.device
+    """Device that computes the scores."""
+
+    def setup_of(self, method: Method) -> Setup:
+        """Setup of a method; NAME+gain shares the setup of NAME."""
+        return self.setups[method.section]
+
+
+@torch.no_grad()
+def predictions_of(names: Sequence[str], sequence: TestSequence, context: Context) -> dict[str, Prediction]:
+    """Prediction by row, one frame per window, on the CPU; NAME and NAME+gain share one run over the events."""
+    windows = sequence.windows
+    predictions: dict[str, Prediction] = {}
+    for name in sorted(names, key=lambda name: name in METHODS and METHODS[name].wraps is not None):
+        if name in REFERENCES:
+            predictions[name] = clamped(REFERENCES[name].predict(sequence, context.train_mean))
+            continue
+        method = METHODS[name]
+        if method.wraps is not None and method.convert is not None and method.wraps.name in predictions:
+            _, prediction = method.convert(context.setup_of(method), None, predictions[method.wraps.name])
+            predictions[name] = clamped(prediction)
+        else:
+            predictions[name] = run(opened(method, context), windows)
+    return {name: each_map(predictions[name]._replace(stokes=None, intensities=None), Tensor.cpu) for name in names}
+
+
+def run(recoverer: Recoverer, windows: Sequence[EventWindow]) -> Prediction:
+    """Run a method over consecutive windows from its initial state, one window at a time as from a camera."""
+    first = windows[0].channels[0]
+    state: State = recoverer.start(first.height, first.width)
+    frames: list[Prediction] = []
+    for window in windows:
+        state, prediction = recoverer.step(state, [window])
+        frames.append(prediction)
+    joined = [None if fields[0] is None else torch.cat(fields) for fields in zip(*frames, strict=True)]
+    return Prediction(*joined)  # type: ignore[arg-type]
+
+
+def opened(method: Method, context: Context) -> Recoverer:
+    """The method, ready to run; cached while its settings and weights file are unchanged."""
+    setup = context.setup_of(method)
+    written = setup.weights.stat().st_mtime_ns if setup.weights is not None and setup.weights.exists() else None
+    return _opened(method, setup, written)
+
+
+@functools.lru_cache(maxsize=MAX_OPEN)
+def _opened(method: Method, setup: Setup, written: int | None) -> Recoverer:
+    return method.open(setup)
+
+
+def available(names: Sequence[str], context: Context) -> tuple[list[str], dict[str, str]]:
+    """The rows that can run, in the given order, and the reasons for leaving out the others."""
+    reasons = {name: reason for name in names if (reason := why_left_out(name, context))}
+    return [name for name in names if name not in reasons], reasons
+
+
+def why_left_out(name: str, context: Context) -> str | None:
+    """Reason why a row cannot run; None if it can."""
+    row = ROWS[name]
+    if isinstance(row, Reference):
+        missing = row.needs_train_mean and context.train_mean is None
+        return "the training split is not there; run `dvc repro synthesize`" if missing else None
+    return why_absent(row, context.setup_of(row))
+
+
+def weights_used(names: Sequence[str], context: Context) -> dict[str, dict[str, str]]:
+    """File name, sha256 and network of the weights, by section of `methods`, for the rows that need weights.
+
+    ValueError or FileNotFoundError if weights are missing or belong to another network.
+    """
+    return {method.section: weights_record(method, context.setup_of(method)) for method in _with_weights(names)}
+
+
+def metadata_used(names: Sequence[str], context: Context) -> dict[str, dict[str, Any]]:
+    """Checkpoint metadata by section of `methods`, for the rows with a checkpoint of polarnet."""
+    paths = {method.section: weights_file(context.setup_of(method)) for method in _with_weights(names)}
+    return {row: load_checkpoint(path)[1] for row, path in paths.items() if path.suffix == ".safetensors"}
+
+
+def _with_weights(names: Sequence[str]) -> list[Method]:
+    return [METHODS[name] for name in names if name in METHODS and METHODS[name].weights is not None]

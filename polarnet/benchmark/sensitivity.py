@@ -1,0 +1,108 @@
+"""Sensitivity to the sensor and the motion: change one setting at a time and score the methods."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from polarnet.benchmark.resimulate import resimulated
+from polarnet.benchmark.rows import Context, predictions_of
+from polarnet.benchmark.score import FrameScore, scene_means, score_sequence
+from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.motion import MotionConfig
+from polarnet.storage.scenes import SceneStore
+
+CHANNEL_SIGNS = (1, -1, -1, 1)
+"""Signs of the threshold error behind 0, 45, 90 and 135 degrees, opposite within each pair that gives S1 or S2."""
+
+SETTINGS: Mapping[str, Sequence[float]] = {
+    "threshold_mismatch": (0.0, 0.03, 0.06, 0.12),
+    "noise_rate_hz": (0.0, 0.1, 1.0, 5.0),
+    "speed": (0.25, 0.5, 1.0, 2.0, 4.0),
+    "channel_error": (0.0, 0.05, 0.1, 0.2, 0.4),
+}
+"""Values of each setting.
+
+- threshold_mismatch: standard deviation of the contrast threshold between pixels, in natural-log intensity.
+- noise_rate_hz: shot-noise events per pixel and second.
+- speed: factor on the configured speed.
+- channel_error: relative error of the contrast threshold in each channel, with the signs `CHANNEL_SIGNS`. The
+  thresholds of a Prophesee sensor differ by 0.2 to 0.3 over its settings.
+"""
+SHOWN = ("mse", "psnr", "corr", "skill")
+
+
+def sensors(setting: str, value: float, emulate: EmulatorConfig) -> list[EmulatorConfig]:
+    """Sensors behind the four polarizers with one setting changed; `speed` leaves them unchanged."""
+    if setting == "threshold_mismatch":
+        return [dataclasses.replace(emulate, contrast_threshold_sigma=value)] * 4
+    if setting == "noise_rate_hz":
+        return [dataclasses.replace(emulate, shot_noise_rate_hz=value)] * 4
+    if setting == "channel_error":
+        return [
+            dataclasses.replace(
+                emulate,
+                contrast_threshold_on=emulate.contrast_threshold_on * (1 + sign * value),
+                contrast_threshold_off=emulate.contrast_threshold_off * (1 + sign * value),
+            )
+            for sign in CHANNEL_SIGNS
+        ]
+    if setting == "speed":
+        return [emulate] * 4
+    raise ValueError(f"expected one of {', '.join(SETTINGS)}, got {setting!r}")
+
+
+def sensitivity(
+    scenes: SceneStore,
+    sequences: Sequence[str],
+    motion: MotionConfig,
+    emulate: EmulatorConfig,
+    seed: int,
+    warmup_windows: int,
+    methods: Sequence[str],
+    context: Context,
+    settings: Mapping[str, Sequence[float]] = SETTINGS,
+    threads: int = 1,
+) -> dict[str, list[dict[str, Any]]]:
+    """Event rates per pixel and second and mean scores over scenes of each method, for every value of each setting.
+
+    Sequences are emulated again from their stored scenes with their original noise. A sequence is left out at speeds
+    that its picture has no room for; `sequences` in each entry counts the remaining ones.
+    """
+    table: dict[str, list[dict[str, Any]]] = {}
+    points = [(setting, value) for setting, values in settings.items() for value in values]
+    for setting, value in tqdm(points, "sensitivity", unit="setting"):
+        rows: list[FrameScore] = []
+        rates: list[float] = []
+        left_out: list[str] = []
+        for sequence in sequences:
+            speed = value if setting == "speed" else 1.0
+            try:
+                test = resimulated(scenes, sequence, motion, sensors(setting, value, emulate), seed, speed, threads)
+            except ValueError as error:
+                if setting != "speed":
+                    raise
+                left_out.append(f"{sequence}: {error}")
+                continue
+            predictions = predictions_of(methods, test, context)
+            rows += score_sequence(test, predictions, warmup_windows, None, context.device)
+            pixels = test.events[0].height * test.events[0].width
+            seconds = (int(test.t_us[-1]) - int(test.t_us[0])) / 1e6
+            rates.append(sum(map(len, test.events)) / (4 * pixels * seconds))
+        if rows:
+            entry = {
+                "value": value,
+                "sequences": len(rates),
+                "left_out": left_out,
+                "events_per_pixel_second": float(np.mean(rates)),
+                "scores": {method: _means(rows, method) for method in methods},
+            }
+            table.setdefault(setting, []).append(entry)
+    return table
+
+
+def _means(rows: Sequence[FrameScore], method: str) -> dict[str, float]:
+    of_method = [row for row in rows if row.method == method]
+    return {metric: float(np.mean([*scene_means(of_method, metric)[method].values()])) for metric in SHOWN}

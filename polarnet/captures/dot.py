@@ -1,0 +1,255 @@
+"""Division-of-time captures of one target (paper, section 4): four of events, four of intensity, each with its clock.
+
+A target moves in the same way eight times, behind a polarizer at 0, 45, 90 and 135 degrees. In each capture a dark
+landmark enters a region of the picture. That moment is time 0 of the clock that all eight share.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt16
+from torch import Tensor
+
+from polarnet.events.stream import Events, concatenate, crop
+from polarnet.recordings.formats.celex5_bin import Picture, celex5_pictures
+from polarnet.recordings.recording import open_recording
+from polarnet.recordings.source import RecordingError
+from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.stokes import POLARIZER_ANGLES_DEG
+
+EVENT_CAPTURES = tuple(f"events_{angle}" for angle in POLARIZER_ANGLES_DEG)
+INTENSITY_CAPTURES = tuple(f"intensity_{angle}" for angle in POLARIZER_ANGLES_DEG)
+STARTS_FILE = "starts.json"
+STEPS_OF_8_BITS = 16.0  # 12-bit steps per level of 8 bits, the scale of the vendor's programs and the paper's 30
+STAMP_US = 1000  # resolution of the computer's picture times, which are rounded down
+IRREGULAR_US = 3000.0  # larger deviations from a regular clock mean that the pictures were not taken by one
+
+
+@dataclass(frozen=True)
+class RecordingsConfig:
+    """Section `recordings` of params.yaml. Sizes are [height, width] in pixels."""
+
+    enabled: bool
+    root: str
+    """Folder with one folder for each target."""
+    sensor: list[int] = field(metadata=allowed(low=8, high=1280))
+    """The part of the sensor in use, from its upper left corner."""
+    region: list[int] = field(metadata=allowed(low=1, high=1280))
+    """Size of the landmark's region, in the upper right corner of the part in use."""
+    dark_level: float = field(metadata=allowed(above=0, high=255))
+    """An intensity capture starts with the first picture whose mean in the region is below this level, of 255."""
+    negative_events: int = field(metadata=allowed(low=1))
+    """Number of negative events in the region at which an event capture starts."""
+    crop: list[int] = field(metadata=allowed(low=2, high=1280))
+    """Size of the central crop."""
+    size: list[int] = field(metadata=allowed(low=2, high=1280))
+    """Size to which the crop is reduced."""
+    keep_event_rate: bool
+    """true: a reduced pixel fires as often as one sensor pixel; false: as often as all those it covers together."""
+    picture_rate_hz: float | None = field(metadata=allowed(above=0))
+    """Rate of the pictures in intensity captures whose files have no times."""
+    hot_pixel_factor: float | None = field(metadata=allowed(above=1))
+    """A pixel is hot, and left out, above this multiple of the third busiest of the 5 x 5 around it; null: none is."""
+    alignment: str = field(metadata=allowed(choices=("landmark", "refined")))
+    """landmark: start times by the landmark alone (the paper); refined: refined over the whole picture."""
+    refine_within_ms: float = field(metadata=allowed(above=0))
+    """Search range of the refined start times around the landmark's."""
+    frame_rate_hz: float = field(metadata=allowed(above=0))
+    """Frame rate of the sequence's ground truth."""
+    duration_s: float | None = field(metadata=allowed(above=0))
+    """Length of the sequence, from the landmark on; null: as long as all captures last."""
+
+    def __post_init__(self):
+        check_ranges(self)
+        for name in ("sensor", "region", "crop", "size"):
+            if len(getattr(self, name)) != 2:
+                raise ValueError(f"{name}: expected [height, width], got {list(getattr(self, name))}")
+        for inner, outer in (("region", "sensor"), ("crop", "sensor"), ("size", "crop")):
+            if any(a > b for a, b in zip(getattr(self, inner), getattr(self, outer), strict=True)):
+                raise ValueError(
+                    f"{inner}: expected at most the {outer}'s {list(getattr(self, outer))}, "
+                    f"got {list(getattr(self, inner))}"
+                )
+
+    @property
+    def crop_corner(self) -> tuple[int, int]:
+        """Row and column of the crop's upper left pixel."""
+        return (self.sensor[0] - self.crop[0]) // 2, (self.sensor[1] - self.crop[1]) // 2
+
+
+class IntensityCapture(NamedTuple):
+    """The pictures of one intensity capture, cropped, with their times."""
+
+    t_us: Int64[np.ndarray, " n"]
+    """Times of the pictures, by the capture's own clock."""
+    pictures: UInt16[np.ndarray, "n h w"]
+    """Values within the crop, 0 to 4095, linear in light."""
+    region: Float64[np.ndarray, " n"]
+    """Mean in the landmark's region, 0 to 255."""
+
+
+def find_captures(folder: Path) -> dict[str, Path]:
+    """The eight files of a target: events_0.*, ..., events_135.*, intensity_0.*, ..., intensity_135.*.
+
+    RecordingError where a capture has no file or more than one.
+    """
+    found = {}
+    for name in (*EVENT_CAPTURES, *INTENSITY_CAPTURES):
+        files = sorted(path for path in folder.glob(f"{name}.*") if path.stem == name)
+        if len(files) != 1:
+            there = ", ".join(path.name for path in files) or "none"
+            raise RecordingError(
+                f"target {folder.name}: expected one file {name}.bin (or another ending), got {there}; a target has "
+                f"{', '.join((*EVENT_CAPTURES, *INTENSITY_CAPTURES))}"
+            )
+        found[name] = files[0]
+    return found
+
+
+def given_starts(folder: Path) -> dict[str, int]:
+    """Start times set by hand in starts.json, {"events_45": microseconds, ...}; empty without the file."""
+    path = folder / STARTS_FILE
+    if not path.exists():
+        return {}
+    try:
+        starts = json.loads(path.read_text())
+    except ValueError as error:
+        raise RecordingError(f"{folder.name}/{path.name}: not JSON: {error}") from error
+    known = (*EVENT_CAPTURES, *INTENSITY_CAPTURES)
+    if not isinstance(starts, dict) or not all(
+        name in known and isinstance(t, int) and not isinstance(t, bool) for name, t in starts.items()
+    ):
+        raise RecordingError(
+            f"{folder.name}/{path.name}: expected whole microseconds of the capture's own clock for any of "
+            f"{', '.join(known)}, got {starts!r}"
+        )
+    return starts
+
+
+def read_event_capture(path: Path, config: RecordingsConfig) -> Events:
+    """Events from the part of the sensor in use, by the capture's own clock."""
+    height, width = config.sensor
+    reader = open_recording(path)
+    if reader.height < height or reader.width < width:
+        raise RecordingError(
+            f"{path.name}: recordings.sensor is {height}x{width}, the file's sensor {reader.height}x{reader.width}"
+        )
+    parts = [crop(chunk, 0, 0, height, width) for chunk in reader]
+    return concatenate(parts) if parts else Events.empty(height, width)
+
+
+def read_intensity_capture(path: Path, config: RecordingsConfig) -> IntensityCapture:
+    """The pictures of a BIN file; RecordingError where it has fewer than two, or they have no times."""
+    (top, left), (height, width) = config.crop_corner, config.crop
+    times, pictures, region = [], [], []
+    for k, picture in enumerate(celex5_pictures(path)):
+        times.append(_stamp_us(path, k, picture, config))
+        pictures.append(picture.intensity[top : top + height, left : left + width].copy())
+        region.append(float(region_of(picture.intensity, config).mean()) / STEPS_OF_8_BITS)
+    if len(pictures) < 2:
+        raise RecordingError(f"{path.name}: expected at least two full pictures, got {len(pictures)}")
+    stamps_us = np.array(times, np.int64)
+    t_us = stamps_us if config.picture_rate_hz else regular_times_us(path.name, stamps_us)
+    return IntensityCapture(t_us, np.stack(pictures), np.array(region))
+
+
+def reduced(crop: UInt16[np.ndarray, "h w"], config: RecordingsConfig) -> Float32[np.ndarray, "h2 w2"]:
+    """The crop of a picture, averaged over areas to the final size, 0 to 255."""
+    small = cv2.resize(crop.astype(np.float32), tuple(config.size[::-1]), interpolation=cv2.INTER_AREA)
+    return small / np.float32(STEPS_OF_8_BITS)
+
+
+def region_of(picture: UInt16[np.ndarray, "h w"], config: RecordingsConfig) -> UInt16[np.ndarray, "h2 w2"]:
+    """The landmark's region: the upper right corner of the part of the sensor in use."""
+    height, width = config.region
+    return picture[:height, config.sensor[1] - width : config.sensor[1]]
+
+
+def regular_times_us(name: str, stamps_us: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+    """Times of pictures from stamps rounded down to milliseconds, by the best-fitting regular clock.
+
+    Lost pictures leave gaps. Where no regular clock fits, the times are the middles of the milliseconds.
+    """
+    middles = stamps_us + STAMP_US // 2
+    steps = np.diff(stamps_us)
+    if (steps <= 0).any():
+        k = int((steps <= 0).argmax())
+        raise RecordingError(f"{name}: picture {k + 1} is stamped {stamps_us[k + 1]} us, not later than the one before")
+    number = np.concatenate([[0], np.cumsum(np.maximum(1, np.rint(steps / np.median(steps))))])
+    period, first = np.polyfit(number, middles - middles[0], 1)
+    fitted = first + period * number
+    if np.abs(fitted - (middles - middles[0])).max() > IRREGULAR_US:
+        return middles
+    return middles[0] + np.rint(fitted).astype(np.int64)
+
+
+def intensity_start_us(name: str, capture: IntensityCapture, config: RecordingsConfig) -> int:
+    """Time of the first picture whose mean in the region is below `dark_level` (paper, section 4)."""
+    dark = np.flatnonzero(capture.region < config.dark_level)
+    if not len(dark):
+        raise RecordingError(
+            f"{name}: no picture is darker than {config.dark_level:g} in the landmark's region, the darkest has mean "
+            f"{capture.region.min():.1f}; set the start by hand in {STARTS_FILE}, or recordings.dark_level"
+        )
+    if dark[0] == 0:
+        raise RecordingError(
+            f"{name}: the first picture is dark in the landmark's region already (mean {capture.region[0]:.1f}), so "
+            f"its start cannot be told; set it by hand in {STARTS_FILE}, or move recordings.region"
+        )
+    return int(capture.t_us[dark[0]])
+
+
+def event_start_us(name: str, events: Events, config: RecordingsConfig) -> int:
+    """Time of negative event number `negative_events` in the region (paper, section 4)."""
+    times = region_negative_times_us(events, config)
+    if len(times) < config.negative_events:
+        raise RecordingError(
+            f"{name}: expected {config.negative_events} negative events in the landmark's region, got {len(times)}; "
+            f"set the start by hand in {STARTS_FILE}, or recordings.negative_events"
+        )
+    return int(times[config.negative_events - 1])
+
+
+def region_negative_times_us(events: Events, config: RecordingsConfig) -> Int64[Tensor, " n"]:
+    """Times of the negative events in the landmark's region."""
+    height, width = config.region
+    return events.t[(events.p < 0) & (events.y < height) & (events.x >= events.width - width)]
+
+
+def landmark_starts(
+    events: Mapping[str, Events],
+    intensities: Mapping[str, IntensityCapture],
+    config: RecordingsConfig,
+    given: Mapping[str, int],
+) -> dict[str, int]:
+    """Start time of each capture by its own clock: `given` by hand, or when the landmark enters the region."""
+    starts = {}
+    for name, capture in events.items():
+        starts[name] = given[name] if name in given else event_start_us(name, capture, config)
+    for name, pictures in intensities.items():
+        starts[name] = given[name] if name in given else intensity_start_us(name, pictures, config)
+    return starts
+
+
+def _stamp_us(path: Path, k: int, picture: Picture, config: RecordingsConfig) -> int:
+    if config.picture_rate_hz is not None:
+        return round(k * 1e6 / config.picture_rate_hz)
+    if picture.t_us is None:
+        raise RecordingError(
+            f"{path.name}: its pictures have no times (recorded without the IMU's data); "
+            f"set recordings.picture_rate_hz to the rate they were taken at"
+        )
+    return picture.t_us
+
+
+def targets_of(root: Path) -> list[str]:
+    """Sorted names of the folders in `root`; RecordingError if there are none."""
+    names = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
+    if not names:
+        raise RecordingError(f"{root}: expected a folder for each target with its eight captures, there is none")
+    return names

@@ -1,0 +1,191 @@
+"""Put imported division-of-time captures on one clock, in the stores that every later stage reads.
+
+The stores `events.zarr` and `frames.zarr` have the layout of simulated sequences; all targets are in the split `test`.
+"""
+
+import itertools
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int64
+from torch import Tensor
+
+from polarnet import stokes
+from polarnet.captures.calibration import Alignment, refined_starts
+from polarnet.captures.dot import (
+    EVENT_CAPTURES,
+    INTENSITY_CAPTURES,
+    IntensityCapture,
+    RecordingsConfig,
+    landmark_starts,
+    reduced,
+    region_negative_times_us,
+)
+from polarnet.captures.imported import Target, open_target, shifted
+from polarnet.captures.status import start_over
+from polarnet.events.stream import Events, crop, downscale, slice_time
+from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
+from polarnet.recordings.source import RecordingError
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
+
+WHITE = 255.0  # maximum of reduced pictures
+
+
+class Calibrated(NamedTuple):
+    """Calibration result of one target, for a report and a picture."""
+
+    name: str
+    landmark_us: Mapping[str, int]
+    """Start times by the landmark, by each capture's own clock."""
+    start_us: Mapping[str, int]
+    """Start times used."""
+    alignment: Alignment | None
+    """None where the landmark's start times were used unchanged."""
+    hot: Mapping[str, int]
+    """Number of pixels left out of each event capture."""
+    region_events_us: Mapping[str, Int64[np.ndarray, " n"]]
+    """Times of the negative events in the landmark's region."""
+    region_pictures: Mapping[str, tuple[Int64[np.ndarray, " n"], np.ndarray]]
+    """Times of the pictures, and their mean in the region."""
+    duration_us: int
+
+
+def calibrate_targets(
+    imported: Path, out: Path, config: RecordingsConfig, about: Mapping[str, Any]
+) -> list[Calibrated]:
+    """Put every imported target on one clock and write events.zarr, frames.zarr and calibration.json into `out`.
+
+    `about` becomes the stores' attributes.
+    """
+    source = EventStore.open(imported / "events.zarr")
+    names, (height, width) = source.sequences, config.size
+    start_over(out, enabled=True)
+    longest_us = max(source.duration_us(name) for name in names)
+    events = EventStore.create(out / "events.zarr", names, height, width, about)
+    frames = FrameStore.create(
+        out / "frames.zarr",
+        names,
+        dict.fromkeys(names, "test"),
+        len(frame_times_us(longest_us, config)),
+        height,
+        width,
+        about,
+    )
+    found = []
+    for name in names:
+        target = open_target(imported, name)
+        one, clean = calibrate_target(target, config)
+        channels, t_us, intensity = aligned(target._replace(events=clean), one, config)
+        seen = stokes.stokes_from_intensities(intensity)
+        events.write(name, channels, int(t_us[-1]))
+        frames.write(name, t_us, intensity, stokes.dolp(seen).clamp(0, 1), stokes.aolp(seen))
+        found.append(one)
+    events.finish()
+    frames.finish()
+    (out / "calibration.json").write_text(json.dumps({one.name: _record(one) for one in found}, indent=2) + "\n")
+    return found
+
+
+def calibrate_target(target: Target, config: RecordingsConfig) -> tuple[Calibrated, dict[str, Events]]:
+    """Start times of a target's captures, and its events without those of hot pixels."""
+    clean, hot = {}, {}
+    for capture, events in target.events.items():
+        bad = np.zeros((events.height, events.width), np.bool_)
+        if config.hot_pixel_factor is not None:
+            duration_s = float(events.t[-1] - events.t[0]) * 1e-6 if len(events) else 0.0
+            bad = hot_pixels(event_counts(events), duration_s, config.hot_pixel_factor)
+        clean[capture], hot[capture] = without_pixels(events, bad), int(bad.sum())
+    try:
+        starts = landmark_starts(clean, target.intensities, config, target.given)
+        alignment = None
+        if config.alignment == "refined":
+            alignment = refined_starts(starts, clean, target.intensities, config, target.given)
+    except RecordingError as error:
+        raise RecordingError(f"target {target.name}: {error}") from None
+    used = starts if alignment is None else alignment.start_us
+    ends = [int(clean[capture].t[-1]) - used[capture] if len(clean[capture]) else 0 for capture in EVENT_CAPTURES]
+    ends += [int(target.intensities[capture].t_us[-1]) - used[capture] for capture in INTENSITY_CAPTURES]
+    duration_us = min(ends) if config.duration_s is None else round(config.duration_s * 1e6)
+    if duration_us > min(ends) or len(frame_times_us(max(duration_us, 0), config)) < 2:
+        raise RecordingError(
+            f"target {target.name}: after their starts the captures have {min(ends) * 1e-6:.3f} s in common; expected "
+            f"at least {config.duration_s or 1 / config.frame_rate_hz:.3f} s. Is a start wrong? Used: {dict(used)} us"
+        )
+    late = [c for c in INTENSITY_CAPTURES if target.intensities[c].t_us[0] > used[c]]
+    if late:
+        raise RecordingError(f"target {target.name}: {', '.join(late)} has no picture before its start; record earlier")
+    found = Calibrated(
+        target.name,
+        starts,
+        used,
+        alignment,
+        hot,
+        {capture: region_negative_times_us(events, config).numpy() for capture, events in clean.items()},
+        {capture: (pictures.t_us, pictures.region) for capture, pictures in target.intensities.items()},
+        duration_us,
+    )
+    return found, clean
+
+
+def aligned(
+    target: Target, found: Calibrated, config: RecordingsConfig
+) -> tuple[list[Events], Int64[Tensor, " n"], Float32[Tensor, "n 4 h w"]]:
+    """The sequence of a target without hot pixels: events of its four channels, frame times, intensities in [0, 1].
+
+    The events are those of the crop from the common start on, reduced by `downscale` with the rule `keep_event_rate`.
+    The intensities come from the reduced pictures before and after each frame's time, interpolated.
+    """
+    t_us = frame_times_us(found.duration_us, config)
+    channels = []
+    for capture in EVENT_CAPTURES:
+        events, start = target.events[capture], found.start_us[capture]
+        during = shifted(slice_time(events, start, start + int(t_us[-1]) + 1), start)
+        part = crop(during, *config.crop_corner, *config.crop)
+        channels.append(downscale(part, config.size[0], config.size[1], keep_rate=config.keep_event_rate))
+    planes = [interpolated(target.intensities[c], t_us + found.start_us[c], config) for c in INTENSITY_CAPTURES]
+    return channels, torch.from_numpy(t_us), torch.stack(planes, dim=1)
+
+
+def interpolated(
+    capture: IntensityCapture, t_us: Int64[np.ndarray, " n"], config: RecordingsConfig
+) -> Float32[Tensor, "n h w"]:
+    """Reduced pictures, 0 to 1, interpolated to the times `t_us`."""
+    k = np.clip(np.searchsorted(capture.t_us, t_us, side="right") - 1, 0, len(capture.t_us) - 2)
+    share = (t_us - capture.t_us[k]) / (capture.t_us[k + 1] - capture.t_us[k])
+    frames = []
+    for before, s in zip(k.tolist(), share.tolist(), strict=True):
+        pair = [reduced(np.asarray(capture.pictures[before + step]), config) for step in (0, 1)]
+        frames.append((1 - s) * pair[0] + s * pair[1])
+    return torch.from_numpy(np.stack(frames)).float().div_(WHITE).clamp_(0, 1)
+
+
+def frame_times_us(duration_us: int, config: RecordingsConfig) -> Int64[np.ndarray, " n"]:
+    """Times of the ground-truth frames, starting at 0."""
+    count = int(duration_us * 1e-6 * config.frame_rate_hz) + 1
+    return np.rint(np.arange(count) * 1e6 / config.frame_rate_hz).astype(np.int64)
+
+
+def _record(found: Calibrated) -> dict[str, Any]:
+    record: dict[str, Any] = {
+        "landmark_us": dict(found.landmark_us),
+        "start_us": dict(found.start_us),
+        "duration_us": found.duration_us,
+        "hot_pixels": dict(found.hot),
+    }
+    if found.alignment is not None:
+        record["redundancy_residual"] = found.alignment.residual
+        for capture, lag in zip(EVENT_CAPTURES, found.alignment.lags, strict=True):
+            known = {key: None if np.isnan(value) else value for key, value in lag.thresholds._asdict().items()}
+            record[capture] = {"agreement": lag.agreement, "thresholds": known}
+    return record
+
+
+def spread_us(starts: Mapping[str, int], others: Mapping[str, int]) -> Sequence[float]:
+    """Differences between two sets of start times, minus their mean: the zero of the clock is a convention."""
+    differences = np.array([starts[c] - others[c] for c in itertools.chain(EVENT_CAPTURES, INTENSITY_CAPTURES)], float)
+    return (differences - differences.mean()).tolist()

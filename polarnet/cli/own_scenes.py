@@ -1,0 +1,96 @@
+"""The benchmark on a user's own folder of photographs or measured polarization, without training."""
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any
+
+from polarnet.benchmark.conditions import configured, sentence, warnings
+from polarnet.benchmark.rows import available, metadata_used, weights_used
+from polarnet.benchmark.run import run_benchmark, train_mean_dolp, write_benchmark
+from polarnet.config.pipeline import context_of, made_set, mapper_of
+from polarnet.config.tree import Config, with_lpips
+from polarnet.methods import METHODS
+from polarnet.metrics.lpips import NO_RECORD
+from polarnet.metrics.lpips_weights import find_weights
+from polarnet.metrics.similarity import Lpips
+from polarnet.networks.weights import shipped_weights
+from polarnet.pictures.manifest import read_manifest
+from polarnet.reports.set_page import write_set_page
+from polarnet.runtime.machine import threads_of
+from polarnet.simulation.sets import Recipe, make_folder_set
+from polarnet.simulation.truth import motions_of
+from polarnet.storage.frames import FrameStore
+from polarnet.storage.scenes import SceneStore
+
+SET_THEM = "To score on sequences like those of the training, add to the command, or write into params.yaml:"
+
+
+def benchmark_folder(
+    config: Config, root: Path, kind: str, out: Path, work: Path, weights: Path | None, command: str
+) -> tuple[dict[str, dict[str, Any]], list[str]]:
+    """Run the benchmark on a folder of photographs or measured scenes, without training; return (metrics, notes).
+
+    `out` receives metrics.json, details.json, frames.csv, panels and index.html. `work` receives the intermediate
+    files, so a stopped run resumes and a second run with other weights computes only the new results. Methods without
+    weights are left out and unusable files are skipped; `notes` lists both. Size, duration and sensor are printed
+    first, with a warning if a network was trained with others. `weights` is a checkpoint of the DoLP network; None
+    uses the shipped one. Raises ValueError if the folder has no usable file, or if the weights for an LPIPS column are
+    missing.
+    """
+    if weights is not None and not weights.is_file():
+        raise ValueError(
+            f"--weights {weights}: expected a checkpoint of the DoLP network (.safetensors), there is none"
+        )
+    lpips_weights = with_lpips(config, "benchmark", find_weights)  # the pipeline need not have found them before
+    lpips = None if lpips_weights is None else Lpips.of(lpips_weights.backbone, lpips_weights.tensors)
+    train_mean = _train_mean(config)
+    wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
+    context = context_of(config, train_mean, weights or shipped_weights())
+    methods, left_out = available(wanted, context)
+    used = configured(config.synthesize, config.emulate)
+    differences = warnings(used, metadata_used(methods, context), SET_THEM)
+    print("\n".join([sentence(used), *(f"WARNING: {line}" for line in differences)]), flush=True)
+    recipe = Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads_of(config.runtime))
+    try:
+        make_folder_set(root, kind, work, recipe, functools.partial(mapper_of, config))
+    except ValueError as error:
+        raise ValueError(f"--scenes {root}: nothing to test on. {error}") from error
+    notes = [*_skipped(config, work), *(_left_out(row, reason) for row, reason in left_out.items())]
+    settings = dataclasses.replace(config.benchmark, methods=methods)
+    test_set = made_set(root.resolve().name, work)
+    benchmark = run_benchmark(test_set, context, settings, lpips, work / "cache", mapper_of(config, "benchmark"))
+    about = {
+        "set": test_set.name,
+        "conditions": {"sentence": sentence(used), "warnings": differences, **used._asdict()},
+        "lpips": NO_RECORD if lpips_weights is None else lpips_weights.record,
+        "train_mean": train_mean,
+        "left_out": notes,
+        "weights": weights_used(methods, context),
+    }
+    metrics = write_benchmark(out, benchmark, settings, config.seed, about)
+    write_set_page(out, test_set.name, command, [*differences, *notes])
+    return metrics, notes
+
+
+def _skipped(config: Config, work: Path) -> list[str]:
+    """One line for each file of the folder that was skipped."""
+    manifest = read_manifest(work / "images")
+    seen = set(SceneStore.open(work / "scenes.zarr").picture_of.values())
+    unseen = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name not in seen))
+    _, small = motions_of(unseen, config.synthesize, config.seed)
+    return [f"{skipped.file} was skipped: {skipped.reason}" for skipped in (*manifest.skipped, *small)]
+
+
+def _train_mean(config: Config) -> float | None:
+    """Mean DoLP of the pipeline's training split; None if the pipeline has not made the split."""
+    frames = Path(config.paths.frames)
+    return train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None
+
+
+def _left_out(row: str, reason: str) -> str:
+    """One line for a method that cannot run."""
+    weights = METHODS[row].weights if row in METHODS else None
+    trained = weights is not None and weights.trained_by is not None
+    advice = "; name it in benchmark.methods of params.yaml and run `dvc repro`" if trained else ""
+    return f"{row} was left out: {reason}{advice}."

@@ -1,0 +1,1 @@
+"""Configuration of all stages as one tree, the experiments, and the table of a sweep."""

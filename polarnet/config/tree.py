@@ -1,0 +1,399 @@
+"""The typed configuration of every stage, read from params.yaml and conf/ and checked before anything runs."""
+
+import dataclasses
+import fnmatch
+import functools
+import logging
+import os
+import re
+import sys
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from polarnet.benchmark.score import BenchmarkConfig
+from polarnet.captures.dot import RecordingsConfig
+from polarnet.config.experiments import preset_names, preset_values
+from polarnet.methods import METHODS
+from polarnet.methods.postprocessing import PostprocessingConfig
+from polarnet.methods.stokes_gain import GainConfig
+from polarnet.metrics.lpips import BACKBONES, PURPOSES, Purpose, is_stored
+from polarnet.metrics.lpips_weights import LpipsConfig, local_source
+from polarnet.networks.dolp_unet import DolpUNetConfig
+from polarnet.networks.registry import NetworkConfig
+from polarnet.networks.stokes_unet import StokesUNetConfig
+from polarnet.pictures.ingest import IngestConfig
+from polarnet.runtime.machine import RuntimeConfig, configure
+from polarnet.runtime.ranges import check_ranges
+from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.motion import MotionConfig
+from polarnet.simulation.sets import SetsConfig
+from polarnet.simulation.variation import VariationConfig
+from polarnet.training.e2p import E2pConfig
+from polarnet.training.e2v import E2vConfig
+from polarnet.training.loop import TrainConfig
+from polarnet.training.losses import LossConfig
+
+ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
+EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # subfolder of the project in which DVC runs queued experiments
+CHOICES = re.compile(r"(?:glob\()?([^()=]*)\)?")
+
+Stage = Callable[["Config"], None]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class NetworksConfig:
+    """Section `networks` of params.yaml: one entry per network; `network` names the network in use."""
+
+    paper: DolpUNetConfig
+    polarnet: StokesUNetConfig
+
+
+if typing.TYPE_CHECKING:
+    MethodsConfig = Any
+else:
+    MethodsConfig = dataclasses.make_dataclass(
+        "MethodsConfig", [(m.name, m.config) for m in METHODS.values() if m.config is not None], frozen=True
+    )
+    """Section `methods` of params.yaml: one section for each method whose record declares settings."""
+
+
+@dataclass(frozen=True)
+class BaselinesConfig:
+    """Section `baselines` of params.yaml."""
+
+    postprocessing: PostprocessingConfig
+    gain: GainConfig
+    e2v: E2vConfig
+    e2p: E2pConfig
+
+
+@dataclass(frozen=True)
+class ClusterConfig:
+    """Section `cluster` of conf/config.yaml."""
+
+    address: str | None
+    """Address of a Dask scheduler (tcp://host:port); null runs processes on this machine."""
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Section `paths` of conf/config.yaml: the location of each artefact. dvc.yaml names the same locations."""
+
+    data: str
+    images: str
+    scenes: str
+    frames: str
+    events: str
+    weights: str
+    baselines: str
+    train: str
+    train_e2v: str
+    train_e2p: str
+    sets: str
+    benchmark: str
+    report: str
+    imported: str
+    calibrated: str
+    resume: str
+    cache: str
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of a stage: those of params.yaml, then the paths and runtime settings of conf/config.yaml."""
+
+    seed: int
+    ingest: IngestConfig
+    synthesize: MotionConfig
+    variation: VariationConfig
+    emulate: EmulatorConfig
+    network: str
+    networks: NetworksConfig
+    loss: LossConfig
+    train: TrainConfig
+    lpips: LpipsConfig
+    methods: MethodsConfig
+    baselines: BaselinesConfig
+    benchmark: BenchmarkConfig
+    sets: SetsConfig
+    recordings: RecordingsConfig
+    paths: Paths
+    runtime: RuntimeConfig
+    cluster: ClusterConfig
+
+    def __post_init__(self):
+        check_ranges(self)
+        known = [field.name for field in dataclasses.fields(NetworksConfig)]
+        if self.network not in known:
+            raise ValueError(f"network: expected one of {', '.join(known)}, got {self.network!r}")
+        window = [self.synthesize.window_height, self.synthesize.window_width]
+        crops = {
+            "train.crop": self.train.crop,
+            "baselines.e2v.crop": self.baselines.e2v.crop,
+            "baselines.e2p.crop": self.baselines.e2p.crop,
+        }
+        for key, crop in crops.items():
+            if crop is not None and (crop[0] > window[0] or crop[1] > window[1]):
+                raise ValueError(f"{key}: expected at most the window of section synthesize, {window}, got {crop}")
+        e2v, e2p, loss = self.baselines.e2v, self.baselines.e2p, self.lpips.backbone
+        compared = (
+            ("loss.lpips", self.loss.lpips > 0, loss, self.train.crop),
+            ("baselines.e2v.lpips", e2v.lpips > 0, loss, e2v.crop),
+            ("baselines.e2p.lpips", max(e2p.lpips, e2p.intensity_lpips) > 0, loss, e2p.crop),
+            ("benchmark.lpips", self.benchmark.lpips, self.benchmark.lpips_backbone, None),
+        )
+        for key, used, backbone, crop in compared:
+            side, size = BACKBONES[backbone].least_side, crop or window
+            if used and min(size) < side:
+                raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {size}")
+
+    @property
+    def network_config(self) -> NetworkConfig:
+        """Settings of the network in use."""
+        return getattr(self.networks, self.network)
+
+
+def typed(node: DictConfig) -> Config:
+    """Build the frozen, range-checked configuration; ValueError names the full key of the first invalid value."""
+    values = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
+    return _built(Config, values, "")
+
+
+def load(root: Path, overrides: list[str] | None = None) -> Config:
+    """Load the configuration of the project at `root`, outside any Hydra application.
+
+    Raises ValueError for an unknown key (see `check_keys`), a value out of range, or an ablation that changes nothing.
+    """
+    overrides = overrides or []
+    check_keys(root, overrides)
+    os.environ[ROOT_VARIABLE] = str(root)
+    register_schema()
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(root / "conf")):
+        config = typed(hydra.compose("config", overrides=overrides))
+        _check_ablation(root, config, overrides)
+    return config
+
+
+def register_schema() -> None:
+    """Register the schema with Hydra under the first name in the defaults list of conf/config.yaml."""
+    ConfigStore.instance().store(name="schema", node=_schema_of(Config))
+
+
+def check_keys(root: Path, overrides: list[str]) -> None:
+    """Raise ValueError for the first key in params.yaml or `overrides` that is not a setting.
+
+    A choice for a group (`experiment`, `sensor`, `ablation`) without a file in conf/ raises ValueError too. Hydra
+    refuses both as well, but this message lists the available keys and choices.
+    """
+    params = OmegaConf.to_container(OmegaConf.load(root / "params.yaml"))
+    for key in _leaves(params):
+        _check_key(key, "params.yaml")
+    groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
+    for override in overrides:
+        key, _, value = override.partition("=")
+        key = key.lstrip("+~").split("@")[0]
+        if key in groups:
+            _check_choices(root, key, value)
+        elif not key.startswith(("hydra.", "hydra/", "paths.data")):
+            _check_key(key, "command line")
+
+
+def hydra_stage(main: Stage) -> Callable[[], None]:
+    """Make `main(config)` a Hydra command line that checks the configuration and sets up the runtime first.
+
+    The command refuses an unknown key or choice, a wrong type, a value out of range and an ablation that changes
+    nothing. It also refuses a configuration with LPIPS on a machine without the weights.
+    """
+    root = _root_of(main)
+
+    @functools.wraps(main)
+    def checked(node: DictConfig) -> None:
+        config = or_exit(lambda: typed(node))
+        or_exit(lambda: _check_ablation(root, config, list(HydraConfig.get().overrides.task)))
+        if _file_of(main).stem != "weights":  # that stage searches for weights and may download them
+            or_exit(lambda: _check_lpips(config))
+        configure(config.runtime, config.seed)
+        main(config)
+
+    return hydra_command(checked)
+
+
+def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
+    """Make `main(node)` a Hydra command line that refuses unknown keys and choices; values in `node` are not checked.
+
+    Hydra's log also receives the warnings of Python and its packages.
+    """
+    root = _root_of(main)
+    os.environ[ROOT_VARIABLE] = str(root)
+    register_schema()
+    run = hydra.main(version_base="1.3", config_path=str(root / "conf"), config_name="config")(main)
+
+    def command_line() -> None:
+        overrides = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
+        or_exit(lambda: check_keys(root, overrides))
+        logging.captureWarnings(True)
+        run()
+
+    return command_line
+
+
+def input_folder(key: str, folder: str) -> Path:
+    """Folder that setting `key` names; SystemExit with a one-line message if it holds no user files.
+
+    A queued DVC experiment runs in a copy of the workspace; there the message says how to bring in the files.
+    """
+    files = (path for path in Path(folder).rglob("*") if path.is_file() and not path.name.startswith("."))
+    if any(path.name != "README.md" and path.suffix != ".dvc" for path in files):
+        return Path(folder)
+    project, copy, _ = str(Path.cwd()).partition(EXPERIMENT_COPY)
+    advice = f"put your files there, or set {key} to another folder"
+    if copy:
+        advice = (
+            "a queued DVC experiment runs in a copy of the workspace without untracked files; queue it with "
+            f"-S {key}={Path(project) / folder}, or `dvc add` your files in a folder below {folder} first"
+        )
+    raise SystemExit(f"{key}={folder}: no files there; {advice}")
+
+
+def _root_of(main: Callable[..., None]) -> Path:
+    """Root of the project whose folder `stages` contains the module of `main`."""
+    return _file_of(main).parent.parent
+
+
+def _file_of(main: Callable[..., None]) -> Path:
+    return Path(sys.modules[main.__module__].__file__ or "").resolve()
+
+
+def with_lpips(config: Config, purpose: Purpose, use: Callable[[str, str | None], T]) -> T | None:
+    """Call `use` with the LPIPS backbone and weights file for a purpose; None if the purpose needs no LPIPS.
+
+    The message of a ValueError from `use` is preceded by the keys that request LPIPS and followed by the overrides
+    that turn it off.
+    """
+    e2v, e2p = config.baselines.e2v, config.baselines.e2p
+    weights = {
+        "loss.lpips": config.loss.lpips,
+        "baselines.e2v.lpips": e2v.lpips,
+        "baselines.e2p.lpips": e2p.lpips,
+        "baselines.e2p.intensity_lpips": e2p.intensity_lpips,
+    }
+    if purpose == "loss":
+        backbone, asking, off = config.lpips.backbone, [key for key, weight in weights.items() if weight > 0], "0"
+    else:
+        backbone, off = config.benchmark.lpips_backbone, "false"
+        asking = ["benchmark.lpips"] if config.benchmark.lpips else []
+    if not asking:
+        return None
+    try:
+        return use(backbone, config.lpips.path_of(backbone))
+    except ValueError as error:
+        without = " ".join(f"{key}={off}" for key in asking)
+        raise ValueError(f"{', '.join(asking)}: {error}; to go without: {without}") from None
+
+
+def _check_lpips(config: Config) -> None:
+    """Raise ValueError unless stage `weights` has stored the required weights or can find them without a download."""
+
+    def look(purpose: Purpose, backbone: str, path: str | None) -> bool:
+        return is_stored(config.paths.weights, purpose, backbone) or bool(local_source(backbone, path))
+
+    for purpose in PURPOSES:
+        with_lpips(config, purpose, functools.partial(look, purpose))
+
+
+def _check_choices(root: Path, group: str, value: str) -> None:
+    """Raise ValueError if a name or pattern for `group`, alone, in a list or in glob(...), matches no file.
+
+    Other Hydra syntax, such as choice(...), is left to Hydra to check.
+    """
+    known = preset_names(root, group)
+    plain = CHOICES.fullmatch(value)
+    for name in (word.strip("[]'\" ") for word in (plain[1].split(",") if plain else [])):
+        if not fnmatch.filter(["null", *known], name):
+            raise ValueError(f"{group}: there is no {name!r}; conf/{group} has {', '.join(known)}")
+
+
+def _check_ablation(root: Path, config: Config, overrides: list[str]) -> None:
+    """Raise ValueError if the chosen ablation changes no setting in use.
+
+    The exception is `nothing`, the baseline of a sweep. Hydra must be initialised before the call.
+    """
+    chosen = dict(override.split("=", 1) for override in overrides if "=" in override)
+    name = chosen.get("ablation", "null").strip("'\"")
+    if name in ("null", "nothing"):
+        return
+    others = [override for override in overrides if not override.startswith("ablation=")]
+    without = typed(hydra.compose("config", overrides=others))
+    if _in_use(config) != _in_use(without):
+        return
+    experiment = f"experiment={chosen['experiment']}" if "experiment" in chosen else "params.yaml"
+    reasons = []
+    for key in preset_values(root, "ablation", name):
+        if key.startswith("networks.") and key.split(".")[1] != config.network:
+            reasons.append(f"{key} has no effect on network={config.network}")
+        else:
+            value = functools.reduce(getattr, key.split("."), config)
+            reasons.append(f"{key} is {value} already in {experiment}")
+    raise ValueError(f"ablation={name} changes nothing: {', '.join(reasons)}")
+
+
+def _in_use(config: Config) -> tuple[Any, ...]:
+    """All settings except the sections of networks that are not in use."""
+    sections = [getattr(config, field.name) for field in dataclasses.fields(config) if field.name != "networks"]
+    return (*sections, config.network_config)
+
+
+def _check_key(key: str, where: str) -> None:
+    section: Any = Config
+    path = key.split(".")
+    for depth, name in enumerate(path):
+        names = sorted(field.name for field in dataclasses.fields(section)) if dataclasses.is_dataclass(section) else []
+        if name not in names:
+            inside = ".".join(path[:depth]) or "the configuration"
+            allowed = f"{inside} has {', '.join(names)}" if names else f"{inside} is a value, not a section"
+            raise ValueError(f"{where}: {key} is not a setting; {allowed}")
+        section = typing.get_type_hints(section)[name]
+
+
+def _leaves(values: Any, prefix: str = "") -> list[str]:
+    if not isinstance(values, dict):
+        return [prefix]
+    return [leaf for key, value in values.items() for leaf in _leaves(value, f"{prefix}.{key}" if prefix else str(key))]
+
+
+def or_exit(check: Callable[[], T]) -> T:
+    """Return the result of `check`; a ValueError ends the program with its message."""
+    try:
+        return check()
+    except ValueError as error:
+        raise SystemExit(f"configuration error: {error}") from None
+
+
+@functools.cache
+def _schema_of(config_class: type) -> type:
+    """Copy of `config_class` that is not frozen, because OmegaConf cannot merge into frozen dataclasses."""
+    hints = typing.get_type_hints(config_class)
+    twin = [(f.name, _schema_of(hints[f.name]) if dataclasses.is_dataclass(hints[f.name]) else hints[f.name])
+            for f in dataclasses.fields(config_class)]  # fmt: skip
+    return dataclasses.make_dataclass(config_class.__name__, twin)
+
+
+def _built(config_class: type, values: Any, key: str) -> Any:
+    hints = typing.get_type_hints(config_class)
+    arguments = {
+        name: _built(hints[name], value, f"{key}{name}.") if dataclasses.is_dataclass(hints[name]) else value
+        for name, value in values.items()
+    }
+    try:
+        return config_class(**arguments)
+    except ValueError as error:
+        raise ValueError(str(error) if str(error).startswith(key) else f"{key}{error}") from None

@@ -1,0 +1,1 @@
+"""SSIM, LPIPS, correlation and the calibration of expected errors."""

@@ -1,0 +1,205 @@
+"""LPIPS v0.1, the learned perceptual distance (Zhang et al., CVPR 2018).
+
+The backbones are torchvision's classifiers up to the last layer that LPIPS compares. They are defined here because
+torchvision builds often conflict with the installed torch. polarnet/metrics/lpips_weights.py finds the weights.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Literal, NamedTuple, get_args
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from polarnet.runtime.arrays import Array, as_tensor, check_floating, check_range
+
+SHIFT = (-0.030, -0.088, -0.188)  # for RGB in [-1, 1]; SHIFT and SCALE are LPIPS v0.1's scaling layer
+SCALE = (0.458, 0.448, 0.450)
+NORM_FLOOR = 1e-8  # added under the square root, whose slope at 0 is infinite
+
+Purpose = Literal["loss", "benchmark"]
+"""Use of LPIPS: in the training losses, or as a column of the benchmark table."""
+PURPOSES: tuple[Purpose, ...] = get_args(Purpose)
+NO_RECORD: Mapping[str, str | None] = {"backbone": None, "sha256": None, "source": None}
+"""Record for a purpose that does not use LPIPS."""
+
+
+class Fire(nn.Module):
+    """SqueezeNet's block: a 1x1 bottleneck, then 1x1 and 3x3 convolutions side by side."""
+
+    def __init__(self, channels: int, squeezed: int, expanded: int):
+        super().__init__()
+        self.squeeze = nn.Conv2d(channels, squeezed, 1)
+        self.expand1x1 = nn.Conv2d(squeezed, expanded, 1)
+        self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h w"]:
+        """Return 2 * `expanded` channels of the same size."""
+        x = self.squeeze(x).relu()
+        return torch.cat([self.expand1x1(x), self.expand3x3(x)], dim=1).relu()
+
+
+def squeezenet1_1() -> nn.Sequential:
+    """torchvision's squeezenet1_1 `features`."""
+    pool = nn.MaxPool2d(3, stride=2, ceil_mode=True)
+    return nn.Sequential(
+        *(nn.Conv2d(3, 64, 3, stride=2), nn.ReLU(), pool),
+        *(Fire(64, 16, 64), Fire(128, 16, 64), pool),
+        *(Fire(128, 32, 128), Fire(256, 32, 128), pool),
+        *(Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)),
+    )
+
+
+def alexnet() -> nn.Sequential:
+    """torchvision's alexnet `features` (Krizhevsky, "One weird trick", 2014) without the last pooling."""
+    pool = nn.MaxPool2d(3, stride=2)
+    return nn.Sequential(
+        *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), pool),
+        *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), pool),
+        *(nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU()),
+    )
+
+
+def vgg16() -> nn.Sequential:
+    """torchvision's vgg16 `features` without the last pooling."""
+    layers: list[nn.Module] = []
+    channels = 3
+    for width, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+        for _ in range(depth):
+            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+            channels = width
+        layers.append(nn.MaxPool2d(2))
+    return nn.Sequential(*layers[:-1])
+
+
+class Backbone(NamedTuple):
+    """A classifier and the layers that LPIPS v0.1 compares."""
+
+    features: Callable[[], nn.Sequential]
+    taps: tuple[int, ...]
+    """1-based indices of the layers whose outputs are compared."""
+    channels: tuple[int, ...]
+    """Number of channels at each tap."""
+    least_side: int
+    """Minimum side of an image in pixels; below it the last tap has no output."""
+
+
+BACKBONES = {
+    "squeeze": Backbone(squeezenet1_1, (2, 5, 8, 10, 11, 12, 13), (64, 128, 256, 384, 384, 512, 512), 17),
+    "alex": Backbone(alexnet, (2, 5, 8, 10, 12), (64, 192, 384, 256, 256), 31),
+    "vgg": Backbone(vgg16, (4, 9, 16, 23, 30), (64, 128, 256, 512, 512), 16),
+}
+
+
+class Lpips(nn.Module):
+    """LPIPS v0.1: differences of unit-length features, weighted per channel. The weights are frozen.
+
+    Grey images are repeated to three channels. Under autocast the convolutions run in reduced precision; the features
+    are normalised and compared in float32.
+    """
+
+    def __init__(self, backbone: str):
+        super().__init__()
+        self.backbone = backbone
+        self.layers = BACKBONES[backbone].features()
+        self.heads = nn.ParameterList(torch.ones(n) for n in BACKBONES[backbone].channels)
+        self.requires_grad_(False).eval()
+
+    @classmethod
+    def of(cls, backbone: str, tensors: Mapping[str, Tensor]) -> "Lpips":
+        """Build the network from tensors named as in torchvision and LPIPS.
+
+        Raises ValueError if they do not fit the backbone.
+        """
+        state = {
+            name.replace("features.", "layers."): (
+                value.contiguous(memory_format=torch.channels_last) if value.ndim == 4 else value  # the faster layout
+            )
+            for name, value in tensors.items()
+        }
+        for i in range(len(BACKBONES[backbone].taps)):
+            if (head := state.pop(f"lin{i}.model.1.weight", None)) is not None:
+                state[f"heads.{i}"] = head.flatten()
+        with torch.device("meta"):  # no memory and no random numbers for weights that are replaced below
+            lpips = cls(backbone)
+        try:
+            lpips.load_state_dict(state, assign=True)
+        except RuntimeError as error:
+            raise ValueError(f"these are not the weights of LPIPS's {backbone} backbone: {error}") from None
+        return lpips
+
+    @classmethod
+    def load(cls, folder: Path | str, purpose: Purpose, backbone: str) -> "Lpips":
+        """Load the network that stage `weights` wrote to `folder` for a purpose; ValueError if there is none."""
+        if not is_stored(folder, purpose, backbone):
+            raise ValueError(f"{folder} has no weights of LPIPS ({backbone}) for the {purpose}; run stage `weights`")
+        file = Path(folder) / f"{backbone}.safetensors"
+        with file.open("rb") as content:
+            found = hashlib.file_digest(content, "sha256").hexdigest()
+        if found != stored_record(folder, purpose)["sha256"]:
+            raise ValueError(f"{file} is not the file that {purpose}.json describes; run stage `weights` again")
+        return cls.of(backbone, load_file(file))
+
+    def forward(
+        self,
+        images: Float[Array, "b h w"] | Float[Array, "b 3 h w"],
+        truth: Float[Array, "b h w"] | Float[Array, "b 3 h w"],
+    ) -> Float[Tensor, " b"]:
+        """Distance of each pair of images, grey or RGB in [0, 1], numpy or torch; 0 for equal images.
+
+        Gradients flow to `images` only. Raises the errors of `features`, and ValueError if `truth` is outside [0, 1].
+        """
+        check_range("truth", as_tensor("truth", truth), 0, 1, "images")
+        with torch.no_grad():
+            of_truth = self.features(truth)
+        return self.distance(self.features(images), of_truth)
+
+    def features(self, images: Float[Array, "b h w"] | Float[Array, "b 3 h w"]) -> list[Float[Tensor, "b _c _h _w"]]:
+        """Unit-length features of images in [0, 1] at each tap; keep them for a truth that is compared often.
+
+        Raises TypeError for anything but an array, and ValueError for integers or images too small for the backbone.
+        """
+        images = as_tensor("images", images)
+        check_floating("images", images)
+        least = BACKBONES[self.backbone].least_side
+        if min(images.shape[-2:]) < least:
+            raise ValueError(
+                f"LPIPS ({self.backbone}) needs images of {least} pixels a side, got {tuple(images.shape)}"
+            )
+        if images.ndim == 3:
+            images = images[:, None].expand(-1, 3, -1, -1)
+        x = (2 * images - 1 - images.new_tensor(SHIFT).view(3, 1, 1)) / images.new_tensor(SCALE).view(3, 1, 1)
+        tapped = []
+        for number, layer in enumerate(self.layers, start=1):
+            x = layer(x)
+            if number in BACKBONES[self.backbone].taps:
+                exact = x.to(torch.promote_types(x.dtype, torch.float32))
+                tapped.append(exact / (exact.square().sum(dim=1, keepdim=True) + NORM_FLOOR).sqrt())
+        return tapped
+
+    def distance(
+        self, a: list[Float[Tensor, "b _c _h _w"]], b: list[Float[Tensor, "b _c _h _w"]]
+    ) -> Float[Tensor, " b"]:
+        """LPIPS of two images, computed from their `features`."""
+        per_tap = [
+            ((at_a - at_b).square().mean(dim=(-2, -1)) * head).sum(dim=1)
+            for at_a, at_b, head in zip(a, b, self.heads, strict=True)
+        ]
+        return torch.stack(per_tap).sum(dim=0)
+
+
+def stored_record(folder: Path | str, purpose: Purpose) -> Mapping[str, str | None]:
+    """Backbone, sha256 and source of a purpose's weights in the folder of stage `weights`; all None without weights."""
+    file = Path(folder) / f"{purpose}.json"
+    return json.loads(file.read_text()) if file.is_file() else NO_RECORD
+
+
+def is_stored(folder: Path | str, purpose: Purpose, backbone: str) -> bool:
+    """Whether stage `weights` wrote this backbone to `folder` for this purpose."""
+    return stored_record(folder, purpose)["backbone"] == backbone

@@ -1,0 +1,239 @@
+"""RGB pictures from any file that OpenImageIO reads: upright, without alpha, in sRGB, cut and scaled to one size."""
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import OpenImageIO as oiio
+import torch
+from jaxtyping import Float, Float32, Shaped
+from torch import Tensor
+
+from polarnet.pictures.icc import srgb_from_profile
+
+SRGB = "srgb_rec709_scene"  # OpenImageIO's name
+TAKEN_AS_SRGB = {"", SRGB, "g22_rec709_scene"}  # a PNG that says gamma 1/2.2 is how older programs wrote sRGB
+LINEAR_FORMATS = {"openexr", "hdr"}  # hold linear light unless they say otherwise
+CAMERA_RAW = frozenset(
+    [
+        "dng",
+        "nef",
+        "nrw",
+        "cr2",
+        "cr3",
+        "crw",
+        "arw",
+        "srf",
+        "sr2",
+        "raf",
+        "orf",
+        "rw2",
+        "pef",
+        "srw",
+        "3fr",
+        "iiq",
+        "erf",
+        "mrw",
+        "x3f",
+    ]
+)
+NOT_IN_THE_WHEEL = frozenset(["heic", "heif", "avif"])
+NO_PICTURES = frozenset(
+    ["null", "nul", "term", "zfile", "z", "env", "sm", "tx", "vsm", "int", "inta"]
+)  # extensions OpenImageIO lists as well
+
+
+class UnreadablePicture(ValueError):
+    """This file gives no RGB picture; the message says why."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture as its file holds it, but upright."""
+
+    pixels: Shaped[np.ndarray, "h w 3"]  # uint8, uint16 or float32; float: 1.0 is white
+    profile: bytes | None  # embedded ICC profile
+    colour_space: str  # OpenImageIO's name of the encoding; means nothing beside a profile
+    profile_name: str | None
+    author: str | None
+    licence: str | None
+
+    @property
+    def bits(self) -> int:
+        """Of a PNG that keeps what this file holds: 8 for bytes, 16 for anything finer."""
+        return 8 if self.pixels.dtype == np.uint8 else 16
+
+    @property
+    def sha256(self) -> str:
+        """Of the upright pixels with their shape and type, whatever the file's name and format."""
+        pixels = np.ascontiguousarray(self.pixels)
+        return hashlib.sha256(f"{pixels.dtype}{pixels.shape}".encode() + pixels.tobytes()).hexdigest()
+
+
+def picture_extensions() -> frozenset[str]:
+    """Lower-case extensions, without the dot, of files that are meant as pictures, readable here or not."""
+    formats = oiio.get_string_attribute("extension_list").split(";")
+    known = {extension for entry in formats for extension in entry.partition(":")[2].split(",")}
+    return frozenset(known - NO_PICTURES) | CAMERA_RAW | NOT_IN_THE_WHEEL
+
+
+def read_picture(path: str | os.PathLike[str]) -> Picture:
+    """The first picture of a file, without alpha and turned as its EXIF orientation says.
+
+    Raises UnreadablePicture: not a picture, damaged or cut off (a JPEG that ends early is), camera raw,
+    fewer than three channels, or a number that is not finite.
+    """
+    pixels, spec, file_format = _read(Path(path))
+    profile = spec.get("ICCProfile")
+    linear = file_format in LINEAR_FORMATS
+    return Picture(
+        pixels=np.ascontiguousarray(pixels[..., _rgb_channels(spec.channelnames, spec.alpha_channel)]),
+        profile=None if profile is None else np.asarray(profile, dtype=np.uint8).tobytes(),
+        colour_space=spec.get_string_attribute("oiio:ColorSpace") or ("lin_rec709_scene" if linear else ""),
+        profile_name=spec.get_string_attribute("ICCProfile:profile_description") or None,
+        author=spec.get_string_attribute("Artist") or None,
+        licence=spec.get_string_attribute("Copyright") or None,
+    )
+
+
+def read_channels(path: str | os.PathLike[str]) -> Shaped[np.ndarray, "h w c"]:
+    """The upright code values of all channels but alpha, whatever they mean; raises as `read_picture` does."""
+    pixels, spec, _ = _read(Path(path))
+    return pixels[..., [i for i in range(spec.nchannels) if i != spec.alpha_channel]]
+
+
+def upright(pixels: Shaped[np.ndarray, "h w c"], orientation: int) -> Shaped[np.ndarray, "a b c"]:
+    """Pixels as they should be shown, by the EXIF orientation 1 to 8; others are taken as 1."""
+    if orientation in (5, 6, 7, 8):  # stored with rows and columns swapped
+        pixels = pixels.transpose(1, 0, 2)
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    return pixels
+
+
+def srgb_of(pixels: Float32[np.ndarray, "h w 3"], picture: Picture) -> Float32[np.ndarray, "h w 3"]:
+    """Pixels in the colours of `picture` as sRGB code values in [0, 1], out of range clipped.
+
+    By the embedded profile; without one, by the encoding that the file names (linear light, a gamma, Display P3);
+    without that, they are sRGB already. UnreadablePicture where the profile or encoding cannot be used.
+    """
+    if picture.profile is not None:
+        try:
+            return srgb_from_profile(np.clip(pixels, 0, 1), picture.profile)
+        except ValueError as error:
+            raise UnreadablePicture(str(error)) from error
+    if picture.colour_space in TAKEN_AS_SRGB:
+        return np.clip(pixels, 0, 1)
+    converted = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(pixels), picture.colour_space, SRGB)
+    if converted.has_error:
+        raise UnreadablePicture(f"encoding {picture.colour_space}: {converted.geterror().strip()}")
+    return np.clip(np.asarray(converted.get_pixels("float")), 0, 1)
+
+
+def fit(
+    pixels: Shaped[np.ndarray, "h w 3"], height: int, width: int, max_upscale: float
+) -> Float32[np.ndarray, "height width 3"]:
+    """The largest centred part of shape height:width, scaled to that size; integer pixels become [0, 1].
+
+    Shrinks by averaging areas, enlarges by cubic interpolation, in the encoding the pixels have.
+    UnreadablePicture where the part would be enlarged more than `max_upscale` times.
+    """
+    rows, columns = pixels.shape[:2]
+    part_height = min(rows, max(1, round(columns * height / width)))
+    part_width = min(columns, max(1, round(rows * width / height)))
+    enlargement = max(height / part_height, width / part_width)
+    if enlargement > max_upscale:
+        raise UnreadablePicture(
+            f"too small: {columns}x{rows} pixels would be enlarged {enlargement:.2f} times to fill {width}x{height}, "
+            f"more than ingest.max_upscale={max_upscale:g}"
+        )
+    top, left = (rows - part_height) // 2, (columns - part_width) // 2
+    part = pixels[top : top + part_height, left : left + part_width]
+    white = np.iinfo(part.dtype).max if np.issubdtype(part.dtype, np.integer) else 1
+    values = part.astype(np.float32) / np.float32(white)
+    if (part_height, part_width) == (height, width):
+        return values
+    method = cv2.INTER_CUBIC if enlargement > 1 else cv2.INTER_AREA
+    scaled = cv2.resize(values, (width, height), interpolation=method).astype(np.float32)
+    return np.clip(scaled, 0, 1) if enlargement > 1 else scaled  # cubic interpolation overshoots at edges
+
+
+def write_png(path: str | os.PathLike[str], rgb: Float32[np.ndarray, "h w 3"], bits: int) -> None:
+    """sRGB code values in [0, 1] as PNG with 8 or 16 bits; the same values give the same bytes."""
+    levels = 2**bits - 1
+    quantised = np.round(rgb.astype(np.float64) * levels).astype(np.uint8 if bits == 8 else np.uint16)
+    done, encoded = cv2.imencode(".png", quantised[..., ::-1])
+    if not done:
+        raise OSError(f"{path}: OpenCV could not encode {rgb.shape} as PNG")
+    Path(path).write_bytes(encoded.tobytes())
+
+
+def read_rgb(path: str | os.PathLike[str]) -> Float[Tensor, "3 h w"]:
+    """sRGB code values in [0, 1] of a whole picture; raises like `read_picture` and `srgb_of`."""
+    picture = read_picture(path)
+    rows, columns = picture.pixels.shape[:2]
+    rgb = srgb_of(fit(picture.pixels, rows, columns, 1.0), picture)
+    return torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))
+
+
+def _read(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
+    """Upright pixels of all channels, OpenImageIO's description of them, and the name of the format."""
+    _refuse_by_extension(path)
+    as_stored = oiio.ImageSpec()
+    as_stored["oiio:UnassociatedAlpha"] = 1  # otherwise the reader multiplies the colours by alpha
+    file = oiio.ImageInput.open(str(path), as_stored)
+    if file is None:
+        raise UnreadablePicture(f"cannot be read: {_first_line(oiio.geterror(), path)}")
+    try:
+        spec = file.spec()
+        pixels = file.read_image(0, 0, 0, spec.nchannels, "unknown")
+        problem = file.geterror()
+    finally:
+        file.close()
+    if pixels is None or problem:
+        raise UnreadablePicture(f"cannot be read: {_first_line(problem, path)}")
+    return upright(_plain(pixels), spec.get_int_attribute("Orientation", 1)), spec, file.format_name()
+
+
+def _refuse_by_extension(path: Path) -> None:
+    extension = path.suffix.lower().lstrip(".")
+    if extension in CAMERA_RAW:
+        raise UnreadablePicture("camera raw: what can be read of it is a preview; develop it to 16-bit TIFF first")
+    if extension in NOT_IN_THE_WHEEL:
+        raise UnreadablePicture(f"OpenImageIO's wheel has no reader for .{extension}; convert it to PNG or TIFF first")
+
+
+def _rgb_channels(names: Sequence[str], alpha: int) -> list[int]:
+    """Where R, G and B lie; the first three channels beside alpha where nothing is called so."""
+    capitals = [name.upper() for name in names]
+    if all(name in capitals for name in "RGB"):
+        return [capitals.index(name) for name in "RGB"]
+    colours = [i for i in range(len(names)) if i != alpha]
+    if len(colours) < 3:
+        words = "one channel" if len(colours) == 1 else f"{len(colours)} channels"
+        raise UnreadablePicture(f"{words}, no RGB: saturation and hue, and so polarization, would be 0 everywhere")
+    return colours[:3]
+
+
+def _plain(pixels: Shaped[np.ndarray, "h w c"]) -> Shaped[np.ndarray, "h w c"]:
+    """As uint8, uint16 or finite float32."""
+    if pixels.dtype in (np.uint8, np.uint16):
+        return pixels
+    if np.issubdtype(pixels.dtype, np.integer):
+        return (pixels / np.iinfo(pixels.dtype).max).astype(np.float32)
+    if not np.isfinite(pixels).all():
+        raise UnreadablePicture(f"{np.count_nonzero(~np.isfinite(pixels))} values are not finite numbers")
+    return pixels.astype(np.float32)
+
+
+def _first_line(message: str, path: Path) -> str:
+    """Of what OpenImageIO says, without the folder, which differs from machine to machine."""
+    lines = message.replace(str(path), path.name).strip().splitlines()
+    return lines[0] if lines else "OpenImageIO gives no reason"

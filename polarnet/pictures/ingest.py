@@ -1,0 +1,350 @@
+"""Source pictures -> data/images: RGB pictures of one size, each with a split, and a manifest of what was left out."""
+
+import dataclasses
+import functools
+import hashlib
+import logging
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from polarnet.pictures.builtin import BUILTIN_PHOTOS, BuiltinPhoto
+from polarnet.pictures.dead_leaves import dead_leaves
+from polarnet.pictures.images import (
+    UnreadablePicture,
+    fit,
+    picture_extensions,
+    read_picture,
+    srgb_of,
+    write_png,
+)
+from polarnet.pictures.manifest import (
+    Manifest,
+    ManifestEntry,
+    Skipped,
+    listed,
+    split_by_content,
+    write_manifest,
+)
+from polarnet.pictures.polarimetry import (
+    group_by_measurement,
+    read_measurement,
+    shrink,
+    write_intensities,
+)
+from polarnet.runtime.machine import generator_for
+from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.stokes import parse_mosaic
+
+logger = logging.getLogger(__name__)
+
+EDGE_BYTES = 1 << 16  # of a file's start and end, hashed to choose `limit` files without reading all of them
+
+Mapper = Callable[..., Iterable[Any]]
+
+
+@dataclass(frozen=True)
+class IngestConfig:
+    """Section `ingest` of params.yaml."""
+
+    source: str = field(metadata=allowed(choices=("builtin", "folder", "polarization")))
+    root: str
+    """Folder of the sources folder and polarization, searched recursively."""
+    limit: int | None = field(metadata=allowed(low=1))
+    """At most this many pictures of the folder, chosen by content hash."""
+    dead_leaves: int = field(metadata=allowed(low=0))
+    """Generated pictures beside the builtin photographs."""
+    height: int = field(metadata=allowed(low=16))
+    """Pixels of every picture after the centre crop."""
+    width: int = field(metadata=allowed(low=16))
+    max_upscale: float = field(metadata=allowed(low=1))
+    """A picture that would have to be enlarged more is too small."""
+    val_fraction: float = field(metadata=allowed(low=0, high=1))
+    test_fraction: float = field(metadata=allowed(low=0, high=1))
+    mosaic: str
+    """Of source=polarization: angles under the 2x2 pixels of a raw mosaic, even row / odd row."""
+    residual_max: float = field(metadata=allowed(above=0))
+    """Of source=polarization: the largest median of |I0 + I90 - I45 - I135| / S0 that is not refused."""
+
+    def __post_init__(self):
+        check_ranges(self)
+        parse_mosaic(self.mosaic)
+        if self.val_fraction + self.test_fraction > 1:
+            raise ValueError(
+                f"val_fraction: expected <= 1 - test_fraction = {1 - self.test_fraction:g}, got {self.val_fraction}"
+            )
+
+
+@dataclass(frozen=True)
+class Source:
+    """One picture to read, and what is known about it."""
+
+    files: tuple[Path, ...]  # four of them where each polarizer has its own
+    kind: str  # photograph, folder or polarization
+    stem: str
+    origin: str
+    licence: str | None
+    author: str | None
+
+
+def ingest(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Manifest:
+    """Fill `folder` with PNG pictures of config.height x config.width and their manifest, replacing what was there.
+
+    `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; like the order of the
+    files, it does not matter to the result. Writes beside `folder` first, so that it is never half full. Warns about
+    every file skipped; ValueError where no picture is left.
+    """
+    temporary = folder.with_name(folder.name + ".tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    if config.source == "builtin":
+        manifest = _ingest_builtin(config, seed, temporary, mapper)
+    else:
+        manifest = _ingest_folder(config, temporary, mapper)
+    for skipped in manifest.skipped:
+        logger.warning("skipped %s: %s", skipped.file, skipped.reason)
+    _check_not_empty(config, manifest)
+    write_manifest(manifest, temporary)
+    shutil.rmtree(folder, ignore_errors=True)
+    temporary.rename(folder)
+    return manifest
+
+
+def _ingest_builtin(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Manifest:
+    photographs = list(mapper(functools.partial(_convert, config=config, folder=folder), list(enumerate(_builtin()))))
+    make = functools.partial(_make_dead_leaves, config=config, seed=seed, folder=folder)
+    made = list(mapper(make, range(config.dead_leaves)))
+    kept, skipped = _without_duplicates([*photographs, *made])
+    groups = [[entry for entry in kept if entry.source == kind] for kind in ("photograph", "dead_leaves")]
+    return _manifest([entry for group in groups for entry in _split(config, group)], skipped, folder)
+
+
+def _builtin() -> list[Source]:
+    def source(photo: BuiltinPhoto) -> Source:
+        return Source(
+            files=(photo.path,),
+            kind="photograph",
+            stem=photo.path.stem,
+            origin=photo.origin,
+            licence=photo.licence,
+            author=photo.author,
+        )
+
+    return [source(photo) for photo in BUILTIN_PHOTOS]
+
+
+def _ingest_folder(config: IngestConfig, folder: Path, mapper: Mapper) -> Manifest:
+    """Reads as many files, in the order of their hashes, as it takes to get `limit` pictures."""
+    sources, ignored = _find_pictures(Path(config.root), config.source)
+    if config.limit is not None:
+        sources.sort(key=lambda source: _edge_hash(source.files))
+    convert = functools.partial(_CONVERTERS[config.source], config=config, folder=folder)
+    kept: list[ManifestEntry] = []
+    outcomes: list[ManifestEntry | Skipped] = []
+    while len(outcomes) < len(sources) and (config.limit is None or len(kept) < config.limit):
+        wanted = len(sources) if config.limit is None else config.limit - len(kept)
+        batch = list(enumerate(sources))[len(outcomes) : len(outcomes) + wanted]
+        outcomes.extend(mapper(convert, batch))
+        kept, skipped = _without_duplicates(outcomes)
+    if not kept:
+        _refuse_folder(config, len(sources), ignored, [o for o in outcomes if isinstance(o, Skipped)])
+    manifest = _manifest(_split(config, kept), skipped, folder)
+    return dataclasses.replace(manifest, ignored_files=ignored, unread_files=len(sources) - len(outcomes))
+
+
+def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int]:
+    """What has a picture's extension under `root`, by path, and how many other files there are."""
+    if not root.is_dir():
+        raise ValueError(f"ingest.root: expected a folder with pictures, {root} is none; see ingest.source")
+    files = sorted(path for path in root.rglob("*") if path.is_file())
+    pictures = [path for path in files if path.suffix.lower().lstrip(".") in _extensions(kind)]
+    groups = group_by_measurement(pictures) if kind == "polarization" else [(path,) for path in pictures]
+    sources = [
+        Source(
+            files=group,
+            kind=kind,
+            stem=group[0].stem if len(group) == 1 else group[0].stem.rpartition("_")[0],
+            origin=", ".join(path.relative_to(root).as_posix() for path in group),
+            licence=None,
+            author=None,
+        )
+        for group in groups
+    ]
+    return sources, len(files) - len(pictures)
+
+
+def _extensions(kind: str) -> frozenset[str]:
+    return picture_extensions() | ({"npz"} if kind == "polarization" else set())
+
+
+def _edge_hash(files: Sequence[Path]) -> str:
+    digest = hashlib.sha256()
+    for path in files:
+        try:
+            with path.open("rb") as file:
+                digest.update(file.read(EDGE_BYTES))
+                size = file.seek(0, os.SEEK_END)
+                file.seek(max(0, size - EDGE_BYTES))
+                digest.update(file.read() + str(size).encode())
+        except OSError:  # named when it is its turn to be read
+            continue
+    return digest.hexdigest()
+
+
+def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> ManifestEntry | Skipped:
+    """Read, cut, scale and convert one file to `folder`/<number>.png; the reason where that cannot be done."""
+    number, source = item
+    try:
+        picture = read_picture(source.files[0])
+        fitted = fit(picture.pixels, config.height, config.width, config.max_upscale)
+        rgb = srgb_of(fitted, picture)
+    except UnreadablePicture as error:
+        return Skipped(source.origin if source.kind == "folder" else source.files[0].name, str(error))
+    file = f"source-{number:08d}.png"
+    write_png(folder / file, rgb, picture.bits)
+    return ManifestEntry(
+        name=f"{_slug(source.stem)}-{picture.sha256[:8]}",
+        file=file,
+        split="",
+        source=source.kind,
+        origin=source.origin,
+        licence=source.licence or picture.licence,
+        author=source.author or picture.author,
+        sha256=picture.sha256,
+        bits=picture.bits,
+        height=config.height,
+        width=config.width,
+        source_height=picture.pixels.shape[0],
+        source_width=picture.pixels.shape[1],
+        colour_profile=picture.profile_name,
+    )
+
+
+def _convert_polarization(item: tuple[int, Source], config: IngestConfig, folder: Path) -> ManifestEntry | Skipped:
+    """Read, check and shrink one measurement to `folder`/<number>.npz; the reason where that cannot be done."""
+    number, source = item
+    try:
+        measured = read_measurement(source.files, parse_mosaic(config.mosaic))
+        if measured.residual > config.residual_max:
+            raise UnreadablePicture(
+                f"the angles do not fit: the median of |I0 + I90 - I45 - I135| / S0 is {measured.residual:.4f}, more "
+                f"than ingest.residual_max={config.residual_max:g}; is an angle mislabelled, the light not stored "
+                f"linearly, or ingest.mosaic={config.mosaic} wrong?"
+            )
+    except UnreadablePicture as error:
+        return Skipped(source.origin, str(error))
+    shrunk = shrink(measured, config.height, config.width)
+    file = f"source-{number:08d}.npz"
+    write_intensities(folder / file, shrunk)
+    sha256 = hashlib.sha256(measured.intensities.tobytes() + measured.valid.tobytes()).hexdigest()
+    return ManifestEntry(
+        name=f"{_slug(source.stem)}-{sha256[:8]}",
+        file=file,
+        split="",
+        source=source.kind,
+        origin=source.origin,
+        licence=None,
+        author=None,
+        sha256=sha256,
+        bits=16,
+        height=shrunk.valid.shape[0],
+        width=shrunk.valid.shape[1],
+        source_height=measured.valid.shape[0],
+        source_width=measured.valid.shape[1],
+        colour_profile=None,
+        residual=round(measured.residual, 6),
+        saturated_fraction=round(measured.saturated, 6),
+        masked_fraction=round(float(1 - shrunk.valid.mean()), 6),
+    )
+
+
+_CONVERTERS = {"folder": _convert, "polarization": _convert_polarization}
+
+
+def _make_dead_leaves(number: int, config: IngestConfig, seed: int, folder: Path) -> ManifestEntry:
+    stem = f"dead-leaves-{number:04d}"
+    rgb = dead_leaves(generator_for(seed, stem, "picture"), config.height, config.width)
+    write_png(folder / f"{stem}.png", rgb, bits=8)
+    sha256 = hashlib.sha256(np.round(rgb * 255).astype(np.uint8).tobytes()).hexdigest()
+    return ManifestEntry(
+        name=f"{stem}-{sha256[:8]}",
+        file=f"{stem}.png",
+        split="",
+        source="dead_leaves",
+        origin=f"generated from seed {seed}",
+        licence="CC0-1.0",
+        author="polarnet",
+        sha256=sha256,
+        bits=8,
+        height=config.height,
+        width=config.width,
+        source_height=config.height,
+        source_width=config.width,
+        colour_profile=None,
+    )
+
+
+def _without_duplicates(
+    outcomes: Iterable[ManifestEntry | Skipped],
+) -> tuple[list[ManifestEntry], list[Skipped]]:
+    """The first entry of each content; what was skipped, with the others."""
+    first: dict[str, ManifestEntry] = {}
+    skipped = []
+    for outcome in outcomes:
+        if isinstance(outcome, Skipped):
+            skipped.append(outcome)
+        elif outcome.sha256 in first:
+            skipped.append(Skipped(outcome.origin, f"the same pixels as {first[outcome.sha256].origin}"))
+        else:
+            first[outcome.sha256] = outcome
+    return list(first.values()), skipped
+
+
+def _split(config: IngestConfig, group: Sequence[ManifestEntry]) -> list[ManifestEntry]:
+    splits = split_by_content([entry.sha256 for entry in group], config.val_fraction, config.test_fraction)
+    return [dataclasses.replace(entry, split=split) for entry, split in zip(group, splits, strict=True)]
+
+
+def _manifest(entries: Sequence[ManifestEntry], skipped: Sequence[Skipped], folder: Path) -> Manifest:
+    """The manifest of entries whose files get their final names here; files without an entry are removed."""
+    named = []
+    for entry in entries:
+        file = f"{entry.name}{Path(entry.file).suffix}"
+        (folder / entry.file).rename(folder / file)
+        named.append(dataclasses.replace(entry, file=file))
+    for path in folder.iterdir():
+        if path.name not in {entry.file for entry in named}:
+            path.unlink()
+    return Manifest(
+        pictures=tuple(sorted(named, key=lambda entry: entry.name)),
+        skipped=tuple(sorted(skipped, key=lambda skip: skip.file)),
+        ignored_files=0,
+        unread_files=0,
+    )
+
+
+def _check_not_empty(config: IngestConfig, manifest: Manifest) -> None:
+    if not manifest.pictures:
+        raise ValueError(f"ingest.source={config.source}: no picture is left; raise ingest.dead_leaves")
+    val, test = config.val_fraction, config.test_fraction
+    for split, fraction in (("train", 1 - val - test), ("val", val), ("test", test)):
+        if fraction > 0 and not manifest.counts[split]:
+            logger.warning("no picture is in split %s: %d pictures are few", split, len(manifest.pictures))
+
+
+def _refuse_folder(config: IngestConfig, found: int, ignored: int, skipped: Sequence[Skipped]) -> NoReturn:
+    raise ValueError(
+        f"ingest.root={config.root}: no picture could be used. Looked, in all subfolders, for files that end in "
+        f"{', '.join(sorted(_extensions(config.source)))}: found {found} pictures and {ignored} other files."
+        f"{listed(skipped)}"
+    )
+
+
+def _slug(stem: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", stem.lower()).strip("-")[:40].strip("-") or "picture"

@@ -1,0 +1,205 @@
+"""Measured polarization: pictures taken behind polarizers at 0, 45, 90 and 135 degrees, or through a mosaic of them.
+
+Code values are taken as proportional to light, as cameras for measuring write them.
+"""
+
+import os
+import re
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Float64, Shaped
+from torch import Tensor
+
+from polarnet.pictures.images import UnreadablePicture, read_channels
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
+
+ANGLE_SUFFIX = re.compile(r"(?P<name>.+)_0*(?P<angle>0|45|90|135)")
+WHITE_LEVELS = (2**10 - 1, 2**12 - 1, 2**14 - 1, 2**16 - 1)  # of sensors whose values come as 16 bits
+STEPS = 2**16 - 1  # of the files written here
+NPZ_KEYS = tuple(f"I{angle}" for angle in POLARIZER_ANGLES_DEG)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Four pictures of one still scene."""
+
+    intensities: Float32[np.ndarray, "4 h w"]  # linear in light; S0 = I0 + I90 is 1 where unpolarized light saturates
+    valid: Bool[np.ndarray, "h w"]  # False where saturation hides what the light was
+    residual: float  # median of |I0 + I90 - I45 - I135| / S0 over unsaturated, lit pixels; 0 for ideal polarizers
+    saturated: float  # share of pixels with at least one saturated angle
+
+
+def group_by_measurement(files: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, ...]]:
+    """Files NAME_0, NAME_45, NAME_90, NAME_135 of one folder together, as far as they are there; others alone."""
+    groups: dict[Path, list[Path]] = {}
+    for file in map(Path, files):
+        match = ANGLE_SUFFIX.fullmatch(file.stem) if file.suffix.lower() != ".npz" else None
+        groups.setdefault(file.with_name(match["name"]) if match else file, []).append(file)
+    return [tuple(sorted(group)) for group in groups.values()]
+
+
+def read_measurement(files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], mosaic: Mosaic) -> Measurement:
+    """The measurement in a group of files: four pictures, one .npz with I0, I45, I90, I135, or one raw mosaic.
+
+    Where one angle is saturated it follows from the other three, I0 + I90 = I45 + I135; where more are, the pixel is
+    not valid. UnreadablePicture where files are missing, damaged, or do not belong together.
+    """
+    paths = [Path(files)] if isinstance(files, (str, os.PathLike)) else [Path(file) for file in files]
+    if not paths:
+        raise UnreadablePicture("expected the files of a measurement, got none")
+    if paths[0].suffix.lower() == ".npz":
+        values, white = _scaled(_read_npz(paths[0]))
+        saturated = values >= white
+    elif ANGLE_SUFFIX.fullmatch(paths[0].stem):
+        values, white = _scaled(_read_angles(paths))
+        saturated = values >= white
+    else:
+        raw, white = _scaled(_read_raw(paths[0]))
+        values = demosaic(raw[0], mosaic)
+        saturated = demosaic((raw[0] >= white).astype(np.float64), mosaic) > 0
+    return _measurement(values / (2 * white), saturated)
+
+
+def demosaic(raw: Float64[np.ndarray, "h w"], mosaic: Mosaic) -> Float64[np.ndarray, "4 h2 w2"]:
+    """Each angle at the centre of every 2x2 cell but those on the rim: shape (h // 2 - 2, w // 2 - 2).
+
+    The four pixels of a cell look at four places, and an edge between them would look polarized. So each angle is
+    interpolated bilinearly, with weights 9, 3, 3, 1 of 16, where all four then agree: half a pixel right of and below
+    the cell's first pixel.
+    """
+    height, width = raw.shape[0] // 2, raw.shape[1] // 2
+    at_angle = {}
+    for row in (0, 1):
+        for column in (0, 1):
+            samples = raw[row : 2 * height : 2, column : 2 * width : 2]
+            # the centre of a cell lies below its upper samples and above its lower ones
+            vertical = samples[2:] if row == 0 else samples[:-2]
+            samples = (3 * samples[1:-1] + vertical) / 4
+            horizontal = samples[:, 2:] if column == 0 else samples[:, :-2]
+            at_angle[mosaic[row][column]] = (3 * samples[:, 1:-1] + horizontal) / 4
+    return np.stack([at_angle[angle] for angle in POLARIZER_ANGLES_DEG])
+
+
+def shrink(measurement: Measurement, height: int, width: int) -> Measurement:
+    """The centre of shape height:width scaled down to that size by averaging; as it is where it would be enlarged.
+
+    A pixel is valid where all pixels are that it averages.
+    """
+    rows, columns = measurement.valid.shape
+    part_height, part_width = min(rows, round(columns * height / width)), min(columns, round(rows * width / height))
+    if part_height < height or part_width < width:
+        return measurement
+    top, left = (rows - part_height) // 2, (columns - part_width) // 2
+    part = np.s_[top : top + part_height, left : left + part_width]
+
+    def scaled(plane: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:
+        return cv2.resize(plane[part].astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+
+    return Measurement(
+        intensities=np.stack([scaled(plane) for plane in measurement.intensities]),
+        valid=scaled(~measurement.valid) == 0,
+        residual=measurement.residual,
+        saturated=measurement.saturated,
+    )
+
+
+def write_intensities(path: str | os.PathLike[str], measurement: Measurement) -> None:
+    """As .npz with I0, I45, I90, I135 (uint16, 65535 is S0 = 1) and valid; equal measurements give equal bytes."""
+    steps = np.round(np.clip(measurement.intensities, 0, 1) * STEPS).astype(np.uint16)
+    np.savez_compressed(path, **dict(zip(NPZ_KEYS, steps, strict=True)), valid=measurement.valid)
+
+
+def read_intensities(path: str | os.PathLike[str]) -> tuple[Float32[Tensor, "4 h w"], Bool[Tensor, "h w"]]:
+    """What `write_intensities` wrote: intensities behind the four polarizers, and where they are valid."""
+    with np.load(path) as file:
+        steps = np.stack([file[key] for key in NPZ_KEYS])
+        return torch.from_numpy(steps.astype(np.float32) / STEPS), torch.from_numpy(file["valid"])
+
+
+def _measurement(values: Float64[np.ndarray, "4 h w"], saturated: Bool[np.ndarray, "4 h w"]) -> Measurement:
+    i0, i45, i90, i135 = values
+    total = values.sum(axis=0) / 2
+    trusted = ~saturated.any(axis=0) & (total > 0)
+    if not trusted.any():
+        raise UnreadablePicture("no pixel is lit and unsaturated at all four angles")
+    residual = np.abs(i0 + i90 - i45 - i135)[trusted] / total[trusted]
+    from_the_others = np.stack([i45 + i135 - i90, i0 + i90 - i135, i45 + i135 - i0, i0 + i90 - i45])
+    count = saturated.sum(axis=0)
+    recovered = np.where(saturated & (count == 1), np.maximum(from_the_others, values), values)
+    return Measurement(
+        intensities=recovered.astype(np.float32),
+        valid=count <= 1,
+        residual=float(np.median(residual)),
+        saturated=float((count > 0).mean()),
+    )
+
+
+def _scaled(values: Shaped[np.ndarray, "n h w"]) -> tuple[Float64[np.ndarray, "n h w"], float]:
+    """Values as floats, and the level at which they saturate.
+
+    Of 16-bit files the lowest of 10, 12, 14 and 16 bits that holds them all: cameras often leave the upper bits empty.
+    """
+    if values.dtype == np.uint8:
+        return values.astype(np.float64), 255.0
+    if values.dtype == np.uint16:
+        highest = int(values.max())
+        return values.astype(np.float64), float(min(white for white in WHITE_LEVELS if white >= highest))
+    if np.issubdtype(values.dtype, np.floating):
+        if not (values.min() >= 0 and values.max() <= 1):  # false for NaN too
+            raise UnreadablePicture(f"expected floats in [0, 1], got {values.min():g} to {values.max():g}")
+        return values.astype(np.float64), 1.0
+    raise UnreadablePicture(f"expected 8 or 16 bits or floats in [0, 1], got {values.dtype}")
+
+
+def _read_npz(path: Path) -> Shaped[np.ndarray, "4 h w"]:
+    try:
+        with np.load(path) as file:
+            missing = [key for key in NPZ_KEYS if key not in file]
+            if missing:
+                raise UnreadablePicture(f"expected the arrays {', '.join(NPZ_KEYS)}, {', '.join(missing)} is missing")
+            arrays = [file[key] for key in NPZ_KEYS]
+    except UnreadablePicture:
+        raise
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise UnreadablePicture(f"cannot be read: {error}".replace(str(path), path.name)) from error
+    return _stacked(arrays, NPZ_KEYS)
+
+
+def _read_angles(files: Sequence[Path]) -> Shaped[np.ndarray, "4 h w"]:
+    """Of colour pictures the green channel, as polarization differs between colours."""
+    by_angle: dict[int, Path] = {}
+    for file in files:
+        match = ANGLE_SUFFIX.fullmatch(file.stem)
+        if match is None or by_angle.setdefault(int(match["angle"]), file) != file:
+            raise UnreadablePicture(f"two files for one angle: {', '.join(file.name for file in files)}")
+    missing = [angle for angle in POLARIZER_ANGLES_DEG if angle not in by_angle]
+    if missing:
+        raise UnreadablePicture(f"no file for {', '.join(f'_{angle}' for angle in missing)} beside {files[0].name}")
+    pictures = [read_channels(by_angle[angle]) for angle in POLARIZER_ANGLES_DEG]
+    planes = [picture[..., 1 if picture.shape[2] >= 3 else 0] for picture in pictures]
+    return _stacked(planes, [by_angle[angle].name for angle in POLARIZER_ANGLES_DEG])
+
+
+def _read_raw(path: Path) -> Shaped[np.ndarray, "1 h w"]:
+    pixels = read_channels(path)
+    if pixels.shape[2] != 1:
+        raise UnreadablePicture(
+            f"{pixels.shape[2]} channels: neither a raw mosaic nor one of NAME_0, NAME_45, NAME_90, NAME_135"
+        )
+    if min(pixels.shape[:2]) < 6:
+        raise UnreadablePicture(f"too small for a mosaic: {pixels.shape[1]}x{pixels.shape[0]} pixels")
+    return pixels[..., 0][None]
+
+
+def _stacked(planes: Sequence[np.ndarray], names: Sequence[str]) -> Shaped[np.ndarray, "4 h w"]:
+    kinds = {(plane.shape, plane.dtype) for plane in planes}
+    if len(kinds) > 1 or planes[0].ndim != 2:
+        sizes = ", ".join(f"{name} {plane.dtype} {plane.shape}" for name, plane in zip(names, planes, strict=True))
+        raise UnreadablePicture(f"expected four pictures of one size and type, got {sizes}")
+    return np.stack(planes)

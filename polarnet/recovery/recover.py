@@ -1,0 +1,333 @@
+"""`polarnet recover`: frames of DoLP and AoLP from event-camera files or a running camera."""
+
+import dataclasses
+import itertools
+import operator
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from torch import Tensor
+from tqdm import tqdm
+
+from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
+from polarnet.captures.imported import import_targets
+from polarnet.captures.targets import calibrate_targets
+from polarnet.events.stream import Events, downscale
+from polarnet.events.streaming import SHORTEST_STEP_US, EventWindow, WindowCutter, WindowRule
+from polarnet.methods import METHODS
+from polarnet.methods.dolp_network import dolp_recoverer
+from polarnet.methods.method import Method, Recoverer, Setup, each_map, why_absent
+from polarnet.methods.overlap import advance, begin, warm_up
+from polarnet.networks.checkpoint import load_network
+from polarnet.networks.weights import shipped_weights
+from polarnet.recordings.arrangements import read_four, read_mosaic
+from polarnet.recordings.live import LiveLines, Piece, live_lines
+from polarnet.recordings.recording import Recording, detect_format
+from polarnet.recovery.writer import RecoveryWriter
+from polarnet.runtime.machine import RuntimeConfig, device_of, precision_on, tune
+from polarnet.stokes import Mosaic, Prediction
+from polarnet.storage.events import EventStore
+
+STANDARD_INPUT = "-"
+PIXELS_AT_ONCE = 4 * 120 * 180  # total over the windows of one batch; bounds the memory of a network
+BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}{postfix}]"
+LIVE_BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
+TRAINED_WINDOW_US = 33_333
+"""Window length in the training of the networks, 1/30 s."""
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """Arrangement of the polarizers in front of the sensor, as given by the user."""
+
+    angles: Sequence[int] | None
+    """Polarizer angle of each of four files, in degrees and in the order of the files."""
+    mosaic: Mosaic | None
+    sequence: str | None
+    """Sequence to read from an event store that holds several."""
+
+
+class Input(NamedTuple):
+    """Events of four channels of equal size, read whole or piece by piece."""
+
+    name: str
+    height: int
+    width: int
+    pieces: Iterable[Piece]
+    duration_us: int | None
+    """None for live input, whose duration is unknown."""
+
+
+class Frame(NamedTuple):
+    """Prediction for one window, on the CPU, with its timing."""
+
+    window: EventWindow
+    prediction: Prediction
+    step_s: float
+    """Time from the window's events in memory to the frame in memory; for a batch of windows, an equal share."""
+    latency_s: float
+    """Time from the arrival of the window's last event to the frame in memory."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Number of frames and timing of one run."""
+
+    frames: int
+    stream_s: float
+    """Time in the recording at the end of the last window."""
+    run_s: float
+    step_ms: float
+    """Median of `Frame.step_s`, in ms."""
+    latency_ms: float | None
+    """Median of `Frame.latency_s`, in ms; None if all events were available from the start."""
+    latency_ms_95: float | None
+    """95th percentile of the latency, in ms; None as for `latency_ms`."""
+
+    @property
+    def realtime_factor(self) -> float:
+        """Seconds of recording processed per second of computation."""
+        return self.stream_s / self.run_s
+
+
+def open_files(
+    paths: Sequence[Path],
+    arrangement: Arrangement,
+    read: Callable[[Path], Recording],
+    size: tuple[int, int] | None,
+    work: Path,
+    captures: Callable[[], RecordingsConfig],
+) -> Input:
+    """Read four channels from files, starting at time 0 and reduced to `size` (height, width) if given.
+
+    Four files hold one channel each, in the order of `arrangement.angles`, and are read by `read`. A single path is a
+    recording of a camera with a mosaic, an event store, or a folder of division-of-time captures. Captures are
+    calibrated in `work` with the settings that `captures` returns. A ValueError or FileNotFoundError says what is
+    missing.
+    """
+    missing = [str(path) for path in paths if not path.exists()]
+    if missing:
+        raise FileNotFoundError(f"{', '.join(missing)}: there is no such file")
+    name = paths[0].name if len(paths) == 1 else ", ".join(path.name for path in paths)
+    channels = _channels(paths, arrangement, read, work, captures)
+    duration_us = max((int(events.t[-1]) + 1 for events in channels if len(events)), default=0)
+    if size is not None:
+        channels = [downscale(events, *size, keep_rate=True) for events in channels]
+    pieces = [Piece(channels, duration_us, time.perf_counter())]
+    return Input(name, channels[0].height, channels[0].width, pieces, duration_us)
+
+
+def _channels(
+    paths: Sequence[Path],
+    arrangement: Arrangement,
+    read: Callable[[Path], Recording],
+    work: Path,
+    captures: Callable[[], RecordingsConfig],
+) -> Sequence[Events]:
+    if len(paths) == 4:
+        if arrangement.angles is None:
+            raise ValueError("four files: say the polarizer of each, in their order, such as --angles 0 45 90 135")
+        if len(set(arrangement.angles)) < 4:
+            raise ValueError(f"four files: expected four different angles, got {list(arrangement.angles)}")
+        return read_four(dict(zip(arrangement.angles, paths, strict=True)), read=read)
+    if len(paths) != 1:
+        raise ValueError(f"expected one file or folder, or four files with --angles, got {len(paths)}")
+    (path,) = paths
+    if arrangement.mosaic is not None:
+        return read_mosaic(path, arrangement.mosaic, read)
+    if path.is_dir() and any(path.glob(f"{EVENT_CAPTURES[0]}.*")):
+        return _captures(path, work, captures())
+    if detect_format(path) == "store":
+        return _sequence(EventStore.open(path), path, arrangement.sequence)
+    raise ValueError(
+        f"{path.name} is one file of events: say where the polarizers of its pixels are, such as --mosaic "
+        f"'90 45 / 135 0', or give four files with --angles, an event store, or a folder of {EVENT_CAPTURES[0]}.*, ..."
+    )
+
+
+def _sequence(store: EventStore, path: Path, sequence: str | None) -> Sequence[Events]:
+    if sequence is None and len(store.sequences) == 1:
+        (sequence,) = store.sequences
+    if sequence not in store.sequences:
+        names = ", ".join(store.sequences[:8]) + (", ..." if len(store.sequences) > 8 else "")
+        raise ValueError(f"{path.name}: say --sequence, one of {names}; got {sequence!r}")
+    return store.read(sequence)
+
+
+def _captures(folder: Path, work: Path, config: RecordingsConfig) -> Sequence[Events]:
+    root = work / "targets"
+    root.mkdir(parents=True, exist_ok=True)
+    target = root / folder.resolve().name
+    if not target.exists():
+        target.symlink_to(folder.resolve(), target_is_directory=True)
+    import_targets(root, work / "imported", config)
+    calibrate_targets(work / "imported", work / "calibrated", config, {})
+    return EventStore.open(work / "calibrated" / "events.zarr").read(target.name)
+
+
+def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> tuple[Input, LiveLines]:
+    """Read lines live from standard input (-) or from a growing file, until it has not grown for `idle_s` seconds."""
+    if path != STANDARD_INPUT and not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: there is no such file; - reads standard input")
+    source = sys.stdin.buffer if path == STANDARD_INPUT else open(path, "rb")  # noqa: SIM115 - read until the end
+    name = "standard input" if path == STANDARD_INPUT else Path(path).name
+    lines = LiveLines(source, name, mosaic, idle_s)
+    return Input(name, lines.height, lines.width, lines, None), lines
+
+
+def open_method(
+    name: str | None,
+    weights: Path | None,
+    device: str,
+    precision: str,
+    setup_of: Callable[[Method], Setup],
+) -> tuple[Recoverer, str]:
+    """Open a method for `recover` and describe it in words.
+
+    Without a `name` the method is the DoLP network with `weights`, else the shipped weights. Any other method runs
+    with the settings of `setup_of`. `precision` applies to networks: fp32, bf16,
+    or auto, which selects bf16 if the device has units for it. A ValueError or FileNotFoundError says what is missing.
+    """
+    tune()
+    place = device_of(RuntimeConfig(device, threads=0, workers=1, devices=1, nodes=1, rendezvous=""))
+    precision = precision_on(place, precision)
+    if name in (None, "ours"):
+        file = weights or shipped_weights()
+        if not file.is_file():
+            raise FileNotFoundError(f"--weights {file}: expected a checkpoint (NAME.safetensors), there is none")
+        network, metadata = load_network(file)
+        words = f"network {metadata['network']} ({precision}), {file}"
+        return dolp_recoverer(network, metadata, place, precision), words
+    assert name is not None
+    if name not in METHODS:
+        raise ValueError(f"--method: expected a method of {', '.join(METHODS)}, got {name!r}")
+    method = METHODS[name]
+    if weights is not None:
+        raise ValueError(f"--weights is for the DoLP network; set methods.{method.section}.weights for {name}")
+    setup = dataclasses.replace(setup_of(method), device=place, precision=precision)
+    if reason := why_absent(method, setup):
+        raise ValueError(f"--method {name}: {reason}")
+    return method.open(setup), name
+
+
+def frames_of(
+    source: Input, rule: WindowRule, recoverer: Recoverer, pixels_at_once: int = PIXELS_AT_ONCE
+) -> Iterator[Frame]:
+    """Yield a frame for each window as soon as the window's last event has arrived.
+
+    Windows that are already available, such as those of a file, are processed in batches of up to `pixels_at_once`
+    pixels.
+    """
+    warm_up(recoverer, source.height, source.width)
+    cutter = WindowCutter(rule, source.height, source.width)
+    history = begin(recoverer, source.height, source.width)
+    most = max(1, pixels_at_once // (source.height * source.width))
+    for piece in source.pieces:
+        for windows in _runs(cutter.add(piece.channels, piece.until_us), most):
+            start = time.perf_counter()
+            history, prediction = advance(recoverer, history, windows)
+            maps = each_map(prediction, Tensor.cpu)
+            done = time.perf_counter()
+            for k, window in enumerate(windows):
+                frame = each_map(maps, operator.itemgetter(k))
+                yield Frame(window, frame, (done - start) / len(windows), done - piece.read_at)
+
+
+def _runs(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWindow]]:
+    """Group adjacent windows, which neither overlap nor leave gaps, into batches of up to `most`."""
+    run: list[EventWindow] = []
+    for window in windows:
+        if run and (len(run) == most or run[-1].stop_us != window.start_us):
+            yield run
+            run = []
+        run.append(window)
+    if run:
+        yield run
+
+
+def recover(source: Input, rule: WindowRule, recoverer: Recoverer, writer: RecoveryWriter) -> Summary:
+    """Recover and write every frame, with a progress bar; ValueError if the input is shorter than one window."""
+    live = source.duration_us is None
+    steps: list[float] = []
+    latencies: list[float] = []
+    last_us, started = 0, time.perf_counter()
+    with (
+        writer,
+        tqdm(total=source.duration_us, desc="recover", unit_scale=1e-6, bar_format=LIVE_BAR if live else BAR) as bar,
+    ):
+        for frame in frames_of(source, rule, recoverer):
+            writer.add(frame.window, frame.prediction)
+            steps.append(frame.step_s)
+            latencies.append(frame.latency_s)
+            bar.update(frame.window.stop_us - last_us)
+            last_us = frame.window.stop_us
+            shown = {"latency": f"{1000 * frame.latency_s:.1f} ms"} if live else {}
+            bar.set_postfix(frames=len(steps), step=f"{1000 * frame.step_s:.1f} ms", refresh=False, **shown)
+    if not steps:
+        raise ValueError(_too_short(source, rule))
+    return Summary(
+        len(steps),
+        last_us * 1e-6,
+        time.perf_counter() - started,
+        1000 * statistics.median(steps),
+        1000 * statistics.median(latencies) if live else None,
+        1000 * sorted(latencies)[int(0.95 * (len(latencies) - 1))] if live else None,
+    )
+
+
+def _too_short(source: Input, rule: WindowRule) -> str:
+    """Error message for an input shorter than one window, with advice."""
+    if rule.length_us is None:
+        return f"{source.name} ends before {rule.events:,} events, one window: record for longer, or give fewer events"
+    length = f"one window of {rule.length_us / 1000:g} ms"
+    if source.duration_us is None:
+        return f"{source.name} ended before {length} was full: record for longer"
+    lasts = f"{source.name} lasts {source.duration_us / 1000:g} ms, less than {length}: record for longer"
+    if source.duration_us >= TRAINED_WINDOW_US:
+        return f"{lasts}, or give --window {TRAINED_WINDOW_US / 1000:g}ms"
+    if source.duration_us >= SHORTEST_STEP_US:
+        return (
+            f"{lasts}. Networks need windows of {TRAINED_WINDOW_US / 1000:g} ms, filters do not: "
+            f"--method highpass --window {source.duration_us}us"
+        )
+    return lasts
+
+
+def facts_of(source: Input, rule: WindowRule, words: str, summary: Summary) -> dict[str, str]:
+    """Facts about a run for the HTML page and the terminal."""
+    length = f"{rule.length_us / 1000:g} ms" if rule.length_us is not None else f"{rule.events:,} events"
+    step = "one after the other" if rule.step_us is None else f"one every {rule.step_us / 1000:g} ms"
+    facts = {
+        "input": source.name,
+        "size": f"{source.height} x {source.width} px",
+        "method": words,
+        "windows": f"of {length}, {step}",
+        "frames": f"{summary.frames:,} of {summary.stream_s:.3f} s",
+        "step": f"{summary.step_ms:.2f} ms (median)",
+    }
+    if summary.latency_ms is None:
+        return facts | {"time": f"{summary.run_s:.2f} s, {summary.realtime_factor:.2f} times as fast as real time"}
+    return facts | {"latency": f"{summary.latency_ms:.1f} ms (median), 95 % within {summary.latency_ms_95:.1f} ms"}
+
+
+def replay(store: EventStore, sequence: str, speed: float, write: Callable[[bytes], object]) -> None:
+    """Write a sequence in the line format of `LiveLines`, at `speed` times the original pace."""
+    head, times, lines = live_lines(store.read(sequence))
+    write(head)
+    ends = [0, *itertools.accumulate(map(len, lines.splitlines(keepends=True)))]
+    started, sent = time.perf_counter(), 0
+    while sent < len(times):
+        due_us = int((time.perf_counter() - started) * 1e6 * speed)
+        come = int(times.searchsorted(due_us, side="right"))
+        if come > sent:
+            asked = time.perf_counter()
+            write(lines[ends[sent] : ends[come]])
+            started += time.perf_counter() - asked  # time spent waiting for the reader does not count
+            sent = come
+        else:
+            time.sleep(0.001)

@@ -1,0 +1,266 @@
+"""Write the results of `polarnet recover`: numbers (Zarr, EXR), pictures (PNG), a video, and a page.
+
+A picture shows DoLP, AoLP and the events of the window side by side. Everything is written as frames arrive, in
+constant memory.
+"""
+
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import OpenImageIO as oiio
+import torch
+import zarr
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from zarr.codecs import BloscCodec
+
+from polarnet.events.streaming import EventWindow
+from polarnet.reports.figures import dolp_bar
+from polarnet.reports.maps import (
+    dolp_image,
+    encode_jpeg,
+    encode_png,
+    event_full_scale,
+    event_image,
+    hue_wheel,
+    polarization_hsv,
+)
+from polarnet.reports.tiles import chart, data_uri, template
+from polarnet.runtime.machine import usable_cores
+from polarnet.stokes import Prediction
+
+VIDEO, CODEC = "recovered.mp4", "mp4v"  # MPEG-4, which players show and browsers do not
+FILM_FRAMES = 24
+"""Minimum number of pictures in the page's animation, evenly spread (fewer if there are fewer frames)."""
+PNG_STORED, NO_FILTER = 0, 8  # no compression, libpng's PNG_FILTER_NONE: larger files, but fast to write
+FRAMES_PER_CHUNK = 32
+ZARR_CODEC = BloscCodec(cname="lz4", shuffle="shuffle")
+MOST_WAITING = 64  # frames queued for writing
+FEW_CORES = 2  # up to this number, the network needs all cores: a concurrent writing thread delays every operation
+SHOWN_ON_PAGE = 6
+GAP = 4  # pixels between the maps of a picture
+SCALE_KEPT = 0.9  # share of the previous picture's full scale of events, which prevents flicker
+ZARR_CONVENTIONS = {
+    "t_us": "time, microseconds from the first event: the end of the window that a frame was recovered from",
+    "dolp": "degree of linear polarization, divided by 65535",
+    "aolp": "angle of linear polarization in radians in [0, pi), divided by 65536 and times pi",
+    "log_variance": "natural logarithm of the variance that the network expects of its own DoLP",
+}
+
+
+class Film(NamedTuple):
+    """Pictures stacked into one image, through which the page's style moves."""
+
+    source: str
+    frames: int
+    height: int
+    width: int
+
+
+class Shown(NamedTuple):
+    """A picture on the page."""
+
+    t_us: int
+    picture: UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass
+class _Kept:
+    """A sample of the pictures, evenly spread over a stream of unknown length."""
+
+    pictures: list[Shown]
+    every: int = 1
+
+    def offer(self, number: int, shown: Shown) -> None:
+        if number % self.every == 0:
+            self.pictures.append(shown)
+        if len(self.pictures) > 2 * FILM_FRAMES:
+            self.pictures, self.every = self.pictures[::2], 2 * self.every
+
+
+class RecoveryWriter:
+    """Writes frames into a folder as they arrive; as a context manager it waits for the last and closes the files.
+
+    `outputs` is a subset of zarr, png, exr and mp4. The folder gets recovered.zarr, png/*.png, exr/*.exr and
+    recovered.mp4 (`video_rate_hz` frames a second, whatever the time between them). `write_page` adds index.html and
+    recovered.png.
+    """
+
+    def __init__(self, folder: Path, outputs: Collection[str], video_rate_hz: float):
+        self.folder, self.outputs, self.video_rate_hz = folder, outputs, video_rate_hz
+        self.frames = 0
+        self._kept = _Kept([])
+        self._scale: float | None = None
+        self._arrays: dict[str, zarr.Array] = {}
+        self._buffer: dict[str, list[np.ndarray]] = {}
+        self._video: cv2.VideoWriter | None = None
+        # A second thread that computes on several cores would put those of the network to sleep between operations.
+        self._thread = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,))
+        self._waiting: deque[Future] = deque()
+        folder.mkdir(parents=True, exist_ok=True)
+        for kind in ("png", "exr"):
+            if kind in outputs:
+                (folder / kind).mkdir(exist_ok=True)
+
+    def __enter__(self) -> "RecoveryWriter":
+        return self
+
+    def __exit__(self, *problem: object) -> None:
+        try:
+            self._wait(0)
+            self._flush()
+        finally:
+            self._thread.shutdown(cancel_futures=True)
+            if self._video is not None:
+                self._video.release()
+
+    def add(self, window: EventWindow, found: Prediction) -> None:
+        """Add a frame on the CPU; returns before it is written, unless the queue is long or cores are few."""
+        self._waiting.append(self._thread.submit(self._write, self.frames, window, found))
+        self._wait(MOST_WAITING if usable_cores() > FEW_CORES else 0)
+        self.frames += 1
+
+    def write_page(self, title: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:
+        """Write index.html and recovered.png; call it after the `with` block."""
+        some = _spread(self._kept.pictures, SHOWN_ON_PAGE)
+        if some:
+            sheet = np.concatenate([_with_margin(shown.picture) for shown in some[1::2] or some])
+            (self.folder / "recovered.png").write_bytes(encode_png(sheet))
+        page = template("recovery.html.jinja").render(
+            title=title,
+            facts=facts,
+            notes=notes,
+            video=VIDEO if self._video is not None else None,
+            film=_film([shown.picture for shown in self._kept.pictures]),
+            pictures=[(shown.t_us / 1000, data_uri(encode_png(shown.picture), "png")) for shown in some],
+            dolp_bar=chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
+            wheel=data_uri(encode_png(hue_wheel(192)), "png"),
+        )
+        path = self.folder / "index.html"
+        path.write_text(page, encoding="utf-8")
+        return path
+
+    def _wait(self, most: int) -> None:
+        while len(self._waiting) > most:
+            self._waiting.popleft().result()
+
+    def _write(self, number: int, window: EventWindow, found: Prediction) -> None:
+        if "zarr" in self.outputs:
+            self._add_to_zarr(window, found)
+        if "exr" in self.outputs:
+            _write_exr(self.folder / "exr" / f"{number:06d}.exr", found)
+        drawn = {"png", "mp4"} & set(self.outputs)
+        if not drawn and number % self._kept.every:
+            return
+        picture = self._picture(window, found)
+        self._kept.offer(number, Shown(window.stop_us, picture))
+        if "png" in self.outputs:
+            _write_png(self.folder / "png" / f"{number:06d}.png", picture)
+        if "mp4" in self.outputs:
+            if self._video is None:
+                self._video = _open_video(self.folder / VIDEO, self.video_rate_hz, *picture.shape[:2])
+            self._video.write(np.ascontiguousarray(picture[..., ::-1]))
+
+    def _picture(self, window: EventWindow, found: Prediction) -> UInt8[np.ndarray, "h w 3"]:
+        events = signed_events(window)
+        present = event_full_scale(events)
+        self._scale = present if self._scale is None else SCALE_KEPT * self._scale + (1 - SCALE_KEPT) * present
+        maps = [dolp_image(found.dolp)]
+        if found.aolp is not None:
+            maps.append(polarization_hsv(torch.ones_like(found.dolp), found.dolp, found.aolp))
+        maps.append(event_image(events, self._scale))
+        gap = np.full((maps[0].shape[0], GAP, 3), 255, np.uint8)
+        side_by_side = np.concatenate([part for one in maps for part in (one, gap)][:-1], axis=1)
+        height, width = side_by_side.shape[:2]
+        return np.pad(side_by_side, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")  # codecs want even sides
+
+    def _add_to_zarr(self, window: EventWindow, found: Prediction) -> None:
+        frame = {"t_us": np.array(window.stop_us, np.int64), "dolp": _quantised(found.dolp * 65535, 65535)}
+        if found.aolp is not None:
+            frame["aolp"] = _quantised(found.aolp * (65536 / np.pi) % 65536, 65535)
+        if found.log_variance is not None:
+            frame["log_variance"] = found.log_variance.numpy().astype(np.float32)
+        for name, values in frame.items():
+            self._buffer.setdefault(name, []).append(values)
+        if len(self._buffer["t_us"]) == FRAMES_PER_CHUNK:
+            self._flush()
+
+    def _flush(self) -> None:
+        if not self._buffer:
+            return
+        if not self._arrays:
+            group = zarr.open_group(self.folder / "recovered.zarr", mode="w")
+            group.attrs["conventions"] = {name: ZARR_CONVENTIONS[name] for name in self._buffer}
+            for name, (first, *_) in self._buffer.items():
+                chunks = (FRAMES_PER_CHUNK, *first.shape)
+                self._arrays[name] = group.create_array(
+                    name, shape=(0, *first.shape), chunks=chunks, dtype=first.dtype, compressors=ZARR_CODEC
+                )
+        for name, values in self._buffer.items():
+            self._arrays[name].append(np.stack(values))
+        self._buffer.clear()
+
+
+def signed_events(window: EventWindow) -> Float[Tensor, "h w"]:
+    """ON minus OFF events of the four channels, summed per pixel."""
+    first = window.channels[0]
+    image = torch.zeros(first.height * first.width)
+    for events in window.channels:
+        image.index_add_(0, events.y.long() * events.width + events.x.long(), events.p.float())
+    return image.view(first.height, first.width)
+
+
+def _quantised(values: Tensor, largest: int) -> np.ndarray:
+    return values.round().clamp(0, largest).numpy().astype(np.uint16)
+
+
+def _spread(items: Sequence[Shown], count: int) -> list[Shown]:
+    places = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[k] for k in places]
+
+
+def _film(pictures: Sequence[np.ndarray]) -> Film | None:
+    if not pictures:
+        return None
+    height, width = pictures[0].shape[:2]
+    return Film(data_uri(encode_jpeg(np.concatenate(pictures)), "jpeg"), len(pictures), height, width)
+
+
+def _open_video(path: Path, rate_hz: float, height: int, width: int) -> cv2.VideoWriter:
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), rate_hz, (width, height))
+    if not video.isOpened():
+        raise RuntimeError(f"{path}: OpenCV cannot write it ({CODEC}); leave mp4 out of --write")
+    return video
+
+
+def _with_margin(picture: np.ndarray) -> np.ndarray:
+    return np.pad(picture, ((GAP, GAP), (GAP, GAP), (0, 0)), constant_values=255)
+
+
+def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+    spec = oiio.ImageSpec(picture.shape[1], picture.shape[0], 3, oiio.UINT8)
+    spec["png:compressionLevel"] = PNG_STORED  # thousands of files are written while a camera runs
+    spec["png:filter"] = NO_FILTER
+    _write_picture(path, spec, picture)
+
+
+def _write_exr(path: Path, found: Prediction) -> None:
+    """Write the channels DoLP and, if present, AoLP (radians) and log_variance, as half floats."""
+    maps = {"DoLP": found.dolp, "AoLP": found.aolp, "log_variance": found.log_variance}
+    known: dict[str, Any] = {name: values for name, values in maps.items() if values is not None}
+    height, width = found.dolp.shape
+    spec = oiio.ImageSpec(width, height, len(known), oiio.HALF)
+    spec.channelnames = tuple(known)
+    _write_picture(path, spec, torch.stack([*known.values()], dim=-1).float().numpy())
+
+
+def _write_picture(path: Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> None:
+    file = oiio.ImageOutput.create(str(path))
+    if not (file and file.open(str(path), spec) and file.write_image(np.ascontiguousarray(pixels)) and file.close()):
+        raise OSError(f"{path}: {file.geterror() if file else oiio.geterror()}")

@@ -1,0 +1,114 @@
+"""Figures of the event budget (paper, Fig. 11) and of the sensitivity to sensor and motion."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+
+from polarnet.reports.figures import Theme, chart_style
+from polarnet.reports.legend import GENERAL
+from polarnet.reports.tables import in_order
+
+PAPER_EVENTS_PER_PIXEL = 1.04  # events per pixel at which the paper's recovery is good (section 5)
+SETTING_LABELS = {
+    "threshold_mismatch": "threshold mismatch between pixels, log intensity",
+    "noise_rate_hz": "shot noise, events per pixel and second",
+    "speed": "speed, times the configured",
+    "channel_error": "threshold error between polarizers",
+}
+
+
+def event_budget_figure(results: Mapping[str, Any], theme: Theme) -> Figure:
+    """PSNR and correlation against events per pixel since the start, window length, and overlapping windows."""
+    with matplotlib.rc_context(chart_style(theme)):
+        figure = Figure(figsize=(9.6, 5.0), layout="constrained", facecolor="none")
+        axes = figure.subplots(2, 3, sharey="row")
+        for row, (metric, label) in enumerate((("psnr", "PSNR, dB"), ("corr", "correlation"))):
+            start, length, sliding = axes[row]
+            _lines(start, results["since_start"], "events_per_pixel", metric)
+            start.axvline(PAPER_EVENTS_PER_PIXEL, color=theme.quiet, linewidth=0.9, linestyle="--")
+            _log_ticks(start, [entry["events_per_pixel"] for entry in _first(results["since_start"])])
+            _lines(length, results["window_length"], "window_us", metric, scale=1e-3)
+            _log_ticks(length, [entry["window_us"] / 1000 for entry in _first(results["window_length"])])
+            for carry, marker in ((False, "o"), (True, "s")):
+                entries = [entry for entry in results["sliding"] if entry["carry"] is carry]
+                sliding.plot(
+                    [entry["events_per_pixel"] for entry in entries],
+                    [entry[metric] for entry in entries],
+                    marker=marker,
+                    markersize=3.5,
+                    color=GENERAL.colour("ours"),
+                    linestyle="-" if carry else ":",
+                    label="state carried on" if carry else "each window alone",
+                )
+            _log_ticks(sliding, sorted({entry["events_per_pixel"] for entry in results["sliding"]}))
+            start.set_ylabel(label)
+        axes[0][0].set_title("since the start (dashed: the paper's 1.04)", loc="left", fontsize=9)
+        axes[0][1].set_title("by window length", loc="left", fontsize=9)
+        spacing = results["sliding"][0]["spacing_us"] if results["sliding"] else 0
+        axes[0][2].set_title(f"ours, a frame every {spacing / 1000:g} ms", loc="left", fontsize=9)
+        labels = ("events per pixel", "window, ms", "events per pixel in the window")
+        for axis, name in zip(axes[1], labels, strict=True):
+            axis.set_xlabel(name)
+        axes[0][0].legend(frameon=False, fontsize=7, labelcolor=theme.text)
+        axes[0][2].legend(frameon=False, fontsize=7, labelcolor=theme.text)
+    return figure
+
+
+def sensitivity_figure(results: Mapping[str, Sequence[Mapping[str, Any]]], theme: Theme) -> Figure:
+    """PSNR and correlation against each setting, one column per setting."""
+    with matplotlib.rc_context(chart_style(theme)):
+        figure = Figure(figsize=(2.7 * len(results) + 0.4, 4.6), layout="constrained", facecolor="none")
+        axes = figure.subplots(2, len(results), sharey="row", squeeze=False)
+        for column, (setting, entries) in enumerate(results.items()):
+            for row, metric in enumerate(("psnr", "corr")):
+                for method in in_order(entries[0]["scores"]):
+                    axes[row][column].plot(
+                        range(len(entries)),
+                        [entry["scores"][method][metric] for entry in entries],
+                        marker="o",
+                        markersize=3,
+                        color=GENERAL.colour(method),
+                        label=GENERAL.label(method),
+                    )
+                axes[row][column].set_xticks(range(len(entries)), [f"{entry['value']:g}" for entry in entries])
+            axes[1][column].set_xlabel(SETTING_LABELS.get(setting, setting), fontsize=7)
+        axes[0][0].set_ylabel("PSNR, dB")
+        axes[1][0].set_ylabel("correlation")
+        axes[0][-1].legend(frameon=False, fontsize=7, labelcolor=theme.text)
+    return figure
+
+
+def _lines(
+    axes: Axes, of_methods: Mapping[str, Sequence[Mapping[str, Any]]], x: str, y: str, scale: float = 1.0
+) -> None:
+    for method in in_order(of_methods):
+        entries = of_methods[method]
+        axes.plot(
+            [scale * entry[x] for entry in entries],
+            [entry[y] for entry in entries],
+            marker="o",
+            markersize=3,
+            color=GENERAL.colour(method),
+            label=GENERAL.label(method),
+        )
+
+
+def _log_ticks(axes: Axes, values: Sequence[float]) -> None:
+    """Make the axis logarithmic, with ticks at the points where there is room."""
+    axes.set_xscale("log")
+    shown = [value for value in values if value > 0]
+    kept: list[float] = []
+    for value in shown:
+        if not kept or np.log(value / kept[-1]) > np.log(shown[-1] / shown[0]) / 9:
+            kept.append(value)
+    axes.set_xticks(kept, [f"{value:.3g}" if value >= 100 else f"{value:.2g}" for value in kept])
+    axes.xaxis.set_minor_locator(NullLocator())
+
+
+def _first(of_methods: Mapping[str, Sequence[Mapping[str, Any]]]) -> Sequence[Mapping[str, Any]]:
+    return next(iter(of_methods.values()))

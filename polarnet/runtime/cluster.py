@@ -1,0 +1,115 @@
+"""Map a function over many sequences: in this process, in processes of this machine, or on a Dask cluster."""
+
+import functools
+import multiprocessing
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, TypeVar
+
+from tqdm import tqdm
+
+from polarnet.runtime.machine import limit_threads, tune, usable_cores
+
+ATTEMPTS = 4  # Dask's own limit for a task whose workers die (allowed-failures 3)
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def pmap(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    *,
+    workers: int,
+    label: str,
+    address: str | None = None,
+) -> list[Result]:
+    """`[function(item) for item in items]`, in that order, with a progress bar called `label`.
+
+    `address` names a Dask scheduler (extra `cluster`). Without it, `workers` processes share the items; one worker
+    means this process. If a worker dies, only its current items are lost and handed out again. RuntimeError names the
+    unfinished items after workers have died `ATTEMPTS` times without one result. An exception raised by `function` ends
+    the map and propagates unchanged.
+    """
+    with tqdm(total=len(items), desc=label, unit="", disable=None if len(items) > 1 else True) as bar:
+        if address is not None:
+            return _over_dask(function, items, address, bar)
+        if workers > 1 and len(items) > 1:
+            return _over_processes(function, items, min(workers, len(items)), bar, label)
+        results = []
+        for item in items:
+            results.append(function(item))
+            bar.update()
+        return results
+
+
+def _over_processes(
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int, bar: tqdm, label: str
+) -> list[Result]:
+    results: dict[int, Result] = {}
+    deaths = 0
+    while len(results) < len(items):
+        before = len(results)
+        try:
+            _collect(function, items, workers, results, bar)
+        except BrokenProcessPool:
+            deaths = 1 if len(results) > before else deaths + 1
+            undone = [items[i] for i in range(len(items)) if i not in results]
+            if deaths >= ATTEMPTS:
+                raise RuntimeError(
+                    f"{label}: worker processes died {deaths} times in a row (out of memory?) with these undone: "
+                    f"{', '.join(map(str, undone[:8]))}; run again with runtime.workers=1 to see which one it is"
+                ) from None
+            bar.write(f"{label}: a worker process died; {len(undone)} items are given out again")
+    return [results[i] for i in range(len(items))]
+
+
+def _start_worker(threads: int) -> None:
+    limit_threads(threads)
+    tune()
+
+
+def _collect(
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int, results: dict[int, Result], bar: tqdm
+) -> None:
+    """Add the missing entries of `results`, until all are there or the pool breaks."""
+    spawn = multiprocessing.get_context("spawn")  # forking a process with running OpenMP threads can hang
+    threads = max(1, usable_cores() // workers)
+    with ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(threads,)) as pool:
+        futures = {pool.submit(function, items[i]): i for i in range(len(items)) if i not in results}
+        try:
+            for future in as_completed(futures):
+                results[futures[future]] = future.result()
+                bar.update()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], address: str, bar: tqdm) -> list[Result]:
+    try:
+        from distributed import Client
+        from distributed import as_completed as dask_as_completed
+    except ImportError:
+        raise RuntimeError(
+            "cluster.address needs Dask on this machine and on the workers: pip install 'polarnet[cluster]'"
+        ) from None
+    with Client(address, timeout="30s") as client:
+        futures = client.map(_guarded(function), items, retries=ATTEMPTS - 1, pure=False)
+        order: dict[Any, int] = {future.key: i for i, future in enumerate(futures)}
+        results: dict[int, Result] = {}
+        for future, result in dask_as_completed(futures, with_results=True):
+            results[order[future.key]] = result
+            bar.update()
+    return [results[i] for i in range(len(items))]
+
+
+def _guarded(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
+    """`function` on one thread, since Dask runs several tasks of one worker side by side."""
+    return functools.partial(_on_one_thread, function)
+
+
+def _on_one_thread(function: Callable[[Item], Result], item: Item) -> Result:
+    limit_threads(1)
+    return function(item)

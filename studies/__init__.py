@@ -1,0 +1,1 @@
+"""Studies of speed and quality, and the writers of the tables in README and docs; not part of the installed package."""

@@ -1,0 +1,83 @@
+"""Figures of the expected errors and of the sweep over the weights of the loss."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from polarnet.reports.figures import ReliabilityLine, Theme, chart_style, draw_reliability
+from polarnet.reports.tables import SET_TITLES
+
+SWEEP_SCORES = {
+    "mse": ("MSE ↓", -1, 4),
+    "psnr": ("PSNR ↑", 1, 2),
+    "ssim": ("SSIM ↑", 1, 3),
+    "lpips": ("LPIPS ↓", -1, 3),
+}
+"""Heading, 1 if higher is better and -1 if lower is, decimals."""
+
+
+def expected_errors_figure(seeds: Mapping[str, Mapping[str, Any]], theme: Theme) -> Figure:
+    """Measured against expected squared error of DoLP, a column per set of scenes and a line per seed.
+
+    `seeds` are the entries of docs/results/expected_errors.json by seed number.
+    """
+    sets = list(dict.fromkeys(name for found in seeds.values() for name in found["sets"]))
+    with matplotlib.rc_context(chart_style(theme)):
+        figure = Figure(figsize=(3.5 * len(sets), 3.2), layout="constrained", facecolor="none")
+        colours = matplotlib.rcParams["axes.prop_cycle"].by_key()["color"]
+        for axes, name in zip(figure.subplots(1, len(sets), squeeze=False)[0], sets, strict=True):
+            lines = [
+                ReliabilityLine(f"seed {seed}", colour, found["sets"][name]["curve"])
+                for (seed, found), colour in zip(seeds.items(), itertools.cycle(colours), strict=False)
+            ]
+            draw_reliability(axes, lines, theme)
+            axes.set_title(SET_TITLES[name], loc="left", fontsize=9)
+    return figure
+
+
+def loss_sweep_figure(points: Sequence[Mapping[str, Any]], theme: Theme) -> Figure:
+    """Test scores by the weights of Eq. 9: a row per score, a column per MSE weight, SSIM against LPIPS weights inside.
+
+    `points` are those of docs/results/sweep.json. Lighter is better, the best of a score is bold, and the frame marks
+    the point with the smallest validation MSE. Combinations that were not trained stay empty.
+    """
+    scores = [key for key in SWEEP_SCORES if any(key in point["test"] for point in points)]
+    mse, ssim, lpips = (sorted({point["weights"][name] for point in points}) for name in ("mse", "ssim", "lpips"))
+    chosen = min(points, key=lambda point: point["validation"]["mse"]["mean"])
+    with matplotlib.rc_context(chart_style(theme)):
+        size = (1.0 + 0.85 * len(lpips) * len(mse), 0.9 + (0.45 + 0.42 * len(ssim)) * len(scores))
+        figure = Figure(figsize=size, layout="constrained", facecolor="none")
+        for row, key in zip(figure.subplots(len(scores), len(mse), squeeze=False), scores, strict=True):
+            label, sign, decimals = SWEEP_SCORES[key]
+            values = {id(point): point["test"][key]["mean"] for point in points if key in point["test"]}
+            best = max(values.values(), key=lambda value: sign * value)
+            low, high = min(sign * value for value in values.values()), max(sign * value for value in values.values())
+            for axes, weight in zip(row, mse, strict=True):
+                image = np.full((len(ssim), len(lpips)), np.nan)
+                for point in points:
+                    if point["weights"]["mse"] != weight or id(point) not in values:
+                        continue
+                    i, j = ssim.index(point["weights"]["ssim"]), lpips.index(point["weights"]["lpips"])
+                    value = values[id(point)]
+                    image[i, j] = goodness = (sign * value - low) / (high - low) if high > low else 1.0
+                    axes.text(
+                        j, i, f"{value:.{decimals}f}", ha="center", va="center", fontsize=7,
+                        color="black" if goodness > 0.5 else "white", weight="bold" if value == best else "normal",
+                    )  # fmt: skip
+                    if point is chosen:
+                        frame = Rectangle((j - 0.46, i - 0.46), 0.92, 0.92, fill=False, color="#d6336c", linewidth=1.8)
+                        axes.add_patch(frame)
+                axes.imshow(image, cmap="cividis", vmin=0, vmax=1, aspect="auto")
+                axes.grid(False)
+                axes.set_xticks(range(len(lpips)), [f"{value:g}" for value in lpips])
+                axes.set_yticks(range(len(ssim)), [f"{value:g}" for value in ssim])
+                axes.set_title(f"{label}, loss.mse={weight:g}", loc="left", fontsize=8)
+            row[0].set_ylabel("loss.ssim")
+        for axes in figure.axes[-len(mse) :]:
+            axes.set_xlabel("loss.lpips")
+    return figure

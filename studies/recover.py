@@ -1,0 +1,169 @@
+"""How fast `polarnet recover` is: python -m studies.recover
+    [--write] [--weights FILE] [--precision auto|fp32|bf16] [--picture FILE]
+
+A window moves over a photograph of scikit-image; the events of its 120 x 180 pixels behind four polarizers, on a clock
+stretched so that 1 M of them come in a second, are recovered as the command does it: windows of 1/30 s, frames written
+as Zarr, PNG and video. `realtime_factor` is seconds of the stream in a second of work, writing included, and more than
+1 is faster than real time; `latency_ms` is the median of a step where windows come one by one, from the window's
+events in memory to DoLP and AoLP in memory. Methods: the network of --weights, else the shipped one, else one of
+params.yaml that nobody trained (which costs the same); the high-pass filter, with and without solved gains. Live, the
+stream comes through a pipe at its own pace from another process; its latency is that from the arrival of an event to
+the frame that it completes.
+
+`--write` merges the figures into docs/results/recordings.json under `recover`. `--picture` copies the pictures that
+the network made of the stream, the high-pass filter if nobody trained the network.
+"""
+
+import argparse
+import json
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from skimage import data
+
+from polarnet.config.pipeline import setup_of
+from polarnet.config.tree import Config, load
+from polarnet.events.representations import REPRESENTATIONS, channels_of
+from polarnet.events.stream import Events
+from polarnet.events.streaming import WindowRule
+from polarnet.methods import METHODS
+from polarnet.methods.dolp_network import dolp_recoverer
+from polarnet.methods.method import Recoverer
+from polarnet.networks.checkpoint import load_network
+from polarnet.networks.registry import NETWORKS
+from polarnet.networks.weights import shipped_weights
+from polarnet.recordings.arrangements import write_store
+from polarnet.recordings.live import LiveLines, Piece
+from polarnet.recovery.recover import Input, Summary, frames_of, recover
+from polarnet.recovery.writer import RecoveryWriter
+from polarnet.runtime.machine import precision_on, tune
+from polarnet.simulation import simulate
+from studies.measure import machine_record, uncommitted
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "docs" / "results" / "recordings.json"
+RATE = 1_000_000  # events a second of the four polarizers together
+WINDOWS = WindowRule(33_333, None, None)
+WRITTEN = ("zarr", "png", "mp4")
+UNTRAINED = ", untrained"
+FILTERS = ("highpass", "highpass+gain")
+CPU = torch.device("cpu")
+
+
+def stream_of_events(config: Config, seconds: float) -> list[Events]:
+    """Four channels of 120 x 180 pixels, `seconds` long, at `RATE`."""
+    picture = torch.from_numpy(data.coffee()).permute(2, 0, 1).float() / 255
+    motion = replace(config.synthesize, duration_s=seconds, window_height=120, window_width=180)
+    channels = simulate(picture, motion, config.emulate, seed=1).events
+    stretch = sum(map(len, channels)) / (RATE * seconds)
+    stretched = [replace(events, t=(events.t * stretch).long()) for events in channels]
+    return [replace(e, **{c: getattr(e, c)[e.t < seconds * 1e6] for c in "txyp"}) for e in stretched]
+
+
+def network_of(config: Config, weights: Path | None, precision: str) -> tuple[Recoverer, str]:
+    """The network to measure, and what it is."""
+    try:
+        weights = weights or shipped_weights()
+    except FileNotFoundError:
+        build, _ = NETWORKS[config.network]
+        representation = config.train.representation or build.representation
+        torch.manual_seed(config.seed)
+        module = build(config.network_config, 4 * channels_of(REPRESENTATIONS[representation]))
+        return dolp_recoverer(module, {"representation": representation}, CPU, precision), config.network + UNTRAINED
+    network, metadata = load_network(weights)
+    return dolp_recoverer(network, metadata, CPU, precision), metadata["network"]
+
+
+def latency_ms(channels: Sequence[Events], recoverer: Recoverer) -> float:
+    """The median of a step when windows come one by one."""
+    source = Input("stream", channels[0].height, channels[0].width, [piece_of(channels)], None)
+    return 1000 * statistics.median(frame.step_s for frame in frames_of(source, WINDOWS, recoverer, pixels_at_once=1))
+
+
+def piece_of(channels: Sequence[Events]) -> Piece:
+    """All events at once."""
+    return Piece(channels, max(int(events.t[-1]) for events in channels) + 1, time.perf_counter())
+
+
+def measured(channels: Sequence[Events], recoverer: Recoverer, out: Path) -> tuple[Summary, Path]:
+    """A run of the command's own loop over events in memory, and the pictures it left."""
+    piece = piece_of(channels)
+    source = Input("stream", channels[0].height, channels[0].width, [piece], piece.until_us)
+    writer = RecoveryWriter(out, WRITTEN, 30.0)
+    summary = recover(source, WINDOWS, recoverer, writer)
+    writer.write_page("stream", {}, [])
+    return summary, out / "recovered.png"
+
+
+def measured_live(store: Path, recoverer: Recoverer, out: Path) -> Summary:
+    """The same, as lines come through a pipe from another process at their own pace."""
+    command = [sys.executable, "-m", "polarnet.cli", "replay", str(store), "stream"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as camera:
+        assert camera.stdout is not None
+        lines = LiveLines(camera.stdout, "pipe", None, idle_s=0.0)
+        source = Input("pipe", lines.height, lines.width, lines, None)
+        return recover(source, WINDOWS, recoverer, RecoveryWriter(out, ("zarr", "mp4"), 30.0))
+
+
+def figures_of(summary: Summary, step_ms: float) -> dict[str, float]:
+    """What is reported of a run, and of a step when windows come one by one."""
+    return {"realtime_factor": round(summary.realtime_factor, 3), "latency_ms": round(step_ms, 2)}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
+    parser.add_argument("--weights", type=Path, help="of the network")
+    parser.add_argument("--precision", choices=("auto", "fp32", "bf16"), default="auto", help="of the network")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of the stream")
+    parser.add_argument("--picture", type=Path, help="where to copy the pictures of a run")
+    arguments = parser.parse_args()
+    if arguments.write and (changed := uncommitted(ROOT)):
+        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    config = load(ROOT)
+    tune()
+    figures: dict[str, Any] = machine_record(ROOT)
+    channels = stream_of_events(config, arguments.seconds)
+    precision = precision_on(CPU, arguments.precision)
+    network, name = network_of(config, arguments.weights, precision)
+    recoverers = {"network": network}
+    for name_of_filter in FILTERS:
+        method = METHODS[name_of_filter]
+        recoverers[name_of_filter] = method.open(replace(setup_of(config, method), device=CPU))
+    count = sum(map(len, channels))
+    figures |= {"network": name, "precision": precision, "events": count, "seconds": arguments.seconds, "methods": {}}
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        pictures = {}
+        for key, recoverer in recoverers.items():
+            summary, pictures[key] = measured(channels, recoverer, folder / key)
+            figures["methods"][key] = figures_of(summary, latency_ms(channels, recoverer))
+            print(key, asdict(summary), flush=True)
+        write_store(folder / "events.zarr", {"stream": channels})
+        for key in ("network", "highpass"):
+            summary = measured_live(folder / "events.zarr", recoverers[key], folder / f"{key}_live")
+            figures["methods"][key]["live_latency_ms"] = round(summary.latency_ms or 0.0, 1)
+            print(f"{key}, live", asdict(summary), flush=True)
+        if arguments.picture:
+            shutil.copy(pictures["highpass" if name.endswith(UNTRAINED) else "network"], arguments.picture)
+    figures |= figures["methods"]["network"]
+    print(json.dumps(figures, indent=2))
+    if arguments.write:
+        known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+        RESULTS.parent.mkdir(parents=True, exist_ok=True)
+        RESULTS.write_text(json.dumps(known | {"recover": figures}, indent=2) + "\n")
+        print(f"written to {RESULTS.relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""Which scenes to train on: trainings held against each other without the test split.
+
+python -m studies.scenes --photographs FOLDER --work FOLDER [--seeds N] [--threads N] [--write]
+
+The photographs that the study's test split has are left out first (`studies/study.py`). The others are split
+anew, a third of them to score on, and the pipeline's stages make each choice's scenes, train polarnet on them and score
+it. So a choice is made without the study's test photographs, and on more scenes than its validation split has. What is
+there already in the folder --work is not made again. --write puts the scores into docs/results/scenes.json.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from polarnet.pictures.manifest import read_manifest
+from studies.measure import ABLATION_KEYS, machine_record, uncommitted, write_section
+
+ROOT = Path(__file__).resolve().parents[1]
+HELD_OUT = 1 / 3  # of the photographs that are left
+
+
+class Choice(NamedTuple):
+    """What is compared: how the scenes are made."""
+
+    about: str
+    synthesis: tuple[str, ...] = ()
+
+
+SHORT = ("train.epochs=1",)
+"""Of all trainings here, as of the ablation's."""
+CHOICES = {
+    "shipped": Choice("`experiment=photographs`: three further scenes of each photograph, a third of them evened."),
+    "none_evened": Choice("Three further scenes, none evened.", ("variation.uniform_share=0",)),
+}
+
+
+def stage(name: str, arguments: argparse.Namespace, data: Path, *overrides: str) -> None:
+    """Run one stage of the pipeline on the data of one choice."""
+    common = (
+        "experiment=photographs", "loss.lpips=0", f"paths.data={data}", f"paths.cache={arguments.work / 'cache'}",
+        f"runtime.threads={arguments.threads}",
+    )  # fmt: skip
+    subprocess.run([sys.executable, "-m", f"stages.{name}", *common, *overrides], cwd=ROOT, check=True)
+
+
+def without_test_split(arguments: argparse.Namespace) -> Path:
+    """A folder of links to the photographs that the study's test split does not have."""
+    data = arguments.work / "all"
+    stage("ingest", arguments, data, f"ingest.root={arguments.photographs}")
+    folder = arguments.work / "photographs"
+    folder.mkdir(exist_ok=True)
+    for entry in read_manifest(data / "images").pictures:
+        link = folder / entry.origin.replace("/", "_")
+        if entry.split != "test" and not link.exists():
+            link.symlink_to(arguments.photographs / entry.origin)
+    return folder
+
+
+def scored(name: str, seed: int, photographs: Path, arguments: argparse.Namespace) -> dict[str, Any]:
+    """The scores of a choice and of the oracle mean on the photographs held out here, trained from a seed."""
+    choice, run = CHOICES[name], f"{name}_{seed}"
+    data, results, trained = (arguments.work / folder for folder in (name, f"benchmark_{run}", f"train_{run}"))
+    fractions = (f"ingest.root={photographs}", f"ingest.test_fraction={HELD_OUT}")
+    if not (data / "weights" / "loss.json").exists():
+        for step in ("ingest", "synthesize", "emulate", "weights"):
+            stage(step, arguments, data, *fractions, *choice.synthesis)
+    if not (results / "metrics.json").exists():
+        paths = (f"paths.train={trained}", f"paths.benchmark={results}")
+        resume = f"paths.resume={arguments.work / 'resume' / run}"
+        stage("train", arguments, data, f"seed={seed}", *SHORT, *paths, resume)
+        stage("benchmark", arguments, data, "benchmark.methods=[oracle_mean,ours]", *paths)
+    metrics = json.loads((results / "metrics.json").read_text())
+    return {row: {key: scores.get(key) for key in ABLATION_KEYS} for row, scores in metrics.items()}
+
+
+def parsed() -> argparse.Namespace:
+    """The command line, with paths as every working directory understands them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--photographs", type=Path, required=True)
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--seeds", type=int, default=2, help="trainings of each choice")
+    parser.add_argument("--threads", type=int, default=0, help="0: all cores")
+    parser.add_argument("--write", action="store_true", help="write docs/results/scenes.json")
+    arguments = parser.parse_args()
+    if arguments.write and uncommitted(ROOT):
+        parser.error("the tree has uncommitted changes; commit them first, the figures name a commit")
+    arguments.photographs, arguments.work = arguments.photographs.resolve(), arguments.work.resolve()
+    return arguments
+
+
+def main() -> None:
+    """Train and score every choice, print and perhaps write."""
+    arguments = parsed()
+    record = machine_record(ROOT)
+    photographs = without_test_split(arguments)
+    found: dict[str, Any] = {}
+    for seed in range(1, arguments.seeds + 1):
+        for name, choice in CHOICES.items():
+            scores = scored(name, seed, photographs, arguments)
+            row = found.setdefault(name, {"about": choice.about, "seeds": []})
+            row["seeds"].append(scores["ours"])
+            found["oracle_mean"] = {"about": "Each frame's own mean.", "seeds": [scores["oracle_mean"]]}
+            print(name, seed, json.dumps(scores["ours"]), flush=True)
+    if arguments.write:
+        print(write_section(ROOT, "scenes", "choices", {"overrides": SHORT, "rows": found}, record))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,250 @@
+"""A simulated rig (paper, section 4): a scene moves across a CeleX-5 eight times, giving eight files with their truth.
+
+The module imports `simulation`, which makes the light and the events, and `recordings`, which knows the file formats.
+Those two packages never import each other. The readers of the files know nothing of this module.
+
+The scene drifts from right to left at constant speed. A bright stripe runs above it, and a dark landmark enters on the
+stripe from the right. Until then the region in the upper right corner is bright. Each capture starts at a random time
+before the landmark.
+"""
+
+import dataclasses
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int64, UInt16
+from torch import Tensor
+
+from polarnet import stokes
+from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
+from polarnet.events.stream import Events, merge
+from polarnet.recordings.formats.celex5 import HEIGHT, WHITE, WIDTH
+from polarnet.recordings.formats.celex5_csv import write_celex5_csv
+from polarnet.runtime.machine import generator_for, seed_for
+from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory, render
+from polarnet.simulation.moving_sensor import emulate_motion
+from polarnet.simulation.scene import PolarizationScene
+from studies.celex5_bin_writer import write_celex5_bin, write_celex5_pictures
+
+STRIPE_S0, LANDMARK_S0 = 0.8, 0.04  # unpolarized
+SHORTEST_DELAY_S = 0.08  # from the start of a capture to the landmark
+HOT_HZ = (1500.0, 3000.0)
+BORDER = 2  # margin of the scene around the area that the sensor sees, in pixels
+_STILL = Sine(0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class RigConfig:
+    """Motion of the rig and noise of its camera; RecordingsConfig gives sensor, region, crop and size."""
+
+    speed_px_s: float = field(metadata=allowed(above=0))
+    """Speed of the image on the sensor, in sensor pixels per second."""
+    longest_delay_s: float = field(metadata=allowed(above=SHORTEST_DELAY_S))
+    """Maximum time from the random start of a capture to the landmark."""
+    duration_s: float = field(metadata=allowed(above=0))
+    """Duration of a capture after the landmark."""
+    picture_rate_hz: float = field(metadata=allowed(above=0))
+    full_well_electrons: float = field(metadata=allowed(above=0))
+    """Electrons collected by a white pixel of an intensity capture; sets the shot noise."""
+    read_noise: float = field(metadata=allowed(low=0))
+    """Read noise of an intensity image, in steps of 12 bits."""
+    hot_pixels: int = field(metadata=allowed(low=0))
+    """Number of hot pixels, the same in all four event captures; each fires a few thousand times a second."""
+    file_type: str = field(metadata=allowed(choices=("bin", "csv")))
+    """File type of the event captures; intensity captures are always BIN."""
+
+    def __post_init__(self):
+        check_ranges(self)
+
+
+class RigTruth(NamedTuple):
+    """Truth for the eight files of a target."""
+
+    start_us: Mapping[str, int]
+    """Time on each capture's own clock at which the mean of the landmark's region falls below the dark level."""
+    hot: frozenset[tuple[int, int]]
+    """(row, column) of each hot pixel."""
+    scene: PolarizationScene
+    """Scene that the sensor moves over, including stripe and landmark."""
+    path: "Drift"
+    landmark_us: int
+    """Time of the landmark on the clock of the motion."""
+
+
+class Drift(Trajectory):
+    """Motion of the sensor to the right at constant speed; x is its position at time 0."""
+
+    def pose(self, t_s: Float64[np.ndarray, "*n"]) -> Pose:
+        """Pose of the sensor at times in seconds."""
+        still = np.zeros_like(t_s)
+        return Pose(self.x + self.speed_px_s * t_s, self.y + still, still, still + 1)
+
+
+def write_rig(
+    folder: str | os.PathLike[str],
+    picture: PolarizationScene,
+    config: RigConfig,
+    recordings: RecordingsConfig,
+    emulator: EmulatorConfig,
+    seed: int,
+    threads: int = 1,
+) -> RigTruth:
+    """Write the eight captures of a target into `folder`, with truth.json and truth.npz, and return the truth.
+
+    `picture` is enlarged to the area that the moving sensor sees. All random values depend on the seed and the folder's
+    name only.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    name, (height, width) = folder.name, recordings.sensor
+    scene, path = rig_scene(picture, config, recordings)
+    landmark_us = _landmark_us(scene, path, recordings)
+    total_us = landmark_us + round(config.duration_s * 1e6)
+    generator = generator_for(seed, name, "rig")
+    captures = (*EVENT_CAPTURES, *INTENSITY_CAPTURES)
+    delays_s = generator.uniform(SHORTEST_DELAY_S, config.longest_delay_s, len(captures))
+    start_us = {capture: round(delay * 1e6) for capture, delay in zip(captures, delays_s, strict=True)}
+
+    channels = emulate_motion(scene, path, total_us, height, width, emulator, seed_for(seed, name, "emulate"), threads)
+    hot = _random_pixels(config.hot_pixels, recordings, generator)
+    for capture, events in zip(EVENT_CAPTURES, channels, strict=True):
+        noisy = merge([events, _hot_events(hot, total_us, height, width, generator)])
+        begin_us = landmark_us - start_us[capture]
+        later = noisy.t >= begin_us
+        seen = Events(
+            noisy.t[later] - begin_us, noisy.x[later], noisy.y[later], noisy.p[later], height, width
+        )  # fmt: skip
+        write = write_celex5_bin if config.file_type == "bin" else write_celex5_csv
+        write(folder / f"{capture}.{config.file_type}", seen)
+    for polarizer, capture in enumerate(INTENSITY_CAPTURES):
+        begin_us = landmark_us - start_us[capture]
+        count = int((total_us - begin_us) * 1e-6 * config.picture_rate_hz)
+        t_us = np.rint((np.arange(count) + generator.uniform()) * 1e6 / config.picture_rate_hz).astype(np.int64)
+        t_us = t_us[t_us + begin_us <= total_us]
+        pictures = _pictures(scene, path, t_us + begin_us, polarizer, config, recordings, generator)
+        write_celex5_pictures(folder / f"{capture}.bin", pictures, t_us.tolist())
+
+    truth = RigTruth(start_us, hot, scene, path, landmark_us)
+    _write_truth(folder, truth, config, recordings)
+    return truth
+
+
+def rig_scene(
+    picture: PolarizationScene, config: RigConfig, recordings: RecordingsConfig
+) -> tuple[PolarizationScene, Drift]:
+    """Scene that the sensor moves over, including stripe and landmark, and the motion."""
+    height, width = recordings.sensor
+    before = config.speed_px_s * config.longest_delay_s
+    total = BORDER + width + int(before + config.speed_px_s * config.duration_s) + BORDER
+    planes = np.ascontiguousarray(picture.stokes.permute(1, 2, 0).numpy())
+    scene = cv2.resize(planes, (total, height + 2 * BORDER), interpolation=cv2.INTER_LINEAR).transpose(2, 0, 1).copy()
+    stripe = BORDER + recordings.region[0] + BORDER
+    scene[:, :stripe] = np.array([STRIPE_S0, 0, 0], np.float32)[:, None, None]
+    entry = round(BORDER + width + before)  # the landmark's edge reaches the right border after longest_delay_s
+    scene[:, :stripe, entry:] = np.array([LANDMARK_S0, 0, 0], np.float32)[:, None, None]
+    path = Drift(
+        BORDER + (width - 1) / 2, BORDER + (height - 1) / 2,
+        (_STILL,) * HARMONICS, (_STILL,) * HARMONICS, _STILL, _STILL, config.speed_px_s,
+    )  # fmt: skip
+    return PolarizationScene(torch.from_numpy(scene)), path
+
+
+def true_intensity(
+    truth: RigTruth, t_us: Int64[np.ndarray, " n"], recordings: RecordingsConfig
+) -> Float32[Tensor, "n 4 h w"]:
+    """Noiseless intensities in [0, 1] of the reduced crop behind each polarizer; times count from the landmark."""
+    (height, width), (top, left) = recordings.crop, recordings.crop_corner
+    # offset from the centre of the sensor to the centre of the crop
+    right, down = left + (width - recordings.sensor[1]) / 2, top + (height - recordings.sensor[0]) / 2
+    path = dataclasses.replace(truth.path, x=truth.path.x + right, y=truth.path.y + down)
+    frames = []
+    for t in t_us.tolist():
+        seen = render(truth.scene, path, np.array([(t + truth.landmark_us) * 1e-6]), height, width)[0]
+        planes = np.ascontiguousarray(stokes.intensities_from_stokes(seen).clamp(0, 1).permute(1, 2, 0).numpy())
+        small = cv2.resize(planes, tuple(recordings.size[::-1]), interpolation=cv2.INTER_AREA)
+        frames.append(torch.from_numpy(small).permute(2, 0, 1))
+    return torch.stack(frames)
+
+
+def true_dolp(truth: RigTruth, t_us: Int64[np.ndarray, " n"], recordings: RecordingsConfig) -> Float32[Tensor, "n h w"]:
+    """DoLP of `true_intensity`."""
+    return stokes.dolp(stokes.stokes_from_intensities(true_intensity(truth, t_us, recordings))).clamp(0, 1)
+
+
+def _landmark_us(scene: PolarizationScene, path: Drift, recordings: RecordingsConfig) -> int:
+    """Time on the clock of the motion at which the noiseless mean of the region falls below the dark level."""
+    height, width = recordings.region
+    profile = scene.stokes[0, BORDER : BORDER + height].double().mean(0).numpy() / 2 * 255
+    right = path.x + (recordings.sensor[1] - 1) / 2
+    t_us = np.arange(0, int(1e6 * (scene.width - 1 - right) / path.speed_px_s), 10)
+    columns = right + path.speed_px_s * t_us * 1e-6
+    mean = sum(np.interp(columns - k, np.arange(scene.width), profile) for k in range(width)) / width
+    return int(t_us[np.argmax(mean < recordings.dark_level)])
+
+
+def _pictures(
+    scene: PolarizationScene,
+    path: Drift,
+    t_us: Int64[np.ndarray, " n"],
+    polarizer: int,
+    config: RigConfig,
+    recordings: RecordingsConfig,
+    generator: np.random.Generator,
+) -> Iterator[UInt16[np.ndarray, "800 1280"]]:
+    height, width = recordings.sensor
+    for t in t_us:
+        seen = render(scene, path, np.array([t * 1e-6]), height, width)[0]
+        light = stokes.intensities_from_stokes(seen)[polarizer].clamp(0, 1).numpy()
+        electrons = light * config.full_well_electrons
+        noise = np.hypot(np.sqrt(electrons) * (WHITE / config.full_well_electrons), config.read_noise)
+        values = light * WHITE + noise * generator.standard_normal(light.shape, dtype=np.float32)
+        whole = np.zeros((HEIGHT, WIDTH), np.uint16)
+        whole[:height, :width] = np.clip(np.rint(values), 0, WHITE)
+        yield whole
+
+
+def _random_pixels(
+    count: int, recordings: RecordingsConfig, generator: np.random.Generator
+) -> frozenset[tuple[int, int]]:
+    rows, columns = (generator.integers(0, side, count).tolist() for side in recordings.sensor)
+    return frozenset(zip(rows, columns, strict=True))
+
+
+def _hot_events(
+    hot: frozenset[tuple[int, int]], total_us: int, height: int, width: int, generator: np.random.Generator
+) -> Events:
+    times, pixels = [np.empty(0, np.int64)], [np.empty((0, 2), np.int16)]
+    for pixel in sorted(hot):
+        count = generator.poisson(generator.uniform(*HOT_HZ) * total_us * 1e-6)
+        times.append(generator.integers(0, total_us, count))
+        pixels.append(np.tile(np.array(pixel, np.int16), (count, 1)))
+    t, yx = np.concatenate(times), np.concatenate(pixels)
+    order = np.argsort(t, kind="stable")
+    p = np.where(generator.random(len(t)) < 0.5, np.int8(1), np.int8(-1))
+    y, x = np.ascontiguousarray(yx[order].T)
+    from_numpy = torch.from_numpy
+    return Events(from_numpy(t[order]), from_numpy(x), from_numpy(y), from_numpy(p), height, width)
+
+
+def _write_truth(folder: Path, truth: RigTruth, config: RigConfig, recordings: RecordingsConfig) -> None:
+    count = int(config.duration_s * recordings.frame_rate_hz) + 1
+    t_us = np.rint(np.arange(count) * 1e6 / recordings.frame_rate_hz).astype(np.int64)
+    dolp = true_dolp(truth, t_us, recordings).numpy()
+    np.savez(folder / "truth.npz", t_us=t_us, dolp=dolp)
+    content = {
+        "start_us": dict(truth.start_us),
+        "speed_px_s": config.speed_px_s,
+        "hot_pixels": sorted(truth.hot),
+        "mean_dolp": round(float(dolp.mean()), 6),
+        "dolp": "truth.npz: t_us from the landmark on, dolp of each of these times",
+    }
+    (folder / "truth.json").write_text(json.dumps(content, indent=2) + "\n")

@@ -1,0 +1,282 @@
+"""The pictures of docs/simulation.md: python -m studies.simulation_pictures [FOLDER]
+
+Every line and every event in them comes from the simulation itself.
+"""
+
+import argparse
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+import torch
+from jaxtyping import Float64
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from PIL import Image
+
+from polarnet.events.stream import Events, slice_time
+from polarnet.pictures.builtin import BUILTIN_PHOTOS
+from polarnet.pictures.images import read_rgb
+from polarnet.reports.figures import LIGHT, chart_style, show_picture
+from polarnet.reports.maps import event_image
+from polarnet.reports.overview import OFF, ON
+from polarnet.reports.png import png
+from polarnet.simulation.emulator import EmulatorConfig, emulate
+from polarnet.simulation.motion import MotionConfig, Trajectory, random_trajectory, sensor_to_scene
+from polarnet.simulation.moving_sensor import emulate_motion
+from polarnet.simulation.presets import MOTIONS, SENSORS
+from polarnet.simulation.scene import scene_from_rgb
+
+FOLDER = Path("docs") / "pictures"
+PHOTO = "coffee.png"
+DURATION_MS = 500
+RATE_HZ = 2000.0  # sampling rate of the light on the pixel
+PIXELS = 12  # number of pixels side by side under the same light, to show their differences
+QUIET = replace(SENSORS["clean"], contrast_threshold_sigma=0.0)
+WINDOW_US = (200_000, 233_333)
+COLOURS = 96  # palette size of a picture on disk
+LINE: dict[str, Any] = {"color": LIGHT.quiet, "linewidth": 1.3}
+
+
+class Variation(NamedTuple):
+    """A parameter of the pixel, and its values in a picture."""
+
+    title: str
+    name: str
+    values: tuple[float, ...]
+    unit: str
+
+
+VARIATIONS = (
+    Variation("contrast threshold", "contrast_threshold", (0.1, 0.2, 0.4), ""),
+    Variation("photoreceptor bandwidth", "cutoff_hz", (0.0, 100.0, 20.0), " Hz"),
+    Variation("refractory period", "refractory_period_us", (0.0, 5_000.0, 30_000.0), " µs"),
+    Variation("leak", "leak_rate_hz", (0.0, 5.0, 20.0), " Hz"),
+    Variation("shot noise", "shot_noise_rate_hz", (0.0, 20.0, 80.0), " Hz"),
+)
+SETTINGS: Mapping[str, dict[str, Any]] = {
+    "noiseless": {},
+    "threshold 0.1": {"contrast_threshold_on": 0.1, "contrast_threshold_off": 0.1},
+    "threshold 0.4": {"contrast_threshold_on": 0.4, "contrast_threshold_off": 0.4},
+    "mismatch 0.08": {"contrast_threshold_sigma": 0.08},
+    "bandwidth 20 Hz": {"cutoff_hz": 20.0},
+    "refractory 20 ms": {"refractory_period_us": 20_000.0},
+    "leak 5 Hz": {"leak_rate_hz": 5.0},
+    "shot noise 10 Hz": {"shot_noise_rate_hz": 10.0},
+    "all of v2e's noise": {
+        "contrast_threshold_sigma": 0.03,
+        "cutoff_hz": 300.0,
+        "leak_rate_hz": 0.01,
+        "leak_jitter": 0.1,
+        "noise_rate_cov_decades": 0.1,
+        "shot_noise_rate_hz": 0.001,
+        "refractory_period_us": 500.0,
+    },
+    "v2e": {"model": "v2e"},
+    "esim": {"model": "esim"},
+    "dvs_voltmeter": {"model": "dvs_voltmeter"},
+}
+"""Tiles of the window picture: the changes of each to a noiseless `exact` pixel."""
+
+
+def light_of_one_pixel(t_ms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """Light on one pixel in digital numbers: a slow swell, a quick flash, then steady dim light."""
+    swell = 0.7 * (1 - np.cos(2 * math.pi * t_ms.clip(0, 180) / 180)) / 2
+    flash = (_edge(t_ms, 230.0) - _edge(t_ms, 290.0)) * 1.3
+    return 69 * np.exp(swell + flash - 0.6 * _edge(t_ms, 340.0))
+
+
+def _edge(t_ms: Float64[np.ndarray, " n"], at_ms: float) -> Float64[np.ndarray, " n"]:
+    return ((t_ms - at_ms) / 6).clip(0, 1)
+
+
+def pixel_events(config: EmulatorConfig, rate_hz: float = RATE_HZ, pixels: int = 1) -> Events:
+    """Events of neighbouring pixels under the light of `light_of_one_pixel`."""
+    t_us = np.rint(np.arange(1 + DURATION_MS * 1e-3 * rate_hz) * 1e6 / rate_hz)
+    frames = torch.from_numpy(light_of_one_pixel(t_us / 1000).astype(np.float32))
+    (events,), _ = emulate(frames[:, None, None, None].expand(-1, 1, 1, pixels), torch.from_numpy(t_us), config, key=3)
+    return events
+
+
+def parameters_figure() -> Figure:
+    """Draw one pixel's events for several values of each physical parameter."""
+    t_ms = np.linspace(0, DURATION_MS, 2001)
+    with matplotlib.rc_context(chart_style(LIGHT)):
+        figure = Figure(figsize=(9.0, 5.2), layout="constrained", facecolor=LIGHT.face)
+        panels = figure.subplots(2, 3, sharex=True).ravel()
+        for axes, variation in zip(panels, VARIATIONS, strict=False):
+            _light(axes, t_ms, variation.title)
+            for row, value in enumerate(variation.values):
+                _ticks(axes, pixel_events(_with(QUIET, variation.name, value)), row)
+            off = "∞ Hz" if variation.name == "cutoff_hz" else f"0{variation.unit}"
+            _rows(axes, [f"{value:g}{variation.unit}" if value else off for value in variation.values])
+        _light(panels[-1], t_ms, "mismatch 0.05: twelve pixels, one light")
+        events = pixel_events(replace(QUIET, contrast_threshold_sigma=0.05), pixels=PIXELS)
+        for pixel in range(PIXELS):
+            _ticks(panels[-1], _of_pixel(events, pixel), 3 * pixel / PIXELS, 2.4 / PIXELS)
+        panels[-1].set_yticks([])
+        for axes in panels[3:]:
+            axes.set_xlabel("ms")
+    return figure
+
+
+def crossings_figure() -> Figure:
+    """Draw the threshold crossings of log intensity, and their times by `exact` and `v2e`, from frames at 60 Hz."""
+    rate_hz, threshold = 60.0, QUIET.contrast_threshold_on
+    frames_ms = np.arange(0, 200, 1000 / rate_hz)
+    t_ms = np.linspace(0, frames_ms[-1], 2001)
+    log = np.interp(t_ms, frames_ms, np.log(light_of_one_pixel(frames_ms)))
+    with matplotlib.rc_context(chart_style(LIGHT)):
+        figure = Figure(figsize=(9.0, 2.9), layout="constrained", facecolor=LIGHT.face)
+        curve, stamps = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+        curve.plot(t_ms, log, **LINE)
+        curve.plot(frames_ms, np.log(light_of_one_pixel(frames_ms)), "o", color=LIGHT.text, markersize=3)
+        events = slice_time(pixel_events(QUIET, rate_hz), 0, int(1000 * t_ms[-1]))
+        for t, p in zip(events.t.numpy() / 1000, events.p.numpy(), strict=True):
+            level = float(np.interp(t, t_ms, log))
+            curve.plot([0, t], [level, level], color=LIGHT.grid, linewidth=0.8, zorder=0)
+            curve.plot([t], [level], "^" if p > 0 else "v", color=ON if p > 0 else OFF, markersize=6)
+        curve.set_ylabel("ln light")
+        curve.set_title(
+            f"a step of {threshold:g} in log light is an event; dots: frames at 60 Hz", loc="left", fontsize=9
+        )
+        curve.grid(axis="y", visible=False)
+        for row, model in enumerate(("exact", "v2e")):
+            shown = slice_time(pixel_events(replace(QUIET, model=model), rate_hz), 0, int(1000 * t_ms[-1]))
+            _ticks(stamps, shown, row, 0.7)
+        stamps.set_yticks([0.35, 1.35], ["exact", "v2e"])
+        stamps.set(ylim=(1.9, -0.2), xlabel="ms", xlim=(0, t_ms[-1]))
+        stamps.grid(visible=False)
+    return figure
+
+
+def window_figure() -> Figure:
+    """Draw one thirtieth of a second of the coffee photograph's events, behind the polarizer at 0 degrees."""
+    scene = scene_from_rgb(read_rgb(_photo()))
+    motion = replace(MOTIONS["default"], window_height=100, window_width=150, speed_min_px_s=150.0)
+    trajectory = random_trajectory(motion, scene.height, scene.width, np.random.default_rng(4))
+    columns, rows = 4, 3
+    with matplotlib.rc_context(chart_style(LIGHT)):
+        figure = Figure(figsize=(9.0, 5.1), layout="constrained", facecolor=LIGHT.face)
+        panels = figure.subplots(rows, columns).ravel()
+        for axes, (label, changes) in zip(panels, SETTINGS.items(), strict=True):
+            config = replace(QUIET, **changes)
+            events = emulate_motion(scene, trajectory, WINDOW_US[1], 100, 150, config, key=1)[0]
+            window = slice_time(events, *WINDOW_US)
+            show_picture(axes, event_image(_counts(window), 3.0), LIGHT)
+            axes.set_title(label, loc="left", fontsize=9)
+            axes.set_xlabel(f"{len(window):,} events", color=LIGHT.quiet, fontsize=7)
+    return figure
+
+
+def motion_figure() -> Figure:
+    """Draw the sensor's path over a picture for several values of the motion parameters."""
+    picture = read_rgb(_photo()).permute(1, 2, 0).numpy()
+    default = MOTIONS["default"]
+    slow = replace(default, speed_min_px_s=40.0, speed_max_px_s=50.0)
+    fast = replace(default, speed_min_px_s=250.0, speed_max_px_s=300.0, acceleration_max_px_s2=4000.0)
+    motions = {
+        "40 to 50 px/s": slow,
+        "250 to 300 px/s": fast,
+        "rotation up to 40°": replace(default, rotation_max_deg=40.0),
+        "zoom up to 2.5": replace(default, zoom_max=2.5),
+    }
+    with matplotlib.rc_context(chart_style(LIGHT)):
+        figure = Figure(figsize=(9.0, 1.75), layout="constrained", facecolor=LIGHT.face)
+        for axes, (label, motion) in zip(figure.subplots(1, 4), motions.items(), strict=True):
+            show_picture(axes, picture[::2, ::2], LIGHT)
+            axes.images[0].set_extent((-0.5, picture.shape[1] - 0.5, picture.shape[0] - 0.5, -0.5))
+            trajectory = random_trajectory(motion, picture.shape[0], picture.shape[1], np.random.default_rng(4))
+            _way(axes, trajectory, motion)
+            axes.set_title(label, loc="left", fontsize=9)
+    return figure
+
+
+def _way(axes: Axes, trajectory: Trajectory, motion: MotionConfig) -> None:
+    """Draw the path of the sensor's centre over a second, and its outline at five times, the last one strongest."""
+    pose = trajectory.pose(np.linspace(0, motion.duration_s, 200))
+    axes.plot(pose.x, pose.y, color="white", linewidth=1.6)
+    height, width = motion.window_height, motion.window_width
+    for k, place in enumerate(np.linspace(0, 199, 5).astype(int)):
+        left, top, along, across = sensor_to_scene(*(float(v[place]) for v in pose), height, width)
+        columns, rows = np.array([[0, 1, 1, 0, 0], [0, 0, 1, 1, 0]]) * np.array([[width - 1], [height - 1]])
+        axes.plot(left + columns * along - rows * across, top + columns * across + rows * along, color="white",
+                  linewidth=1.0, alpha=0.3 + 0.7 * k / 4)  # fmt: skip
+
+
+def _light(axes: Axes, t_ms: Float64[np.ndarray, " n"], title: str) -> None:
+    """Draw log light on the upper half of a panel; rows of events come below."""
+    log = np.log(light_of_one_pixel(t_ms))
+    axes.plot(t_ms, -0.3 - 2.2 * (log - log.min()) / np.ptp(log), **LINE)
+    axes.set_title(title, loc="left", fontsize=9)
+    axes.set(ylim=(3.2, -2.8), xlim=(0, DURATION_MS))
+    axes.grid(visible=False)
+    axes.tick_params(axis="y", length=0)
+
+
+def _rows(axes: Axes, labels: Sequence[str]) -> None:
+    axes.set_yticks([row + 0.4 for row in range(len(labels))], list(labels))
+
+
+def _ticks(axes: Axes, events: Events, row: float | int, height: float = 0.8) -> None:
+    for polarity, colour in ((1, ON), (-1, OFF)):
+        t_ms = events.t[events.p == polarity].numpy() / 1000
+        axes.vlines(t_ms, row, row + height, color=colour, linewidth=1.1)
+
+
+def _of_pixel(events: Events, pixel: int) -> Events:
+    mine = events.x == pixel
+    return Events(events.t[mine], events.x[mine], events.y[mine], events.p[mine], events.height, events.width)
+
+
+def _counts(events: Events) -> torch.Tensor:
+    pixel = events.y.long() * events.width + events.x.long()
+    counts = torch.zeros(events.height * events.width).index_add_(0, pixel, events.p.float())
+    return counts.view(events.height, events.width)
+
+
+def _with(config: EmulatorConfig, name: str, value: float) -> EmulatorConfig:
+    names = [f"{name}_on", f"{name}_off"] if name == "contrast_threshold" else [name]
+    changed: dict[str, Any] = dict.fromkeys(names, value)
+    return replace(config, **changed)
+
+
+def _photo() -> Path:
+    return next(photo.path for photo in BUILTIN_PHOTOS if photo.file == PHOTO)
+
+
+def few_colours(content: bytes) -> bytes:
+    """Reduce the picture to a palette: a third of the bytes, without a visible difference."""
+    buffer = io.BytesIO()
+    picture = Image.open(io.BytesIO(content)).convert("RGB")
+    picture.quantize(COLOURS, dither=Image.Dither.NONE).save(buffer, format="png", optimize=True)
+    return buffer.getvalue()
+
+
+FIGURES = {
+    "simulation_parameters": parameters_figure,
+    "simulation_crossings": crossings_figure,
+    "simulation_window": window_figure,
+    "simulation_motion": motion_figure,
+}
+
+
+def main() -> None:
+    """Write all pictures."""
+    parser = argparse.ArgumentParser(description="Draw the pictures of docs/simulation.md.")
+    parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help=f"default: {FOLDER}")
+    folder = parser.parse_args().folder
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in FIGURES.items():
+        path = folder / f"{name}.png"
+        path.write_bytes(few_colours(png(figure())))
+        print(f"{path}: {path.stat().st_size / 1024:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,227 @@
+"""How fast the networks train and run: python -m studies.training [--write] [--rounds N] [--device cuda]
+
+Frames (four polarizers, 120 x 180 pixels) a second. Training: forward and backward through batches of sequences, the
+squares of the outputs as loss, without optimizer and data loading. Inference: one stream, the state carried on. Weights
+and inputs are random. Every network of `params.yaml` that there is a class for is measured, with
+
+- `naive`: float32, images as torch makes them (contiguous NCHW), a window at a time, torch as it starts;
+- `shipped`: channels_last, a run of windows at once, `train.precision`'s `auto`; in training with the settings of
+  `polarnet.runtime.machine.configure`, as in stages; in inference as many windows as `polarnet recover` takes from a
+  file;
+- `compiled` (with --compile): `shipped` through torch.compile, which needs a C++ compiler; a network that it fails for
+  has no such row.
+
+Each is measured in a process of its own, in turns; figures are medians over the turns. `peak_gflop_per_s` is what the
+same threads reach in a matrix product of the setting's precision. torch.profiler's table is that of the last turn.
+
+`--write` merges the figures into docs/results/network.json: the section `throughput` and the headline figures
+`train_speedup_over_eager_fp32` and `infer_windows_per_s` of `paper`, and `ours.infer_windows_per_s` of `polarnet`.
+"""
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
+
+from polarnet.config.tree import load
+from polarnet.events.representations import REPRESENTATIONS, channels_of
+from polarnet.networks.registry import NETWORKS
+from polarnet.recovery.recover import PIXELS_AT_ONCE
+from polarnet.runtime.machine import configure, device_of, limit_threads, precision_on, usable_cores
+from polarnet.stokes import Prediction
+from polarnet.training.loop import autocast
+from studies.measure import machine_record, uncommitted, write_section
+
+ROOT = Path(__file__).resolve().parents[1]
+HEIGHT, WIDTH = 120, 180
+BATCH, RUN = 2, 5  # sequences and windows of a training step
+STREAMED = 20  # windows of an inference
+REPEATS = 3  # in a process, after one that is not timed
+MATRIX = 1024  # rows of the product that measures the peak
+OPERATIONS = 12  # of the profile
+SETTINGS = ("naive", "shipped", "compiled")
+MEASURED = ("train_frames_per_s", "infer_windows_per_s")
+
+
+def network_of(name: str, setting: str, device: torch.device) -> tuple[nn.Module, int]:
+    """The network with random weights under a setting, and its input channels."""
+    config = load(ROOT)
+    build, _ = NETWORKS[name]
+    channels = 4 * channels_of(REPRESENTATIONS[build.representation])
+    torch.manual_seed(0)
+    network = build(getattr(config.networks, name), channels).to(device)
+    if setting == "naive":
+        for module in network.modules():
+            if isinstance(module, nn.Conv2d):
+                module.register_forward_pre_hook(lambda _, inputs: (inputs[0].contiguous(),))
+    else:
+        network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return network, channels
+
+
+def loss_of(prediction: Prediction) -> Tensor:
+    """A number that every output takes part in."""
+    return torch.stack([output.square().mean() for output in prediction if output is not None]).sum()
+
+
+def measure_one(name: str, setting: str, threads: int, device_name: str) -> dict[str, Any]:
+    """Figures of one network under one setting, in this process."""
+    runtime = replace(load(ROOT).runtime, device=device_name, threads=threads)
+    device = device_of(runtime)
+    limit_threads(threads)
+    if setting != "naive":
+        configure(runtime, seed=0)
+    precision = "fp32" if setting == "naive" else precision_on(device, "auto")
+    network, channels = network_of(name, setting, device)
+    windows = torch.randn(RUN, BATCH, channels, HEIGHT, WIDTH, device=device)
+    stream = torch.randn(STREAMED, 1, channels, HEIGHT, WIDTH, device=device)
+    unroll = torch.compile(network.unroll) if setting == "compiled" else network.unroll
+
+    def train() -> None:
+        network.zero_grad()
+        state, loss = None, torch.zeros((), device=device)
+        for run in windows.split(1) if setting == "naive" else [windows]:
+            with autocast(precision, device):
+                prediction, state = unroll(run, state)
+                loss = loss + loss_of(prediction)
+        loss.backward()
+
+    at_once = 1 if setting == "naive" else PIXELS_AT_ONCE // (HEIGHT * WIDTH)
+
+    @torch.inference_mode()
+    def infer() -> None:
+        state = None
+        for run in stream.split(at_once):
+            with autocast(precision, device):
+                _, state = unroll(run, state)
+
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        network(stream[0])
+    figures: dict[str, Any] = {"precision": precision, "gflop_per_window": round(counter.get_total_flops() / 1e9, 2)}
+    network.train()
+    figures["train_frames_per_s"] = RUN * BATCH / seconds_of(train, device)
+    figures["train_profile"] = profile_of(train)
+    network.eval()
+    torch.use_deterministic_algorithms(False)  # which `configure` asks for, and `recover` does not
+    figures["infer_windows_per_s"] = STREAMED / seconds_of(infer, device)
+    figures["infer_profile"] = profile_of(infer)
+    figures["peak_gflop_per_s"] = peak_gflop_per_s(precision, device)
+    return figures
+
+
+def seconds_of(run: Callable[[], None], device: torch.device) -> float:
+    """Median of the repeats, the first call left out."""
+    seconds = []
+    for _ in range(1 + REPEATS):
+        start = time.perf_counter()
+        run()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds[1:])
+
+
+def profile_of(run: Callable[[], None]) -> dict[str, float]:
+    """Percent of the time in each of torch's operations, the longest first."""
+    with torch.profiler.profile() as profiler:
+        run()
+    times: dict[str, float] = {}
+    for row in profiler.key_averages():
+        name = "compiled graphs" if "CompiledFxGraph" in row.key else row.key
+        times[name] = times.get(name, 0.0) + (row.self_device_time_total or row.self_cpu_time_total)
+    total = sum(times.values())
+    longest = sorted(times, key=lambda name: -times[name])[:OPERATIONS]
+    return {name: round(100 * times[name] / total, 1) for name in longest}
+
+
+def peak_gflop_per_s(precision: str, device: torch.device) -> float:
+    """What a product of large matrices of a precision reaches here."""
+    dtype = torch.bfloat16 if precision == "bf16" else torch.float32
+    a, b = torch.randn(2, MATRIX, MATRIX, dtype=dtype, device=device)
+    return 2 * MATRIX**3 / seconds_of(lambda: torch.mm(a, b), device) / 1e9
+
+
+def in_own_process(name: str, setting: str, threads: int, device: str) -> dict[str, Any]:
+    """`measure_one` in a new process of this script."""
+    command = [sys.executable, __file__, "--one", name, setting, "--threads", str(threads), "--device", device]
+    return json.loads(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.splitlines()[-1])
+
+
+def measure(names: list[str], settings: list[str], rounds: int, threads: int, device: str) -> dict[str, Any]:
+    """The section `throughput`, printed as it comes."""
+    figures: dict[str, Any] = {
+        "threads": threads, "device": device, "rounds": rounds, "height": HEIGHT, "width": WIDTH, "batch": BATCH,
+        "run_windows": RUN, "networks": {},
+    }  # fmt: skip
+    for name in names:
+        turns: dict[str, list[dict[str, Any]]] = {setting: [] for setting in settings}
+        for _ in range(rounds):
+            for setting in list(turns):
+                try:
+                    one = in_own_process(name, setting, threads, device)
+                except subprocess.CalledProcessError:
+                    if setting != "compiled":
+                        raise
+                    print(f"{name:10s} left out: torch.compile failed, see above", flush=True)
+                    del turns[setting]
+                    continue
+                turns[setting].append(one)
+                print(f"{name:10s} {setting:9s}", *(f"{key} {one[key]:.2f}" for key in MEASURED), flush=True)
+        rows = {}
+        for setting, runs in turns.items():
+            medians = {key: statistics.median(run[key] for run in runs) for key in (*MEASURED, "peak_gflop_per_s")}
+            rows[setting] = runs[-1] | {key: round(value, 2) for key, value in medians.items()}
+        faster = {key: round(rows["shipped"][key] / rows["naive"][key], 2) for key in MEASURED}
+        figures["networks"][name] = {**rows, "shipped_over_naive": faster}
+        print(f"{name:10s} shipped over naive: {faster}")
+    return figures
+
+
+def headlines(networks: dict[str, Any]) -> dict[str, Any]:
+    """The figures of docs/results/network.json that stand above its sections."""
+    found: dict[str, Any] = {}
+    if "paper" in networks:
+        found["train_speedup_over_eager_fp32"] = networks["paper"]["shipped_over_naive"]["train_frames_per_s"]
+        found["infer_windows_per_s"] = networks["paper"]["shipped"]["infer_windows_per_s"]
+    if "polarnet" in networks:
+        found["ours"] = {"infer_windows_per_s": networks["polarnet"]["shipped"]["infer_windows_per_s"]}
+    return found
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/network.json")
+    parser.add_argument("--rounds", type=int, default=3, help="turns of every setting")
+    parser.add_argument("--threads", type=int, default=usable_cores())
+    parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
+    parser.add_argument("--compile", action="store_true", help="measure torch.compile as well")
+    parser.add_argument("--networks", nargs="+", choices=list(NETWORKS), default=list(NETWORKS))
+    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.one:
+        print(json.dumps(measure_one(*arguments.one, arguments.threads, arguments.device)))
+        return
+    if arguments.write and (changed := uncommitted(ROOT)):
+        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    record = machine_record(ROOT)
+    print(f"{record['machine']}, {record['cores']} cores, load {record['load']}")
+    settings = list(SETTINGS if arguments.compile else SETTINGS[:2])
+    figures = measure(arguments.networks, settings, arguments.rounds, arguments.threads, arguments.device)
+    if arguments.write:
+        path = write_section(ROOT, "network", "throughput", figures, record, headlines(figures["networks"]))
+        print(f"written to {path.relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,29 @@
+import pytest
+import torch
+from method_fixtures import checkpoints, context, make_context, make_sequence, make_setup, sequence
+
+from polarnet.benchmark.run import BenchmarkSet
+from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
+
+__all__ = ["checkpoints", "context", "make_context", "make_sequence", "make_setup", "sequence"]
+
+SCENES = {"t1": "photo", "a1": "lake", "a2": "lake", "b1": "wood", "c1": "town"}
+
+
+@pytest.fixture
+def five_scenes(make_sequence, tmp_path):
+    splits = {name: "train" if name.startswith("t") else "test" for name in SCENES}
+    frames = FrameStore.create(tmp_path / "frames.zarr", list(SCENES), splits, 5, 18, 20, {"scenes": SCENES})
+    events = EventStore.create(tmp_path / "events.zarr", list(SCENES), 18, 20, {})
+    for seed, name in enumerate(SCENES):
+        made = make_sequence(name, seed=seed)
+        dolp, aolp, s0 = (torch.cat([x[:1], x]) for x in (made.dolp, made.aolp, made.s0))
+        frames.write(name, made.t_us, intensities_from_stokes(stokes_from_polarization(s0, dolp, aolp)), dolp, aolp)
+        events.write(name, made.events, 4000)
+    for store in (frames, events):
+        store.finish()
+    return BenchmarkSet(
+        "simulated", EventStore.open(tmp_path / "events.zarr"), FrameStore.open(tmp_path / "frames.zarr")
+    )

@@ -1,0 +1,191 @@
+import dataclasses
+import functools
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet.benchmark.references import REFERENCES, Reference
+from polarnet.benchmark.rows import ROWS, predictions_of
+from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp, write_benchmark
+from polarnet.benchmark.score import BenchmarkConfig
+from polarnet.metrics.similarity import Lpips
+from polarnet.runtime.cluster import pmap
+from polarnet.stokes import Prediction
+from polarnet.storage.frames import FrameStore
+
+
+def config(**changes):
+    values = {
+        "methods": list(ROWS),
+        "sets": ["simulated"],
+        "warmup_windows": 1,
+        "precision": "fp32",
+        "lpips": False,
+        "lpips_backbone": "alex",
+        "bootstrap_samples": 50,
+    }
+    return BenchmarkConfig(**{**values, "panel_scenes": 2, **changes})
+
+
+def test_a_test_sequence_has_the_truth_at_the_end_of_each_window(five_scenes, make_sequence):
+    sequences = [five_scenes.sequence(name) for name in five_scenes.sequences]
+    assert [(r.name, r.scene) for r in sequences] == [("a1", "lake"), ("a2", "lake"), ("b1", "wood"), ("c1", "town")]
+    made = make_sequence("a1", seed=1)
+    torch.testing.assert_close(sequences[0].dolp, made.dolp, atol=1e-5, rtol=0)
+    torch.testing.assert_close(sequences[0].s0, made.s0, atol=2e-5, rtol=0)
+    assert torch.equal(sequences[0].events[3].t, made.events[3].t)
+
+
+def test_the_training_mean_counts_training_frames_after_the_warm_up(five_scenes, make_sequence):
+    expected = make_sequence("t1", seed=0).dolp[1:].mean().item()
+    assert train_mean_dolp(five_scenes.frames, 1) == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
+    benchmark = run_benchmark(five_scenes, context, config(), None, tmp_path / "cache")
+    folder = tmp_path / "benchmark"
+    returned = write_benchmark(folder, benchmark, config(), 1, {"lpips": {"backbone": None}, "train_mean": 0.25})
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics == returned
+    assert list(metrics) == list(ROWS)
+    for scores in metrics.values():
+        assert scores["ms_per_window"] > 0
+        assert scores["lpips"] is None
+        assert "lpips_backbone" not in scores
+        assert scores["mse_ci"][0] <= scores["mse"] <= scores["mse_ci"][1]
+        assert scores["mse"] == pytest.approx(scores["level_mse"] + scores["pattern_mse"], rel=1e-4)
+    assert metrics["oracle_mean"]["skill"] == pytest.approx(0, abs=1e-3)  # frames are scored in steps of 1/65535
+    assert metrics["zeros"]["aolp_deg"] is None
+    assert 0 < metrics["cf"]["aolp_deg"] < 90
+    assert metrics["ours"]["gflop"] > 0
+    assert metrics["ours"]["params"] > 1000
+    assert metrics["cf"]["gflop"] is None
+    assert metrics["zeros"]["corr"] == metrics["oracle_mean"]["corr"] == 0
+    assert metrics["oracle_mean"]["mse"] < min(metrics["zeros"]["mse"], metrics["train_mean"]["mse"])
+    assert len((folder / "frames.csv").read_text().splitlines()) == 1 + len(ROWS) * 4 * 3
+    details = json.loads((folder / "details.json").read_text())
+    assert details["lpips"] == {"backbone": None}
+    assert details["scenes"] == ["lake", "town", "wood"]
+    assert details["frames"] == 12
+    assert "lpips" not in details["scene_means"]
+    assert details["paired"]["cf"]["mse"]["scenes"] == 3
+    assert set(details["paired"]) == set(ROWS) - {"ours"}
+    assert set(details["scene_means"]["ssim"]["cf"]) == {"lake", "town", "wood"}
+
+
+def test_expected_errors_are_held_against_measured_ones_in_the_scored_windows(
+    five_scenes, context, tmp_path, monkeypatch
+):
+    def sure(sequence, train_mean):
+        """Off by 0.1 everywhere and knows it, but in the warm-up."""
+        log_variance = torch.full_like(sequence.dolp, math.log(0.01))
+        log_variance[0] = 0.0
+        off = torch.where(sequence.dolp < 0.5, 0.1, -0.1)
+        return Prediction(sequence.dolp + off, None, log_variance)
+
+    monkeypatch.setitem(REFERENCES, "train_mean", Reference("train_mean", sure))
+    for _ in range(2):  # made, and from the cache
+        found = run_benchmark(five_scenes, context, config(methods=["zeros", "train_mean"]), None, tmp_path / "cache")
+        assert set(found.reliability) == {"train_mean"}
+        assert found.reliability["train_mean"].pixels.sum() == 4 * 3 * 18 * 20
+        assert found.reliability["train_mean"].log_error() < 0.01
+    write_benchmark(tmp_path / "out", found, config(methods=["zeros", "train_mean"]), 1, {})
+    written = json.loads((tmp_path / "out" / "details.json").read_text())["reliability"]["train_mean"]
+    ((predicted, measured, pixels),) = written["curve"]
+    assert (predicted, measured, pixels) == (pytest.approx(0.01, rel=0.01), pytest.approx(0.01, rel=0.01), 4320)
+
+
+def test_panels_show_one_window_of_different_scenes_and_every_method(five_scenes, context, tmp_path):
+    wanted = config(methods=["zeros", "cf"])
+    benchmark = run_benchmark(five_scenes, context, wanted, None, tmp_path / "cache")
+    assert [(p.sequence, p.scene, p.window, p.t_us) for p in benchmark.panels] == [
+        ("a1", "lake", 2, 3000),
+        ("c1", "town", 2, 3000),
+    ]
+    folder = tmp_path / "benchmark"
+    (folder / "panels").mkdir(parents=True)
+    (folder / "panels" / "old.npz").touch()
+    write_benchmark(folder, benchmark, wanted, 1, {})
+    assert {p.name for p in (folder / "panels").iterdir()} == {"a1.npz", "c1.npz"}
+    with np.load(folder / "panels" / "a1.npz") as panel:
+        assert set(panel.files) == {
+            *("window", "t_us", "events", "truth_dolp", "truth_aolp", "truth_s0", "dolp_zeros", "dolp_cf", "aolp_cf"),
+        }
+        assert panel["events"].shape == (4, 18, 20)
+        assert panel["dolp_cf"].dtype == np.float32
+
+
+def test_all_but_the_time_is_the_same_in_two_runs(five_scenes, context, tmp_path):
+    some = config(methods=["cf", "e2v", "ours"])
+    for name in ("one", "two"):
+        found = run_benchmark(five_scenes, context, some, None, tmp_path / f"cache_{name}")
+        write_benchmark(tmp_path / name, found, some, 1, {})
+    for file in ("frames.csv", "details.json", "panels/a1.npz"):
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
+
+
+def test_no_test_sequence_is_an_error(five_scenes, context, tmp_path):
+    frames = FrameStore.create(tmp_path / "f.zarr", ["t1"], {"t1": "train"}, 5, 18, 20, {})
+    frames.write("t1", *five_scenes.frames.frames("t1"))
+    frames.finish()
+    without = BenchmarkSet("simulated", five_scenes.events, FrameStore.open(tmp_path / "f.zarr"))
+    with pytest.raises(ValueError, match=r"has no test sequence; raise ingest.test_fraction"):
+        run_benchmark(without, context, config(), None, tmp_path / "cache")
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """The methods that ran on whole sequences, with the sequence, in order."""
+    ran = []
+
+    def noting(rows, sequence, context):
+        ran.extend((row, sequence.name) for row in rows)
+        return predictions_of(rows, sequence, context)
+
+    monkeypatch.setattr("polarnet.benchmark.run.predictions_of", noting)
+    return ran
+
+
+def test_a_second_run_recovers_nothing_and_a_new_method_recovers_itself_alone(five_scenes, context, tmp_path, ran):
+    first = run_benchmark(five_scenes, context, config(methods=["zeros", "cf"]), None, tmp_path / "cache")
+    assert len(ran) == 2 * 4
+    ran.clear()
+    again = run_benchmark(five_scenes, context, config(methods=["zeros", "cf"]), None, tmp_path / "cache")
+    assert ran == []
+    assert again.rows == first.rows
+    assert again.costs == first.costs
+    more = run_benchmark(five_scenes, context, config(methods=["zeros", "cf", "highpass"]), None, tmp_path / "cache")
+    assert {method for method, _ in ran} == {"highpass"}
+    assert [row for row in more.rows if row.method != "highpass"] == list(first.rows)
+
+
+def test_a_changed_parameter_recovers_the_methods_that_use_it(five_scenes, context, make_context, tmp_path, ran):
+    chosen = config(methods=["zeros", "cf", "highpass"])
+    run_benchmark(five_scenes, context, chosen, None, tmp_path / "cache")
+    ran.clear()
+    slower = dataclasses.replace(context.setups["cf"].config, cutoff_hz=1.0)
+    other = make_context(cf={"config": slower})
+    run_benchmark(five_scenes, other, chosen, None, tmp_path / "cache")
+    assert {method for method, _ in ran} == {"cf"}
+
+
+def test_another_warm_up_or_lpips_scores_anew_without_recovering(five_scenes, context, tmp_path, ran):
+    run_benchmark(five_scenes, context, config(methods=["cf"]), None, tmp_path / "cache")
+    ran.clear()
+    torch.manual_seed(0)
+    changed = config(methods=["cf"], warmup_windows=2)
+    found = run_benchmark(five_scenes, context, changed, Lpips("squeeze"), tmp_path / "cache")
+    assert ran == []
+    assert len(found.rows) == 4 * 2
+    assert all(row.lpips is not None for row in found.rows)
+
+
+def test_two_processes_give_the_rows_of_one(five_scenes, context, tmp_path):
+    chosen = config(methods=["zeros", "cf"])
+    mapper = functools.partial(pmap, workers=2, label="test")
+    one = run_benchmark(five_scenes, context, chosen, None, tmp_path / "one")
+    two = run_benchmark(five_scenes, context, chosen, None, tmp_path / "two", mapper)
+    assert one.rows == two.rows

@@ -1,0 +1,99 @@
+import pytest
+import torch
+
+from polarnet.benchmark.event_budget import (
+    EVENTS_PER_PIXEL,
+    by_sliding_window,
+    by_window_length,
+    events_per_pixel,
+    since_start,
+    sliding_recovery,
+)
+from polarnet.benchmark.resimulate import sequence_at
+from polarnet.storage.events import EventStore
+from polarnet.storage.scenes import SceneStore
+
+
+def test_events_per_pixel_is_the_mean_over_channels_before_each_time(sequence):
+    t_us = sequence.t_us
+    found = events_per_pixel(sequence.events, t_us)
+    assert found[-1].item() == pytest.approx(300 / (18 * 20))
+    half = sum(int((e.t < 2000).sum()) for e in sequence.events) / (4 * 18 * 20)
+    assert found[2].item() == pytest.approx(half)
+
+
+def test_frames_of_overlapping_windows_stand_alone_unless_the_state_is_carried(sequence, context):
+    times = list(range(2000, 2400, 100))
+    alone = sliding_recovery(sequence, 50, times, False, "ours", context)
+    assert alone.shape == (4, 18, 20)
+    torch.testing.assert_close(alone[-1], sliding_recovery(sequence, 50, times[-1:], False, "ours", context)[0])
+    carried = sliding_recovery(sequence, 50, times, True, "ours", context)
+    torch.testing.assert_close(carried[0], alone[0])
+    assert not torch.equal(carried[-1], alone[-1])
+
+
+def test_every_frame_falls_into_one_bin_of_events_per_pixel(make_sequence, context):
+    sequences = [make_sequence(name, seed=k) for k, name in enumerate("ab")]
+    table = since_start(sequences, ["zeros", "oracle_mean"], context)
+    assert sum(entry["frames"] for entry in table["zeros"]) == 2 * 4
+    for entry in table["zeros"]:
+        assert entry["from"] <= entry["events_per_pixel"] <= entry["to"]
+    for entry in table["oracle_mean"]:
+        assert entry["skill"] == pytest.approx(0, abs=1e-6)
+
+
+@pytest.fixture
+def scenes_and_events(simulated):
+    return SceneStore.open(simulated.scenes), EventStore.open(simulated.events)
+
+
+def test_windows_twice_as_long_are_half_as_many_with_twice_the_events(scenes_and_events, context):
+    scenes, events = scenes_and_events
+    assert scenes.duration_us("a-0") == 200_000
+    table = by_window_length(scenes, events, ["a-0"], [20_000, 40_000], 0, ["zeros", "oracle_mean"], context)
+    short, long = table["zeros"]
+    assert (short["window_us"], short["frames"]) == (20_000, 10)
+    assert (long["window_us"], long["frames"]) == (40_000, 5)
+    assert long["events_per_pixel"] == pytest.approx(2 * short["events_per_pixel"], rel=1e-6)
+    total = sum(len(channel) for channel in events.read("a-0")) / (4 * 18 * 24)
+    assert 10 * short["events_per_pixel"] == pytest.approx(total, rel=1e-3)  # but for events at time 0
+
+
+def test_the_truth_is_that_of_each_windows_own_end(scenes_and_events, context):
+    scenes, events = scenes_and_events
+    (entry,) = by_window_length(scenes, events, ["a-0"], [50_000], 100_000, ["zeros"], context)["zeros"]
+    ends = sequence_at(scenes, "a-0", events.read("a-0"), torch.tensor([100_000, 150_000, 200_000]))
+    assert entry["frames"] == 2  # the windows that end after the first 100 ms
+    assert entry["mse"] == pytest.approx(float(ends.dolp.square().mean()), rel=1e-5)
+
+
+def test_a_window_length_that_leaves_no_window_is_refused(scenes_and_events, context):
+    scenes, events = scenes_and_events
+    with pytest.raises(ValueError, match="a-0: windows of 150000 us leave none after the first 160000 us of 200000 us"):
+        by_window_length(scenes, events, ["a-0"], [150_000], 160_000, ["zeros"], context)
+
+
+def test_overlapping_windows_of_more_events_reach_further_back_and_meet_the_same_truth(scenes_and_events, context):
+    scenes, events = scenes_and_events
+    table = by_sliding_window(scenes, events, ["a-0"], (150_000, 152_000), 1_000, "ours", context)
+    assert [(e["events_per_pixel"], e["carry"]) for e in table] == [
+        (size, carry) for size in EVENTS_PER_PIXEL for carry in (False, True)
+    ]
+    alone, carried = table[::2], table[1::2]
+    assert [e["window_ms"] for e in alone] == [e["window_ms"] for e in carried]
+    lengths = [e["window_ms"] for e in alone]
+    assert lengths == sorted(lengths)
+    assert lengths[0] < lengths[-1]
+    truth = sequence_at(scenes, "a-0", events.read("a-0"), torch.tensor([149_000, 150_000, 151_000, 152_000])).dolp
+    expected = pytest.approx(float(truth.diff(dim=0).abs().mean()), rel=1e-5)
+    assert all(e["true_change"] == expected for e in table)
+
+
+def test_overlapping_windows_are_scored_as_they_are_recovered(scenes_and_events, context):
+    scenes, events = scenes_and_events
+    entry = by_sliding_window(scenes, events, ["b-0"], (150_000, 152_000), 1_000, "ours", context)[0]
+    times = [150_000, 151_000, 152_000]
+    sequence = sequence_at(scenes, "b-0", events.read("b-0"), torch.tensor([149_000, *times]))
+    frames = sliding_recovery(sequence, round(0.25 * 18 * 24), times, False, "ours", context)
+    assert entry["mse"] == pytest.approx(float((frames - sequence.dolp).square().mean()), rel=1e-5)
+    assert entry["change"] == pytest.approx(float(frames.diff(dim=0).abs().mean()), rel=1e-5)

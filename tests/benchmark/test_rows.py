@@ -1,0 +1,93 @@
+import dataclasses
+
+import pytest
+import torch
+
+from polarnet.benchmark.references import oracle_mean
+from polarnet.benchmark.rows import ROWS, available, metadata_used, predictions_of, weights_used
+from polarnet.events.stream import Events
+from polarnet.methods import METHODS
+from polarnet.metrics.similarity import mse
+
+
+def dolp_of(row, sequence, context):
+    return predictions_of([row], sequence, context)[row].dolp
+
+
+def test_all_rows_of_one_sequence_come_in_the_order_asked_for(sequence, context):
+    wanted = ["ours", "cf+gain", "oracle_mean", "cf"]
+    predictions = predictions_of(wanted, sequence, context)
+    assert list(predictions) == wanted
+    for row, prediction in predictions.items():
+        assert torch.equal(prediction.dolp, dolp_of(row, sequence, context)), row
+
+
+@pytest.mark.parametrize("row", [name for name in ROWS if name != "oracle_mean"])
+def test_only_the_oracle_looks_at_the_truth(row, sequence, context):
+    blind = dataclasses.replace(sequence, dolp=torch.full_like(sequence.dolp, 0.5))
+    assert torch.equal(dolp_of(row, sequence, context), dolp_of(row, blind, context))
+
+
+@pytest.mark.parametrize("row", ["zeros", "train_mean", "oracle_mean"])
+def test_references_look_at_no_event(row, sequence, context):
+    still = dataclasses.replace(sequence, events=[Events.empty(18, 20)] * 4)
+    assert torch.equal(dolp_of(row, sequence, context), dolp_of(row, still, context))
+
+
+@pytest.mark.parametrize("constant", [0.0, 0.25, 0.45, 0.5, 0.55, 1.0])
+def test_the_oracle_mean_beats_every_constant_on_every_frame(constant, sequence, context):
+    oracle = dolp_of("oracle_mean", sequence, context)
+    assert (mse(oracle, sequence.dolp) <= mse(torch.full_like(oracle, constant), sequence.dolp)).all()
+
+
+def test_the_oracle_knows_the_mean_of_the_valid_pixels_alone():
+    truth = torch.rand(3, 4, 5)
+    valid = truth < 0.6
+    valid[1] = False
+    best = oracle_mean(truth, valid)
+    for frame, mean, where in zip(truth, best, valid, strict=True):
+        expected = frame[where].mean() if where.any() else torch.tensor(0.0)
+        torch.testing.assert_close(mean, expected.expand(4, 5))
+
+
+def test_a_method_and_its_gains_share_one_run(sequence, context, monkeypatch):
+    method, runs = METHODS["cf"], []
+
+    def counted(setup):
+        recoverer = method.open(setup)
+        return recoverer._replace(start=lambda height, width: runs.append("cf") or recoverer.start(height, width))
+
+    alone = dolp_of("cf+gain", sequence, context)
+    monkeypatch.setitem(METHODS, "cf", dataclasses.replace(method, open=counted))
+    predictions = predictions_of(["cf+gain", "cf"], sequence, context)
+    assert runs == ["cf"]
+    assert torch.equal(predictions["cf+gain"].dolp, alone)
+
+
+def test_a_row_that_cannot_run_is_left_out_with_the_reason(make_context, tmp_path):
+    missing = tmp_path / "none.safetensors"
+    context = make_context(None, firenet_published={"weights": None}, paper={"weights": missing})
+    wanted = ["zeros", "train_mean", "cf+gain", "firenet", "firenet_published+gain", "paper", "ours"]
+    there, left_out = available(wanted, context)
+    assert there == ["zeros", "cf+gain", "firenet", "ours"]
+    assert left_out["train_mean"] == "the training split is not there; run `dvc repro synthesize`"
+    assert "set methods.firenet_published.weights" in left_out["firenet_published+gain"]
+    assert left_out["paper"] == f"{missing} is not there"
+    assert available(list(ROWS), make_context()) == (list(ROWS), {})
+
+
+def test_weights_that_are_not_there_are_missed_by_their_methods_alone(sequence, make_context, tmp_path):
+    context = make_context(ours={"weights": tmp_path / "none.safetensors"})
+    predictions_of(["cf"], sequence, context)
+    with pytest.raises(FileNotFoundError, match=r"none.safetensors is missing"):
+        predictions_of(["ours"], sequence, context)
+
+
+def test_the_weights_behind_a_table_are_named_once_a_section(context):
+    used = weights_used(["zeros", "cf", "firenet", "firenet+gain"], context)
+    assert {section: one["file"] for section, one in used.items()} == {"firenet": "firenet.safetensors"}
+
+
+def test_checkpoints_of_polarnet_say_what_they_are_and_files_of_other_authors_say_nothing(context):
+    metadata = metadata_used(["zeros", "cf", "e2v", "e2v+gain", "firenet_published", "ours"], context)
+    assert {row: one["network"] for row, one in metadata.items()} == {"e2v": "firenet", "ours": "paper"}

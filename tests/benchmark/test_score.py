@@ -1,0 +1,251 @@
+import csv
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from polarnet.benchmark.score import (
+    METRICS,
+    BenchmarkConfig,
+    FrameScore,
+    scene_means,
+    score_sequence,
+    summary,
+    write_frames,
+)
+from polarnet.metrics.similarity import Lpips, psnr, ssim
+from polarnet.stokes import Prediction
+
+CPU = torch.device("cpu")
+
+
+def row(scene, value, method="m", sequence=None, window=0, lpips=None, aolp_deg=None, oracle_mse=0.5):
+    scores = {name: value for name in METRICS if name != "skill"} | {"lpips": lpips, "aolp_deg": aolp_deg}
+    scores["oracle_mse"] = oracle_mse
+    return FrameScore(method, scene, sequence or scene, window, 0, **scores)
+
+
+def config(**changes):
+    values = {
+        "methods": ["zeros"],
+        "sets": ["simulated"],
+        "warmup_windows": 1,
+        "precision": "fp32",
+        "lpips": False,
+        "lpips_backbone": "alex",
+        "bootstrap_samples": 10,
+        "panel_scenes": 1,
+    }
+    return BenchmarkConfig(**{**values, **changes})
+
+
+def test_a_constant_offset_scores_its_square_as_level(sequence):
+    sequence = dataclasses.replace(sequence, dolp=0.5 * sequence.dolp)
+    rows = score_sequence(sequence, {"m": Prediction(sequence.dolp + 0.1)}, 0, None, CPU)
+    assert [r.window for r in rows] == [0, 1, 2, 3]
+    assert [r.t_us for r in rows] == [1000, 2000, 3000, 4000]
+    for r in rows:
+        assert r.mse == pytest.approx(0.01)
+        assert r.psnr == pytest.approx(20)
+        assert r.level_mse == pytest.approx(0.01)
+        assert r.pattern_mse == pytest.approx(0, abs=1e-9)
+        assert r.corr == pytest.approx(1)
+        assert r.lpips is None
+
+
+def test_rows_hold_the_metrics_of_their_own_frame(make_sequence):
+    sequence, other = make_sequence(seed=1), make_sequence(seed=2)
+    rows = score_sequence(sequence, {"m": Prediction(other.dolp)}, 1, None, CPU)
+    for r in rows:
+        pair = other.dolp[r.window], sequence.dolp[r.window]
+        assert r.ssim == pytest.approx(ssim(*pair).item(), rel=1e-5)
+        assert r.psnr == pytest.approx(psnr(*pair).item(), rel=1e-6)
+
+
+def test_warm_up_windows_count_for_no_method(sequence):
+    spoilt = sequence.dolp.clone()
+    spoilt[:2] = float("nan")
+    rows = score_sequence(sequence, {"a": Prediction(spoilt), "b": Prediction(sequence.dolp)}, 2, None, CPU)
+    assert [(r.method, r.window) for r in rows] == [("a", 2), ("a", 3), ("b", 2), ("b", 3)]
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_frame_that_is_not_a_number_is_named_not_dropped(sequence, bad):
+    spoilt = sequence.dolp.clone()
+    spoilt[3, 5, 5] = bad
+    with pytest.raises(ValueError, match=r"m on a, window 3: mse is (nan|inf)"):
+        score_sequence(sequence, {"m": Prediction(spoilt)}, 0, None, CPU)
+
+
+def test_a_sequence_with_nothing_left_after_the_warm_up_is_refused(sequence):
+    with pytest.raises(
+        ValueError, match=r"a has 4 windows and the first 4 are warm-up.*lower benchmark.warmup_windows"
+    ):
+        score_sequence(sequence, {"m": Prediction(sequence.dolp)}, 4, None, CPU)
+
+
+def test_frames_of_another_size_are_refused(sequence):
+    with pytest.raises(ValueError, match=r"m on a: expected frames of \(4, 18, 20\), got \(3, 18, 20\)"):
+        score_sequence(sequence, {"m": Prediction(sequence.dolp[:3])}, 0, None, CPU)
+
+
+def test_lpips_sees_the_truth_once_for_all_methods_and_a_constant_once(make_sequence, monkeypatch):
+    torch.manual_seed(0)
+    lpips, seen = Lpips("squeeze"), []
+    features = Lpips.features
+
+    def counted(self, images):
+        seen.append(len(images))
+        return features(self, images)
+
+    monkeypatch.setattr(Lpips, "features", counted)
+    sequence, other = make_sequence(windows=8), make_sequence(windows=8, seed=1)
+    constant, zeros = Prediction(torch.full_like(other.dolp, 0.3)), Prediction(0 * other.dolp)
+    rows = score_sequence(sequence, {"m": Prediction(other.dolp), "c": constant, "z": zeros}, 0, lpips, CPU)
+    assert seen == [8, 8, 1, 1]  # the truth, m, c, z
+    of_constant = [r.lpips for r in rows if r.method == "c"]
+    assert of_constant == pytest.approx(lpips(constant.dolp, sequence.dolp).tolist(), rel=1e-4)
+
+
+def test_lpips_in_chunks_is_lpips_frame_by_frame(make_sequence):
+    torch.manual_seed(0)
+    lpips = Lpips("squeeze")
+    sequence, other = make_sequence(windows=10), make_sequence(windows=10, seed=1)
+    rows = score_sequence(sequence, {"m": Prediction(other.dolp)}, 0, lpips, CPU)
+    for r in rows:
+        k = slice(r.window, r.window + 1)
+        assert r.lpips == pytest.approx(lpips(other.dolp[k], sequence.dolp[k]).item(), rel=1e-4)
+
+
+def test_scenes_weigh_alike_however_many_sequences_show_them():
+    rows = [row("x", 1.0, sequence="x1"), row("x", 3.0, sequence="x2"), row("x", 5.0, sequence="x2", window=1)]
+    rows += [row("y", 9.0)]
+    assert summary(rows, 100, 0)["m"]["mse"] == 6.0  # (3 + 9) / 2, not (1 + 3 + 5 + 9) / 4
+
+
+def test_the_interval_is_the_same_every_time_and_shrinks_to_a_single_scene():
+    rows = [row(f"s{i}", float(i)) for i in range(10)]
+    first, again, other = summary(rows, 500, 1), summary(rows, 500, 1), summary(rows, 500, 2)
+    assert first == again
+    assert first["m"]["mse_ci"] != other["m"]["mse_ci"]
+    low, high = first["m"]["mse_ci"]
+    assert 2 < low < 4.5 < high < 7  # +- 1.96 * 2.87 / sqrt(10) = 1.78
+    assert summary(rows[3:4], 500, 1)["m"]["mse_ci"] == [3.0, 3.0]
+
+
+def test_all_methods_see_the_same_resampled_scenes():
+    values = (0.0, 4.0, 2.0)
+    rows = [row(f"s{i}", value, "a") for i, value in enumerate(values)]
+    rows += [row(f"s{i}", value + 1, "b") for i, value in enumerate(values)]
+    table = summary(rows, 200, 0)
+    assert table["b"]["mse_ci"] == pytest.approx([end + 1 for end in table["a"]["mse_ci"]])
+
+
+def test_the_order_of_rows_changes_nothing():
+    rows = [row(f"s{i}", math.sqrt(i), window=k) for i in range(5) for k in range(3)]
+    assert summary(rows, 50, 0) == summary(rows[::-1], 50, 0)
+
+
+def test_skill_is_a_ratio_of_means_against_the_oracle_mean():
+    rows = [row("x", 0.1, oracle_mse=0.2), row("y", 0.3, oracle_mse=0.6)]
+    rows += [row("x", 0.2, "best", oracle_mse=0.2), row("y", 0.6, "best", oracle_mse=0.6)]
+    table = summary(rows, 100, 0)
+    assert table["m"]["skill"] == pytest.approx(0.5)  # 1 - 0.2 / 0.4
+    assert table["best"]["skill"] == pytest.approx(0)
+    assert table["m"]["skill_ci"] == pytest.approx([0.5, 0.5])
+    uneven = [row("x", 0.1, oracle_mse=0.1), row("y", 0.1, oracle_mse=0.9)]
+    assert summary(uneven, 10, 0)["m"]["skill"] == pytest.approx(1 - 0.1 / 0.5)
+    assert scene_means(uneven, "skill")["m"] == pytest.approx({"x": 0.0, "y": 1 - 0.1 / 0.9})
+
+
+def test_the_oracle_mean_has_skill_0_and_the_truth_skill_1(make_sequence):
+    sequence = make_sequence()
+    mean = sequence.dolp.mean(dim=(-2, -1), keepdim=True).expand_as(sequence.dolp)
+    answers = {"mean": Prediction(mean), "truth": Prediction(sequence.dolp)}
+    table = summary(score_sequence(sequence, answers, 1, None, CPU), 10, 0)
+    assert table["mean"]["skill"] == pytest.approx(0, abs=1e-6)
+    assert table["truth"]["skill"] == 1
+
+
+def test_the_angle_is_scored_where_there_is_one(sequence):
+    turned = (sequence.aolp + math.pi / 18) % math.pi
+    answers = {"m": Prediction(sequence.dolp, turned), "without": Prediction(sequence.dolp)}
+    rows = score_sequence(sequence, answers, 0, None, CPU)
+    assert [r.aolp_deg for r in rows[:4]] == pytest.approx([10.0] * 4, abs=1e-3)
+    table = summary(rows, 10, 0)
+    assert table["m"]["aolp_deg"] == pytest.approx(10, abs=1e-3)
+    assert table["without"]["aolp_deg"] is None
+    assert "without" not in scene_means(rows, "aolp_deg")
+
+
+def test_an_angle_for_some_frames_alone_is_refused():
+    with pytest.raises(ValueError, match="m has no aolp_deg for 1 of its frames"):
+        scene_means([row("x", 1.0, aolp_deg=3.0), row("y", 1.0)], "aolp_deg")
+
+
+def test_lpips_that_was_not_computed_is_null_without_an_interval():
+    table = summary([row("x", 1.0), row("y", 2.0)], 10, 0)["m"]
+    assert table["lpips"] is None
+    assert "lpips_ci" not in table
+    assert summary([row("x", 1.0, lpips=0.5)], 10, 0)["m"]["lpips"] == 0.5
+
+
+def test_a_method_that_lacks_a_scene_is_named():
+    with pytest.raises(ValueError, match=r"b has no score for \['y'\]"):
+        summary([row("x", 1.0, "a"), row("y", 1.0, "a"), row("x", 1.0, "b")], 10, 0)
+
+
+def test_frames_are_written_one_a_line_with_empty_cells_for_what_is_not_known(tmp_path):
+    write_frames(tmp_path / "frames.csv", [row("x", 0.1), row("y", 1 / 3, lpips=0.25)])
+    with (tmp_path / "frames.csv").open() as file:
+        first, second = csv.DictReader(file)
+    assert first["lpips"] == ""
+    assert float(second["mse"]) == 1 / 3
+    assert second["scene"] == "y"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"methods": ["zeros", "magic"]}, "methods: expected some of zeros, train_mean, .*, got magic"),
+        ({"methods": ["zeros", "zeros"]}, "methods: expected at least one and none twice"),
+        ({"methods": []}, "methods: expected at least one and none twice"),
+        ({"sets": ["measured"]}, "sets: expected simulated and others, none twice"),
+        ({"sets": ["simulated", "real"]}, "sets: expected one of simulated, complex_motion, measured, got"),
+        ({"warmup_windows": -1}, "warmup_windows: expected >= 0, got -1"),
+        ({"precision": "fp16"}, "precision: expected one of fp32, bf16, got 'fp16'"),
+    ],
+)
+def test_settings_out_of_range_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        config(**change)
+
+
+def test_masked_pixels_count_in_no_score(make_sequence):
+    sequence, other = make_sequence(seed=1), make_sequence(seed=2).dolp
+    valid = torch.rand(sequence.dolp.shape, generator=torch.Generator().manual_seed(3)) < 0.7
+    masked = dataclasses.replace(sequence, valid=valid)
+    torch.manual_seed(0)
+    lpips = Lpips("squeeze")
+    spoilt = torch.where(valid, other, 1 - other)
+    rows, again = (score_sequence(masked, {"m": Prediction(frames)}, 1, lpips, CPU) for frames in (other, spoilt))
+    assert rows == again
+    for r in rows:
+        where = valid[r.window]
+        difference = (other - sequence.dolp)[r.window][where]
+        assert r.mse == pytest.approx(difference.square().mean().item(), rel=1e-5)
+        assert r.level_mse == pytest.approx(difference.mean().square().item(), rel=1e-4, abs=1e-9)
+        mixed = torch.where(where, other[r.window], sequence.dolp[r.window])
+        assert r.lpips == pytest.approx(lpips(mixed[None], sequence.dolp[r.window][None]).item(), rel=1e-4)
+    unmasked = score_sequence(sequence, {"m": Prediction(other)}, 1, lpips, CPU)
+    assert all(a.ssim != b.ssim for a, b in zip(rows, unmasked, strict=True))
+
+
+def test_a_frame_without_a_valid_pixel_is_not_left_out_silently(sequence):
+    valid = torch.ones_like(sequence.dolp, dtype=torch.bool)
+    valid[2] = False
+    masked = dataclasses.replace(sequence, valid=valid)
+    with pytest.raises(ValueError, match="window 2: no pixel is valid"):
+        score_sequence(masked, {"m": Prediction(sequence.dolp)}, 1, None, CPU)
+    assert len(score_sequence(masked, {"m": Prediction(sequence.dolp)}, 3, None, CPU)) == 1

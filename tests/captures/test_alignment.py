@@ -1,0 +1,95 @@
+"""Lags between events and pictures of the same light, where both are known exactly."""
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet.captures.alignment import agreement, best_lag, changes, logarithms, spread, steps, thresholds
+from polarnet.events.stream import Events
+
+HEIGHT, WIDTH, THRESHOLD_ON, THRESHOLD_OFF = 4, 5, 0.2, 0.25
+PERIOD_US = 16_667
+
+
+def log_light(t_s, pixel):
+    """Smooth, different in every pixel."""
+    return 6.6 + np.sin(2 * np.pi * (3 + pixel / 7) * t_s + pixel) + 0.4 * np.sin(2 * np.pi * 7.3 * t_s + 2 * pixel)
+
+
+@pytest.fixture(scope="module")
+def events():
+    """Of ideal pixels whose thresholds for darker are larger than those for brighter."""
+    t_us = np.arange(0, 1_000_000, 20)
+    found = []
+    for pixel in range(HEIGHT * WIDTH):
+        light = log_light(t_us * 1e-6, pixel)
+        reference = light[0]
+        for t, level in zip(t_us.tolist(), light.tolist(), strict=True):
+            if level >= reference + THRESHOLD_ON:
+                reference += THRESHOLD_ON
+                found.append((t, pixel % WIDTH, pixel // WIDTH, 1))
+            elif level <= reference - THRESHOLD_OFF:
+                reference -= THRESHOLD_OFF
+                found.append((t, pixel % WIDTH, pixel // WIDTH, -1))
+    t, x, y, p = np.array(sorted(found)).T
+    return Events(torch.from_numpy(t), *map(torch.from_numpy, (x.astype(np.int16), y.astype(np.int16))),
+                  torch.from_numpy(p.astype(np.int8)), HEIGHT, WIDTH)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    """Times and pictures of 12 bits of the same light."""
+    t_us = np.arange(0, 1_000_000, PERIOD_US)
+    light = np.exp(np.stack([log_light(t_us * 1e-6, pixel) for pixel in range(HEIGHT * WIDTH)], axis=1))
+    return t_us, np.rint(light).astype(np.uint16).reshape(-1, HEIGHT, WIDTH)
+
+
+def of(events):
+    return steps(events, (0, 0), (HEIGHT, WIDTH), -(10**9), 10**9)
+
+
+def test_each_step_lies_between_two_events_of_one_pixel():
+    x = torch.tensor([0, 1, 0, 1, 0], dtype=torch.int16)
+    p = torch.tensor([1, -1, 1, 1, -1], dtype=torch.int8)
+    found = steps(Events(torch.tensor([1, 2, 5, 9, 9]), x, torch.zeros_like(x), p, 1, 2), (0, 0), (1, 2), 0, 9)
+    assert found.before_us.tolist() == [1]  # those that end at 9 us are not before the stop
+    assert (found.after_us.tolist(), found.pixel.tolist(), found.polarity.tolist()) == ([5], [0], [1])
+
+
+@pytest.mark.parametrize("shift_us", [-31_400, -700, 0, 12_345])
+def test_the_lag_of_pictures_is_found_much_finer_than_a_picture(events, pictures, shift_us):
+    t_us, values = pictures
+    lag = best_lag(of(events), t_us + shift_us, logarithms(values), 50_000)
+    assert lag.lag_us == pytest.approx(shift_us, abs=150)
+    assert lag.agreement > 0.97
+    assert len(lag.searched_us) == len(lag.agreements) == 51
+
+
+def test_noise_of_the_pictures_does_not_move_the_lag(events, pictures):
+    t_us, values = pictures
+    noise = np.random.default_rng(0).normal(0, 0.03, values.shape)
+    noisy = np.rint(values * np.exp(noise)).astype(np.uint16)
+    assert best_lag(of(events), t_us, logarithms(noisy), 20_000).lag_us == pytest.approx(0, abs=500)
+
+
+def test_thresholds_are_the_changes_between_events(events, pictures):
+    t_us, values = pictures
+    found = best_lag(of(events), t_us, logarithms(values), 20_000).thresholds
+    assert found.on == pytest.approx(THRESHOLD_ON, rel=0.05)
+    assert found.off == pytest.approx(THRESHOLD_OFF, rel=0.05)
+
+
+def test_without_any_change_there_is_no_agreement(events, pictures):
+    t_us, values = pictures
+    still = logarithms(np.full_like(values, 2000))
+    change = changes(of(events), 0, t_us, still)
+    polarity = of(events).polarity
+    assert agreement(polarity, change) == 0
+    assert spread(polarity, change) == 0
+    assert np.isnan(thresholds(polarity[:0], change[:0]).on)
+
+
+def test_dark_pixels_and_steps_outside_of_the_pictures_do_not_count(events, pictures):
+    t_us, values = pictures
+    assert np.isnan(changes(of(events), 0, t_us, logarithms(np.full_like(values, 63)))).all()
+    assert np.isnan(changes(of(events), 2_000_000, t_us, logarithms(values))).all()

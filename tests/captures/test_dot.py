@@ -1,0 +1,133 @@
+"""The paper's rule for start times, and what files a target needs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet.captures.dot import (
+    IntensityCapture,
+    event_start_us,
+    find_captures,
+    given_starts,
+    intensity_start_us,
+    landmark_starts,
+    reduced,
+    regular_times_us,
+)
+from polarnet.config.tree import load
+from polarnet.events.stream import Events
+from polarnet.recordings.source import RecordingError
+
+HEIGHT, WIDTH = 80, 60
+
+
+@pytest.fixture(scope="module")
+def config(project_root):
+    return replace(load(project_root).recordings, sensor=[HEIGHT, WIDTH], crop=[8, 12], size=[2, 3])
+
+
+def events_at(times, x, y, p):
+    n = len(times)
+    full = lambda value, dtype: torch.as_tensor(np.broadcast_to(value, n).copy(), dtype=dtype)  # noqa: E731
+    return Events(
+        torch.as_tensor(times, dtype=torch.int64), full(x, torch.int16), full(y, torch.int16), full(p, torch.int8),
+        HEIGHT, WIDTH,
+    )  # fmt: skip
+
+
+def pictures(region, t_us=None):
+    n = len(region)
+    t_us = np.arange(n, dtype=np.int64) * 10_000 if t_us is None else t_us
+    return IntensityCapture(t_us, np.zeros((n, 8, 12), np.uint16), np.array(region, float))
+
+
+def test_the_papers_values_are_the_default(project_root):
+    config = load(project_root).recordings
+    assert (config.sensor, config.region, config.crop, config.size) == ([800, 1280], [45, 2], [480, 720], [120, 180])
+    assert (config.dark_level, config.negative_events) == (30.0, 45)
+    assert not config.enabled
+
+
+def test_an_intensity_capture_starts_with_the_first_picture_whose_mean_is_below_30(config):
+    assert intensity_start_us("a", pictures([100.0, 30.0, 29.99, 100.0, 5.0]), config) == 20_000
+
+
+def test_a_region_that_is_never_or_always_dark_has_no_start(config):
+    with pytest.raises(
+        RecordingError, match=r"a: no picture is darker than 30 .* darkest has mean 31\.0; set the start"
+    ):
+        intensity_start_us("a", pictures([100.0, 31.0]), config)
+    with pytest.raises(RecordingError, match=r"a: the first picture is dark .* already \(mean 3\.0\)"):
+        intensity_start_us("a", pictures([3.0, 4.0]), config)
+
+
+def test_an_event_capture_starts_with_the_45th_negative_event_of_the_region(config):
+    times = np.arange(100) * 10
+    assert event_start_us("a", events_at(times, WIDTH - 2, 44, -1), config) == 440
+    for elsewhere in ({"x": WIDTH - 3}, {"y": 45}, {"p": 1}):
+        place = {"x": WIDTH - 2, "y": 44, "p": -1, **elsewhere}
+        with pytest.raises(RecordingError, match="expected 45 negative events in the landmark's region, got 0"):
+            event_start_us("a", events_at(times, **place), config)
+
+
+def test_starts_given_by_hand_take_the_place_of_the_rule(config):
+    starts = landmark_starts(
+        {"events_0": events_at([1, 2], 0, 0, 1)},
+        {"intensity_0": pictures([100.0, 1.0])},
+        config,
+        {"events_0": 123},
+    )
+    assert starts == {"events_0": 123, "intensity_0": 10_000}
+
+
+def test_pictures_stamped_in_whole_milliseconds_get_the_times_of_their_regular_clock():
+    true_us = 5_400 + np.arange(40) * 16_667
+    assert np.abs(regular_times_us("a", true_us // 1000 * 1000) - true_us).max() < 300
+    without_some = np.delete(true_us, [7, 20, 21])
+    assert np.abs(regular_times_us("a", without_some // 1000 * 1000) - without_some).max() < 300
+
+
+def test_pictures_of_no_regular_clock_get_the_middles_of_their_milliseconds():
+    stamps = np.array([0, 10, 47, 61, 150, 158, 300]) * 1000
+    assert regular_times_us("a", stamps).tolist() == (stamps + 500).tolist()
+    with pytest.raises(RecordingError, match="a: picture 2 is stamped 3000 us"):
+        regular_times_us("a", np.array([0, 5000, 3000]))
+
+
+def test_a_picture_is_reduced_by_averaging(config):
+    picture = np.zeros((8, 12), np.uint16)
+    picture[4:, :4] = 1600  # of 4095
+    assert reduced(picture, config).tolist() == [[0, 0, 0], [100, 0, 0]]
+
+
+def test_a_target_needs_one_file_for_each_of_its_eight_captures(tmp_path):
+    for name in ("events", "intensity"):
+        for angle in (0, 45, 90, 135):
+            (tmp_path / f"{name}_{angle}.bin").touch()
+    assert len(find_captures(tmp_path)) == 8
+    (tmp_path / "events_45.csv").touch()
+    with pytest.raises(RecordingError, match=r"expected one file events_45\.bin .* got events_45\.bin, events_45\.csv"):
+        find_captures(tmp_path)
+    (tmp_path / "events_45.csv").unlink()
+    (tmp_path / "intensity_135.bin").unlink()
+    with pytest.raises(RecordingError, match=r"expected one file intensity_135\.bin .* got none"):
+        find_captures(tmp_path)
+
+
+@pytest.mark.parametrize("text", ['{"events_1": 5}', '{"events_45": 5.5}', "[1]", "{", '{"events_45": true}'])
+def test_starts_by_hand_that_make_no_sense_are_refused(tmp_path, text):
+    assert given_starts(tmp_path) == {}
+    (tmp_path / "starts.json").write_text(text)
+    with pytest.raises(RecordingError, match=r"starts\.json"):
+        given_starts(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"crop": [90, 12]}, "crop: expected at most the sensor's"), ({"size": [2]}, r"size: expected \[height, width\]")],
+)
+def test_sizes_that_do_not_fit_into_each_other_are_refused(config, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        replace(config, **wrong)

@@ -1,0 +1,170 @@
+"""The simulated rig end to end: eight files, their start times, the ground truth, the stores, the benchmark."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet.benchmark.run import run_benchmark
+from polarnet.captures.dot import (
+    EVENT_CAPTURES,
+    INTENSITY_CAPTURES,
+    RecordingsConfig,
+    find_captures,
+    read_event_capture,
+    read_intensity_capture,
+)
+from polarnet.captures.imported import import_targets
+from polarnet.captures.targets import calibrate_targets, spread_us
+from polarnet.config.pipeline import context_of, made_set
+from polarnet.config.tree import load
+from polarnet.pictures.dead_leaves import dead_leaves
+from polarnet.recordings.recording import read_recording
+from polarnet.recovery.recover import Arrangement, open_files
+from polarnet.reports.calibration import draw_calibration
+from polarnet.simulation.scene import scene_from_rgb
+from polarnet.storage.frames import FrameStore
+from studies.simulated_rig import RigConfig, true_dolp, write_rig
+
+PICTURE_RATE_HZ = 60.0
+SMALL = {
+    "enabled": True,
+    "sensor": [96, 160],
+    "region": [24, 2],
+    "negative_events": 24,
+    "crop": [64, 96],
+    "size": [16, 24],
+}
+RIG = RigConfig(
+    speed_px_s=80.0,
+    longest_delay_s=0.25,
+    duration_s=0.3,
+    picture_rate_hz=PICTURE_RATE_HZ,
+    full_well_electrons=20000.0,
+    read_noise=2.0,
+    hot_pixels=3,
+    file_type="bin",
+)
+
+
+@pytest.fixture(scope="module")
+def config(project_root) -> RecordingsConfig:
+    return replace(load(project_root).recordings, **SMALL)
+
+
+@pytest.fixture(scope="module")
+def rig(project_root, config, tmp_path_factory):
+    """A folder with one target, and what is true of it."""
+    root = tmp_path_factory.mktemp("rig")
+    emulator = replace(load(project_root).emulate, model="exact", cutoff_hz=3000.0)
+    picture = dead_leaves(np.random.default_rng(3), 96, 200)
+    scene = scene_from_rgb(torch.from_numpy(picture).permute(2, 0, 1) * 0.85 + 0.1)
+    return root, write_rig(root / "one", scene, RIG, config, emulator, seed=1)
+
+
+@pytest.fixture(scope="module")
+def calibrated(rig, config, tmp_path_factory):
+    root, truth = rig
+    folder = tmp_path_factory.mktemp("calibrated")
+    import_targets(root, folder / "imported", config)
+    (found,) = calibrate_targets(folder / "imported", folder / "out", config, {})
+    return folder / "out", found, truth
+
+
+def test_a_folder_of_captures_goes_into_recover_calibrated(rig, config, project_root, tmp_path):
+    root, _ = rig
+    source = open_files([root / "one"], Arrangement(None, None, None), read_recording, None, tmp_path, lambda: config)
+    (piece,) = source.pieces
+    assert (source.height, source.width) == tuple(config.size)
+    assert min(map(len, piece.channels)) > 0
+    assert 0 <= min(int(events.t[0]) for events in piece.channels) <= source.duration_us == piece.until_us
+
+
+def test_the_rig_writes_eight_captures_and_says_what_is_true_of_them(rig):
+    root, truth = rig
+    assert set(find_captures(root / "one")) == {*EVENT_CAPTURES, *INTENSITY_CAPTURES}
+    written = json.loads((root / "one" / "truth.json").read_text())
+    assert written["start_us"] == dict(truth.start_us)
+    assert len(set(truth.start_us.values())) == 8  # random delays
+    assert all(80_000 <= start <= 250_000 for start in truth.start_us.values())
+    with np.load(root / "one" / "truth.npz") as frames:
+        assert frames["dolp"].shape == (10, 16, 24)
+        assert frames["dolp"].mean() == pytest.approx(written["mean_dolp"], abs=1e-6)
+
+
+def test_the_landmark_darkens_the_region_at_the_true_start_and_fires_negative_events(rig, config):
+    root, truth = rig
+    files = find_captures(root / "one")
+    pictures = read_intensity_capture(files["intensity_90"], config)
+    before = pictures.t_us < truth.start_us["intensity_90"]
+    assert (pictures.region[before] > config.dark_level).all()
+    assert (pictures.region[~before] < config.dark_level).all()
+    events = read_event_capture(files["events_90"], config)
+    region = (events.x >= 158) & (events.y < 24) & (events.p < 0)
+    near = (events.t - truth.start_us["events_90"]).abs() < 50_000
+    assert int((region & near).sum()) > 10 * int((region & ~near).sum())
+
+
+def test_start_times_by_the_landmark_are_right_within_one_picture(calibrated):
+    _, found, truth = calibrated
+    for capture, start in truth.start_us.items():
+        assert abs(found.landmark_us[capture] - start) <= 1e6 / PICTURE_RATE_HZ, capture
+
+
+def test_refined_start_times_are_right_within_a_millisecond(calibrated):
+    _, found, truth = calibrated
+    by_landmark = np.abs(spread_us(found.landmark_us, truth.start_us)).max()
+    refined = np.abs(spread_us(found.start_us, truth.start_us)).max()
+    assert refined < 1000 < by_landmark
+
+
+def test_the_ground_truth_is_the_scenes_own(calibrated, config):
+    out, found, truth = calibrated
+    store = FrameStore.open(out / "frames.zarr")
+    # time 0 is where the landmark's events have it, a little before the mean of the region is dark
+    zero_us = np.mean([found.start_us[capture] - start for capture, start in truth.start_us.items()])
+    assert abs(zero_us) < 1e6 / PICTURE_RATE_HZ
+    t_us = store.t_us("one").numpy()
+    assert len(t_us) >= 8
+    expected = true_dolp(truth, t_us + round(zero_us), config)
+    assert float((store.dolp("one") - expected).pow(2).mean().sqrt()) < 0.01
+    assert float(expected.std()) > 0.05
+
+
+def test_thresholds_and_hot_pixels_come_out_as_they_were_put_in(calibrated):
+    _, found, truth = calibrated
+    assert found.alignment is not None
+    for lag in found.alignment.lags:
+        assert lag.thresholds.on == pytest.approx(0.2, rel=0.15)
+        assert lag.thresholds.off == pytest.approx(0.2, rel=0.15)
+    assert set(found.hot.values()) == {len(truth.hot)}
+
+
+def test_a_start_set_by_hand_stays(rig, config, tmp_path):
+    root, truth = rig
+    imported = tmp_path / "imported"
+    (root / "one" / "starts.json").write_text(json.dumps({"intensity_45": truth.start_us["intensity_45"]}))
+    try:
+        import_targets(root, imported, config)
+    finally:
+        (root / "one" / "starts.json").unlink()
+    (found,) = calibrate_targets(imported, tmp_path / "out", config, {})
+    assert found.start_us["intensity_45"] == truth.start_us["intensity_45"]
+
+
+def test_the_stores_are_benchmarked_like_simulated_sequences_and_the_diagnosis_is_drawn(
+    calibrated, config, tmp_path, project_root
+):
+    out, found, _ = calibrated
+    test_set = made_set("recordings", out)
+    assert (test_set.events.height, test_set.events.width) == (16, 24)
+    assert all(count > 100 for count in test_set.events.count("one"))
+    whole = load(project_root, [f"paths.data={tmp_path}"])
+    methods = ["zeros", "oracle_mean", "cf", "highpass"]
+    settings = replace(whole.benchmark, methods=methods, warmup_windows=2, bootstrap_samples=20, panel_scenes=1)
+    benchmark = run_benchmark(test_set, context_of(whole, 0.2), settings, None, tmp_path / "cache")
+    assert {row.method for row in benchmark.rows} == set(methods)
+    draw_calibration(found, config, tmp_path / "one.png")
+    assert (tmp_path / "one.png").stat().st_size > 10_000

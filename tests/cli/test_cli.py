@@ -1,0 +1,171 @@
+import subprocess
+import zipfile
+from pathlib import Path
+
+import fsspec
+import pytest
+import torch
+
+from polarnet.cli import main
+from polarnet.config.experiments import stage_names
+from polarnet.events.stream import Events
+from polarnet.storage.events import EventStore
+
+
+@pytest.fixture
+def store(tmp_path):
+    """One sequence with one event behind each polarizer."""
+    path = tmp_path / "events.zarr"
+    writer = EventStore.create(path, ["lake"], 4, 6, {})
+    one = Events(
+        torch.tensor([500]),
+        torch.tensor([5]).short(),
+        torch.tensor([3]).short(),
+        torch.tensor([1]).to(torch.int8),
+        4,
+        6,
+    )
+    writer.write("lake", [one] * 4, 1000)
+    writer.finish()
+    return path
+
+
+def test_doctor_names_versions_device_and_what_to_do_about_missing_weights(capsys):
+    assert main(["doctor"]) == 0
+    printed = capsys.readouterr().out
+    for word in ("polarnet", "torch", "device", "threads", "bf16", "LPIPS      vgg", "memory", "disk"):
+        assert word in printed
+
+
+def test_the_stages_come_in_the_order_they_run_in(capsys, project_root, monkeypatch):
+    monkeypatch.chdir(project_root / "tests")
+    assert main(["stages"]) == 0
+    assert capsys.readouterr().out.split() == [
+        "ingest", "synthesize", "emulate", "weights", "baselines", "train", "train_e2v", "train_e2p",
+        "import_recordings", "calibrate", "sets", "benchmark", "report",
+    ]  # fmt: skip
+
+
+def test_verify_finds_a_flipped_byte_and_names_the_sequence(store, capsys):
+    assert main(["verify", str(store)]) == 0
+    flip_a_byte(chunk_of(store, "events/x", 0))
+    assert main(["verify", str(store)]) == 1
+    assert "lake" in capsys.readouterr().out
+
+
+def flip_a_byte(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 3] ^= 1
+    file.write_bytes(content)
+
+
+def chunk_of(store: Path, column: str, number: int) -> Path:
+    """The one file that holds a column's row."""
+    place = store / column / "c" / str(number)
+    return next(path for path in (place, *place.rglob("*")) if path.is_file())
+
+
+def zipped(store: Path, archive: Path) -> Path:
+    with zipfile.ZipFile(archive, "w") as writer:
+        for file in sorted(store.rglob("*")):
+            writer.write(file, file.relative_to(store))
+    return archive
+
+
+@pytest.fixture
+def two(tmp_path):
+    """Two sequences with an event behind each polarizer."""
+    path = tmp_path / "two.zarr"
+    writer = EventStore.create(path, ["lake", "road"], 4, 6, {})
+    one = Events(
+        torch.tensor([500]), *(torch.tensor([1], dtype=d) for d in (torch.int16, torch.int16, torch.int8)), 4, 6
+    )
+    for name in writer.sequences:
+        writer.write(name, [one] * 4, 1000)
+    writer.finish()
+    return path
+
+
+COLUMNS = ("events/x", "events/y", "events/t", "events/p", "ms_to_idx", "offsets", "duration_us")
+
+
+def assert_verify_names_the_road(place: str | Path, column: str, capsys) -> None:
+    assert main(["verify", str(place)]) == 1
+    printed = capsys.readouterr().out
+    assert f"road, column {column} is unreadable" in printed
+    assert "lake" not in printed
+
+
+@pytest.mark.parametrize("column", COLUMNS)
+def test_verify_of_a_zip_and_of_a_url_names_the_sequence_with_a_flipped_byte(two, tmp_path, capsys, column):
+    bucket, url = fsspec.filesystem("memory"), "memory://bucket/two.zarr"
+    bucket.put(str(two), "/bucket/two.zarr", recursive=True)
+    try:
+        for place in (two, zipped(two, tmp_path / "whole.zip"), url):
+            assert main(["verify", str(place)]) == 0
+            assert "every sequence is whole" in capsys.readouterr().out
+        chunk = chunk_of(two, column, 1)
+        flip_a_byte(chunk)
+        bucket.pipe_file(f"/bucket/two.zarr/{chunk.relative_to(two).as_posix()}", chunk.read_bytes())
+        for place in (two, zipped(two, tmp_path / "damaged.zip"), url):
+            assert_verify_names_the_road(place, column, capsys)
+    finally:
+        bucket.rm("/bucket", recursive=True)
+
+
+def test_verify_names_the_sequence_where_a_byte_of_the_zip_itself_is_flipped(two, tmp_path, capsys):
+    archive = zipped(two, tmp_path / "two.zip")
+    chunk = chunk_of(two, "events/t", 1).relative_to(two).as_posix()
+    with zipfile.ZipFile(archive) as reader:
+        entry = reader.getinfo(chunk)
+    content = bytearray(archive.read_bytes())
+    content[entry.header_offset + 30 + len(chunk) + entry.file_size // 2] ^= 1  # after a local header of 30 bytes
+    archive.write_bytes(content)
+    assert_verify_names_the_road(archive, "events/t", capsys)
+
+
+def test_verify_names_a_sequence_whose_file_is_missing_from_a_bucket(two, capsys):
+    bucket = fsspec.filesystem("memory")
+    bucket.put(str(two), "/bucket/two.zarr", recursive=True)
+    try:
+        bucket.rm(f"/bucket/two.zarr/{chunk_of(two, 'events/p', 1).relative_to(two).as_posix()}")
+        assert_verify_names_the_road("memory://bucket/two.zarr", "events/p", capsys)
+    finally:
+        bucket.rm("/bucket", recursive=True)
+
+
+def test_verify_of_something_else_says_what_was_expected(tmp_path, capsys):
+    assert main(["verify", str(tmp_path / "nothing.zarr")]) == 1
+    assert "there is no Zarr v3 group" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("form", ["text", "hdf5"])
+def test_export_and_import_give_the_same_store_back(store, tmp_path, form):
+    if form == "hdf5":
+        pytest.importorskip("h5py")
+    assert main(["export", str(store), str(tmp_path / "files"), "--format", form]) == 0
+    assert main(["import", str(tmp_path / "files"), str(tmp_path / "again.zarr")]) == 0
+    files = {path.relative_to(store): path.read_bytes() for path in store.rglob("*") if path.is_file()}
+    again = tmp_path / "again.zarr"
+    assert files == {path.relative_to(again): path.read_bytes() for path in again.rglob("*") if path.is_file()}
+
+
+def test_a_folder_that_is_no_project_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["preset", "smoke"]) == 1
+    assert "run this inside a polarnet clone" in capsys.readouterr().err
+
+
+def test_a_run_with_another_sensor_has_a_folder_of_its_own(project_root, monkeypatch, capsys):
+    calls = []
+
+    def ran(command, cwd):
+        calls.append(command)
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr("polarnet.cli.project.subprocess.run", ran)
+    monkeypatch.chdir(project_root)
+    assert main(["run", "experiment=smoke", "sensor=noisy"]) == 0
+    assert calls[0][2:] == ["stages.ingest", "experiment=smoke", "sensor=noisy", "paths.data=outputs/run/smoke-noisy"]
+    assert len(calls) == len(stage_names(project_root))
+    assert "outputs/run/smoke-noisy/report/index.html" in capsys.readouterr().out

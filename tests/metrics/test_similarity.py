@@ -1,0 +1,271 @@
+import numpy as np
+import pytest
+import torch
+from skimage.filters import sobel_h, sobel_v
+from skimage.metrics import mean_squared_error, peak_signal_noise_ratio, structural_similarity
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from polarnet.metrics.lpips import Lpips
+from polarnet.metrics.similarity import (
+    aolp_error_deg,
+    correlation,
+    gradient_agreement,
+    level_mse,
+    mse,
+    pattern_mse,
+    psnr,
+    spread_mse,
+    ssim,
+)
+
+
+@pytest.fixture
+def pair():
+    generator = torch.Generator().manual_seed(3)
+    smooth = torch.linspace(0, 1, 31).expand(2, 24, 31)
+    return smooth.clone(), (smooth + 0.2 * torch.rand(2, 24, 31, generator=generator)).clamp(0, 1)
+
+
+def test_an_offset_of_a_tenth_is_20_db_and_all_level():
+    a, b = torch.full((3, 8, 8), 0.5), torch.full((3, 8, 8), 0.6)
+    torch.testing.assert_close(mse(a, b), torch.full((3,), 0.01))
+    torch.testing.assert_close(psnr(a, b), torch.full((3,), 20.0))
+    torch.testing.assert_close(level_mse(a, b), mse(a, b))
+    torch.testing.assert_close(pattern_mse(a, b), torch.zeros(3), atol=1e-12, rtol=0)
+
+
+def test_level_and_pattern_add_up_to_the_squared_error(pair):
+    a, b = (x.double() for x in pair)
+    torch.testing.assert_close(level_mse(a, b) + pattern_mse(a, b), mse(a, b), rtol=1e-12, atol=0)
+
+
+def test_equal_frames_have_100_db_ssim_1_and_correlation_1(pair):
+    a, _ = pair
+    assert psnr(a, a).tolist() == [100.0, 100.0]
+    torch.testing.assert_close(ssim(a, a), torch.ones(2))
+    torch.testing.assert_close(correlation(a, a), torch.ones(2))
+
+
+def test_correlation_ignores_gain_and_offset_but_not_sign(pair):
+    a, _ = pair
+    torch.testing.assert_close(correlation(a, 0.3 * a + 0.1), torch.ones(2))
+    torch.testing.assert_close(correlation(a, 1 - a), -torch.ones(2))
+
+
+@pytest.mark.parametrize("value", [0.0, 0.1, 1 / 3])
+def test_a_constant_frame_correlates_0_with_anything_and_has_a_gradient(pair, value):
+    constant = torch.full((2, 24, 31), value, requires_grad=True)
+    scores = correlation(constant, pair[0])
+    assert scores.tolist() == [0.0, 0.0]
+    scores.sum().backward()
+    assert constant.grad.isfinite().all()
+
+
+def test_correlation_is_that_of_numpy(pair):
+    a, b = pair
+    expected = [np.corrcoef(x.flatten(), y.flatten())[0, 1] for x, y in zip(a, b, strict=True)]
+    np.testing.assert_allclose(correlation(a, b), expected, rtol=1e-6)
+
+
+def test_ssim_is_that_of_torchmetrics(pair):
+    a, b = (x.double() for x in pair)
+    for i in range(2):
+        expected = structural_similarity_index_measure(
+            b[i][None, None], a[i][None, None], gaussian_kernel=True, sigma=1.5, kernel_size=11, data_range=1.0
+        )
+        torch.testing.assert_close(ssim(a, b)[i], expected, rtol=1e-7, atol=0)
+        assert ssim(*(x.float() for x in (a, b)))[i].item() == pytest.approx(expected.item(), rel=1e-4)
+
+
+def test_ssim_is_that_of_scikit_image_where_its_window_meets_no_border():
+    # a pattern of period 26 whose mirror at both borders continues it: every pixel is as an interior one
+    phase = torch.arange(27, dtype=torch.float64) * torch.pi / 13
+    a = 0.5 + 0.4 * torch.cos(phase)[:, None] * torch.cos(phase)
+    b = 0.5 + 0.3 * torch.cos(2 * phase)[:, None] * torch.cos(phase)
+    tiles = [torch.cat([x, x[1:], x[1:]]) for x in (a, b)]
+    tiles = [torch.cat([x, x[:, 1:], x[:, 1:]], dim=1) for x in tiles]
+    _, expected = structural_similarity(
+        *(x.numpy() for x in tiles), data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+        full=True,
+    )  # fmt: skip
+    middle = expected[26:53, 26:53].mean()
+    assert ssim(a, b).item() == pytest.approx(middle, abs=1e-12)
+
+
+def test_ssim_of_two_constants_is_their_luminance_term():
+    a, b = torch.full((12, 12), 0.4, dtype=torch.float64), torch.full((12, 12), 0.6, dtype=torch.float64)
+    assert ssim(a, b).item() == pytest.approx((2 * 0.24 + 1e-4) / (0.16 + 0.36 + 1e-4), rel=1e-12)
+
+
+def test_ssim_has_the_gradient_of_its_finite_differences():
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.rand(1, 7, 6, generator=generator, dtype=torch.float64) for _ in range(2))
+    assert torch.autograd.gradcheck(lambda x: ssim(x, b), a.requires_grad_())
+
+
+def test_ssim_keeps_float32_under_autocast(pair):
+    a, b = pair
+    with torch.autocast("cpu", torch.bfloat16):
+        inside = ssim(a, b)
+    assert torch.equal(inside, ssim(a, b))
+
+
+def test_ssim_of_a_frame_smaller_than_half_its_window_is_refused():
+    with pytest.raises(ValueError, match="at least 6 pixels a side, got \\(5, 40\\)"):
+        ssim(torch.zeros(5, 40), torch.zeros(5, 40))
+
+
+def test_mse_and_psnr_are_those_of_scikit_image(pair):
+    a, b = (x.double() for x in pair)
+    for i in range(2):
+        pictures = b[i].numpy(), a[i].numpy()
+        assert mse(a, b)[i].item() == pytest.approx(mean_squared_error(*pictures), rel=1e-12)
+        assert psnr(a, b)[i].item() == pytest.approx(peak_signal_noise_ratio(*pictures, data_range=1), rel=1e-12)
+
+
+def test_the_spread_is_the_error_of_the_frames_own_mean(pair):
+    _, b = pair
+    torch.testing.assert_close(spread_mse(b), mse(b.mean(dim=(-2, -1), keepdim=True).expand_as(b), b))
+
+
+def test_gradients_of_equal_ramps_agree_and_half_as_steep_a_one_agrees_less():
+    ramp = torch.linspace(0, 1, 9).expand(7, 9)
+    assert gradient_agreement(ramp, ramp + 0.1).item() == pytest.approx(1)
+    assert gradient_agreement(ramp, 0.5 * ramp).item() == pytest.approx(2 * 0.5 / (1 + 0.25))
+    assert gradient_agreement(ramp, -ramp).item() == pytest.approx(-1)
+    assert gradient_agreement(ramp, torch.linspace(0, 1, 7)[:, None].expand(7, 9)).item() == pytest.approx(0, abs=1e-7)
+
+
+def test_gradient_agreement_is_that_of_scikit_images_sobel(pair):
+    a, b = (x.double() for x in pair)
+    # scikit-image's kernels sum to 1 on either side of the centre; ours take the slope per pixel: half as much
+    along = [[f(x[0].numpy())[1:-1, 1:-1] for f in (sobel_h, sobel_v)] for x in (a, b)]
+    common = sum((x * y).sum() for x, y in zip(*along, strict=True))
+    energy = sum((x * x).sum() for gradient in along for x in gradient)
+    assert gradient_agreement(a, b)[0].item() == pytest.approx(2 * common / energy, rel=1e-12)
+
+
+def test_a_constant_frame_agrees_with_no_gradient():
+    assert gradient_agreement(torch.full((5, 5), 1 / 3), torch.rand(5, 5)).item() == 0
+    with pytest.raises(ValueError, match="at least 3 pixels a side"):
+        gradient_agreement(torch.zeros(2, 9), torch.zeros(2, 9))
+
+
+@pytest.mark.parametrize(
+    ("a_deg", "b_deg", "error"), [(10, 30, 20), (175, 5, 10), (0, 90, 90), (0, 180, 0), (1, 179, 2), (40, 140, 80)]
+)
+def test_the_angle_between_two_orientations_goes_the_shorter_way_round(a_deg, b_deg, error):
+    a, b = (torch.full((1, 2, 2), float(np.deg2rad(x)), dtype=torch.float64) for x in (a_deg, b_deg))
+    assert aolp_error_deg(a, b, torch.ones(1, 2, 2)).item() == pytest.approx(error, abs=1e-9)
+    assert aolp_error_deg(b, a, torch.ones(1, 2, 2)).item() == pytest.approx(error, abs=1e-9)
+
+
+def test_an_angle_weighs_as_much_as_the_light_is_polarized():
+    error = torch.tensor([[0.0, np.deg2rad(40)]])
+    assert aolp_error_deg(error, 0 * error, torch.tensor([[0.9, 0.3]])).item() == pytest.approx(10, abs=1e-5)
+    assert aolp_error_deg(error, 0 * error, torch.tensor([[0.9, 0.0]])).item() == 0
+
+
+def test_pixels_that_are_not_valid_count_in_no_gradient_angle_or_spread(pair):
+    a, b = pair
+    valid = torch.ones(2, 24, 31, dtype=torch.bool)
+    valid[:, :, 20:] = False
+    spoilt = torch.where(valid, a, 7.0)
+    known, other = a[..., :20], b[..., :20]
+    torch.testing.assert_close(gradient_agreement(spoilt, b, valid), gradient_agreement(known, other))
+    torch.testing.assert_close(aolp_error_deg(spoilt, b, b, valid), aolp_error_deg(known, other, other))
+    torch.testing.assert_close(spread_mse(spoilt, valid), spread_mse(known))
+
+
+def test_without_polarization_an_angle_is_right_by_chance():
+    zero = torch.zeros(2, 3, 3)
+    assert aolp_error_deg(zero, zero, zero).tolist() == [45.0, 45.0]
+    random = torch.rand(1, 300, 300, generator=torch.Generator().manual_seed(0)) * torch.pi
+    assert aolp_error_deg(random, torch.zeros(1, 300, 300), torch.ones(1, 300, 300)).item() == pytest.approx(
+        45, abs=0.3
+    )
+
+
+def test_leading_axes_are_kept(pair):
+    a, b = (x.view(1, 2, 24, 31) for x in pair)
+    for score in (mse, psnr, ssim, correlation, level_mse, pattern_mse, gradient_agreement):
+        assert score(a, b).shape == (1, 2)
+
+
+PIXELWISE = [mse, level_mse, pattern_mse, psnr, correlation]
+
+
+@pytest.mark.parametrize("metric", PIXELWISE)
+def test_a_masked_frame_scores_like_the_part_that_is_valid(pair, metric):
+    valid = torch.zeros(2, 24, 31, dtype=torch.bool)
+    valid[:, 3:20, 5:30] = True
+    part = [x[:, 3:20, 5:30] for x in pair]
+    torch.testing.assert_close(metric(*pair, valid), metric(*part), rtol=1e-5, atol=1e-7)
+
+
+def test_masked_ssim_is_the_mean_of_the_map_over_the_valid_pixels(pair):
+    """scikit-image's map, which it makes in its own way; the frames agree where they are masked."""
+    truth, other = pair
+    valid = torch.zeros(24, 31, dtype=torch.bool)
+    valid[6:12, 8:20] = True
+    mixed = torch.where(valid, other, truth)
+    for a, b, score in zip(mixed, truth, ssim(mixed, truth, valid.expand(2, -1, -1)), strict=True):
+        options = {"data_range": 1.0, "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+        _, whole = structural_similarity(a.numpy(), b.numpy(), full=True, **options)
+        assert score.item() == pytest.approx(float(whole[valid.numpy()].mean()), abs=1e-5)
+
+
+@pytest.mark.parametrize("metric", [*PIXELWISE, ssim])
+def test_what_lies_outside_a_mask_does_not_matter(pair, metric):
+    predicted, truth = pair
+    valid = torch.rand(2, 24, 31, generator=torch.Generator().manual_seed(5)) < 0.7
+    spoilt = torch.where(valid, predicted, 1 - predicted)
+    assert not torch.equal(metric(spoilt, truth), metric(predicted, truth))
+    assert torch.equal(metric(spoilt, truth, valid), metric(predicted, truth, valid))
+
+
+@pytest.mark.parametrize("metric", [*PIXELWISE, ssim])
+def test_a_mask_that_masks_nothing_changes_nothing_and_one_that_masks_all_leaves_no_number(pair, metric):
+    everywhere = torch.ones(2, 24, 31, dtype=torch.bool)
+    torch.testing.assert_close(metric(*pair, everywhere), metric(*pair))
+    assert metric(*pair, ~everywhere).isnan().all()
+
+
+@pytest.mark.parametrize("metric", [mse, psnr, ssim, correlation, gradient_agreement, level_mse, pattern_mse])
+def test_numpy_gives_what_torch_gives(pair, metric):
+    a, b = pair
+    valid = b > 0.2
+    assert torch.equal(metric(a.numpy(), b.numpy()), metric(a, b))
+    assert torch.equal(metric(a.numpy(), b.numpy(), valid.numpy()), metric(a, b, valid))
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+def test_a_truth_of_another_data_range_is_refused(pair, metric):
+    a, b = pair
+    with pytest.raises(ValueError, match=r"b: expected frames in \[0, 1\], got values up to 255; divide by 255"):
+        metric(255 * a, 255 * b / b.max())
+    metric(3 * a, b)  # a prediction may exceed it
+    metric(a, torch.where(a > 0.5, 255, b), a <= 0.5)  # so may what nobody looks at
+
+
+@pytest.mark.parametrize("metric", [mse, psnr, ssim, correlation, gradient_agreement, level_mse, pattern_mse])
+def test_frames_of_bytes_or_of_different_shapes_are_refused(unchecked_annotations, pair, metric):
+    a, b = pair
+    with pytest.raises(ValueError, match=r"a: expected floating-point numbers, got torch\.uint8; divide by 255"):
+        metric((255 * a).byte(), b)
+    with pytest.raises(ValueError, match=r"expected a and b of one shape, got a \(2, 24, 31\), b \(24, 31\)"):
+        metric(a, b[0])
+    with pytest.raises(ValueError, match="valid: expected a mask, bool of shape"):
+        metric(a, b, b)
+
+
+def test_lpips_takes_numpy_and_refuses_bytes_and_a_truth_of_another_range(unchecked_annotations):
+    network = Lpips("squeeze")
+    a, b = torch.rand(2, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(network(a.numpy(), b.numpy()), network(a, b))
+    with pytest.raises(ValueError, match=r"images: expected floating-point numbers, got torch\.uint8"):
+        network((255 * a).byte(), b)
+    with pytest.raises(
+        ValueError, match=r"truth: expected images in \[0, 1\], got values up to 2\d\d.*; divide by 255"
+    ):
+        network(a, 255 * b)

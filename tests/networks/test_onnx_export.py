@@ -1,0 +1,248 @@
+import builtins
+import contextlib
+import io
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import jaxtyping
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+from polarnet.cli import main
+from polarnet.config.tree import load
+from polarnet.events.representations import event_counts
+from polarnet.events.stream import Events
+from polarnet.networks import onnx_export
+from polarnet.networks.checkpoint import load_network, save_checkpoint
+from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.networks.onnx_export import export_network, largest_differences, random_windows
+from polarnet.networks.stokes_unet import StokesUNet
+
+HEIGHT, WIDTH = 30, 44  # neither divides by 8
+CONFIGS = {
+    "paper": DolpUNetConfig(
+        channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1, input_mixing="contrasts"
+    ),
+    "polarnet": replace(
+        load(Path(__file__).resolve().parents[2]).networks.polarnet,
+        channels=[8, 8, 8],
+        memories=[0.0, 0.5],
+        decays=[0.9],
+        scales=[1, 3, 0],
+        mosaic_scale=5,
+    ),
+}
+REPRESENTATIONS = {"paper": "event_tensor", "polarnet": "event_counts"}
+
+
+def save_small(name: str, folder: Path) -> Path:
+    """A checkpoint of a small network with random weights everywhere."""
+    torch.manual_seed(0)
+    config = CONFIGS[name]
+    network = DolpUNet(config) if isinstance(config, DolpUNetConfig) else StokesUNet(config)
+    tensors = {key: tensor + 0.1 * torch.randn(tensor.shape) for key, tensor in network.state_dict().items()}
+    metadata = {
+        "network": name,
+        "config": asdict(config),
+        "in_channels": 4 if name == "paper" else 8,
+        "representation": REPRESENTATIONS[name],
+        "data": {"events_from": {"scenes": {"synthesize": {"frame_rate_hz": 50.0}}}},
+    }
+    save_checkpoint(folder / f"{name}.safetensors", tensors, metadata)
+    return folder / f"{name}.safetensors"
+
+
+class Written(NamedTuple):
+    """What `polarnet onnx` made of a checkpoint, and what it printed."""
+
+    path: Path
+    checkpoint: Path
+    printed: str
+
+
+@contextlib.contextmanager
+def unchecked() -> Iterator[None]:
+    """Without the shape checks of jaxtyping, which make tracing several times slower."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        yield
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def write_small(name: str, folder: Path) -> Written:
+    checkpoint, path = save_small(name, folder), folder / "polarnet.onnx"
+    with unchecked(), contextlib.redirect_stdout(io.StringIO()) as printed:
+        size = ("--height", str(HEIGHT), "--width", str(WIDTH))
+        assert main(["onnx", str(path), "--weights", str(checkpoint), *size]) == 0
+    return Written(path, checkpoint, printed.getvalue())
+
+
+@pytest.fixture(scope="module")
+def of_each(tmp_path_factory) -> dict[str, Written]:
+    """Tracing takes seconds, so each network is written once."""
+    return {name: write_small(name, tmp_path_factory.mktemp(name)) for name in CONFIGS}
+
+
+@pytest.fixture(params=list(CONFIGS))
+def written(request, of_each) -> Written:
+    return of_each[request.param]
+
+
+@pytest.fixture
+def small(of_each) -> Path:
+    return of_each["polarnet"].checkpoint
+
+
+@pytest.fixture
+def never_traced(monkeypatch):
+    """Whatever is refused is refused before the long part."""
+    monkeypatch.setattr(onnx_export, "_traced", lambda *_: pytest.fail("traced"))
+
+
+@torch.no_grad()
+def test_onnx_runtime_gives_what_torch_gives_window_after_window(written):
+    path, checkpoint, _ = written
+    network, metadata = load_network(checkpoint)
+    session = onnxruntime.InferenceSession(path)
+    names = [output.name for output in session.get_outputs()]
+    fed = {one.name: np.zeros(one.shape, np.float32) for one in session.get_inputs() if one.name != "events"}
+    state = None
+    for events in random_windows(metadata, HEIGHT, WIDTH):
+        given = dict(zip(names, session.run(names, {"events": events.numpy(), **fed}), strict=True))
+        fed = {name: given[f"new_{name}"] for name in fed}
+        prediction, state = network(events, state)
+        wanted = {name: field for name, field in prediction._asdict().items() if field is not None}
+        assert names == [*wanted, *(f"new_state_{number}" for number in range(len(state)))]
+        expected = wanted | dict(zip(names[len(wanted) :], state, strict=True))
+        for name in expected.keys() - {"aolp"}:  # which is none where (s1, s2) is zero
+            torch.testing.assert_close(torch.from_numpy(given[name]), expected[name], atol=1e-4, rtol=1e-4)
+        if "aolp" in wanted:
+            s1, s2 = given["stokes"][:, 0], given["stokes"][:, 1]
+            length = np.hypot(s1, s2)
+            np.testing.assert_allclose(length * np.cos(2 * given["aolp"]), s1, atol=1e-5)
+            np.testing.assert_allclose(length * np.sin(2 * given["aolp"]), s2, atol=1e-5)
+
+
+def test_the_check_finds_rounding_and_nothing_else(written):
+    said = r"polarnet\.onnx, 0\.\d MB\nONNX Runtime's outputs are within \d\.\de-0[5-9] of torch's \(\w+\); 0\.0001 is"
+    assert re.search(said, written.printed)
+
+
+def test_the_check_sees_one_weight_that_is_off(written):
+    network, metadata = load_network(written.checkpoint)
+    last = network.p1 if hasattr(network, "p1") else network.add
+    with torch.no_grad():
+        last.bias[0] += 0.001
+    assert max(largest_differences(written.path, network, random_windows(metadata, HEIGHT, WIDTH)).values()) > 4e-4
+
+
+def test_a_file_that_onnx_runtime_does_not_take_is_an_error_that_says_so(tmp_path):
+    (tmp_path / "n.onnx").write_bytes(b"no graph")
+    with pytest.raises(RuntimeError, match=r"ONNX Runtime \S+ does not take n\.onnx: "):
+        largest_differences(tmp_path / "n.onnx", torch.nn.Identity(), torch.zeros(1, 1, 8, 2, 2))
+
+
+def test_the_file_says_what_it_takes(written):
+    path, checkpoint, _ = written
+    session = onnxruntime.InferenceSession(path)
+    about = json.loads(session.get_modelmeta().custom_metadata_map["polarnet"])
+    metadata = load_network(checkpoint)[1]
+    assert about["checkpoint"] == metadata
+    assert about["window_us"] == 20_000
+    assert about["representation"] == metadata["representation"]
+    assert about["events"]["images_of_each"] * 4 == metadata["in_channels"]
+    shapes = {"events": about["events"]["shape"], **{one["input"]: one["shape"] for one in about["state"]}}
+    assert shapes == {one.name: one.shape for one in session.get_inputs()}
+    assert shapes["events"] == [1, metadata["in_channels"], HEIGHT, WIDTH]
+    assert [*about["outputs"], *(one["output"] for one in about["state"])] == [o.name for o in session.get_outputs()]
+
+
+def test_the_file_is_alone_and_tells_nothing_of_the_machine_that_wrote_it(written):
+    files = {written.path, written.checkpoint, written.checkpoint.with_suffix(".json")}
+    assert set(written.path.parent.iterdir()) == files
+    assert b".py" not in written.path.read_bytes()
+
+
+@pytest.mark.parametrize("difference", [0.1, float("nan")])
+def test_a_file_that_differs_from_torch_is_not_left_behind(of_each, tmp_path, monkeypatch, capsys, difference):
+    monkeypatch.setattr(onnx_export, "_traced", lambda *_: (onnx.load(of_each["polarnet"].path), {}))
+    monkeypatch.setattr(onnx_export, "largest_differences", lambda *_: {"dolp": difference, "stokes": 0.0})
+    out, weights = tmp_path / "n.onnx", of_each["polarnet"].checkpoint
+    said = f"ONNX Runtime differs from torch by more than 0.0001 in dolp ({difference:.2g});"
+    assert said in refusal(capsys, out, "--weights", weights)
+    assert list(tmp_path.iterdir()) == []
+    out.write_bytes(b"an earlier one")
+    assert said in refusal(capsys, out, "--weights", weights)
+    assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"an earlier one"]
+
+
+def refusal(capsys, *arguments: object) -> str:
+    """What the command says where it must not do what it is told."""
+    assert main(["onnx", *map(str, arguments)]) == 1
+    return capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("never_traced")
+def test_what_cannot_be_written_is_refused_before_the_work(small, tmp_path, monkeypatch, capsys):
+    weights = ("--weights", small)
+    assert "expected a file NAME.onnx to write, got" in refusal(capsys, tmp_path / "n.pt", *weights)
+    assert "no folder; make it first" in refusal(capsys, tmp_path / "none" / "n.onnx", *weights)
+    (tmp_path / "folder.onnx").mkdir()
+    assert "cannot be written: it is a folder" in refusal(capsys, tmp_path / "folder.onnx", *weights)
+    monkeypatch.setattr(onnx_export.os, "access", lambda *_: False)  # tests may run as root, who can write anywhere
+    assert "is read-only for you" in refusal(capsys, tmp_path / "n.onnx", *weights)
+
+
+@pytest.mark.usefixtures("never_traced")
+def test_weights_and_sizes_that_are_none_are_refused(small, tmp_path, capsys):
+    out = tmp_path / "n.onnx"
+    assert "none.safetensors is missing" in refusal(capsys, out, "--weights", tmp_path / "none.safetensors")
+    assert "NAME.safetensors, got" in refusal(capsys, out, "--weights", tmp_path / "best.pth")
+    assert "at least 1 pixel, got 0x180" in refusal(capsys, out, "--weights", small, "--height", 0)
+
+
+@pytest.mark.usefixtures("never_traced")
+@pytest.mark.parametrize("absent", ["onnx", "onnxruntime", "onnxscript"])
+def test_without_the_packages_the_extra_is_named(small, tmp_path, monkeypatch, capsys, absent):
+    real = builtins.__import__
+
+    def importing(name, *rest):
+        if name == absent:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", importing)
+    said = refusal(capsys, tmp_path / "n.onnx", "--weights", small)
+    assert f"ONNX files need {absent}: pip install 'polarnet[export]'" in said
+
+
+def test_the_lines_on_the_page_run_as_they_stand(of_each, monkeypatch, project_root):
+    monkeypatch.chdir(of_each["polarnet"].path.parent)
+    snippet = re.search(r"```python\n(.*?)```", (project_root / "docs" / "network.md").read_text(), re.DOTALL)
+    assert snippet is not None
+    names: dict = {}
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        exec(snippet[1], names)
+    assert len(printed.getvalue().split()) == 2
+    assert names["found"]["dolp"].shape == (1, HEIGHT, WIDTH)
+
+    columns = zip(("x", "y", "polarity"), (torch.int16, torch.int16, torch.int8), strict=True)
+    x, y, p = (torch.from_numpy(names[name]).to(dtype) for name, dtype in columns)
+    of = [torch.from_numpy(names["polarizer"] == number) for number in range(4)]
+    t = torch.arange(len(x))
+    images = [event_counts(Events(t[k], x[k], y[k], p[k], HEIGHT, WIDTH), 33_333) for k in of]
+    assert torch.equal(torch.cat(images), torch.from_numpy(names["events"][0]))
+
+
+def test_the_path_of_an_export_may_be_text(small, tmp_path):
+    network, metadata = load_network(str(small))
+    assert max(export_network(network, metadata, str(tmp_path / "n.onnx"), 16, 24).values()) < 1e-4
+    assert (tmp_path / "n.onnx").is_file()

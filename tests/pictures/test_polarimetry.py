@@ -1,0 +1,294 @@
+"""Measured polarization: three ways to store it, one scene."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+from PIL import Image
+
+from polarnet.pictures.images import UnreadablePicture
+from polarnet.pictures.ingest import IngestConfig, ingest
+from polarnet.pictures.polarimetry import (
+    Measurement,
+    demosaic,
+    group_by_measurement,
+    read_intensities,
+    read_measurement,
+    shrink,
+    write_intensities,
+)
+from polarnet.simulation.motion import MotionConfig
+from polarnet.simulation.scene import scene_from_intensities
+from polarnet.simulation.truth import synthesize
+from polarnet.stokes import aolp, dolp, parse_mosaic
+from polarnet.storage.frames import FrameStore
+from polarnet.storage.scenes import SceneStore
+
+SONY = parse_mosaic("90 45 / 135 0")
+ANGLES = (0, 45, 90, 135)
+CONFIG = IngestConfig(
+    source="polarization",
+    root="",
+    limit=None,
+    dead_leaves=0,
+    height=80,
+    width=120,
+    max_upscale=2.0,
+    val_fraction=0.0,
+    test_fraction=0.0,
+    mosaic="90 45 / 135 0",
+    residual_max=0.1,
+)
+
+
+def light(height: int = 40, width: int = 60, degree: float = 0.6, angle_deg: float = 30.0) -> np.ndarray:
+    """I0, I45, I90, I135 of Eq. 4 as uint8: S0 rises from left to right, DoLP and AoLP are the same everywhere."""
+    s0 = np.linspace(60, 200, width) * np.ones((height, 1))
+    doubled = [2 * math.radians(angle - angle_deg) for angle in ANGLES]
+    return np.stack([np.round(s0 / 2 * (1 + degree * math.cos(d))) for d in doubled]).astype(np.uint8)
+
+
+def save_npz(path: Path, intensities: np.ndarray) -> None:
+    np.savez(path, **{f"I{angle}": plane for angle, plane in zip(ANGLES, intensities, strict=True)})
+
+
+def raw_mosaic(intensities: np.ndarray) -> np.ndarray:
+    """What a sensor with the Sony order sees."""
+    raw = np.zeros(intensities.shape[1:], intensities.dtype)
+    for row in (0, 1):
+        for column in (0, 1):
+            plane = intensities[ANGLES.index(SONY[row][column])]
+            raw[row::2, column::2] = plane[row::2, column::2]
+    return raw
+
+
+def polarization_of(measurement: Measurement) -> tuple[torch.Tensor, torch.Tensor]:
+    stokes = scene_from_intensities(torch.from_numpy(measurement.intensities)).stokes
+    return dolp(stokes), aolp(stokes)
+
+
+def reason(*files: Path) -> str:
+    with pytest.raises(UnreadablePicture) as caught:
+        read_measurement(files, SONY)
+    return str(caught.value)
+
+
+def test_three_ways_to_store_one_scene_give_its_polarization(tmp_path):
+    intensities = light()
+    save_npz(tmp_path / "scene.npz", intensities)
+    for angle, plane in zip(ANGLES, intensities, strict=True):
+        Image.fromarray(plane).save(tmp_path / f"scene_{angle}.png")
+    Image.fromarray(raw_mosaic(intensities)).save(tmp_path / "raw.png")
+    groups = group_by_measurement(sorted(tmp_path.iterdir()))
+    assert sorted(len(group) for group in groups) == [1, 1, 4]
+    for group in groups:
+        measured = read_measurement(group, SONY)
+        degree, angle = polarization_of(measured)
+        assert degree.mean().item() == pytest.approx(0.6, abs=0.005)
+        assert (degree - 0.6).abs().max() < 0.03  # 8 bits
+        assert math.degrees(angle.mean()) == pytest.approx(30, abs=0.2)
+        assert measured.valid.all()
+        assert measured.residual < 0.01
+
+
+def test_16_bit_files_and_colour_files_are_read_too(tmp_path):
+    intensities = light()
+    files = []
+    for angle, plane in zip(ANGLES, intensities, strict=True):
+        files.append(tmp_path / f"scene_{angle:03d}.tif")
+        colour = np.stack([np.zeros_like(plane), plane, np.full_like(plane, 7)], axis=-1)  # green counts
+        tifffile.imwrite(files[-1], colour.astype(np.uint16) * 257, photometric="rgb")
+    save_npz(tmp_path / "scene.npz", intensities)
+    as_files, as_npz = read_measurement(files, SONY), read_measurement([tmp_path / "scene.npz"], SONY)
+    np.testing.assert_allclose(as_files.intensities, as_npz.intensities, atol=1e-6)
+
+
+def test_unpolarized_light_that_just_saturates_is_s0_1(tmp_path):
+    save_npz(tmp_path / "a.npz", np.full((4, 8, 8), 254, np.uint8))
+    s0 = scene_from_intensities(torch.from_numpy(read_measurement([tmp_path / "a.npz"], SONY).intensities)).stokes[0]
+    assert s0.max().item() == pytest.approx(254 / 255)
+
+
+def test_12_bits_in_a_16_bit_file_are_recognised(tmp_path):
+    values = np.full((4, 8, 8), 2000, np.uint16)
+    values[:2, 0, 0] = 4095  # two saturated angles
+    save_npz(tmp_path / "a.npz", values)
+    measured = read_measurement([tmp_path / "a.npz"], SONY)
+    assert measured.intensities[0, 1, 1] == pytest.approx(2000 / 4095 / 2)
+    assert not measured.valid[0, 0]
+
+
+def test_one_saturated_angle_follows_from_the_other_three_and_two_are_masked(tmp_path):
+    values = np.full((4, 8, 8), 100, np.uint8)
+    values[:, 2, 3] = (255, 220, 60, 130)  # I0 was 220 + 130 - 60 = 290
+    values[:, 4, 5] = (255, 255, 60, 60)
+    save_npz(tmp_path / "a.npz", values)
+    measured = read_measurement([tmp_path / "a.npz"], SONY)
+    assert measured.intensities[0, 2, 3] * 510 == pytest.approx(290)
+    assert np.argwhere(~measured.valid).tolist() == [[4, 5]]
+    assert measured.saturated == 2 / 64
+
+
+@pytest.mark.parametrize("order", ["90 45 / 135 0", "0 45 / 135 90", "135 0 / 90 45"])
+def test_every_angle_of_a_mosaic_is_seen_at_the_centre_of_its_cell(order):
+    """Bilinear interpolation is exact on planes: each angle has one of its own."""
+    mosaic = parse_mosaic(order)
+    rows, columns = np.mgrid[:20, :30].astype(float)
+    plane = {0: rows, 45: columns, 90: 10 + rows - 2 * columns, 135: 3 * rows + columns}
+    raw = np.zeros((20, 30))
+    for row in (0, 1):
+        for column in (0, 1):
+            raw[row::2, column::2] = plane[mosaic[row][column]][row::2, column::2]
+    seen = demosaic(raw, mosaic)
+    assert seen.shape == (4, 8, 13)
+    centre_rows, centre_columns = np.mgrid[1:9, 1:14] * 2 + 0.5
+    expected = [centre_rows, centre_columns, 10 + centre_rows - 2 * centre_columns, 3 * centre_rows + centre_columns]
+    np.testing.assert_allclose(seen, expected, atol=1e-12)
+
+
+def test_an_unpolarized_edge_looks_less_polarized_than_with_one_pixel_per_angle():
+    raw = np.full((40, 40), 0.05)
+    raw[:, 21:] = 0.5  # an edge through cells
+    at_centre = scene_from_intensities(torch.from_numpy(demosaic(raw, SONY)))
+    naive = scene_from_intensities(
+        torch.from_numpy(np.stack([raw[1::2, 1::2], raw[::2, 1::2], raw[::2, ::2], raw[1::2, ::2]]))
+    )
+    assert dolp(at_centre.stokes).max() < 0.6 * dolp(naive.stokes).max()
+
+
+@pytest.mark.parametrize("order", ["0 45 90 135", "0 45 / 90", "0 45 / 90 91", "0 0 / 90 135"])
+def test_a_mosaic_without_the_four_angles_is_refused(order):
+    with pytest.raises(ValueError, match="mosaic: expected the angles 0, 45, 90 and 135"):
+        parse_mosaic(order)
+
+
+def test_what_does_not_belong_together_is_named(tmp_path):
+    plane = light()[0]
+    for name in ("a_0.png", "a_45.png", "a_90.png", "b_0.png", "b_45.png", "b_90.png", "b_135.png"):
+        Image.fromarray(plane).save(tmp_path / name)
+    Image.fromarray(plane[:-2]).save(tmp_path / "b_135.png")
+    assert reason(*sorted(tmp_path.glob("a_*"))) == "no file for _135 beside a_0.png"
+    assert "one size and type" in reason(*sorted(tmp_path.glob("b_*")))
+    np.savez(tmp_path / "c.npz", I0=plane, I45=plane)
+    assert reason(tmp_path / "c.npz") == "expected the arrays I0, I45, I90, I135, I90, I135 is missing"
+    save_npz(tmp_path / "d.npz", light().astype(np.float32))
+    assert reason(tmp_path / "d.npz").startswith("expected floats in [0, 1], got 1")
+    (tmp_path / "e.npz").write_text("text")
+    assert "cannot be read" in reason(tmp_path / "e.npz")
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "f.png")
+    assert reason(tmp_path / "f.png").startswith("3 channels: neither a raw mosaic nor one of NAME_0")
+    save_npz(tmp_path / "g.npz", np.full((4, 8, 8), 255, np.uint8))
+    assert reason(tmp_path / "g.npz") == "no pixel is lit and unsaturated at all four angles"
+
+
+def test_shrinking_masks_every_pixel_that_a_masked_one_went_into():
+    valid = np.ones((160, 240), dtype=bool)
+    valid[80, 100] = False
+    measured = Measurement(np.full((4, 160, 240), 0.25, np.float32), valid, residual=0.0, saturated=0.0)
+    shrunk = shrink(measured, 80, 120)
+    assert shrunk.valid.shape == (80, 120)
+    assert np.argwhere(~shrunk.valid).tolist() == [[40, 50]]
+    assert shrink(measured, 200, 300) is measured  # never enlarged
+
+
+def test_intensities_survive_the_way_through_their_file(tmp_path):
+    rng = np.random.default_rng(0)
+    steps = rng.integers(0, 65536, (4, 5, 6))
+    measured = Measurement((steps / 65535).astype(np.float32), rng.random((5, 6)) < 0.5, 0.0, 0.0)
+    write_intensities(tmp_path / "a.npz", measured)
+    write_intensities(tmp_path / "b.npz", measured)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    intensities, valid = read_intensities(tmp_path / "a.npz")
+    assert np.array_equal(intensities.numpy(), measured.intensities)
+    assert np.array_equal(valid.numpy(), measured.valid)
+
+
+MOTION = MotionConfig(
+    sequences_per_picture=1,
+    duration_s=0.2,
+    frame_rate_hz=30.0,
+    window_height=20,
+    window_width=30,
+    speed_min_px_s=30.0,
+    speed_max_px_s=60.0,
+    acceleration_max_px_s2=2000.0,
+    rotation_max_deg=0.0,
+    zoom_max=1.0,
+)
+
+
+def test_saturated_pixels_stay_masked_down_to_the_frames(tmp_path):
+    """A lamp of 8x8 pixels moves over the frames as up to 8x8 pixels, or 9 where it lies between them."""
+    (tmp_path / "measured").mkdir()
+    dark, lamp = light(), light()
+    lamp[:, 16:24, 26:34] = 255
+    save_npz(tmp_path / "measured" / "dark.npz", dark)
+    save_npz(tmp_path / "measured" / "lamp.npz", lamp)
+    manifest = ingest(dataclasses.replace(CONFIG, root=str(tmp_path / "measured")), 1, tmp_path / "images", map)
+    share = {entry.origin: entry.masked_fraction for entry in manifest.pictures}
+    assert sorted(share.values()) == [0, pytest.approx(64 / (40 * 60), abs=1e-6)]
+    synthesize(tmp_path / "images", tmp_path / "scenes.zarr", tmp_path / "frames.zarr", MOTION, 1, map)
+    scenes, frames = SceneStore.open(tmp_path / "scenes.zarr"), FrameStore.open(tmp_path / "frames.zarr")
+    masked = {name: ~frames.valid(name) for name in frames.sequences}
+    (shown,) = (name for name in masked if masked[name].any())
+    assert sum(map(torch.Tensor.any, masked.values())) == 1  # the dark one has a mask too, of nothing
+    assert torch.equal(~scenes.read(shown).valid, torch.from_numpy(lamp.min(axis=0) == 255))
+    for frame in masked[shown]:
+        rows, columns = frame.any(1).sum().item(), frame.any(0).sum().item()
+        assert frame.sum().item() == rows * columns
+        assert max(rows, columns) <= 9
+    assert frames.dolp(shown)[~masked[shown]].mean().item() == pytest.approx(0.6, abs=0.005)
+
+
+def test_a_measurement_becomes_a_scene_whose_frames_show_its_polarization(tmp_path):
+    """From files to ground truth; 40x60 is smaller than 80x120 and used as it is."""
+    (tmp_path / "measured").mkdir()
+    save_npz(tmp_path / "measured" / "glass.npz", light())
+    wrong = light()[[1, 0, 2, 3]]  # 0 and 45 degrees swapped
+    save_npz(tmp_path / "measured" / "mislabelled.npz", wrong)
+    manifest = ingest(dataclasses.replace(CONFIG, root=str(tmp_path / "measured")), 1, tmp_path / "images", map)
+    (entry,) = manifest.pictures
+    assert (entry.file, entry.height, entry.width) == (f"{entry.name}.npz", 40, 60)
+    assert entry.residual < 0.01
+    assert entry.masked_fraction == entry.saturated_fraction == 0
+    (skipped,) = manifest.skipped
+    # I45 + I90 - I0 - I135 over S0, for 30 degrees: 0.6 (cos 30 + cos 120 - cos 60 - cos 210) / 2 = 0.22
+    assert "the angles do not fit: the median of |I0 + I90 - I45 - I135| / S0 is 0.2" in skipped.reason
+
+    synthesize(tmp_path / "images", tmp_path / "scenes.zarr", tmp_path / "frames.zarr", MOTION, 1, map)
+    frames = FrameStore.open(tmp_path / "frames.zarr")
+    assert not frames.masked
+    assert frames.dolp(frames.sequences[0]).mean().item() == pytest.approx(0.6, abs=0.005)
+    assert math.degrees(frames.aolp(frames.sequences[0]).mean()) == pytest.approx(30, abs=0.2)
+
+
+@pytest.mark.shared
+def test_measured_samples_are_taken_with_the_residuals_their_notes_state(shared, tmp_path):
+    """1 to 3 % (FORMATS.md); camera 1 %, carps 4 % of raw pixels saturated; the other mosaic order does not fit."""
+    config = dataclasses.replace(CONFIG, root=str(shared / "data" / "polarization"), height=400, width=600)
+    manifest = ingest(config, 1, tmp_path / "images", map)
+    by_name = {entry.origin: entry for entry in manifest.pictures}
+    assert len(by_name) == 4
+    assert all(0.01 < entry.residual < 0.03 for entry in by_name.values())
+    assert (by_name["carps_IMX250MZR.png"].height, by_name["carps_IMX250MZR.png"].width) == (400, 600)
+    assert by_name["wan_Scene2_LT.npz"].height == 420
+    intensities, valid = read_intensities(tmp_path / "images" / by_name["carps_IMX250MZR.png"].file)
+    assert 0.5 < dolp(scene_from_intensities(intensities).stokes)[valid].median() < 0.6  # light reflected by water
+    other = ingest(dataclasses.replace(config, mosaic="0 45 / 90 135"), 1, tmp_path / "other", map)
+    assert [skipped.file for skipped in other.skipped] == ["carps_IMX250MZR.png"]
+
+
+def test_a_path_may_be_text_and_one_file_needs_no_list(tmp_path):
+    save_npz(tmp_path / "a.npz", light())
+    expected = read_measurement([tmp_path / "a.npz"], SONY)
+    for files in (str(tmp_path / "a.npz"), tmp_path / "a.npz", [str(tmp_path / "a.npz")]):
+        assert np.array_equal(read_measurement(files, SONY).intensities, expected.intensities)
+    write_intensities(str(tmp_path / "b.npz"), expected)
+    assert read_intensities(str(tmp_path / "b.npz"))[1].all()
+    assert group_by_measurement([str(tmp_path / "s_0.png")]) == [(tmp_path / "s_0.png",)]
+    with pytest.raises(UnreadablePicture, match="expected the files of a measurement, got none"):
+        read_measurement([], SONY)

@@ -1,0 +1,290 @@
+import io
+import itertools
+import re
+
+import numpy as np
+import pytest
+import torch
+import zarr
+
+from polarnet.cli import main
+from polarnet.config.tree import load
+from polarnet.events.stream import Events, slice_time
+from polarnet.events.streaming import WindowRule
+from polarnet.methods.dolp_network import dolp_recoverer
+from polarnet.networks.checkpoint import load_network, save_checkpoint
+from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.networks.weights import shipped_weights
+from polarnet.recordings.formats.lines import lines_of
+from polarnet.recordings.live import live_lines
+from polarnet.recordings.recording import read_recording
+from polarnet.recovery.recover import Arrangement, frames_of, open_files, replay
+from polarnet.runtime import machine as runtime
+from polarnet.storage.events import EventStore
+
+HEIGHT, WIDTH, DURATION_US, ANGLES = 16, 20, 100_000, (0, 45, 90, 135)
+NETWORK = {
+    "channels": [4, 8, 8], "swin_depth": 2, "swin_window": 4, "swin_heads": [2, 2], "residual_blocks": 1,
+    "input_mixing": "contrasts",
+}  # fmt: skip
+
+
+def random_events(seed, height=HEIGHT, width=WIDTH, count=2000):
+    generator = np.random.default_rng(seed)
+    t = np.sort(generator.integers(0, DURATION_US, count))
+    t[0], t[-1] = 0, DURATION_US - 1
+    x, y = generator.integers(0, width, count), generator.integers(0, height, count)
+    p = generator.choice([-1, 1], count)
+    columns = (t, x.astype(np.int16), y.astype(np.int16), p.astype(np.int8))
+    return Events(*map(torch.from_numpy, columns), height, width)
+
+
+@pytest.fixture(scope="module")
+def channels():
+    return [random_events(seed) for seed in range(4)]
+
+
+@pytest.fixture(scope="module")
+def store(channels, tmp_path_factory):
+    path = tmp_path_factory.mktemp("store") / "events.zarr"
+    writer = EventStore.create(path, ["lake", "road"], HEIGHT, WIDTH, {})
+    for name in writer.sequences:
+        writer.write(name, channels, DURATION_US)
+    writer.finish()
+    return path
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "mine.safetensors"
+    metadata = {"network": "paper", "config": NETWORK, "in_channels": 4, "representation": "event_tensor"}
+    save_checkpoint(path, DolpUNet(DolpUNetConfig(**NETWORK)).state_dict(), metadata)
+    return path
+
+
+@pytest.fixture
+def at_root(project_root, monkeypatch):
+    monkeypatch.chdir(project_root)
+
+
+def write_lines(path, events):
+    table = np.stack([getattr(events, name).numpy().astype(np.int64) for name in "txyp"], axis=1)
+    path.write_bytes(f"{events.width} {events.height}\n".encode() + lines_of(table, " "))
+    return path
+
+
+def opened(store, size=None):
+    """A sequence of a store, for which neither settings nor a folder are needed."""
+    unused = store / "unused"
+    return open_files(
+        [store], Arrangement(None, None, "lake"), read_recording, size, unused, lambda: load(unused).recordings
+    )
+
+
+def recovered(out):
+    group = zarr.open_group(out / "recovered.zarr", mode="r")
+    return {name: group[name][:] for name in ("t_us", "dolp")}
+
+
+def run(*arguments, out):
+    return main(["recover", *map(str, arguments), "--out", str(out), "--write", "zarr"])
+
+
+def test_a_store_four_files_and_lines_that_come_give_the_same(store, channels, weights, tmp_path, monkeypatch, capsys):
+    options = ("--weights", weights, "--window", "20ms", "--device", "cpu")
+    assert run(store, "--sequence", "road", *options, out=tmp_path / "a") == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"frames +5 of 0\.100 s", printed)
+    assert "times as fast as real time" in printed
+    files = [write_lines(tmp_path / f"{angle}.txt", channels[angle // 45]) for angle in (90, 0, 135, 45)]
+    assert run(*files, "--angles", 90, 0, 135, 45, *options, out=tmp_path / "b") == 0
+    head, _, lines = live_lines(channels)
+    live = tmp_path / "live.txt"
+    live.write_bytes(head + lines + f"{DURATION_US} 0 0 1 0\n".encode())
+    assert run(live, "--live", "--idle", 0, *options, out=tmp_path / "c") == 0
+    assert re.search(r"latency +[\d.]+ ms \(median\)", capsys.readouterr().out)
+    expected = recovered(tmp_path / "a")
+    assert expected["t_us"].tolist() == [20_000, 40_000, 60_000, 80_000, 100_000]
+    for other in "bc":
+        found = recovered(tmp_path / other)
+        assert found["t_us"].tolist() == expected["t_us"].tolist()
+        np.testing.assert_allclose(found["dolp"].astype(float), expected["dolp"], atol=3)
+
+
+def test_a_mosaic_is_one_file_with_channels_of_half_its_size(tmp_path, at_root):
+    whole = write_lines(tmp_path / "camera.txt", random_events(1, 2 * HEIGHT, 2 * WIDTH))
+    options = ("--mosaic", "90 45 / 135 0", "--method", "cf+gain", "--window", "500ev", "--step", "5ms")
+    assert run(whole, *options, out=tmp_path / "out") == 0
+    assert recovered(tmp_path / "out")["dolp"].shape[1:] == (HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize(
+    ("asked", "units", "taken"), [("auto", ["AMX"], "bf16"), ("auto", [], "fp32"), ("fp32", ["AMX"], "fp32")]
+)
+def test_the_network_computes_in_bfloat16_where_there_are_units_for_it(
+    store, weights, tmp_path, monkeypatch, capsys, asked, units, taken
+):
+    monkeypatch.setattr(runtime, "bf16_units", lambda device: units)
+    options = ("--sequence", "lake", "--weights", weights, "--device", "cpu", "--precision", asked)
+    assert run(store, *options, out=tmp_path / "auto") == 0
+    assert f"network paper ({taken})" in capsys.readouterr().out
+    assert run(store, *options[:-1], taken, out=tmp_path / "same") == 0
+    assert run(store, *options[:-1], {"bf16": "fp32", "fp32": "bf16"}[taken], out=tmp_path / "other") == 0
+    found, same, other = (recovered(tmp_path / name)["dolp"] for name in ("auto", "same", "other"))
+    assert np.array_equal(found, same)
+    assert not np.array_equal(found, other)
+
+
+def test_the_lines_on_the_page_run_as_they_stand(store, channels, weights, project_root):
+    snippet = re.search(r"```python\n(.*?)```", (project_root / "docs" / "recover.md").read_text(), re.DOTALL)
+    assert snippet is not None
+    camera = [
+        ([slice_time(events, begin, begin + 50_000) for events in channels], begin + 50_000)
+        for begin in range(0, DURATION_US, 50_000)
+    ]
+    names = {"path": weights, "height": HEIGHT, "width": WIDTH, "camera": camera}
+    exec(snippet[1], names)
+    *_, last = frames_of(opened(store), WindowRule(33_333, None, None), dolp_recoverer(*load_network(weights)))
+    torch.testing.assert_close(names["prediction"].dolp[0], last.prediction.dolp, atol=1e-5, rtol=1e-4)
+
+
+def test_windows_that_overlap_give_a_frame_every_tenth_of_a_millisecond(store, weights):
+    source = opened(store)
+    frames = list(frames_of(source, WindowRule(33_333, None, 100), dolp_recoverer(*load_network(weights))))
+    ends = [frame.window.stop_us for frame in frames]
+    assert ends == list(range(33_333, DURATION_US + 1, 100))
+    change = torch.stack([frame.prediction.dolp for frame in frames]).diff(dim=0).abs().mean(dim=(1, 2))
+    assert change.max() < 0.05
+
+
+def test_a_file_goes_through_the_network_several_windows_at_once_and_gives_the_same(store, weights):
+    rule, source = WindowRule(20_000, None, None), opened(store)
+    by_one, by_two = (
+        list(frames_of(source, rule, dolp_recoverer(*load_network(weights)), pixels_at_once=n * HEIGHT * WIDTH))
+        for n in (1, 2)
+    )
+    assert [frame.window.stop_us for frame in by_two] == [20_000, 40_000, 60_000, 80_000, 100_000]
+    assert [frame.step_s == after.step_s for frame, after in itertools.pairwise(by_two)] == [True, False, True, False]
+    for one, other in zip(by_one, by_two, strict=True):
+        torch.testing.assert_close(one.prediction.dolp, other.prediction.dolp, atol=1e-5, rtol=1e-4)
+
+
+def test_files_are_reduced_to_the_size_that_is_asked_for(store):
+    source = opened(store, (8, 10))
+    assert (source.height, source.width) == (8, 10)
+    assert source.duration_us == DURATION_US
+
+
+def test_a_sequence_is_replayed_as_lines_at_its_own_pace(store, channels):
+    head, _, lines = live_lines(channels)
+    out = io.BytesIO()
+    replay(EventStore.open(store), "lake", 1000.0, out.write)
+    assert out.getvalue() == head + lines
+
+
+@pytest.mark.parametrize(("arguments", "reason"), [
+    ((), "say --sequence, one of lake, road; got None"),
+    (("--sequence", "lake", "--method", "oracle_mean"), "expected a method of cf"),
+    (("--sequence", "lake", "--method", "e2vid_published"), "no weights are given"),
+    (("--sequence", "lake", "--method", "cf", "--window", "1s"),
+     "events.zarr lasts 100 ms, less than one window of 1000 ms: record for longer, or give --window 33.333ms"),
+    (("--sequence", "lake", "--method", "cf", "--step", "9ev"), "expected a time such as 0.1ms"),
+    (("--sequence", "lake", "--method", "cf", "--step", "1s"), "events between windows would be lost"),
+    (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
+    (("--sequence", "lake", "--weights", "nothing.safetensors"), "expected a checkpoint"),
+    (("--live", "--method", "cf", "--size", 8, 10), "--live: expected no --size"),
+    (("--live", "--method", "cf", "--clock-mhz", 70), "--live: expected no --clock-mhz"),
+    (("--sequence", "lake", "--method", "cf", "--height", 8, "--angles", 0, 45, 90, 135), "no --angles, --height"),
+])  # fmt: skip
+def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, capsys):
+    if "cuda:9" in arguments and torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    method = () if {"--method", "--weights"} & set(arguments) else ("--method", "cf")
+    assert run(store, *arguments, *method, out=tmp_path / "new" / "out") == 1
+    assert reason in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_second_recovery_replaces_the_first_and_other_files_are_refused(store, tmp_path, at_root, capsys):
+    out, arguments = tmp_path / "out", ("recover", str(store), "--sequence", "lake", "--method", "highpass")
+    arguments = (*arguments, "--out", str(out), "--write")
+    assert main([*arguments, "png", "mp4", "--window", "10ms"]) == 0
+    assert len(list((out / "png").iterdir())) == 10
+    assert main([*arguments, "png", "--window", "50ms"]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["index.html", "png", "recovered.png", "run.json"]
+    assert len(list((out / "png").iterdir())) == 2
+    assert f"the page: {out / 'index.html'}" in capsys.readouterr().out
+    assert main([*arguments, "png", "--window", "1s"]) == 1
+    assert len(list((out / "png").iterdir())) == 2
+    (tmp_path / "out" / "run.json").unlink()
+    assert main([*arguments, "png", "--window", "50ms"]) == 1
+    assert "holds files that `polarnet recover` did not write; name another folder" in capsys.readouterr().err
+
+
+def test_a_mosaic_without_polarizers_is_named_on_the_terminal_and_on_the_page(tmp_path, at_root, capsys):
+    """Every pixel fires at once in a random pattern of edges, whatever its place in a cell."""
+    generator = np.random.default_rng(2)
+    t = np.repeat(np.arange(0, 330_000, 1000), 60)
+    cells = generator.integers(0, (40, 60), (len(t), 2))
+    p = generator.choice([-1, 1], len(t))
+    y, x, t, p = (np.repeat(values, 4) for values in (2 * cells[:, 0], 2 * cells[:, 1], t, p))
+    y, x = y + np.tile([0, 0, 1, 1], len(cells)), x + np.tile([0, 1, 0, 1], len(cells))
+    keep = generator.random(len(t)) < 0.9  # pixels do not fire alike to the last event
+    columns = (t[keep], x[keep].astype(np.int16), y[keep].astype(np.int16), p[keep].astype(np.int8))
+    camera = write_lines(tmp_path / "camera.txt", Events(*map(torch.from_numpy, columns), 80, 120))
+    out = tmp_path / "out"
+    assert run(camera, "--mosaic", "90 45 / 135 0", "--method", "highpass", out=out) == 0
+    printed = capsys.readouterr()
+    assert "warning: The four channels show the same" in printed.err
+    assert re.search(r"events +[\d,]+ at 0, [\d,]+ at 45, [\d,]+ at 90, [\d,]+ at 135 degrees", printed.out)
+    assert "was made without polarizers" in (out / "index.html").read_text()
+
+
+@pytest.mark.parametrize(("window", "advice"), [
+    ("1s", "lasts 100 ms, less than one window of 1000 ms: record for longer, or give --window 33.333ms"),
+    ("9000ev", "ends before 9,000 events, one window: record for longer, or give fewer events"),
+])  # fmt: skip
+def test_a_recording_shorter_than_a_window_is_told_what_works(window, advice, store, tmp_path, at_root, capsys):
+    arguments = (store, "--sequence", "lake", "--method", "highpass")
+    assert run(*arguments, "--window", window, out=tmp_path / "out") == 1
+    assert advice in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_a_very_short_recording_is_told_works(channels, tmp_path, at_root, capsys):
+    early = [slice_time(events, 0, 8000) for events in channels]
+    files = [write_lines(tmp_path / f"{angle}.txt", e) for angle, e in zip(ANGLES, early, strict=True)]
+    arguments = (*files, "--angles", *ANGLES, "--method", "highpass")
+    assert run(*arguments, out=tmp_path / "out") == 1
+    told = re.search(r"record for longer\. Networks need .*--method highpass --window (\d+us)", capsys.readouterr().err)
+    assert told is not None
+    assert not (tmp_path / "out").exists()
+    assert run(*arguments, "--window", told[1], out=tmp_path / "out") == 0
+
+
+def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):
+    one = write_lines(tmp_path / "camera.txt", random_events(1))
+    for files, reason in (
+        ([one], "say where the polarizers of its pixels are"),
+        ([one, one], "four files with --angles, got 2"),
+        ([one] * 4, "say the polarizer of each"),
+        ([one] * 4 + ["--angles", 0, 45, 90, 90], "four different angles"),
+        ([one] * 4 + ["--sequence", "lake"], "four files: expected no --sequence"),
+        ([one, "--mosaic", "90 45 / 135 0", "--angles", 0, 45, 90, 135], "with --mosaic: expected no --angles"),
+        ([one, "--live", "--sequence", "lake"], "--live: expected no --sequence"),
+        ([one, one, "--live"], "--live: expected one file or -, got 2"),
+        ([tmp_path / "none.csv"], "there is no such file"),
+    ):
+        assert run(*files, "--method", "cf", out=tmp_path / "out") == 1
+        assert not (tmp_path / "out").exists()
+        assert reason in capsys.readouterr().err
+
+
+def test_shipped_weights_are_a_checkpoint_or_say_what_to_do():
+    try:
+        network, _ = load_network(shipped_weights())
+    except FileNotFoundError as absent:
+        assert "--weights FILE" in str(absent)  # noqa: PT017 - a version may ship weights or not
+    else:
+        assert isinstance(network, torch.nn.Module)

@@ -1,0 +1,101 @@
+import cv2
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+import zarr
+
+from polarnet.events.stream import Events
+from polarnet.events.streaming import EventWindow
+from polarnet.recovery import writer as recovery
+from polarnet.recovery.writer import FRAMES_PER_CHUNK, RecoveryWriter, signed_events
+from polarnet.stokes import Prediction
+
+HEIGHT, WIDTH = 15, 21
+FRAMES = 40
+assert FRAMES > FRAMES_PER_CHUNK
+
+
+def window(k):
+    one = Events(torch.tensor([1000 * k]), torch.tensor([k]).short(), torch.tensor([3]).short(),
+                 torch.tensor([1]).to(torch.int8), HEIGHT, WIDTH)  # fmt: skip
+    return EventWindow([one] * 4, 1000 * k, 1000 * (k + 1))
+
+
+def frame(k, *, angle=True):
+    dolp = torch.full((HEIGHT, WIDTH), k / FRAMES)
+    return Prediction(dolp, torch.full_like(dolp, 0.05 * k) if angle else None, -dolp)
+
+
+@pytest.fixture(params=[2, 4], ids=["two cores", "four cores"])
+def cores(request, monkeypatch):
+    monkeypatch.setattr(recovery, "usable_cores", lambda: request.param)
+    return request.param
+
+
+@pytest.fixture
+def written(tmp_path, cores):
+    with RecoveryWriter(tmp_path, ("zarr", "png", "exr", "mp4"), 30.0) as writer:
+        for k in range(FRAMES):
+            writer.add(window(k), frame(k))
+    writer.write_page("a & b", {"windows": "of 1 ms"}, ["one note"])
+    return tmp_path
+
+
+def test_the_numbers_are_in_a_zarr_group_of_its_own(written):
+    group = zarr.open_group(written / "recovered.zarr", mode="r")
+    assert group["t_us"][:].tolist() == [1000 * (k + 1) for k in range(FRAMES)]
+    np.testing.assert_allclose(group["dolp"][:, 0, 0] / 65535, np.arange(FRAMES) / FRAMES, atol=1e-5)
+    np.testing.assert_allclose(group["aolp"][:, 3, 4] * np.pi / 65536, 0.05 * np.arange(FRAMES), atol=1e-4)
+    np.testing.assert_allclose(group["log_variance"][:, 3, 4], -np.arange(FRAMES) / FRAMES, rtol=1e-6)
+    assert set(group.attrs["conventions"]) == {"t_us", "dolp", "aolp", "log_variance"}
+
+
+def test_exr_holds_the_floats_and_names_them(written):
+    file = oiio.ImageInput.open(str(written / "exr" / "000007.exr"))
+    assert set(file.spec().channelnames) == {"DoLP", "AoLP", "log_variance"}
+    pixels = dict(zip(file.spec().channelnames, file.read_image()[2, 5], strict=True))
+    assert pixels == pytest.approx({"DoLP": 0.175, "AoLP": 0.35, "log_variance": -0.175}, abs=1e-3)
+
+
+def test_pictures_and_video_show_three_maps_side_by_side(written):
+    picture = cv2.imread(str(written / "png" / "000039.png"))
+    assert picture.shape == (16, 72, 3)  # 3 * 21 + 2 * 4, brought to even sides
+    assert len(list((written / "png").iterdir())) == FRAMES
+    video, count = cv2.VideoCapture(str(written / "recovered.mp4")), 0
+    while video.read()[0]:
+        count += 1
+    assert count == FRAMES
+    assert video.get(cv2.CAP_PROP_FRAME_WIDTH) == 72
+
+
+def test_the_page_needs_no_network_and_escapes_names(written):
+    page = (written / "index.html").read_text()
+    assert "a &amp; b" in page
+    assert "one note" in page
+    assert page.count("data:image/png") >= 6
+    assert 'src="http' not in page
+    assert '<a href="recovered.mp4">' in page
+    assert "steps(40,jump-none)" in page
+    assert (written / "recovered.png").exists()
+
+
+def test_without_an_angle_two_maps_are_shown_and_nothing_else_is_written(tmp_path):
+    with RecoveryWriter(tmp_path, ("zarr",), 30.0) as writer:
+        for k in range(3):
+            writer.add(window(k), frame(k, angle=False))
+    writer.write_page("x", {}, [])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["index.html", "recovered.png", "recovered.zarr"]
+    assert "aolp" not in zarr.open_group(tmp_path / "recovered.zarr", mode="r")
+
+
+def test_a_failure_while_writing_reaches_whoever_recovers(tmp_path, cores):
+    writer = RecoveryWriter(tmp_path, ("png",), 30.0)
+    (tmp_path / "png").rmdir()
+    with pytest.raises(OSError, match=r"000000\.png"), writer:
+        writer.add(window(0), frame(0))
+
+
+def test_events_of_all_polarizers_add_up():
+    assert signed_events(window(2))[3, 2] == 4
+    assert signed_events(window(2)).sum() == 4

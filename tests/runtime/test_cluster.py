@@ -1,0 +1,64 @@
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from polarnet.runtime.cluster import pmap
+
+
+def square(value: int) -> int:
+    return value * value
+
+
+def die_once(marker_and_value: tuple[str, int]) -> int:
+    """Kills its own process the first time it sees value 3; the marker file remembers that."""
+    marker, value = marker_and_value
+    if value == 3 and not Path(marker).exists():
+        Path(marker).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return value
+
+
+def die_always(value: int) -> int:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return value
+
+
+def fail_on_two(value: int) -> int:
+    if value == 2:
+        raise ValueError("two is not allowed here")
+    return value
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_come_in_the_order_of_the_items(workers):
+    assert pmap(square, list(range(7)), workers=workers, label="squares") == [0, 1, 4, 9, 16, 25, 36]
+
+
+def test_no_items_no_work():
+    assert pmap(square, [], workers=2, label="squares") == []
+
+
+def test_a_killed_worker_loses_nothing(tmp_path):
+    items = [(str(tmp_path / "died"), value) for value in range(6)]
+    assert pmap(die_once, items, workers=2, label="values") == list(range(6))
+    assert (tmp_path / "died").exists()
+
+
+def test_an_item_that_always_kills_its_worker_is_named():
+    with pytest.raises(RuntimeError, match="died 4 times in a row"):
+        pmap(die_always, [1, 2], workers=2, label="values")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_of_the_function_comes_through_as_it_is(workers):
+    with pytest.raises(ValueError, match="two is not allowed here"):
+        pmap(fail_on_two, [1, 2, 3], workers=workers, label="values")
+
+
+def test_a_dask_cluster_gives_the_same_results():
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        results = pmap(square, [3, 1, 2], workers=1, label="squares", address=cluster.scheduler_address)
+    assert results == [9, 1, 4]

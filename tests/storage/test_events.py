@@ -1,0 +1,268 @@
+"""The event store: what is written comes back, a window reads little, and damage has a name."""
+
+import hashlib
+import pickle
+import shutil
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import zarr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import polarnet.storage.events as store_module
+from polarnet.events.stream import Events, slice_time
+from polarnet.storage.events import LONGEST_US, EventStore, verify
+
+HEIGHT, WIDTH = 12, 18
+DURATIONS_US = {"coffee": 1_000_000, "leaves": 250_500, "still": 40_000}
+COUNTS = {"coffee": (300_000, 20, 5000, 1), "leaves": (900, 0, 1200, 800), "still": (0, 0, 0, 0)}
+ATTRIBUTES = {"seed": 7, "emulate": {"model": "v2e", "contrast_threshold_on": 0.2}}
+
+
+@pytest.fixture(scope="module")
+def channels(make_random_events):
+    return {
+        name: [make_random_events(10 * i + k, n, DURATIONS_US[name], HEIGHT, WIDTH) for k, n in enumerate(COUNTS[name])]
+        for i, name in enumerate(DURATIONS_US)
+    }
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, channels) -> Path:
+    path = tmp_path_factory.mktemp("store") / "events.zarr"
+    store = EventStore.create(path, list(DURATIONS_US), HEIGHT, WIDTH, ATTRIBUTES)
+    for name, duration_us in DURATIONS_US.items():
+        store.write(name, channels[name], duration_us)
+    store.finish()
+    return path
+
+
+@pytest.fixture
+def copy(finished, tmp_path) -> Path:
+    return shutil.copytree(finished, tmp_path / "copy.zarr")
+
+
+def equal(a: Events, b: Events) -> bool:
+    return (a.height, a.width) == (b.height, b.width) and all(
+        torch.equal(getattr(a, name), getattr(b, name)) for name in "txyp"
+    )
+
+
+def digest(folder: Path) -> dict[str, str]:
+    files = (file for file in sorted(folder.rglob("*")) if file.is_file())
+    return {str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+
+
+def test_events_come_back_as_they_were(finished, channels):
+    store = EventStore.open(finished)
+    for name in DURATIONS_US:
+        assert store.duration_us(name) == DURATIONS_US[name]
+        assert store.count(name) == COUNTS[name]
+        assert all(equal(a, b) for a, b in zip(store.read(name), channels[name], strict=True))
+
+
+def test_the_store_says_what_is_needed_to_interpret_it(finished):
+    store = EventStore.open(finished)
+    assert store.sequences == list(DURATIONS_US)
+    assert (store.height, store.width) == (HEIGHT, WIDTH)
+    assert store.attributes == ATTRIBUTES
+    raw = zarr.open_group(finished, mode="r")
+    assert raw.attrs["polarizer_angles_deg"] == [0, 45, 90, 135]
+    assert raw.attrs["conventions"]["events/p"] == "polarity: +1 brighter, -1 darker"
+
+
+def test_any_zarr_reader_finds_a_channel_by_its_offsets_and_a_millisecond_by_its_index(finished, channels):
+    raw = zarr.open_group(finished, mode="r")
+    start, stop = raw["offsets"][0, 2:4]
+    t = raw["events/t"][0, start:stop]
+    assert np.array_equal(t, channels["coffee"][2].t.numpy())
+    assert np.array_equal(raw["ms_to_idx"][0, 2] - start, np.searchsorted(t, 1000 * np.arange(1001)))
+    assert raw["events/x"].shape == (3, sum(COUNTS["coffee"]))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(-5, 260_000), st.integers(0, 260_000))
+def test_a_window_is_what_slicing_the_whole_would_give(finished, channels, start_us, length_us):
+    stop_us = start_us + length_us
+    window = EventStore.open(finished).read("leaves", start_us, stop_us)
+    expected = [slice_time(channel, start_us, stop_us) for channel in channels["leaves"]]
+    assert all(equal(a, b) for a, b in zip(window, expected, strict=True))
+
+
+def test_a_window_may_be_open_at_either_end(finished, channels):
+    store = EventStore.open(finished)
+    assert equal(store.read("leaves", start_us=100_000)[0], slice_time(channels["leaves"][0], 100_000, 250_501))
+    assert equal(store.read("leaves", stop_us=100_000)[0], slice_time(channels["leaves"][0], 0, 100_000))
+    assert [len(channel) for channel in store.read("still", 10_000, 20_000)] == [0, 0, 0, 0]
+
+
+def test_a_window_reads_only_its_own_chunks(channels, tmp_path, monkeypatch):
+    """One channel of 300,000 events in 1 s: 10 ms are 3000 of them, in one or two chunks of 4096 of the 74."""
+    monkeypatch.setattr(store_module, "CHUNK", 2**12)
+    monkeypatch.setattr(store_module, "SHARD", 2**16)
+    store = EventStore.create(tmp_path / "events.zarr", ["coffee"], HEIGHT, WIDTH, {})
+    store.write("coffee", channels["coffee"], DURATIONS_US["coffee"])
+    store.finish()
+    read = []
+    get = zarr.storage._local._get
+
+    def counted(*arguments):
+        value = get(*arguments)
+        read.append(len(value))
+        return value
+
+    monkeypatch.setattr(zarr.storage._local, "_get", counted)
+    store = EventStore.open(tmp_path / "events.zarr")
+    store.read("coffee")
+    whole = sum(read)
+    read.clear()
+    store.read("coffee", 500_000, 510_000)
+    assert sum(read) < 0.2 * whole
+
+
+def test_sequences_may_fill_several_shards_of_events_and_of_the_time_index(make_random_events, tmp_path, monkeypatch):
+    for name, value in {"CHUNK": 128, "SHARD": 512, "MILLISECOND_CHUNK": 8, "MILLISECOND_SHARD": 32}.items():
+        monkeypatch.setattr(store_module, name, value)
+    long = [make_random_events(k, 300 * (k + 1), 99_500, HEIGHT, WIDTH) for k in range(4)]
+    short = [make_random_events(k, 40, 9_000, HEIGHT, WIDTH) for k in range(4)]
+    store = EventStore.create(tmp_path / "events.zarr", ["long", "short"], HEIGHT, WIDTH, {})
+    store.write("long", long, 99_500)
+    store.write("short", short, 9_000)
+    store.finish()
+    assert len(list((tmp_path / "events.zarr" / "events" / "t" / "c" / "0").iterdir())) == 6  # 3000 events
+    assert len(list((tmp_path / "events.zarr" / "ms_to_idx" / "c" / "0" / "0").iterdir())) == 4  # 101 entries
+    assert verify(tmp_path / "events.zarr") == []
+    store = EventStore.open(tmp_path / "events.zarr")
+    for name, channels in (("long", long), ("short", short)):
+        for start_us, stop_us in ((0, 200_000), (4_000, 5_001), (31_999, 32_001), (99_000, 100_000)):
+            window = store.read(name, start_us, stop_us)
+            assert all(equal(a, slice_time(b, start_us, stop_us)) for a, b in zip(window, channels, strict=True))
+
+
+def test_a_sequence_that_is_there_already_stays_as_it_is(channels, tmp_path):
+    store = EventStore.create(tmp_path / "events.zarr", ["a"], HEIGHT, WIDTH, {})
+    store.write("a", channels["leaves"], DURATIONS_US["leaves"])
+    store.write("a", channels["still"], DURATIONS_US["still"])
+    assert store.count("a") == COUNTS["leaves"]
+
+
+def write_one(arguments: tuple[EventStore, str, list[Events], int]) -> None:
+    store, name, streams, duration_us = arguments
+    store.write(name, streams, duration_us)
+
+
+def test_several_processes_in_any_order_write_the_same_bytes(finished, channels, tmp_path):
+    store = EventStore.create(tmp_path / "events.zarr", list(DURATIONS_US), HEIGHT, WIDTH, ATTRIBUTES)
+    tasks = [(store, name, channels[name], DURATIONS_US[name]) for name in reversed(DURATIONS_US)]
+    with ProcessPoolExecutor(2, get_context("fork"), torch.set_num_threads, (1,)) as pool:
+        list(pool.map(write_one, tasks))
+    store.finish()
+    assert digest(tmp_path / "events.zarr") == digest(finished)
+
+
+def test_an_unfinished_store_is_taken_up_where_it_was_left(channels, tmp_path):
+    arguments = (tmp_path / "events.zarr", list(DURATIONS_US), HEIGHT, WIDTH)
+    EventStore.create(*arguments, ATTRIBUTES).write("leaves", channels["leaves"], DURATIONS_US["leaves"])
+    again = EventStore.create(*arguments, ATTRIBUTES)
+    assert again.missing() == ["coffee", "still"]
+    assert equal(again.read("leaves")[0], channels["leaves"][0])
+    with pytest.raises(ValueError, match="2 not written yet: coffee, still"):
+        again.finish()
+    assert EventStore.create(*arguments, {**ATTRIBUTES, "seed": 8}).missing() == list(DURATIONS_US)
+
+
+def test_an_open_store_can_be_sent_to_another_process(finished, channels):
+    assert equal(pickle.loads(pickle.dumps(EventStore.open(finished))).read("leaves")[3], channels["leaves"][3])
+
+
+def test_events_that_break_the_format_are_refused_before_anything_is_written(make_events, tmp_path):
+    store = EventStore.create(tmp_path / "events.zarr", ["a"], HEIGHT, WIDTH, {})
+    good = Events.empty(HEIGHT, WIDTH)
+
+    def write(bad: Events, duration_us: int = 1000) -> None:
+        store.write("a", [good, bad, good, good], duration_us)
+
+    with pytest.raises(ValueError, match="polarizer 45: event 1 of 2: expected a time no earlier"):
+        write(make_events([(5, 0, 0, 1), (4, 0, 0, 1)], HEIGHT, WIDTH))
+    with pytest.raises(ValueError, match="polarizer 45: event 0 of 1: expected x from 0 to 17"):
+        write(make_events([(5, 18, 0, 1)], HEIGHT, WIDTH))
+    with pytest.raises(
+        ValueError, match="polarizer 45: expected times from 0 to the duration of 1000 us, got 0 to 1001"
+    ):
+        write(make_events([(0, 0, 0, 1), (1001, 0, 0, 1)], HEIGHT, WIDTH))
+    with pytest.raises(ValueError, match="polarizer 45: expected a sensor of 12x18 px, got 12x19"):
+        write(Events.empty(HEIGHT, 19))
+    with pytest.raises(ValueError, match=f"expected a duration of 1 to {LONGEST_US} us, got 0"):
+        write(good, 0)
+    with pytest.raises(ValueError, match="each of 4 polarizers, got 1"):
+        store.write("a", [good], 1000)
+    with pytest.raises(ValueError, match="there is no 'b'"):
+        store.write("b", [good] * 4, 1000)
+    assert store.missing() == ["a"]
+
+
+def test_names_that_come_twice_and_sensors_too_large_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="expected each name once, got a again"):
+        EventStore.create(tmp_path / "events.zarr", ["a", "b", "a"], 1, 1, {})
+    with pytest.raises(ValueError, match="sides of 1 to 32767 px, got 1x40000"):
+        EventStore.create(tmp_path / "events.zarr", ["a"], 1, 40_000, {})
+
+
+def test_a_whole_store_has_no_problems(finished):
+    assert verify(finished) == []
+
+
+def test_verify_names_sequence_and_column_of_a_flipped_byte(copy):
+    for number, name in enumerate(["coffee", "leaves"]):
+        for column in ("events/x", "events/y", "events/t", "events/p", "ms_to_idx", "offsets", "duration_us"):
+            chunk = next(f for f in [copy / column / "c" / str(number), *(copy / column / "c").rglob("*")]
+                         if f.is_file() and str(number) in f.relative_to(copy / column / "c").parts[:1])  # fmt: skip
+            content = chunk.read_bytes()
+            damaged = bytearray(content)
+            damaged[len(content) // 2] ^= 0x10
+            chunk.write_bytes(damaged)
+            problems = verify(copy)
+            assert len(problems) == 1
+            assert f"{name}, column {column} is unreadable" in problems[0]
+            chunk.write_bytes(content)
+    assert verify(copy) == []
+
+
+def test_verify_names_a_file_that_is_missing(copy):
+    (copy / "events" / "y" / "c" / "1" / "0").unlink()
+    (problem,) = verify(copy)
+    assert "leaves, column events/y is unreadable: there is no c/1/0" in problem
+    with pytest.raises(ValueError, match="leaves, column events/y"):
+        EventStore.open(copy).read("leaves")
+
+
+@pytest.mark.parametrize(
+    ("column", "place", "value", "message"),
+    [
+        ("events/t", 10, 0, "leaves, polarizer 0: event 10 of 900: expected a time no earlier"),
+        ("events/x", 899, 18, "leaves, polarizer 0: event 899 of 900: expected x from 0 to 17"),
+        ("events/p", 900, 0, r"leaves, polarizer 90: event 0 of 1200: expected polarity \+1 or -1"),
+        ("events/t", 2899, 250_501, "leaves, polarizer 135: expected times from 0 to the duration of 250500 us"),
+    ],
+)
+def test_verify_names_events_that_a_foreign_writer_got_wrong(copy, column, place, value, message):
+    zarr.open_group(copy, mode="r+")[column][1, place] = value
+    with pytest.raises(ValueError, match=message):
+        raise ValueError(verify(copy)[0])
+
+
+def test_verify_notices_a_time_index_that_does_not_fit(copy):
+    index = zarr.open_group(copy, mode="r+")["ms_to_idx"]
+    index[1, 2, 100] = index[1, 2, 100] + 1
+    assert verify(copy) == [f"{copy}: leaves, polarizer 90: ms_to_idx does not match events/t"]
+
+
+def test_verify_of_something_else_says_what_it_is(tmp_path):
+    zarr.open_group(tmp_path / "other.zarr", mode="w")
+    assert "expected a store of format 'polarnet.events', got None" in verify(tmp_path / "other.zarr")[0]
+    assert "there is no Zarr v3 group" in verify(tmp_path / "nothing.zarr")[0]

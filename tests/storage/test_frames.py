@@ -1,0 +1,196 @@
+"""Ground-truth frames on disk."""
+
+import math
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet.storage.frames import (
+    FrameStore,
+    dequantise_angle,
+    dequantise_fraction,
+    quantise_angle,
+    quantise_fraction,
+    verify_frames,
+)
+
+STEPS = np.arange(2**16, dtype=np.uint16)
+HEIGHT, WIDTH, FRAMES = 4, 6, 40
+
+
+def frames_of(seed: int, n: int = FRAMES) -> tuple[torch.Tensor, ...]:
+    generator = torch.Generator().manual_seed(seed)
+    shapes = [(n, 4, HEIGHT, WIDTH), (n, HEIGHT, WIDTH), (n, HEIGHT, WIDTH)]
+    intensity, dolp, aolp = (torch.rand(shape, generator=generator) for shape in shapes)
+    return 33_333 * torch.arange(n), intensity, dolp, aolp * 3.14
+
+
+def store_at(path, **changes) -> FrameStore:
+    arguments = {
+        "sequences": ["a", "b"],
+        "splits": {"a": "train", "b": "test"},
+        "n_frames": FRAMES,
+        "height": HEIGHT,
+        "width": WIDTH,
+        "attributes": {"seed": 1},
+    }
+    return FrameStore.create(path, **{**arguments, **changes})
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    path = tmp_path_factory.mktemp("frames") / "frames.zarr"
+    store = store_at(path)
+    store.write("a", *frames_of(1))
+    store.write("b", *frames_of(2, n=33))
+    store.finish()
+    return path
+
+
+def test_every_stored_value_comes_back_as_itself():
+    assert np.array_equal(quantise_fraction(dequantise_fraction(STEPS)), STEPS)
+    assert np.array_equal(quantise_angle(dequantise_angle(STEPS)), STEPS)
+
+
+def test_the_ends_of_the_range_are_exact():
+    assert dequantise_fraction(quantise_fraction(torch.tensor([0.0, 1.0]))).tolist() == [0.0, 1.0]
+    assert dequantise_angle(quantise_angle(torch.tensor([0.0, math.pi / 2]))).tolist() == pytest.approx(
+        [0, math.pi / 2]
+    )
+    assert float(dequantise_angle(STEPS).max()) < math.pi
+
+
+def test_an_angle_that_rounds_up_to_pi_is_zero():
+    assert quantise_angle(torch.tensor([math.pi - 1e-6])).tolist() == [0]
+
+
+@pytest.mark.parametrize("bad", [-0.01, 1.01, math.nan, math.inf])
+def test_a_fraction_out_of_range_is_refused(bad):
+    with pytest.raises(ValueError, match=r"fraction: expected (values in \[0, 1\]|finite numbers), got"):
+        quantise_fraction(torch.tensor([0.5, bad]))
+
+
+def test_a_degree_taken_for_a_radian_is_refused():
+    with pytest.raises(
+        ValueError, match=r"expected radians in \[0, 3\.14159\], got values up to 90; .* torch\.deg2rad"
+    ):
+        quantise_angle(torch.tensor([90.0]))
+
+
+def test_frames_come_back_to_half_a_step(finished):
+    t_us, intensity, dolp, aolp = frames_of(1)
+    frames = FrameStore.open(finished).frames("a")
+    assert torch.equal(frames.t_us, t_us)
+    torch.testing.assert_close(frames.intensity, intensity, atol=0.51 / 65535, rtol=0)
+    torch.testing.assert_close(frames.dolp, dolp, atol=0.51 / 65535, rtol=0)
+    torch.testing.assert_close(frames.aolp, aolp, atol=0.51 * math.pi / 65536, rtol=0)
+
+
+def test_a_sequence_may_have_fewer_frames_than_the_store_has_room_for(finished):
+    store = FrameStore.open(finished)
+    assert torch.equal(store.t_us("b"), frames_of(2, n=33)[0])
+    torch.testing.assert_close(store.dolp("b"), frames_of(2, n=33)[2], atol=0.51 / 65535, rtol=0)
+
+
+def test_splits_are_kept_in_order(finished):
+    store = FrameStore.open(finished)
+    assert store.splits == {"a": "train", "b": "test"}
+    assert [store.of_split(split) for split in ("train", "val", "test")] == [["a"], [], ["b"]]
+    with pytest.raises(ValueError, match="train, val, test, got 'validation'"):
+        store.of_split("validation")
+
+
+def test_black_unpolarized_frames_are_not_taken_for_missing_ones(tmp_path):
+    store = store_at(tmp_path / "f.zarr", sequences=["a"])
+    t_us, intensity, dolp, aolp = frames_of(1)
+    store.write("a", t_us, 0 * intensity, 0 * dolp, 0 * aolp)
+    store.finish()
+    assert verify_frames(tmp_path / "f.zarr") == []
+    assert FrameStore.open(tmp_path / "f.zarr").intensity("a").abs().max() == 0
+
+
+def test_a_missing_file_is_an_error_and_not_a_black_frame(tmp_path):
+    store = store_at(tmp_path / "f.zarr", sequences=["a"])
+    store.write("a", *frames_of(1))
+    store.finish()
+    (tmp_path / "f.zarr" / "dolp" / "c" / "0" / "0" / "0" / "0").unlink()
+    with pytest.raises(ValueError, match=r"a, column dolp is unreadable: there is no c/0/0/0/0"):
+        FrameStore.open(tmp_path / "f.zarr").dolp("a")
+    assert len(verify_frames(tmp_path / "f.zarr")) == 1
+
+
+def test_frames_of_a_wrong_shape_range_or_order_are_refused(tmp_path):
+    store = store_at(tmp_path / "f.zarr")
+    t_us, intensity, dolp, aolp = frames_of(1)
+    with pytest.raises(ValueError, match="increasing"):
+        store.write("a", t_us.flip(0), intensity, dolp, aolp)
+    with pytest.raises(ValueError, match=r"intensity: expected \(40, 4, 4, 6\), got \(40, 4, 3, 6\)"):
+        store.write("a", t_us, intensity[..., 1:, :], dolp[..., 1:, :], aolp[..., 1:, :])
+    with pytest.raises(ValueError, match=r"dolp: expected values in \[0, 1\]"):
+        store.write("a", t_us, intensity, 2 * dolp, aolp)
+    assert store.missing() == ["a", "b"]
+
+
+def test_a_sequence_without_a_split_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="expected b in one of the splits train, val, test, got None"):
+        store_at(tmp_path / "f.zarr", splits={"a": "train"})
+
+
+def test_a_flipped_byte_is_found_and_named(finished, tmp_path):
+    damaged = shutil.copytree(finished, tmp_path / "frames.zarr")
+    chunk = next(file for file in (damaged / "aolp" / "c" / "1").rglob("*") if file.is_file())
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 3] ^= 4
+    chunk.write_bytes(content)
+    (problem,) = verify_frames(damaged)
+    assert "b, column aolp is unreadable" in problem
+
+
+def masks(seed: int, n: int = FRAMES) -> torch.Tensor:
+    return torch.rand(n, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(seed)) < 0.5
+
+
+def test_a_mask_comes_back_as_it_was_whatever_the_width(tmp_path):
+    store = store_at(tmp_path / "frames.zarr", masked=True)
+    store.write("a", *frames_of(1), masks(1))
+    store.write("b", *frames_of(2, n=33))  # nothing masked
+    store.finish()
+    assert WIDTH % 8
+    read = FrameStore.open(tmp_path / "frames.zarr")
+    assert torch.equal(read.valid("a"), masks(1))
+    assert torch.equal(read.frames("a").valid, masks(1))
+    assert read.frames("b").valid.shape == (33, HEIGHT, WIDTH)
+    assert read.valid("b").all()
+    assert verify_frames(tmp_path / "frames.zarr") == []
+    (chunk,) = (file for file in (tmp_path / "frames.zarr" / "valid" / "c" / "0").rglob("*") if file.is_file())
+    chunk.write_bytes(chunk.read_bytes()[:-1])
+    assert any("a, column valid is unreadable" in problem for problem in verify_frames(tmp_path / "frames.zarr"))
+
+
+def test_without_masks_nothing_is_stored_about_them(finished, tmp_path):
+    store = FrameStore.open(finished)
+    assert not store.masked
+    assert store.valid("a") is None
+    assert store.frames("a").valid is None
+    assert not (finished / "valid").exists()
+    with pytest.raises(ValueError, match="got a mask for a store without one"):
+        store_at(tmp_path / "frames.zarr").write("a", *frames_of(1), masks(1))
+
+
+def test_numpy_frames_and_a_path_of_text_make_the_same_store(tmp_path, finished):
+    store = FrameStore.create(str(tmp_path / "n.zarr"), ["a"], {"a": "train"}, 40, 4, 6, {})
+    store.write("a", *(values.numpy() for values in frames_of(1)))
+    store.finish()
+    written, expected = (FrameStore.open(str(path)).frames("a") for path in (tmp_path / "n.zarr", finished))
+    assert all(torch.equal(a, b) for a, b in zip(written[:4], expected[:4], strict=True))
+
+
+def test_frames_of_bytes_and_times_between_microseconds_are_refused(tmp_path, unchecked_annotations):
+    store = store_at(tmp_path / "f.zarr")
+    t_us, intensity, dolp, aolp = frames_of(1)
+    with pytest.raises(ValueError, match=r"intensity: expected values in \[0, 1\], got values up to .*; divide by 255"):
+        store.write("a", t_us, (255 * intensity).byte(), dolp, aolp)
+    with pytest.raises(ValueError, match=r"t_us: expected whole numbers, got torch\.float32"):
+        store.write("a", t_us.float(), intensity, dolp, aolp)
