@@ -1,27 +1,35 @@
-"""Results of all stages -> data/report: the HTML report."""
+"""Results of all stages -> tables in data/benchmark and the HTML report in data/report."""
 
 import dataclasses
 import os
 import sys
 from pathlib import Path
 
+from polarnet.config.tables import collect_rows
 from polarnet.config.tree import Config, hydra_stage
 from polarnet.reports.artefacts import ReportPaths
 from polarnet.reports.page import write_report
 from polarnet.reports.provenance import Run, facts
+from polarnet.reports.tables import as_plain, score_table
 
-PLUMBING = ("paths", "runtime", "cluster")  # sections that do not affect results
+PLUMBING = ("rows", "row", "baseline", "paths", "runtime", "cluster")  # what does not affect results
 
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Write the report and print its location."""
+    """Put the tables together from the rows of `benchmark.methods`, write the report and print its location."""
+    try:
+        tables = collect_rows(config)
+    except FileNotFoundError as error:
+        raise SystemExit(str(error)) from None
+    for name, scores in tables.items():
+        print(f"\ntest set {name}\n" + as_plain(score_table(scores)))
     paths = ReportPaths(**{f.name: Path(getattr(config.paths, f.name)) for f in dataclasses.fields(ReportPaths)})
     parameters = {name: value for name, value in dataclasses.asdict(config).items() if name not in PLUMBING}
     overrides = [override for override in sys.argv[1:] if not override.startswith("hydra.")]
     command = "dvc repro" if "DVC_STAGE" in os.environ else " ".join(["polarnet run", *overrides])
     run = Run(command, parameters, {"seed": str(config.seed)} | facts(Path(__file__).resolve().parent.parent))
-    print(f"the report: {write_report(paths, run, Path(config.paths.report))}")
+    print(f"the report: {write_report(paths, config.used_baselines, run, Path(config.paths.report))}")
 
 
 if __name__ == "__main__":

@@ -1,31 +1,51 @@
-"""Events (data/events.zarr or emulated from data/scenes.zarr), data/frames.zarr -> data/train: the DoLP network."""
+"""Events (data/events.zarr or emulated from data/scenes.zarr), data/frames.zarr -> data/train/NAME: a trained network.
+
+`python -m stages.train` trains the DoLP network `network` into data/train/ours; `python -m stages.train baseline=NAME`
+trains a baseline, with the settings of section `baselines.NAME`.
+"""
 
 from pathlib import Path
 
-from polarnet.config.tree import Config, hydra_stage, or_exit
+from polarnet.config.tree import DOLP_TRAINING, Config, hydra_stage, or_exit
+from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.machine import device_of, threads_of
+from polarnet.training.baselines import BASELINES
 from polarnet.training.dolp import dolp_task
-from polarnet.training.loop import train
+from polarnet.training.loop import LoopConfig, train
 from polarnet.training.parallel import join, launched
 from polarnet.training.recorder import Recorder
-from polarnet.training.task import describe, lpips_of, open_events, open_split
+from polarnet.training.task import Task, describe, lpips_of, open_events, open_split
 
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Train `network` on the training split; a killed run of the same training resumes."""
+    """Train one network on the training split; a killed run of the same training resumes."""
     if launched("stages.train", config.runtime):
         return
     device = device_of(config.runtime)
     join(device)
-    lpips = or_exit(lambda: lpips_of(config.paths.weights, config.lpips.backbone, config.loss.lpips))
-    task = dolp_task(config.network, config.network_config, config.train, config.loss, lpips, config.seed)
+    settings, task = or_exit(lambda: _task(config))
     paths, threads = config.paths, threads_of(config.runtime)
-    events = open_events(config.train.data, paths.events, paths.scenes, config.emulate, config.seed, threads)
+    events = open_events(settings.data, paths.events, paths.scenes, config.emulate, config.seed, threads)
     split = open_split(events, paths.frames, task.encode)
-    metadata = describe(task, split, config.train, Path(paths.weights), config.seed, device)
-    recorder = Recorder(Path(paths.train), Path(paths.resume), metadata)
-    train(task, split, config.train, recorder, config.seed, device, config.runtime.workers)
+    metadata = describe(task, split, settings, Path(paths.weights), config.seed, device)
+    recorder = Recorder(Path(paths.train) / (config.baseline or DOLP_TRAINING), Path(paths.resume), metadata)
+    train(task, split, settings, recorder, config.seed, device, config.runtime.workers)
+
+
+def _task(config: Config) -> tuple[LoopConfig, Task]:
+    """Settings and task of the training; ValueError if LPIPS weights that it needs are missing."""
+
+    def lpips(weight: float) -> Lpips | None:
+        return lpips_of(config.paths.weights, config.lpips.backbone, weight)
+
+    if config.baseline is None:
+        loss = config.loss
+        task = dolp_task(config.network, config.network_config, config.train, loss, lpips(loss.lpips), config.seed)
+        return config.train, task
+    baseline, settings = BASELINES[config.baseline], getattr(config.baselines, config.baseline)
+    largest = max(getattr(settings, key) for key in baseline.lpips)
+    return settings, baseline.task(settings, lpips(largest), config.seed)
 
 
 if __name__ == "__main__":

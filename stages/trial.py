@@ -1,14 +1,12 @@
 """One point of a sweep: train and benchmark in the job's own folder, without touching the files that DVC tracks.
 
 `python -m stages.trial -m loss.mse=1.0 loss.ssim=0.0,1.0 seed=1,2,3` runs every combination on the pipeline's existing
-sequences and ends with one table (polarnet.config.sweep). Jobs may run in parallel: each keeps its own predictions
-until they are scored, because a cache holds only one prediction per method and sequence.
+sequences and ends with one table (polarnet.config.sweep). Jobs may run in parallel.
 
 A failed point writes the reason to `failure.txt`; the other points continue.
 """
 
 import io
-import shutil
 import subprocess
 import sys
 from collections import deque
@@ -40,13 +38,12 @@ def main(node: DictConfig) -> None:
         overrides.append(REFERENCE_METHODS)
     failure = None
     for stage in ("train", "benchmark"):
-        folders = [f"paths.{name}={job / name}" for name in ("train", "benchmark", "cache")]
+        folders = [f"paths.{name}={job / name}" for name in ("train", "benchmark")]
         logs = [f"hydra.run.dir={job / 'logs' / stage}"]
         failure = _failure([sys.executable, "-m", f"stages.{stage}", *overrides, *folders, *logs])
         if failure:
             (job / FAILURE).write_text(f"{stage}: {failure}\n")
             break
-    shutil.rmtree(job / "cache", ignore_errors=True)
     if failure and hydra.mode == RunMode.RUN:  # in a multirun the sweep table reports it and sets the exit status
         raise SystemExit(1)
 

@@ -27,7 +27,7 @@ from studies.figures import loss_sweep_figure
 
 ROOT = Path(__file__).resolve().parents[1]
 VERSIONS_OF = ("torch", "numpy", "numba", "zarr", "dvc", "hydra-core")
-STAGE_STARTS = re.compile(r"Running stage '([\w@]+)'")  # printed by dvc repro
+STAGE_STARTS = re.compile(r"Running stage '([\w@+]+)'")  # printed by dvc repro
 
 
 def machine_record(root: Path) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def measure_pipeline(root: Path) -> Path:
         _, again = _timed("repro", clone)
         if again:
             raise RuntimeError(f"a second make repro ran {', '.join(again)}; everything should have been cached")
-        record["metrics"] = json.loads((clone / "data" / "benchmark" / "metrics.json").read_text())
+        record["metrics"] = scores_and_costs(clone / "data" / "benchmark")
         record["lpips"] = json.loads((clone / "data" / "benchmark" / "details.json").read_text())["lpips"]
         shutil.copy(clone / "data" / "report" / "overview.png", root / "docs" / "pictures" / "overview.png")
         path = root / "docs" / "results" / "pipeline.json"
@@ -113,6 +113,12 @@ BENCHMARK_KEYS = (
     "ms_per_window", "gflop", "params", "peak_mib",
 )  # fmt: skip
 """Scores of each method in docs/results/benchmark.json; the intervals stay in metrics.json."""
+
+
+def scores_and_costs(folder: Path) -> dict[str, dict[str, Any]]:
+    """Scores and costs by row, from metrics.json and cost.json in the folder of a test set's results."""
+    metrics, costs = (json.loads((folder / f"{name}.json").read_text()) for name in ("metrics", "cost"))
+    return {row: {**scores, **costs[row]} for row, scores in metrics.items()}
 
 
 def measure_benchmark(root: Path, benchmark: Path, record: Mapping[str, Any] | None = None) -> Path:
@@ -135,7 +141,7 @@ def measure_benchmark(root: Path, benchmark: Path, record: Mapping[str, Any] | N
         )
     found: dict[str, Any] = {**(record or machine_record(root)), "paired": {}, "about": {}}
     for name, folder in folders.items():
-        metrics, details = (json.loads((folder / f"{file}.json").read_text()) for file in ("metrics", "details"))
+        metrics, details = scores_and_costs(folder), json.loads((folder / "details.json").read_text())
         found[name] = {method: {key: scores.get(key) for key in BENCHMARK_KEYS} for method, scores in metrics.items()}
         found["paired"][name] = details["paired"]
         found["about"][name] = {key: details[key] for key in ("frames", "warmup_windows", "precision")} | {
@@ -248,7 +254,10 @@ def _timed(target: str, folder: Path) -> tuple[float, dict[str, float]]:
     if process.returncode:
         raise RuntimeError(f"make {target} failed in a fresh clone; what it printed is above")
     spans = itertools.pairwise([*marks, ("", ended)])
-    stages = {name: round((end - start) / 60, 2) for (name, start), (_, end) in spans}
+    stages: dict[str, float] = {}
+    for (name, start), (_, end) in spans:
+        stage = name.partition("@")[0]  # all rows and all trained baselines together
+        stages[stage] = round(stages.get(stage, 0) + (end - start) / 60, 2)
     return round((ended - started) / 60, 2), stages
 
 

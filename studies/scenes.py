@@ -40,7 +40,7 @@ CHOICES = {
 def stage(name: str, arguments: argparse.Namespace, data: Path, *overrides: str) -> None:
     """Run one stage of the pipeline on the data of one choice."""
     common = (
-        "experiment=photographs", "loss.lpips=0", f"paths.data={data}", f"paths.cache={arguments.work / 'cache'}",
+        "experiment=photographs", "loss.lpips=0", f"paths.data={data}",
         f"runtime.threads={arguments.threads}",
     )  # fmt: skip
     subprocess.run([sys.executable, "-m", f"stages.{name}", *common, *overrides], cwd=ROOT, check=True)

@@ -32,13 +32,13 @@ from studies.study_tables import best_reconstruction, over_seeds, seeds_of
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAININGS: dict[str, tuple[str, ...]] = {
-    "ours": ("train", "network=polarnet"),
-    "paper": ("train", "network=paper"),
-    "firenet": ("train_e2v", "baselines.e2v.arch=firenet"),
-    "e2vid": ("train_e2v", "baselines.e2v.arch=e2vid"),
-    "e2p": ("train_e2p",),
+    "ours": ("network=polarnet",),
+    "paper": ("network=paper",),
+    "firenet": ("baseline=e2v", "baselines.e2v.arch=firenet"),
+    "e2vid": ("baseline=e2v", "baselines.e2v.arch=e2vid"),
+    "e2p": ("baseline=e2p",),
 }
-"""Row of the table: the stage that trains its network, and what makes the stage train this one."""
+"""Row of the table: overrides with which stage train trains its network."""
 PUBLISHED = ("firenet_published", "cista_tc")
 SOLVED = [f"{row}{gain}" for row in ("cf", "highpass", *PUBLISHED, "firenet") for gain in ("", "+gain")]
 METHODS = ["zeros", "train_mean", "oracle_mean", *SOLVED, "e2vid", "e2p", "paper", "ours"]
@@ -52,7 +52,6 @@ def common(arguments: argparse.Namespace) -> list[str]:
         "experiment=photographs",
         f"ingest.root={arguments.photographs}",
         f"paths.data={arguments.work / 'data'}",
-        f"paths.cache={arguments.work / 'cache'}",
         f"runtime.threads={arguments.threads}",
     ]
 
@@ -63,27 +62,19 @@ def stage(name: str, arguments: argparse.Namespace, *overrides: str) -> None:
 
 
 def trained(row: str, arguments: argparse.Namespace) -> Path:
-    """The folder of a row's training, and in its minutes.json how long that took; null: a killed one went on."""
-    folder = arguments.work / f"train_{row}_{arguments.seed}"
+    """Folder of a row's training; its minutes.json holds the duration, null if a killed training was resumed."""
+    choice = TRAININGS[row]
+    root = arguments.work / f"train_{row}_{arguments.seed}"
+    folder = root / next((one.removeprefix("baseline=") for one in choice if one.startswith("baseline=")), "ours")
     if not (folder / "minutes.json").exists():
-        name, *choice = TRAININGS[row]
         chosen = [pair for of_row, _, pair in (one.partition(":") for one in arguments.override) if of_row == row]
-        resume = arguments.work / "resume" / folder.name
+        resume = arguments.work / "resume" / root.name
         whole, started = not any(resume.glob("*/running.pt")), time.monotonic()
-        paths = (f"paths.{name}={folder}", f"paths.resume={resume}")
-        stage(name, arguments, *choice, f"benchmark.methods=[{row}]", f"seed={arguments.seed}", *paths, *chosen)
+        paths = (f"paths.train={root}", f"paths.resume={resume}")
+        stage("train", arguments, *choice, f"benchmark.methods=[{row}]", f"seed={arguments.seed}", *paths, *chosen)
         minutes = round((time.monotonic() - started) / 60, 1) if whole else None
         (folder / "minutes.json").write_text(json.dumps(minutes))
     return folder
-
-
-def stand_in(arguments: argparse.Namespace) -> Path:
-    """Given weights of `ours`, where a training would have left them."""
-    best = arguments.work / "given_ours" / "best.safetensors"
-    best.parent.mkdir(exist_ok=True)
-    for suffix in (".safetensors", ".json"):
-        shutil.copy(arguments.ours.with_suffix(suffix), best.with_suffix(suffix))
-    return best
 
 
 def headlines(tables: dict[str, dict[str, dict[str, Any]]]) -> dict[str, Any]:
@@ -152,13 +143,20 @@ def main() -> None:
     results = arguments.work / f"benchmark_{section}"
     best = {row: folder / "best.safetensors" for row, folder in folders.items()}
     if arguments.ours:
-        best["ours"] = stand_in(arguments)
-    weights = [f"methods.{row}.weights={file}" for row, file in best.items() if row != "ours"]
+        best["ours"] = arguments.ours
+    weights = [f"methods.{row}.weights={file}" for row, file in best.items()]
     weights += [f"methods.{row}.weights={file}" for row, file in arguments.published.items()]
     scored = [row for row in METHODS if row.removesuffix("+gain") not in set(TRAININGS) - set(arguments.rows)]
     methods = f"benchmark.methods=[{','.join(scored)}]"
-    paths = (f"paths.train={best['ours'].parent}", f"paths.benchmark={results}")
-    stage("benchmark", arguments, *sets, methods, *weights, *paths, f"runtime.workers={arguments.workers}")
+    stage(
+        "benchmark",
+        arguments,
+        *sets,
+        methods,
+        *weights,
+        f"paths.benchmark={results}",
+        f"runtime.workers={arguments.workers}",
+    )
     folders_of = {"simulated": results, "measured": results / "sets" / "measured"}
     tables, details = (
         {name: json.loads((path / file).read_text()) for name, path in folders_of.items()}

@@ -168,7 +168,7 @@ def write_trial() -> Callable[..., None]:
         }
         if validation or test:
             scores = validation or {"mse": 0.5, "psnr": 3.0}
-            files["train/history.json"] = json.dumps([{"train": loss, "val": scores}])
+            files["train/ours/history.json"] = json.dumps([{"train": loss, "val": scores}])
         if test:
             files["benchmark/metrics.json"] = json.dumps({"ours": test, "zeros": {}})
         if failure:

@@ -5,7 +5,7 @@ import time
 import tracemalloc
 import weakref
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -14,6 +14,7 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop
 
 from polarnet.benchmark.rows import Context, opened, predictions_of
+from polarnet.benchmark.score import Cost
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import slice_time
 from polarnet.methods import METHODS
@@ -29,20 +30,6 @@ CPU_ATTENTION = {
         q, k, v
     )
 }
-
-
-@dataclass(frozen=True)
-class Cost:
-    """Cost of a method; times and arithmetic are per window of all four channels."""
-
-    ms_per_window: float
-    """Time from events in memory to a DoLP frame in memory, including encoding the input."""
-    gflop: float | None
-    """Convolutions, matrix products and attention; a multiply-add counts as 2. None for a method without a network."""
-    params: int
-    """Parameters of the method's networks."""
-    peak_mib: float
-    """Peak memory of tensors and arrays over `COUNTED_WINDOWS` windows, without the sequence itself."""
 
 
 def cost_of(row: str, sequence: TestSequence, context: Context) -> Cost:

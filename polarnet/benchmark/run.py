@@ -1,45 +1,31 @@
-"""The benchmark: runs every method on every sequence of a test set, scores it, measures its cost and saves panels."""
+"""Run every method on every sequence of a test set, score it, measure its cost and keep panels."""
 
-import dataclasses
 import functools
-import json
-import platform
-import shutil
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from polarnet.benchmark.cache import FORMAT, Cache, sequence_digest
-from polarnet.benchmark.cost import Cost, cost_of
-from polarnet.benchmark.paired import paired_comparisons
-from polarnet.benchmark.references import REFERENCES, mean_dolp
+from polarnet.benchmark.references import mean_dolp
 from polarnet.benchmark.rows import Context, predictions_of
-from polarnet.benchmark.score import (
-    METRICS,
-    BenchmarkConfig,
-    FrameScore,
-    scene_means,
-    score_sequence,
-    scored_windows,
-    summary,
-    write_frames,
-)
+from polarnet.benchmark.score import BenchmarkConfig, Cost, FrameScore, score_sequence, scored_windows
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.representations import event_tensor
 from polarnet.events.windows import encode_windows
-from polarnet.methods import METHODS
-from polarnet.metrics.reliability import Reliability, reliability
+from polarnet.metrics.reliability import HIGHEST, LOWEST, Reliability, reliability
 from polarnet.metrics.similarity import Lpips
-from polarnet.runtime.fingerprint import code_digest, digest, method_digest, value_digest
 from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore
-from polarnet.storage.frames import FrameStore
+from polarnet.storage.frames import (
+    FrameStore,
+    dequantise_angle,
+    dequantise_fraction,
+    quantise_angle,
+    quantise_fraction,
+)
 
 
 @dataclass(frozen=True)
@@ -127,143 +113,70 @@ def run_benchmark(
     context: Context,
     config: BenchmarkConfig,
     lpips: Lpips | None,
-    cache: Path,
     mapper: Callable[..., Iterable[Any]] = map,
 ) -> Benchmark:
     """Run and score `config.methods` on a test set; ValueError if it has no sequence.
 
-    Results in `cache` are reused while method, sequence and code are unchanged (see `Cache`), so adding a method
-    runs only that method. `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`;
-    each task is one sequence. Costs are measured in this process, one method after another, on the first sequence.
+    `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each task is one
+    sequence. Costs are measured in this process, one method after another, on the first sequence.
     """
+    from polarnet.benchmark.cost import cost_of  # torch's counter of operations takes a second to import
+
     names = test_set.sequences
     if lpips is not None:
         lpips = lpips.to(context.device)
-    kept = Cache(cache / test_set.name)
-    digests = {row: _row_digest(row, context) for row in config.methods}
-    scoring = digest(code_digest(score_sequence), str(config.warmup_windows), _lpips_digest(lpips))
-    shown = _spread(names, config.panel_scenes, {name: test_set.scene_of(name) for name in names})
+    panels = _spread(names, config.panel_scenes, {name: test_set.scene_of(name) for name in names})
     task = functools.partial(
-        _measured,
-        test_set=test_set,
-        context=context,
-        digests=digests,
-        scoring=scoring,
-        config=config,
-        lpips=lpips,
-        cache=kept,
-        shown=shown,
+        _measured, test_set=test_set, context=context, config=config, lpips=lpips, panel_sequences=panels
     )
     results: list[SequenceResult] = list(mapper(task, names))
-    costs = _costs(test_set.sequence(names[0]), context, digests, kept)
-    kept.forget([*names])
+    first = test_set.sequence(names[0])
+    costs = {row: cost_of(row, first, context) for row in config.methods}
     sums: dict[str, Reliability] = {}
     for result in results:
         for method, here in result.reliability.items():
             sums[method] = sums[method] + here if method in sums else here
     rows = [row for result in results for row in result.rows]
-    panels = [result.panel for result in results if result.panel is not None]
-    return Benchmark(rows, costs, panels, sums)
+    return Benchmark(rows, costs, [result.panel for result in results if result.panel is not None], sums)
 
 
 def _measured(
     name: str,
     test_set: BenchmarkSet,
     context: Context,
-    digests: Mapping[str, str],
-    scoring: str,
     config: BenchmarkConfig,
     lpips: Lpips | None,
-    cache: Cache,
-    shown: Collection[str],
+    panel_sequences: Collection[str],
 ) -> SequenceResult:
-    """Run and score every row on one sequence, which is read once; cached predictions and scores are reused."""
+    """Run and score every row on one sequence, which is read once."""
     sequence = test_set.sequence(name)
-    keys = _prediction_keys(sequence, digests)
-    predictions = {row: known for row, key in keys.items() if (known := cache.prediction(row, name, key)) is not None}
-    made = predictions_of([row for row in keys if row not in predictions], sequence, context)
-    predictions |= {row: cache.write_prediction(row, name, keys[row], made[row]) for row in made}
-    ordered = {row: predictions[row] for row in keys}
-    score_keys = {row: digest(key, scoring) for row, key in keys.items()}
-    scores = {row: rows for row, key in score_keys.items() if (rows := cache.scores(row, name, key)) is not None}
-    unscored = {row: prediction for row, prediction in ordered.items() if row not in scores}
-    if unscored:  # together, so that LPIPS's features of the truth are computed once
-        scored = score_sequence(sequence, unscored, config.warmup_windows, lpips, context.device)
-        for row in unscored:
-            scores[row] = [score for score in scored if score.method == row]
-            cache.write_scores(row, name, score_keys[row], scores[row])
-    rows = [score for row in keys for score in scores[row]]
-    panel = _panel(sequence, ordered, config.warmup_windows) if name in shown else None
-    return SequenceResult(rows, _reliability(sequence, ordered, config.warmup_windows), panel)
-
-
-def _row_digest(row: str, context: Context) -> str:
-    """A hash of a row's code, settings and weights."""
-    if row in REFERENCES:
-        reference = REFERENCES[row]
-        return digest(code_digest(reference.predict), str(context.train_mean if reference.needs_train_mean else None))
-    method = METHODS[row]
-    return method_digest(method.open, context.setup_of(method))
-
-
-def _prediction_keys(sequence: TestSequence, digests: Mapping[str, str]) -> dict[str, str]:
-    of_sequence = sequence_digest(sequence)
-    return {method: digest(FORMAT, of_method, of_sequence) for method, of_method in digests.items()}
-
-
-def _lpips_digest(lpips: Lpips | None) -> str:
-    if lpips is None:
-        return "none"
-    return digest(lpips.backbone, *(f"{name}={value_digest(t)}" for name, t in lpips.state_dict().items()))
-
-
-def _costs(sequence: TestSequence, context: Context, digests: Mapping[str, str], cache: Cache) -> dict[str, Cost]:
-    """Cost of each method; cached costs are reused on the same machine with the same number of threads."""
-    device = torch.cuda.get_device_name(context.device) if context.device.type == "cuda" else "cpu"
-    here = digest(platform.node(), platform.machine(), device, str(torch.get_num_threads()))
-    costs = {}
-    for method, key in _prediction_keys(sequence, digests).items():
-        cost_key = digest(key, here)
-        if (cost := cache.cost(method, cost_key)) is None:
-            cost = cost_of(method, sequence, context)
-            cache.write_cost(method, cost_key, cost)
-        costs[method] = cost
-    return costs
-
-
-def write_benchmark(
-    folder: Path, benchmark: Benchmark, config: BenchmarkConfig, seed: int, about: Mapping[str, Any]
-) -> dict[str, dict[str, Any]]:
-    """Write metrics.json, details.json (`about`, settings), frames.csv, panels/<sequence>.npz; return the metrics."""
-    shutil.rmtree(folder / "panels", ignore_errors=True)  # an earlier run may have saved other scenes
-    (folder / "panels").mkdir(parents=True)
-    backbone = {"lpips_backbone": config.lpips_backbone} if config.lpips else {}
-    metrics: dict[str, dict[str, Any]] = {
-        method: {**scores, **backbone, **dataclasses.asdict(benchmark.costs[method])}
-        for method, scores in summary(benchmark.rows, config.bootstrap_samples, seed).items()
+    predictions = {
+        row: at_stored_precision(row, name, prediction)
+        for row, prediction in predictions_of(config.methods, sequence, context).items()
     }
-    means = {metric: scene_means(benchmark.rows, metric) for metric in METRICS}
-    details = {
-        **about,
-        "scenes": sorted({row.scene for row in benchmark.rows}),
-        "sequences": sorted({row.sequence for row in benchmark.rows}),
-        "frames": len(benchmark.rows) // len(config.methods),
-        "warmup_windows": config.warmup_windows,
-        "precision": config.precision,
-        "bootstrap_samples": config.bootstrap_samples,
-        "scene_means": {metric: of_methods for metric, of_methods in means.items() if of_methods},
-        "paired": paired_comparisons(benchmark.rows, "ours"),
-        "reliability": {
-            method: {"curve": sums.curve(), "log_error": sums.log_error()}
-            for method, sums in benchmark.reliability.items()
-        },
-    }
-    for name, content in (("metrics", metrics), ("details", details)):
-        (folder / f"{name}.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-    write_frames(folder / "frames.csv", benchmark.rows)
-    for panel in benchmark.panels:
-        _write_panel(folder / "panels" / f"{panel.sequence}.npz", panel)
-    return metrics
+    rows = score_sequence(sequence, predictions, config.warmup_windows, lpips, context.device)
+    panel = _panel(sequence, predictions, config.warmup_windows) if name in panel_sequences else None
+    return SequenceResult(rows, _reliability(sequence, predictions, config.warmup_windows), panel)
+
+
+def at_stored_precision(row: str, sequence: str, prediction: Prediction) -> Prediction:
+    """The prediction in the steps of the stored truth: DoLP 1/65535, AoLP pi/65536; log-variance as float16.
+
+    ValueError, naming the row and the window, if a value is not finite.
+    """
+    for frames in (prediction.dolp, prediction.aolp, prediction.log_variance):
+        if frames is not None and not (finite := frames.isfinite().flatten(1).all(dim=1)).all():
+            raise ValueError(
+                f"{row} on {sequence}, window {int((~finite).nonzero()[0])}: it predicted values that are not "
+                f"numbers; the method, its weights or the events are damaged"
+            )
+    dolp = dequantise_fraction(quantise_fraction(prediction.dolp))
+    aolp = log_variance = None
+    if prediction.aolp is not None:
+        aolp = dequantise_angle(quantise_angle(prediction.aolp.remainder(torch.pi)))
+    if prediction.log_variance is not None:
+        log_variance = prediction.log_variance.clamp(LOWEST, HIGHEST).half().float()
+    return Prediction(dolp, aolp, log_variance)
 
 
 def _spread(names: Sequence[str], count: int, scenes: Mapping[str, str]) -> set[str]:
@@ -303,16 +216,3 @@ def _panel(sequence: TestSequence, predictions: Mapping[str, Prediction], warmup
         {method: prediction.dolp[k] for method, prediction in predictions.items()},
         {method: prediction.aolp[k] for method, prediction in predictions.items() if prediction.aolp is not None},
     )
-
-
-def _write_panel(path: Path, panel: Panel) -> None:
-    frames = {
-        "events": panel.events,
-        "truth_dolp": panel.truth_dolp,
-        "truth_aolp": panel.truth_aolp,
-        "truth_s0": panel.truth_s0,
-        **{f"dolp_{method}": frame for method, frame in panel.dolp.items()},
-        **{f"aolp_{method}": frame for method, frame in panel.aolp.items()},
-    }
-    arrays: dict[str, Any] = {name: frame.numpy() for name, frame in frames.items()}
-    np.savez(path, window=np.int64(panel.window), t_us=np.int64(panel.t_us), **arrays)

@@ -96,6 +96,20 @@ class FrameScore(NamedTuple):
     """MSE of the true frame's mean: not a score, but the reference of the skill."""
 
 
+@dataclass(frozen=True)
+class Cost:
+    """Cost of a method; times and arithmetic are per window of all four channels."""
+
+    ms_per_window: float
+    """Time from events in memory to a DoLP frame in memory, including encoding the input."""
+    gflop: float | None
+    """Convolutions, matrix products and attention; a multiply-add counts as 2. None for a method without a network."""
+    params: int
+    """Parameters of the method's networks."""
+    peak_mib: float
+    """Peak memory of tensors and arrays over the first windows, without the sequence itself."""
+
+
 def scored_windows(sequence: TestSequence, warmup_windows: int) -> range:
     """Indices of the scored windows; ValueError if the warm-up leaves none."""
     if len(sequence.dolp) <= warmup_windows:

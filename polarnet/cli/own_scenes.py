@@ -7,7 +7,8 @@ from typing import Any
 
 from polarnet.benchmark.conditions import configured, sentence, warnings
 from polarnet.benchmark.rows import available, metadata_used, weights_used
-from polarnet.benchmark.run import run_benchmark, train_mean_dolp, write_benchmark
+from polarnet.benchmark.results import write_benchmark
+from polarnet.benchmark.run import run_benchmark, train_mean_dolp
 from polarnet.config.pipeline import context_of, made_set, mapper_of
 from polarnet.config.tree import Config, with_lpips
 from polarnet.methods import METHODS
@@ -31,8 +32,8 @@ def benchmark_folder(
 ) -> tuple[dict[str, dict[str, Any]], list[str]]:
     """Run the benchmark on a folder of photographs or measured scenes, without training; return (metrics, notes).
 
-    `out` receives metrics.json, details.json, frames.csv, panels and index.html. `work` receives the intermediate
-    files, so a stopped run resumes and a second run with other weights computes only the new results. Methods without
+    `out` receives metrics.json, cost.json, details.json, frames.csv, panels and index.html. `work` receives the
+    pictures, scenes and events, so a stopped run resumes and a second run only runs the methods. Methods without
     weights are left out and unusable files are skipped; `notes` lists both. Size, duration and sensor are printed
     first, with a warning if a network was trained with others. `weights` is a checkpoint of the DoLP network; None
     uses the shipped one. Raises ValueError if the folder has no usable file, or if the weights for an LPIPS column are
@@ -59,7 +60,7 @@ def benchmark_folder(
     notes = [*_skipped(config, work), *(_left_out(row, reason) for row, reason in left_out.items())]
     settings = dataclasses.replace(config.benchmark, methods=methods)
     test_set = made_set(root.resolve().name, work)
-    benchmark = run_benchmark(test_set, context, settings, lpips, work / "cache", mapper_of(config, "benchmark"))
+    benchmark = run_benchmark(test_set, context, settings, lpips, mapper_of(config, "benchmark"))
     about = {
         "set": test_set.name,
         "conditions": {"sentence": sentence(used), "warnings": differences, **used._asdict()},

@@ -55,21 +55,37 @@ def _preset(options: argparse.Namespace) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from polarnet.config.experiments import stage_names
+    from polarnet.config.tree import load
 
     root = project_root()
     chosen = dict(item.split("=", 1) for item in options.overrides if "=" in item)
     name = "-".join([chosen.get("experiment", "demo"), *([chosen["sensor"]] if "sensor" in chosen else [])])
     folder = chosen.get("paths.data", f"outputs/run/{name}")
     overrides = [*options.overrides, *([] if "paths.data" in chosen else [f"paths.data={folder}"])]
-    for stage in stage_names(root):
-        print(f"== {stage}", flush=True)
-        status = subprocess.run([sys.executable, "-m", f"stages.{stage}", *overrides], cwd=root).returncode
+    for name, stage, own in _hydra_runs(root, load(root, options.overrides).used_baselines):
+        print(f"== {name}", flush=True)
+        status = subprocess.run([sys.executable, "-m", f"stages.{stage}", *overrides, *own], cwd=root).returncode
         if status:
-            print(f"polarnet run: stage {stage} failed; what earlier stages made lies in {folder}", file=sys.stderr)
+            print(f"polarnet run: stage {name} failed; what earlier stages made lies in {folder}", file=sys.stderr)
             return status
     print(f"done: {os.path.join(folder, 'report', 'index.html')}")
     return 0
+
+
+def _hydra_runs(root: Path, baselines: list[str]) -> list[tuple[str, str, list[str]]]:
+    """The pipeline without DVC, in order: name of a run, module in `stages`, and the overrides of this run alone.
+
+    One pass runs all rows; `baselines` are those to train.
+    """
+    from polarnet.config.experiments import stage_names
+
+    runs: list[tuple[str, str, list[str]]] = []
+    for name in dict.fromkeys(stage.partition("@")[0] for stage in stage_names(root)):
+        if name == "train_baseline":
+            runs += [(f"{name}@{baseline}", "train", [f"baseline={baseline}"]) for baseline in baselines]
+        else:
+            runs.append((name, name, []))
+    return runs
 
 
 def _stages(options: argparse.Namespace) -> int:

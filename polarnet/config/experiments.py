@@ -1,5 +1,7 @@
 """Named presets in conf/: overrides that Hydra reads directly and DVC reads through params.yaml."""
 
+import functools
+import operator
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +16,20 @@ It sets every value that another preset of the group changes, so no value of an 
 
 
 def stage_names(root: Path) -> list[str]:
-    """Names of the stages in dvc.yaml, in the order of the file, which is the order of execution."""
-    return list(YAML(typ="safe").load(root / "dvc.yaml")["stages"])
+    """Names of the stages in dvc.yaml, in the order of the file, which is the order of execution.
+
+    A stage with `foreach` gives one name, STAGE@ITEM, for each key or item of its section of params.yaml.
+    """
+    yaml = YAML(typ="safe")
+    params = yaml.load(root / "params.yaml")
+    names = []
+    for stage, content in yaml.load(root / "dvc.yaml")["stages"].items():
+        if "foreach" not in content:
+            names.append(stage)
+            continue
+        keys = content["foreach"].removeprefix("${").removesuffix("}").split(".")
+        names += [f"{stage}@{item}" for item in functools.reduce(operator.getitem, keys, params)]
+    return names
 
 
 def preset_names(root: Path, group: str) -> list[str]:

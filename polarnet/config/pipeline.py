@@ -1,17 +1,18 @@
-"""The benchmark of a configuration: the inputs of the methods and the test sets on which they run."""
+"""The benchmark of a configuration: the inputs of the methods, the test sets, and running rows on them."""
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from polarnet.benchmark.references import REFERENCES
+from polarnet.benchmark.row_results import RowRecord, write_row
 from polarnet.benchmark.rows import Context, available, weights_used
-from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp, write_benchmark
-from polarnet.config.tree import Config
+from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp
+from polarnet.config.tree import Config, or_exit
 from polarnet.methods import METHODS
 from polarnet.methods.method import Method, Setup
-from polarnet.metrics.lpips import NO_RECORD, stored_record
 from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.cluster import pmap
 from polarnet.runtime.machine import device_of
@@ -39,7 +40,7 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
         if section.weights:
             weights = Path(section.weights)
         elif method.weights.trained_by:
-            weights = Path(getattr(config.paths, method.weights.trained_by)) / "best.safetensors"
+            weights = Path(config.paths.train) / method.weights.trained_by / "best.safetensors"
     return Setup(
         config=section,
         weights=weights,
@@ -56,7 +57,9 @@ def mapper_of(config: Config, label: str) -> Callable[..., list[Any]]:
 
 
 def pipeline_set(config: Config, name: str) -> BenchmarkSet:
-    """Open a test set of `benchmark.sets` that the pipeline made."""
+    """Open a test set that the pipeline made: one of `benchmark.sets`, or `RECORDINGS`."""
+    if name == RECORDINGS:
+        return made_set(RECORDINGS, Path(config.paths.calibrated))
     if name == "simulated":
         return BenchmarkSet(name, EventStore.open(config.paths.events), FrameStore.open(config.paths.frames))
     return made_set(name, Path(config.paths.sets) / name)
@@ -73,17 +76,38 @@ def set_folder(config: Config, name: str) -> Path:
     return folder if name == "simulated" else folder / "sets" / name
 
 
-def run_pipeline_benchmark(config: Config, lpips: Lpips | None) -> dict[str, dict[str, dict[str, Any]]]:
-    """Run the benchmark on all of `benchmark.sets`, write the results, and return the metrics by set and method.
+def row_folder(config: Config, row: str) -> Path:
+    """Folder of a row's own results, from which the table is put together."""
+    return Path(config.paths.benchmark) / "rows" / row
 
-    If `recordings.enabled` is true, the real targets are an additional set, `RECORDINGS`. `lpips` is the result of
-    `lpips_of`.
+
+def set_names(config: Config) -> list[str]:
+    """Test sets of the benchmark: `benchmark.sets`, and the real targets if `recordings.enabled` is true."""
+    return [*config.benchmark.sets, *([RECORDINGS] if config.recordings.enabled else [])]
+
+
+def run_rows(config: Config, rows: Sequence[str]) -> None:
+    """Run rows on every test set, in one pass over the events of each, and write a folder of each row.
+
+    A row that cannot run gets a folder with the reason. SystemExit if LPIPS weights are missing.
     """
-    (Path(config.paths.benchmark) / "sets").mkdir(parents=True, exist_ok=True)
-    tests = {name: pipeline_set(config, name) for name in config.benchmark.sets}
-    if config.recordings.enabled:
-        tests[RECORDINGS] = made_set(RECORDINGS, Path(config.paths.calibrated))
-    return {name: run_on(config, test_set, lpips, set_folder(config, name)) for name, test_set in tests.items()}
+    needs_mean = any(row in REFERENCES and REFERENCES[row].needs_train_mean for row in rows)
+    context = context_of(config, train_mean_of(config) if needs_mean else None)
+    methods, left_out = available(rows, context)
+    for row, reason in left_out.items():
+        print(f"{row} is left out: {reason}")
+        write_row(row_folder(config, row), row, RowRecord(reason, {}), {})
+    if not methods:
+        return
+    lpips = or_exit(lambda: lpips_of(config))
+    settings = dataclasses.replace(config.benchmark, methods=methods)
+    results = {
+        name: run_benchmark(pipeline_set(config, name), context, settings, lpips, mapper_of(config, name))
+        for name in set_names(config)
+    }
+    for row in methods:
+        write_row(row_folder(config, row), row, RowRecord(None, weights_used([row], context)), results)
+    return results
 
 
 def lpips_of(config: Config) -> Lpips | None:
@@ -96,27 +120,6 @@ def lpips_of(config: Config) -> Lpips | None:
     return Lpips.load(config.paths.weights, "benchmark", config.benchmark.lpips_backbone)
 
 
-def run_on(config: Config, test_set: BenchmarkSet, lpips: Lpips | None, folder: Path) -> dict[str, dict[str, Any]]:
-    """Run the methods with available weights on a set, write the results to `folder`, return the metrics by method."""
-    train_mean = train_mean_dolp(FrameStore.open(config.paths.frames), config.benchmark.warmup_windows)
-    context = context_of(config, train_mean)
-    methods, left_out = available(config.benchmark.methods, context)
-    for method, reason in left_out.items():
-        print(f"{method} is left out: {reason}")
-    settings = dataclasses.replace(config.benchmark, methods=methods)
-    mapper = mapper_of(config, test_set.name)
-    benchmark = run_benchmark(test_set, context, settings, lpips, cache_of(config), mapper)
-    about = {
-        "set": test_set.name,
-        "lpips": stored_record(config.paths.weights, "benchmark") if settings.lpips else NO_RECORD,
-        "train_mean": train_mean,
-        "left_out": left_out,
-        "weights": weights_used(methods, context),
-        "postprocessing": dataclasses.asdict(config.baselines.postprocessing),
-    }
-    return write_benchmark(folder, benchmark, settings, config.seed, about)
-
-
-def cache_of(config: Config) -> Path:
-    """Folder that keeps predictions and scores between runs."""
-    return Path(config.paths.cache) / "benchmark"
+def train_mean_of(config: Config) -> float:
+    """Mean DoLP of the pipeline's training split, over what the benchmark scores."""
+    return train_mean_dolp(FrameStore.open(config.paths.frames), config.benchmark.warmup_windows)

@@ -129,7 +129,7 @@ def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 def _point(job: Path) -> dict[str, Any]:
     config: Any = OmegaConf.load(job / ".hydra" / "config.yaml")
-    history = _read(job / "train" / "history.json")
+    history = _read(job / "train" / "ours" / "history.json")
     metrics = _read(job / "benchmark" / "metrics.json")
     unfinished = None if metrics else "it did not finish"
     failure = (job / FAILURE).read_text().strip() if (job / FAILURE).exists() else unfinished

@@ -10,7 +10,7 @@ import sys
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 import hydra
@@ -18,10 +18,11 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.score import BenchmarkConfig
 from polarnet.captures.dot import RecordingsConfig
 from polarnet.config.experiments import preset_names, preset_values
-from polarnet.methods import METHODS
+from polarnet.methods import METHODS, trained_rows
 from polarnet.methods.postprocessing import PostprocessingConfig
 from polarnet.methods.stokes_gain import GainConfig
 from polarnet.metrics.lpips import BACKBONES, PURPOSES, Purpose, is_stored
@@ -36,13 +37,16 @@ from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import MotionConfig
 from polarnet.simulation.sets import SetsConfig
 from polarnet.simulation.variation import VariationConfig
-from polarnet.training.e2p import E2pConfig
-from polarnet.training.e2v import E2vConfig
+from polarnet.training.baselines import BASELINES
 from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
 EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # subfolder of the project in which DVC runs queued experiments
+ROW_KEYS = ("module", "needs", "settings")
+"""Keys of a row in section `rows`: its method's file, what else it is computed from, its section of params.yaml."""
+DOLP_TRAINING = "ours"
+"""Training of the DoLP network, in data/train beside the baselines."""
 CHOICES = re.compile(r"(?:glob\()?([^()=]*)\)?")
 
 Stage = Callable[["Config"], None]
@@ -66,14 +70,20 @@ else:
     """Section `methods` of params.yaml: one section for each method whose record declares settings."""
 
 
-@dataclass(frozen=True)
-class BaselinesConfig:
-    """Section `baselines` of params.yaml."""
-
-    postprocessing: PostprocessingConfig
-    gain: GainConfig
-    e2v: E2vConfig
-    e2p: E2pConfig
+if typing.TYPE_CHECKING:
+    BaselinesConfig = Any
+else:
+    BaselinesConfig = dataclasses.make_dataclass(
+        "BaselinesConfig",
+        [
+            ("trained", list[str]),
+            ("postprocessing", PostprocessingConfig),
+            ("gain", GainConfig),
+            *((name, record.config) for name, record in BASELINES.items()),
+        ],
+        frozen=True,
+    )
+    """Section `baselines` of params.yaml: those to train, and one section for each."""
 
 
 @dataclass(frozen=True)
@@ -94,17 +104,13 @@ class Paths:
     frames: str
     events: str
     weights: str
-    baselines: str
     train: str
-    train_e2v: str
-    train_e2p: str
     sets: str
     benchmark: str
     report: str
     imported: str
     calibrated: str
     resume: str
-    cache: str
 
 
 @dataclass(frozen=True)
@@ -124,8 +130,14 @@ class Config:
     methods: MethodsConfig
     baselines: BaselinesConfig
     benchmark: BenchmarkConfig
+    rows: dict[str, dict[str, str]]
+    """Rows of the tables, each with what it is computed from (`ROW_KEYS`); read by dvc.yaml."""
     sets: SetsConfig
     recordings: RecordingsConfig
+    row: str | None
+    """Row that stage row runs."""
+    baseline: str | None
+    """Baseline that stage train trains; None: the DoLP network."""
     paths: Paths
     runtime: RuntimeConfig
     cluster: ClusterConfig
@@ -135,26 +147,67 @@ class Config:
         known = [field.name for field in dataclasses.fields(NetworksConfig)]
         if self.network not in known:
             raise ValueError(f"network: expected one of {', '.join(known)}, got {self.network!r}")
+        self._check_rows()
+        self._check_baseline()
         window = [self.synthesize.window_height, self.synthesize.window_width]
-        crops = {
-            "train.crop": self.train.crop,
-            "baselines.e2v.crop": self.baselines.e2v.crop,
-            "baselines.e2p.crop": self.baselines.e2p.crop,
+        sections = {name: getattr(self.baselines, name) for name in BASELINES}
+        crops = {"train.crop": self.train.crop} | {
+            f"baselines.{name}.crop": section.crop for name, section in sections.items()
         }
         for key, crop in crops.items():
             if crop is not None and (crop[0] > window[0] or crop[1] > window[1]):
                 raise ValueError(f"{key}: expected at most the window of section synthesize, {window}, got {crop}")
-        e2v, e2p, loss = self.baselines.e2v, self.baselines.e2p, self.lpips.backbone
-        compared = (
+        loss = self.lpips.backbone
+        compared = [
             ("loss.lpips", self.loss.lpips > 0, loss, self.train.crop),
-            ("baselines.e2v.lpips", e2v.lpips > 0, loss, e2v.crop),
-            ("baselines.e2p.lpips", max(e2p.lpips, e2p.intensity_lpips) > 0, loss, e2p.crop),
             ("benchmark.lpips", self.benchmark.lpips, self.benchmark.lpips_backbone, None),
-        )
+        ]
+        for name, section in sections.items():
+            used = any(getattr(section, key) > 0 for key in BASELINES[name].lpips)
+            compared.append((f"baselines.{name}.lpips", used, loss, section.crop))
         for key, used, backbone, crop in compared:
             side, size = BACKBONES[backbone].least_side, crop or window
             if used and min(size) < side:
                 raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {size}")
+
+    def _check_rows(self) -> None:
+        """ValueError for an unknown row or key, and for a row whose weights no stage trains."""
+        unknown = [name for name in (*self.rows, *([self.row] if self.row is not None else [])) if name not in ROWS]
+        if unknown:
+            raise ValueError(f"rows: expected some of {', '.join(ROWS)}, got {', '.join(unknown)}")
+        if unknown := [name for name in self.baselines.trained if name not in BASELINES]:
+            raise ValueError(f"baselines.trained: expected some of {', '.join(BASELINES)}, got {', '.join(unknown)}")
+        for row, keys in self.rows.items():
+            if set(keys) != set(ROW_KEYS):
+                raise ValueError(f"rows.{row}: expected the keys {', '.join(ROW_KEYS)}, got {', '.join(keys)}")
+            training = PurePath(keys["needs"])
+            if training.parts[:2] == ("data", "train") and training.name not in (
+                DOLP_TRAINING,
+                *self.baselines.trained,
+            ):
+                raise ValueError(
+                    f"rows.{row}.needs: no stage makes {training}; add {training.name} to baselines.trained"
+                )
+
+    def _check_baseline(self) -> None:
+        """ValueError for an unknown baseline, and for one to train whose weights no row uses."""
+        name = self.baseline
+        if name is None:
+            return
+        if name not in BASELINES:
+            raise ValueError(f"baseline: expected one of {', '.join(BASELINES)}, got {name!r}")
+        if name not in self.used_baselines:
+            raise ValueError(
+                f"baseline: no row of benchmark.methods uses the weights of baselines.{name}, so it is not trained; "
+                f"add {' or '.join(trained_rows(name))} to the rows, or remove {name} from baselines.trained"
+            )
+
+    @property
+    def used_baselines(self) -> list[str]:
+        """Trained baselines whose weights a row of `benchmark.methods` uses; one with a file of its own does not."""
+        sections = {METHODS[row].section for row in self.benchmark.methods if row in METHODS}
+        given = {section for section in sections if getattr(getattr(self.methods, section), "weights", None)}
+        return [name for name in BASELINES if (sections - given).intersection(trained_rows(name))]
 
     @property
     def network_config(self) -> NetworkConfig:
@@ -279,12 +332,10 @@ def with_lpips(config: Config, purpose: Purpose, use: Callable[[str, str | None]
     The message of a ValueError from `use` is preceded by the keys that request LPIPS and followed by the overrides
     that turn it off.
     """
-    e2v, e2p = config.baselines.e2v, config.baselines.e2p
-    weights = {
-        "loss.lpips": config.loss.lpips,
-        "baselines.e2v.lpips": e2v.lpips,
-        "baselines.e2p.lpips": e2p.lpips,
-        "baselines.e2p.intensity_lpips": e2p.intensity_lpips,
+    weights = {"loss.lpips": config.loss.lpips} | {
+        f"baselines.{name}.{key}": getattr(getattr(config.baselines, name), key)
+        for name, baseline in BASELINES.items()
+        for key in baseline.lpips
     }
     if purpose == "loss":
         backbone, asking, off = config.lpips.backbone, [key for key, weight in weights.items() if weight > 0], "0"
@@ -356,6 +407,8 @@ def _check_key(key: str, where: str) -> None:
     section: Any = Config
     path = key.split(".")
     for depth, name in enumerate(path):
+        if typing.get_origin(section) is dict:  # section `rows`, whose keys `Config` checks
+            return
         names = sorted(field.name for field in dataclasses.fields(section)) if dataclasses.is_dataclass(section) else []
         if name not in names:
             inside = ".".join(path[:depth]) or "the configuration"

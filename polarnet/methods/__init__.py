@@ -22,3 +22,11 @@ def _assembled() -> dict[str, Method]:
 
 METHODS = _assembled()
 """Method by name, in the order of all tables and figures."""
+
+
+def trained_rows(training: str) -> tuple[str, ...]:
+    """Rows, without `+gain`, that use the weights of a training unless their section names a file."""
+    return tuple(
+        name for name, method in METHODS.items() if method.wraps is None and method.weights is not None
+        and method.weights.trained_by == training
+    )  # fmt: skip

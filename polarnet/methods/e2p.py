@@ -35,7 +35,7 @@ METHODS = (
         colour="#7a5cc4",
         open=open_e2p,
         config=WeightsConfig,
-        weights=Weights(("e2p",), trained_by="train_e2p"),
+        weights=Weights(("e2p",), trained_by="e2p"),
         about="E2P (Mei et al. 2023), a published network from events to polarization.",
     ),
 )

@@ -7,18 +7,15 @@ from polarnet.methods.intensities import with_gain
 from polarnet.methods.intensity_network import intensity_network, load_baseline
 from polarnet.methods.method import Method, Recoverer, Setup, Weights, WeightsConfig
 from polarnet.networks.checkpoint import load_checkpoint
-from polarnet.networks.e2vid import E2vid
-from polarnet.networks.firenet import FireNet
-
-NETWORKS = {"firenet": FireNet, "e2vid": E2vid}
+from polarnet.networks.e2v import ARCHITECTURES
 
 
 def load(path: Path) -> Any:
-    """Load the network named in the checkpoint; ValueError if it is not in `NETWORKS`."""
+    """Load the network named in the checkpoint; ValueError if it is not in `ARCHITECTURES`."""
     name = load_checkpoint(path)[1]["network"]
-    if name not in NETWORKS:
-        raise ValueError(f"{path} holds a {name}, expected a {' or '.join(NETWORKS)}")
-    return load_baseline(NETWORKS[name], name, path)
+    if name not in ARCHITECTURES:
+        raise ValueError(f"{path} holds a {name}, expected a {' or '.join(ARCHITECTURES)}")
+    return load_baseline(ARCHITECTURES[name], name, path)
 
 
 def open_e2v(setup: Setup) -> Recoverer:
@@ -32,7 +29,7 @@ E2V = Method(
     colour="#3d8fd9",
     open=open_e2v,
     config=WeightsConfig,
-    weights=Weights(tuple(NETWORKS), trained_by="train_e2v"),
+    weights=Weights(tuple(ARCHITECTURES), trained_by="e2v"),
     reconstructs=True,
     about="Events to video.",
 )

@@ -26,7 +26,7 @@ E2VID = Method(
     colour="#2f6fb0",
     open=open_e2vid,
     config=WeightsConfig,
-    weights=Weights(("e2vid",), trained_by="train_e2v", remedy="train one with baselines.e2v.arch=e2vid"),
+    weights=Weights(("e2vid",), trained_by="e2v", remedy="train one with baselines.e2v.arch=e2vid"),
     reconstructs=True,
     about="E2VID (Rebecq et al. 2019), a recurrent network from events to intensity, one polarizer at a time, then "
     "DoLP by the Stokes formula.",

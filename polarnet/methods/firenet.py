@@ -31,7 +31,7 @@ FIRENET = Method(
     colour="#3d8fd9",
     open=open_firenet,
     config=WeightsConfig,
-    weights=Weights(("firenet",), trained_by="train_e2v", remedy="train one with baselines.e2v.arch=firenet"),
+    weights=Weights(("firenet",), trained_by="e2v", remedy="train one with baselines.e2v.arch=firenet"),
     reconstructs=True,
     about="FireNet (Scheerlinck et al. 2020), a recurrent network from events to intensity, one polarizer at a time, "
     "then DoLP by the Stokes formula.",

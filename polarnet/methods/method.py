@@ -86,7 +86,7 @@ class Weights:
     networks: tuple[str, ...]
     """Names of the networks that a checkpoint of polarnet may hold, as in its JSON."""
     trained_by: str | None = None
-    """Training stage that provides best.safetensors if `methods.NAME.weights` is null; None: no stage."""
+    """Training whose best.safetensors is used if `methods.NAME.weights` is null; None: no training."""
     remedy: str = ""
     """Advice on obtaining weights other than from a file."""
 

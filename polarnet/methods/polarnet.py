@@ -10,7 +10,7 @@ METHODS = (
         colour="#d6336c",
         open=open_dolp_network,
         config=WeightsConfig,
-        weights=Weights(DOLP_NETWORKS, trained_by="train"),
+        weights=Weights(DOLP_NETWORKS, trained_by="ours"),
         about="The DoLP network in use.",
     ),
 )

@@ -20,8 +20,8 @@ from polarnet.simulation.motion import Pose, Trajectory, sensor_to_scene
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
-from polarnet.training.baselines import NOT_TRAINED
 
+OURS = "ours"  # folder of the DoLP network's training
 THUMBNAIL_WIDTH = 208  # pixels, twice the displayed size
 MOST_THUMBNAILS = 24  # per split
 
@@ -35,24 +35,23 @@ class ReportPaths:
     frames: Path
     events: Path
     train: Path
-    train_e2v: Path
-    train_e2p: Path
+    """Holds a folder for each trained network."""
     benchmark: Path
 
-    def check(self) -> None:
-        """FileNotFoundError that names each missing artefact and the stage that makes it."""
+    def check(self, baselines: Sequence[str]) -> None:
+        """FileNotFoundError that names each missing artefact and the stage that makes it; `baselines` were trained."""
         needed = {
             self.images / "manifest.json": "ingest",
             self.scenes: "synthesize",
             self.frames: "synthesize",
             self.events: "emulate",
-            self.train / "history.json": "train",
+            self.train / OURS / "history.json": "train",
+            **{self.train / name / "history.json": f"train_baseline@{name}" for name in baselines},
             self.benchmark / "metrics.json": "benchmark",
+            self.benchmark / "cost.json": "benchmark",
             self.benchmark / "details.json": "benchmark",
         }
         missing = [f"{path} (stage {stage})" for path, stage in needed.items() if not path.exists()]
-        baselines = {"train_e2v": self.train_e2v, "train_e2p": self.train_e2p}
-        missing += [f"{folder} (stage {stage})" for stage, folder in baselines.items() if not folder.exists()]
         if missing:
             raise FileNotFoundError(f"the report needs {', '.join(missing)}; run `dvc repro` to make what is missing")
 
@@ -106,6 +105,7 @@ class SetResults(NamedTuple):
 
     name: str
     metrics: Mapping[str, Mapping[str, Any]]
+    """Scores and costs by row."""
     details: Mapping[str, Any]
     panels: Sequence[Panel]
 
@@ -116,15 +116,15 @@ class Artefacts:
 
     manifest: Manifest
     metrics: Mapping[str, Mapping[str, Any]]
+    """Scores and costs by row."""
     details: Mapping[str, Any]
     """Content of data/benchmark/details.json: the test data scored, and each scene's mean."""
     panels: Sequence[Panel]
     sets: Sequence[SetResults]
     """Test sets besides the simulated one."""
     ours: History
-    e2v: History | None
-    """`e2v` and `e2p` are None if no row of the benchmark uses the network, so that it was not trained."""
-    e2p: History | None
+    baselines: Mapping[str, History]
+    """Trained baselines by name."""
     rates: Sequence[EventRate]
     overview: Overview | None
     """None if the benchmark stored no panel of the network."""
@@ -132,9 +132,9 @@ class Artefacts:
     """The first `MOST_THUMBNAILS` of each split, photographs first."""
 
 
-def read_artefacts(paths: ReportPaths) -> Artefacts:
-    """Read everything under `paths`; FileNotFoundError names the stage to run."""
-    paths.check()
+def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
+    """Read everything under `paths`, with the trainings of `baselines`; FileNotFoundError names the stage to run."""
+    paths.check(baselines)
     scenes, frames, events = (
         SceneStore.open(paths.scenes),
         FrameStore.open(paths.frames),
@@ -150,13 +150,12 @@ def read_artefacts(paths: ReportPaths) -> Artefacts:
     panels.sort(key=lambda panel: panel.generated)
     return Artefacts(
         manifest=manifest,
-        metrics=_json(paths.benchmark / "metrics.json"),
+        metrics=_scores_and_costs(paths.benchmark),
         details=_json(paths.benchmark / "details.json"),
         panels=panels,
         sets=[read_set(folder) for folder in sorted(paths.benchmark.glob("sets/*")) if folder.is_dir()],
-        ours=read_history(paths.train / "history.json"),
-        e2v=_history_of(paths.train_e2v),
-        e2p=_history_of(paths.train_e2p),
+        ours=read_history(paths.train / OURS / "history.json"),
+        baselines={name: read_history(paths.train / name / "history.json") for name in baselines},
         rates=event_rates(events, frames),
         overview=next((overview_of(panel, scenes, frames, events) for panel in _telling(panels)), None),
         thumbnails={
@@ -167,12 +166,12 @@ def read_artefacts(paths: ReportPaths) -> Artefacts:
 
 def read_set(folder: Path) -> SetResults:
     """Read a folder written by `write_benchmark`; the set's name comes from details.json, or from the folder."""
-    for name in ("metrics.json", "details.json"):
+    for name in ("metrics.json", "cost.json", "details.json"):
         if not (folder / name).exists():
             raise FileNotFoundError(f"{folder / name} is missing; run the benchmark of this test set again")
     details = _json(folder / "details.json")
     panels = [_panel(file, generated=False) for file in sorted((folder / "panels").glob("*.npz"))]
-    return SetResults(details.get("set", folder.name), _json(folder / "metrics.json"), details, panels)
+    return SetResults(details.get("set", folder.name), _scores_and_costs(folder), details, panels)
 
 
 def read_history(path: Path) -> History:
@@ -190,9 +189,10 @@ def read_history(path: Path) -> History:
     return History(network, list(curves("train").values()), curves("val"), best["epoch"])
 
 
-def _history_of(folder: Path) -> History | None:
-    """Curves of a baseline's training; None if its stage recorded a reason for not training."""
-    return None if (folder / NOT_TRAINED).exists() else read_history(folder / "history.json")
+def _scores_and_costs(folder: Path) -> dict[str, dict[str, Any]]:
+    """Content of metrics.json and cost.json, by row."""
+    costs = _json(folder / "cost.json")
+    return {row: {**scores, **costs[row]} for row, scores in _json(folder / "metrics.json").items()}
 
 
 def event_rates(events: EventStore, frames: FrameStore) -> list[EventRate]:

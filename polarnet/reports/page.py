@@ -1,14 +1,15 @@
 """data/report/index.html: one self-contained page with all results of a run."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from polarnet.methods import METHODS
 from polarnet.pictures.manifest import SPLITS
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, SetResults, read_artefacts
 from polarnet.reports.figures import PanelScene, comparison_panel, dolp_bar, training_curves
-from polarnet.reports.legend import Legend, glossary, legend_of, lpips_about, network_label
+from polarnet.reports.legend import NAMED_BY_NETWORK, Legend, glossary, legend_of, lpips_about, network_label
 from polarnet.reports.maps import (
     encode_jpeg,
     encode_png,
@@ -21,6 +22,7 @@ from polarnet.reports.tables import (
     COLUMNS,
     COSTS,
     ERROR_PARTS,
+    LABELS,
     PAPER_COMPARABILITY,
     PAPER_SOURCE,
     SET_TITLES,
@@ -73,12 +75,12 @@ class Card(NamedTuple):
     rivals: str
 
 
-def write_report(paths: ReportPaths, run: Run, folder: Path) -> Path:
-    """Write index.html and, beside it, overview.png and comparison.png.
+def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder: Path) -> Path:
+    """Write index.html and, beside it, overview.png and comparison.png; `baselines` are those trained for the run.
 
     The page needs no other file and no network. FileNotFoundError names missing artefacts and the stage to run.
     """
-    artefacts = read_artefacts(paths)
+    artefacts = read_artefacts(paths, baselines)
     legend = legend_of(artefacts.details["weights"])
     folder.mkdir(parents=True, exist_ok=True)
     overview = None
@@ -129,10 +131,8 @@ def _context(artefacts: Artefacts, run: Run, overview: bytes | None, legend: Leg
             f"{row}{network_label(history.network)}, events to {of}": _training(history, of)
             for row, history, of in (
                 ("ours: ", artefacts.ours, "DoLP"),
-                ("E2V: ", artefacts.e2v, "intensity"),
-                ("", artefacts.e2p, "polarization"),
+                *(_baseline(name, history) for name, history in artefacts.baselines.items()),
             )
-            if history is not None
         },
         "ours": labels["ours"],
         "rows": glossary(metrics, details["weights"]),
@@ -175,6 +175,12 @@ def _thumbnails(artefacts: Artefacts, split: str) -> TileRow:
     thumbnails = artefacts.thumbnails[split]
     tiles = [Tile(data_uri(encode_jpeg(picture), "jpeg"), name) for name, picture in thumbnails]
     return TileRow(split, tiles, artefacts.manifest.counts[split] - len(tiles))
+
+
+def _baseline(name: str, history: History) -> tuple[str, History, str]:
+    """Row (if its label does not name the network), training and output of a trained baseline."""
+    row = f"{LABELS[name]}: " if name in NAMED_BY_NETWORK else ""
+    return row, history, "intensity" if METHODS[name].reconstructs else "polarization"
 
 
 def _training(history: History, of: str) -> dict[str, Any]:

@@ -5,6 +5,7 @@ A set is a folder with images, scenes.zarr, frames.zarr and events.zarr, made by
 
 import dataclasses
 import functools
+import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterable
@@ -16,7 +17,6 @@ from polarnet.pictures.images import picture_extensions
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.pictures.polarimetry import group_by_measurement
-from polarnet.runtime.fingerprint import code_digest, digest, value_digest
 from polarnet.runtime.ranges import allowed, check_ranges
 from polarnet.simulation.dataset import emulate_scenes
 from polarnet.simulation.emulator import EmulatorConfig
@@ -65,7 +65,7 @@ def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Re
     names = ("rotation_max_deg", "zoom_max", "speed_min_px_s", "speed_max_px_s", "acceleration_max_px_s2")
     motion = dataclasses.replace(recipe.motion, **{name: getattr(sets, name) for name in names})
     fill = functools.partial(_held_out, images)
-    return _make(folder, dataclasses.replace(recipe, motion=motion), mapper, fill, value_digest(images))
+    return _make(folder, dataclasses.replace(recipe, motion=motion), mapper, fill, _content(images))
 
 
 def make_folder_set(root: Path, kind: str, folder: Path, recipe: Recipe, mapper: MakeMapper) -> bool:
@@ -81,7 +81,7 @@ def make_folder_set(root: Path, kind: str, folder: Path, recipe: Recipe, mapper:
         recipe.ingest, source=source, root=str(root), limit=None, val_fraction=0.0, test_fraction=1.0
     )
     recipe = dataclasses.replace(recipe, ingest=chosen)
-    return _make(folder, recipe, mapper, lambda recipe, images, m: _ingested(recipe, images, m), value_digest(root))
+    return _make(folder, recipe, mapper, lambda recipe, images, m: _ingested(recipe, images, m), _content(root))
 
 
 def kind_of(root: Path) -> str:
@@ -103,10 +103,13 @@ def _make(
     fill: Callable[[Recipe, Path, MakeMapper], None],
     source: str,
 ) -> bool:
-    """Fill `folder`, going on where a run of the same recipe stopped; a folder of another recipe is emptied first."""
+    """Fill `folder`, resuming a stopped run with the same settings, seed and source pictures.
+
+    A folder made with others is emptied first. The code is not compared: DVC does that for the pipeline's sets.
+    """
     sections = {name: asdict(getattr(recipe, name)) for name in ("ingest", "motion", "emulate")}
-    settings = json.dumps(sections | {"seed": recipe.seed}, sort_keys=True)
-    key = digest(settings, source, code_digest(synthesize, emulate_scenes, ingest))
+    settings = json.dumps(sections | {"seed": recipe.seed, "source": source}, sort_keys=True)
+    key = hashlib.sha256(settings.encode()).hexdigest()
     note = folder / MADE
     if note.exists():
         known = json.loads(note.read_text())
@@ -125,6 +128,16 @@ def _make(
         emulate_scenes(scenes, events, recipe.emulate, recipe.seed, mapper("emulate"), recipe.threads)
     note.write_text(json.dumps({"key": key, "complete": True}))
     return True
+
+
+def _content(folder: Path) -> str:
+    """Hash of the names and bytes of all files in a folder."""
+    files = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        with path.open("rb") as file:
+            content = hashlib.file_digest(file, "sha256").hexdigest()
+        files.update(f"{path.relative_to(folder)} {content}\n".encode())
+    return files.hexdigest()
 
 
 def _ingested(recipe: Recipe, images: Path, mapper: MakeMapper) -> None:

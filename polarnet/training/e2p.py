@@ -15,7 +15,7 @@ from polarnet.runtime.ranges import allowed
 from polarnet.training.loop import LoopConfig
 from polarnet.training.losses import FrameLoss
 from polarnet.training.sequences import Batch
-from polarnet.training.task import Task, initialised
+from polarnet.training.task import Baseline, Task, initialised
 
 
 @dataclass(frozen=True)
@@ -87,3 +87,6 @@ def e2p_task(config: E2pConfig, lpips: Lpips | None, seed: int) -> Task:
         },
         scored=lambda maps: maps[:, :, BRANCHES.index("dolp")],
     )
+
+
+BASELINE = Baseline("e2p", E2pConfig, e2p_task, lpips=("lpips", "intensity_lpips"))

@@ -7,15 +7,12 @@ from torch import Tensor
 from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.stream import Events
 from polarnet.metrics.similarity import Lpips
-from polarnet.networks.e2vid import E2vid
-from polarnet.networks.firenet import FireNet
+from polarnet.networks.e2v import ARCHITECTURES
 from polarnet.runtime.ranges import allowed
 from polarnet.training.loop import LoopConfig
 from polarnet.training.losses import FrameLoss
 from polarnet.training.sequences import Batch
-from polarnet.training.task import Task, initialised
-
-ARCHITECTURES: dict[str, type[FireNet] | type[E2vid]] = {"firenet": FireNet, "e2vid": E2vid}
+from polarnet.training.task import Baseline, Task, initialised
 
 
 @dataclass(frozen=True)
@@ -59,3 +56,6 @@ def e2v_task(config: E2vConfig, lpips: Lpips | None, seed: int) -> Task:
             "representation": "voxel_grid, nonzero entries normalised",
         },
     )
+
+
+BASELINE = Baseline("e2v", E2vConfig, e2v_task, lpips=("lpips",))

@@ -59,6 +59,20 @@ class Task:
     network with this module has a method `expect(weight, bias)`."""
 
 
+@dataclass(frozen=True)
+class Baseline:
+    """Record of a baseline that the pipeline trains; its module in polarnet.training holds it as `BASELINE`."""
+
+    name: str
+    """Section of `baselines` in params.yaml, and folder below data/train."""
+    config: type
+    """Class of that section."""
+    task: Callable[[Any, Lpips | None, int], Task]
+    """Section, LPIPS and seed -> the task of a new network."""
+    lpips: tuple[str, ...]
+    """Keys of the section that are weights of LPIPS in the loss."""
+
+
 class Split(NamedTuple):
     """Training and validation sequences."""
 
