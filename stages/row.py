@@ -1,4 +1,4 @@
-"""Test sequences -> data/benchmark/rows/ROW: one row of the tables on every test set (`python -m stages.row row=ROW`)."""
+"""Test sequences -> data/benchmark/rows/ROW: one row of the tables on every test set (`row=ROW`)."""
 
 from polarnet.config.pipeline import run_rows
 from polarnet.config.tree import Config, hydra_stage

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.benchmark.conditions import configured, sentence, warnings
-from polarnet.benchmark.rows import available, metadata_used, weights_used
 from polarnet.benchmark.results import write_benchmark
+from polarnet.benchmark.rows import available, metadata_used, weights_used
 from polarnet.benchmark.run import run_benchmark, train_mean_dolp
 from polarnet.config.pipeline import context_of, made_set, mapper_of
 from polarnet.config.tree import Config, with_lpips

@@ -98,7 +98,7 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
         print(f"{row} is left out: {reason}")
         write_row(row_folder(config, row), row, RowRecord(reason, {}), {})
     if not methods:
-        return
+        return None
     lpips = or_exit(lambda: lpips_of(config))
     settings = dataclasses.replace(config.benchmark, methods=methods)
     results = {

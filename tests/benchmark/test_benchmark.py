@@ -1,4 +1,3 @@
-import dataclasses
 import functools
 import json
 import math
@@ -8,10 +7,10 @@ import pytest
 import torch
 
 from polarnet.benchmark.references import REFERENCES, Reference
-from polarnet.benchmark.rows import ROWS, predictions_of
-from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp, write_benchmark
+from polarnet.benchmark.results import write_benchmark
+from polarnet.benchmark.rows import ROWS
+from polarnet.benchmark.run import BenchmarkSet, at_stored_precision, run_benchmark, train_mean_dolp
 from polarnet.benchmark.score import BenchmarkConfig
-from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.cluster import pmap
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import FrameStore
@@ -45,14 +44,15 @@ def test_the_training_mean_counts_training_frames_after_the_warm_up(five_scenes,
 
 
 def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
-    benchmark = run_benchmark(five_scenes, context, config(), None, tmp_path / "cache")
+    benchmark = run_benchmark(five_scenes, context, config(), None)
     folder = tmp_path / "benchmark"
     returned = write_benchmark(folder, benchmark, config(), 1, {"lpips": {"backbone": None}, "train_mean": 0.25})
-    metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics == returned
-    assert list(metrics) == list(ROWS)
-    for scores in metrics.values():
-        assert scores["ms_per_window"] > 0
+    metrics, costs = (json.loads((folder / f"{name}.json").read_text()) for name in ("metrics", "cost"))
+    assert returned == {row: metrics[row] | costs[row] for row in metrics}
+    assert list(metrics) == list(costs) == list(ROWS)
+    for row, scores in metrics.items():
+        assert costs[row]["ms_per_window"] > 0
+        assert not set(costs[row]) & set(scores)
         assert scores["lpips"] is None
         assert "lpips_backbone" not in scores
         assert scores["mse_ci"][0] <= scores["mse"] <= scores["mse_ci"][1]
@@ -60,9 +60,9 @@ def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
     assert metrics["oracle_mean"]["skill"] == pytest.approx(0, abs=1e-3)  # frames are scored in steps of 1/65535
     assert metrics["zeros"]["aolp_deg"] is None
     assert 0 < metrics["cf"]["aolp_deg"] < 90
-    assert metrics["ours"]["gflop"] > 0
-    assert metrics["ours"]["params"] > 1000
-    assert metrics["cf"]["gflop"] is None
+    assert costs["ours"]["gflop"] > 0
+    assert costs["ours"]["params"] > 1000
+    assert costs["cf"]["gflop"] is None
     assert metrics["zeros"]["corr"] == metrics["oracle_mean"]["corr"] == 0
     assert metrics["oracle_mean"]["mse"] < min(metrics["zeros"]["mse"], metrics["train_mean"]["mse"])
     assert len((folder / "frames.csv").read_text().splitlines()) == 1 + len(ROWS) * 4 * 3
@@ -87,11 +87,10 @@ def test_expected_errors_are_held_against_measured_ones_in_the_scored_windows(
         return Prediction(sequence.dolp + off, None, log_variance)
 
     monkeypatch.setitem(REFERENCES, "train_mean", Reference("train_mean", sure))
-    for _ in range(2):  # made, and from the cache
-        found = run_benchmark(five_scenes, context, config(methods=["zeros", "train_mean"]), None, tmp_path / "cache")
-        assert set(found.reliability) == {"train_mean"}
-        assert found.reliability["train_mean"].pixels.sum() == 4 * 3 * 18 * 20
-        assert found.reliability["train_mean"].log_error() < 0.01
+    found = run_benchmark(five_scenes, context, config(methods=["zeros", "train_mean"]), None)
+    assert set(found.reliability) == {"train_mean"}
+    assert found.reliability["train_mean"].pixels.sum() == 4 * 3 * 18 * 20
+    assert found.reliability["train_mean"].log_error() < 0.01
     write_benchmark(tmp_path / "out", found, config(methods=["zeros", "train_mean"]), 1, {})
     written = json.loads((tmp_path / "out" / "details.json").read_text())["reliability"]["train_mean"]
     ((predicted, measured, pixels),) = written["curve"]
@@ -100,7 +99,7 @@ def test_expected_errors_are_held_against_measured_ones_in_the_scored_windows(
 
 def test_panels_show_one_window_of_different_scenes_and_every_method(five_scenes, context, tmp_path):
     wanted = config(methods=["zeros", "cf"])
-    benchmark = run_benchmark(five_scenes, context, wanted, None, tmp_path / "cache")
+    benchmark = run_benchmark(five_scenes, context, wanted, None)
     assert [(p.sequence, p.scene, p.window, p.t_us) for p in benchmark.panels] == [
         ("a1", "lake", 2, 3000),
         ("c1", "town", 2, 3000),
@@ -121,9 +120,9 @@ def test_panels_show_one_window_of_different_scenes_and_every_method(five_scenes
 def test_all_but_the_time_is_the_same_in_two_runs(five_scenes, context, tmp_path):
     some = config(methods=["cf", "e2v", "ours"])
     for name in ("one", "two"):
-        found = run_benchmark(five_scenes, context, some, None, tmp_path / f"cache_{name}")
+        found = run_benchmark(five_scenes, context, some, None)
         write_benchmark(tmp_path / name, found, some, 1, {})
-    for file in ("frames.csv", "details.json", "panels/a1.npz"):
+    for file in ("metrics.json", "frames.csv", "details.json", "panels/a1.npz"):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
 
 
@@ -133,59 +132,28 @@ def test_no_test_sequence_is_an_error(five_scenes, context, tmp_path):
     frames.finish()
     without = BenchmarkSet("simulated", five_scenes.events, FrameStore.open(tmp_path / "f.zarr"))
     with pytest.raises(ValueError, match=r"has no test sequence; raise ingest.test_fraction"):
-        run_benchmark(without, context, config(), None, tmp_path / "cache")
+        run_benchmark(without, context, config(), None)
 
 
-@pytest.fixture
-def ran(monkeypatch):
-    """The methods that ran on whole sequences, with the sequence, in order."""
-    ran = []
-
-    def noting(rows, sequence, context):
-        ran.extend((row, sequence.name) for row in rows)
-        return predictions_of(rows, sequence, context)
-
-    monkeypatch.setattr("polarnet.benchmark.run.predictions_of", noting)
-    return ran
+def test_a_prediction_is_scored_in_the_steps_of_the_stored_truth(sequence):
+    given = Prediction(sequence.dolp, sequence.aolp, 3 * sequence.dolp - 4)
+    stored = at_stored_precision("m", "a", given)
+    torch.testing.assert_close(stored.dolp, given.dolp, atol=0.51 / 65535, rtol=0)
+    torch.testing.assert_close(stored.log_variance, given.log_variance, atol=0.002, rtol=0)
+    again = at_stored_precision("m", "a", stored)
+    assert all(torch.equal(one, two) for one, two in zip(stored[:3], again[:3], strict=True))
+    assert at_stored_precision("m", "a", Prediction(sequence.dolp)).aolp is None
 
 
-def test_a_second_run_recovers_nothing_and_a_new_method_recovers_itself_alone(five_scenes, context, tmp_path, ran):
-    first = run_benchmark(five_scenes, context, config(methods=["zeros", "cf"]), None, tmp_path / "cache")
-    assert len(ran) == 2 * 4
-    ran.clear()
-    again = run_benchmark(five_scenes, context, config(methods=["zeros", "cf"]), None, tmp_path / "cache")
-    assert ran == []
-    assert again.rows == first.rows
-    assert again.costs == first.costs
-    more = run_benchmark(five_scenes, context, config(methods=["zeros", "cf", "highpass"]), None, tmp_path / "cache")
-    assert {method for method, _ in ran} == {"highpass"}
-    assert [row for row in more.rows if row.method != "highpass"] == list(first.rows)
-
-
-def test_a_changed_parameter_recovers_the_methods_that_use_it(five_scenes, context, make_context, tmp_path, ran):
-    chosen = config(methods=["zeros", "cf", "highpass"])
-    run_benchmark(five_scenes, context, chosen, None, tmp_path / "cache")
-    ran.clear()
-    slower = dataclasses.replace(context.setups["cf"].config, cutoff_hz=1.0)
-    other = make_context(cf={"config": slower})
-    run_benchmark(five_scenes, other, chosen, None, tmp_path / "cache")
-    assert {method for method, _ in ran} == {"cf"}
-
-
-def test_another_warm_up_or_lpips_scores_anew_without_recovering(five_scenes, context, tmp_path, ran):
-    run_benchmark(five_scenes, context, config(methods=["cf"]), None, tmp_path / "cache")
-    ran.clear()
-    torch.manual_seed(0)
-    changed = config(methods=["cf"], warmup_windows=2)
-    found = run_benchmark(five_scenes, context, changed, Lpips("squeeze"), tmp_path / "cache")
-    assert ran == []
-    assert len(found.rows) == 4 * 2
-    assert all(row.lpips is not None for row in found.rows)
+def test_a_predicted_value_that_is_not_a_number_is_named(sequence):
+    sequence.dolp[2, 3, 3] = math.nan
+    with pytest.raises(ValueError, match="m on a, window 2: it predicted values that are not numbers"):
+        at_stored_precision("m", "a", Prediction(sequence.dolp))
 
 
 def test_two_processes_give_the_rows_of_one(five_scenes, context, tmp_path):
     chosen = config(methods=["zeros", "cf"])
     mapper = functools.partial(pmap, workers=2, label="test")
-    one = run_benchmark(five_scenes, context, chosen, None, tmp_path / "one")
-    two = run_benchmark(five_scenes, context, chosen, None, tmp_path / "two", mapper)
+    one = run_benchmark(five_scenes, context, chosen, None)
+    two = run_benchmark(five_scenes, context, chosen, None, mapper)
     assert one.rows == two.rows

@@ -8,8 +8,9 @@ import torch
 
 from polarnet import methods
 from polarnet.benchmark.event_budget import since_start, sliding_recovery
+from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.rows import ROWS
-from polarnet.benchmark.run import run_benchmark, write_benchmark
+from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.score import BenchmarkConfig
 from polarnet.events.streaming import WindowRule
 from polarnet.methods import METHODS
@@ -42,7 +43,7 @@ def with_activity(activity, context, make_setup):
 
 def test_it_is_a_row_of_the_benchmark_with_its_name_in_tables(activity, with_activity, five_scenes, tmp_path):
     config = BenchmarkConfig(["zeros", "activity", "ours"], ["simulated"], 1, "fp32", False, "alex", 20, 1)
-    benchmark = run_benchmark(five_scenes, with_activity, config, None, tmp_path / "cache")
+    benchmark = run_benchmark(five_scenes, with_activity, config, None)
     metrics = write_benchmark(tmp_path / "out", benchmark, config, 1, {})
     assert set(metrics) == {"zeros", "activity", "ours"}
     assert metrics["activity"]["gflop"] is None

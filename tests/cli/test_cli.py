@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from polarnet.cli import main
-from polarnet.config.experiments import stage_names
 from polarnet.events.stream import Events
 from polarnet.storage.events import EventStore
 
@@ -41,8 +40,10 @@ def test_the_stages_come_in_the_order_they_run_in(capsys, project_root, monkeypa
     monkeypatch.chdir(project_root / "tests")
     assert main(["stages"]) == 0
     assert capsys.readouterr().out.split() == [
-        "ingest", "synthesize", "emulate", "weights", "baselines", "train", "train_e2v", "train_e2p",
-        "import_recordings", "calibrate", "sets", "benchmark", "report",
+        "ingest", "synthesize", "emulate", "weights", "train", "train_baseline@e2v", "import_recordings", "calibrate",
+        "sets", "benchmark@zeros", "benchmark@train_mean", "benchmark@oracle_mean", "benchmark@cf",
+        "benchmark@highpass", "benchmark@cf+gain", "benchmark@highpass+gain", "benchmark@e2v", "benchmark@ours",
+        "report",
     ]  # fmt: skip
 
 
@@ -167,5 +168,10 @@ def test_a_run_with_another_sensor_has_a_folder_of_its_own(project_root, monkeyp
     monkeypatch.chdir(project_root)
     assert main(["run", "experiment=smoke", "sensor=noisy"]) == 0
     assert calls[0][2:] == ["stages.ingest", "experiment=smoke", "sensor=noisy", "paths.data=outputs/run/smoke-noisy"]
-    assert len(calls) == len(stage_names(project_root))
+    assert [call[2] for call in calls] == [
+        f"stages.{name}"
+        for name in ("ingest", "synthesize", "emulate", "weights", "train", "train", "import_recordings", "calibrate",
+                     "sets", "benchmark", "report")
+    ]  # fmt: skip
+    assert [call[-1] for call in calls if call[2] == "stages.train"] == [calls[0][-1], "baseline=e2v"]
     assert "outputs/run/smoke-noisy/report/index.html" in capsys.readouterr().out

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.benchmark.cost import Cost
-from polarnet.benchmark.run import Benchmark, BenchmarkSet, Panel, write_benchmark
-from polarnet.benchmark.score import BenchmarkConfig, score_sequence
+from polarnet.benchmark.results import write_benchmark
+from polarnet.benchmark.run import Benchmark, BenchmarkSet, Panel
+from polarnet.benchmark.score import BenchmarkConfig, Cost, score_sequence
 from polarnet.events.stream import Events
 from polarnet.pictures.images import write_png
 from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, write_manifest
@@ -19,7 +19,6 @@ from polarnet.simulation.truth import synthesize
 from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
-from polarnet.training.baselines import leave_untrained
 
 SPLITS = {"park": "train", "lake": "val", "tree": "test", "leaf": "test"}
 HISTORY = [
@@ -116,7 +115,7 @@ def paths(tmp_path_factory):
     data = tmp_path_factory.mktemp("data")
     paths = ReportPaths(
         data / "images", data / "scenes.zarr", data / "frames.zarr", data / "events.zarr", data / "train",
-        data / "train_e2v", data / "train_e2p", data / "benchmark",
+        data / "benchmark",
     )  # fmt: skip
     write_images(paths.images)
     motion = MotionConfig(
@@ -127,9 +126,8 @@ def paths(tmp_path_factory):
     frames = FrameStore.open(paths.frames)
     write_events(paths.events, frames)
     run_methods(EventStore.open(paths.events), frames, paths.benchmark)
-    for folder, network in ((paths.train, "paper"), (paths.train_e2v, "firenet")):
-        folder.mkdir()
+    for folder, network in ((paths.train / "ours", "paper"), (paths.train / "e2v", "firenet")):
+        folder.mkdir(parents=True)
         (folder / "history.json").write_text(json.dumps(HISTORY))
         (folder / "best.json").write_text(json.dumps({"network": network}))
-    leave_untrained("e2p", paths.train_e2p)
     return paths

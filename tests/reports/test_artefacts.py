@@ -12,13 +12,13 @@ from polarnet.storage.frames import FrameStore
 
 @pytest.fixture(scope="module")
 def artefacts(paths):
-    return read_artefacts(paths)
+    return read_artefacts(paths, ["e2v"])
 
 
 def test_everything_missing_is_named_with_the_stage_that_makes_it(paths, tmp_path):
     elsewhere = dataclasses.replace(paths, events=tmp_path / "events.zarr", train=tmp_path / "train")
     with pytest.raises(FileNotFoundError, match=r"events\.zarr \(stage emulate\).*history\.json \(stage train\)"):
-        read_artefacts(elsewhere)
+        read_artefacts(elsewhere, [])
 
 
 def test_a_panel_holds_the_truth_of_the_window_it_names(artefacts, paths):
@@ -76,7 +76,7 @@ def test_event_rates_count_every_event_of_a_split_once(paths):
 
 
 def test_the_best_epoch_is_the_one_with_the_lowest_validation_mse(paths):
-    history = read_history(paths.train / "history.json")
+    history = read_history(paths.train / "ours" / "history.json")
     assert history.best_epoch == 1
     assert [curve.label for curve in history.loss] == ["total", "mse"]
     assert history.validation["psnr"].values == [10.0, 11.0, 12.0]

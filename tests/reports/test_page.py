@@ -18,7 +18,7 @@ RUN = Run(
 @pytest.fixture(scope="module")
 def folder(paths, tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
-    assert write_report(paths, RUN, folder) == folder / "index.html"
+    assert write_report(paths, ["e2v"], RUN, folder) == folder / "index.html"
     return folder
 
 
@@ -109,20 +109,20 @@ def test_a_benchmark_without_panels_and_without_ours_still_gives_a_page(paths, t
     metrics = json.loads((benchmark / "metrics.json").read_text())
     del metrics["ours"]
     (benchmark / "metrics.json").write_text(json.dumps(metrics))
-    page = write_report(dataclasses.replace(paths, benchmark=benchmark), RUN, tmp_path / "report").read_text()
+    page = write_report(dataclasses.replace(paths, benchmark=benchmark), ["e2v"], RUN, tmp_path / "report").read_text()
     assert "kept no window of the network" in page
     assert 'class="card"' not in page
 
 
 def test_the_same_artefacts_give_the_same_page(paths, page, tmp_path):
-    assert write_report(paths, RUN, tmp_path).read_text() == page
+    assert write_report(paths, ["e2v"], RUN, tmp_path).read_text() == page
 
 
 def test_a_further_test_set_has_its_table_and_its_pictures(paths, tmp_path):
     benchmark = tmp_path / "benchmark"
     shutil.copytree(paths.benchmark, benchmark)
     shutil.copytree(paths.benchmark, benchmark / "sets" / "measured")
-    page = write_report(dataclasses.replace(paths, benchmark=benchmark), RUN, tmp_path / "report").read_text()
+    page = write_report(dataclasses.replace(paths, benchmark=benchmark), ["e2v"], RUN, tmp_path / "report").read_text()
     assert page.count("Measured polarization") >= 3  # heading, caption, pictures
     assert "Scenes whose polarization a camera measured" in page
     assert "ours is better in" in page

@@ -1,0 +1,81 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from polarnet.benchmark.results import write_benchmark
+from polarnet.benchmark.row_results import RowRecord, read_record, read_rows, write_row
+from polarnet.benchmark.run import run_benchmark
+from polarnet.benchmark.score import BenchmarkConfig
+
+ROWS = ["zeros", "cf", "ours"]
+
+
+@pytest.fixture
+def config():
+    return BenchmarkConfig(ROWS, ["simulated"], 1, "fp32", False, "alex", 50, 2)
+
+
+def written(folder, benchmark, rows=ROWS):
+    for row in rows:
+        write_row(folder / row, row, RowRecord(None, {}), {"simulated": benchmark})
+    return {row: folder / row for row in rows}
+
+
+def test_rows_that_ran_alone_give_the_table_of_one_run_to_the_last_digit(five_scenes, context, config, tmp_path):
+    together = run_benchmark(five_scenes, context, config, None)
+    folders = {}
+    for row in ROWS:
+        alone = run_benchmark(five_scenes, context, dataclasses.replace(config, methods=[row]), None)
+        folders |= written(tmp_path / "rows", alone, [row])
+    write_benchmark(tmp_path / "one", together, config, 1, {})
+    write_benchmark(tmp_path / "two", read_rows(folders, "simulated"), config, 1, {})
+    for file in ("metrics.json", "details.json", "frames.csv"):
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes(), file
+    for panel in ("a1", "c1"):
+        one, two = (np.load(tmp_path / run / "panels" / f"{panel}.npz") for run in ("one", "two"))
+        assert set(one.files) == set(two.files)
+        assert all(np.array_equal(one[name], two[name]) for name in one.files)
+
+
+def test_a_table_holds_the_rows_it_is_asked_for_whatever_else_lies_in_the_folder(
+    five_scenes, context, config, tmp_path
+):
+    folders = written(tmp_path, run_benchmark(five_scenes, context, config, None))
+    del folders["cf"]
+    left = read_rows(folders, "simulated")
+    assert {score.method for score in left.rows} == {"zeros", "ours"}
+    assert all(set(panel.dolp) == {"zeros", "ours"} for panel in left.panels)
+    assert set(left.costs) == {"zeros", "ours"}
+
+
+def test_a_row_that_was_left_out_says_why(tmp_path):
+    record = RowRecord("no weights are given: set methods.e2p.weights to their file", {})
+    write_row(tmp_path / "e2p", "e2p", record, {})
+    assert read_record(tmp_path / "e2p") == record
+
+
+def test_a_row_or_a_set_that_was_not_run_is_named(five_scenes, context, config, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"row cf was not run; run `dvc repro`"):
+        read_record(tmp_path / "cf")
+    folders = written(tmp_path, run_benchmark(five_scenes, context, config, None))
+    with pytest.raises(FileNotFoundError, match="row zeros has not run on set measured"):
+        read_rows(folders, "measured")
+
+
+def test_rows_of_different_sequences_make_no_table(five_scenes, context, config, tmp_path):
+    folders = written(tmp_path, run_benchmark(five_scenes, context, config, None))
+    file = folders["cf"] / "simulated" / "results.json"
+    results = json.loads(file.read_text())
+    results["frames"] = [score for score in results["frames"] if score[1] != "b1"]
+    file.write_text(json.dumps(results))
+    with pytest.raises(ValueError, match="row cf was scored on other sequences of set simulated than row zeros"):
+        read_rows(folders, "simulated")
+
+
+def test_a_row_written_anew_keeps_nothing_of_an_earlier_run(five_scenes, context, config, tmp_path):
+    benchmark = run_benchmark(five_scenes, context, config, None)
+    write_row(tmp_path / "cf", "cf", RowRecord(None, {}), {"simulated": benchmark, "measured": benchmark})
+    written(tmp_path, benchmark, ["cf"])
+    assert sorted(path.name for path in (tmp_path / "cf").iterdir()) == ["row.json", "simulated"]
