@@ -62,7 +62,7 @@ def _run(options: argparse.Namespace) -> int:
     name = "-".join([chosen.get("experiment", "demo"), *([chosen["sensor"]] if "sensor" in chosen else [])])
     folder = chosen.get("paths.data", f"outputs/run/{name}")
     overrides = [*options.overrides, *([] if "paths.data" in chosen else [f"paths.data={folder}"])]
-    for name, stage, own in _hydra_runs(root, load(root, options.overrides).used_baselines):
+    for name, stage, own in hydra_runs(root, load(root, options.overrides).used_baselines):
         print(f"== {name}", flush=True)
         status = subprocess.run([sys.executable, "-m", f"stages.{stage}", *overrides, *own], cwd=root).returncode
         if status:
@@ -72,7 +72,7 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _hydra_runs(root: Path, baselines: list[str]) -> list[tuple[str, str, list[str]]]:
+def hydra_runs(root: Path, baselines: list[str]) -> list[tuple[str, str, list[str]]]:
     """The pipeline without DVC, in order: name of a run, module in `stages`, and the overrides of this run alone.
 
     One pass runs all rows; `baselines` are those to train.

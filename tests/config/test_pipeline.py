@@ -50,5 +50,7 @@ def test_a_baseline_that_no_row_uses_is_not_trained(project_root):
 
 
 def test_a_row_whose_weights_no_stage_trains_is_refused(project_root):
-    with pytest.raises(ValueError, match="rows.e2v.needs: no stage makes data/train/e2v; add e2v to baselines.trained"):
+    with pytest.raises(
+        ValueError, match=r"rows.e2v.needs: no stage makes data/train/e2v; add e2v to baselines.trained"
+    ):
         load(project_root, ["baselines.trained=[]"])

@@ -8,7 +8,7 @@ from pathlib import Path
 import preloaded
 import pytest
 
-from polarnet.config.experiments import stage_names
+from polarnet.cli.project import hydra_runs
 from polarnet.metrics.lpips import PURPOSES
 
 TINY = [
@@ -41,7 +41,7 @@ GENERATED = ("images", "scenes.zarr", "frames.zarr", "events.zarr")
 
 
 def run_stage(root: Path, stage: str, data: Path, *overrides: str) -> str:
-    arguments = [*TINY, f"paths.data={data}", f"paths.resume={data / 'resume'}", f"paths.cache={data / 'cache'}",
+    arguments = [*TINY, f"paths.data={data}", f"paths.resume={data / 'resume'}",
                  f"hydra.run.dir={data / 'logs' / stage}", *overrides]  # fmt: skip
     done = preloaded.run_stage(root, stage, arguments)
     assert done.returncode == 0, done.stdout
@@ -57,8 +57,8 @@ def bytes_of(folder: Path) -> dict[str, str]:
 def data(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the whole pipeline leaves behind, one worker."""
     folder = tmp_path_factory.mktemp("pipeline") / "data"
-    for stage in stage_names(project_root):
-        run_stage(project_root, stage, folder)
+    for _, stage, overrides in hydra_runs(project_root, ["e2v", "e2p"]):
+        run_stage(project_root, stage, folder, *overrides)
     return folder
 
 
@@ -70,31 +70,39 @@ def test_the_benchmark_has_a_row_for_every_method_with_lpips_and_says_of_which_b
     assert set(details["weights"]) == {"e2v", "e2p", "ours"}
     weights = {purpose: json.loads((data / "weights" / f"{purpose}.json").read_text()) for purpose in PURPOSES}
     assert details["lpips"] == weights["benchmark"]
-    for network in ("train", "train_e2v", "train_e2p"):
-        trained = json.loads((data / network / "best.json").read_text())["lpips"]
+    for network in ("ours", "e2v", "e2p"):
+        trained = json.loads((data / "train" / network / "best.json").read_text())["lpips"]
         assert trained == {key: weights["loss"][key] for key in ("backbone", "sha256")}
+    costs = json.loads((data / "benchmark" / "cost.json").read_text())
+    assert list(costs) == list(metrics)
     for method, row in metrics.items():
-        assert {"mse", "psnr", "ssim", "lpips", "corr", "ms_per_window"} <= set(row), method
+        assert {"mse", "psnr", "ssim", "lpips", "corr"} <= set(row), method
+        assert costs[method]["ms_per_window"] > 0
         assert 0 <= row["mse"] <= 1
         assert row["lpips"] > 0, method
         assert row["lpips_backbone"] == "alex"
     assert metrics["oracle_mean"]["mse"] <= min(metrics["zeros"]["mse"], metrics["train_mean"]["mse"])
 
 
-def test_a_baseline_that_no_row_uses_is_not_trained_and_another_row_changes_nothing(project_root, data, tmp_path):
-    asked = bytes_of(data / "baselines")
-    rows = "benchmark.methods=[zeros,e2v,{}ours]".format
-    printed = run_stage(project_root, "train_e2p", tmp_path, rows(""))  # without any event: nothing is read
-    assert "no row of benchmark.methods uses weights of baselines.e2p" in printed
-    assert [path.name for path in (tmp_path / "train_e2p").iterdir()] == ["not_trained.json"]
-    run_stage(project_root, "baselines", tmp_path, rows(""))
-    without = bytes_of(tmp_path / "baselines")
-    run_stage(project_root, "baselines", tmp_path, rows("cf,e2v+gain,"))
-    assert bytes_of(tmp_path / "baselines") == without
-    run_stage(project_root, "baselines", tmp_path, rows("e2p,"))
-    assert bytes_of(tmp_path / "baselines") == asked
-    assert without["e2v.json"] == asked["e2v.json"]
-    assert without["e2p.json"] != asked["e2p.json"]
+def test_a_baseline_that_no_row_uses_is_not_trained(project_root, tmp_path):
+    arguments = [*TINY, "benchmark.methods=[zeros,e2v,ours]", "baseline=e2p", f"paths.data={tmp_path / 'data'}",
+                 f"hydra.run.dir={tmp_path / 'log'}"]  # fmt: skip
+    done = preloaded.run_stage(project_root, "train", arguments)
+    assert done.returncode != 0
+    assert "no row of benchmark.methods uses the weights of baselines.e2p" in done.stdout
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_row_run_alone_gives_the_scores_of_one_pass_over_all_rows(project_root, data, tmp_path):
+    shutil.copytree(data / "benchmark", tmp_path / "benchmark")
+    for row in ("cf+gain", "ours", "e2vid"):
+        run_stage(project_root, "row", data, f"row={row}", f"paths.benchmark={tmp_path / 'benchmark'}")
+        one, all_rows = (folder / "benchmark" / "rows" / row for folder in (tmp_path, data))
+        assert (one / "row.json").read_text() == (all_rows / "row.json").read_text()
+        if row != "e2vid":  # no network of that architecture was trained
+            alone, together = (json.loads((f / "simulated" / "results.json").read_text()) for f in (one, all_rows))
+            assert alone["frames"] == together["frames"]
+            assert alone["reliability"] == together["reliability"]
 
 
 def test_pictures_are_split_by_source(data):
@@ -119,7 +127,7 @@ def test_the_same_values_give_the_same_bytes_whatever_the_number_of_workers(proj
 
 
 def test_a_point_of_a_sweep_leaves_what_the_pipeline_made_and_kept_alone(project_root, data, tmp_path):
-    parts = ("train", "benchmark", "cache")
+    parts = ("train", "benchmark")
     before = {name: bytes_of(data / name) for name in parts}
     run_stage(project_root, "trial", data, "loss.ssim=0.5", f"hydra.sweep.dir={tmp_path}", "--multirun")
     assert {name: bytes_of(data / name) for name in parts} == before
@@ -129,23 +137,20 @@ def test_a_point_of_a_sweep_leaves_what_the_pipeline_made_and_kept_alone(project
     whole = json.loads((data / "benchmark" / "metrics.json").read_text())
     assert point["test"] == own["ours"] != whole["ours"]
     assert own["oracle_mean"]["mse"] == whole["oracle_mean"]["mse"]
-    assert not (tmp_path / point["job"] / "cache").exists()
 
 
 def test_a_removed_method_is_in_no_table_and_no_picture_though_its_files_are_there(project_root, data, tmp_path):
-    """The benchmark's folder and the cache still hold what `highpass` gave."""
-    folders = {name: tmp_path / name for name in ("benchmark", "report", "cache")}
-    for name in ("benchmark", "cache"):
-        shutil.copytree(data / name, folders[name])
+    """The report alone, over rows among which `highpass` still lies."""
+    folders = {name: tmp_path / name for name in ("benchmark", "report")}
+    shutil.copytree(data / "benchmark", folders["benchmark"])
     settings = [f"paths.{name}={folder}" for name, folder in folders.items()]
     settings.append("benchmark.methods=[zeros,train_mean,oracle_mean,cf,ours]")
-    for stage in ("benchmark", "report"):
-        run_stage(project_root, stage, data, *settings)
+    run_stage(project_root, "report", data, *settings)
     before, after = (
         json.loads((folder / "metrics.json").read_text()) for folder in (data / "benchmark", folders["benchmark"])
     )
     assert set(after) == {"zeros", "train_mean", "oracle_mean", "cf", "ours"}
-    assert after["cf"]["mse"] == before["cf"]["mse"]
+    assert all(after[row] == before[row] for row in after)
     full, reduced = ((folder / "index.html").read_text() for folder in (data / "report", folders["report"]))
     assert 'class="m-highpass"' in full
     assert ">high-pass<" in full

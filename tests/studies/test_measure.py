@@ -158,13 +158,11 @@ def test_a_loss_sweep_is_complete_and_of_one_setting(tmp_path, write_trial):
 
 def write_results(folder):
     folder.mkdir(parents=True)
-    ours = dict.fromkeys(BENCHMARK_KEYS, 0.5) | {
-        "lpips": None,
-        "lpips_backbone": None,
-        "mse_ci": [0.4, 0.6],
-        "params": 7,
-    }
+    costs = {"ms_per_window": 0.5, "gflop": 0.5, "params": 7, "peak_mib": 0.5}
+    scores = {key: 0.5 for key in BENCHMARK_KEYS if key not in costs}
+    ours = scores | {"lpips": None, "lpips_backbone": None, "mse_ci": [0.4, 0.6]}
     (folder / "metrics.json").write_text(json.dumps({"zeros": {"mse": 1.0}, "ours": ours}))
+    (folder / "cost.json").write_text(json.dumps({"zeros": costs | {"gflop": None}, "ours": costs}))
     pairs = {"zeros": {"mse": {"scenes": 6, "better": 6, "effect": 1.0, "p": 0.03125, "p_holm": 0.03125}}}
     about = {"frames": 12, "warmup_windows": 5, "precision": "fp32", "scenes": ["a"] * 6, "paired": pairs}
     (folder / "details.json").write_text(json.dumps(about | {"lpips": {"backbone": None}}))
@@ -210,6 +208,7 @@ def test_figures_are_kept_where_the_tests_fail(tmp_path):
         (root / folder).mkdir(parents=True)
         (root / folder / ".keep").write_text("")
     (root / "data" / "benchmark" / "metrics.json").write_text('{"ours": {"mse": 0.1}}')
+    (root / "data" / "benchmark" / "cost.json").write_text('{"ours": {"params": 7}}')
     (root / "data" / "benchmark" / "details.json").write_text('{"lpips": {"backbone": "alex"}}')
     (root / "data" / "report" / "overview.png").write_bytes(b"picture")
     (root / "Makefile").write_text("setup:\n\t@true\nrepro:\n\t@true\ntest:\n\t@false\n")
@@ -219,7 +218,7 @@ def test_figures_are_kept_where_the_tests_fail(tmp_path):
     with pytest.raises(RuntimeError, match="make test failed"):
         measure_pipeline(root)
     record = json.loads((root / "docs" / "results" / "pipeline.json").read_text())
-    assert record["metrics"] == {"ours": {"mse": 0.1}}
+    assert record["metrics"] == {"ours": {"mse": 0.1, "params": 7}}
     assert record["lpips"] == {"backbone": "alex"}
     assert "test_minutes" not in record
     assert (root / "docs" / "pictures" / "overview.png").read_bytes() == b"picture"
