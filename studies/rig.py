@@ -5,7 +5,7 @@ files with random delays, sensor noise and hot pixels, are imported and calibrat
 of start times by the landmark (in pictures of the camera) and refined (in milliseconds, but for what all eight have in
 common, as the zero of their clock is a convention; that is `clock_zero_ms_max`), the root mean square difference of the
 DoLP from the scene's own, thresholds, and the benchmark's table, with the networks that `--data` has in train and
-train_e2v.
+train_baseline@e2v.
 
 The sensor is a quarter of a CeleX-5 in each direction (200 x 320, pictures of 30 x 45), with --full all of it (800 x
 1280, pictures of 120 x 180). `--write` merges the figures into docs/results/recordings.json as section `rig`, or

@@ -78,7 +78,8 @@ def listed(root: Path, deps: list[str]) -> set[str]:
         if dep.startswith(("polarnet/", "stages/")):
             path = root / dep
             files = list(path.rglob("*.py")) if path.is_dir() else [path]
-            assert files and all(file.exists() for file in files), f"{dep} is not there"
+            assert files, f"{dep} holds no module"
+            assert all(file.exists() for file in files), f"{dep} is not there"
             names |= {".".join(file.relative_to(root).with_suffix("").parts) for file in files}
     return {name.removesuffix(".__init__") for name in names}
 

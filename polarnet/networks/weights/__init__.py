@@ -9,6 +9,6 @@ def shipped_weights() -> Path:
     if not path.is_file():
         raise FileNotFoundError(
             f"{path} is not there: this version ships no weights. Give --weights FILE, the best.safetensors of a "
-            f"training (`dvc repro train` leaves one in data/train), or --method highpass, which needs none"
+            f"training (`dvc repro train` leaves one in data/train/ours), or --method highpass, which needs none"
         )
     return path
