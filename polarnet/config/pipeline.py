@@ -98,7 +98,7 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
         print(f"{row} is left out: {reason}")
         write_row(row_folder(config, row), row, RowRecord(reason, {}), {})
     if not methods:
-        return None
+        return
     lpips = or_exit(lambda: lpips_of(config))
     settings = dataclasses.replace(config.benchmark, methods=methods)
     results = {
@@ -107,7 +107,6 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
     }
     for row in methods:
         write_row(row_folder(config, row), row, RowRecord(None, weights_used([row], context)), results)
-    return results
 
 
 def lpips_of(config: Config) -> Lpips | None:

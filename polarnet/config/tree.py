@@ -171,7 +171,7 @@ class Config:
                 raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {size}")
 
     def _check_rows(self) -> None:
-        """ValueError for an unknown row or key, and for a row whose weights no stage trains."""
+        """ValueError for an unknown row, and for one whose entry in `rows` differs from the record of its method."""
         unknown = [name for name in (*self.rows, *([self.row] if self.row is not None else [])) if name not in ROWS]
         if unknown:
             raise ValueError(f"rows: expected some of {', '.join(ROWS)}, got {', '.join(unknown)}")
@@ -180,14 +180,25 @@ class Config:
         for row, keys in self.rows.items():
             if set(keys) != set(ROW_KEYS):
                 raise ValueError(f"rows.{row}: expected the keys {', '.join(ROW_KEYS)}, got {', '.join(keys)}")
-            training = PurePath(keys["needs"])
-            if training.parts[:2] == ("data", "train") and training.name not in (
-                DOLP_TRAINING,
-                *self.baselines.trained,
-            ):
-                raise ValueError(
-                    f"rows.{row}.needs: no stage makes {training}; add {training.name} to baselines.trained"
-                )
+            for key, value in self._row_entry(row).items():
+                if keys[key] != value:
+                    raise ValueError(f"rows.{row}.{key}: expected {value}, as in the row's record, got {keys[key]}")
+            needs = PurePath(keys["needs"])
+            if needs.parent == PurePath("data/train") and needs.name not in (DOLP_TRAINING, *self.baselines.trained):
+                raise ValueError(f"rows.{row}.needs: no stage makes {needs}; add {needs.name} to baselines.trained")
+
+    def _row_entry(self, row: str) -> dict[str, str]:
+        """Keys of a row's entry in `rows` that its record decides."""
+        if row not in METHODS:
+            return {"module": _file_of_module(type(ROWS[row]).__module__)}
+        method = METHODS[row].wraps or METHODS[row]
+        entry = {"module": _file_of_module(method.open.__module__)}
+        if method.config is not None:
+            entry["settings"] = f"methods.{method.section}"
+            given = getattr(getattr(self.methods, method.section), "weights", None)
+            if given is None and method.weights is not None and method.weights.trained_by:
+                entry["needs"] = f"data/train/{method.weights.trained_by}"
+        return entry
 
     def _check_baseline(self) -> None:
         """ValueError for an unknown baseline, and for one to train whose weights no row uses."""
@@ -415,6 +426,11 @@ def _check_key(key: str, where: str) -> None:
             allowed = f"{inside} has {', '.join(names)}" if names else f"{inside} is a value, not a section"
             raise ValueError(f"{where}: {key} is not a setting; {allowed}")
         section = typing.get_type_hints(section)[name]
+
+
+def _file_of_module(module: str) -> str:
+    """Path of a module's file from the root of the project."""
+    return f"{module.replace('.', '/')}.py"
 
 
 def _leaves(values: Any, prefix: str = "") -> list[str]:

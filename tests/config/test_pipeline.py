@@ -1,3 +1,5 @@
+import re
+
 import pytest
 
 from polarnet.config import pipeline, tables
@@ -47,6 +49,21 @@ def test_rows_of_published_weights_ask_for_no_training(project_root):
 def test_a_baseline_that_no_row_uses_is_not_trained(project_root):
     with pytest.raises(ValueError, match=r"no row of benchmark.methods uses the weights of baselines.e2p.*add e2p to"):
         load(project_root, ["baseline=e2p"])
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ("rows.cf.module=polarnet/methods/e2v.py", "rows.cf.module: expected polarnet/methods/complementary_filter.py"),
+        ("rows.highpass.settings=methods.cf", "rows.highpass.settings: expected methods.highpass"),
+        ("rows.ours.needs=data/train/e2v", "rows.ours.needs: expected data/train/ours"),
+        ("rows.zeros.module=polarnet/stokes.py", "rows.zeros.module: expected polarnet/benchmark/references.py"),
+        ("~rows.cf.needs", "rows.cf: expected the keys module, needs, settings, got module, settings"),
+    ],
+)
+def test_a_row_that_declares_less_than_it_uses_is_refused(project_root, change, expected):
+    with pytest.raises(ValueError, match=re.escape(expected)):
+        load(project_root, [change])
 
 
 def test_a_row_whose_weights_no_stage_trains_is_refused(project_root):
