@@ -22,7 +22,7 @@ from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.score import BenchmarkConfig
 from polarnet.captures.dot import RecordingsConfig
 from polarnet.config.experiments import preset_names, preset_values
-from polarnet.methods import METHODS, trained_rows
+from polarnet.methods import METHODS, module_of, trained_rows
 from polarnet.methods.postprocessing import PostprocessingConfig
 from polarnet.methods.stokes_gain import GainConfig
 from polarnet.metrics.lpips import BACKBONES, PURPOSES, Purpose, is_stored
@@ -192,7 +192,7 @@ class Config:
         if row not in METHODS:
             return {"module": _file_of_module(type(ROWS[row]).__module__)}
         method = METHODS[row].wraps or METHODS[row]
-        entry = {"module": _file_of_module(method.open.__module__)}
+        entry = {"module": _file_of_module(module_of(row))}
         if method.config is not None:
             entry["settings"] = f"methods.{method.section}"
             given = getattr(getattr(self.methods, method.section), "weights", None)

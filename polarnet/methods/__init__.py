@@ -2,8 +2,13 @@
 
 import importlib
 import pkgutil
+from types import ModuleType
 
 from polarnet.methods.method import Method
+
+
+def _modules() -> list[ModuleType]:
+    return [importlib.import_module(f"{__name__}.{name}") for _, name, _ in pkgutil.iter_modules(__path__)]
 
 
 def _assembled() -> dict[str, Method]:
@@ -12,8 +17,7 @@ def _assembled() -> dict[str, Method]:
     Filters come first, then networks that reconstruct intensities, then networks that predict DoLP. Within each
     group the modules are in alphabetical order.
     """
-    modules = [importlib.import_module(f"{__name__}.{name}") for _, name, _ in pkgutil.iter_modules(__path__)]
-    records = [method for module in modules for method in getattr(module, "METHODS", ())]
+    records = [method for module in _modules() for method in getattr(module, "METHODS", ())]
     records.sort(key=lambda method: (method.weights is not None, not method.reconstructs))
     by_name = {method.name: method for method in records}
     assert len(by_name) == len(records), f"two methods have one name: {[method.name for method in records]}"
@@ -22,6 +26,13 @@ def _assembled() -> dict[str, Method]:
 
 METHODS = _assembled()
 """Method by name, in the order of all tables and figures."""
+
+
+def module_of(method: str) -> str:
+    """Full name of the module whose `METHODS` holds the record of a method."""
+    return next(
+        module.__name__ for module in _modules() if any(one.name == method for one in getattr(module, "METHODS", ()))
+    )
 
 
 def trained_rows(training: str) -> tuple[str, ...]:

@@ -2,12 +2,12 @@
 
 import importlib
 import pkgutil
+from pathlib import Path
 
-from polarnet import training
 from polarnet.training.task import Baseline
 
-_MODULES = sorted(name for _, name, _ in pkgutil.iter_modules(training.__path__) if name != "baselines")
-_RECORDS = [getattr(importlib.import_module(f"{training.__name__}.{name}"), "BASELINE", None) for name in _MODULES]
+_NAMES = [name for _, name, _ in pkgutil.iter_modules([str(Path(__file__).parent)]) if name != "baselines"]
+_RECORDS = [getattr(importlib.import_module(f"{__package__}.{name}"), "BASELINE", None) for name in _NAMES]
 
 BASELINES: dict[str, Baseline] = {record.name: record for record in _RECORDS if record is not None}
 """Baseline by name, the section of `baselines` in params.yaml."""

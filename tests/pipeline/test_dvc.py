@@ -12,7 +12,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from polarnet.config.experiments import stage_names
-from polarnet.methods import METHODS
+from polarnet.methods import METHODS, module_of
 from polarnet.training.baselines import BASELINES
 
 # What starts a stage and checks its values decides no output; listing it would re-run everything at each new setting.
@@ -115,8 +115,7 @@ def test_a_row_depends_on_the_file_of_its_method_on_its_settings_and_on_its_trai
             assert "polarnet/benchmark/references.py" in stage["deps"]
             continue
         method = METHODS[row]
-        inner = method.wraps or method
-        assert f"{inner.open.__module__.replace('.', '/')}.py" in stage["deps"]
+        assert f"{module_of(row).replace('.', '/')}.py" in stage["deps"]
         assert f"methods.{method.section}" in stage["params"]
         if method.weights is not None and method.weights.trained_by:
             assert f"data/train/{method.weights.trained_by}" in stage["deps"]
