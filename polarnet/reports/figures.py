@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
-from cycler import cycler
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -272,7 +271,7 @@ def chart_style(theme: Theme) -> dict[Any, Any]:
         "xtick.labelsize": 7,
         "ytick.labelsize": 7,
         "lines.linewidth": 1.5,
-        "axes.prop_cycle": cycler(color=["#d6336c", "#3d8fd9", "#e08a1e", "#4aa37c", "#8b6fd6"]),
+        "axes.prop_cycle": matplotlib.cycler(color=["#d6336c", "#3d8fd9", "#e08a1e", "#4aa37c", "#8b6fd6"]),
     }
 
 

@@ -17,8 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from dvclive import Live
-from scmrepo.exceptions import SCMError
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -169,6 +167,9 @@ def write_curves(folder: Path, history: Sequence[Mapping[str, Any]]) -> None:
     The whole history is written again each time. DVCLive's own resumption would not work, because DVC empties the
     outputs of a stage before it reruns the stage.
     """
+    from dvclive import Live  # extra `pipeline`; half a second
+    from scmrepo.exceptions import SCMError
+
     try:
         live = Live(str(folder), dvcyaml=None, save_dvc_exp=False, monitor_system=False, cache_images=False)
     except SCMError as error:  # in a git repository without a commit
