@@ -21,7 +21,6 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from polarnet.networks.checkpoint import save_checkpoint
-from polarnet.training.optimizers import Stepper
 from polarnet.training.parallel import place
 from polarnet.training.sequences import Batch
 
@@ -85,7 +84,7 @@ class Recorder:
             shutil.rmtree(out, ignore_errors=True)
             out.mkdir(parents=True)
 
-    def resume(self, network: nn.Module, optimizer: Stepper) -> Progress:
+    def resume(self, network: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
         """Restore network and optimizer from the running checkpoint, if it exists, and return the progress."""
         file = self.running / "running.pt"
         if not file.exists():
@@ -99,7 +98,7 @@ class Recorder:
             self._write(progress, network)  # __init__ emptied `out`, so the last epoch's files are written again
         return progress
 
-    def keep(self, progress: Progress, network: nn.Module, optimizer: Stepper, at_once: bool = False) -> None:
+    def keep(self, progress: Progress, network: nn.Module, optimizer: torch.optim.Optimizer, at_once: bool = False) -> None:
         """Write the running checkpoint if `at_once`, or if `keep_every_s` have passed since the last one."""
         if not self.writes or (not at_once and time.monotonic() - self.kept_at < self.keep_every_s):
             return
