@@ -29,8 +29,8 @@ NETWORK = {
     "input_mixing": "contrasts",
 }
 SECTIONS = {
-    "cf": ComplementaryFilterConfig(0.5, 0.1, -0.1, [-0.1, 1.2], "fixed"),
-    "highpass": HighPassConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5], "fixed"),
+    "cf": ComplementaryFilterConfig(0.5, 0.1, -0.1, [-0.1, 1.2]),
+    "highpass": HighPassConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5]),
 }
 
 

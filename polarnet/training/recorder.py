@@ -98,7 +98,9 @@ class Recorder:
             self._write(progress, network)  # __init__ emptied `out`, so the last epoch's files are written again
         return progress
 
-    def keep(self, progress: Progress, network: nn.Module, optimizer: torch.optim.Optimizer, at_once: bool = False) -> None:
+    def keep(
+        self, progress: Progress, network: nn.Module, optimizer: torch.optim.Optimizer, at_once: bool = False
+    ) -> None:
         """Write the running checkpoint if `at_once`, or if `keep_every_s` have passed since the last one."""
         if not self.writes or (not at_once and time.monotonic() - self.kept_at < self.keep_every_s):
             return
