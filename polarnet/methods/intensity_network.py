@@ -12,7 +12,7 @@ from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.intensities import from_intensities
 from polarnet.methods.method import Recoverer, Setup, State, weights_file
-from polarnet.methods.postprocessing import PostprocessingConfig, stretched, unsharp_masked
+from polarnet.methods.postprocessing import postprocessed
 from polarnet.networks.checkpoint import load_checkpoint, load_tensors
 from polarnet.stokes import Prediction
 
@@ -38,36 +38,20 @@ def intensity_network(
     post-processing of published weights; otherwise intensities are on their true scale and only clipped.
     """
     network = load(weights_file(setup)).to(setup.device)
-    postprocessing = setup.postprocessing if published else None
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        inner, sharp = state
         images = []
         for window in windows:
             grids = voxel_grids(window, network.bins).to(setup.device)
             with setup.autocast():
-                intensity, inner = network(normalise_nonzero(grids) if normalised else grids, inner)
+                intensity, state = network(normalise_nonzero(grids) if normalised else grids, state)
             images.append(intensity.float())
-        intensities, sharp = _displayed(torch.stack(images), sharp, postprocessing)
-        return (inner, sharp), from_intensities(intensities)
+        raw = torch.stack(images)
+        return state, from_intensities(postprocessed(raw, setup.postprocessing) if published else raw.clamp(0, 1))
 
-    def start(height: int, width: int) -> State:
-        return None, torch.zeros(0, 4, height, width, device=setup.device)
-
-    return Recoverer(start, predict, network=network)
+    return Recoverer(lambda height, width: None, predict, network=network)
 
 
 def voxel_grids(window: EventWindow, bins: int) -> Float[Tensor, "4 bins h w"]:
     """Voxel grid of each channel."""
     return torch.stack([voxel_grid(events, bins) for events in window.channels])
-
-
-def _displayed(
-    images: Float[Tensor, "n 4 h w"], before: Float[Tensor, "m 4 h w"], config: PostprocessingConfig | None
-) -> tuple[Float[Tensor, "n 4 h w"], Float[Tensor, "k 4 h w"]]:
-    """Intensities in [0, 1] of n images after m earlier ones, and the images that set the range of later ones."""
-    if config is None:
-        return images.clamp(0, 1), before
-    sharp = torch.cat([before, unsharp_masked(images, config.unsharp_amount, config.unsharp_sigma)])
-    kept = config.auto_hdr_frames - 1 if config.auto_hdr else 0
-    return stretched(sharp, config)[len(before) :], sharp[len(sharp) - min(kept, len(sharp)) :]
