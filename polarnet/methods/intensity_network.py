@@ -1,5 +1,6 @@
 """Networks that reconstruct intensity from events, as methods; the four channels form one batch."""
 
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,8 @@ from torch import Tensor
 
 from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.streaming import EventWindow
-from polarnet.methods.intensities import from_intensities
-from polarnet.methods.method import Recoverer, Setup, State, weights_file
+from polarnet.methods.intensities import from_intensities, with_gain
+from polarnet.methods.method import Method, Recoverer, Setup, State, Weights, WeightsConfig, weights_file
 from polarnet.methods.postprocessing import postprocessed
 from polarnet.networks.checkpoint import load_checkpoint, load_tensors
 from polarnet.stokes import Prediction
@@ -27,6 +28,40 @@ def load_baseline(build: Any, name: str, path: Path) -> Any:
     network = build(**metadata["config"])
     load_tensors(network, tensors, path)
     return network.eval()
+
+
+def intensity_methods(
+    name: str,
+    label: str,
+    colour: str,
+    build: Any,
+    weights: Weights,
+    *,
+    about: str = "",
+    normalised: bool = True,
+    published: bool = False,
+) -> tuple[Method, Method]:
+    """The method NAME that runs a network of the class `build`, and NAME+gain.
+
+    `weights` names that network alone; see `intensity_network` for `normalised` and `published`.
+    """
+    (network,) = weights.networks
+    load = functools.partial(load_baseline, build, network)
+
+    def open_network(setup: Setup) -> Recoverer:
+        return intensity_network(load, setup, normalised=normalised, published=published)
+
+    method = Method(
+        name=name,
+        label=label,
+        colour=colour,
+        open=open_network,
+        config=WeightsConfig,
+        weights=weights,
+        reconstructs=True,
+        about=about,
+    )
+    return method, with_gain(method)
 
 
 def intensity_network(
