@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
+from matplotlib.rcsetup import cycler
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from torch import Tensor
 
@@ -271,7 +272,7 @@ def chart_style(theme: Theme) -> dict[Any, Any]:
         "xtick.labelsize": 7,
         "ytick.labelsize": 7,
         "lines.linewidth": 1.5,
-        "axes.prop_cycle": matplotlib.cycler(color=["#d6336c", "#3d8fd9", "#e08a1e", "#4aa37c", "#8b6fd6"]),
+        "axes.prop_cycle": cycler(color=["#d6336c", "#3d8fd9", "#e08a1e", "#4aa37c", "#8b6fd6"]),
     }
 
 

@@ -3,11 +3,9 @@
 The outputs contain no dates or durations, so equal trainings write equal bytes.
 """
 
-import hashlib
 import json
 import logging
 import math
-import os
 import shutil
 import time
 from collections import Counter
@@ -21,6 +19,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from polarnet.networks.checkpoint import save_checkpoint
+from polarnet.runtime.files import replaced, sha256
 from polarnet.training.parallel import place
 from polarnet.training.sequences import Batch
 
@@ -76,7 +75,7 @@ class Recorder:
 
     def __init__(self, out: Path, resume: Path, metadata: Mapping[str, Any], keep_every_s: float = KEEP_EVERY_S):
         self.out, self.metadata, self.keep_every_s = out, dict(metadata), keep_every_s
-        key = hashlib.sha256(json.dumps(self.metadata, sort_keys=True).encode()).hexdigest()
+        key = sha256(json.dumps(self.metadata, sort_keys=True).encode())
         self.running = resume / key[:16]
         self.kept_at = time.monotonic()
         self.writes = place()[0] == 0
@@ -110,8 +109,8 @@ class Recorder:
             "optimizer": optimizer.state_dict(),
             "progress": asdict(progress),
         }
-        torch.save(content, self.running / "running.pt.tmp")
-        os.replace(self.running / "running.pt.tmp", self.running / "running.pt")
+        with replaced(self.running / "running.pt") as temporary:
+            torch.save(content, temporary)
         self.kept_at = time.monotonic()
 
     def show(self, batches: Iterable[Batch], progress: Progress, visits: int, epochs: int) -> Iterator[Batch]:
