@@ -29,8 +29,8 @@ NETWORK = {
     "input_mixing": "contrasts",
 }
 SECTIONS = {
-    "cf": ComplementaryFilterConfig(0.5, 0.1, -0.1, [-0.1, 1.2], "fixed"),
-    "highpass": HighPassConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5], "fixed"),
+    "cf": ComplementaryFilterConfig(0.5, 0.1, -0.1, [-0.1, 1.2]),
+    "highpass": HighPassConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5]),
 }
 
 
@@ -96,7 +96,7 @@ def make_setup(checkpoints):
         values = {
             "config": SECTIONS.get(section),
             "weights": checkpoints.get(section),
-            "postprocessing": PostprocessingConfig(0.3, 1.0, False, 10, False),
+            "postprocessing": PostprocessingConfig(0.3, 1.0),
             "gain": GainConfig(10, 5, 20_000, 0.1, 0.0),
             "device": torch.device("cpu"),
             "precision": "fp32",

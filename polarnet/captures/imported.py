@@ -1,6 +1,5 @@
 """Decode division-of-time captures once, for later steps that read them repeatedly, whatever the file format."""
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,6 +20,7 @@ from polarnet.captures.dot import (
 )
 from polarnet.captures.status import start_over
 from polarnet.events.stream import Events
+from polarnet.runtime.files import sha256
 from polarnet.storage.events import EventStore
 
 
@@ -45,7 +45,7 @@ def import_targets(root: Path, out: Path, config: RecordingsConfig) -> list[str]
     start_over(out, enabled=True)
     attributes = {
         "sensor": list(config.sensor),
-        "files": {name: {key: _digest(path) for key, path in find_captures(root / name).items()} for name in names},
+        "files": {name: {key: sha256(path) for key, path in find_captures(root / name).items()} for name in names},
     }
     store = EventStore.create(out / "events.zarr", names, config.sensor[0], config.sensor[1], attributes)
     for name in names:
@@ -88,8 +88,3 @@ def open_target(imported: Path, name: str) -> Target:
 def shifted(events: Events, origin_us: int) -> Events:
     """The same events, with `origin_us` as time 0."""
     return Events(events.t - origin_us, events.x, events.y, events.p, events.height, events.width)
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 
 from polarnet import __version__
 from polarnet.cli import benchmark, networks, project, recordings, stores
+from polarnet.runtime.environment import let_threads_sleep
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; the exit status."""
+    let_threads_sleep()
     options = _parser().parse_args(arguments)
     try:
         return options.run(options)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from polarnet.cli.outputs import MARKER, WORK, run_folder
 from polarnet.cli.parsers import Commands
-from polarnet.cli.project import project_root
+from polarnet.cli.project import project_root, settings_root, working_folder
 
 if TYPE_CHECKING:
     from polarnet.config.tree import Config
@@ -46,15 +46,16 @@ def _benchmark(options: argparse.Namespace) -> int:
 
     if options.scenes and options.limit is not None:
         raise ValueError("--limit is for --event-budget and --sensitivity; --scenes scores all that lies in its folder")
-    root = project_root()
+    settings = settings_root() if options.scenes else project_root()  # a study needs the pipeline's test sequences
+    folder = working_folder()
     scenes = options.scenes.resolve() if options.scenes else None
     name = scenes.name if scenes else "event_budget" if options.event_budget else "sensitivity"
-    out = (options.out or root / "outputs" / "benchmark" / name).resolve()
+    out = (options.out or folder / "outputs" / "benchmark" / name).resolve()
     weights = options.weights.resolve() if options.weights else None
-    with contextlib.chdir(root):  # paths of conf/config.yaml are relative to it
+    with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
         chosen = [f"benchmark.methods=[{options.methods}]"] if scenes and options.methods else []
-        check_keys(root, options.overrides)
-        config = load(root, [*options.overrides, *chosen])
+        check_keys(settings, options.overrides)
+        config = load(settings, [*options.overrides, *chosen])
         configure(config.runtime, config.seed)
         if scenes is None:
             return _study(options, config, out, weights)

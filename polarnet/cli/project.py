@@ -8,6 +8,10 @@ from pathlib import Path
 
 from polarnet.cli.parsers import Commands
 
+INSTALLED_SETTINGS = Path(__file__).parents[1] / "config" / "settings"
+"""Copy of params.yaml and conf/ that setup.py puts into the wheel."""
+SOURCE_TREE = Path(__file__).parents[2]
+
 
 def add_to(commands: Commands) -> None:
     """Its commands."""
@@ -32,7 +36,30 @@ def project_root(start: Path | None = None) -> Path:
     for folder in [start, *start.parents]:
         if (folder / "params.yaml").exists() and (folder / "dvc.yaml").exists():
             return folder
-    raise FileNotFoundError(f"no params.yaml beside a dvc.yaml in {start} or above; run this inside a polarnet clone")
+    raise FileNotFoundError(
+        f"expected a clone of polarnet, found no params.yaml beside a dvc.yaml in {start} or above; "
+        f"run this command inside a clone"
+    )
+
+
+def settings_root() -> Path:
+    """The folder whose params.yaml and conf/ hold the settings, in this order.
+
+    The clone at or above the current folder; the copy in an installed wheel; the source tree of an editable
+    installation.
+    """
+    try:
+        return project_root()
+    except FileNotFoundError:
+        return INSTALLED_SETTINGS if INSTALLED_SETTINGS.is_dir() else SOURCE_TREE
+
+
+def working_folder() -> Path:
+    """The folder that the paths of conf/config.yaml start from: the clone at or above the current folder, or that."""
+    try:
+        return project_root()
+    except FileNotFoundError:
+        return Path.cwd()
 
 
 def _doctor(options: argparse.Namespace) -> int:

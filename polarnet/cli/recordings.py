@@ -9,7 +9,7 @@ from typing import Any
 
 from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.parsers import Commands
-from polarnet.cli.project import project_root
+from polarnet.cli.project import settings_root
 
 OF_FILES = ("format", "height", "width", "clock_mhz", "assume_polarity")
 """Options of commands that say how to read a camera's files."""
@@ -166,7 +166,7 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
     _check_taken(options)
-    config = functools.cache(lambda: load(project_root()))
+    config = functools.cache(lambda: load(settings_root()))
     length_us, events = parse_window(options.window)
     step_us, step_events = parse_window(options.step) if options.step else (None, None)
     if step_events is not None:

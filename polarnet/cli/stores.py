@@ -1,4 +1,4 @@
-"""Commands on stores: check, export, import."""
+"""Commands on stores: check, export."""
 
 import argparse
 from pathlib import Path
@@ -18,11 +18,6 @@ def add_to(commands: Commands) -> None:
     export.add_argument("folder", type=Path, help="gets a file for each sequence and polarizer")
     export.add_argument("--format", choices=("hdf5", "text"), default="hdf5", help="DSEC's HDF5, or lines of t x y p")
     export.set_defaults(run=_export)
-
-    import_ = commands.add_parser("import", help="the files that export wrote, as an event store")
-    import_.add_argument("folder", type=Path)
-    import_.add_argument("store", type=Path, help="written anew")
-    import_.set_defaults(run=_import)
 
 
 def _verify(options: argparse.Namespace) -> int:
@@ -50,12 +45,4 @@ def _export(options: argparse.Namespace) -> int:
     with run_folder(options.folder, "export") as folder:
         export_store(store, folder, options.format)
     print(f"{options.store} -> {options.folder}")
-    return 0
-
-
-def _import(options: argparse.Namespace) -> int:
-    from polarnet.storage.exchange import import_store
-
-    import_store(options.folder, options.store)
-    print(f"{options.folder} -> {options.store}")
     return 0

@@ -8,6 +8,8 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
+from polarnet.runtime.files import replaced
+
 BASE = {"experiment": "demo", "sensor": "default"}
 """Base preset of each group (a folder of conf/).
 
@@ -75,10 +77,8 @@ def write_preset(root: Path, name: str) -> list[str]:
         if node[last] != value:
             changed.append(f"{key}: {node[last]} -> {value}")
             node[last] = _in_a_line(value) if isinstance(value, list) else value
-    temporary = path.with_suffix(".yaml.tmp")
-    with temporary.open("w") as file:
-        yaml.dump(params, file)
-    temporary.replace(path)
+    with replaced(path) as temporary:
+        yaml.dump(params, temporary)
     return changed
 
 

@@ -297,11 +297,11 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
     Hydra's log also receives the warnings of Python and its packages.
     """
     root = _root_of(main)
-    os.environ[ROOT_VARIABLE] = str(root)
-    register_schema()
     run = hydra.main(version_base="1.3", config_path=str(root / "conf"), config_name="config")(main)
 
     def command_line() -> None:
+        os.environ[ROOT_VARIABLE] = str(root)
+        register_schema()
         overrides = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
         or_exit(lambda: check_keys(root, overrides))
         logging.captureWarnings(True)

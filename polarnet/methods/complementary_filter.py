@@ -23,10 +23,6 @@ from polarnet.runtime.ranges import allowed, check_ranges
 from polarnet.stokes import Prediction
 
 HIGHPASS_GAIN = 1.5  # output gain of the high-pass filter, I = 1.5 exp(L) - 1, from the package's source
-ROBUST = (0.0025, 0.9975)  # the package's quantiles for the darkest and brightest intensity of an image
-FOLLOWED_S = 2.0  # time in which the automatic range ...
-FOLLOWED = 0.95  # ... follows this fraction of a change
-RANGE_RULES = ("fixed", "common", "per_polarizer")
 
 Step = Callable[..., tuple[Tensor, "FilterState"]]
 
@@ -41,10 +37,7 @@ class ComplementaryFilterConfig:
     """Step in log intensity per ON event."""
     contrast_off: float = field(metadata=allowed(high=0))
     intensity_range: list[float]
-    """Intensities mapped to 0 and 1; the initial value of an automatic range."""
-    range_rule: str = field(metadata=allowed(choices=RANGE_RULES))
-    """fixed: `intensity_range` for all four channels; common: one range for all channels that follows the images;
-    per_polarizer: one such range per channel, which loses the ratios that Stokes parameters need."""
+    """Intensities mapped to 0 and 1, in all four channels."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -53,7 +46,7 @@ class ComplementaryFilterConfig:
 
 @dataclass(frozen=True)
 class HighPassConfig:
-    """Section `methods.highpass` of params.yaml; the package's defaults, except for its automatic range."""
+    """Section `methods.highpass` of params.yaml; the package's defaults, with a fixed range."""
 
     cutoff_hz: float = field(metadata=allowed(low=0))
     decay_per_event: float = field(metadata=allowed(low=0))
@@ -61,7 +54,6 @@ class HighPassConfig:
     contrast_on: float = field(metadata=allowed(above=0))
     contrast_off: float = field(metadata=allowed(high=0))
     intensity_range: list[float]
-    range_rule: str = field(metadata=allowed(choices=RANGE_RULES))
 
     def __post_init__(self):
         check_ranges(self)
@@ -113,16 +105,11 @@ class FilterState(NamedTuple):
     """Integrator of each channel."""
     t_us: int
     """Time of the last image."""
-    shown: Float64[np.ndarray, "2 c"]
-    """Intensities mapped to 0 and 1, for each channel."""
 
 
-def filter_at_rest(
-    channels: int, height: int, width: int, config: ComplementaryFilterConfig | HighPassConfig
-) -> FilterState:
+def filter_at_rest(channels: int, height: int, width: int) -> FilterState:
     """State of a filter at time 0, before any event."""
-    shown = np.array(config.intensity_range)[:, None] + np.zeros(channels)
-    return FilterState([at_rest(height, width)] * channels, 0, shown)
+    return FilterState([at_rest(height, width)] * channels, 0)
 
 
 def step_cf(
@@ -130,12 +117,12 @@ def step_cf(
 ) -> tuple[Float64[Tensor, "c h w"], FilterState]:
     """Intensity at `t_us` from the events since the last image: I = exp(L) - 1, scaled to [0, 1].
 
-    Each of the c channels is filtered independently. `config.range_rule` sets the intensities mapped to 0 and 1;
-    intensities outside are clipped.
+    Each of the c channels is filtered independently. `config.intensity_range` becomes [0, 1]; intensities outside are
+    clipped.
     """
     decay = Decay(_rate_per_us(config.cutoff_hz), 0.0, config.contrast_on, config.contrast_off)
     logs, pixels = _log_intensities(state, channels, t_us, decay)
-    return _shown(np.expm1(logs), state._replace(pixels=pixels), t_us, config.range_rule)
+    return _scaled(np.expm1(logs), config.intensity_range), FilterState(pixels, t_us)
 
 
 def step_highpass(
@@ -144,15 +131,7 @@ def step_highpass(
     """Like `step_cf`, with a decay per event and I = 1.5 exp(L) - 1."""
     decay = Decay(_rate_per_us(config.cutoff_hz), config.decay_per_event, config.contrast_on, config.contrast_off)
     logs, pixels = _log_intensities(state, channels, t_us, decay)
-    return _shown(HIGHPASS_GAIN * np.exp(logs) - 1, state._replace(pixels=pixels), t_us, config.range_rule)
-
-
-def followed_range(
-    shown: Float64[np.ndarray, "2 c"], image: Float64[np.ndarray, "2 c"], elapsed_us: int
-) -> Float64[np.ndarray, "2 c"]:
-    """The automatic range: a low-pass filter of each image's darkest and brightest value, 95 % in 2 s."""
-    kept = (1 - FOLLOWED) ** (elapsed_us * 1e-6 / FOLLOWED_S)
-    return kept * shown + (1 - kept) * image
+    return _scaled(HIGHPASS_GAIN * np.exp(logs) - 1, config.intensity_range), FilterState(pixels, t_us)
 
 
 def _log_intensities(
@@ -162,18 +141,9 @@ def _log_intensities(
     return np.stack([log_intensity_at(after, t_us, decay) for after in pixels]), pixels
 
 
-def _shown(
-    intensity: Float64[np.ndarray, "c h w"], state: FilterState, t_us: int, rule: str
-) -> tuple[Float64[Tensor, "c h w"], FilterState]:
-    shown = state.shown
-    if rule != "fixed":
-        over = (-3, -2, -1) if rule == "common" else (-2, -1)
-        image = np.quantile(intensity, ROBUST, axis=over).reshape(2, -1)
-        shown = followed_range(shown, np.broadcast_to(image, shown.shape), t_us - state.t_us)
-    low, high = shown[..., None, None]
-    span = np.maximum(high - low, np.finfo(np.float64).tiny)  # the range of a constant image shrinks to 0
-    unit = torch.from_numpy(((intensity - low) / span).clip(0, 1))
-    return unit, state._replace(t_us=t_us, shown=shown)
+def _scaled(intensity: Float64[np.ndarray, "c h w"], intensity_range: Sequence[float]) -> Float64[Tensor, "c h w"]:
+    low, high = intensity_range
+    return torch.from_numpy(((intensity - low) / (high - low)).clip(0, 1))
 
 
 @numba.njit(nogil=True, cache=True)
@@ -204,7 +174,7 @@ def filtered(step: Step, config: ComplementaryFilterConfig | HighPassConfig) -> 
     """Wrap a filter as a method: `step` runs once per window, on the events that no earlier window held."""
 
     def start(height: int, width: int) -> State:
-        return filter_at_rest(4, height, width, config)
+        return filter_at_rest(4, height, width)
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
         images = []

@@ -1,5 +1,6 @@
 """Networks that reconstruct intensity from events, as methods; the four channels form one batch."""
 
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,9 @@ from torch import Tensor
 
 from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.streaming import EventWindow
-from polarnet.methods.intensities import from_intensities
-from polarnet.methods.method import Recoverer, Setup, State, weights_file
-from polarnet.methods.postprocessing import PostprocessingConfig, stretched, unsharp_masked
+from polarnet.methods.intensities import from_intensities, with_gain
+from polarnet.methods.method import Method, Recoverer, Setup, State, Weights, WeightsConfig, weights_file
+from polarnet.methods.postprocessing import postprocessed
 from polarnet.networks.checkpoint import load_checkpoint, load_tensors
 from polarnet.stokes import Prediction
 
@@ -29,6 +30,40 @@ def load_baseline(build: Any, name: str, path: Path) -> Any:
     return network.eval()
 
 
+def intensity_methods(
+    name: str,
+    label: str,
+    colour: str,
+    build: Any,
+    weights: Weights,
+    *,
+    about: str = "",
+    normalised: bool = True,
+    published: bool = False,
+) -> tuple[Method, Method]:
+    """The method NAME that runs a network of the class `build`, and NAME+gain.
+
+    `weights` names that network alone; see `intensity_network` for `normalised` and `published`.
+    """
+    (network,) = weights.networks
+    load = functools.partial(load_baseline, build, network)
+
+    def open_network(setup: Setup) -> Recoverer:
+        return intensity_network(load, setup, normalised=normalised, published=published)
+
+    method = Method(
+        name=name,
+        label=label,
+        colour=colour,
+        open=open_network,
+        config=WeightsConfig,
+        weights=weights,
+        reconstructs=True,
+        about=about,
+    )
+    return method, with_gain(method)
+
+
 def intensity_network(
     load: Callable[[Path], Any], setup: Setup, *, normalised: bool = True, published: bool = False
 ) -> Recoverer:
@@ -38,36 +73,20 @@ def intensity_network(
     post-processing of published weights; otherwise intensities are on their true scale and only clipped.
     """
     network = load(weights_file(setup)).to(setup.device)
-    postprocessing = setup.postprocessing if published else None
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        inner, sharp = state
         images = []
         for window in windows:
             grids = voxel_grids(window, network.bins).to(setup.device)
             with setup.autocast():
-                intensity, inner = network(normalise_nonzero(grids) if normalised else grids, inner)
+                intensity, state = network(normalise_nonzero(grids) if normalised else grids, state)
             images.append(intensity.float())
-        intensities, sharp = _displayed(torch.stack(images), sharp, postprocessing)
-        return (inner, sharp), from_intensities(intensities)
+        raw = torch.stack(images)
+        return state, from_intensities(postprocessed(raw, setup.postprocessing) if published else raw.clamp(0, 1))
 
-    def start(height: int, width: int) -> State:
-        return None, torch.zeros(0, 4, height, width, device=setup.device)
-
-    return Recoverer(start, predict, network=network)
+    return Recoverer(lambda height, width: None, predict, network=network)
 
 
 def voxel_grids(window: EventWindow, bins: int) -> Float[Tensor, "4 bins h w"]:
     """Voxel grid of each channel."""
     return torch.stack([voxel_grid(events, bins) for events in window.channels])
-
-
-def _displayed(
-    images: Float[Tensor, "n 4 h w"], before: Float[Tensor, "m 4 h w"], config: PostprocessingConfig | None
-) -> tuple[Float[Tensor, "n 4 h w"], Float[Tensor, "k 4 h w"]]:
-    """Intensities in [0, 1] of n images after m earlier ones, and the images that set the range of later ones."""
-    if config is None:
-        return images.clamp(0, 1), before
-    sharp = torch.cat([before, unsharp_masked(images, config.unsharp_amount, config.unsharp_sigma)])
-    kept = config.auto_hdr_frames - 1 if config.auto_hdr else 0
-    return stretched(sharp, config)[len(before) :], sharp[len(sharp) - min(kept, len(sharp)) :]

@@ -1,6 +1,5 @@
 """The record of a method: its name, settings and weights, and its step from window to window."""
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from polarnet.events.streaming import EventWindow
 from polarnet.methods.postprocessing import PostprocessingConfig
 from polarnet.methods.stokes_gain import GainConfig
 from polarnet.networks.checkpoint import load_checkpoint
+from polarnet.runtime.files import sha256
 from polarnet.stokes import Prediction
 
 State = Any
@@ -155,7 +155,7 @@ def weights_record(method: Method, setup: Setup) -> dict[str, str]:
     own = path.suffix == ".safetensors"
     return {
         "file": path.name,
-        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "sha256": sha256(path),
         "network": load_checkpoint(path)[1]["network"] if own else method.weights.networks[0],
     }
 

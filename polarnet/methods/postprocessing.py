@@ -1,7 +1,6 @@
-"""Post-processing of reconstructed images from the public code of E2VID's authors.
+"""Post-processing of reconstructed images from the public code of E2VID's authors: an unsharp mask, then clipping.
 
-Each step can be switched off, and the settings are recorded. The authors then round images to 8 bits; polarnet does
-not.
+The authors then round images to 8 bits; polarnet does not.
 """
 
 from dataclasses import dataclass, field
@@ -15,8 +14,6 @@ from torch.nn import functional as F
 from polarnet.runtime.ranges import allowed, check_ranges
 
 KERNEL_SIZE = 5  # blur kernel of the unsharp mask, pixels
-DARKEST_AT_MOST = 0.45  # bounds of the automatic range, so that it spans at least 0.1
-BRIGHTEST_AT_LEAST = 0.55
 
 
 @dataclass(frozen=True)
@@ -27,28 +24,14 @@ class PostprocessingConfig:
     """Factor on the difference between image and blurred copy, which is added to the image; 0: off."""
     unsharp_sigma: float = field(metadata=allowed(above=0))
     """Width of the blur, in the units of the published kernel."""
-    auto_hdr: bool
-    """Stretch the range of the images to [0, 1]."""
-    auto_hdr_frames: int = field(metadata=allowed(low=1))
-    """Number of frames for the median of the range, up to and including the present frame."""
-    auto_hdr_per_polarizer: bool
-    """One range per channel, which loses the ratios that Stokes parameters need; false: one range for all four."""
 
     def __post_init__(self):
         check_ranges(self)
 
 
 def postprocessed(images: Float[Tensor, "t c h w"], config: PostprocessingConfig) -> Float[Tensor, "t c h w"]:
-    """Sharpen images, stretch them to [0, 1] if `auto_hdr` is set, and clip them."""
-    return stretched(unsharp_masked(images, config.unsharp_amount, config.unsharp_sigma), config)
-
-
-def stretched(sharp: Float[Tensor, "t c h w"], config: PostprocessingConfig) -> Float[Tensor, "t c h w"]:
-    """Stretch sharpened images to [0, 1] if `auto_hdr` is set, and clip them."""
-    if config.auto_hdr:
-        low, high = _range(sharp, config.auto_hdr_frames, per_channel=config.auto_hdr_per_polarizer)
-        sharp = (sharp - low) / (high - low)
-    return sharp.clamp(0, 1)
+    """Sharpen images and clip them to [0, 1]."""
+    return unsharp_masked(images, config.unsharp_amount, config.unsharp_sigma).clamp(0, 1)
 
 
 def unsharp_masked(images: Float[Tensor, "t c h w"], amount: float, sigma: float) -> Float[Tensor, "t c h w"]:
@@ -71,15 +54,3 @@ def blur_kernel(sigma: float) -> Float[Tensor, "5 5"]:
     shares = torch.tensor([NormalDist().cdf(edge) for edge in edges.tolist()], dtype=torch.float64).diff()
     kernel = torch.outer(shares, shares).sqrt()
     return kernel / kernel.sum()
-
-
-def _range(images: Float[Tensor, "t c h w"], frames: int, *, per_channel: bool) -> tuple[Tensor, Tensor]:
-    over = (-2, -1) if per_channel else (-3, -2, -1)
-    low = images.amin(over, keepdim=True).clamp(0, DARKEST_AT_MOST)
-    high = images.amax(over, keepdim=True).clamp(BRIGHTEST_AT_LEAST, 1)
-    return _running_median(low, frames), _running_median(high, frames)
-
-
-def _running_median(values: Float[Tensor, "t *rest"], frames: int) -> Float[Tensor, "t *rest"]:
-    windows = (values[max(0, last + 1 - frames) : last + 1] for last in range(len(values)))
-    return torch.stack([window.quantile(0.5, dim=0) for window in windows])

@@ -4,7 +4,6 @@ The backbones are torchvision's classifiers up to the last layer that LPIPS comp
 torchvision builds often conflict with the installed torch. polarnet/metrics/lpips_weights.py finds the weights.
 """
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -16,6 +15,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from polarnet.runtime.arrays import Array, as_tensor, check_floating, check_range
+from polarnet.runtime.files import sha256
 
 SHIFT = (-0.030, -0.088, -0.188)  # for RGB in [-1, 1]; SHIFT and SCALE are LPIPS v0.1's scaling layer
 SCALE = (0.458, 0.448, 0.450)
@@ -140,9 +140,7 @@ class Lpips(nn.Module):
         if not is_stored(folder, purpose, backbone):
             raise ValueError(f"{folder} has no weights of LPIPS ({backbone}) for the {purpose}; run stage `weights`")
         file = Path(folder) / f"{backbone}.safetensors"
-        with file.open("rb") as content:
-            found = hashlib.file_digest(content, "sha256").hexdigest()
-        if found != stored_record(folder, purpose)["sha256"]:
+        if sha256(file) != stored_record(folder, purpose)["sha256"]:
             raise ValueError(f"{file} is not the file that {purpose}.json describes; run stage `weights` again")
         return cls.of(backbone, load_file(file))
 

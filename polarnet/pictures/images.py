@@ -1,6 +1,5 @@
 """RGB pictures from any file that OpenImageIO reads: upright, without alpha, in sRGB, cut and scaled to one size."""
 
-import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from jaxtyping import Float, Float32, Shaped
 from torch import Tensor
 
 from polarnet.pictures.icc import srgb_from_profile
+from polarnet.runtime.files import sha256
 
 SRGB = "srgb_rec709_scene"  # OpenImageIO's name
 TAKEN_AS_SRGB = {"", SRGB, "g22_rec709_scene"}  # a PNG that says gamma 1/2.2 is how older programs wrote sRGB
@@ -72,7 +72,7 @@ class Picture:
     def sha256(self) -> str:
         """Of the upright pixels with their shape and type, whatever the file's name and format."""
         pixels = np.ascontiguousarray(self.pixels)
-        return hashlib.sha256(f"{pixels.dtype}{pixels.shape}".encode() + pixels.tobytes()).hexdigest()
+        return sha256(f"{pixels.dtype}{pixels.shape}".encode(), pixels.data)
 
 
 def picture_extensions() -> frozenset[str]:

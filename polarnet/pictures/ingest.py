@@ -38,6 +38,7 @@ from polarnet.pictures.polarimetry import (
     shrink,
     write_intensities,
 )
+from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import generator_for
 from polarnet.runtime.ranges import allowed, check_ranges
 from polarnet.stokes import parse_mosaic
@@ -242,16 +243,16 @@ def _convert_polarization(item: tuple[int, Source], config: IngestConfig, folder
     shrunk = shrink(measured, config.height, config.width)
     file = f"source-{number:08d}.npz"
     write_intensities(folder / file, shrunk)
-    sha256 = hashlib.sha256(measured.intensities.tobytes() + measured.valid.tobytes()).hexdigest()
+    digest = sha256(measured.intensities.tobytes(), measured.valid.tobytes())
     return ManifestEntry(
-        name=f"{_slug(source.stem)}-{sha256[:8]}",
+        name=f"{_slug(source.stem)}-{digest[:8]}",
         file=file,
         split="",
         source=source.kind,
         origin=source.origin,
         licence=None,
         author=None,
-        sha256=sha256,
+        sha256=digest,
         bits=16,
         height=shrunk.valid.shape[0],
         width=shrunk.valid.shape[1],
@@ -271,16 +272,16 @@ def _make_dead_leaves(number: int, config: IngestConfig, seed: int, folder: Path
     stem = f"dead-leaves-{number:04d}"
     rgb = dead_leaves(generator_for(seed, stem, "picture"), config.height, config.width)
     write_png(folder / f"{stem}.png", rgb, bits=8)
-    sha256 = hashlib.sha256(np.round(rgb * 255).astype(np.uint8).tobytes()).hexdigest()
+    digest = sha256(np.round(rgb * 255).astype(np.uint8).tobytes())
     return ManifestEntry(
-        name=f"{stem}-{sha256[:8]}",
+        name=f"{stem}-{digest[:8]}",
         file=f"{stem}.png",
         split="",
         source="dead_leaves",
         origin=f"generated from seed {seed}",
         licence="CC0-1.0",
         author="polarnet",
-        sha256=sha256,
+        sha256=digest,
         bits=8,
         height=config.height,
         width=config.width,

@@ -5,7 +5,6 @@ file of a camera with a mosaic of polarizers on its pixels (division of focal pl
 handles division-of-time captures.
 """
 
-import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from polarnet.events.stream import Events
 from polarnet.recordings.recording import Recording, read_recording
 from polarnet.recordings.registration import warp_events
 from polarnet.recordings.source import RecordingError
+from polarnet.runtime.files import sha256
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 from polarnet.storage.events import EventStore
 
@@ -122,8 +122,5 @@ def write_store(path: str | os.PathLike[str], sequences: Mapping[str, Sequence[E
 
 def _digest(channels: Sequence[Events]) -> str:
     """Digest of all columns; it keeps an interrupted store of other events from being resumed."""
-    digest = hashlib.sha256()
-    for channel in channels:
-        for column in (channel.t, channel.x, channel.y, channel.p):
-            digest.update(len(column).to_bytes(8, "little") + column.numpy().tobytes())
-    return digest.hexdigest()
+    columns = (column for channel in channels for column in (channel.t, channel.x, channel.y, channel.p))
+    return sha256(*(part for c in columns for part in (len(c).to_bytes(8, "little"), c.numpy().data)))

@@ -7,6 +7,7 @@ polarizers gives `t x y p`. # starts a comment.
 
 import os
 import stat
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -52,7 +53,8 @@ class LiveLines:
     """Read lines as they arrive, in pieces; ends with the input, or once a file has not grown for `idle_s`.
 
     Unusable lines are left out and counted in `counts`; late lines are those older than an event of an earlier piece.
-    RecordingError where more than 1 % (and 8) are of one kind, or where the first line is not a size.
+    RecordingError where more than 1 % (and 8) are of one kind, or where the first line is not a size. The source is
+    closed at its end, unless it is standard input.
     """
 
     def __init__(self, source: BinaryIO, name: str, mosaic: Mosaic | None, idle_s: float):
@@ -139,6 +141,8 @@ class LiveLines:
             return
         finally:
             os.close(descriptor)
+            if self._source is not sys.stdin.buffer:
+                self._source.close()
             self._queue.put(None)
 
     def _usable(self, table: Int64[np.ndarray, "n columns"]) -> Int64[np.ndarray, "m columns"]:

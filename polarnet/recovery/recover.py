@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import operator
+import shutil
 import statistics
 import sys
 import time
@@ -161,10 +162,10 @@ def _sequence(store: EventStore, path: Path, sequence: str | None) -> Sequence[E
 
 def _captures(folder: Path, work: Path, config: RecordingsConfig) -> Sequence[Events]:
     root = work / "targets"
-    root.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(root, ignore_errors=True)  # of a run on another folder, maybe of the same name
+    root.mkdir(parents=True)
     target = root / folder.resolve().name
-    if not target.exists():
-        target.symlink_to(folder.resolve(), target_is_directory=True)
+    target.symlink_to(folder.resolve(), target_is_directory=True)
     import_targets(root, work / "imported", config)
     calibrate_targets(work / "imported", work / "calibrated", config, {})
     return EventStore.open(work / "calibrated" / "events.zarr").read(target.name)

@@ -8,42 +8,15 @@ from typing import Any, NamedTuple
 from polarnet.methods import METHODS
 from polarnet.pictures.manifest import SPLITS
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, SetResults, read_artefacts
-from polarnet.reports.figures import PanelScene, comparison_panel, dolp_bar, training_curves
-from polarnet.reports.legend import NAMED_BY_NETWORK, Legend, glossary, legend_of, lpips_about, network_label
-from polarnet.reports.maps import (
-    encode_jpeg,
-    encode_png,
-    hue_wheel,
-)
+from polarnet.reports.figures import training_curves
+from polarnet.reports.legend import NAMED_BY_NETWORK, Legend, legend_of, network_label
+from polarnet.reports.maps import encode_jpeg
 from polarnet.reports.overview import overview_figure
 from polarnet.reports.png import png
 from polarnet.reports.provenance import Run
-from polarnet.reports.tables import (
-    COLUMNS,
-    COSTS,
-    ERROR_PARTS,
-    LABELS,
-    PAPER_COMPARABILITY,
-    PAPER_SOURCE,
-    SET_TITLES,
-    Scores,
-    paired_lines,
-    paper_table,
-    score_table,
-    standing,
-)
-from polarnet.reports.tiles import (
-    Tile,
-    TileRow,
-    chart,
-    data_uri,
-    distribution,
-    event_tiles,
-    panel_tiles,
-    polarization_tiles,
-    reliability_chart,
-    template,
-)
+from polarnet.reports.results import results_context, write_comparison
+from polarnet.reports.tables import COLUMNS, LABELS, SET_TITLES, Scores, score_table
+from polarnet.reports.tiles import Tile, TileRow, chart, data_uri, event_tiles, panel_tiles, template
 
 CARDS = {
     "psnr": "PSNR",
@@ -87,9 +60,7 @@ def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder:
     if artefacts.overview is not None:
         overview = png(overview_figure(artefacts.overview))
         (folder / "overview.png").write_bytes(overview)
-    if artefacts.panels:
-        rows = [PanelScene(panel.sequence, panel.events, panel.truth_dolp, panel.dolp) for panel in artefacts.panels]
-        comparison_panel(rows, folder / "comparison.png", legend)
+    write_comparison(folder / "comparison.png", artefacts, legend)
     page = template("page.html.jinja").render(_context(artefacts, run, overview, legend))
     path = folder / "index.html"
     path.write_text(page, encoding="utf-8")
@@ -97,34 +68,19 @@ def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder:
 
 
 def _context(artefacts: Artefacts, run: Run, overview: bytes | None, legend: Legend) -> dict[str, Any]:
-    metrics, details, manifest, labels = artefacts.metrics, artefacts.details, artefacts.manifest, legend.labels
+    manifest, context = artefacts.manifest, results_context(artefacts, legend)
     return {
-        "metrics": metrics,
-        "cards": _cards(metrics, legend),
-        "details": details,
+        **context,
+        "cards": _cards(artefacts.metrics, legend),
         "overview": None if overview is None else data_uri(overview, "png"),
         "overview_name": None if artefacts.overview is None else artefacts.overview.name,
-        "scores": score_table(metrics, labels=labels),
-        "error_parts": score_table(metrics, columns=ERROR_PARTS, labels=labels),
-        "costs": score_table(metrics, columns=COSTS, labels=labels),
-        "paired": paired_lines(details.get("paired", {}), labels=labels),
         "sets": [_set(one, legend) for one in artefacts.sets],
-        "paper_simulated": paper_table("simulated"),
-        "paper_real": paper_table("real"),
-        "paper_source": PAPER_SOURCE,
-        "comparability": PAPER_COMPARABILITY,
-        "standing": standing(metrics, labels),
-        "distribution": distribution(details["scene_means"], legend),
-        "reliability": reliability_chart(details, legend),
-        "dolp_bar": chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
-        "wheel": data_uri(encode_png(hue_wheel(192)), "png"),
-        "panels": [TileRow(panel.sequence, panel_tiles(panel, legend)) for panel in artefacts.panels]
+        "panels": context["panels"]
         + [
             TileRow(f"{SET_TITLES.get(one.name, one.name)}: {panel.sequence}", panel_tiles(panel, legend))
             for one in artefacts.sets
             for panel in one.panels
         ],
-        "polarization": [TileRow(panel.sequence, polarization_tiles(panel, legend)) for panel in artefacts.panels],
         "events": [TileRow(panel.sequence, event_tiles(panel)) for panel in artefacts.panels[:MOST_EVENT_ROWS]],
         "rates": artefacts.rates,
         "training": {
@@ -134,9 +90,7 @@ def _context(artefacts: Artefacts, run: Run, overview: bytes | None, legend: Leg
                 *(_baseline(name, history) for name, history in artefacts.baselines.items()),
             )
         },
-        "ours": labels["ours"],
-        "rows": glossary(metrics, details["weights"]),
-        "lpips_about": lpips_about(details["lpips"]),
+        "ours": legend.labels["ours"],
         "ours_has_aolp": any("ours" in panel.aolp for panel in artefacts.panels),
         "manifest": manifest,
         "source_names": SOURCE_NAMES,

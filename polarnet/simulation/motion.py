@@ -309,6 +309,14 @@ def bilinear(image: Float32[np.ndarray, "h w"], x: float, y: float) -> float:
 
 
 @no_type_check
+@numba.njit(cache=True, nogil=True, inline="always")
+def stokes_seen(stokes: Float32[np.ndarray, "3 h w"], x: float, y: float, cos: float, sin: float) -> tuple:
+    """(S0, S1, S2) at a point (x, y), by the axes of a camera rolled by a; `cos` and `sin` are those of 2 a."""
+    s1, s2 = bilinear(stokes[1], x, y), bilinear(stokes[2], x, y)
+    return bilinear(stokes[0], x, y), s1 * cos + s2 * sin, s2 * cos - s1 * sin
+
+
+@no_type_check
 @numba.njit(cache=True, nogil=True)
 def _render(stokes, x, y, angle, zoom, out) -> None:
     height, width = out.shape[2:]
@@ -319,7 +327,7 @@ def _render(stokes, x, y, angle, zoom, out) -> None:
             for column in range(width):
                 at_x = left + column * along - row * across
                 at_y = top + column * across + row * along
-                s1, s2 = bilinear(stokes[1], at_x, at_y), bilinear(stokes[2], at_x, at_y)
-                out[k, 0, row, column] = bilinear(stokes[0], at_x, at_y)
-                out[k, 1, row, column] = s1 * cos + s2 * sin
-                out[k, 2, row, column] = s2 * cos - s1 * sin
+                s0, s1, s2 = stokes_seen(stokes, at_x, at_y, cos, sin)
+                out[k, 0, row, column] = s0
+                out[k, 1, row, column] = s1
+                out[k, 2, row, column] = s2

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from polarnet.simulation.compilation import compiled, forget_stale_code
-from polarnet.simulation.motion import Pose, Trajectory, bilinear, sensor_to_scene
+from polarnet.simulation.motion import Pose, Trajectory, sensor_to_scene, stokes_seen
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_scene
 from polarnet.simulation.scene import PolarizationScene
 from polarnet.stokes import POLARIZER_ANGLES_DEG, behind_polarizer
@@ -101,10 +101,8 @@ def _render(stokes, x, y, angle, zoom, frames) -> None:  # pragma: no cover (com
             for column in range(width):
                 at_x = left + column * along - row * across
                 at_y = top + column * across + row * along
-                s0 = bilinear(stokes[0], at_x, at_y)
-                s1, s2 = bilinear(stokes[1], at_x, at_y), bilinear(stokes[2], at_x, at_y)
-                # the polarizers roll with the camera
-                for channel, part in enumerate((s1 * cos + s2 * sin, s2 * cos - s1 * sin)):
+                s0, s1, s2 = stokes_seen(stokes, at_x, at_y, cos, sin)  # the polarizers roll with the camera
+                for channel, part in enumerate((s1, s2)):
                     frames[channel, k, row, column] = max(half * (s0 + part), np.float32(0)) + rounding
                     frames[channel + 2, k, row, column] = max(half * (s0 - part), np.float32(0)) + rounding
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import hashlib
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -18,6 +17,7 @@ from polarnet import stokes
 from polarnet.pictures.images import read_rgb
 from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, listed, read_manifest
 from polarnet.pictures.polarimetry import read_intensities
+from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import generator_for, one_thread
 from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.scene import (
@@ -216,7 +216,5 @@ def _read_polarization(images: Path, picture: str) -> tuple[Float[Tensor, "3 h w
 
 def _digest(manifest: Manifest, images: Path) -> str:
     """Of all picture files."""
-    digest = hashlib.sha256()
-    for entry in manifest.pictures:
-        digest.update(entry.file.encode() + b"\0" + hashlib.sha256((images / entry.file).read_bytes()).digest())
-    return digest.hexdigest()
+    files = [entry.file for entry in manifest.pictures]
+    return sha256(*(part for name in files for part in (name.encode(), b"\0", bytes.fromhex(sha256(images / name)))))

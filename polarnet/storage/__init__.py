@@ -1,1 +1,1 @@
-"""Stores of events, frames and scenes on disk, and their exchange with other tools."""
+"""Stores of events, frames and scenes on disk, and their export for other tools."""

@@ -1,4 +1,7 @@
-"""Convert events to and from other tools' files: HDF5 in DSEC's layout, and text lines `t x y p`."""
+"""Write events as other tools' files: HDF5 in DSEC's layout, and text lines `t x y p`.
+
+`polarnet.recordings` reads both.
+"""
 
 import json
 import os
@@ -7,9 +10,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
-from polarnet.events.stream import Events, validate
+from polarnet.events.stream import Events
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore, first_at_millisecond
 
@@ -37,22 +39,6 @@ def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -
         file.attrs["height"], file.attrs["width"] = events.height, events.width
 
 
-def read_hdf5(path: str | os.PathLike[str], height: int | None = None, width: int | None = None) -> Events:
-    """Read the events of a DSEC file, at times t + t_offset; the sensor's size comes from the file where stated.
-
-    ValueError that names the file where it has no events, no size (give one; DSEC is 480x640) or broken events.
-    """
-    with _h5py().File(path, "r") as file:
-        absent = [name for name in ("events/x", "events/y", "events/t", "events/p") if name not in file]
-        if absent:
-            raise ValueError(f"{path}: expected DSEC's HDF5, there is no {', '.join(absent)}")
-        t, x, y, p = (file[f"events/{name}"][:] for name in "txyp")
-        offset_us = int(file["t_offset"][()]) if "t_offset" in file else 0
-        if "height" in file.attrs and "width" in file.attrs:
-            height, width = int(file.attrs["height"]), int(file.attrs["width"])
-    return _events(path, t.astype(np.int64) + offset_us, x, y, p, height, width)
-
-
 def write_text(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:
     """Write one channel as a line `width height`, then a line `t x y p` per event, the format of E2VID's tools.
 
@@ -64,45 +50,25 @@ def write_text(path: str | os.PathLike[str], events: Events, duration_us: int) -
         file.writelines(f"{t // 1_000_000}.{t % 1_000_000:06d} {x} {y} {int(p > 0)}\n" for t, x, y, p in rows)
 
 
-def read_text(path: str | os.PathLike[str], height: int | None = None, width: int | None = None) -> Events:
-    """Read events from lines `t x y p`, after a line `width height` or with the given size; # starts a comment.
-
-    t is in seconds where the first event's t has a decimal point, else in microseconds; p is 1 or 0, or 1 or -1.
-    ValueError that names the file where it has any other content.
-    """
-    lines = [text for line in Path(path).read_text(encoding="ascii", errors="replace").splitlines()
-             if (text := line.split("#")[0].strip())]  # fmt: skip
-    try:
-        if lines and len(lines[0].split()) == 2:
-            width, height = (int(side) for side in lines.pop(0).split())
-        table = np.loadtxt(lines, ndmin=2) if lines else np.empty((0, 4))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected lines 't x y p': {error}") from None
-    if table.shape[1] != 4:
-        raise ValueError(f"{path}: expected the four columns t x y p, got {table.shape[1]}")
-    t, x, y, p = table.T
-    unit_us = 1_000_000 if lines and "." in lines[0].split()[0] else 1
-    return _events(path, np.rint(t * unit_us).astype(np.int64), x, y, p, height, width)
-
-
 class Form(NamedTuple):
-    """Suffix, writer and reader of one file format."""
+    """Suffix and writer of one file format."""
 
     suffix: str
     write: Callable[[Path, Events, int], None]
-    read: Callable[[Path], Events]
 
 
-FORMS = {"hdf5": Form(".h5", write_hdf5, read_hdf5), "text": Form(".txt", write_text, read_text)}
+FORMS = {"hdf5": Form(".h5", write_hdf5), "text": Form(".txt", write_text)}
 
 
 def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -> None:
     """Write FOLDER/SEQUENCE/polarizer_{000,045,090,135}.{h5,txt} for every sequence, then FOLDER/store.json.
 
-    `form` is hdf5 or text. store.json holds the data that these files cannot; `import_store` reads it.
+    `form` is hdf5 or text. store.json holds the data that these files cannot: durations, sizes and attributes.
     """
     folder = Path(folder)
-    suffix, write, _ = _form(form)
+    if form not in FORMS:
+        raise ValueError(f"expected a form of {', '.join(FORMS)}, got {form!r}")
+    suffix, write = FORMS[form]
     for sequence in store.sequences:
         if Path(sequence).name != sequence:
             raise ValueError(f"{store.path}: {sequence!r} cannot be the name of a folder")
@@ -121,58 +87,8 @@ def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -
     (folder / CONTENTS).write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
 
 
-def import_store(folder: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
-    """Rebuild an event store, byte for byte, from a folder that `export_store` wrote.
-
-    Other files are recordings: `polarnet.recordings` reads, checks and repairs them.
-    """
-    folder = Path(folder)
-    try:
-        contents: dict[str, Any] = json.loads((folder / CONTENTS).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{folder}: expected a folder that export_store wrote, it has no {CONTENTS}") from None
-    suffix, _, read = _form(contents["form"])
-    durations = contents["duration_us"]
-    store = EventStore.create(path, list(durations), contents["height"], contents["width"], contents["attributes"])
-    for sequence in store.missing():
-        store.write(sequence, [read(file) for file in _files(folder / sequence, suffix)], durations[sequence])
-    store.finish()
-
-
-def _form(name: str) -> Form:
-    if name not in FORMS:
-        raise ValueError(f"expected a form of {', '.join(FORMS)}, got {name!r}")
-    return FORMS[name]
-
-
 def _files(folder: Path, suffix: str) -> list[Path]:
     return [folder / f"polarizer_{angle:03d}{suffix}" for angle in POLARIZER_ANGLES_DEG]
-
-
-def _events(
-    path: str | os.PathLike[str],
-    t_us: np.ndarray,
-    x: np.ndarray,
-    y: np.ndarray,
-    p: np.ndarray,
-    height: int | None,
-    width: int | None,
-) -> Events:
-    """Convert a file's columns to events; darker may be 0 or -1 there."""
-    if height is None or width is None:
-        raise ValueError(f"{path}: the file does not say how large the sensor is; give height and width")
-    if not (np.isin(p, (0, 1)).all() or np.isin(p, (-1, 1)).all()):
-        raise ValueError(f"{path}: expected polarities 0 and 1, or -1 and 1, got {np.unique(p)[:8].tolist()}")
-    if len(x) and not (min(x.min(), y.min()) >= 0 and x.max() < width and y.max() < height):
-        raise ValueError(f"{path}: events up to x={x.max():g}, y={y.max():g} are not on a sensor of {height}x{width}")
-    if not (np.equal(x, np.floor(x)).all() and np.equal(y, np.floor(y)).all()):
-        raise ValueError(f"{path}: expected x and y to be whole numbers")
-    columns = t_us, x.astype(np.int16), y.astype(np.int16), np.where(p > 0, 1, -1).astype(np.int8)
-    t, column, row, polarity = (torch.from_numpy(values) for values in columns)
-    try:
-        return validate(Events(t, column, row, polarity, height, width))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
 
 
 def _h5py() -> Any:

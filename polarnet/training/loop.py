@@ -18,7 +18,7 @@ from polarnet.storage.scenes import without_variants
 from polarnet.storage.windows import WindowDataset
 from polarnet.training.calibration import Scene, fitted
 from polarnet.training.losses import known_frames
-from polarnet.training.optimizers import OPTIMIZERS, Stepper
+from polarnet.training.optimizers import OPTIMIZERS
 from polarnet.training.parallel import add_up, place, wait_for_all
 from polarnet.training.recorder import Recorder
 from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, kept_in_memory, parts_of, shuffled
@@ -99,7 +99,7 @@ def train(
 
 
 def train_batch(
-    task: Task, optimizer: Stepper, batch: Batch, config: LoopConfig, device: torch.device
+    task: Task, optimizer: torch.optim.Optimizer, batch: Batch, config: LoopConfig, device: torch.device
 ) -> list[dict[str, float]]:
     """Take one optimizer step per run of `bptt_windows` windows; return the loss and its terms at each step.
 
@@ -194,7 +194,7 @@ def validate(
     return {name: value / count for name, value in zip(sums, totals, strict=True)}
 
 
-def set_learning_rate(optimizer: Stepper, config: LoopConfig, done: float) -> None:
+def set_learning_rate(optimizer: torch.optim.Optimizer, config: LoopConfig, done: float) -> None:
     """Set the learning rate for the fraction `done` of the training: peak rate times warm-up times schedule."""
     rise = min(1.0, done / config.warmup) if config.warmup else 1.0
     fall = (1 + math.cos(math.pi * done)) / 2 if config.schedule == "cosine" else 1.0

@@ -5,9 +5,10 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim import Adam, Optimizer
 
 
-class Muon:
+class Muon(Optimizer):
     """Muon for the weights of hidden layers, Adam for everything else, as recommended by Jordan et al. (2024).
 
     Muon steps along the orthogonalised momentum of the gradient, so all directions of a layer's matrix move equally;
@@ -23,21 +24,25 @@ class Muon:
         hidden = {name for name, weight in named if weight.ndim > 1 and not name.startswith(outputs)}
         self._weights = [weight for name, weight in named if name in hidden]
         self._matrices = [nn.Parameter(weight.detach().flatten(1).clone()) for weight in self._weights]
-        others = [weight for name, weight in named if name not in hidden]
+        self._others = [weight for name, weight in named if name not in hidden]
         self._muon = torch.optim.Muon(
             self._matrices, lr=learning_rate, weight_decay=0.0, adjust_lr_fn="match_rms_adamw"
         )
-        self._adam = torch.optim.Adam(others, lr=learning_rate, fused=True)
-        self.zero_grad = network.zero_grad
+        self._adam = Adam(self._others, lr=learning_rate, fused=True)
+        super().__init__([*self._matrices, *self._others], {"lr": learning_rate})
+        self._share_groups()
 
-    @property
-    def param_groups(self) -> list[dict[str, Any]]:
-        """Parameter groups of both optimizers; the loop sets their learning rate `lr`."""
-        return [*self._muon.param_groups, *self._adam.param_groups]
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Reset the gradients of the network's weights."""
+        for weight in (*self._weights, *self._others):
+            if set_to_none:
+                weight.grad = None
+            elif weight.grad is not None:
+                weight.grad.zero_()
 
     @torch.no_grad()
-    def step(self) -> None:
-        """Update the weights that have gradients."""
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
+        """Update the weights that have gradients; there is no `closure`."""
         for matrix, weight in self._pairs():
             matrix.copy_(weight.flatten(1))
             matrix.grad = None if weight.grad is None else weight.grad.flatten(1)
@@ -54,17 +59,19 @@ class Muon:
         """Restore the state of both optimizers."""
         self._muon.load_state_dict(state_dict["muon"])
         self._adam.load_state_dict(state_dict["adam"])
+        self._share_groups()
+
+    def _share_groups(self) -> None:
+        """Let a learning rate that is set here, as by torch's schedulers, hold in both optimizers."""
+        self.param_groups = [*self._muon.param_groups, *self._adam.param_groups]
 
     def _pairs(self) -> Iterator[tuple[Tensor, Tensor]]:
         return zip(self._matrices, self._weights, strict=True)
 
 
-Stepper = torch.optim.Optimizer | Muon
+def _adam(network: nn.Module, learning_rate: float) -> Optimizer:
+    return Adam(network.parameters(), lr=learning_rate, fused=True)
 
 
-def _adam(network: nn.Module, learning_rate: float) -> Stepper:
-    return torch.optim.Adam(network.parameters(), lr=learning_rate, fused=True)
-
-
-OPTIMIZERS: dict[str, Callable[[nn.Module, float], Stepper]] = {"adam": _adam, "muon": Muon}
+OPTIMIZERS: dict[str, Callable[[nn.Module, float], Optimizer]] = {"adam": _adam, "muon": Muon}
 """Functions that build an optimizer from a network and a learning rate."""

@@ -3,11 +3,9 @@
 The outputs contain no dates or durations, so equal trainings write equal bytes.
 """
 
-import hashlib
 import json
 import logging
 import math
-import os
 import shutil
 import time
 from collections import Counter
@@ -17,13 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from dvclive import Live
-from scmrepo.exceptions import SCMError
 from torch import Tensor, nn
 from tqdm import tqdm
 
 from polarnet.networks.checkpoint import save_checkpoint
-from polarnet.training.optimizers import Stepper
+from polarnet.runtime.files import replaced, sha256
 from polarnet.training.parallel import place
 from polarnet.training.sequences import Batch
 
@@ -79,7 +75,7 @@ class Recorder:
 
     def __init__(self, out: Path, resume: Path, metadata: Mapping[str, Any], keep_every_s: float = KEEP_EVERY_S):
         self.out, self.metadata, self.keep_every_s = out, dict(metadata), keep_every_s
-        key = hashlib.sha256(json.dumps(self.metadata, sort_keys=True).encode()).hexdigest()
+        key = sha256(json.dumps(self.metadata, sort_keys=True).encode())
         self.running = resume / key[:16]
         self.kept_at = time.monotonic()
         self.writes = place()[0] == 0
@@ -87,7 +83,7 @@ class Recorder:
             shutil.rmtree(out, ignore_errors=True)
             out.mkdir(parents=True)
 
-    def resume(self, network: nn.Module, optimizer: Stepper) -> Progress:
+    def resume(self, network: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
         """Restore network and optimizer from the running checkpoint, if it exists, and return the progress."""
         file = self.running / "running.pt"
         if not file.exists():
@@ -101,7 +97,9 @@ class Recorder:
             self._write(progress, network)  # __init__ emptied `out`, so the last epoch's files are written again
         return progress
 
-    def keep(self, progress: Progress, network: nn.Module, optimizer: Stepper, at_once: bool = False) -> None:
+    def keep(
+        self, progress: Progress, network: nn.Module, optimizer: torch.optim.Optimizer, at_once: bool = False
+    ) -> None:
         """Write the running checkpoint if `at_once`, or if `keep_every_s` have passed since the last one."""
         if not self.writes or (not at_once and time.monotonic() - self.kept_at < self.keep_every_s):
             return
@@ -111,8 +109,8 @@ class Recorder:
             "optimizer": optimizer.state_dict(),
             "progress": asdict(progress),
         }
-        torch.save(content, self.running / "running.pt.tmp")
-        os.replace(self.running / "running.pt.tmp", self.running / "running.pt")
+        with replaced(self.running / "running.pt") as temporary:
+            torch.save(content, temporary)
         self.kept_at = time.monotonic()
 
     def show(self, batches: Iterable[Batch], progress: Progress, visits: int, epochs: int) -> Iterator[Batch]:
@@ -169,6 +167,9 @@ def write_curves(folder: Path, history: Sequence[Mapping[str, Any]]) -> None:
     The whole history is written again each time. DVCLive's own resumption would not work, because DVC empties the
     outputs of a stage before it reruns the stage.
     """
+    from dvclive import Live  # extra `pipeline`; half a second
+    from scmrepo.exceptions import SCMError
+
     try:
         live = Live(str(folder), dvcyaml=None, save_dvc_exp=False, monitor_system=False, cache_images=False)
     except SCMError as error:  # in a git repository without a commit

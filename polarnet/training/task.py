@@ -1,6 +1,5 @@
 """The network-specific parts of a training (`Task`) and its data (`Split`)."""
 
-import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from polarnet import __version__
 from polarnet.events.representations import Encode
 from polarnet.metrics.lpips import NO_RECORD, stored_record
 from polarnet.metrics.similarity import Lpips
+from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import precision_on, seed_for
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.fly import EmulatedEvents
@@ -23,8 +23,6 @@ from polarnet.storage.scenes import SceneStore
 from polarnet.storage.windows import EventSource, WindowDataset
 from polarnet.training.losses import FrameLoss
 from polarnet.training.sequences import Batch
-
-BLOCK = 2**20  # bytes
 
 State = list[Tensor] | None
 Network = TypeVar("Network", bound=nn.Module)
@@ -149,12 +147,8 @@ def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, de
 
 def content_hash(path: str) -> str:
     """Return the sha256 of all file names and contents at `path`, or of the path string if nothing is there."""
-    digest = hashlib.sha256()
     if not Path(path).exists():
-        digest.update(path.encode())
-    for file in sorted(file for file in [Path(path), *Path(path).rglob("*")] if file.is_file()):
-        digest.update(f"{file.relative_to(path)}\0{file.stat().st_size}\0".encode())
-        with file.open("rb") as content:
-            while block := content.read(BLOCK):
-                digest.update(block)
-    return digest.hexdigest()
+        return sha256(path.encode())
+    files = sorted(file for file in [Path(path), *Path(path).rglob("*")] if file.is_file())
+    heads = (f"{file.relative_to(path)}\0{file.stat().st_size}\0".encode() for file in files)
+    return sha256(*(part for pair in zip(heads, files, strict=True) for part in pair))

@@ -140,21 +140,11 @@ def test_verify_of_something_else_says_what_was_expected(tmp_path, capsys):
     assert "there is no Zarr v3 group" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("form", ["text", "hdf5"])
-def test_export_and_import_give_the_same_store_back(store, tmp_path, form):
-    if form == "hdf5":
-        pytest.importorskip("h5py")
-    assert main(["export", str(store), str(tmp_path / "files"), "--format", form]) == 0
-    assert main(["import", str(tmp_path / "files"), str(tmp_path / "again.zarr")]) == 0
-    files = {path.relative_to(store): path.read_bytes() for path in store.rglob("*") if path.is_file()}
-    again = tmp_path / "again.zarr"
-    assert files == {path.relative_to(again): path.read_bytes() for path in again.rglob("*") if path.is_file()}
-
-
-def test_a_folder_that_is_no_project_is_refused(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("command", [["preset", "smoke"], ["run"], ["stages"], ["benchmark", "--event-budget"]])
+def test_a_command_on_a_clone_says_so_elsewhere(tmp_path, monkeypatch, capsys, command):
     monkeypatch.chdir(tmp_path)
-    assert main(["preset", "smoke"]) == 1
-    assert "run this inside a polarnet clone" in capsys.readouterr().err
+    assert main(command) == 1
+    assert "run this command inside a clone" in capsys.readouterr().err
 
 
 def test_a_run_with_another_sensor_has_a_folder_of_its_own(project_root, monkeypatch, capsys):

@@ -11,7 +11,6 @@ from polarnet.methods.complementary_filter import (
     HighPassConfig,
     at_rest,
     filter_at_rest,
-    followed_range,
     integrate,
     log_intensity_at,
     step_cf,
@@ -22,14 +21,12 @@ LN2 = math.log(2)
 HALVING_PER_MS_HZ = LN2 / (2 * math.pi * 1e-3)  # the cut-off at which log intensity halves every millisecond
 
 
-def cf_config(
-    cutoff_hz=HALVING_PER_MS_HZ, contrast_on=0.1, contrast_off=-0.1, intensity_range=(-0.1, 1.2), range_rule="fixed"
-):
-    return ComplementaryFilterConfig(cutoff_hz, contrast_on, contrast_off, list(intensity_range), range_rule)
+def cf_config(cutoff_hz=HALVING_PER_MS_HZ, contrast_on=0.1, contrast_off=-0.1, intensity_range=(-0.1, 1.2)):
+    return ComplementaryFilterConfig(cutoff_hz, contrast_on, contrast_off, list(intensity_range))
 
 
 def highpass_config(cutoff_hz=HALVING_PER_MS_HZ, decay_per_event=LN2, intensity_range=(-0.5, 1.5)):
-    return HighPassConfig(cutoff_hz, decay_per_event, 0.1, -0.1, list(intensity_range), "fixed")
+    return HighPassConfig(cutoff_hz, decay_per_event, 0.1, -0.1, list(intensity_range))
 
 
 def events_of(*rows, height=2, width=3):
@@ -51,7 +48,7 @@ def times(*t_us):
 
 def reconstructed(step, channels, t_us, config):
     """Images at rising times, each from the events before it: windows are half-open."""
-    state = filter_at_rest(len(channels), channels[0].height, channels[0].width, config)
+    state = filter_at_rest(len(channels), channels[0].height, channels[0].width)
     images, before = [], 0
     for t in t_us.tolist():
         image, state = step(state, [slice_time(events, before, t) for events in channels], t, config)
@@ -110,35 +107,11 @@ def test_intensities_outside_the_range_are_clipped():
     assert reconstruct_cf([dark], times(9), cf_config(cutoff_hz=0.0))[0, 0, 0, 0] == 0
 
 
-def test_a_range_has_followed_19_twentieths_of_a_change_after_2_s():
-    shown, image = np.array([[0.0], [2.0]]), np.array([[1.0], [3.0]])
-    np.testing.assert_array_equal(followed_range(shown, image, 0), shown)
-    once = followed_range(shown, image, 2_000_000)
-    np.testing.assert_allclose(once, [[0.95], [2.95]], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(followed_range(once, image, 2_000_000), [[0.9975], [2.9975]], rtol=0, atol=1e-12)
-
-
-def ramp(events_a_column):
-    """A row of three pixels: none, one and two times so many ON events."""
-    return events_of(*((k, x, 0, 1) for k in range(2 * events_a_column) for x in range(3) if k < x * events_a_column),
-                     height=1)  # fmt: skip
-
-
-@pytest.mark.parametrize(("rule", "kept"), [("fixed", True), ("common", True), ("per_polarizer", False)])
-def test_only_a_range_per_polarizer_loses_the_ratio_of_the_polarizers(rule, kept):
-    shown = reconstruct_cf([ramp(3), ramp(1)], times(60_000_000), cf_config(cutoff_hz=0.0, range_rule=rule))
-    assert bool(shown[0, 0, 0, 2] > shown[0, 1, 0, 2] + 0.1) == kept
-
-
-def test_an_automatic_range_shows_the_darkest_and_the_brightest_at_the_ends():
-    shown = reconstruct_cf([ramp(1)], times(60_000_000), cf_config(cutoff_hz=0.0, range_rule="common"))[0, 0, 0]
-    torch.testing.assert_close(shown[[0, 2]], torch.tensor([0.0, 1.0], dtype=torch.float64))
-    assert shown[1].item() == pytest.approx(math.expm1(0.1) / math.expm1(0.2), abs=5e-3)  # quantiles lie inside
-
-
-def test_an_image_of_one_value_has_an_automatic_range_too():
-    shown = reconstruct_cf([Events.empty(2, 3)], times(10**12), cf_config(range_rule="common"))
-    assert shown.isfinite().all()
+def test_twice_the_contrast_behind_one_polarizer_shows_as_twice_the_contrast():
+    three, six = (events_of(*((t, 0, 0, 1) for t in range(count))) for count in (3, 6))
+    shown = reconstruct_cf([three, six], times(9), cf_config(cutoff_hz=0.0))[0, :, 0, 0]
+    intensity = 1.3 * shown - 0.1
+    assert intensity.tolist() == pytest.approx([math.expm1(0.3), math.expm1(0.6)])
 
 
 def test_asking_for_more_output_times_changes_no_frame(hand_list):

@@ -177,19 +177,6 @@ def test_published_networks_are_post_processed_and_firenet_plus_sees_voxels_as_t
     assert not torch.allclose(shown, recovered(normalised, sequence.windows).intensities)
 
 
-def test_an_automatic_range_follows_the_images_from_step_to_step(sequence, make_setup):
-    setup = make_setup("firenet_published")
-    setup = dataclasses.replace(
-        setup, postprocessing=dataclasses.replace(setup.postprocessing, auto_hdr=True, auto_hdr_frames=3)
-    )
-    recoverer = METHODS["firenet_published"].open(setup)
-    together = recovered(recoverer, sequence.windows).intensities
-    state = recoverer.start(18, 20)
-    for window, expected in zip(sequence.windows, together, strict=True):
-        state, one = recoverer.step(state, [window])
-        torch.testing.assert_close(one.intensities[0], expected)
-
-
 def test_e2p_sees_the_channels_as_a_mosaic_and_carries_its_state_on(sequence, open_method, checkpoints):
     grids = encode_windows(sequence.events, sequence.t_us, lambda events, _: voxel_grid(events, 5))
     network = load_baseline(E2p, "e2p", checkpoints["e2p"])

@@ -1,11 +1,8 @@
-import dataclasses
-
 import torch
 
 from polarnet.methods.postprocessing import PostprocessingConfig, blur_kernel, postprocessed, unsharp_masked
 
-OFF = PostprocessingConfig(0.0, 1.0, False, 10, False)
-HDR = dataclasses.replace(OFF, auto_hdr=True)
+OFF = PostprocessingConfig(unsharp_amount=0.0, unsharp_sigma=1.0)
 
 
 def test_switched_off_it_only_clips():
@@ -32,22 +29,3 @@ def test_the_kernel_is_the_published_one():
     torch.testing.assert_close(kernel.sum().item(), 1.0)
     torch.testing.assert_close((kernel[2, 1] / kernel[2, 2]).item(), (near / middle) ** 0.5, atol=1e-5, rtol=0)
     torch.testing.assert_close((kernel[0, 2] / kernel[2, 2]).item(), (far / middle) ** 0.5, atol=1e-5, rtol=0)
-
-
-def test_the_automatic_range_spans_at_least_a_tenth_and_is_common_to_the_polarizers():
-    images = torch.full((1, 4, 4, 4), 0.5)
-    images[0, 0], images[0, 1, 0, 0] = 0.3, 0.8
-    found = postprocessed(images, HDR)
-    torch.testing.assert_close(found[0, 0], torch.zeros(4, 4))
-    torch.testing.assert_close(found[0, 2], torch.full((4, 4), 0.4))  # (0.5 - 0.3) / (0.8 - 0.3)
-    alone = postprocessed(images, dataclasses.replace(HDR, auto_hdr_per_polarizer=True))
-    torch.testing.assert_close(alone[0, 2], torch.full((4, 4), 0.5))  # between 0.45 and 0.55
-
-
-def test_the_automatic_range_is_a_median_over_present_and_past_frames():
-    brightest = torch.tensor([0.6, 0.9, 0.7, 1.0]).view(4, 1, 1, 1)
-    images = torch.cat([torch.zeros(4, 1, 4, 2), brightest.expand(4, 1, 4, 2)], dim=-1)
-    found = postprocessed(images, dataclasses.replace(HDR, auto_hdr_frames=3))[:, 0, 0, -1]
-    torch.testing.assert_close(found, torch.tensor([1.0, 1.0, 0.7 / 0.7, 1.0]))
-    shorter = postprocessed(images[:3], dataclasses.replace(HDR, auto_hdr_frames=3))
-    assert torch.equal(postprocessed(images, dataclasses.replace(HDR, auto_hdr_frames=3))[:3], shorter)

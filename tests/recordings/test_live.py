@@ -34,6 +34,14 @@ def test_what_is_written_as_lines_is_read_back(tmp_path, make_random_events):
     assert pieces[-1].until_us == int(times[-1]) - first
 
 
+def test_a_file_is_closed_at_its_end(tmp_path):
+    path = tmp_path / "camera.txt"
+    path.write_text("4 3\n100 1 2 0 0\n")
+    source = path.open("rb")
+    assert len(list(LiveLines(source, path.name, None, idle_s=0.0))) == 1
+    assert source.closed
+
+
 def test_commas_comments_zeros_and_a_last_line_without_an_end_are_read(tmp_path):
     _, pieces = read(tmp_path, "4 3\n# t x y p angle\n100,1,2,0,0\n150 3 0 1 135\n160 0 0 -1 90")
     events = [(int(e.t[k]), int(e.x[k]), int(e.y[k]), int(e.p[k])) for piece in pieces for e in piece.channels

@@ -9,7 +9,7 @@ import zarr
 
 from polarnet.cli import main
 from polarnet.config.tree import load
-from polarnet.events.stream import Events, slice_time
+from polarnet.events.stream import Events, slice_count, slice_time
 from polarnet.events.streaming import WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks.checkpoint import load_network, save_checkpoint
@@ -18,6 +18,7 @@ from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines
 from polarnet.recordings.recording import read_recording
+from polarnet.recovery import recover as recovery
 from polarnet.recovery.recover import Arrangement, frames_of, open_files, replay
 from polarnet.runtime import machine as runtime
 from polarnet.storage.events import EventStore
@@ -181,6 +182,31 @@ def test_a_sequence_is_replayed_as_lines_at_its_own_pace(store, channels):
     out = io.BytesIO()
     replay(EventStore.open(store), "lake", 1000.0, out.write)
     assert out.getvalue() == head + lines
+
+
+def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channels, tmp_path, monkeypatch):
+    """Import and calibration are replaced by a copy of the one file of each folder, its number of events."""
+
+    def imported(root, out, config):
+        (one,) = root.iterdir()
+        out.mkdir(exist_ok=True)
+        (out / "count").write_text((one / "events_0.bin").read_text())
+
+    def calibrated(imported, out, config, about):
+        count = int((imported / "count").read_text())
+        writer = EventStore.create(out / "events.zarr", ["target"], HEIGHT, WIDTH, {})
+        writer.write("target", [slice_count(channel, 0, count) for channel in channels], DURATION_US)
+        writer.finish()
+
+    monkeypatch.setattr(recovery, "import_targets", imported)
+    monkeypatch.setattr(recovery, "calibrate_targets", calibrated)
+    for parent, count in (("first", 10), ("second", 20), ("first", 10)):
+        folder = tmp_path / parent / "target"
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "events_0.bin").write_text(str(count))
+        arrangement = Arrangement(None, None, None)
+        source = open_files([folder], arrangement, read_recording, None, tmp_path / "work", lambda: None)
+        assert sum(len(events) for piece in source.pieces for events in piece.channels) == 4 * count
 
 
 @pytest.mark.parametrize(("arguments", "reason"), [

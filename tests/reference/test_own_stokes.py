@@ -21,9 +21,7 @@ REST = 0.25  # of full scale, behind each polarizer
 S0 = 0.8
 HEIGHT, WIDTH = 12, 16
 APPEARS_US = 100_000
-FILTER = ComplementaryFilterConfig(
-    cutoff_hz=0.0, contrast_on=C, contrast_off=-C, intensity_range=[-1.0, 1 / REST - 1], range_rule="fixed"
-)
+FILTER = ComplementaryFilterConfig(cutoff_hz=0.0, contrast_on=C, contrast_off=-C, intensity_range=[-1.0, 1 / REST - 1])
 """Shows exp(L) REST, which is the intensity itself: L is 0 at REST."""
 
 
@@ -49,7 +47,7 @@ def recovered(request, stokes) -> torch.Tensor:
     share = torch.linspace(0, 1, 31)[:, None, None, None]
     frames = 255 * (REST + share * (intensities - REST))
     events, _ = emulate(frames, torch.linspace(0, APPEARS_US, 31, dtype=torch.float64), config, key=1)
-    found, _ = step_cf(filter_at_rest(4, HEIGHT, WIDTH, FILTER), events, APPEARS_US, FILTER)
+    found, _ = step_cf(filter_at_rest(4, HEIGHT, WIDTH), events, APPEARS_US, FILTER)
     assert ((found / intensities).log().abs() < 1.01 * C).all()
     return stokes_from_intensities(found)
 

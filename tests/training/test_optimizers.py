@@ -62,6 +62,20 @@ def test_the_loop_can_set_the_rate():
 
 
 @pytest.mark.parametrize("name", sorted(OPTIMIZERS))
+def test_a_scheduler_of_torch_sets_the_rate_of_every_step_also_after_a_restart(name):
+    network = small()
+    optimizer = OPTIMIZERS[name](network, RATE)
+    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: [1.0, 0.5, 0.0][step])
+    optimizer.load_state_dict(copy.deepcopy(optimizer.state_dict()))
+    stepped(network, optimizer)
+    scheduler.step()
+    assert [group["lr"] for group in optimizer.param_groups] == [RATE / 2] * len(optimizer.param_groups)
+    assert stepped(network, optimizer)["hidden.weight"].any()
+    scheduler.step()
+    assert not any(change.any() for change in stepped(network, optimizer).values())
+
+
+@pytest.mark.parametrize("name", sorted(OPTIMIZERS))
 def test_what_an_optimizer_remembers_can_be_kept(name):
     network = small()
     optimizer = OPTIMIZERS[name](network, RATE)

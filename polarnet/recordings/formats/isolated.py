@@ -1,5 +1,6 @@
 """Run format libraries in separate processes, so that a crash on a damaged file does not end the main process."""
 
+import atexit
 import contextlib
 import importlib.util
 import os
@@ -75,7 +76,14 @@ class IsolatedLibrary:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
             )
+            atexit.unregister(self._end)
+            atexit.register(self._end)
         return self._process
+
+    def _end(self) -> None:
+        """Stop this process's own worker."""
+        if self._process is not None and self._owner == os.getpid():
+            self._stop(self._process)
 
     def _stop(self, process: "subprocess.Popen[bytes]") -> None:
         process.kill()

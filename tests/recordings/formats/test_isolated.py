@@ -1,4 +1,5 @@
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -46,6 +47,16 @@ def library(tmp_path, monkeypatch):
 def test_requests_are_answered_by_one_process_that_is_not_ours(library):
     assert library.ask(FILE, "size", 2) == 7
     assert library.ask(FILE, "process") == library.ask(FILE, "process") != os.getpid()
+
+
+def test_a_program_that_ends_leaves_no_process_and_no_pipe_open(library, project_root):
+    script = "from pathlib import Path; from polarnet.recordings.formats.isolated import IsolatedLibrary as Library; "
+    script += "library = Library('Fragile', 'numpy', 'recordings', Path('tasks.py'), ''); "
+    script += "print(library.ask(Path('file.bin'), 'size', 2))"
+    command = [sys.executable, "-X", "dev", "-c", script]
+    environment = os.environ | {"PYTHONPATH": str(project_root)}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert (done.stdout, done.stderr) == ("7\n", "")
 
 
 def test_a_crash_ends_in_a_reason_and_the_next_request_in_a_new_process(library):

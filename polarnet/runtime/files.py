@@ -1,0 +1,32 @@
+"""The hash of contents, and files that are written whole or not at all."""
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+def sha256(*parts: bytes | memoryview | Path) -> str:
+    """Hexadecimal SHA-256 of the parts one after another; a path stands for the content of its file."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Path):
+            with part.open("rb") as file:
+                hashlib.file_digest(file, lambda: digest)
+        else:
+            digest.update(part)
+    return digest.hexdigest()
+
+
+@contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """PATH.tmp for the new content of a file; it becomes `path` once the block ends.
+
+    After an error, `path` is as it was and PATH.tmp is gone.
+    """
+    temporary = path.with_name(f"{path.name}.tmp")
+    try:
+        yield temporary
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

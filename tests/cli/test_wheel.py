@@ -1,0 +1,71 @@
+"""The wheel holds the package alone, with the settings of the repository."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+
+import pytest
+
+SOURCES = ("polarnet", "stages", "studies", "conf", "params.yaml", "pyproject.toml", "setup.py", "MANIFEST.in",
+           "README.md", "LICENSE")  # fmt: skip
+BUILD = "import setuptools.build_meta as backend; backend.build_{kind}({folder!r})"  # what pip calls
+
+
+@pytest.fixture(scope="module")
+def distributions(project_root, tmp_path_factory):
+    """The source distribution, and the wheel that is built from it."""
+    root = tmp_path_factory.mktemp("distributions")
+    clone = root / "clone"
+    clone.mkdir()
+    for name in SOURCES:
+        if (project_root / name).is_dir():
+            shutil.copytree(project_root / name, clone / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(project_root / name, clone / name)
+    sdist = built(clone, "sdist", root)
+    with tarfile.open(sdist) as archive:
+        archive.extractall(root, filter="data")
+    return sdist, built(root / sdist.name.removesuffix(".tar.gz"), "wheel", root)
+
+
+def built(source, kind, folder):
+    before = set(folder.iterdir())
+    command = [sys.executable, "-c", BUILD.format(kind=kind, folder=str(folder))]
+    subprocess.run(command, cwd=source, check=True, capture_output=True, env=os.environ | {"PYTHONPATH": ""})
+    (made,) = set(folder.iterdir()) - before
+    return made
+
+
+def test_the_wheel_holds_the_package_alone_with_the_settings(distributions, project_root):
+    with zipfile.ZipFile(distributions[1]) as wheel:
+        names = {name for name in wheel.namelist() if ".dist-info/" not in name}
+        settings = {name.removeprefix("polarnet/config/settings/"): wheel.read(name) for name in names
+                    if name.startswith("polarnet/config/settings/")}  # fmt: skip
+    modules = {str(path.relative_to(project_root)) for path in (project_root / "polarnet").rglob("*.py")}
+    assert {name for name in names if name.endswith(".py")} == modules
+    assert {name.split("/")[0] for name in names} == {"polarnet"}
+    assert {"polarnet/networks/weights/polarnet.safetensors", "polarnet/reports/page.html.jinja"} <= names
+    expected = [project_root / "params.yaml", *(project_root / "conf").rglob("*.yaml")]
+    assert settings == {str(path.relative_to(project_root)): path.read_bytes() for path in expected}
+
+
+def test_a_wheel_reads_its_own_settings_outside_a_clone_and_those_of_the_clone_inside(
+    distributions, project_root, tmp_path
+):
+    with zipfile.ZipFile(distributions[1]) as wheel:
+        wheel.extractall(tmp_path / "installed")
+    (tmp_path / "empty").mkdir()
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "installed")}
+
+    def printed(script, folder):
+        command = [sys.executable, "-c", f"from polarnet.cli.project import settings_root; {script}"]
+        return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True).stdout
+
+    assert printed("print(settings_root())", project_root / "tests").strip() == str(project_root)
+    load = "from polarnet.config.tree import load; print(load(settings_root(), ['seed=7', 'experiment=smoke']).seed)"
+    assert printed(f"print(settings_root()); {load}", tmp_path / "empty").split() == [
+        str(tmp_path / "installed" / "polarnet" / "config" / "settings"), "7",
+    ]  # fmt: skip
