@@ -107,7 +107,17 @@ def measure_one(name: str, threads: int, repeats: int) -> dict[str, Any]:
 
 def in_own_process(name: str, threads: int, repeats: int) -> dict[str, Any]:
     """`measure_one` in a new process of this script."""
-    command = [sys.executable, __file__, "--one", name, "--threads", str(threads), "--repeats", str(repeats)]
+    command = [
+        sys.executable,
+        "-m",
+        "studies.emulation",
+        "--one",
+        name,
+        "--threads",
+        str(threads),
+        "--repeats",
+        str(repeats),
+    ]
     environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout)

@@ -79,7 +79,7 @@ def fuzz(form: str, cases: int, state: str) -> dict[str, Any]:
     found = json.loads(kept.read_text()) if kept.exists() else {}
     if found.get("state") != state or found["cases"] > cases or found["cases"] % BATCH:
         found = {"state": state, "batches": 0, "cases": 0, "seconds": 0.0, "endings": {}}
-    command = [sys.executable, __file__, "--one", form, str(found["batches"]), str(cases)]
+    command = [sys.executable, "-m", "studies.fuzz_recordings", "--one", form, str(found["batches"]), str(cases)]
     start, before_s = time.monotonic(), found["seconds"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

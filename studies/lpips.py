@@ -96,7 +96,11 @@ def training(config: Config, lpips: Lpips | None, windows: int, device: torch.de
     events: Tensor = torch.randn(*frames[:2], 4 * channels_of(task.encode), *frames[2:])
     names = [str(number) for number in range(config.train.batch_size)]
     batch = Batch(names, events, torch.rand(frames), torch.rand(frames), torch.rand(*frames[:2], 0, *frames[2:]))
-    return lambda: train_batch(task, optimizer, batch, config.train, device) and None
+
+    def run() -> None:
+        train_batch(task, optimizer, batch, config.train, device)
+
+    return run
 
 
 def milliseconds(runs: Mapping[str, Callable[[], None]], rounds: int, device: torch.device) -> dict[str, float]:

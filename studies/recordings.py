@@ -66,12 +66,19 @@ def write_lines(path: Path, count: int) -> None:
             file.write(lines_of(part.T, " "))
 
 
+def events_of(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> Events:
+    """Events of one channel from columns of any integer type; `p` is 0 or 1."""
+    types = (np.int64, np.int16, np.int16, np.int8)
+    t_us, column, row, polarity = (
+        torch.from_numpy(values.astype(kind)) for values, kind in zip((t, x, y, 2 * p - 1), types, strict=True)
+    )
+    return Events(t_us, column, row, polarity, HEIGHT, WIDTH)
+
+
 def write_bin(event_format: int) -> Callable[[Path, int], None]:
     def write(path: Path, count: int) -> None:
         t, x, y, p = next(parts(count))
-        short = (torch.from_numpy(column.astype(np.int16)) for column in (x, y))
-        events = Events(torch.from_numpy(t), *short, torch.from_numpy((2 * p - 1).astype(np.int8)), HEIGHT, WIDTH)
-        write_celex5_bin(path, events, event_format)
+        write_celex5_bin(path, events_of(t, x, y, p), event_format)
         content = path.read_bytes()
         with path.open("ab") as file:
             for _ in range(PART, count, PART):
@@ -136,9 +143,7 @@ def write_aedat2(path: Path, count: int) -> None:
 
 def write_store(path: Path, count: int) -> None:
     t, x, y, p = np.concatenate(list(parts(count)), axis=1)
-    types = (np.int64, np.int16, np.int16, np.int8)
-    columns = (torch.from_numpy(v.astype(d)) for v, d in zip((t, x, y, 2 * p - 1), types, strict=True))
-    events = Events(*columns, HEIGHT, WIDTH)
+    events = events_of(t, x, y, p)
     store = EventStore.create(path, ["random"], HEIGHT, WIDTH, {})
     nothing = Events.empty(HEIGHT, WIDTH)
     store.write("random", [events, nothing, nothing, nothing], int(t[-1]) + 1)
@@ -265,7 +270,17 @@ def peak_mib() -> float:
 
 
 def in_own_process(reader: str, path: Path, small: Path, repeats: int) -> dict[str, float]:
-    command = [sys.executable, __file__, "--one", reader, str(path), str(small), "--repeats", str(repeats)]
+    command = [
+        sys.executable,
+        "-m",
+        "studies.recordings",
+        "--one",
+        reader,
+        str(path),
+        str(small),
+        "--repeats",
+        str(repeats),
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"{reader} on {path.name}: {done.stderr[-2000:]}")
@@ -281,7 +296,7 @@ def measure(name: str, sizes: list[int], repeats: int) -> dict[str, dict[str, An
             path, small = Path(folder) / f"large.{name}", Path(folder) / f"small.{name}"
             FILES[name](path, size)
             FILES[name](small, SMALL)
-            held = size
+            held: float = size
             for reader in ["own", *(libraries if size == sizes[0] else [])]:
                 one = in_own_process(reader, path, small, repeats if size == sizes[0] else 1)
                 held = one["events"] if reader == "own" else held

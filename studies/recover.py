@@ -25,7 +25,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import torch
 from skimage import data
@@ -109,7 +109,7 @@ def measured_live(store: Path, recoverer: Recoverer, out: Path) -> Summary:
     command = [sys.executable, "-m", "polarnet.cli", "replay", str(store), "stream"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as camera:
         assert camera.stdout is not None
-        lines = LiveLines(camera.stdout, "pipe", None, idle_s=0.0)
+        lines = LiveLines(cast(BinaryIO, camera.stdout), "pipe", None, idle_s=0.0)
         source = Input("pipe", lines.height, lines.width, lines, None)
         return recover(source, WINDOWS, recoverer, RecoveryWriter(out, ("zarr", "mp4"), 30.0))
 

@@ -28,7 +28,7 @@ from skimage import data
 
 from polarnet.benchmark.rows import available
 from polarnet.benchmark.run import run_benchmark
-from polarnet.benchmark.score import summary
+from polarnet.benchmark.score import FrameScore, summary
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig, read_event_capture
 from polarnet.captures.imported import import_targets, shifted
 from polarnet.captures.targets import Calibrated, calibrate_targets, spread_us
@@ -53,7 +53,7 @@ from studies.simulation_pictures import few_colours
 
 ROOT = Path(__file__).resolve().parents[1]
 PHOTOGRAPHS = (data.coffee, data.chelsea, data.astronaut, data.rocket)
-QUARTER = {"sensor": [200, 320], "region": [45, 2], "crop": [120, 180], "size": [30, 45]}
+QUARTER: dict[str, Any] = {"sensor": [200, 320], "region": [45, 2], "crop": [120, 180], "size": [30, 45]}
 RIG = RigConfig(
     speed_px_s=100.0,
     longest_delay_s=0.35,
@@ -129,13 +129,14 @@ def benchmarked(folder: Path, names: list[str], config: Config) -> dict[str, dic
     context = context_of(config, train_mean=None)
     methods, absent = available(config.benchmark.methods, context)
     benchmark = replace(config.benchmark, methods=methods, panel_scenes=0)
-    rows, costs = [], {}
+    rows: list[FrameScore] = []
+    costs: dict[str, dict[str, Any]] = {}
     for name in names:
         one = run_benchmark(made_set(name, folder / name), context, benchmark, None, folder / "cache")
         rows += one.rows
         costs = {method: asdict(cost) for method, cost in one.costs.items()}
     scores = {m: {**s, **costs[m]} for m, s in summary(rows, benchmark.bootstrap_samples, config.seed).items()}
-    print(as_plain(score_table(scores, "not loaded here")))
+    print(as_plain(score_table(scores)))
     for method, reason in absent.items():
         print(f"{method} is left out: {reason}")
     return {method: {key: scores[method].get(key) for key in BENCHMARK_KEYS} for method in scores}

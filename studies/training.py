@@ -85,7 +85,8 @@ def measure_one(name: str, setting: str, threads: int, device_name: str) -> dict
     network, channels = network_of(name, setting, device)
     windows = torch.randn(RUN, BATCH, channels, HEIGHT, WIDTH, device=device)
     stream = torch.randn(STREAMED, 1, channels, HEIGHT, WIDTH, device=device)
-    unroll = torch.compile(network.unroll) if setting == "compiled" else network.unroll
+    steps: Any = network  # every network has `unroll`, which nn.Module does not declare
+    unroll = torch.compile(steps.unroll) if setting == "compiled" else steps.unroll
 
     def train() -> None:
         network.zero_grad()
@@ -119,7 +120,7 @@ def measure_one(name: str, setting: str, threads: int, device_name: str) -> dict
     return figures
 
 
-def seconds_of(run: Callable[[], None], device: torch.device) -> float:
+def seconds_of(run: Callable[[], object], device: torch.device) -> float:
     """Median of the repeats, the first call left out."""
     seconds = []
     for _ in range(1 + REPEATS):
@@ -153,7 +154,18 @@ def peak_gflop_per_s(precision: str, device: torch.device) -> float:
 
 def in_own_process(name: str, setting: str, threads: int, device: str) -> dict[str, Any]:
     """`measure_one` in a new process of this script."""
-    command = [sys.executable, __file__, "--one", name, setting, "--threads", str(threads), "--device", device]
+    command = [
+        sys.executable,
+        "-m",
+        "studies.training",
+        "--one",
+        name,
+        setting,
+        "--threads",
+        str(threads),
+        "--device",
+        device,
+    ]
     return json.loads(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.splitlines()[-1])
 
 
@@ -210,7 +222,8 @@ def main() -> None:
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.one:
-        print(json.dumps(measure_one(*arguments.one, arguments.threads, arguments.device)))
+        name, setting = arguments.one
+        print(json.dumps(measure_one(name, setting, arguments.threads, arguments.device)))
         return
     if arguments.write and (changed := uncommitted(ROOT)):
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
