@@ -36,6 +36,8 @@ def score_columns(keys: Iterable[str] = ABLATION_KEYS, path: str = "{}", prefix:
     return {f"{prefix}{c.heading}": f"{{{path.format(key)}:.{c.decimals}f}}" for key, c in known.items()}
 
 
+RENAMED_ABLATIONS = {"mosaic": "panorama"}
+"""Files of conf/ablation that had another name when docs/results/network.json was measured."""
 SETS = {"simulated": "new photographs", "measured": "measured scenes"}
 BENCHMARK_COLUMNS = {**COLUMNS, **COSTS}
 
@@ -129,7 +131,8 @@ def _expected_error_rows(results: Results) -> Iterator[Row]:
 def _ablation_rows(results: Results) -> list[Row]:
     rows = results["ablation"]["rows"]
     order = sorted(rows, key=lambda name: (name != "nothing", -rows[name]["mse"]))
-    return [{**rows[name], "name": name, "about": ablation_about(ROOT, name)} for name in order]
+    names = {name: RENAMED_ABLATIONS.get(name, name) for name in order}
+    return [{**rows[old], "name": name, "about": ablation_about(ROOT, name)} for old, name in names.items()]
 
 
 def _design_rows(results: Results) -> Iterator[Row]:

@@ -75,7 +75,8 @@ def make_folder_set(root: Path, kind: str, folder: Path, recipe: Recipe, mapper:
     none can be used.
     """
     if not root.is_dir():
-        raise ValueError(f"{root}: expected a folder of photographs or of measured polarization, it is none")
+        actual = "a file" if root.exists() else "no such folder"
+        raise ValueError(f"{root}: expected a folder of photographs or of measured polarization, got {actual}")
     source = "polarization" if (kind if kind != "auto" else kind_of(root)) == "polarization" else "folder"
     chosen = dataclasses.replace(
         recipe.ingest, source=source, root=str(root), limit=None, val_fraction=0.0, test_fraction=1.0

@@ -18,7 +18,7 @@ from torch import Tensor
 from polarnet import stokes
 from polarnet.runtime.ranges import allowed, check_ranges
 
-GREATEST_DOLP = 0.99
+MAX_DOLP = 0.99
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def varied(
     aolp = torch.remainder(direction * aolp + turn, math.pi)
     aolp = torch.where(aolp >= math.pi, 0.0, aolp)  # what is just below 0 rounds up
     if generator.random() < config.share:
-        dolp = _graded(dolp, config.dolp_factor, config.dolp_exponent_spread, generator).clamp(max=GREATEST_DOLP)
+        dolp = _graded(dolp, config.dolp_factor, config.dolp_exponent_spread, generator).clamp(max=MAX_DOLP)
     if generator.random() < config.share:
         s0 = _graded(s0, config.s0_factor, config.s0_exponent_spread, generator)
     if generator.random() < config.uniform_share:
@@ -71,11 +71,11 @@ def _evened(
     """DoLP and AoLP of a mean of the scene's own S1 / S0, S2 / S0 and a constant."""
     lightest, heaviest = weight
     share = generator.uniform(lightest, heaviest)
-    degree, angle = generator.uniform(0, GREATEST_DOLP), generator.uniform(0, math.pi)
+    degree, angle = generator.uniform(0, MAX_DOLP), generator.uniform(0, math.pi)
     mean = stokes.stokes_from_polarization(torch.ones_like(dolp), (1 - share) * dolp, aolp)
     mean[1] += share * degree * math.cos(2 * angle)
     mean[2] += share * degree * math.sin(2 * angle)
-    return stokes.dolp(mean).clamp(max=GREATEST_DOLP), stokes.aolp(mean)
+    return stokes.dolp(mean).clamp(max=MAX_DOLP), stokes.aolp(mean)
 
 
 def _graded(values: Tensor, factor: list[float], spread: float, generator: np.random.Generator) -> Tensor:
