@@ -124,7 +124,7 @@ def in_own_process(name: str, threads: int, repeats: int) -> dict[str, Any]:
 
 
 def figures_of(name: str, processes: dict[int, list[dict[str, Any]]]) -> dict[str, Any]:
-    """What goes into the results of one model, from all its processes by their number of threads."""
+    """Figures of one model, from its processes by their number of threads."""
     medians = {t: float(np.median(np.concatenate([one["seconds"] for one in ones]))) for t, ones in processes.items()}
     one, steps = processes[1][0], DURATION_US * 1e-6 * float(MODELS[name].render_rate_hz or 0)
     return {
@@ -184,7 +184,7 @@ def measure_timing() -> dict[str, dict[str, float]]:
 
 
 def golden_cases_passed() -> int:
-    """Of 15 v2e and 8 ESIM cases."""
+    """Number of reference cases met, out of 15 of v2e and 8 of ESIM."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "golden.xml"
         tests = ROOT / "tests" / "reference" / "test_golden.py"

@@ -1,4 +1,4 @@
-"""What LPIPS costs, and how exact it is: python -m studies.lpips [--squeeze FILE] [--rounds N] [--write]
+"""Cost and accuracy of LPIPS: python -m studies.lpips [--squeeze FILE] [--rounds N] [--write]
 
 - Errors: the largest difference from the values in tests/golden/lpips.json, by the programs that the weights come from.
 - Scoring: milliseconds for one frame of one method, 120 x 180 pixels, in float32 as the benchmark scores; the truth's

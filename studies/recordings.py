@@ -246,7 +246,7 @@ LIBRARIES: dict[str, tuple[Callable[[Path], int], tuple[str, ...]]] = {
     "dv_processing": (read_dv_processing, ("aedat4",)),
     "numpy": (read_numpy, ("text",)),
 }
-"""What reads the formats it knows."""
+"""Readers of a library and the formats that it supports."""
 
 
 def measure_one(reader: str, path: Path, small: Path, repeats: int) -> dict[str, float]:
@@ -263,7 +263,7 @@ def measure_one(reader: str, path: Path, small: Path, repeats: int) -> dict[str,
 
 
 def peak_mib() -> float:
-    """Of this process and of those it started."""
+    """Peak memory in MiB of this process and its children."""
     own = psutil.Process()
     marks = [Path(f"/proc/{process.pid}/status").read_text() for process in (own, *own.children(recursive=True))]
     return sum(int(line.split()[1]) for mark in marks for line in mark.splitlines() if line.startswith("VmHWM")) / 1024

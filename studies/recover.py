@@ -115,7 +115,7 @@ def measured_live(store: Path, recoverer: Recoverer, out: Path) -> Summary:
 
 
 def figures_of(summary: Summary, step_ms: float) -> dict[str, float]:
-    """What is reported of a run, and of a step when windows come one by one."""
+    """Figures of a run, and of a step whose windows arrive one by one."""
     return {"realtime_factor": round(summary.realtime_factor, 3), "latency_ms": round(step_ms, 2)}
 
 
@@ -123,10 +123,12 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
-    parser.add_argument("--weights", type=Path, help="of the network")
-    parser.add_argument("--precision", choices=("auto", "fp32", "bf16"), default="auto", help="of the network")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of the stream")
-    parser.add_argument("--picture", type=Path, help="where to copy the pictures of a run")
+    parser.add_argument("--weights", type=Path, help="checkpoint of the network")
+    parser.add_argument(
+        "--precision", choices=("auto", "fp32", "bf16"), default="auto", help="number format of the network"
+    )
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of the stream in seconds")
+    parser.add_argument("--picture", type=Path, help="file for the pictures of a run")
     arguments = parser.parse_args()
     if arguments.write and (changed := uncommitted(ROOT)):
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")

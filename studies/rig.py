@@ -185,11 +185,15 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
-    parser.add_argument("--targets", type=int, default=8, help="of eight captures each")
+    parser.add_argument("--targets", type=int, default=8, help="number of targets, with eight captures each")
     parser.add_argument("--full", action="store_true", help="the whole sensor")
-    parser.add_argument("--cutoff-hz", type=float, default=3000.0, help="of the photoreceptor; a slow one adds a delay")
-    parser.add_argument("--data", type=Path, default=ROOT / "data", help="where trained networks are looked for")
-    parser.add_argument("--pictures", type=Path, default=ROOT / "outputs" / "rig", help="where diagnoses are drawn")
+    parser.add_argument(
+        "--cutoff-hz", type=float, default=3000.0, help="cutoff of the photoreceptor; a low one adds a delay"
+    )
+    parser.add_argument("--data", type=Path, default=ROOT / "data", help="data folder with trained networks")
+    parser.add_argument(
+        "--pictures", type=Path, default=ROOT / "outputs" / "rig", help="folder for diagnostic pictures"
+    )
     parser.add_argument("--docs", action="store_true", help="only draw the pictures of the pages on recordings")
     arguments = parser.parse_args()
     if arguments.write and (changed := uncommitted(ROOT)):

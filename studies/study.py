@@ -88,7 +88,7 @@ def stand_in(arguments: argparse.Namespace) -> Path:
 
 
 def headlines(tables: dict[str, dict[str, dict[str, Any]]]) -> dict[str, Any]:
-    """What the tables say of the two DoLP networks."""
+    """Comparisons of the two DoLP networks, from the tables."""
     simulated, measured = tables["simulated"], tables["measured"]
     best = measured[best_reconstruction(measured)]["mse"]
     return {
@@ -123,10 +123,12 @@ def parsed() -> argparse.Namespace:
         metavar="ROW=FILE",
         help=f"published weights of {' or '.join(PUBLISHED)}; a row without them is left out",
     )
-    parser.add_argument("--override", action="append", default=[], metavar="ROW:KEY=VALUE", help="of a row's training")
+    parser.add_argument(
+        "--override", action="append", default=[], metavar="ROW:KEY=VALUE", help="value for the training of one row"
+    )
     parser.add_argument("--only", choices=tuple(TRAININGS), help="train this one and stop")
     parser.add_argument("--rows", nargs="+", choices=tuple(TRAININGS), default=[*TRAININGS], help="to train and score")
-    parser.add_argument("--seed", type=int, default=1, help="of the trainings; the data are the same for all")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the trainings; all seeds share the data")
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     parser.add_argument("--workers", type=int, default=1, help="processes that share the benchmark's sequences")
     parser.add_argument("--write", action="store_true", help="write docs/results")

@@ -70,7 +70,7 @@ def network_of(name: str, setting: str, device: torch.device) -> tuple[nn.Module
 
 
 def loss_of(prediction: Prediction) -> Tensor:
-    """A number that every output takes part in."""
+    """A loss that depends on every output."""
     return torch.stack([output.square().mean() for output in prediction if output is not None]).sum()
 
 
@@ -146,7 +146,7 @@ def profile_of(run: Callable[[], None]) -> dict[str, float]:
 
 
 def peak_gflop_per_s(precision: str, device: torch.device) -> float:
-    """What a product of large matrices of a precision reaches here."""
+    """Rate of a product of large matrices in this precision, in GFLOP/s."""
     dtype = torch.bfloat16 if precision == "bf16" else torch.float32
     a, b = torch.randn(2, MATRIX, MATRIX, dtype=dtype, device=device)
     return 2 * MATRIX**3 / seconds_of(lambda: torch.mm(a, b), device) / 1e9

@@ -36,6 +36,6 @@ def _onnx(options: argparse.Namespace) -> int:
     worst = max(differences, key=differences.__getitem__)
     print(f"{weights} -> {options.file}, {options.file.stat().st_size / 1e6:.1f} MB")
     print(
-        f"ONNX Runtime's outputs differ from torch's by at most {differences[worst]:.1e} ({worst}; allowed: {TOLERANCE:g})"
+        f"ONNX Runtime's outputs differ from torch's by up to {differences[worst]:.1e} ({worst}; limit {TOLERANCE:g})"
     )
     return 0

@@ -153,7 +153,7 @@ def emulate_columns(
     labels: bool = False,
     unrounded_times: bool = False,
 ) -> tuple[list[Columns], SensorState]:
-    """As `emulate`, in numpy columns, with each event's process (`labels`) and time before rounding (`unrounded_times`)."""
+    """As `emulate`, in numpy columns; optionally with each event's process (`labels`) and `unrounded_times`."""
     frames = as_tensor("frames", frames).detach().cpu()
     check_shape("frames", frames, "... channels height width")
     channels = tuple(range(frames.shape[-3])) if channels is None else tuple(channels)

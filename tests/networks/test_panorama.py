@@ -18,7 +18,7 @@ def scene(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
 
 
 def views(places: list[tuple[float, float]]) -> torch.Tensor:
-    """What a sensor sees whose first pixel lies at these (x, y): [n, 4, h, w]."""
+    """Images [n, 4, h, w] of a sensor whose first pixel lies at these (x, y)."""
     rows, columns = torch.arange(HEIGHT).view(-1, 1), torch.arange(WIDTH)
     return torch.stack([scene(columns + x, rows + y) for x, y in places])
 

@@ -1,4 +1,4 @@
-"""What every pixel model promises: hand-worked ramps, equal bytes however work is cut, errors that say what to do."""
+"""Properties of every pixel model: hand-worked ramps, equal bytes for any split of the work, clear errors."""
 
 import dataclasses
 import math

@@ -17,7 +17,7 @@ SIDE = 50
 
 
 def drift_and_noise(camera: str, before: float, after: float, dt_us: float) -> tuple[float, float]:
-    """Of the voltage, in thresholds per microsecond and per its square root (the paper's Eq. 10)."""
+    """Drift and diffusion of the voltage, in thresholds per us and per sqrt(us) (the paper's Eq. 10)."""
     k1, k2, k3, k4, k5, k6 = CAMERAS[camera]
     mean = (before + after) / 2
     drift = k1 * (after - before) / dt_us / (mean + k2) + k4 + k5 * mean

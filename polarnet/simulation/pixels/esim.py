@@ -20,16 +20,16 @@ from polarnet.simulation.pixels.physics import PixelConfig
 from polarnet.simulation.pixels.strips import rows_of_strip
 
 EIGHT_BIT_VIDEO = False
-NO_CHANGE = 1e-6  # log intensity: the CPU variant takes a smaller change for rest
+NO_CHANGE = 1e-6  # log intensity; the CPU variant ignores smaller changes
 NEARLY = np.float32(0.99999)  # narrows a first look at thresholds by more than rounding
 
 
 @dataclass(frozen=True)
 class EsimConfig(PixelConfig):
-    """Parameters of ESIM's pixel; of the inherited ones it has thresholds and refractory period alone."""
+    """Parameters of ESIM's pixel; ESIM uses only thresholds and refractory period of the inherited ones."""
 
     esim_log_eps: float = field(metadata=allowed(above=0))
-    """Added to intensity in [0, 1] before its logarithm is taken."""
+    """Constant added to the intensity in [0, 1] before the logarithm."""
 
 
 class Physics(NamedTuple):

@@ -30,7 +30,7 @@ class Pending(NamedTuple):
 
 @compiled
 def pending_events(capacity, unrounded_times):
-    """Room for `capacity` events."""
+    """Empty room for `capacity` events."""
     return Pending(
         np.empty(capacity, np.int64), np.empty(capacity if unrounded_times else 0), np.empty(capacity, np.int64)
     )
