@@ -435,12 +435,12 @@ BLOCKS = {
         _overrides("loss_weights"),
     ),
     "house": Block(
-        "house", "house", "studies.house",
+        "house", "house", "studies.house --write",
         lambda results: [{"about": about, "value": results["house"][key]} for key, about in HOUSE_FIGURES.items()],
         {"figure": "{about}", "value": "{value:,}"},
     ),
     "house-folders": Block(
-        "house", "house", "studies.house",
+        "house", "house", "studies.house --write",
         lambda results: [{"name": name, **one} for name, one in results["house"]["folders"].items()],
         {"folder": "`{name}`", "files": "{files:,}", "lines": "{lines:,}"}, caption="",
     ),

@@ -1,15 +1,15 @@
-"""How fast recordings are read, and in how much memory: python -m studies.recordings [--write] [--full]
+"""Speed and memory of the readers of recordings: python -m studies.recordings [--write] [--full]
 
-For each format and size, a file of random events of a 1280 x 720 sensor (CeleX-5: 1280 x 800, AEDAT-2: 346 x 260), 1 M
-a second, is written to a temporary folder and read by polarnet in chunks, and by each library that is installed (faery;
-`pip install eventcv expelliarmus aedat dv-processing`) whole or in packets, as it does. Every reader is a process of
-its own, whose kernels are compiled. Seconds are the shortest of the repeats, from opening to the last chunk; the file
-is in the disk cache. Memory is the most that the process and those it started held, added up, less what they held when
-they had read a small file (Linux: high-water marks of resident memory).
+For each format and size, the study writes a file of random events, 1 M a second, of a 1280 x 720 sensor (CeleX-5:
+1280 x 800, AEDAT-2: 346 x 260) to a temporary folder. polarnet reads it in chunks; every installed library (faery;
+`pip install eventcv expelliarmus aedat dv-processing`) reads it whole or in packets, as its interface does. Every reader
+runs in its own process with compiled kernels. Times are the shortest of the repeats, from opening to the last chunk,
+with the file in the disk cache. Memory is the peak of the process and its children, minus their memory after reading a
+small file (Linux: high-water marks of resident memory).
 
-Sizes are 1 M and 10 M events, with --full 100 M too (3 GB of disk; a store is written whole, so 8 GB of memory). Speed
-is that of the smallest. `--write` puts `readers.NAME.mevents_per_s` and `readers.NAME.peak_mib` of each size into
-docs/results/recordings.json; formats left out of this run keep their figures, with the commit they were measured at.
+Sizes are 1 M and 10 M events, and 100 M with --full (3 GB of disk; a store is written whole and needs 8 GB of memory).
+The speed is that of the smallest size. `--write` puts `readers.NAME.mevents_per_s` and `readers.NAME.peak_mib` into
+docs/results/recordings.json; formats that did not run keep their figures and the commit of these figures.
 """
 
 import argparse

@@ -1,15 +1,11 @@
-"""How well a simulated rig is calibrated: python -m studies.rig [--write] [--targets N] [--full]
+"""Accuracy of the calibration of a simulated rig: python -m studies.rig [--write] [--targets N] [--full]
 
-Each target is another picture: photographs of scikit-image and dead leaves. Its eight captures, written as CeleX-5
-files with random delays, sensor noise and hot pixels, are imported and calibrated as the stages do it. Printed: errors
-of start times by the landmark (in pictures of the camera) and refined (in milliseconds, but for what all eight have in
-common, as the zero of their clock is a convention; that is `clock_zero_ms_max`), the root mean square difference of the
-DoLP from the scene's own, thresholds, and the benchmark's table, with the networks that `--data` has in train and
-train_e2v.
-
-The sensor is a quarter of a CeleX-5 in each direction (200 x 320, pictures of 30 x 45), with --full all of it (800 x
-1280, pictures of 120 x 180). `--write` merges the figures into docs/results/recordings.json as section `rig`, or
-`rig_full`. `--docs` draws the pictures of docs/recordings.md and docs/recordings-dot.md instead.
+Each target is another picture: photographs of scikit-image and dead leaves. Its eight captures are written as CeleX-5
+files with random delays, sensor noise and hot pixels, and then imported and calibrated as in the stages. The study
+prints errors of the start times from the landmark (in camera frames) and refined (in ms). The refined errors exclude the
+part common to all eight captures, because the zero of their clock is a convention; `clock_zero_ms_max` is that part. It
+also prints the RMS difference between the DoLP and the scene's own, the thresholds, and the benchmark's table, with the
+networks that `--data` has in train and train_e2v.
 """
 
 import argparse

@@ -1,18 +1,19 @@
-"""Every network trained on the same photographs, then every method on held-out photographs and on measured scenes.
+"""Train every network on the same photographs, and score every method on held-out and on measured scenes.
 
 python -m studies.study --photographs FOLDER --measured FOLDER --work FOLDER
     [--ours FILE] [--published ROW=FILE ...] [--override ROW:KEY=VALUE ...] [--only ROW]
     [--seed N] [--rows ROW ...] [--write]
 
-Runs the pipeline's stages with experiment=photographs in the folder --work, where a killed run goes on and nothing is
-trained twice. Networks are trained one after the other, or side by side: start the command once for each with --only
-ROW, then without. Choose `--override paper:train.epochs=N` so that both DoLP networks take about as long; the minutes
-are printed. --write puts what the tables say of the two networks into docs/results/network.json, as the section of the
-seed and in the means over seeds; the errors that ours expects into expected_errors.json and docs/pictures; and if every
-row was scored also the tables into benchmark.json and the event budget into event_budget.json and docs/pictures. With
---ours the section is `shipped`, and no part of the means. For further seeds `--rows ours paper` is enough, and `--rows
-ours` for the expected errors alone. Nothing is trained on measured scenes or on the test split; the split is by source
-picture.
+The study runs the pipeline's stages with experiment=photographs in the folder --work. An interrupted run resumes, and
+finished trainings are reused. To train networks side by side, start the command once for each with --only ROW, then
+without. Choose `--override paper:train.epochs=N` so that both DoLP networks train for about the same time; the minutes
+are printed.
+
+--write updates docs/results/network.json with the scores of the two networks (section of the seed, and means over
+seeds), and expected_errors.json with its picture. If every row was scored, it also updates benchmark.json,
+event_budget.json and its picture. With --ours the section is `shipped` and does not enter the means. Further seeds need
+only `--rows ours paper`, or `--rows ours` for the expected errors. No network is trained on measured scenes or on the
+test split; the split is by source picture.
 """
 
 import argparse

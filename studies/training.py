@@ -1,18 +1,19 @@
-"""How fast the networks train and run: python -m studies.training [--write] [--rounds N] [--device cuda]
+"""Speed of training and inference: python -m studies.training [--write] [--rounds N] [--device cuda]
 
-Frames (four polarizers, 120 x 180 pixels) a second. Training: forward and backward through batches of sequences, the
-squares of the outputs as loss, without optimizer and data loading. Inference: one stream, the state carried on. Weights
-and inputs are random. Every network of `params.yaml` that there is a class for is measured, with
+Rates are in frames a second, of four channels of 120 x 180 pixels. Training is a forward and backward pass through
+batches of sequences, with the squared outputs as loss, without optimizer and data loading. Inference is one stream with
+its state. Weights and inputs are random. Every network of `params.yaml` with a class of its own is measured in these
+settings:
 
-- `naive`: float32, images as torch makes them (contiguous NCHW), a window at a time, torch as it starts;
-- `shipped`: channels_last, a run of windows at once, `train.precision`'s `auto`; in training with the settings of
-  `polarnet.runtime.machine.configure`, as in stages; in inference as many windows as `polarnet recover` takes from a
-  file;
-- `compiled` (with --compile): `shipped` through torch.compile, which needs a C++ compiler; a network that it fails for
-  has no such row.
+- `naive`: float32, contiguous NCHW images, one window at a time, torch's default settings;
+- `shipped`: channels_last, several windows at once, `train.precision` auto; training with the settings of
+  `polarnet.runtime.machine.configure`, as in the stages; inference with as many windows as `polarnet recover` takes from
+  a file;
+- `compiled` (with --compile): `shipped` with torch.compile, which needs a C++ compiler; networks for which it fails have
+  no such row.
 
-Each is measured in a process of its own, in turns; figures are medians over the turns. `peak_gflop_per_s` is what the
-same threads reach in a matrix product of the setting's precision. torch.profiler's table is that of the last turn.
+Each measurement has its own process; they take turns, and figures are medians over the turns. `peak_gflop_per_s` is the
+rate of a matrix product with the same threads and precision. The profile is that of the last turn.
 
 `--write` merges the figures into docs/results/network.json: the section `throughput` and the headline figures
 `train_speedup_over_eager_fp32` and `infer_windows_per_s` of `paper`, and `ours.infer_windows_per_s` of `polarnet`.
