@@ -5,8 +5,9 @@ thousand at a time, and one line reports the outcomes. A file that ends in anyth
 reduced to a minimal case and kept in outputs/fuzz with a description.
 
 outputs/fuzz also holds the finished cases, so that an interrupted run resumes while commit and tree are unchanged.
-`--write` puts each reader's cases into docs/results/recordings.json as `fuzz.readers.NAME`, and the smallest number over
-all readers as `fuzz.cases_per_reader`. Readers that did not run keep their figures and the commit of these figures.
+`--write` puts each reader's cases into docs/results/recordings.json as `fuzz.readers.NAME`, and the smallest number
+over all readers as `fuzz.cases_per_reader`. Readers that did not run keep their figures and the commit of these
+figures.
 """
 
 import argparse

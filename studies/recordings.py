@@ -1,8 +1,8 @@
 """Speed and memory of the readers of recordings: python -m studies.recordings [--write] [--full]
 
-For each format and size, the study writes a file of random events, 1 M a second, of a 1280 x 720 sensor (CeleX-5:
-1280 x 800, AEDAT-2: 346 x 260) to a temporary folder. polarnet reads it in chunks; every installed library (faery;
-`pip install eventcv expelliarmus aedat dv-processing`) reads it whole or in packets, as its interface does. Every reader
+For each format and size, the study writes a file of random events, 1 M a second, of a 1280 x 720 sensor (CeleX-5: 1280
+x 800, AEDAT-2: 346 x 260) to a temporary folder. polarnet reads it in chunks; every installed library (faery; `pip
+install eventcv expelliarmus aedat dv-processing`) reads it whole or in packets, as its interface does. Every reader
 runs in its own process with compiled kernels. Times are the shortest of the repeats, from opening to the last chunk,
 with the file in the disk cache. Memory is the peak of the process and its children, minus their memory after reading a
 small file (Linux: high-water marks of resident memory).

@@ -1,17 +1,17 @@
 """Speed of `polarnet recover`: python -m studies.recover
     [--write] [--weights FILE] [--precision auto|fp32|bf16] [--picture FILE]
 
-A sensor of 120 x 180 pixels behind four polarizers moves over a photograph of scikit-image, on a clock stretched to
-1 M events a second. The events are recovered as the command does it: windows of 1/30 s, frames written as Zarr, PNG and
-video. `realtime_factor` is the length of the stream divided by the time of the run, writing included; above 1 the run is
-faster than the camera. `latency_ms` is the median time of a step for windows that arrive one by one, from events in
+A sensor of 120 x 180 pixels behind four polarizers moves over a photograph of scikit-image, on a clock stretched to 1
+M events a second. The events are recovered as the command does it: windows of 1/30 s, frames written as Zarr, PNG and
+video. `realtime_factor` is the length of the stream divided by the time of the run, writing included; above 1 the run
+is faster than the camera. `latency_ms` is the median time of a step for windows that arrive one by one, from events in
 memory to DoLP and AoLP in memory. Methods are the network and the high-pass filter with and without solved gains. The
 network is that of --weights, else the shipped one, else an untrained one of params.yaml, which costs the same. In the
 live measurement, another process sends the stream through a pipe at its own pace; its latency runs from the arrival of
 an event to the frame that contains it.
 
-`--write` merges the figures into docs/results/recordings.json under `recover`. `--picture` copies the network's pictures
-of the stream, or those of the high-pass filter if the network is untrained.
+`--write` merges the figures into docs/results/recordings.json under `recover`. `--picture` copies the network's
+pictures of the stream, or those of the high-pass filter if the network is untrained.
 """
 
 import argparse

@@ -2,10 +2,10 @@
 
 Each target is another picture: photographs of scikit-image and dead leaves. Its eight captures are written as CeleX-5
 files with random delays, sensor noise and hot pixels, and then imported and calibrated as in the stages. The study
-prints errors of the start times from the landmark (in camera frames) and refined (in ms). The refined errors exclude the
-part common to all eight captures, because the zero of their clock is a convention; `clock_zero_ms_max` is that part. It
-also prints the RMS difference between the DoLP and the scene's own, the thresholds, and the benchmark's table, with the
-networks that `--data` has in train and train_e2v.
+prints errors of the start times from the landmark (in camera frames) and refined (in ms). The refined errors exclude
+the part common to all eight captures, because the zero of their clock is a convention; `clock_zero_ms_max` is that
+part. It also prints the RMS difference between the DoLP and the scene's own, the thresholds, and the benchmark's
+table, with the networks that `--data` has in train and train_e2v.
 """
 
 import argparse

@@ -11,9 +11,9 @@ are printed.
 
 --write updates docs/results/network.json with the scores of the two networks (section of the seed, and means over
 seeds), and expected_errors.json with its picture. If every row was scored, it also updates benchmark.json,
-event_budget.json and its picture. With --ours the section is `shipped` and does not enter the means. Further seeds need
-only `--rows ours paper`, or `--rows ours` for the expected errors. No network is trained on measured scenes or on the
-test split; the split is by source picture.
+event_budget.json and its picture. With --ours the section is `shipped` and does not enter the means. Further seeds
+need only `--rows ours paper`, or `--rows ours` for the expected errors. No network is trained on measured scenes or on
+the test split; the split is by source picture.
 """
 
 import argparse

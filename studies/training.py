@@ -1,19 +1,19 @@
 """Speed of training and inference: python -m studies.training [--write] [--rounds N] [--device cuda]
 
 Rates are in frames a second, of four channels of 120 x 180 pixels. Training is a forward and backward pass through
-batches of sequences, with the squared outputs as loss, without optimizer and data loading. Inference is one stream with
-its state. Weights and inputs are random. Every network of `params.yaml` with a class of its own is measured in these
-settings:
+batches of sequences, with the squared outputs as loss, without optimizer and data loading. Inference is one stream
+with its state. Weights and inputs are random. Every network of `params.yaml` with a class of its own is measured in
+these settings:
 
 - `naive`: float32, contiguous NCHW images, one window at a time, torch's default settings;
 - `shipped`: channels_last, several windows at once, `train.precision` auto; training with the settings of
-  `polarnet.runtime.machine.configure`, as in the stages; inference with as many windows as `polarnet recover` takes from
-  a file;
-- `compiled` (with --compile): `shipped` with torch.compile, which needs a C++ compiler; networks for which it fails have
-  no such row.
+  `polarnet.runtime.machine.configure`, as in the stages; inference with as many windows as `polarnet recover` takes
+  from a file;
+- `compiled` (with --compile): `shipped` with torch.compile, which needs a C++ compiler; networks for which it fails
+  have no such row.
 
-Each measurement has its own process; they take turns, and figures are medians over the turns. `peak_gflop_per_s` is the
-rate of a matrix product with the same threads and precision. The profile is that of the last turn.
+Each measurement has its own process; they take turns, and figures are medians over the turns. `peak_gflop_per_s` is
+the rate of a matrix product with the same threads and precision. The profile is that of the last turn.
 
 `--write` merges the figures into docs/results/network.json: the section `throughput` and the headline figures
 `train_speedup_over_eager_fp32` and `infer_windows_per_s` of `paper`, and `ours.infer_windows_per_s` of `polarnet`.
