@@ -5,6 +5,7 @@ This script measures nothing. It collects docs/results/network.json from earlier
 needs the whole history of the repository.
 """
 
+import argparse
 import json
 from pathlib import Path
 from typing import NamedTuple
@@ -45,6 +46,8 @@ DESIGNS = (
 
 def main() -> None:
     """Collect the figures and write them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.parse_args()
     rows = []
     for design in DESIGNS:
         results = json.loads(git(ROOT, "show", f"{design.commit}:docs/results/network.json"))
