@@ -1,10 +1,11 @@
-"""What the designs of the network scored on the way: python -m studies.designs
+"""Scores of earlier designs of the network: python -m studies.designs
 
-Nothing is measured here. docs/results/network.json was written at each of these commits by `studies/study.py
---write`, which trained and scored the network of its day on the same photographs; git still has it. Writes
-docs/results/designs.json; today's network is in network.json itself. Needs the whole history of the repository.
+This script measures nothing. It collects docs/results/network.json from earlier commits, where `studies/study.py
+--write` trained and scored the network of that commit on the same photographs. It writes docs/results/designs.json and
+needs the whole history of the repository.
 """
 
+import argparse
 import json
 from pathlib import Path
 from typing import NamedTuple
@@ -16,23 +17,27 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 class Design(NamedTuple):
-    """What was new, and where its figures are."""
+    """A design: its difference from the one before, and the commit with its figures."""
 
     about: str
     commit: str
     sections: tuple[str, ...]
-    """Of network.json: a training each."""
+    """Sections of network.json, one for each training."""
 
 
 DESIGNS = (
-    Design("The redundancy solved at many scales, a U-Net that mixes.", "4c440ea", ("seed_1", "seed_2", "seed_3")),
-    Design("+ training scenes evened towards any degree", "a6073c9", ("shipped",)),
-    Design("+ averaged with a mosaic after the training", "74fb33b", ("shipped",)),
-    Design("+ trained with the mosaic, sees further, whole images", "43e460a", ("seed_1",)),
+    Design("redundancy solved at several scales, combined by a U-Net", "4c440ea", ("seed_1", "seed_2", "seed_3")),
+    Design("+ training scenes drawn towards one uniform polarization of any degree", "a6073c9", ("shipped",)),
+    Design("+ prediction averaged with a panorama after training", "74fb33b", ("shipped",)),
+    Design("+ panorama part of training, larger receptive field, whole frames", "43e460a", ("seed_1",)),
     Design("+ Muon instead of Adam", "5bfdc00", ("seed_1", "seed_2", "seed_3")),
-    Design("... of that, without evened scenes, in shorter visits", "160795c", ("seed_2", "seed_3")),
     Design(
-        "+ slopes of the mosaic, squared errors alone; scenes evened towards one of their own points",
+        "the same without scenes drawn towards one polarization, with fewer windows of each sequence",
+        "160795c",
+        ("seed_2", "seed_3"),
+    ),
+    Design(
+        "+ gradients of the panorama, squared error only; scenes drawn towards the polarization at one of their points",
         "29c0c05",
         ("seed_1",),
     ),
@@ -40,7 +45,9 @@ DESIGNS = (
 
 
 def main() -> None:
-    """Collect and write."""
+    """Collect the figures and write them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.parse_args()
     rows = []
     for design in DESIGNS:
         results = json.loads(git(ROOT, "show", f"{design.commit}:docs/results/network.json"))
@@ -48,7 +55,6 @@ def main() -> None:
         found = [results[section]["rows"] for section in design.sections]
         simulated = [one["simulated"] for one in found]
         rows.append({
-            "about": design.about,
             "commit": commit,
             "seeds": [{key: one["ours"][key] for key in ABLATION_KEYS} for one in simulated],
             "mse_over_oracle_mean": [one["ours"]["mse"] / one["oracle_mean"]["mse"] for one in simulated],

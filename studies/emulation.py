@@ -1,23 +1,22 @@
-"""How fast and how true the emulator is: python -m studies.emulation [--write] [--rounds N] [--paper-set N]
+"""Speed and accuracy of the emulator: python -m studies.emulation [--write] [--rounds N] [--paper-set N]
 
-The clip is that of the shared reference figures: scikit-image's coffee photograph mapped to polarization, a window of
-120 x 180 pixels drifting over it at 110 px/s, 300 steps a second, four polarizers, one second; from rendering to
-columns in memory. Seconds are medians of wall-clock time, of processes whose kernels are compiled. Every model and
-number of threads runs in processes of its own, one after the other in each of several rounds, so that what a shared
-machine does to one hour it does to all of them; a process also gives its peak memory.
+The clip is that of the shared reference figures: scikit-image's coffee photograph mapped to polarization, a sensor of
+120 x 180 pixels that drifts over it at 110 px/s, 300 steps a second, four channels, one second. Times run from
+rendering to columns in memory and are medians of wall-clock time with compiled kernels. Every model and number of
+threads runs in its own process, and the processes take turns over several rounds, so that other load on the machine
+affects all of them alike. Each process also reports its peak memory.
 
-Timing errors are those of noiseless pixels with equal thresholds, against `exact` at 4800 steps a second, over the
-pixels whose polarities agree from the first event to the last. `exact` places its steps where pixels meet; its figure
-for regular frames is printed too.
+Timing errors are those of noiseless pixels with equal thresholds, relative to `exact` at 4800 steps a second. They
+cover the pixels whose polarities agree from the first event to the last. `exact` places its steps where pixels meet;
+its figure for regular frames is printed too.
 
-The paper's set is made as a user would make it: `python -m stages.ingest`, `stages.synthesize` and `stages.emulate`
-with experiment=paper on two workers, into a temporary folder, from the builtin photographs and dead leaves. Minutes
-are wall-clock time. Peak memory is the largest that a stage's processes held together, looked at twice a second; pages
-that several of them share (libraries) count once (Linux: proportional set size). `--paper-set N` makes about N
-sequences instead of 1000; minutes are those of the number stated, never scaled. `--paper-set 0` leaves it out,
-`--only-paper-set` everything else.
+The paper's set is made with `python -m stages.ingest`, `stages.synthesize` and `stages.emulate`, with experiment=paper
+on two workers, from the built-in photographs and dead leaves. Minutes are wall-clock time. Peak memory is the largest
+sum over a stage's processes, sampled twice a second; shared pages count once (Linux: proportional set size).
+`--paper-set N` makes about N sequences instead of 1000, and minutes are never scaled. `--paper-set 0` skips the set,
+`--only-paper-set` skips everything else.
 
-The cases of tests/golden are counted. `--write` merges the figures into docs/results/emulation.json.
+The passed cases of tests/golden are counted. `--write` merges the figures into docs/results/emulation.json.
 """
 
 import argparse
@@ -107,14 +106,24 @@ def measure_one(name: str, threads: int, repeats: int) -> dict[str, Any]:
 
 def in_own_process(name: str, threads: int, repeats: int) -> dict[str, Any]:
     """`measure_one` in a new process of this script."""
-    command = [sys.executable, __file__, "--one", name, "--threads", str(threads), "--repeats", str(repeats)]
+    command = [
+        sys.executable,
+        "-m",
+        "studies.emulation",
+        "--one",
+        name,
+        "--threads",
+        str(threads),
+        "--repeats",
+        str(repeats),
+    ]
     environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout)
 
 
 def figures_of(name: str, processes: dict[int, list[dict[str, Any]]]) -> dict[str, Any]:
-    """What goes into the results of one model, from all its processes by their number of threads."""
+    """Figures of one model, from its processes by their number of threads."""
     medians = {t: float(np.median(np.concatenate([one["seconds"] for one in ones]))) for t, ones in processes.items()}
     one, steps = processes[1][0], DURATION_US * 1e-6 * float(MODELS[name].render_rate_hz or 0)
     return {
@@ -174,7 +183,7 @@ def measure_timing() -> dict[str, dict[str, float]]:
 
 
 def golden_cases_passed() -> int:
-    """Of 15 v2e and 8 ESIM cases."""
+    """Number of reference cases met, out of 15 of v2e and 8 of ESIM."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "golden.xml"
         tests = ROOT / "tests" / "reference" / "test_golden.py"

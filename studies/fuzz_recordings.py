@@ -1,13 +1,13 @@
-"""How many damaged files each reader survives: python -m studies.fuzz_recordings [--write] [--cases N]
+"""Behaviour of the readers on damaged files: python -m studies.fuzz_recordings [--write] [--cases N]
 
-Each reader gets N damaged copies of a small file (hypothesis; tests/recordings/damaged_files.py) in a process of its
-own, a thousand at a time, and a line says how they ended. A file that ends in anything but events or a RecordingError
-is made as small as it gets, and left in outputs/fuzz with what happened.
+Each reader gets N damaged copies of a small file (hypothesis; tests/recordings/damaged_files.py) in its own process, a
+thousand at a time, and one line reports the outcomes. A file that ends in anything but events or a RecordingError is
+reduced to a minimal case and kept in outputs/fuzz with a description.
 
-What has been run is kept in outputs/fuzz, so that a run that was ended goes on where it was, as long as the commit and
-the tree are the same. `--write` puts each reader's cases into docs/results/recordings.json as `fuzz.readers.NAME`, and
-the smallest of all readers as `fuzz.cases_per_reader`; readers left out of this run keep the figures they have there,
-with the commit they were measured at.
+outputs/fuzz also holds the finished cases, so that an interrupted run resumes while commit and tree are unchanged.
+`--write` puts each reader's cases into docs/results/recordings.json as `fuzz.readers.NAME`, and the smallest number
+over all readers as `fuzz.cases_per_reader`. Readers that did not run keep their figures and the commit of these
+figures.
 """
 
 import argparse
@@ -79,7 +79,7 @@ def fuzz(form: str, cases: int, state: str) -> dict[str, Any]:
     found = json.loads(kept.read_text()) if kept.exists() else {}
     if found.get("state") != state or found["cases"] > cases or found["cases"] % BATCH:
         found = {"state": state, "batches": 0, "cases": 0, "seconds": 0.0, "endings": {}}
-    command = [sys.executable, __file__, "--one", form, str(found["batches"]), str(cases)]
+    command = [sys.executable, "-m", "studies.fuzz_recordings", "--one", form, str(found["batches"]), str(cases)]
     start, before_s = time.monotonic(), found["seconds"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

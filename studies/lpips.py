@@ -1,4 +1,4 @@
-"""What LPIPS costs, and how exact it is: python -m studies.lpips [--squeeze FILE] [--rounds N] [--write]
+"""Cost and accuracy of LPIPS: python -m studies.lpips [--squeeze FILE] [--rounds N] [--write]
 
 - Errors: the largest difference from the values in tests/golden/lpips.json, by the programs that the weights come from.
 - Scoring: milliseconds for one frame of one method, 120 x 180 pixels, in float32 as the benchmark scores; the truth's
@@ -96,7 +96,11 @@ def training(config: Config, lpips: Lpips | None, windows: int, device: torch.de
     events: Tensor = torch.randn(*frames[:2], 4 * channels_of(task.encode), *frames[2:])
     names = [str(number) for number in range(config.train.batch_size)]
     batch = Batch(names, events, torch.rand(frames), torch.rand(frames), torch.rand(*frames[:2], 0, *frames[2:]))
-    return lambda: train_batch(task, optimizer, batch, config.train, device) and None
+
+    def run() -> None:
+        train_batch(task, optimizer, batch, config.train, device)
+
+    return run
 
 
 def milliseconds(runs: Mapping[str, Callable[[], None]], rounds: int, device: torch.device) -> dict[str, float]:

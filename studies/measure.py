@@ -161,7 +161,7 @@ ABLATION_KEYS = ("mse", "level_mse", "pattern_mse", "psnr", "ssim", "corr", "aol
 def measure_ablation(root: Path, sweep: Path) -> Path:
     """Write section `ablation` of docs/results/network.json from a sweep over the files of conf/ablation.
 
-    The comment in conf/ablation/NAME says which part the ablation removes. Raises RuntimeError if a job has no
+    Raises RuntimeError if a job has no
     `ablation=NAME`, if the baseline `ablation=nothing` is missing, if an ablation has two jobs, or if the tree has
     uncommitted changes. Failed jobs are left out.
     """
@@ -177,13 +177,17 @@ def measure_ablation(root: Path, sweep: Path) -> Path:
         name = given.pop("ablation")
         if name in rows:
             raise RuntimeError(f"{sweep / point['job']}: expected one job with ablation={name}, got a second")
-        about = (root / "conf" / "ablation" / f"{name}.yaml").read_text().splitlines()[1].removeprefix("# ")
-        rows[name] = {"about": about} | {key: point["test"].get(key) for key in ABLATION_KEYS}
+        rows[name] = {key: point["test"].get(key) for key in ABLATION_KEYS}
         overrides |= {f"{key}={value}" for key, value in given.items() if not key.startswith(("paths.", "ingest.root"))}
     if "nothing" not in rows:
         raise RuntimeError(f"{sweep}: expected a finished job with ablation=nothing, got {', '.join(rows) or 'no job'}")
     found = {"overrides": sorted(overrides), "rows": rows}
     return write_section(root, "network", "ablation", found, machine_record(root))
+
+
+def ablation_about(root: Path, name: str) -> str:
+    """The comment of conf/ablation/NAME.yaml: the part that the ablation removes or changes."""
+    return (root / "conf" / "ablation" / f"{name}.yaml").read_text().splitlines()[1].removeprefix("# ")
 
 
 EQ9_WEIGHTS = ("mse", "ssim", "lpips")

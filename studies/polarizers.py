@@ -52,7 +52,7 @@ class Result(NamedTuple):
 
 
 def mosaic_of(channels: list[Events], order: tuple[tuple[int, int], tuple[int, int]]) -> Events:
-    """What a sensor reports whose pixels have polarizers in this order, of what each polarizer lets through."""
+    """Events of a sensor whose pixels have polarizers in this order, from the light behind each polarizer."""
     parts = []
     for index, events in enumerate(channels):
         row, column = next((r, c) for r in (0, 1) for c in (0, 1) if order[r][c] == 45 * index)

@@ -1,15 +1,15 @@
-"""How fast recordings are read, and in how much memory: python -m studies.recordings [--write] [--full]
+"""Speed and memory of the readers of recordings: python -m studies.recordings [--write] [--full]
 
-For each format and size, a file of random events of a 1280 x 720 sensor (CeleX-5: 1280 x 800, AEDAT-2: 346 x 260), 1 M
-a second, is written to a temporary folder and read by polarnet in chunks, and by each library that is installed (faery;
-`pip install eventcv expelliarmus aedat dv-processing`) whole or in packets, as it does. Every reader is a process of
-its own, whose kernels are compiled. Seconds are the shortest of the repeats, from opening to the last chunk; the file
-is in the disk cache. Memory is the most that the process and those it started held, added up, less what they held when
-they had read a small file (Linux: high-water marks of resident memory).
+For each format and size, the study writes a file of random events, 1 M a second, of a 1280 x 720 sensor (CeleX-5: 1280
+x 800, AEDAT-2: 346 x 260) to a temporary folder. polarnet reads it in chunks; every installed library (faery; `pip
+install eventcv expelliarmus aedat dv-processing`) reads it whole or in packets, as its interface does. Every reader
+runs in its own process with compiled kernels. Times are the shortest of the repeats, from opening to the last chunk,
+with the file in the disk cache. Memory is the peak of the process and its children, minus their memory after reading a
+small file (Linux: high-water marks of resident memory).
 
-Sizes are 1 M and 10 M events, with --full 100 M too (3 GB of disk; a store is written whole, so 8 GB of memory). Speed
-is that of the smallest. `--write` puts `readers.NAME.mevents_per_s` and `readers.NAME.peak_mib` of each size into
-docs/results/recordings.json; formats left out of this run keep their figures, with the commit they were measured at.
+Sizes are 1 M and 10 M events, and 100 M with --full (3 GB of disk; a store is written whole and needs 8 GB of memory).
+The speed is that of the smallest size. `--write` puts `readers.NAME.mevents_per_s` and `readers.NAME.peak_mib` into
+docs/results/recordings.json; formats that did not run keep their figures and the commit of these figures.
 """
 
 import argparse
@@ -66,12 +66,19 @@ def write_lines(path: Path, count: int) -> None:
             file.write(lines_of(part.T, " "))
 
 
+def events_of(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> Events:
+    """Events of one channel from columns of any integer type; `p` is 0 or 1."""
+    types = (np.int64, np.int16, np.int16, np.int8)
+    t_us, column, row, polarity = (
+        torch.from_numpy(values.astype(kind)) for values, kind in zip((t, x, y, 2 * p - 1), types, strict=True)
+    )
+    return Events(t_us, column, row, polarity, HEIGHT, WIDTH)
+
+
 def write_bin(event_format: int) -> Callable[[Path, int], None]:
     def write(path: Path, count: int) -> None:
         t, x, y, p = next(parts(count))
-        short = (torch.from_numpy(column.astype(np.int16)) for column in (x, y))
-        events = Events(torch.from_numpy(t), *short, torch.from_numpy((2 * p - 1).astype(np.int8)), HEIGHT, WIDTH)
-        write_celex5_bin(path, events, event_format)
+        write_celex5_bin(path, events_of(t, x, y, p), event_format)
         content = path.read_bytes()
         with path.open("ab") as file:
             for _ in range(PART, count, PART):
@@ -136,9 +143,7 @@ def write_aedat2(path: Path, count: int) -> None:
 
 def write_store(path: Path, count: int) -> None:
     t, x, y, p = np.concatenate(list(parts(count)), axis=1)
-    types = (np.int64, np.int16, np.int16, np.int8)
-    columns = (torch.from_numpy(v.astype(d)) for v, d in zip((t, x, y, 2 * p - 1), types, strict=True))
-    events = Events(*columns, HEIGHT, WIDTH)
+    events = events_of(t, x, y, p)
     store = EventStore.create(path, ["random"], HEIGHT, WIDTH, {})
     nothing = Events.empty(HEIGHT, WIDTH)
     store.write("random", [events, nothing, nothing, nothing], int(t[-1]) + 1)
@@ -241,7 +246,7 @@ LIBRARIES: dict[str, tuple[Callable[[Path], int], tuple[str, ...]]] = {
     "dv_processing": (read_dv_processing, ("aedat4",)),
     "numpy": (read_numpy, ("text",)),
 }
-"""What reads the formats it knows."""
+"""Readers of a library and the formats that it supports."""
 
 
 def measure_one(reader: str, path: Path, small: Path, repeats: int) -> dict[str, float]:
@@ -258,14 +263,24 @@ def measure_one(reader: str, path: Path, small: Path, repeats: int) -> dict[str,
 
 
 def peak_mib() -> float:
-    """Of this process and of those it started."""
+    """Peak memory in MiB of this process and its children."""
     own = psutil.Process()
     marks = [Path(f"/proc/{process.pid}/status").read_text() for process in (own, *own.children(recursive=True))]
     return sum(int(line.split()[1]) for mark in marks for line in mark.splitlines() if line.startswith("VmHWM")) / 1024
 
 
 def in_own_process(reader: str, path: Path, small: Path, repeats: int) -> dict[str, float]:
-    command = [sys.executable, __file__, "--one", reader, str(path), str(small), "--repeats", str(repeats)]
+    command = [
+        sys.executable,
+        "-m",
+        "studies.recordings",
+        "--one",
+        reader,
+        str(path),
+        str(small),
+        "--repeats",
+        str(repeats),
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"{reader} on {path.name}: {done.stderr[-2000:]}")
@@ -281,7 +296,7 @@ def measure(name: str, sizes: list[int], repeats: int) -> dict[str, dict[str, An
             path, small = Path(folder) / f"large.{name}", Path(folder) / f"small.{name}"
             FILES[name](path, size)
             FILES[name](small, SMALL)
-            held = size
+            held: float = size
             for reader in ["own", *(libraries if size == sizes[0] else [])]:
                 one = in_own_process(reader, path, small, repeats if size == sizes[0] else 1)
                 held = one["events"] if reader == "own" else held

@@ -1,17 +1,17 @@
-"""How fast `polarnet recover` is: python -m studies.recover
+"""Speed of `polarnet recover`: python -m studies.recover
     [--write] [--weights FILE] [--precision auto|fp32|bf16] [--picture FILE]
 
-A window moves over a photograph of scikit-image; the events of its 120 x 180 pixels behind four polarizers, on a clock
-stretched so that 1 M of them come in a second, are recovered as the command does it: windows of 1/30 s, frames written
-as Zarr, PNG and video. `realtime_factor` is seconds of the stream in a second of work, writing included, and more than
-1 is faster than real time; `latency_ms` is the median of a step where windows come one by one, from the window's
-events in memory to DoLP and AoLP in memory. Methods: the network of --weights, else the shipped one, else one of
-params.yaml that nobody trained (which costs the same); the high-pass filter, with and without solved gains. Live, the
-stream comes through a pipe at its own pace from another process; its latency is that from the arrival of an event to
-the frame that it completes.
+A sensor of 120 x 180 pixels behind four polarizers moves over a photograph of scikit-image, on a clock stretched to 1
+M events a second. The events are recovered as the command does it: windows of 1/30 s, frames written as Zarr, PNG and
+video. `realtime_factor` is the length of the stream divided by the time of the run, writing included; above 1 the run
+is faster than the camera. `latency_ms` is the median time of a step for windows that arrive one by one, from events in
+memory to DoLP and AoLP in memory. Methods are the network and the high-pass filter with and without solved gains. The
+network is that of --weights, else the shipped one, else an untrained one of params.yaml, which costs the same. In the
+live measurement, another process sends the stream through a pipe at its own pace; its latency runs from the arrival of
+an event to the frame that contains it.
 
-`--write` merges the figures into docs/results/recordings.json under `recover`. `--picture` copies the pictures that
-the network made of the stream, the high-pass filter if nobody trained the network.
+`--write` merges the figures into docs/results/recordings.json under `recover`. `--picture` copies the network's
+pictures of the stream, or those of the high-pass filter if the network is untrained.
 """
 
 import argparse
@@ -25,7 +25,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import torch
 from skimage import data
@@ -109,13 +109,13 @@ def measured_live(store: Path, recoverer: Recoverer, out: Path) -> Summary:
     command = [sys.executable, "-m", "polarnet.cli", "replay", str(store), "stream"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as camera:
         assert camera.stdout is not None
-        lines = LiveLines(camera.stdout, "pipe", None, idle_s=0.0)
+        lines = LiveLines(cast(BinaryIO, camera.stdout), "pipe", None, idle_s=0.0)
         source = Input("pipe", lines.height, lines.width, lines, None)
         return recover(source, WINDOWS, recoverer, RecoveryWriter(out, ("zarr", "mp4"), 30.0))
 
 
 def figures_of(summary: Summary, step_ms: float) -> dict[str, float]:
-    """What is reported of a run, and of a step when windows come one by one."""
+    """Figures of a run, and of a step whose windows arrive one by one."""
     return {"realtime_factor": round(summary.realtime_factor, 3), "latency_ms": round(step_ms, 2)}
 
 
@@ -123,10 +123,12 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
-    parser.add_argument("--weights", type=Path, help="of the network")
-    parser.add_argument("--precision", choices=("auto", "fp32", "bf16"), default="auto", help="of the network")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of the stream")
-    parser.add_argument("--picture", type=Path, help="where to copy the pictures of a run")
+    parser.add_argument("--weights", type=Path, help="checkpoint of the network")
+    parser.add_argument(
+        "--precision", choices=("auto", "fp32", "bf16"), default="auto", help="number format of the network"
+    )
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of the stream in seconds")
+    parser.add_argument("--picture", type=Path, help="file for the pictures of a run")
     arguments = parser.parse_args()
     if arguments.write and (changed := uncommitted(ROOT)):
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")

@@ -1,15 +1,11 @@
-"""How well a simulated rig is calibrated: python -m studies.rig [--write] [--targets N] [--full]
+"""Accuracy of the calibration of a simulated rig: python -m studies.rig [--write] [--targets N] [--full]
 
-Each target is another picture: photographs of scikit-image and dead leaves. Its eight captures, written as CeleX-5
-files with random delays, sensor noise and hot pixels, are imported and calibrated as the stages do it. Printed: errors
-of start times by the landmark (in pictures of the camera) and refined (in milliseconds, but for what all eight have in
-common, as the zero of their clock is a convention; that is `clock_zero_ms_max`), the root mean square difference of the
-DoLP from the scene's own, thresholds, and the benchmark's table, with the networks that `--data` has in train and
-train_baseline@e2v.
-
-The sensor is a quarter of a CeleX-5 in each direction (200 x 320, pictures of 30 x 45), with --full all of it (800 x
-1280, pictures of 120 x 180). `--write` merges the figures into docs/results/recordings.json as section `rig`, or
-`rig_full`. `--docs` draws the pictures of docs/recordings.md and docs/recordings-dot.md instead.
+Each target is another picture: photographs of scikit-image and dead leaves. Its eight captures are written as CeleX-5
+files with random delays, sensor noise and hot pixels, and then imported and calibrated as in the stages. The study
+prints errors of the start times from the landmark (in camera frames) and refined (in ms). The refined errors exclude
+the part common to all eight captures, because the zero of their clock is a convention; `clock_zero_ms_max` is that
+part. It also prints the RMS difference between the DoLP and the scene's own, the thresholds, and the benchmark's
+table, with the networks that `--data` has in train and train_baseline@e2v.
 """
 
 import argparse
@@ -28,7 +24,7 @@ from skimage import data
 
 from polarnet.benchmark.rows import available
 from polarnet.benchmark.run import run_benchmark
-from polarnet.benchmark.score import summary
+from polarnet.benchmark.score import FrameScore, summary
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig, read_event_capture
 from polarnet.captures.imported import import_targets, shifted
 from polarnet.captures.targets import Calibrated, calibrate_targets, spread_us
@@ -53,7 +49,7 @@ from studies.simulation_pictures import few_colours
 
 ROOT = Path(__file__).resolve().parents[1]
 PHOTOGRAPHS = (data.coffee, data.chelsea, data.astronaut, data.rocket)
-QUARTER = {"sensor": [200, 320], "region": [45, 2], "crop": [120, 180], "size": [30, 45]}
+QUARTER: dict[str, Any] = {"sensor": [200, 320], "region": [45, 2], "crop": [120, 180], "size": [30, 45]}
 RIG = RigConfig(
     speed_px_s=100.0,
     longest_delay_s=0.35,
@@ -129,13 +125,14 @@ def benchmarked(folder: Path, names: list[str], config: Config) -> dict[str, dic
     context = context_of(config, train_mean=None)
     methods, absent = available(config.benchmark.methods, context)
     benchmark = replace(config.benchmark, methods=methods, panel_scenes=0)
-    rows, costs = [], {}
+    rows: list[FrameScore] = []
+    costs: dict[str, dict[str, Any]] = {}
     for name in names:
         one = run_benchmark(made_set(name, folder / name), context, benchmark, None, folder / "cache")
         rows += one.rows
         costs = {method: asdict(cost) for method, cost in one.costs.items()}
     scores = {m: {**s, **costs[m]} for m, s in summary(rows, benchmark.bootstrap_samples, config.seed).items()}
-    print(as_plain(score_table(scores, "not loaded here")))
+    print(as_plain(score_table(scores)))
     for method, reason in absent.items():
         print(f"{method} is left out: {reason}")
     return {method: {key: scores[method].get(key) for key in BENCHMARK_KEYS} for method in scores}
@@ -184,11 +181,15 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
-    parser.add_argument("--targets", type=int, default=8, help="of eight captures each")
+    parser.add_argument("--targets", type=int, default=8, help="number of targets, with eight captures each")
     parser.add_argument("--full", action="store_true", help="the whole sensor")
-    parser.add_argument("--cutoff-hz", type=float, default=3000.0, help="of the photoreceptor; a slow one adds a delay")
-    parser.add_argument("--data", type=Path, default=ROOT / "data", help="where trained networks are looked for")
-    parser.add_argument("--pictures", type=Path, default=ROOT / "outputs" / "rig", help="where diagnoses are drawn")
+    parser.add_argument(
+        "--cutoff-hz", type=float, default=3000.0, help="cutoff of the photoreceptor; a low one adds a delay"
+    )
+    parser.add_argument("--data", type=Path, default=ROOT / "data", help="data folder with trained networks")
+    parser.add_argument(
+        "--pictures", type=Path, default=ROOT / "outputs" / "rig", help="folder for diagnostic pictures"
+    )
     parser.add_argument("--docs", action="store_true", help="only draw the pictures of the pages on recordings")
     arguments = parser.parse_args()
     if arguments.write and (changed := uncommitted(ROOT)):

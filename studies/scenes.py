@@ -1,11 +1,11 @@
-"""Which scenes to train on: trainings held against each other without the test split.
+"""Choices of training scenes, compared without the test split.
 
 python -m studies.scenes --photographs FOLDER --work FOLDER [--seeds N] [--threads N] [--write]
 
-The photographs that the study's test split has are left out first (`studies/study.py`). The others are split
-anew, a third of them to score on, and the pipeline's stages make each choice's scenes, train polarnet on them and score
-it. So a choice is made without the study's test photographs, and on more scenes than its validation split has. What is
-there already in the folder --work is not made again. --write puts the scores into docs/results/scenes.json.
+The photographs of the study's test split (`studies/study.py`) are left out. A third of the others is held out for
+scoring; the pipeline's stages make each choice's scenes from the rest, train polarnet on them and score it. The choice
+therefore sees no test photograph, and scores more scenes than the study's validation split has. Finished work in the
+folder --work is reused. --write puts the scores into docs/results/scenes.json.
 """
 
 import argparse
@@ -19,21 +19,23 @@ from polarnet.pictures.manifest import read_manifest
 from studies.measure import ABLATION_KEYS, machine_record, uncommitted, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
-HELD_OUT = 1 / 3  # of the photographs that are left
+HELD_OUT = 1 / 3  # share of the remaining photographs
 
 
 class Choice(NamedTuple):
-    """What is compared: how the scenes are made."""
+    """One way to make the training scenes."""
 
     about: str
     synthesis: tuple[str, ...] = ()
 
 
 SHORT = ("train.epochs=1",)
-"""Of all trainings here, as of the ablation's."""
+"""Overrides of all trainings here and of the ablation's."""
 CHOICES = {
-    "shipped": Choice("`experiment=photographs`: three further scenes of each photograph, a third of them evened."),
-    "none_evened": Choice("Three further scenes, none evened.", ("variation.uniform_share=0",)),
+    "shipped": Choice(
+        "three variants of each photograph, a third drawn towards one polarization (`experiment=photographs`)"
+    ),
+    "none_evened": Choice("three variants, none drawn towards one polarization", ("variation.uniform_share=0",)),
 }
 
 
@@ -98,11 +100,11 @@ def main() -> None:
     photographs = without_test_split(arguments)
     found: dict[str, Any] = {}
     for seed in range(1, arguments.seeds + 1):
-        for name, choice in CHOICES.items():
+        for name in CHOICES:
             scores = scored(name, seed, photographs, arguments)
-            row = found.setdefault(name, {"about": choice.about, "seeds": []})
+            row = found.setdefault(name, {"seeds": []})
             row["seeds"].append(scores["ours"])
-            found["oracle_mean"] = {"about": "Each frame's own mean.", "seeds": [scores["oracle_mean"]]}
+            found["oracle_mean"] = {"seeds": [scores["oracle_mean"]]}
             print(name, seed, json.dumps(scores["ours"]), flush=True)
     if arguments.write:
         print(write_section(ROOT, "scenes", "choices", {"overrides": SHORT, "rows": found}, record))

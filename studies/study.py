@@ -1,18 +1,19 @@
-"""Every network trained on the same photographs, then every method on held-out photographs and on measured scenes.
+"""Train every network on the same photographs, and score every method on held-out and on measured scenes.
 
 python -m studies.study --photographs FOLDER --measured FOLDER --work FOLDER
     [--ours FILE] [--published ROW=FILE ...] [--override ROW:KEY=VALUE ...] [--only ROW]
     [--seed N] [--rows ROW ...] [--write]
 
-Runs the pipeline's stages with experiment=photographs in the folder --work, where a killed run goes on and nothing is
-trained twice. Networks are trained one after the other, or side by side: start the command once for each with --only
-ROW, then without. Choose `--override paper:train.epochs=N` so that both DoLP networks take about as long; the minutes
-are printed. --write puts what the tables say of the two networks into docs/results/network.json, as the section of the
-seed and in the means over seeds; the errors that ours expects into expected_errors.json and docs/pictures; and if every
-row was scored also the tables into benchmark.json and the event budget into event_budget.json and docs/pictures. With
---ours the section is `shipped`, and no part of the means. For further seeds `--rows ours paper` is enough, and `--rows
-ours` for the expected errors alone. Nothing is trained on measured scenes or on the test split; the split is by source
-picture.
+The study runs the pipeline's stages with experiment=photographs in the folder --work. An interrupted run resumes, and
+finished trainings are reused. To train networks side by side, start the command once for each with --only ROW, then
+without. Choose `--override paper:train.epochs=N` so that both DoLP networks train for about the same time; the minutes
+are printed.
+
+--write updates docs/results/network.json with the scores of the two networks (section of the seed, and means over
+seeds), and expected_errors.json with its picture. If every row was scored, it also updates benchmark.json,
+event_budget.json and its picture. With --ours the section is `shipped` and does not enter the means. Further seeds
+need only `--rows ours paper`, or `--rows ours` for the expected errors. No network is trained on measured scenes or on
+the test split; the split is by source picture.
 """
 
 import argparse
@@ -22,13 +23,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from polarnet.reports.figures import LIGHT
 from polarnet.reports.png import png
+from studies.blocks import best_reconstruction, seeds_of
 from studies.figures import expected_errors_figure
 from studies.measure import ABLATION_KEYS, machine_record, measure_benchmark, read_results, uncommitted, write_section
-from studies.study_tables import best_reconstruction, over_seeds, seeds_of
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAININGS: dict[str, tuple[str, ...]] = {
@@ -78,7 +80,7 @@ def trained(row: str, arguments: argparse.Namespace) -> Path:
 
 
 def headlines(tables: dict[str, dict[str, dict[str, Any]]]) -> dict[str, Any]:
-    """What the tables say of the two DoLP networks."""
+    """Comparisons of the two DoLP networks, from the tables."""
     simulated, measured = tables["simulated"], tables["measured"]
     best = measured[best_reconstruction(measured)]["mse"]
     return {
@@ -87,6 +89,16 @@ def headlines(tables: dict[str, dict[str, dict[str, Any]]]) -> dict[str, Any]:
         "mse_over_oracle_mean": simulated["ours"]["mse"] / simulated["oracle_mean"]["mse"],
         "measured": {"mse_over_best_baseline": measured["ours"]["mse"] / best},
     }
+
+
+COMPARISONS = ("gain_over_paper_db", "mse_over_paper", "mse_over_oracle_mean")
+
+
+def over_seeds(seeds: list[dict[str, Any]]) -> dict[str, Any]:
+    """Means over the seeds of the comparisons of the two DoLP networks."""
+    measured = fmean(seed["measured"]["mse_over_best_baseline"] for seed in seeds)
+    means = {key: fmean(seed[key] for seed in seeds) for key in COMPARISONS}
+    return means | {"measured": {"mse_over_best_baseline": measured}}
 
 
 def parsed() -> argparse.Namespace:
@@ -103,10 +115,12 @@ def parsed() -> argparse.Namespace:
         metavar="ROW=FILE",
         help=f"published weights of {' or '.join(PUBLISHED)}; a row without them is left out",
     )
-    parser.add_argument("--override", action="append", default=[], metavar="ROW:KEY=VALUE", help="of a row's training")
+    parser.add_argument(
+        "--override", action="append", default=[], metavar="ROW:KEY=VALUE", help="value for the training of one row"
+    )
     parser.add_argument("--only", choices=tuple(TRAININGS), help="train this one and stop")
     parser.add_argument("--rows", nargs="+", choices=tuple(TRAININGS), default=[*TRAININGS], help="to train and score")
-    parser.add_argument("--seed", type=int, default=1, help="of the trainings; the data are the same for all")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the trainings; all seeds share the data")
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     parser.add_argument("--workers", type=int, default=1, help="processes that share the benchmark's sequences")
     parser.add_argument("--write", action="store_true", help="write docs/results")

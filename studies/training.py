@@ -1,18 +1,19 @@
-"""How fast the networks train and run: python -m studies.training [--write] [--rounds N] [--device cuda]
+"""Speed of training and inference: python -m studies.training [--write] [--rounds N] [--device cuda]
 
-Frames (four polarizers, 120 x 180 pixels) a second. Training: forward and backward through batches of sequences, the
-squares of the outputs as loss, without optimizer and data loading. Inference: one stream, the state carried on. Weights
-and inputs are random. Every network of `params.yaml` that there is a class for is measured, with
+Rates are in frames a second, of four channels of 120 x 180 pixels. Training is a forward and backward pass through
+batches of sequences, with the squared outputs as loss, without optimizer and data loading. Inference is one stream
+with its state. Weights and inputs are random. Every network of `params.yaml` with a class of its own is measured in
+these settings:
 
-- `naive`: float32, images as torch makes them (contiguous NCHW), a window at a time, torch as it starts;
-- `shipped`: channels_last, a run of windows at once, `train.precision`'s `auto`; in training with the settings of
-  `polarnet.runtime.machine.configure`, as in stages; in inference as many windows as `polarnet recover` takes from a
-  file;
-- `compiled` (with --compile): `shipped` through torch.compile, which needs a C++ compiler; a network that it fails for
-  has no such row.
+- `naive`: float32, contiguous NCHW images, one window at a time, torch's default settings;
+- `shipped`: channels_last, several windows at once, `train.precision` auto; training with the settings of
+  `polarnet.runtime.machine.configure`, as in the stages; inference with as many windows as `polarnet recover` takes
+  from a file;
+- `compiled` (with --compile): `shipped` with torch.compile, which needs a C++ compiler; networks for which it fails
+  have no such row.
 
-Each is measured in a process of its own, in turns; figures are medians over the turns. `peak_gflop_per_s` is what the
-same threads reach in a matrix product of the setting's precision. torch.profiler's table is that of the last turn.
+Each measurement has its own process; they take turns, and figures are medians over the turns. `peak_gflop_per_s` is
+the rate of a matrix product with the same threads and precision. The profile is that of the last turn.
 
 `--write` merges the figures into docs/results/network.json: the section `throughput` and the headline figures
 `train_speedup_over_eager_fp32` and `infer_windows_per_s` of `paper`, and `ours.infer_windows_per_s` of `polarnet`.
@@ -70,7 +71,7 @@ def network_of(name: str, setting: str, device: torch.device) -> tuple[nn.Module
 
 
 def loss_of(prediction: Prediction) -> Tensor:
-    """A number that every output takes part in."""
+    """A loss that depends on every output."""
     return torch.stack([output.square().mean() for output in prediction if output is not None]).sum()
 
 
@@ -85,7 +86,8 @@ def measure_one(name: str, setting: str, threads: int, device_name: str) -> dict
     network, channels = network_of(name, setting, device)
     windows = torch.randn(RUN, BATCH, channels, HEIGHT, WIDTH, device=device)
     stream = torch.randn(STREAMED, 1, channels, HEIGHT, WIDTH, device=device)
-    unroll = torch.compile(network.unroll) if setting == "compiled" else network.unroll
+    steps: Any = network  # every network has `unroll`, which nn.Module does not declare
+    unroll = torch.compile(steps.unroll) if setting == "compiled" else steps.unroll
 
     def train() -> None:
         network.zero_grad()
@@ -119,7 +121,7 @@ def measure_one(name: str, setting: str, threads: int, device_name: str) -> dict
     return figures
 
 
-def seconds_of(run: Callable[[], None], device: torch.device) -> float:
+def seconds_of(run: Callable[[], object], device: torch.device) -> float:
     """Median of the repeats, the first call left out."""
     seconds = []
     for _ in range(1 + REPEATS):
@@ -145,7 +147,7 @@ def profile_of(run: Callable[[], None]) -> dict[str, float]:
 
 
 def peak_gflop_per_s(precision: str, device: torch.device) -> float:
-    """What a product of large matrices of a precision reaches here."""
+    """Rate of a product of large matrices in this precision, in GFLOP/s."""
     dtype = torch.bfloat16 if precision == "bf16" else torch.float32
     a, b = torch.randn(2, MATRIX, MATRIX, dtype=dtype, device=device)
     return 2 * MATRIX**3 / seconds_of(lambda: torch.mm(a, b), device) / 1e9
@@ -153,7 +155,18 @@ def peak_gflop_per_s(precision: str, device: torch.device) -> float:
 
 def in_own_process(name: str, setting: str, threads: int, device: str) -> dict[str, Any]:
     """`measure_one` in a new process of this script."""
-    command = [sys.executable, __file__, "--one", name, setting, "--threads", str(threads), "--device", device]
+    command = [
+        sys.executable,
+        "-m",
+        "studies.training",
+        "--one",
+        name,
+        setting,
+        "--threads",
+        str(threads),
+        "--device",
+        device,
+    ]
     return json.loads(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.splitlines()[-1])
 
 
@@ -210,7 +223,8 @@ def main() -> None:
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.one:
-        print(json.dumps(measure_one(*arguments.one, arguments.threads, arguments.device)))
+        name, setting = arguments.one
+        print(json.dumps(measure_one(name, setting, arguments.threads, arguments.device)))
         return
     if arguments.write and (changed := uncommitted(ROOT)):
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")

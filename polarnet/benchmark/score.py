@@ -16,7 +16,7 @@ from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.metrics.lpips import BACKBONES
 from polarnet.metrics.similarity import (
-    LEAST_MSE,
+    MIN_MSE,
     Lpips,
     aolp_error_deg,
     correlation,
@@ -254,8 +254,8 @@ def write_frames(path: Path, rows: Iterable[FrameScore]) -> None:
 
 
 def _skill(error: Any, oracle: Any) -> Any:
-    """1 for no error, 0 for the error of the oracle mean, which is at least `LEAST_MSE`, the resolution of PSNR."""
-    return 1 - error / np.maximum(oracle, LEAST_MSE)
+    """1 for no error, 0 for the error of the oracle mean, which is at least `MIN_MSE`, the resolution of PSNR."""
+    return 1 - error / np.maximum(oracle, MIN_MSE)
 
 
 def _lpips_of(

@@ -17,8 +17,8 @@ from polarnet.events.stream import Events
 
 DARKEST = 64.0  # of 4095; below it the logarithm is mostly noise
 BRIGHT = 400.0  # of 4095; darker pixels respond less than logarithmically and have a different threshold
-LARGEST_CHANGE = 1.0  # natural-log intensity; a larger change between two events is not one threshold step
-MOST_STEPS = 300_000
+MAX_CHANGE = 1.0  # natural-log intensity; a larger change between two events is not one threshold step
+MAX_STEPS = 300_000
 STEP_US = 2_000  # of the first, coarse search
 FINEST_US = 20.0
 GOLDEN = (5**0.5 - 1) / 2
@@ -60,7 +60,7 @@ def steps(events: Events, corner: tuple[int, int], crop: tuple[int, int], start_
     found = _steps(events.t.numpy(), events.x.numpy(), events.y.numpy(), events.p.numpy(), *corner, *crop)
     inside = (found[0] >= start_us) & (found[1] < stop_us)
     sample = np.flatnonzero(inside)
-    sample = sample[:: max(1, -(-len(sample) // MOST_STEPS))]
+    sample = sample[:: max(1, -(-len(sample) // MAX_STEPS))]
     return Steps(*(column[sample] for column in found))
 
 
@@ -88,7 +88,7 @@ def agreement(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"
     Large changes are clipped and NaN is ignored; the result is 0 without any known change.
     """
     known = np.isfinite(change)
-    clipped = np.clip(change[known], -LARGEST_CHANGE, LARGEST_CHANGE)
+    clipped = np.clip(change[known], -MAX_CHANGE, MAX_CHANGE)
     norm = np.sqrt(np.dot(clipped, clipped) * len(clipped))
     return float(np.dot(polarity[known], clipped) / norm) if norm > 0 else 0.0
 
@@ -100,7 +100,7 @@ def spread(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) 
     move the extremum.
     """
     known = np.isfinite(change)
-    return float(np.var(np.clip(polarity[known] * change[known], -LARGEST_CHANGE, LARGEST_CHANGE)))
+    return float(np.var(np.clip(polarity[known] * change[known], -MAX_CHANGE, MAX_CHANGE)))
 
 
 def thresholds(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) -> Thresholds:

@@ -23,7 +23,7 @@ from polarnet.captures.dot import (
 from polarnet.events.stream import Events
 from polarnet.recordings.source import RecordingError
 
-MOST_PICTURES = 64  # per capture, from the landmark on; bounds the memory of the refinement
+MAX_PICTURES = 64  # per capture, from the landmark on; bounds the memory of the refinement
 LANDMARK_ERROR_US = 500.0  # difference between the landmark's times in the events of two captures
 REDUNDANCY_SHARE = 1e-3  # share of the samples assumed independent: neighbours in space and time are not
 ITERATIONS = 6
@@ -116,7 +116,7 @@ class _Stack:
 def pictures_after(capture: IntensityCapture, start_us: float | int) -> slice:
     """Up to 64 pictures, starting with the last one before `start_us`."""
     first = max(0, int(np.searchsorted(capture.t_us, start_us)) - 1)
-    return slice(first, first + MOST_PICTURES)
+    return slice(first, first + MAX_PICTURES)
 
 
 def _lag(

@@ -1,4 +1,4 @@
-"""The `polarnet` command. Each subcommand is thin: the library does the work, and is imported when it is needed."""
+"""The `polarnet` command. Subcommands are thin: each imports the library when it runs and leaves the work to it."""
 
 import argparse
 import sys
@@ -22,7 +22,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="polarnet", description="DoLP from event cameras: simulate, train, benchmark. `dvc repro` runs it all."
+        prog="polarnet",
+        description="Degree of linear polarization (DoLP) from event cameras: simulation, training, benchmark and "
+        "recovery. `dvc repro` runs the pipeline.",
     )
     parser.add_argument("--version", action="version", version=f"polarnet {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")

@@ -1,4 +1,4 @@
-"""Command that scores methods: on your own scenes, and in the studies of the pipeline's test sequences."""
+"""Command that scores methods: on your own scenes, or in studies of the pipeline's test sequences."""
 
 import argparse
 import contextlib
@@ -14,29 +14,39 @@ if TYPE_CHECKING:
 
 
 def add_to(commands: Commands) -> None:
-    """Its commands."""
+    """Add the command benchmark."""
     benchmark = commands.add_parser(
         "benchmark",
-        help="every method on your own photographs or measured scenes; the event budget; the sensitivity",
-        description="--scenes makes event sequences of a folder, runs every method that has its weights, prints the "
-        "table and writes it with a page; nothing is trained. The other two study the pipeline's own test sequences. "
-        "Sizes, motion and sensor are those of params.yaml.",
+        help="score every method on your own scenes, or study event budget and sensitivity",
+        description="--scenes simulates event sequences from the pictures of a folder, runs every method whose weights "
+        "are available, prints the table and writes it with a page; it trains nothing. --event-budget and "
+        "--sensitivity study the pipeline's own test sequences. params.yaml sets sizes, motion and sensor.",
     )
     asked = benchmark.add_mutually_exclusive_group(required=True)
-    asked.add_argument("--scenes", type=Path, metavar="FOLDER", help="photographs or measurements, in all subfolders")
+    asked.add_argument(
+        "--scenes", type=Path, metavar="FOLDER", help="photographs or measured polarization, subfolders included"
+    )
     asked.add_argument("--event-budget", action="store_true", help="quality against events per pixel (paper, Fig. 11)")
-    asked.add_argument("--sensitivity", action="store_true", help="quality against mismatch, noise, speed, channels")
+    asked.add_argument(
+        "--sensitivity", action="store_true", help="quality against threshold mismatch, noise, speed and channel errors"
+    )
     benchmark.add_argument(
-        "--weights", type=Path, metavar="FILE", help="of the network; default: shipped; studies: trained here"
+        "--weights",
+        type=Path,
+        metavar="FILE",
+        help="checkpoint of the network (default: the shipped one; for studies the pipeline's)",
     )
     benchmark.add_argument(
         "--kind", choices=("auto", "photographs", "polarization"), default="auto",
-        help="what lies in FOLDER; auto takes .npz files and NAME_0, NAME_45, ... for measured polarization",
+        help="content of FOLDER; auto recognises .npz files and NAME_0, NAME_45, ... as measured polarization "
+        "(default: auto)",
     )  # fmt: skip
-    benchmark.add_argument("--out", type=Path, metavar="DIR", help="default: below outputs/benchmark")
-    benchmark.add_argument("--methods", help="separated by commas; default: benchmark.methods, or what a study studies")
-    benchmark.add_argument("--limit", type=int, metavar="N", help="of the two studies: the first N test sequences")
-    benchmark.add_argument("overrides", nargs="*", help="of params.yaml, as Hydra takes them: seed=2")
+    benchmark.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/benchmark/NAME)")
+    benchmark.add_argument(
+        "--methods", help="methods, separated by commas (default: benchmark.methods; studies have a list of their own)"
+    )
+    benchmark.add_argument("--limit", type=int, metavar="N", help="use only the first N test sequences in a study")
+    benchmark.add_argument("overrides", nargs="*", help="values that replace those of params.yaml: seed=2")
     benchmark.set_defaults(run=_benchmark)
 
 
@@ -45,7 +55,9 @@ def _benchmark(options: argparse.Namespace) -> int:
     from polarnet.runtime.machine import configure
 
     if options.scenes and options.limit is not None:
-        raise ValueError("--limit is for --event-budget and --sensitivity; --scenes scores all that lies in its folder")
+        raise ValueError(
+            "--limit applies to --event-budget and --sensitivity only; --scenes scores every picture of its folder"
+        )
     settings = settings_root() if options.scenes else project_root()  # a study needs the pipeline's test sequences
     folder = working_folder()
     scenes = options.scenes.resolve() if options.scenes else None
@@ -72,7 +84,7 @@ def _own_scenes(options: argparse.Namespace, config: "Config", scenes: Path, out
     print(as_plain(score_table(metrics)))
     for note in notes:
         print(note)
-    print(f"the page: {out / 'index.html'}")
+    print(f"page: {out / 'index.html'}")
     return 0
 
 
@@ -83,5 +95,5 @@ def _study(options: argparse.Namespace, config: "Config", out: Path, weights: Pa
     methods = options.methods.split(",") if options.methods else STUDIED
     with run_folder(out, f"benchmark {'--event-budget' if options.event_budget else '--sensitivity'}") as folder:
         run(config, folder, methods, options.limit, weights)
-    print(f"written to {out}: {', '.join(sorted(path.name for path in out.iterdir() if path.name != MARKER))}")
+    print(f"wrote to {out}: {', '.join(sorted(path.name for path in out.iterdir() if path.name != MARKER))}")
     return 0

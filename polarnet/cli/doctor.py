@@ -52,5 +52,5 @@ def _device() -> str:
 
 
 def _bf16() -> str:
-    found = bf16_units(torch.device("cuda" if torch.cuda.is_available() else "cpu"))
-    return ", ".join(found) if found else "emulated here, slower than fp32, which train.precision=auto therefore takes"
+    units = bf16_units(torch.device("cuda" if torch.cuda.is_available() else "cpu"))
+    return ", ".join(units) if units else "emulated here and slower than fp32; train.precision=auto therefore uses fp32"

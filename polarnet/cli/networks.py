@@ -1,4 +1,4 @@
-"""Command on a network: what others can run."""
+"""Command that exports a network."""
 
 import argparse
 from pathlib import Path
@@ -7,17 +7,22 @@ from polarnet.cli.parsers import Commands
 
 
 def add_to(commands: Commands) -> None:
-    """Its commands."""
+    """Add the command onnx."""
     onnx = commands.add_parser(
         "onnx",
-        help="a network as an ONNX file, checked with ONNX Runtime",
-        description="Writes one window of one stream: events and the state in, DoLP and the new state out. The file "
-        "says in its metadata what these are; it gets its name once ONNX Runtime gives what torch gives.",
+        help="export a network as an ONNX file, checked with ONNX Runtime",
+        description="The exported network takes the events of one window and a state, and returns DoLP and the new "
+        "state; the file's metadata describes all inputs and outputs. The file is renamed to OUT.onnx once ONNX "
+        "Runtime reproduces torch's outputs.",
     )
-    onnx.add_argument("file", type=Path, metavar="OUT.onnx")
-    onnx.add_argument("--weights", type=Path, metavar="FILE", help="of the network; default: shipped")
-    onnx.add_argument("--height", type=int, default=120, help="of the images, which the file is for alone (120)")
-    onnx.add_argument("--width", type=int, default=180, help="(180)")
+    onnx.add_argument("file", type=Path, metavar="OUT.onnx", help="file to write")
+    onnx.add_argument(
+        "--weights", type=Path, metavar="FILE", help="checkpoint of the network (default: the shipped one)"
+    )
+    onnx.add_argument(
+        "--height", type=int, default=120, help="sensor rows; the file works for this size only (default: 120)"
+    )
+    onnx.add_argument("--width", type=int, default=180, help="sensor columns (default: 180)")
     onnx.set_defaults(run=_onnx)
 
 
@@ -27,8 +32,10 @@ def _onnx(options: argparse.Namespace) -> int:
     from polarnet.networks.weights import shipped_weights
 
     weights = options.weights or shipped_weights()
-    found = export_network(*load_network(weights), options.file, options.height, options.width)
-    worst = max(found, key=found.__getitem__)
+    differences = export_network(*load_network(weights), options.file, options.height, options.width)
+    worst = max(differences, key=differences.__getitem__)
     print(f"{weights} -> {options.file}, {options.file.stat().st_size / 1e6:.1f} MB")
-    print(f"ONNX Runtime's outputs are within {found[worst]:.1e} of torch's ({worst}); {TOLERANCE:g} is allowed")
+    print(
+        f"ONNX Runtime's outputs differ from torch's by up to {differences[worst]:.1e} ({worst}; limit {TOLERANCE:g})"
+    )
     return 0

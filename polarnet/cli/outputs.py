@@ -10,20 +10,20 @@ from pathlib import Path
 MARKER = "run.json"
 """File that names the command whose run a folder holds."""
 WORK = "work"
-"""Folder beside the results that a later run of a command may go on from; never removed."""
+"""Folder beside the results from which a later run of a command may resume; never removed."""
 
 
 @contextlib.contextmanager
 def run_folder(folder: Path, command: str) -> Iterator[Path]:
-    """FOLDER.partial, for the files of one run of `command`; they move to `folder` once the block ends.
+    """FOLDER.partial, which takes the files of one run of `command`; they move to `folder` when the block ends.
 
-    They replace those of an earlier run of `command` there. After an error or an interruption, `folder` is as it was,
-    and FOLDER.partial stays only where it holds a file: the next run replaces it. ValueError where either folder holds
-    files of anything else.
+    They replace the files of an earlier run of `command` there. After an error or an interruption, `folder` is
+    unchanged. FOLDER.partial then remains only if it contains a file, and the next run replaces it. Raises ValueError
+    if either folder contains other files.
     """
     partial = folder.resolve().with_name(f"{folder.resolve().name}.partial")
     for each in (folder, partial):
-        _check_held(each, command)
+        _check_owner(each, command)
     if partial.exists():
         shutil.rmtree(partial)
     absent = [each for each in (partial, *partial.parents) if not each.exists()]
@@ -32,48 +32,48 @@ def run_folder(folder: Path, command: str) -> Iterator[Path]:
     try:
         yield partial
     except BaseException:
-        _give_up(partial, absent)
+        _clean_up(partial, absent)
         raise
     folder.mkdir(exist_ok=True)
     for earlier in _entries(folder):
         _remove(earlier)
-    for made in partial.iterdir():
-        if made.name == WORK and (folder / WORK).exists():
+    for entry in partial.iterdir():
+        if entry.name == WORK and (folder / WORK).exists():
             shutil.rmtree(folder / WORK)
-        made.rename(folder / made.name)
+        entry.rename(folder / entry.name)
     partial.rmdir()
 
 
 def _entries(folder: Path) -> list[Path]:
-    """What a folder holds beside `WORK`; nothing where it does not exist."""
+    """Entries of a folder other than `WORK`; none if the folder does not exist."""
     return [path for path in folder.iterdir() if path.name != WORK] if folder.is_dir() else []
 
 
-def _check_held(folder: Path, command: str) -> None:
+def _check_owner(folder: Path, command: str) -> None:
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder} is a file; name a folder")
+        raise ValueError(f"{folder}: expected a folder, got a file; name a folder")
     if not _entries(folder):
         return
     try:
-        held = json.loads((folder / MARKER).read_text(encoding="utf-8"))["command"]
+        owner = json.loads((folder / MARKER).read_text(encoding="utf-8"))["command"]
     except (OSError, ValueError, KeyError, TypeError):
-        held = None
-    if held != f"polarnet {command}":
+        owner = None
+    if owner != f"polarnet {command}":
         raise ValueError(
-            f"{folder} holds files that `polarnet {command}` did not write; name another folder, or empty this one"
+            f"{folder} contains files that `polarnet {command}` did not write; name another folder, or empty this one"
         )
 
 
-def _give_up(partial: Path, absent: list[Path]) -> None:
-    """Remove what a failed run left, unless it holds results; `absent` are the folders it made, innermost first."""
+def _clean_up(partial: Path, absent: list[Path]) -> None:
+    """Remove the files of a failed run that left no results; `absent` are the folders it created, innermost first."""
     results = (path for entry in _entries(partial) for path in (entry, *entry.rglob("*")))
     if any(path.is_file() and path.name != MARKER for path in results):
-        print(f"files made until then: {partial}", file=sys.stderr)
+        print(f"files of the unfinished run: {partial}", file=sys.stderr)
         return
     shutil.rmtree(partial)
-    for made in absent[1:]:
-        with contextlib.suppress(OSError):  # another run has put something there
-            made.rmdir()
+    for created in absent[1:]:
+        with contextlib.suppress(OSError):  # another run has written into it
+            created.rmdir()
 
 
 def _remove(path: Path) -> None:

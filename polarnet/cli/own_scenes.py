@@ -41,7 +41,7 @@ def benchmark_folder(
     """
     if weights is not None and not weights.is_file():
         raise ValueError(
-            f"--weights {weights}: expected a checkpoint of the DoLP network (.safetensors), there is none"
+            f"--weights {weights}: expected a checkpoint of the DoLP network (.safetensors), found no such file"
         )
     lpips_weights = with_lpips(config, "benchmark", find_weights)  # the pipeline need not have found them before
     lpips = None if lpips_weights is None else Lpips.of(lpips_weights.backbone, lpips_weights.tensors)
@@ -56,7 +56,7 @@ def benchmark_folder(
     try:
         make_folder_set(root, kind, work, recipe, functools.partial(mapper_of, config))
     except ValueError as error:
-        raise ValueError(f"--scenes {root}: nothing to test on. {error}") from error
+        raise ValueError(f"--scenes {root}: no scene to score. {error}") from error
     notes = [*_skipped(config, work), *(_left_out(row, reason) for row, reason in left_out.items())]
     settings = dataclasses.replace(config.benchmark, methods=methods)
     test_set = made_set(root.resolve().name, work)
@@ -77,9 +77,9 @@ def benchmark_folder(
 def _skipped(config: Config, work: Path) -> list[str]:
     """One line for each file of the folder that was skipped."""
     manifest = read_manifest(work / "images")
-    seen = set(SceneStore.open(work / "scenes.zarr").picture_of.values())
-    unseen = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name not in seen))
-    _, small = motions_of(unseen, config.synthesize, config.seed)
+    used = set(SceneStore.open(work / "scenes.zarr").picture_of.values())
+    unused = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name not in used))
+    _, small = motions_of(unused, config.synthesize, config.seed)
     return [f"{skipped.file} was skipped: {skipped.reason}" for skipped in (*manifest.skipped, *small)]
 
 

@@ -1,4 +1,4 @@
-"""What the modules of commands share."""
+"""Type of the object to which modules of commands add their parsers."""
 
 import argparse
 from typing import TypeAlias

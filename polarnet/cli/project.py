@@ -1,4 +1,4 @@
-"""Commands of a clone of polarnet: its settings and its stages."""
+"""Commands for a clone of polarnet: its settings and its stages."""
 
 import argparse
 import os
@@ -14,19 +14,19 @@ SOURCE_TREE = Path(__file__).parents[2]
 
 
 def add_to(commands: Commands) -> None:
-    """Its commands."""
-    doctor = commands.add_parser("doctor", help="what this machine offers: versions, device, bf16, weights, free disk")
+    """Add the commands doctor, preset, run and stages."""
+    doctor = commands.add_parser("doctor", help="report versions, device, bf16 support, LPIPS weights, memory and disk")
     doctor.set_defaults(run=_doctor)
 
-    preset = commands.add_parser("preset", help="write a named experiment or sensor into params.yaml, comments kept")
-    preset.add_argument("name", help="a file of conf/experiment or conf/sensor: demo, smoke, paper, noisy, ...")
+    preset = commands.add_parser("preset", help="write a named experiment or sensor into params.yaml, keeping comments")
+    preset.add_argument("name", help="name of a file in conf/experiment or conf/sensor: demo, smoke, paper, noisy, ...")
     preset.set_defaults(run=_preset)
 
     run = commands.add_parser("run", help="run all stages through Hydra alone, into outputs/run/NAME")
-    run.add_argument("overrides", nargs="*", help="as Hydra takes them: experiment=smoke seed=2 paths.data=FOLDER")
+    run.add_argument("overrides", nargs="*", help="overrides for Hydra: experiment=smoke seed=2 paths.data=FOLDER")
     run.set_defaults(run=_run)
 
-    stages = commands.add_parser("stages", help="the names of the stages, in order")
+    stages = commands.add_parser("stages", help="list the stages in order")
     stages.set_defaults(run=_stages)
 
 
@@ -93,7 +93,7 @@ def _run(options: argparse.Namespace) -> int:
         print(f"== {name}", flush=True)
         status = subprocess.run([sys.executable, "-m", f"stages.{stage}", *overrides, *own], cwd=root).returncode
         if status:
-            print(f"polarnet run: stage {name} failed; what earlier stages made lies in {folder}", file=sys.stderr)
+            print(f"polarnet run: stage {name} failed; the results of earlier stages are in {folder}", file=sys.stderr)
             return status
     print(f"done: {os.path.join(folder, 'report', 'index.html')}")
     return 0

@@ -1,4 +1,4 @@
-"""Commands on recordings: look into them, lay them on one another, recover DoLP, play them."""
+"""Commands for recordings: inspect, register, recover DoLP, replay."""
 
 import argparse
 import functools
@@ -11,106 +11,141 @@ from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.parsers import Commands
 from polarnet.cli.project import settings_root
 
-OF_FILES = ("format", "height", "width", "clock_mhz", "assume_polarity")
-"""Options of commands that say how to read a camera's files."""
+READING_OPTIONS = ("format", "height", "width", "clock_mhz", "assume_polarity")
+"""Options that describe a camera's file where the file itself does not."""
 
-TAKEN = {
+OPTIONS_BY_INPUT = {
     "--live": {"mosaic"},
-    "four files": {"angles", "size", *OF_FILES},
-    "one file with --mosaic": {"mosaic", "size", *OF_FILES},
+    "four files": {"angles", "size", *READING_OPTIONS},
+    "one file with --mosaic": {"mosaic", "size", *READING_OPTIONS},
     "an event store or a folder": {"sequence", "size"},
 }
-"""Which options about its input `polarnet recover` takes."""
+"""Options of `polarnet recover` that apply to each kind of input."""
 
 
 def add_to(commands: Commands) -> None:
-    """Its commands."""
+    """Add the commands inspect, register, recover and replay."""
     _add_inspection(commands)
     _add_recovery(commands)
 
 
 def _add_inspection(commands: Commands) -> None:
-    inspect = commands.add_parser("inspect", help="what is in a camera's file, and a picture of its busiest moment")
-    inspect.add_argument("file", type=Path)
-    _add_reading(inspect)
-    inspect.add_argument("--part", metavar="SEQUENCE/ANGLE", help="of an event store")
-    inspect.add_argument(
-        "--hot-pixel-factor", type=float, default=4.0, help="hot: as many times the third busiest around (4)"
+    inspect = commands.add_parser(
+        "inspect",
+        help="summarise a camera's file and draw its busiest moment",
+        description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
+        "camera's file, and draws its busiest moment as a PNG.",
     )
-    inspect.add_argument("--picture", type=Path, help="where to write the PNG (default: FILE.png here)")
-    inspect.add_argument("--hot-pixels", type=Path, metavar="PNG", help="where to draw how often each pixel fired")
+    inspect.add_argument("file", type=Path, help="file of a camera, or an event store with --part")
+    _add_reading(inspect)
+    inspect.add_argument("--part", metavar="SEQUENCE/ANGLE", help="sequence and channel of an event store: NAME/45")
+    inspect.add_argument(
+        "--hot-pixel-factor",
+        type=float,
+        default=4.0,
+        help="a pixel is hot above this multiple of the third busiest of the 5 x 5 pixels around it (default: 4)",
+    )
+    inspect.add_argument("--picture", type=Path, help="PNG of the busiest moment (default: outputs/inspect/FILE.png)")
+    inspect.add_argument(
+        "--hot-pixels", type=Path, metavar="PNG", help="PNG of the number of events of each pixel (default: not drawn)"
+    )
     inspect.set_defaults(run=_inspect)
 
-    register = commands.add_parser("register", help="lay one camera's recording on another's: the homography")
-    register.add_argument("reference", type=Path)
-    register.add_argument("file", type=Path)
+    register = commands.add_parser(
+        "register",
+        help="estimate the homography between the recordings of two cameras",
+        description="Prints the homography that maps pixels of REFERENCE to pixels of FILE, as JSON, with the "
+        "correlation of the edges of both recordings.",
+    )
+    register.add_argument("reference", type=Path, help="recording of the first camera")
+    register.add_argument("file", type=Path, help="recording of the second camera, of the same scene")
     _add_reading(register)
-    register.add_argument("--picture", type=Path, help="where to write a PNG of both event images, before and after")
+    register.add_argument(
+        "--picture", type=Path, help="PNG of both event images, before and after (default: not drawn)"
+    )
     register.set_defaults(run=_register)
 
 
 def _add_reading(command: argparse.ArgumentParser) -> None:
-    """The options of `OF_FILES`."""
-    command.add_argument("--format", help="where the content does not show it: text, celex5_csv, celex5_bin, dat, ...")
-    command.add_argument("--height", type=int, help="of the sensor, where the file does not say it")
-    command.add_argument("--width", type=int)
-    command.add_argument("--clock-mhz", type=float, help="of a CeleX-5, where it was not 100 MHz")
-    command.add_argument("--assume-polarity", type=int, choices=(1, -1), help="of events that come without one")
+    """Add `READING_OPTIONS`."""
+    command.add_argument("--format", help="format if it cannot be recognised: text, celex5_csv, celex5_bin, dat, ...")
+    command.add_argument("--height", type=int, help="rows of the sensor, if the file does not state them")
+    command.add_argument("--width", type=int, help="columns of the sensor, if the file does not state them")
+    command.add_argument("--clock-mhz", type=float, help="clock of a CeleX-5 (default: 100)")
+    command.add_argument("--assume-polarity", type=int, choices=(1, -1), help="polarity of events that have none")
 
 
 def _reading(options: argparse.Namespace) -> dict[str, Any]:
-    return {name: getattr(options, name) for name in OF_FILES}
+    return {name: getattr(options, name) for name in READING_OPTIONS}
 
 
 def _add_recovery(commands: Commands) -> None:
     recover = commands.add_parser(
         "recover",
-        help="DoLP and AoLP of recordings, or of a camera that runs: frames, pictures, a video and a page",
-        description="INPUT is four files, one a polarizer, with --angles; one file of a camera with polarizers on its "
-        "pixels, with --mosaic; an event store; a folder of division-of-time captures; or, with --live, lines "
-        "`t x y p angle` of a file that grows or of standard input (-).",
+        help="recover DoLP and AoLP from recordings or from a running camera",
+        description="Writes frames, pictures, a video and a page. INPUT is one of: four files, one for each polarizer, "
+        "with --angles; one file of a camera with polarizers on its pixels, with --mosaic; an event store; a folder of "
+        "division-of-time captures; with --live, a growing file or standard input (-) with lines `t x y p angle`.",
     )
-    recover.add_argument("input", nargs="+", metavar="INPUT")
-    recover.add_argument("--angles", nargs=4, type=int, metavar="DEG", help="polarizers of the four files, in order")
+    recover.add_argument("input", nargs="+", metavar="INPUT", help="recordings, an event store, a folder, or -")
     recover.add_argument(
-        "--mosaic", metavar="'A B / C D'", help="polarizers of 2x2 pixels: even row / odd row, degrees"
-    )
-    recover.add_argument("--sequence", metavar="NAME", help="of an event store with several")
-    recover.add_argument("--live", action="store_true", help="recover while events come, and show the latency")
-    recover.add_argument(
-        "--idle", type=float, default=5.0, metavar="S", help="a live file that stops growing has ended"
+        "--angles", nargs=4, type=int, metavar="DEG", help="polarizer angles of the four files, in order"
     )
     recover.add_argument(
-        "--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce files to so many pixels"
+        "--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels in degrees: even row / odd row"
+    )
+    recover.add_argument("--sequence", metavar="NAME", help="sequence of an event store with several")
+    recover.add_argument("--live", action="store_true", help="recover while events arrive, and print the latency")
+    recover.add_argument(
+        "--idle",
+        type=float,
+        default=5.0,
+        metavar="S",
+        help="seconds without growth after which a live file has ended (default: 5)",
+    )
+    recover.add_argument(
+        "--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce the sensor to this many rows and columns"
     )
     recover.add_argument(
         "--window", default="33.333ms",
-        help="a time (33.3ms) or a number of events of all polarizers (20000ev); networks are trained on 1/30 s",
+        help="length of a window: a time (33.3ms) or a number of events of all channels (20000ev); networks are "
+        "trained on windows of 1/30 s (default: 33.333ms)",
     )  # fmt: skip
-    recover.add_argument("--step", help="time between the ends of overlapping windows, from 0.1ms; default: no overlap")
     recover.add_argument(
-        "--weights", type=Path, metavar="FILE", help="of the network; default: shipped, or trained here"
+        "--step", help="time between the ends of overlapping windows, at least 0.1ms (default: no overlap)"
     )
-    recover.add_argument("--method", help="instead of the network: cf, highpass, cf+gain, e2v, ... of the benchmark")
-    recover.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N")
+    recover.add_argument(
+        "--weights", type=Path, metavar="FILE", help="checkpoint of the network (default: the shipped one)"
+    )
+    recover.add_argument(
+        "--method", help="method of the benchmark instead of the network: cf, highpass, cf+gain, e2v, ..."
+    )
+    recover.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
     recover.add_argument(
         "--precision",
         choices=("auto", "fp32", "bf16"),
         default="auto",
-        help="auto: bf16 where the device has units for it",
+        help="number format of the network; auto takes bf16 if the device has units for it (default: auto)",
     )
-    recover.add_argument("--out", type=Path, metavar="FOLDER", help="default: outputs/recover/NAME")
-    recover.add_argument("--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), help="default: zarr png mp4")
-    recover.add_argument("--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video")
+    recover.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
+    recover.add_argument(
+        "--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), help="file types to write (default: zarr png mp4)"
+    )
+    recover.add_argument(
+        "--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)"
+    )
     _add_reading(recover)
     recover.set_defaults(run=_recover)
 
     replay = commands.add_parser(
-        "replay", help="a stored sequence as live lines, at its own pace: polarnet recover --live"
+        "replay",
+        help="print a stored sequence as lines `t x y p angle`, at its own pace",
+        description="Prints the events of a stored sequence at the pace of the recording. Pipe them into "
+        "`polarnet recover - --live` to try live recovery without a camera.",
     )
-    replay.add_argument("store", help="folder, zip or fsspec URL")
-    replay.add_argument("sequence")
-    replay.add_argument("--speed", type=float, default=1.0, help="times as fast as recorded")
+    replay.add_argument("store", help="event store: folder, zip or fsspec URL")
+    replay.add_argument("sequence", help="name of the sequence")
+    replay.add_argument("--speed", type=float, default=1.0, help="speed relative to the recording (default: 1)")
     replay.set_defaults(run=_replay)
 
 
@@ -123,7 +158,8 @@ def _inspect(options: argparse.Namespace) -> int:
     inspection = inspect_recording(recording, options.hot_pixel_factor)
     for finding in findings(inspection):
         print(finding)
-    path = options.picture or Path(f"{options.file.name}.png")
+    path = options.picture or Path("outputs") / "inspect" / f"{options.file.name}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(recording_picture(inspection))
     print(f"picture     {path}")
     if options.hot_pixels:
@@ -141,17 +177,17 @@ def _register(options: argparse.Namespace) -> int:
 
     files = options.reference, options.file
     reference, moving = (event_image(read_recording(path, **_reading(options)).events) for path in files)
-    found = register(reference, moving)
-    print(json.dumps({**found._asdict(), "homography": found.homography.tolist()}, indent=2))
-    if found.edge_correlation < UNRELATED:
+    registration = register(reference, moving)
+    print(json.dumps({**registration._asdict(), "homography": registration.homography.tolist()}, indent=2))
+    if registration.edge_correlation < UNRELATED:
         print(
-            f"polarnet register: warning: the edges of the two recordings do not meet (correlation "
-            f"{found.edge_correlation:.2f}, expected at least {UNRELATED:g}): do not use this homography. They show "
-            f"other scenes, too few edges, or cameras too far apart",
+            f"polarnet register: warning: do not use this homography: the edges of the two recordings do not match "
+            f"(correlation {registration.edge_correlation:.2f}, expected at least {UNRELATED:g}). The recordings show "
+            f"different scenes, have too few edges, or come from cameras too far apart",
             file=sys.stderr,
         )
     if options.picture:
-        draw_registration(reference, moving, warped(moving, found.homography), options.picture)
+        draw_registration(reference, moving, warped(moving, registration.homography), options.picture)
     return 0
 
 
@@ -165,7 +201,7 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.recovery.writer import RecoveryWriter
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
-    _check_taken(options)
+    refuse_unused_options(options)
     config = functools.cache(lambda: load(settings_root()))
     length_us, events = parse_window(options.window)
     step_us, step_events = parse_window(options.step) if options.step else (None, None)
@@ -181,7 +217,7 @@ def _recover(options: argparse.Namespace) -> int:
     lines = None
     with run_folder(out, "recover") as folder:
         if options.live:
-            print(f"frames come into {folder}, and move to {out} at the end", file=sys.stderr)
+            print(f"writing frames to {folder}; the folder becomes {out} at the end", file=sys.stderr)
             source, lines = open_live(options.input[0], mosaic, options.idle)
         else:
             read = functools.partial(read_recording, **_reading(options))
@@ -194,7 +230,7 @@ def _recover(options: argparse.Namespace) -> int:
         writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
         summary = recover(source, rule, recoverer, writer)
         left_out = {kind: count for kind, count in lines.counts.items() if count} if lines else {}
-        notes = [*check.findings(), *([f"Lines that were left out: {left_out}."] if left_out else [])]
+        notes = [*check.findings(), *([f"Unusable lines were left out: {left_out}."] if left_out else [])]
         counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)
         facts = facts_of(source, rule, words, summary)
         facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
@@ -203,12 +239,12 @@ def _recover(options: argparse.Namespace) -> int:
         print(f"{key:11s} {value}")
     for note in notes:
         print(f"polarnet recover: warning: {note}", file=sys.stderr)
-    print(f"the page: {out / page.name}")
+    print(f"page        {out / page.name}")
     return 0
 
 
-def _check_taken(options: argparse.Namespace) -> None:
-    """ValueError where an option about the input was given that such an input does not take."""
+def refuse_unused_options(options: argparse.Namespace) -> None:
+    """ValueError for an option that does not apply to the given kind of input."""
     if options.live and len(options.input) != 1:
         raise ValueError(f"--live: expected one file or -, got {len(options.input)}")
     if options.live:
@@ -220,11 +256,11 @@ def _check_taken(options: argparse.Namespace) -> None:
     elif Path(options.input[0]).is_dir() or Path(options.input[0]).suffix == ".zip":
         kind = "an event store or a folder"
     else:
-        return  # refused for what is missing
-    given = [name for name in sorted(set().union(*TAKEN.values()) - TAKEN[kind]) if getattr(options, name) is not None]
+        return  # reading the input will name the missing option
+    unused = set().union(*OPTIONS_BY_INPUT.values()) - OPTIONS_BY_INPUT[kind]
+    given = [f"--{name.replace('_', '-')}" for name in sorted(unused) if getattr(options, name) is not None]
     if given:
-        named = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-        raise ValueError(f"{kind}: expected no {named}, which would not be used; leave it out")
+        raise ValueError(f"{kind}: expected no {', '.join(given)}, which does not apply to this input; leave it out")
 
 
 def _replay(options: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""Commands on stores: check, export."""
+"""Commands for stores: verify, export."""
 
 import argparse
 from pathlib import Path
@@ -8,15 +8,20 @@ from polarnet.cli.parsers import Commands
 
 
 def add_to(commands: Commands) -> None:
-    """Its commands."""
+    """Add the commands verify and export."""
     verify = commands.add_parser("verify", help="check every byte of a store of events, frames or scenes")
-    verify.add_argument("store", help="folder, zip or fsspec URL")
+    verify.add_argument("store", help="store: folder, zip or fsspec URL")
     verify.set_defaults(run=_verify)
 
-    export = commands.add_parser("export", help="an event store as files that other tools read")
-    export.add_argument("store", help="folder, zip or fsspec URL")
-    export.add_argument("folder", type=Path, help="gets a file for each sequence and polarizer")
-    export.add_argument("--format", choices=("hdf5", "text"), default="hdf5", help="DSEC's HDF5, or lines of t x y p")
+    export = commands.add_parser("export", help="export an event store to files for other tools")
+    export.add_argument("store", help="event store: folder, zip or fsspec URL")
+    export.add_argument("folder", type=Path, help="output folder; one file for each sequence and channel")
+    export.add_argument(
+        "--format",
+        choices=("hdf5", "text"),
+        default="hdf5",
+        help="HDF5 in DSEC's layout, or text lines t x y p (default: hdf5)",
+    )
     export.set_defaults(run=_export)
 
 
@@ -28,12 +33,12 @@ def _verify(options: argparse.Namespace) -> int:
     checks = {store.FORMAT: store.verify, frames.FORMAT: frames.verify_frames, scenes.FORMAT: scenes.verify_scenes}
     form = open_group(options.store).attrs.get("format")
     if form not in checks:
-        raise ValueError(f"{options.store}: expected a store of {', '.join(checks)}, its format is {form!r}")
+        raise ValueError(f"{options.store}: expected a store of format {', '.join(checks)}, got {form!r}")
     problems = checks[form](options.store)
     for problem in problems:
         print(problem)
     if not problems:
-        print(f"{options.store}: every sequence is whole")
+        print(f"{options.store}: every sequence is intact")
     return 1 if problems else 0
 
 

@@ -47,8 +47,8 @@ Valid = Bool[Array, "*b h w"] | None
 SSIM_SIGMA = 1.5  # pixels; this and the next three: Wang et al., IEEE TIP 2004
 SSIM_RADIUS = 5  # pixels: an 11 x 11 kernel
 SSIM_K1, SSIM_K2 = 0.01, 0.03
-LEAST_MSE = 1e-10  # half a step of the stored truth (1/65535) squared is 6e-11: nothing finer is known
-LEAST_DEVIATION = 1e-6  # a tenth of a step: a frame with a smaller deviation counts as constant
+MIN_MSE = 1e-10  # half a step of the stored truth (1/65535) squared is 6e-11: nothing finer is known
+MIN_DEVIATION = 1e-6  # a tenth of a step: a frame with a smaller deviation counts as constant
 SOBEL_SMOOTH, SOBEL_SLOPE = (0.25, 0.5, 0.25), (-0.5, 0.0, 0.5)  # across and along; a ramp gives its slope
 CHANCE_AOLP_DEG = 45.0  # mean error of a random angle: the mean of |d| over -90 ... 90 degrees
 
@@ -103,7 +103,7 @@ def psnr(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = No
     a, b = _frames(a=a, b=b)
     valid = None if valid is None else mask_of("valid", valid, a.shape)
     _check_unit(b, valid)
-    return -10 * torch.log10(mse(a, b, valid).clamp(min=LEAST_MSE))
+    return -10 * torch.log10(mse(a, b, valid).clamp(min=MIN_MSE))
 
 
 def correlation(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
@@ -116,7 +116,7 @@ def correlation(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Val
     dtype = torch.promote_types(a.dtype, b.dtype)
     a, b = _centred(a.double(), valid), _centred(b.double(), valid)
     variance = mean_where(a.square(), valid) * mean_where(b.square(), valid)
-    varies = (_deviation(a, valid) > LEAST_DEVIATION) & (_deviation(b, valid) > LEAST_DEVIATION)
+    varies = (_deviation(a, valid) > MIN_DEVIATION) & (_deviation(b, valid) > MIN_DEVIATION)
     covariance = mean_where(a * b, valid)
     constant = torch.zeros_like(covariance)
     if valid is not None:
@@ -151,7 +151,7 @@ def gradient_agreement(
         return (values if seen is None else torch.where(seen, values, 0.0)).sum(dim=(-2, -1))
 
     common, energy = total(a_x * b_x + a_y * b_y), [total(x.square() + y.square()) for x, y in ((a_x, a_y), (b_x, b_y))]
-    floor = LEAST_DEVIATION**2 * a_x.shape[-2] * a_x.shape[-1]
+    floor = MIN_DEVIATION**2 * a_x.shape[-2] * a_x.shape[-1]
     varies = (energy[0] > floor) & (energy[1] > floor)
     return torch.where(varies, 2 * common / torch.where(varies, energy[0] + energy[1], 1.0), 0.0).to(dtype)
 

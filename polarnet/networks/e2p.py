@@ -24,7 +24,7 @@ MOSAIC = ((90, 45), (135, 0))  # polarizer angles in degrees over even and odd r
 CELLS = ((0, 0), (0, 1), (1, 0), (1, 1))  # row and column of each polarizer in a 2x2 cell
 ATTENTION_KERNEL = 5
 GATE_POOL = 4
-SMALLEST_SIDE = 2 * GATE_POOL  # smallest height and width of the result: the gate halves the resolution and pools by 4
+MIN_SIDE = 2 * GATE_POOL  # smallest height and width of the result: the gate halves the resolution and pools by 4
 PUBLISHED_NAME = re.compile(r"(head|G1|G2|R1|R2|pred)_([iad])\.(.*)")
 
 
@@ -47,8 +47,8 @@ class E2p(nn.Module):
         """
         if mosaic.shape[1] != self.bins or mosaic.shape[-1] % 2 or mosaic.shape[-2] % 2:
             raise ValueError(f"this E2P takes {self.bins} bins of even height and width, got {tuple(mosaic.shape[1:])}")
-        if min(mosaic.shape[-2:]) < 2 * SMALLEST_SIDE:
-            raise ValueError(f"E2P needs at least {2 * SMALLEST_SIDE} rows and columns, got {tuple(mosaic.shape[-2:])}")
+        if min(mosaic.shape[-2:]) < 2 * MIN_SIDE:
+            raise ValueError(f"E2P needs at least {2 * MIN_SIDE} rows and columns, got {tuple(mosaic.shape[-2:])}")
         branches: list[Any] = [self.branches[name] for name in BRANCHES]
         before: Sequence[Tensor | None] = state or [None] * (2 * len(branches))
         mosaic = mosaic.contiguous(memory_format=torch.channels_last)

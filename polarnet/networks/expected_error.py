@@ -15,9 +15,9 @@ from torch.nn import functional as F
 from polarnet.networks.redundancy import block_means
 
 TELLING = 5
-LEAST_DISAGREEMENT = 1e-3  # squared DoLP, added because candidates that agree may share an error
-LEAST_WEIGHT = 1e-6  # lower limit of the candidates' total weight
-LEAST_ROOM = 0.05  # added to dolp * (1 - dolp)
+MIN_DISAGREEMENT = 1e-3  # squared DoLP, added because candidates that agree may share an error
+MIN_WEIGHT = 1e-6  # lower limit of the candidates' total weight
+MIN_ROOM = 0.05  # added to dolp * (1 - dolp)
 HARDLY_ANY = 0.1  # a frame with this mean evidence has a silence of 1/2
 
 
@@ -57,14 +57,14 @@ def telling(
     - silence: lack of evidence in the frame, from 0 to 1,
     - log of the room for errors, dolp * (1 - dolp).
     """
-    whole = weights.sum(1, keepdim=True).clamp(min=LEAST_WEIGHT)
+    whole = weights.sum(1, keepdim=True).clamp(min=MIN_WEIGHT)
     mean = (weights * candidates).sum(1, keepdim=True) / whole
     apart = (weights * (candidates - mean).square()).sum(1, keepdim=True) / whole
-    apart = torch.log(apart + LEAST_DISAGREEMENT)
+    apart = torch.log(apart + MIN_DISAGREEMENT)
     at_place = torch.cat([apart, torch.log1p(evidence).mean(1, keepdim=True)], dim=1)
     silence = 1 / (1 + evidence.mean((1, 2, 3)) / HARDLY_ANY)
     of_frame = [apart.mean((-1, -2), keepdim=True), silence[:, None, None, None]]
     bounded = block_means(dolp, 2).clamp(0, 1)
-    room = torch.log(bounded * (1 - bounded) + LEAST_ROOM)
+    room = torch.log(bounded * (1 - bounded) + MIN_ROOM)
     fine = F.interpolate(at_place, scale_factor=2, mode="bilinear")
     return torch.cat([fine, *(one.expand_as(room) for one in of_frame), room], dim=1)

@@ -24,8 +24,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 MOMENTS = 6  # AA, AB, BB, AC, BC and the weighted number of steps
-LEAST_EVIDENCE = 1e-2  # squared events, added to AA and BB: without events the solution is 0, not infinite
-MOST_CORRELATED = 0.95  # limit on the correlation of A and B, which bias correction can push beyond 1
+MIN_EVIDENCE = 1e-2  # squared events, added to AA and BB: without events the solution is 0, not infinite
+MAX_CORRELATION = 0.95  # limit on the correlation of A and B, which bias correction can push beyond 1
 
 
 def faded(x: Float[Tensor, "t *b"], keep: Float[Tensor, "*k"], state: Float[Tensor, "*s"]) -> Float[Tensor, "t *s"]:
@@ -116,9 +116,9 @@ class LeastSquares(nn.Module):
     ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "n c h w"], Float[Tensor, "n c h w"]]:
         """Return s1 and s2, with hypot(s1, s2) <= 1, and the weighted number of steps behind them; c = m * d * k."""
         aa, ab, bb, ac, bc, steps = moments.unbind(4)
-        ridge = self.log_ridge.exp()[..., None, None] * steps + LEAST_EVIDENCE
+        ridge = self.log_ridge.exp()[..., None, None] * steps + MIN_EVIDENCE
         aa, bb = F.relu(aa) + ridge, F.relu(bb) + ridge
-        limit = MOST_CORRELATED * (aa * bb).sqrt()
+        limit = MAX_CORRELATION * (aa * bb).sqrt()
         ab = torch.maximum(torch.minimum(ab, limit), -limit)
         determinant = aa * bb - ab * ab
         s1, s2 = (bc * ab - ac * bb) / determinant, (bc * aa - ac * ab) / determinant

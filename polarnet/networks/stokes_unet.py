@@ -21,7 +21,7 @@ from polarnet.networks.blocks import (
     on_blocks,
 )
 from polarnet.networks.expected_error import ExpectedError, telling
-from polarnet.networks.mosaic import Memory, Motion, Picture, certainty, displacements, follow, nothing_seen
+from polarnet.networks.panorama import Memory, Motion, Picture, certainty, displacements, follow, nothing_seen
 from polarnet.networks.redundancy import (
     MOMENTS,
     LeastSquares,
@@ -38,12 +38,12 @@ from polarnet.stokes import Prediction
 
 STRIDE = 4  # stride of the largest recurrent layer; height and width are padded to multiples of it
 IMAGES = 2  # input images per channel: sum of polarities and number of events (representation `event_counts`)
-PARTS = ("redundancy", "slopes", "sums", "recurrence", "mosaic")
+PARTS = ("redundancy", "slopes", "sums", "recurrence", "panorama")
 MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate
 WIDE = (3, 9)  # widths in pixels of the neighbourhoods that contribute fine structure, besides the single pixel
-MOST_POLARIZED = 0.98  # largest DoLP passed to atanh, to keep it finite
+MAX_DOLP = 0.98  # largest DoLP passed to atanh, to keep it finite
 LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
-OF_LOG_VARIANCE = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
+LOG_VARIANCE_OUTPUTS = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
 
 
 @dataclass(frozen=True)
@@ -60,24 +60,24 @@ class StokesUNetConfig:
     """Widths of the neighbourhoods solved together, in pixels at quarter resolution, odd; 0: the whole image."""
     reach: int = field(metadata=allowed(low=1))
     """Search range in pixels along each axis for the scene's motion from window to window."""
-    mosaic_margin: int = field(metadata=allowed(low=1))
+    panorama_margin: int = field(metadata=allowed(low=1))
     """Margin of the panorama beyond the image, in pixels at half resolution."""
-    mosaic_prior: float = field(metadata=allowed(above=0))
-    """This field and the next four set the panorama filter: see `polarnet.networks.mosaic.Memory`."""
-    mosaic_noise: float = field(metadata=allowed(above=0))
-    mosaic_drift: float = field(metadata=allowed(low=0))
-    mosaic_renewal: float = field(metadata=allowed(low=0, high=1))
-    mosaic_fade: float = field(metadata=allowed(low=0, high=1))
-    mosaic_step: float = field(metadata=allowed(above=0))
+    panorama_prior: float = field(metadata=allowed(above=0))
+    """This field and the next four set the panorama filter: see `polarnet.networks.panorama.Memory`."""
+    panorama_noise: float = field(metadata=allowed(above=0))
+    panorama_drift: float = field(metadata=allowed(low=0))
+    panorama_renewal: float = field(metadata=allowed(low=0, high=1))
+    panorama_fade: float = field(metadata=allowed(low=0, high=1))
+    panorama_step: float = field(metadata=allowed(above=0))
     """Change of natural-log intensity per event."""
-    mosaic_scale: int = field(metadata=allowed(low=1))
+    panorama_scale: int = field(metadata=allowed(low=1))
     """Width of the neighbourhood whose mean comes from the network instead of the panorama, in pixels at quarter
     resolution, odd."""
-    mosaic_share: float = field(metadata=allowed(low=0.01, high=0.99))
+    panorama_share: float = field(metadata=allowed(low=0.01, high=0.99))
     """Initial weight of the panorama where it is certain. The U-Net learns a weight for each pixel."""
     without: list[str]
     """Parts (of PARTS) to ablate. redundancy: all candidates are 0; slopes: the panorama's candidates are 0; sums: the
-    gains that move (s1, s2) by event sums are 0; recurrence: recurrent layers restart in each window; mosaic: no
+    gains that move (s1, s2) by event sums are 0; recurrence: recurrent layers restart in each window; panorama: no
     panorama."""
 
     def __post_init__(self):
@@ -86,8 +86,8 @@ class StokesUNetConfig:
             raise ValueError(f"channels, memories, decays, scales: expected at least 3, 1, 1, 1 numbers, got {self}")
         if any(scale and scale % 2 == 0 for scale in self.scales):
             raise ValueError(f"scales: expected odd numbers, or 0 for the whole image, got {self.scales}")
-        if self.mosaic_scale % 2 == 0:
-            raise ValueError(f"mosaic_scale: expected an odd number, got {self.mosaic_scale}")
+        if self.panorama_scale % 2 == 0:
+            raise ValueError(f"panorama_scale: expected an odd number, got {self.panorama_scale}")
         if unknown := set(self.without) - set(PARTS):
             raise ValueError(f"without: expected some of {', '.join(PARTS)}, got {', '.join(sorted(unknown))}")
 
@@ -110,9 +110,9 @@ class StokesUNet(nn.Module):
        scale.
     2. Fine structure: e0 - e90 counts the change of 2 atanh(s1) at a pixel. Sums of such differences, times gains from
        the U-Net, therefore update (s1, s2).
-    3. Panorama: the result is averaged with the panorama (`polarnet.networks.mosaic`). The panorama's unknown constants
-       are fitted to the result around each pixel. The panorama has no trained parameters; the U-Net receives it as an
-       input and chooses its weight at each pixel.
+    3. Panorama: the result is averaged with the panorama (`polarnet.networks.panorama`). The panorama's unknown
+       constants are fitted to the result around each pixel. The panorama has no trained parameters; the U-Net receives
+       it as an input and chooses its weight at each pixel.
     4. Correction: the U-Net sees the result and adds an unconstrained correction.
 
     DoLP is predicted separately from the length of (s1, s2). Where (s1, s2) are uncertain, their mean is too short,
@@ -132,11 +132,15 @@ class StokesUNet(nn.Module):
             )
         self.memories, self.decays, self.scales = config.memories, config.decays, config.scales
         self.without = frozenset(config.without)
-        self.reach, self.margin = config.reach, config.mosaic_margin
+        self.reach, self.margin = config.reach, config.panorama_margin
         self.memory = Memory(
-            config.mosaic_prior, config.mosaic_noise, config.mosaic_drift, config.mosaic_renewal, config.mosaic_fade
+            config.panorama_prior,
+            config.panorama_noise,
+            config.panorama_drift,
+            config.panorama_renewal,
+            config.panorama_fade,
         )
-        self.step, self.around = config.mosaic_step, config.mosaic_scale
+        self.step, self.around = config.panorama_step, config.panorama_scale
         memories, scales = len(config.memories), len(config.scales)
         solved = (memories * len(config.decays) + 1) * scales
         half, quarter, *smaller = config.channels
@@ -145,7 +149,7 @@ class StokesUNet(nn.Module):
         self.slopes = SlopeMoments()
         self.solve_slopes = LeastSquares(1, 1, scales)
         self.stem = conv3x3(4 * (4 * memories + 1), half)
-        self.from_mosaic = nn.Conv2d(5, half, kernel_size=3, padding=1, bias=False)
+        self.from_mosaic = nn.Conv2d(5, half, kernel_size=3, padding=1, bias=False)  # name in shipped weights
         self.to_quarter = nn.Conv2d(half, quarter, kernel_size=2, stride=2)
         self.from_candidates = nn.Conv2d(len(Candidates._fields) * solved, quarter, kernel_size=1)
         self.join = conv3x3(quarter, quarter)
@@ -168,7 +172,7 @@ class StokesUNet(nn.Module):
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
         assert self.trust.bias is not None
-        nn.init.constant_(self.trust.bias, math.log(config.mosaic_share / (1 - config.mosaic_share)))
+        nn.init.constant_(self.trust.bias, math.log(config.panorama_share / (1 - config.panorama_share)))
 
     def forward(
         self, inputs: Float[Tensor, "b 8 h w"], state: list[Tensor] | None = None
@@ -192,10 +196,10 @@ class StokesUNet(nn.Module):
         events = summed.flatten(0, 1)
         of_events, moments = self._candidates(events, b, state[memories : memories + decays])
 
-        mosaic = memories + decays + len(WIDE)  # index where the state of the panorama begins
-        around = _around(polarity, state[memories + decays : mosaic], keep)
+        panorama = memories + decays + len(WIDE)  # index where the state of the panorama begins
+        around = _around(polarity, state[memories + decays : panorama], keep)
 
-        shown, certain, carried = self._mosaic(polarity, (height, width), state[mosaic : -self.recurrent])
+        shown, certain, carried = self._panorama(polarity, (height, width), state[panorama : -self.recurrent])
         of_slopes = self._of_slopes(shown)
         candidates = Candidates(*(torch.cat(pair, dim=1) for pair in zip(of_events, of_slopes, strict=True)))
         x2 = on_blocks(self.stem, _images(events, count.flatten(0, 1)))
@@ -234,8 +238,8 @@ class StokesUNet(nn.Module):
     def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:
         """Set the log-variance to weight @ x + bias, where x is the input of `expected`; keep other outputs."""
         assert self.add.bias is not None
-        self.add.weight[OF_LOG_VARIANCE] = 0
-        self.add.bias[OF_LOG_VARIANCE] = 0
+        self.add.weight[LOG_VARIANCE_OUTPUTS] = 0
+        self.add.bias[LOG_VARIANCE_OUTPUTS] = 0
         self.expected.weight.copy_(weight)
         self.expected.bias.fill_(bias - LOG_VARIANCE)
 
@@ -267,7 +271,7 @@ class StokesUNet(nn.Module):
             return Candidates(s1, s2, length(s1, s2), stacked[:, :, -1])
 
     @torch.no_grad()
-    def _mosaic(
+    def _panorama(
         self, polarity: Float[Tensor, "t b 4 h w"], seen: tuple[int, int], state: list[Tensor]
     ) -> tuple[Float[Tensor, "n 4 h/2 w/2"], Float[Tensor, "n 1 1 1"], list[Tensor]]:
         """Follow the panorama over t windows; return its four images, its certainty from 0 to 1, and the next state.
@@ -281,7 +285,7 @@ class StokesUNet(nn.Module):
         are 0.
         """
         before, level, own, explained = state
-        if "mosaic" in self.without:
+        if "panorama" in self.without:
             shown = own.new_zeros(len(polarity) * len(own), *own.shape[1:])
             return shown, shown.new_zeros(len(shown), 1, 1, 1), state
         with torch.autocast(polarity.device.type, enabled=False):
@@ -324,9 +328,9 @@ class StokesUNet(nn.Module):
         events = [inputs.new_zeros(b, 4, height, width) for _ in self.memories]
         moments = [inputs.new_zeros(b, len(self.memories) * MOMENTS, height // 4, width // 4) for _ in self.decays]
         wide = [inputs.new_zeros(b, len(self.memories), 2, height, width) for _ in WIDE]
-        mosaic = nothing_seen(inputs[:, :4, ::2, ::2], self.margin)
+        panorama = nothing_seen(inputs[:, :4, ::2, ::2], self.margin)
         before = inputs.new_zeros(b, height, width)
-        return [*events, *moments, *wide, before, *mosaic, *self._nothing_held(quarter)]
+        return [*events, *moments, *wide, before, *panorama, *self._nothing_held(quarter)]
 
 
 def _around(
@@ -353,7 +357,7 @@ def _moved(
     moves = stokes.new_zeros(())
     for gain, near in zip(gains.contiguous().chunk(len(sums), dim=1), sums, strict=True):
         moves = torch.addcmul(moves, gain.unflatten(1, (-1, 1)), near.flatten(0, 1))
-    return torch.tanh(torch.atanh(MOST_POLARIZED * stokes) + moves.sum(1))
+    return torch.tanh(torch.atanh(MAX_DOLP * stokes) + moves.sum(1))
 
 
 def averaged(
@@ -369,11 +373,11 @@ def averaged(
     mean over `around` pixels at quarter resolution matches that of (s1, s2).
     """
     short = length(*stokes.unbind(1))[:, None]
-    own = torch.atanh(stokes / short * torch.maximum(short, dolp).clamp(max=MOST_POLARIZED))
+    own = torch.atanh(stokes / short * torch.maximum(short, dolp).clamp(max=MAX_DOLP))
     constants = box_means(block_means(own, 4) - block_means(shown, 2), around)
     shown = shown + F.interpolate(constants, scale_factor=2, mode="bilinear")
-    mosaic = torch.tanh(F.interpolate(shown, scale_factor=2, mode="bilinear"))
-    return torch.lerp(stokes, mosaic, share), torch.lerp(dolp, length(*mosaic.unbind(1))[:, None], share)
+    panorama = torch.tanh(F.interpolate(shown, scale_factor=2, mode="bilinear"))
+    return torch.lerp(stokes, panorama, share), torch.lerp(dolp, length(*panorama.unbind(1))[:, None], share)
 
 
 def _pattern(shown: Float[Tensor, "n 4 h w"], certain: Float[Tensor, "n 1 1 1"]) -> Float[Tensor, "n 5 h w"]:

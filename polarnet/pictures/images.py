@@ -65,12 +65,12 @@ class Picture:
 
     @property
     def bits(self) -> int:
-        """Of a PNG that keeps what this file holds: 8 for bytes, 16 for anything finer."""
+        """Bits of a PNG that preserves the file's values: 8 for bytes, 16 for finer types."""
         return 8 if self.pixels.dtype == np.uint8 else 16
 
     @property
     def sha256(self) -> str:
-        """Of the upright pixels with their shape and type, whatever the file's name and format."""
+        """Hash of the upright pixels with their shape and type, independent of the file's name and format."""
         pixels = np.ascontiguousarray(self.pixels)
         return sha256(f"{pixels.dtype}{pixels.shape}".encode(), pixels.data)
 
@@ -234,6 +234,6 @@ def _plain(pixels: Shaped[np.ndarray, "h w c"]) -> Shaped[np.ndarray, "h w c"]:
 
 
 def _first_line(message: str, path: Path) -> str:
-    """Of what OpenImageIO says, without the folder, which differs from machine to machine."""
+    """OpenImageIO's message without the folder, which differs between machines."""
     lines = message.replace(str(path), path.name).strip().splitlines()
     return lines[0] if lines else "OpenImageIO gives no reason"

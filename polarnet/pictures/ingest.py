@@ -69,9 +69,9 @@ class IngestConfig:
     val_fraction: float = field(metadata=allowed(low=0, high=1))
     test_fraction: float = field(metadata=allowed(low=0, high=1))
     mosaic: str
-    """Of source=polarization: angles under the 2x2 pixels of a raw mosaic, even row / odd row."""
+    """Polarizer angles of the 2x2 pixels of a raw mosaic, even row / odd row (source=polarization)."""
     residual_max: float = field(metadata=allowed(above=0))
-    """Of source=polarization: the largest median of |I0 + I90 - I45 - I135| / S0 that is not refused."""
+    """Largest accepted median of |I0 + I90 - I45 - I135| / S0 (source=polarization)."""
 
     def __post_init__(self):
         check_ranges(self)
@@ -160,7 +160,7 @@ def _ingest_folder(config: IngestConfig, folder: Path, mapper: Mapper) -> Manife
 
 
 def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int]:
-    """What has a picture's extension under `root`, by path, and how many other files there are."""
+    """Files under `root` with a picture's extension, by path, and the number of other files."""
     if not root.is_dir():
         raise ValueError(f"ingest.root: expected a folder with pictures, {root} is none; see ingest.source")
     files = sorted(path for path in root.rglob("*") if path.is_file())

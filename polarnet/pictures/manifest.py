@@ -1,4 +1,4 @@
-"""What lies in data/images: the pictures, where each comes from, its split, and what was left out and why."""
+"""Manifest of data/images: the origin and split of each picture, and the skipped files with reasons."""
 
 import json
 import math
@@ -16,7 +16,7 @@ class ManifestEntry:
     """One picture of data/images."""
 
     name: str
-    """Of the source and the first 8 digits of `sha256`; sequences are called after it."""
+    """Name of the source and the first 8 digits of `sha256`; sequence names begin with it."""
     file: str
     """In the folder of the manifest."""
     split: str
@@ -28,20 +28,20 @@ class ManifestEntry:
     licence: str | None
     author: str | None
     sha256: str
-    """Of the source's upright pixels, before they were cut, scaled and converted."""
+    """Hash of the source's upright pixels, before cropping, scaling and conversion."""
     bits: int
     height: int
     width: int
     source_height: int
     source_width: int
     colour_profile: str | None
-    """What was converted to sRGB."""
+    """Colour space of the source, if it was converted to sRGB."""
     residual: float | None = None
-    """Of measured polarization: the median of |I0 + I90 - I45 - I135| / S0."""
+    """Median of |I0 + I90 - I45 - I135| / S0 (measured polarization)."""
     saturated_fraction: float | None = None
-    """Of measured polarization: pixels of the source with a saturated angle."""
+    """Share of source pixels with a saturated angle (measured polarization)."""
     masked_fraction: float | None = None
-    """Of measured polarization: pixels whose light cannot be known; `valid` in the file says which."""
+    """Share of pixels with unknown light (measured polarization); `valid` in the file marks the others."""
 
 
 @dataclass(frozen=True)

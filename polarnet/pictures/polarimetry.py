@@ -116,7 +116,7 @@ def write_intensities(path: str | os.PathLike[str], measurement: Measurement) ->
 
 
 def read_intensities(path: str | os.PathLike[str]) -> tuple[Float32[Tensor, "4 h w"], Bool[Tensor, "h w"]]:
-    """What `write_intensities` wrote: intensities behind the four polarizers, and where they are valid."""
+    """Intensities behind the four polarizers and their valid pixels, from a file of `write_intensities`."""
     with np.load(path) as file:
         steps = np.stack([file[key] for key in NPZ_KEYS])
         return torch.from_numpy(steps.astype(np.float32) / STEPS), torch.from_numpy(file["valid"])
@@ -172,7 +172,7 @@ def _read_npz(path: Path) -> Shaped[np.ndarray, "4 h w"]:
 
 
 def _read_angles(files: Sequence[Path]) -> Shaped[np.ndarray, "4 h w"]:
-    """Of colour pictures the green channel, as polarization differs between colours."""
+    """The image itself, or the green channel of a colour picture, because polarization differs between colours."""
     by_angle: dict[int, Path] = {}
     for file in files:
         match = ANGLE_SUFFIX.fullmatch(file.stem)

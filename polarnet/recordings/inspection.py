@@ -12,7 +12,7 @@ from polarnet.recordings.pixels import hot_pixels
 from polarnet.recordings.recording import FORMATS, RecordingReader
 from polarnet.recordings.source import REPAIRS, RecordingError
 
-MOST_PIXELS = 2**25
+MAX_PIXELS = 2**25
 SHORTEST_US = 1000  # shortest time over which a rate is taken
 EVENTS_PER_PIXEL = 0.15  # in the part shown: enough to see edges, few enough not to smear them
 
@@ -49,10 +49,10 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
     if no sensor is as large as the stated size.
     """
     pixels = reader.height * reader.width
-    if pixels > MOST_PIXELS:
+    if pixels > MAX_PIXELS:
         raise RecordingError(
-            f"{reader.path.name}: no event camera has {reader.width} x {reader.height} px: the size that was given "
-            f"is wrong, or the file is damaged"
+            f"{reader.path.name}: no event camera has {reader.height} x {reader.width} px (height x width): the "
+            f"given size is wrong, or the file is damaged"
         )
     counts = np.zeros(pixels, np.int64)
     busiest = _Busiest(pixels)
@@ -95,7 +95,7 @@ def findings(inspection: Inspection) -> Iterator[str]:
     """The summary as lines of text."""
     events = inspection.on + inspection.off
     yield f"format      {inspection.format}: {FORMATS[inspection.format].words}"
-    yield f"sensor      {inspection.width} x {inspection.height} px"
+    yield f"sensor      {inspection.height} x {inspection.width} px (height x width)"
     if inspection.pictures:
         yield f"pictures    {inspection.pictures}"
     yield f"events      {events:,}: {inspection.on:,} ON, {inspection.off:,} OFF"

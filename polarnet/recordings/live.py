@@ -27,7 +27,7 @@ from polarnet.recordings.source import RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 
 READ_BYTES = 2**20
-MOST_READ_AHEAD = 64  # blocks of READ_BYTES, for a file; a camera does not wait, so its queue is unbounded
+MAX_READ_AHEAD = 64  # blocks of READ_BYTES, for a file; a camera does not wait, so its queue is unbounded
 POLL_S = 0.001
 DAMAGE = {
     "unreadable_lines": "lines that are not {columns}",
@@ -64,7 +64,7 @@ class LiveLines:
         self._source, self._idle_s = source, idle_s
         self._grows = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
         self._rest, self._started_with, self._read_at = b"", b"", 0.0
-        self._queue: Queue[tuple[bytes, float] | None] = Queue(MOST_READ_AHEAD if self._grows else 0)
+        self._queue: Queue[tuple[bytes, float] | None] = Queue(MAX_READ_AHEAD if self._grows else 0)
         own = os.dup(source.fileno())  # a duplicate, so that a file opened later cannot get its number
         Thread(target=self._read, args=[own], daemon=True).start()
         self._sensor = self._first_line()

@@ -17,7 +17,7 @@ from polarnet.recordings.pixels import event_counts
 from polarnet.recordings.source import RecordingError
 
 SCALES = (4, 2, 1)
-SMALLEST_SIDE = 48  # pixels; smaller images show too little
+MIN_SIDE = 48  # pixels; smaller images show too little
 BLUR = 5  # pixels; smoothing of the images during the comparison
 ITERATIONS, CHANGE = 200, 1e-6
 FINE, COARSE = 1.0, 4.0  # pixels; standard deviations of the band that contains the edges
@@ -57,7 +57,7 @@ def register(reference: Float32[np.ndarray, "h w"], moving: Float32[np.ndarray, 
     correlation = 0.0
     for scale in SCALES:
         size = reference.shape[1] // scale, reference.shape[0] // scale
-        if scale > 1 and min(size) < SMALLEST_SIDE:
+        if scale > 1 and min(size) < MIN_SIDE:
             continue
         a, b = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (reference, moving))
         to_coarse = np.diag([1 / scale, 1 / scale, 1]).astype(np.float32)

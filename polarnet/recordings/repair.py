@@ -16,12 +16,12 @@ LATE_US = 10_000
 """Events late by at most this are put in order: packets overtake each other, clocks do not."""
 PAUSE_US = 1_000_000  # longer pauses are counted
 LOOKAHEAD = 8  # following events that distinguish a wrong time from a clock that was reset
-MOST_HELD = 2**22  # events held back to wait for late ones
+MAX_HELD = 2**22  # events held back to wait for late ones
 TOLERATED_SHARE = 0.01  # accepted share of a file's events, per kind of damage
 TOLERATED_COUNT = 8  # accepted count in files too short for a share
 HARMLESS = ("no_change", "unsorted", "pauses")
 FIRST_PAUSE_US = 3_600_000_000  # a longer pause right after the first event means that the first event's time is wrong
-LARGEST_TIME = 2**60  # microseconds; differences still fit into int64
+MAX_TIME = 2**60  # microseconds; differences still fit into int64
 
 
 def repaired(name: str, source: Source, counts: Counter[str]) -> Iterator[Block]:
@@ -106,7 +106,7 @@ class _Clock:
         self.name = name
         self.judged = 0
         self.newest: int | None = None
-        self.floor = -LARGEST_TIME
+        self.floor = -MAX_TIME
         self.unjudged: Block | None = None
         self.held: Block | None = None
 
@@ -138,7 +138,7 @@ class _Clock:
         count = len(accepted.t)
         if count and not last:
             count = int(np.searchsorted(accepted.t, (self.newest or 0) - LATE_US))
-            if len(accepted.t) - count > MOST_HELD:
+            if len(accepted.t) - count > MAX_HELD:
                 count = len(accepted.t) // 2
                 self.floor = int(accepted.t[count - 1])
         self.held = Block(*(column[count:] for column in accepted))
@@ -168,7 +168,7 @@ def _judge(t, keep, newest, started, floor):
             else:
                 newest = now
             continue
-        representable = -LARGEST_TIME < now < LARGEST_TIME
+        representable = -MAX_TIME < now < MAX_TIME
         after = t[i + 1 : i + 1 + LOOKAHEAD]
         if not started or now > newest:
             otherwise = 0

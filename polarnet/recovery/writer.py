@@ -41,7 +41,7 @@ FILM_FRAMES = 24
 PNG_STORED, NO_FILTER = 0, 8  # no compression, libpng's PNG_FILTER_NONE: larger files, but fast to write
 FRAMES_PER_CHUNK = 32
 ZARR_CODEC = BloscCodec(cname="lz4", shuffle="shuffle")
-MOST_WAITING = 64  # frames queued for writing
+MAX_WAITING = 64  # frames queued for writing
 FEW_CORES = 2  # up to this number, the network needs all cores: a concurrent writing thread delays every operation
 SHOWN_ON_PAGE = 6
 GAP = 4  # pixels between the maps of a picture
@@ -123,7 +123,7 @@ class RecoveryWriter:
     def add(self, window: EventWindow, found: Prediction) -> None:
         """Add a frame on the CPU; returns before it is written, unless the queue is long or cores are few."""
         self._waiting.append(self._thread.submit(self._write, self.frames, window, found))
-        self._wait(MOST_WAITING if usable_cores() > FEW_CORES else 0)
+        self._wait(MAX_WAITING if usable_cores() > FEW_CORES else 0)
         self.frames += 1
 
     def write_page(self, title: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:

@@ -23,7 +23,7 @@ from polarnet.storage.scenes import SceneStore
 
 OURS = "ours"  # folder of the DoLP network's training
 THUMBNAIL_WIDTH = 208  # pixels, twice the displayed size
-MOST_THUMBNAILS = 24  # per split
+MAX_THUMBNAILS = 24  # per split
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class Artefacts:
     overview: Overview | None
     """None if the benchmark stored no panel of the network."""
     thumbnails: Mapping[str, Sequence[Thumbnail]]
-    """The first `MOST_THUMBNAILS` of each split, photographs first."""
+    """The first `MAX_THUMBNAILS` of each split, photographs first."""
 
 
 def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
@@ -232,10 +232,10 @@ def overview_of(panel: Panel, scenes: SceneStore, frames: FrameStore, events: Ev
 
 
 def thumbnails(pictures: Sequence[str], scenes: SceneStore) -> list[Thumbnail]:
-    """Thumbnails of the first `MOST_THUMBNAILS` pictures, from the scenes made of them."""
+    """Thumbnails of the first `MAX_THUMBNAILS` pictures, from the scenes made of them."""
     sequence_of = {picture: sequence for sequence, picture in reversed(scenes.picture_of.items())}
     found = []
-    for picture in pictures[:MOST_THUMBNAILS]:
+    for picture in pictures[:MAX_THUMBNAILS]:
         scene = scenes.read(sequence_of[picture])
         rgb = polarization_hsv(scene.s0, scene.dolp, scene.aolp)
         size = (THUMBNAIL_WIDTH, round(THUMBNAIL_WIDTH * rgb.shape[0] / rgb.shape[1]))

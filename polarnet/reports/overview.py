@@ -18,7 +18,7 @@ from polarnet.reports.maps import dolp_image, hue_wheel, intensity_image, polari
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 ON, OFF = "#d0312d", "#1f5fb8"
-MOST_EVENTS = 25_000  # drawn per stream; above this number, every k-th event is drawn
+MAX_EVENTS = 25_000  # drawn per stream; above this number, every k-th event is drawn
 # The sheet, in inches. README pages show it about 900 pixels wide: hence few columns and large letters.
 HEIGHT = 4.45
 TOP, BOTTOM = 4.0, 0.2
@@ -143,7 +143,7 @@ def _arrow(figure: Figure, x: float, text: str) -> float:
 
 def _cloud(axes: Axes, events: Events, overview: Overview) -> None:
     """Draw events in space and time: the sensor seen from the side, time running to the right."""
-    step = max(1, -(-len(events) // MOST_EVENTS))
+    step = max(1, -(-len(events) // MAX_EVENTS))
     t, x, y, p = (column.numpy(force=True)[::step] for column in (events.t, events.x, events.y, events.p))
     across, up = _oblique((t - overview.start_us) / overview.duration_us, x / events.width, y / events.height)
     axes.scatter(across, up, s=0.4, c=np.where(p > 0, ON, OFF), alpha=0.5, linewidths=0)

@@ -31,7 +31,7 @@ SOURCE_NAMES = {
     "folder": "of your own",
     "polarization": "of measured polarization",
 }
-MOST_EVENT_ROWS = 2
+MAX_EVENT_ROWS = 2
 SET_ABOUT = {
     "complex_motion": "The same held-out pictures while the camera turns, zooms and moves faster (section sets).",
     "measured": "Scenes whose polarization a camera measured, seen by a simulated event camera: real DoLP and AoLP, "
@@ -81,7 +81,7 @@ def _context(artefacts: Artefacts, run: Run, overview: bytes | None, legend: Leg
             for one in artefacts.sets
             for panel in one.panels
         ],
-        "events": [TileRow(panel.sequence, event_tiles(panel)) for panel in artefacts.panels[:MOST_EVENT_ROWS]],
+        "events": [TileRow(panel.sequence, event_tiles(panel)) for panel in artefacts.panels[:MAX_EVENT_ROWS]],
         "rates": artefacts.rates,
         "training": {
             f"{row}{network_label(history.network)}, events to {of}": _training(history, of)

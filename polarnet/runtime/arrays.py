@@ -15,7 +15,7 @@ Array = Tensor | np.ndarray
 
 TOLERANCE = 1e-4  # float32 rounding may exceed [0, 1] slightly; a larger excess is the caller's error
 WHITE = {torch.uint8: 2**8 - 1, torch.uint16: 2**16 - 1}
-LARGEST_OVERSHOOT = 2.0  # floats up to this are overshoot, as from interpolation; larger ones have another unit
+MAX_OVERSHOOT = 2.0  # floats up to this are overshoot, as from interpolation; larger ones have another unit
 
 
 def as_tensor(name: str, values: Any) -> Shaped[Tensor, "*shape"]:
@@ -166,6 +166,6 @@ def _fits(shape: tuple[int, ...], named: list[str]) -> bool:
 def _scaling(dtype: torch.dtype, highest: float | int) -> str:
     """Advice on scaling an image of this type and maximum to [0, 1]."""
     white = WHITE.get(dtype) or next((white for white in WHITE.values() if highest <= white), None)
-    if white is None or (dtype not in WHITE and highest <= LARGEST_OVERSHOOT):
+    if white is None or (dtype not in WHITE and highest <= MAX_OVERSHOOT):
         return "scale them to [0, 1] as float32"
     return f"divide by {white}"

@@ -93,7 +93,7 @@ def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], addres
         from distributed import as_completed as dask_as_completed
     except ImportError:
         raise RuntimeError(
-            "cluster.address needs Dask on this machine and on the workers: pip install 'polarnet[cluster]'"
+            "cluster.address needs Dask on this machine and on the workers: pip install dask distributed"
         ) from None
     with Client(address, timeout="30s") as client:
         futures = client.map(_guarded(function), items, retries=ATTEMPTS - 1, pure=False)

@@ -15,8 +15,8 @@ import torch
 from polarnet.runtime.ranges import allowed, check_ranges
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
-LARGEST_KEPT = 2**30  # bytes
-LARGEST_MIXED = 2**20  # bytes; larger tensors get separate memory while long-lived ones are allocated
+MAX_KEPT = 2**30  # bytes
+MAX_MIXED = 2**20  # bytes; larger tensors get separate memory while long-lived ones are allocated
 
 
 @dataclass(frozen=True)
@@ -117,8 +117,8 @@ def keep_freed_memory() -> None:
     """
     if platform.libc_ver()[0] == "glibc":
         libc = ctypes.CDLL(None)
-        libc.mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT)
-        libc.mallopt(M_TRIM_THRESHOLD, LARGEST_KEPT)
+        libc.mallopt(M_MMAP_THRESHOLD, MAX_KEPT)
+        libc.mallopt(M_TRIM_THRESHOLD, MAX_KEPT)
 
 
 @contextmanager
@@ -128,7 +128,7 @@ def memory_handed_back() -> Iterator[None]:
     Use it while allocating many long-lived tensors, which would otherwise leave unusable holes in memory.
     """
     if platform.libc_ver()[0] == "glibc":
-        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGEST_MIXED)
+        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, MAX_MIXED)
     try:
         yield
     finally:

@@ -18,7 +18,7 @@ def allowed(
 
 
 def describe(metadata: Mapping[str, Any]) -> str:
-    """What `allowed` admits, in words."""
+    """The values that `allowed` admits, in words."""
     if metadata["choices"]:
         return "one of " + ", ".join(metadata["choices"])
     words = [

@@ -1,13 +1,13 @@
 """From pictures to polarization events: scenes, motion, and the pixels of an event camera.
 
-`from polarnet.simulation import simulate, SENSORS` and the other names of `HOMES` load their modules when first asked
-for, so that importing this package costs nothing.
+`from polarnet.simulation import simulate, SENSORS` loads the modules of these names on first use. Importing the package
+alone loads none.
 """
 
 from importlib import import_module
 from typing import Any
 
-HOMES = {
+MODULE_OF = {
     "BUILTIN_PHOTOS": "pictures.builtin",
     "EmulatorConfig": "emulator",
     "MOTIONS": "presets",
@@ -26,16 +26,16 @@ HOMES = {
     "simulate": "sequence",
     "emulate_motion": "moving_sensor",
 }
-"""The public names, and the module of each."""
+"""Module of each public name."""
 
-__all__ = list(HOMES)
+__all__ = list(MODULE_OF)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in HOMES:
+    if name not in MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{HOMES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{MODULE_OF[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *HOMES])
+    return sorted([*globals(), *MODULE_OF])

@@ -1,4 +1,4 @@
-"""Compilation of the kernels of this folder: by numba, without the interpreter's lock, cached on disk."""
+"""Compilation of this folder's kernels with numba: cached on disk, without the interpreter's lock."""
 
 import contextlib
 import functools
@@ -11,7 +11,7 @@ import numba
 
 
 def compiled(kernel: Callable) -> Any:
-    """Compile a kernel when it is first called."""
+    """Compile a kernel on its first call."""
     return numba.njit(nogil=True, cache=True, error_model="numpy")(_bare(kernel))
 
 
@@ -26,13 +26,13 @@ def _bare(kernel: Callable) -> Callable:
 
 @functools.cache
 def forget_stale_code() -> None:
-    """Delete cached machine code that is older than any source of this folder, once a process.
+    """Delete cached machine code that is older than a source file of this folder, once per process.
 
-    Call it before the first kernel: numba compares the cache with a kernel's own file, not with those of its callees.
+    Call this before the first kernel: numba compares the cache with the kernel's own file, not with its callees'.
     """
     folder = Path(__file__).parent
     newest = max(source.stat().st_mtime for source in folder.rglob("*.py"))
     for index in folder.rglob("__pycache__/*.nbi"):
-        with contextlib.suppress(OSError):  # another process was quicker, or the installation is read-only
+        with contextlib.suppress(OSError):  # another process deleted it first, or the installation is read-only
             if index.stat().st_mtime < newest:
                 index.unlink()

@@ -20,7 +20,7 @@ from polarnet.storage.scenes import SceneStore
 def emulate_scenes(
     scenes: Path, events: Path, config: EmulatorConfig, seed: int, mapper: Callable[..., Iterable[Any]], threads: int
 ) -> int:
-    """Emulate all sequences of a scene store into an event store; returns their number.
+    """Emulate all sequences of a scene store into an event store, and return their number.
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks
     emulates one sequence on `threads` threads. An interrupted run of the same scenes, configuration and seed resumes
@@ -37,7 +37,7 @@ def emulate_scenes(
 
 
 def origin_of(scenes: SceneStore, config: EmulatorConfig, seed: int) -> dict[str, Any]:
-    """Everything that the events of a scene store depend on."""
+    """All settings and data that determine the events of a scene store."""
     return {
         "emulate": asdict(config),
         "seed": seed,
@@ -51,7 +51,7 @@ def emulate_sequence(
 ) -> list[Events]:
     """Events of the four channels of one stored sequence.
 
-    Its noise, and its sensor where `config.randomise`, depend on the seed and its name alone.
+    Its noise, and with `config.randomise` its sensor, depend only on the seed and the sequence's name.
     """
     record = scenes.read(sequence)
     return emulate_motion(

@@ -63,7 +63,7 @@ class EmulatorConfig(EsimConfig, VoltmeterConfig):
 
     model: str = field(metadata=allowed(choices=tuple(MODELS)))
     render_rate_hz: float | None = field(metadata=allowed(above=0))
-    """Frames a second of the light that the pixels see; null: a step for each pixel of motion."""
+    """Rate at which the light is rendered; null: one frame for each pixel of motion."""
     randomise: bool
     """Draw the parameters below for each sequence, uniformly (rates and cutoff: uniformly in their logarithm)."""
     random_threshold_on: list[float] = field(metadata=allowed(low=0.01, high=10))
@@ -131,7 +131,7 @@ def emulate(
     """Events of each channel of a sensor that sees `frames` at times `t_us`, and the sensor's state after them.
 
     Frames are uint8, or float in digital numbers 0..255; frames and times may be numpy or torch.
-    Without a state, the pixels have adapted to the first frame, and it fires nothing. A clip cut into pieces, each
+    Without a state, the pixels are adapted to the first frame, which fires no event. A clip cut into pieces, each
     given the state that the previous piece returned, gives the events of the whole clip. `key` (64 bits) seeds all
     noise. Each channel draws its mismatch and noise by its number in `channels` (default: 0, 1, ...). Events are in
     the order (t, y, x, p), and identical for any number of threads and any order of channels.
@@ -151,9 +151,9 @@ def emulate_columns(
     channels: Sequence[int] | None = None,
     threads: int = 1,
     labels: bool = False,
-    exact: bool = False,
+    unrounded_times: bool = False,
 ) -> tuple[list[Columns], SensorState]:
-    """As `emulate`, in numpy columns, with each event's process (`labels`) and time before rounding (`exact`)."""
+    """As `emulate`, in numpy columns; optionally with each event's process (`labels`) and `unrounded_times`."""
     frames = as_tensor("frames", frames).detach().cpu()
     check_shape("frames", frames, "... channels height width")
     channels = tuple(range(frames.shape[-3])) if channels is None else tuple(channels)
@@ -162,7 +162,7 @@ def emulate_columns(
     clip = frames.numpy() if frames.dtype == torch.uint8 else frames.to(torch.float32).numpy()
     lights = [light_of_frames(np.ascontiguousarray(clip[:, i])) for i in range(len(channels))]
     height, width = frames.shape[2:]
-    return emulate_lights(lights, times, height, width, config, key, state, channels, threads, labels, exact)
+    return emulate_lights(lights, times, height, width, config, key, state, channels, threads, labels, unrounded_times)
 
 
 def emulate_lights(
@@ -176,7 +176,7 @@ def emulate_lights(
     channels: tuple[int, ...],
     threads: int = 1,
     labels: bool = False,
-    exact: bool = False,
+    unrounded_times: bool = False,
 ) -> tuple[list[Columns], SensorState]:
     """Events of channels under `lights` at times `t_us`, and the state after them. Threads share the channels out."""
     forget_stale_code()
@@ -186,7 +186,7 @@ def emulate_lights(
     first_frame, first_number = (1, 0) if state is None else (0, state.steps)
     room = 1 + int(min(MAX_INITIAL_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
     # allocated here, because glibc returns what other threads allocate to the system as soon as they end
-    empty = [empty_columns(room, labels, exact) for _ in channels]
+    empty = [empty_columns(room, labels, unrounded_times) for _ in channels]
 
     def emulate_channel(i: int) -> tuple[Columns, Any]:
         steps = Steps(physics, height, width, times, first_frame, first_number, seed, channels[i])

@@ -1,4 +1,4 @@
-"""Events on the fly: a sequence is emulated when it is first read, and no event is written to disk."""
+"""Events on the fly: a sequence is emulated on its first read, and no event is written to disk."""
 
 from collections import OrderedDict
 from typing import Any
@@ -12,10 +12,10 @@ KEPT_SEQUENCES = 8  # about 25 MB each at 120x180 px and 2 million events
 
 
 class EmulatedEvents:
-    """The events that `emulate_scenes` would store, made in memory: an `EventSource` of the same numbers.
+    """An `EventSource` that emulates in memory the same events that `emulate_scenes` would store.
 
-    A sequence is emulated whole, because the pixels have memory. The last `kept` sequences stay in memory, so that
-    further reads cost nothing. A copy in another process starts without any.
+    Sequences are emulated as a whole, because the pixels have memory. The last `kept` sequences stay in memory for
+    further reads. A copy in another process starts with none.
     """
 
     def __init__(
@@ -32,9 +32,9 @@ class EmulatedEvents:
         self._in_memory: OrderedDict[str, list[Events]] = OrderedDict()
 
     def read(self, sequence: str, start_us: int | None = None, stop_us: int | None = None) -> list[Events]:
-        """The four channels of a sequence, or of its events with start <= t < stop; times stay those of the sequence.
+        """Events of the four channels with start_us <= t < stop_us (default: all), in microseconds of the sequence.
 
-        ValueError for a sequence that the scenes do not have.
+        Raises ValueError for a sequence that the scene store does not have.
         """
         channels = self._emulated(sequence)
         if start_us is None and stop_us is None:
@@ -45,7 +45,7 @@ class EmulatedEvents:
 
     def _emulated(self, sequence: str) -> list[Events]:
         if sequence not in self._scenes.picture_of:
-            raise ValueError(f"{self.path}: expected one of its sequences, got {sequence!r}")
+            raise ValueError(f"{self.path}: expected the name of one of its sequences, got {sequence!r}")
         if sequence not in self._in_memory:
             while len(self._in_memory) >= self._kept:
                 self._in_memory.popitem(last=False)

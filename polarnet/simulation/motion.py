@@ -14,14 +14,14 @@ from torch import Tensor
 from polarnet.runtime.ranges import allowed, check_ranges
 from polarnet.simulation.scene import PolarizationScene
 
-HARMONICS = 3  # of the motion along each axis
-HARMONIC_SPEEDS = np.array([1.0, 0.5, 0.25])  # typical share of each in the speed: mostly drift, some turning
+HARMONICS = 3  # number of sines in the motion along each axis
+HARMONIC_SPEEDS = np.array([1.0, 0.5, 0.25])  # typical share of each sine in the speed: mostly drift, some turning
 PHASES = np.linspace(0, 2 * math.pi, 4096, endpoint=False)
-GRID_SLACK = 1e-4  # relative; a maximum over PHASES is at most (HARMONICS * pi / 4096)^2 = 5e-6 short of the true one
+GRID_SLACK = 1e-4  # relative; a maximum over PHASES is at most (HARMONICS * pi / 4096)^2 = 5e-6 below the true one
 BORDER_SLACK_PX = 0.02  # the same for positions, up to scenes of 4000 pixels
-TURN_SHARE = 0.2  # of the allowed speed and acceleration that roll may use, and zoom
-TURN_RATE_MAX = 2 * math.pi  # radians per second, of the sines of roll and zoom
-FASTEST_OVER_SLOWEST = 3.0  # how much quicker than the room demands the sensor may turn back
+TURN_SHARE = 0.2  # share of the allowed speed and acceleration that roll may use, and zoom may use
+TURN_RATE_MAX = 2 * math.pi  # radians per second, maximum rate of the sines of roll and zoom
+FASTEST_OVER_SLOWEST = 3.0  # factor by which the sensor may turn back faster than the scene's border requires
 ATTEMPTS = 64
 
 
@@ -32,7 +32,7 @@ class MotionConfig:
     sequences_per_picture: int = field(metadata=allowed(low=1))
     duration_s: float = field(metadata=allowed(above=0))
     frame_rate_hz: float = field(metadata=allowed(above=0))
-    """Ground-truth frames; the windows of events between them are the network's inputs."""
+    """Rate of the ground-truth frames; the windows of events between frames are the network's inputs."""
     window_height: int = field(metadata=allowed(low=2))
     window_width: int = field(metadata=allowed(low=2))
     speed_min_px_s: float = field(metadata=allowed(above=0))
@@ -68,17 +68,17 @@ class Sine:
     phase: float
 
     def at(self, t_s: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
-        """Its value at times in seconds."""
+        """Value at times in seconds."""
         return self.amplitude * np.sin(self.rate * t_s + self.phase)
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A motion for all times; the sensor never leaves the scene that the trajectory was drawn for."""
+    """A motion in closed form; the sensor never leaves the scene for which the trajectory was drawn."""
 
     x: float  # mean column of the sensor's centre
     y: float  # mean row
-    x_sines: tuple[Sine, ...]  # HARMONICS of them
+    x_sines: tuple[Sine, ...]  # HARMONICS sines
     y_sines: tuple[Sine, ...]
     roll: Sine  # radians
     zoom: Sine  # about 1 + amplitude
@@ -95,10 +95,10 @@ class Trajectory:
 
     @staticmethod
     def vector_names() -> list[str]:
-        """Names of the numbers of `to_vector`."""
+        """Names of the coefficients in `to_vector`."""
         sines = [f"{axis}_sine{k + 1}" for axis in "xy" for k in range(HARMONICS)] + ["roll", "zoom"]
-        of_sines = [f"{sine}.{number.name}" for sine in sines for number in dataclasses.fields(Sine)]
-        return ["x", "y", *of_sines, "speed_px_s"]
+        coefficients = [f"{sine}.{number.name}" for sine in sines for number in dataclasses.fields(Sine)]
+        return ["x", "y", *coefficients, "speed_px_s"]
 
     def to_vector(self) -> Float64[np.ndarray, " n"]:
         """All coefficients, in the order of the fields; their number is fixed."""
@@ -108,7 +108,7 @@ class Trajectory:
 
     @classmethod
     def from_vector(cls, vector: Float64[np.ndarray, " n"]) -> "Trajectory":
-        """The trajectory whose `to_vector` this is, to the last bit."""
+        """The exact inverse of `to_vector`."""
         names = cls.vector_names()
         if vector.shape != (len(names),):
             raise ValueError(f"a trajectory has {len(names)} coefficients, got an array of shape {vector.shape}")
@@ -123,9 +123,9 @@ def random_trajectory(
 ) -> Trajectory:
     """A smooth motion of a sensor inside a scene.
 
-    The velocity along each axis is a sum of harmonics whose slowest lets the sensor swing over the scene and turn back
-    before the border. Its peak speed, drawn between the configured bounds, is reached at a random time of the sequence.
-    ValueError where the scene is too small for the sensor, or for its slowest motion.
+    The velocity along each axis is a sum of harmonics. The slowest harmonic lets the sensor swing over the scene and
+    turn back before the border. The peak speed is drawn between the configured bounds and reached at a random time.
+    Raises ValueError if the scene is too small for the sensor or for its slowest motion.
     """
     reach_x, reach_y = _reach(config)
     room = np.array([scene_width - 1 - 2 * reach_x, scene_height - 1 - 2 * reach_y]) - 2 * BORDER_SLACK_PX
@@ -163,13 +163,13 @@ def random_trajectory(
 
 @dataclass(frozen=True)
 class _Shape:
-    """A closed path walked once in phase 0 to 2 pi, scaled to peak speed 1 per radian."""
+    """A closed path over the phase 0 to 2 pi, scaled to a peak speed of 1 per radian."""
 
     speeds: Float64[np.ndarray, "2 harmonics"]  # amplitudes of the velocity along x and y
     phases: Float64[np.ndarray, "2 harmonics"]
-    lowest: Float64[np.ndarray, " 2"]  # position relative to where it swings about
+    lowest: Float64[np.ndarray, " 2"]  # lowest position, relative to the centre of the swing
     extent: Float64[np.ndarray, " 2"]
-    acceleration: float  # largest, per radian^2
+    acceleration: float  # maximum, per radian^2
     peak_phase: float  # where the speed is 1
 
 

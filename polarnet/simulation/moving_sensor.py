@@ -1,4 +1,4 @@
-"""Events of a sensor behind four polarizers that moves over a scene, without a clip of frames in between."""
+"""Events of a sensor behind four polarizers that moves over a scene; no clip of frames is stored in between."""
 
 import functools
 
@@ -14,7 +14,7 @@ from polarnet.simulation.rendering import check_inside, drifts, lights_of_drift,
 from polarnet.simulation.scene import PolarizationScene
 
 CHANNELS = (0, 1, 2, 3)  # behind the polarizers at 0, 45, 90 and 135 degrees
-CHUNK = 16  # frames that are rendered before their events are made, where the sensor turns or zooms
+CHUNK = 16  # frames rendered at once if the sensor turns or zooms
 
 
 def emulate_motion(
@@ -39,7 +39,7 @@ def emulate_motion(
 def emulation_times_us(
     trajectory: Trajectory, duration_us: int, height: int, width: int, config: EmulatorConfig
 ) -> Int64[np.ndarray, " n"]:
-    """Times of the frames that the configured pixel model sees: see `render_times_us`."""
+    """Times at which light is rendered for the configured pixel model (`render_times_us`)."""
     regular = MODELS[config.model].EIGHT_BIT_VIDEO
     return render_times_us(trajectory, duration_us, height, width, config.render_rate_hz, regular)
 
@@ -55,11 +55,11 @@ def emulate_motion_steps(
     state: SensorState | None,
     threads: int = 1,
 ) -> tuple[list[Events], SensorState]:
-    """As `emulate_motion`, for light rendered at times `t_us`; hand the state back to continue from there.
+    """As `emulate_motion`, for light rendered at times `t_us`; pass the returned state to continue.
 
-    The light on a sensor that only drifts is rendered row by row as its pixels need it. The light on one that turns
-    or zooms is rendered a few frames at a time. Both interpolate the scene's Stokes parameters as `motion.render` does.
-    ValueError where the sensor leaves the scene.
+    If the sensor only drifts, light is rendered row by row as the pixels need it. If it turns or zooms, light is
+    rendered CHUNK frames at a time. Both interpolate the scene's Stokes parameters like `motion.render`. Raises
+    ValueError if the sensor leaves the scene.
     """
     if len(t_us) == 0 or (np.diff(t_us) <= 0).any():
         raise ValueError(f"expected at least one time, and strictly increasing times, got {t_us[:5].tolist()}...")

@@ -52,7 +52,7 @@ SENSORS = {
         refractory_period_us=0.0,
     ),
 }
-"""v2e's command-line defaults and its options `clean` and `noisy`; `dataclasses.replace` makes others."""
+"""v2e's command-line defaults and its options `clean` and `noisy`; derive others with `dataclasses.replace`."""
 
 MOTIONS = {
     "default": MotionConfig(

@@ -1,4 +1,4 @@
-"""Light that a moving sensor sees behind four polarizers: when it is rendered, and its values at those times."""
+"""Light on a moving sensor behind four polarizers: the times of rendering, and the light at those times."""
 
 import itertools
 import math
@@ -12,20 +12,19 @@ from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_scene
 from polarnet.simulation.scene import PolarizationScene
 from polarnet.stokes import POLARIZER_ANGLES_DEG, behind_polarizer
 
-MIN_RATE_HZ = 30.0  # of an adaptive rate, for a sensor that stands still
-SAMPLES_PER_STEP = 8  # of the motion, for each pixel it moves
-STEP_SLACK = 1e-3  # pixels by which a step may be longer than one
+MIN_RATE_HZ = 30.0  # minimum of the adaptive rate, for a sensor at rest
+SAMPLES_PER_STEP = 8  # samples of the motion for each pixel of movement
+STEP_SLACK = 1e-3  # pixels by which a step may exceed one pixel
 
 
 def render_times_us(
     trajectory: Trajectory, duration_us: int, height: int, width: int, rate_hz: float | None, regular: bool
 ) -> Int64[np.ndarray, " n"]:
-    """Times of the rendered frames, from 0 to `duration_us`: `rate_hz` a second.
+    """Times of the rendered frames, from 0 to `duration_us`, `rate_hz` a second.
 
-    Without a rate, there is a frame whenever the sensor has moved by a pixel, and at least 30 a second.
-    Between two pixels of the scene light changes smoothly, and at each pixel its slope jumps. A drifting sensor meets
-    the pixels of the scene with all its own at once. Unless times are to be `regular`, the frame nearest to each
-    such moment is moved there.
+    Without a rate, there is one frame for each pixel of motion, and at least MIN_RATE_HZ a second.
+    Light changes smoothly between two pixels of the scene, and its slope jumps at each pixel. On a drifting sensor, all
+    pixels reach these jumps at the same time. Unless `regular`, the nearest frame is moved to each such time.
     """
     samples = 2 + math.ceil(SAMPLES_PER_STEP * duration_us * 1e-6 * max(trajectory.speed_px_s, MIN_RATE_HZ))
     sampled_us = np.linspace(0, duration_us, samples)
@@ -49,7 +48,7 @@ def _adaptive_times(
     height: int,
     width: int,
 ) -> Float64[np.ndarray, " m"]:
-    """Times between which no corner moves by more than a sensor pixel, through all `kinks_us`."""
+    """Times that include all `kinks_us`; between two of them no corner moves by more than one sensor pixel."""
     moved = np.hypot(*np.diff(np.stack(_corners(pose, height, width)), axis=-1)).max(axis=0)
     steps = np.maximum(moved * np.maximum(pose.zoom[1:], pose.zoom[:-1]), MIN_RATE_HZ * 1e-6 * np.diff(sampled_us))
     progress = np.concatenate([[0], np.cumsum(steps)])
@@ -61,7 +60,7 @@ def _adaptive_times(
 def _pixel_crossings(
     pose: Pose, sampled_us: Float64[np.ndarray, " n"], height: int, width: int
 ) -> Float64[np.ndarray, " m"]:
-    """Times at which the pixels of a drifting sensor lie on rows or columns of the scene; none if it turns or zooms."""
+    """Times at which a drifting sensor's pixels lie on rows or columns of the scene; none if it turns or zooms."""
     if not drifts(pose):
         return np.empty(0)
     crossings = []
@@ -108,10 +107,10 @@ def _render(stokes, x, y, angle, zoom, frames) -> None:  # pragma: no cover (com
 
 
 def lights_of_drift(scene: PolarizationScene, pose: Pose, height: int, width: int) -> list[Light]:
-    """Light behind the four polarizers of a sensor that only drifts, over the part of the scene that it sees."""
+    """Light behind the four polarizers of a drifting sensor, from the part of the scene that the sensor covers."""
     left, top = pose.x - (width - 1) / 2, pose.y - (height - 1) / 2
     rows, columns = _visible(top, height, scene.height), _visible(left, width, scene.width)
-    # numpy: torch's threads would wait for more work on the cores that the channels' threads are about to use
+    # numpy, because idle torch threads would occupy the cores that the channels' threads need next
     s0, s1, s2 = scene.stokes[:, rows, columns].numpy()
     lights = []
     for angle in POLARIZER_ANGLES_DEG:
@@ -122,7 +121,7 @@ def lights_of_drift(scene: PolarizationScene, pose: Pose, height: int, width: in
 
 
 def _visible(first: Float64[np.ndarray, " n"], size: int, limit: int) -> slice:
-    """Rows or columns of a scene that a sensor needs, given the places of its first row or column and its size."""
+    """Rows (or columns) of a scene that a sensor covers, from the positions of its first row and its size."""
     return slice(math.floor(first.min()), min(math.floor(first.max()) + size + 1, limit))
 
 
@@ -135,7 +134,7 @@ def _corners(pose: Pose, height: int, width: int) -> tuple[Float64[np.ndarray, "
 
 
 def check_inside(scene: PolarizationScene, pose: Pose, t_us: Int64[np.ndarray, " n"], height: int, width: int) -> None:
-    """ValueError that names the first time at which the sensor leaves the scene."""
+    """Raise ValueError with the first time at which the sensor leaves the scene."""
     x, y = _corners(pose, height, width)
     outside = ((x < 0) | (x > scene.width - 1) | (y < 0) | (y > scene.height - 1)).any(axis=0)
     if outside.any():

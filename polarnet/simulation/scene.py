@@ -1,4 +1,4 @@
-"""Scenes of polarized light: still Stokes pictures, from photographs or from measured intensities."""
+"""Scenes of polarized light: constant Stokes parameters, from photographs or from measured intensities."""
 
 import math
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ from polarnet.stokes import stokes_from_intensities, stokes_from_polarization
 class PolarizationScene:
     """Stokes parameters of the area that a sensor moves over: S0 in [0, 1], S1, S2 with hypot(S1, S2) <= S0.
 
-    Making one checks shape and type alone; `check_scene` checks every pixel.
+    The constructor checks shape and type only; `check_scene` checks every pixel.
     """
 
     stokes: Float32[Tensor, "3 h w"]
@@ -39,25 +39,25 @@ class PolarizationScene:
 
     @property
     def height(self) -> int:
-        """Rows."""
+        """Number of rows."""
         return self.stokes.shape[1]
 
     @property
     def width(self) -> int:
-        """Columns."""
+        """Number of columns."""
         return self.stokes.shape[2]
 
 
 def check_scene(scene: PolarizationScene) -> None:
-    """ValueError for a scene that no light can make: NaN, S0 outside [0, 1], or hypot(S1, S2) above S0."""
+    """Raise ValueError for an unphysical scene: NaN, S0 outside [0, 1], or hypot(S1, S2) above S0."""
     check_finite("scene", scene.stokes)
     s0, s1, s2 = scene.stokes
     check_range("scene", s0, 0, 1, "S0")
     excess = float((torch.hypot(s1, s2) - s0).max())
     if excess > TOLERANCE:
         raise ValueError(
-            f"scene: expected hypot(S1, S2) <= S0, got one that is {excess:g} larger; "
-            f"scene_from_intensities shrinks what noise left"
+            f"scene: expected hypot(S1, S2) <= S0, got an excess of {excess:g}; "
+            f"scene_from_intensities scales noisy measurements down"
         )
 
 
@@ -65,8 +65,8 @@ def polarization_from_rgb(rgb: Float[Array, "3 h w"]) -> Float32[Tensor, "3 h w"
     """(S0, DoLP, AoLP) of a picture: its value, saturation and hue (paper, section 3.1).
 
     The picture is RGB in [0, 1] as floating-point numbers of any precision; hue and saturation are computed in float32.
-    The circle of hues is the half circle of angles: red 0, green pi/3, blue 2 pi/3. Grey has DoLP 0 and AoLP 0.
-    Raises TypeError for what is no array, and ValueError that says what to do for integers, values outside [0, 1],
+    The full circle of hue maps to AoLP in [0, pi): red 0, green pi/3, blue 2 pi/3. Grey has DoLP 0 and AoLP 0.
+    Raises TypeError if `rgb` is not an array, and ValueError, with the remedy, for integers, values outside [0, 1],
     another order of axes, NaN and infinity.
     """
     hue, saturation, value = _hsv(fractions("picture", rgb, "3 height width", "RGB"))
@@ -77,12 +77,12 @@ def polarization_from_rgb(rgb: Float[Array, "3 h w"]) -> Float32[Tensor, "3 h w"
 def scene_from_polarization(
     s0: Float[Array, "h w"], dolp: Float[Array, "h w"], aolp: Float[Array, "h w"]
 ) -> PolarizationScene:
-    """The scene of given intensity and degree of linear polarization, both in [0, 1], and its angle in radians.
+    """The scene with given intensity and DoLP, both in [0, 1], and AoLP in radians.
 
-    Raises TypeError for what is no array, and ValueError for different shapes, integers, NaN, intensities and degrees
-    outside [0, 1] and angles outside [-pi, pi], which are taken for degrees.
+    Raises TypeError for arguments that are not arrays. Raises ValueError for different shapes, integers, NaN,
+    intensities and DoLP outside [0, 1], and angles outside [-pi, pi], which are probably in degrees.
     """
-    s0, dolp = (fractions(name, plane, "height width").float() for name, plane in (("s0", s0), ("dolp", dolp)))
+    s0, dolp = (fractions(name, image, "height width").float() for name, image in (("s0", s0), ("dolp", dolp)))
     aolp = floats("aolp", aolp, "height width").float()
     check_same_shape({"s0": s0, "dolp": dolp, "aolp": aolp})
     check_range("aolp", aolp, -math.pi, math.pi, "radians", "convert degrees with torch.deg2rad")
@@ -100,12 +100,12 @@ def scene_from_rgb(rgb: Float[Array, "3 h w"]) -> PolarizationScene:
 def scene_from_intensities(intensities: Float[Array, "4 h w"]) -> PolarizationScene:
     """The scene measured behind polarizers at 0, 45, 90 and 135 degrees, in linear light, I0 + I90 at most 1.
 
-    Noise makes some measurements unphysical: S1 and S2 are shrunk where their length exceeds S0.
-    Raises TypeError for what is no array, and ValueError for integers, NaN, another order of axes, negative values, and
-    light above 1.
+    Noise makes some measurements unphysical: S1 and S2 are scaled down where hypot(S1, S2) exceeds S0.
+    Raises TypeError if `intensities` is not an array, and ValueError for integers, NaN, another order of axes, negative
+    values, and S0 above 1.
     """
     stokes = stokes_from_intensities(fractions("intensities", intensities, "4 height width").float())
-    check_range("intensities", stokes[0], 0, 1, "S0 = I0 + I90", "divide by the S0 that is to be 1")
+    check_range("intensities", stokes[0], 0, 1, "S0 = I0 + I90", "divide the intensities by the largest S0")
     s0, s1, s2 = stokes
     length = torch.hypot(s1, s2)
     shrink = torch.where(length > s0, s0 / torch.where(length > 0, length, 1.0), 1.0)

@@ -1,4 +1,4 @@
-"""Simulation in memory: one picture in, events of four channels and the matching truth out."""
+"""Simulation in memory: from one picture to the events of four channels and their ground truth."""
 
 from typing import NamedTuple
 
@@ -34,14 +34,14 @@ class Simulation(NamedTuple):
 def simulate(
     picture: Float[Array, "3 h w"] | PolarizationScene, motion: MotionConfig, sensor: EmulatorConfig, seed: int
 ) -> Simulation:
-    """Move an event camera's sensor over a picture, or over a scene.
+    """Simulate an event camera whose sensor moves over a picture or a scene.
 
     A picture is RGB, numpy or torch, of shape (3, height, width), in floating-point numbers of any precision in [0, 1].
     Hue becomes AoLP, saturation DoLP and value S0, as in the pipeline. The same arguments give the same numbers.
 
     Raises TypeError for arguments of another kind. Raises ValueError for integers (divide 8 bits by 255, 16 bits by
-    65535), values outside [0, 1], another order of axes, NaN and infinity, scenes that no light can make, and where the
-    picture is too small for the sensor and its motion; the message says what to do.
+    65535), values outside [0, 1], another order of axes, NaN and infinity, unphysical scenes, and pictures
+    too small for the sensor and its motion; the message gives the remedy.
     """
     for name, value, kind, example in (
         ("motion", motion, MotionConfig, 'MOTIONS["default"]'),

@@ -36,7 +36,7 @@ class SetsConfig:
     measured_root: str
     """Folder of the measured polarization of `measured`, searched recursively."""
     rotation_max_deg: float = field(metadata=allowed(low=0, high=90))
-    """This and the next four: the motion of `complex_motion`."""
+    """This field and the next four set the motion of `complex_motion`."""
     zoom_max: float = field(metadata=allowed(low=1, high=16))
     speed_min_px_s: float = field(metadata=allowed(above=0))
     speed_max_px_s: float = field(metadata=allowed(above=0))
@@ -50,18 +50,18 @@ class SetsConfig:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How sequences are made of pictures: the sections of params.yaml that decide it."""
+    """Sections of params.yaml that determine how pictures become sequences."""
 
     ingest: IngestConfig
     motion: MotionConfig
     emulate: EmulatorConfig
     seed: int
     threads: int
-    """Of each task; changes no result."""
+    """Threads of each task; changes no result."""
 
 
 def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Recipe, mapper: MakeMapper) -> bool:
-    """The test pictures of `images` again, under the motion of `sets`. False where they lie there already."""
+    """The test pictures of `images` again, under the motion of `sets`. False if the folder is complete already."""
     names = ("rotation_max_deg", "zoom_max", "speed_min_px_s", "speed_max_px_s", "acceleration_max_px_s2")
     motion = dataclasses.replace(recipe.motion, **{name: getattr(sets, name) for name in names})
     fill = functools.partial(_held_out, images)
@@ -69,13 +69,14 @@ def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Re
 
 
 def make_folder_set(root: Path, kind: str, folder: Path, recipe: Recipe, mapper: MakeMapper) -> bool:
-    """Every photograph or measured scene under `root`, for testing alone. False where they lie there already.
+    """Every photograph or measured scene under `root`, all in the test split. False if the folder is complete already.
 
-    `kind` is photographs, polarization, or auto, which looks at the files. ValueError that says what was expected where
-    none can be used.
+    `kind` is photographs, polarization, or auto, which looks at the files. Raises ValueError if
+    no picture can be used.
     """
     if not root.is_dir():
-        raise ValueError(f"{root}: expected a folder of photographs or of measured polarization, it is none")
+        actual = "a file" if root.exists() else "no such folder"
+        raise ValueError(f"{root}: expected a folder of photographs or of measured polarization, got {actual}")
     source = "polarization" if (kind if kind != "auto" else kind_of(root)) == "polarization" else "folder"
     chosen = dataclasses.replace(
         recipe.ingest, source=source, root=str(root), limit=None, val_fraction=0.0, test_fraction=1.0

@@ -1,4 +1,4 @@
-"""Pictures -> scenes, trajectories and the exact frames that an ideal camera in their place would take."""
+"""Synthesis: from pictures to scenes, trajectories and exact frames of an ideal camera."""
 
 import dataclasses
 import functools
@@ -33,7 +33,7 @@ from polarnet.storage.scenes import SceneStore, made_from, variant_name
 logger = logging.getLogger(__name__)
 
 Motions: TypeAlias = Mapping[str, Mapping[str, Trajectory]]
-"""Of a picture: the trajectory of each sequence of each of its scenes."""
+"""Trajectories of one picture by scene and sequence."""
 
 
 @one_thread()
@@ -42,22 +42,26 @@ def frames_of(
 ) -> tuple[Float[Tensor, "n 4 h w"], Float[Tensor, "n h w"], Float[Tensor, "n h w"]]:
     """(intensity behind the four polarizers, DoLP, AoLP) on a sensor that moves over a scene, at times in microseconds.
 
-    Light mixes between pixels, angles do not: all three follow from the interpolated Stokes vector.
+    Interpolation applies to Stokes parameters, because angles cannot be averaged; all three results follow from them.
     """
-    seen = render(scene, trajectory, np.asarray(t_us) * 1e-6, height, width)
-    return stokes.intensities_from_stokes(seen).clamp(0, 1), stokes.dolp(seen).clamp(0, 1), stokes.aolp(seen)
+    stokes_frames = render(scene, trajectory, np.asarray(t_us) * 1e-6, height, width)
+    return (
+        stokes.intensities_from_stokes(stokes_frames).clamp(0, 1),
+        stokes.dolp(stokes_frames).clamp(0, 1),
+        stokes.aolp(stokes_frames),
+    )
 
 
 def valid_frames(
     valid: Bool[Tensor, "h1 w1"], trajectory: Trajectory, t_us: Sequence[int], height: int, width: int
 ) -> Bool[Tensor, "n h w"]:
-    """Sensor pixels with known light: those whose interpolation uses valid pixels of the scene alone.
+    """Sensor pixels with known light: those interpolated from valid pixels of the scene only.
 
-    The weights of the interpolation are not negative, so that a rendered mask is 0 just there.
+    Interpolation weights are not negative, so the rendered mask of invalid pixels is 0 exactly there.
     """
     masked = (~valid).float()
-    seen = render(PolarizationScene(masked.expand(3, -1, -1)), trajectory, np.asarray(t_us) * 1e-6, height, width)
-    return seen[:, 0] == 0
+    rendered = render(PolarizationScene(masked.expand(3, -1, -1)), trajectory, np.asarray(t_us) * 1e-6, height, width)
+    return rendered[:, 0] == 0
 
 
 def synthesize(
@@ -69,15 +73,14 @@ def synthesize(
     mapper: Callable[..., Iterable[Any]],
     variation: VariationConfig | None = None,
 ) -> int:
-    """Fill both stores with `sequences_per_picture` sequences of every scene; how many there are.
+    """Fill both stores with `sequences_per_picture` sequences of every scene, and return the number of sequences.
 
-    A scene is a picture of `images`, or a variant of one of the training split (`variation` None: there are none).
+    A scene is a picture of `images`, or a variant of a training picture; without `variation` there are no variants.
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`. Every trajectory depends
-    on the seed and the sequence's name alone. An interrupted run goes on where it stopped.
+    only on the seed and the sequence's name. An interrupted run resumes.
 
-    Warns about every picture too small for the sensor and its motion, and makes no scene of it; ValueError where none
-    is left.
+    Skips every picture too small for the sensor and its motion, with a warning. Raises ValueError if none is left.
     """
     manifest = read_manifest(images)
     motions, skipped = motions_of(manifest, config, seed, variation)
@@ -98,7 +101,7 @@ def synthesize(
         variation=variation,
         seed=seed,
     )
-    trajectories = {scene: sequences for of in motions.values() for scene, sequences in of.items()}
+    trajectories = {scene: sequences for scenes_of in motions.values() for scene, sequences in scenes_of.items()}
     for _ in mapper(task, [(picture, trajectories[picture]) for picture in sorted(pictures)]):
         pass
     scene_store.finish()
@@ -109,7 +112,7 @@ def synthesize(
 def motions_of(
     manifest: Manifest, config: MotionConfig, seed: int, variation: VariationConfig | None = None
 ) -> tuple[dict[str, Motions], list[Skipped]]:
-    """The motions over each picture, by its name, and the pictures that are too small for the sensor and its motion."""
+    """Motions by picture, and the pictures that are too small for the sensor and its motion."""
     motions, skipped = {}, []
     for entry in manifest.pictures:
         try:
@@ -142,7 +145,7 @@ def _create(
     variation: VariationConfig | None,
     seed: int,
 ) -> tuple[SceneStore, FrameStore]:
-    """Two unfinished stores; their attributes say what they are made from, so that only the same is resumed."""
+    """Two unfinished stores; their attributes record all inputs, so that only an equal run resumes them."""
     picture_of, splits = {}, {}
     for entry in manifest.pictures:
         for scene, sequences in motions[entry.name].items():
@@ -184,7 +187,7 @@ def _synthesize_scene(
     variation: VariationConfig | None,
     seed: int,
 ) -> None:
-    """Write one picture, or a variant of it, and all its sequences, whose motions come with it."""
+    """Write one scene, a picture or a variant of it, with all its sequences; `item` is the scene and its motions."""
     picture, trajectories = item
     source = made_from(picture)
     polarization, valid = _read_polarization(images, source)
@@ -195,26 +198,26 @@ def _synthesize_scene(
     t_us = frame_times_us(config)
     for sequence, trajectory in trajectories.items():
         scenes.write(sequence, torch.from_numpy(trajectory.to_vector()), t_us[-1])
-        record = scenes.read(sequence)  # quantised: the scene that is emulated, and so the truth
+        record = scenes.read(sequence)  # quantised as in the store, like the scene that is emulated
         scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
-        seen = frames_of(scene, trajectory, t_us, config.window_height, config.window_width)
+        truth = frames_of(scene, trajectory, t_us, config.window_height, config.window_width)
         known = None
         if record.valid is not None:
             known = valid_frames(record.valid, trajectory, t_us, config.window_height, config.window_width)
-        frames.write(sequence, torch.tensor(t_us), *seen, known)
+        frames.write(sequence, torch.tensor(t_us), *truth, known)
 
 
 def _read_polarization(images: Path, picture: str) -> tuple[Float[Tensor, "3 h w"], Bool[Tensor, "h w"] | None]:
-    """(S0, DoLP, AoLP) of a photograph, by its colours, or of a measurement, and where that is known (None: all)."""
+    """(S0, DoLP, AoLP) of a photograph or measurement, and the mask of known pixels (None: all are known)."""
     measured = images / f"{picture}.npz"
     if not measured.exists():
         return polarization_from_rgb(read_rgb(images / f"{picture}.png")), None
     intensities, valid = read_intensities(measured)
-    seen = scene_from_intensities(intensities).stokes
-    return torch.stack([seen[0].clamp(max=1), stokes.dolp(seen).clamp(max=1), stokes.aolp(seen)]), valid
+    s = scene_from_intensities(intensities).stokes
+    return torch.stack([s[0].clamp(max=1), stokes.dolp(s).clamp(max=1), stokes.aolp(s)]), valid
 
 
 def _digest(manifest: Manifest, images: Path) -> str:
-    """Of all picture files."""
+    """Hash of all picture files."""
     files = [entry.file for entry in manifest.pictures]
     return sha256(*(part for name in files for part in (name.encode(), b"\0", bytes.fromhex(sha256(images / name)))))

@@ -1,10 +1,9 @@
-"""Other scenes from the same pictures, to train on: their polarization turned, rescaled or evened out, their light
-regraded.
+"""Variants of training scenes: AoLP rotated, DoLP rescaled or drawn towards one value, intensity regraded.
 
-Photographs are highly polarized by the rule that saturation is DoLP, measured scenes hardly: what is trained on
-scenes in between, whose angles are any, does not learn one world's averages. A scene of about one hue is polarized
-alike everywhere. Then the four polarizers' logarithms change alike, whatever DoLP is, and only how a pixel responds to
-dim and to bright light tells; `uniform_share` makes more such scenes.
+Photographs are highly polarized, because saturation becomes DoLP; measured scenes are hardly polarized. Variants lie in
+between and have any angle, so that a network cannot learn the averages of one kind of scene. A scene of about one hue
+has nearly uniform polarization. The logarithms of the four channels then change alike for any DoLP, and the only cue
+left is the pixel's response to dim and bright light. `uniform_share` makes more such scenes.
 """
 
 import math
@@ -18,7 +17,7 @@ from torch import Tensor
 from polarnet import stokes
 from polarnet.runtime.ranges import allowed, check_ranges
 
-GREATEST_DOLP = 0.99
+MAX_DOLP = 0.99
 
 
 @dataclass(frozen=True)
@@ -26,17 +25,17 @@ class VariationConfig:
     """Section `variation` of params.yaml."""
 
     scenes_per_picture: int = field(metadata=allowed(low=0))
-    """Of the training split, beside the picture itself; pictures of the other splits are never varied."""
+    """Variants of each training picture, beside the picture itself; other splits have none."""
     share: float = field(metadata=allowed(low=0, high=1))
-    """Of them whose DoLP is changed, and of them whose light is; the angle is turned in all."""
+    """Share of variants with changed DoLP, and share with changed S0; AoLP is rotated in all."""
     dolp_factor: list[float] = field(metadata=allowed(low=0))
-    """DoLP is multiplied by a number between these two, drawn uniformly ..."""
+    """DoLP is multiplied by a number drawn uniformly between these two ..."""
     dolp_exponent_spread: float = field(metadata=allowed(low=0))
-    """... after it was raised to a power whose logarithm is normal with this standard deviation."""
+    """... after being raised to a power whose logarithm is normal with this standard deviation."""
     s0_factor: list[float] = field(metadata=allowed(above=0, high=1))
     s0_exponent_spread: float = field(metadata=allowed(low=0))
     uniform_share: float = field(metadata=allowed(low=0, high=1))
-    """Of them whose polarization is drawn towards one of any degree and angle, the same everywhere ..."""
+    """Share of variants whose polarization is drawn towards one uniform value of any DoLP and AoLP ..."""
     uniform_weight: list[float] = field(metadata=allowed(low=0, high=1))
     """... by a weight between these two; 1: DoLP and AoLP are constant."""
 
@@ -45,37 +44,37 @@ class VariationConfig:
         for name in ("dolp_factor", "s0_factor", "uniform_weight"):
             values = getattr(self, name)
             if len(values) != 2 or values[0] > values[1]:
-                raise ValueError(f"{name}: expected a smaller and a greater number, got {values}")
+                raise ValueError(f"{name}: expected [smaller, larger], got {values}")
 
 
 def varied(
     polarization: Float[Tensor, "3 h w"], config: VariationConfig, generator: np.random.Generator
 ) -> Float[Tensor, "3 h w"]:
-    """Another scene (S0, DoLP, AoLP) of the same shapes; S0 in [0, 1], DoLP below 1, AoLP in [0, pi)."""
+    """A variant (S0, DoLP, AoLP) of a scene; S0 in [0, 1], DoLP below 1, AoLP in [0, pi)."""
     s0, dolp, aolp = polarization
     turn, direction = generator.uniform(0, math.pi), 1 - 2 * int(generator.integers(2))
     aolp = torch.remainder(direction * aolp + turn, math.pi)
-    aolp = torch.where(aolp >= math.pi, 0.0, aolp)  # what is just below 0 rounds up
+    aolp = torch.where(aolp >= math.pi, 0.0, aolp)  # values just below 0 round up to pi
     if generator.random() < config.share:
-        dolp = _graded(dolp, config.dolp_factor, config.dolp_exponent_spread, generator).clamp(max=GREATEST_DOLP)
+        dolp = _graded(dolp, config.dolp_factor, config.dolp_exponent_spread, generator).clamp(max=MAX_DOLP)
     if generator.random() < config.share:
         s0 = _graded(s0, config.s0_factor, config.s0_exponent_spread, generator)
     if generator.random() < config.uniform_share:
-        dolp, aolp = _evened(dolp, aolp, config.uniform_weight, generator)
+        dolp, aolp = _drawn_to_one(dolp, aolp, config.uniform_weight, generator)
     return torch.stack([s0, dolp, aolp])
 
 
-def _evened(
+def _drawn_to_one(
     dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"], weight: list[float], generator: np.random.Generator
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """DoLP and AoLP of a mean of the scene's own S1 / S0, S2 / S0 and a constant."""
+    """DoLP and AoLP of the weighted mean of the scene's (s1, s2) and a constant."""
     lightest, heaviest = weight
     share = generator.uniform(lightest, heaviest)
-    degree, angle = generator.uniform(0, GREATEST_DOLP), generator.uniform(0, math.pi)
+    degree, angle = generator.uniform(0, MAX_DOLP), generator.uniform(0, math.pi)
     mean = stokes.stokes_from_polarization(torch.ones_like(dolp), (1 - share) * dolp, aolp)
     mean[1] += share * degree * math.cos(2 * angle)
     mean[2] += share * degree * math.sin(2 * angle)
-    return stokes.dolp(mean).clamp(max=GREATEST_DOLP), stokes.aolp(mean)
+    return stokes.dolp(mean).clamp(max=MAX_DOLP), stokes.aolp(mean)
 
 
 def _graded(values: Tensor, factor: list[float], spread: float, generator: np.random.Generator) -> Tensor:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 RIDGES = (0.01, 0.1, 1.0, 10.0, 100.0)  # penalties on coefficients of unit-variance features; the largest removes them
 FOLDS = 5
-LEAST_SPREAD = 1e-6  # features with a smaller standard deviation are ignored
+MIN_SPREAD = 1e-6  # features with a smaller standard deviation are ignored
 TOLERANCE = 1e-9  # L-BFGS-B stops at this relative change of the mean log-likelihood, or at this gradient
 
 
@@ -66,7 +66,7 @@ def fitted(scenes: Sequence[Scene]) -> ExpectedErrors:
 def _fitted(scenes: Sequence[Scene], ridge: float) -> ExpectedErrors:
     features, squared = (torch.cat(field).numpy() for field in zip(*scenes, strict=True))
     mean, spread = features.mean(0), features.std(0)
-    scale = np.where(spread > LEAST_SPREAD, 1 / spread.clip(LEAST_SPREAD), 0)
+    scale = np.where(spread > MIN_SPREAD, 1 / spread.clip(MIN_SPREAD), 0)
     scaled = (features - mean) * scale
 
     def loss_and_slope(w: Float64[np.ndarray, " k"]) -> tuple[float, Float64[np.ndarray, " k"]]:

@@ -21,7 +21,7 @@ from polarnet.training.losses import known_frames
 from polarnet.training.optimizers import OPTIMIZERS
 from polarnet.training.parallel import add_up, place, wait_for_all
 from polarnet.training.recorder import Recorder
-from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, kept_in_memory, parts_of, shuffled
+from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, loaded_if_it_fits, parts_of, shuffled
 from polarnet.training.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
@@ -78,7 +78,8 @@ def train(
     optimizer = OPTIMIZERS[task.optimizer](network, config.learning_rate)
     progress = recorder.resume(network, optimizer)
     wait_for_all()  # every process has read the running checkpoint before the first process writes it again
-    sequences, workers = kept_in_memory(split.train, workers, task.wants_intensity)
+    loaded = loaded_if_it_fits(split.train, task.wants_intensity)
+    sequences, workers = (split.train, workers) if loaded is None else (loaded, 0)
     for epoch in range(progress.epoch, config.epochs):
         visits = Visits(sequences, config, seed, epoch)
         order = shuffled(len(visits), seed, epoch)

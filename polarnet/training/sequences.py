@@ -120,17 +120,16 @@ class Visits(Dataset[WindowSequence]):
         return seen(sequence, random_view(count, height, width, self.config, generator))
 
 
-def kept_in_memory(dataset: WindowDataset, workers: int, intensity: bool) -> tuple[Sequences, int]:
-    """Load and encode a dataset's sequences in advance if they fit into `KEPT` of the free memory.
+def loaded_if_it_fits(dataset: WindowDataset, intensity: bool) -> list[WindowSequence] | None:
+    """A dataset's encoded sequences, if they fit into `KEPT` of the free memory; None if they do not.
 
-    Returns the sequences and the number of worker processes to read them, which is 0 if they are in memory.
     `intensity` says whether to keep the intensity.
     """
     bytes_each = sum(tensor.nbytes for tensor in packed(dataset[0], intensity)[1:] if tensor is not None)
     if bytes_each * len(dataset) > KEPT * psutil.virtual_memory().available:
-        return dataset, workers
+        return None
     with memory_handed_back():
-        return [packed(dataset[number], intensity) for number in range(len(dataset))], 0
+        return [packed(dataset[number], intensity) for number in range(len(dataset))]
 
 
 def packed(sequence: WindowSequence, intensity: bool) -> WindowSequence:

@@ -18,7 +18,7 @@ def log_light(t_s, pixel):
 
 @pytest.fixture(scope="module")
 def events():
-    """Of ideal pixels whose thresholds for darker are larger than those for brighter."""
+    """Events of ideal pixels with larger OFF than ON thresholds."""
     t_us = np.arange(0, 1_000_000, 20)
     found = []
     for pixel in range(HEIGHT * WIDTH):

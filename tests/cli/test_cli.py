@@ -104,7 +104,7 @@ def test_verify_of_a_zip_and_of_a_url_names_the_sequence_with_a_flipped_byte(two
     try:
         for place in (two, zipped(two, tmp_path / "whole.zip"), url):
             assert main(["verify", str(place)]) == 0
-            assert "every sequence is whole" in capsys.readouterr().out
+            assert "every sequence is intact" in capsys.readouterr().out
         chunk = chunk_of(two, column, 1)
         flip_a_byte(chunk)
         bucket.pipe_file(f"/bucket/two.zarr/{chunk.relative_to(two).as_posix()}", chunk.read_bytes())

@@ -48,13 +48,13 @@ def test_files_move_into_the_folder_at_the_end_alone(tmp_path):
 
 def test_a_folder_with_other_files_is_refused_and_untouched(tmp_path):
     (tmp_path / "thesis.tex").touch()
-    with pytest.raises(ValueError, match="holds files that `polarnet recover` did not write; name another folder"):
+    with pytest.raises(ValueError, match="contains files that `polarnet recover` did not write; name another folder"):
         write(tmp_path, "0.png")
     with run_folder(tmp_path / "out", "export") as partial:
         (partial / "events.h5").touch()
     with pytest.raises(ValueError, match="`polarnet recover` did not write"):
         write(tmp_path / "out", "0.png")
-    with pytest.raises(ValueError, match="is a file; name a folder"):
+    with pytest.raises(ValueError, match="expected a folder, got a file; name a folder"):
         write(tmp_path / "thesis.tex", "0.png")
     assert names(tmp_path) == ["out/events.h5", f"out/{MARKER}", "thesis.tex"]
 
@@ -69,7 +69,7 @@ def test_a_run_that_is_stopped_keeps_its_files_apart_and_the_next_run_replaces_t
     write(tmp_path / "out", "before.png")
     with pytest.raises(KeyboardInterrupt):
         fail(tmp_path / "out", KeyboardInterrupt(), "0.png")
-    assert f"files made until then: {tmp_path / 'out.partial'}" in capsys.readouterr().err
+    assert f"files of the unfinished run: {tmp_path / 'out.partial'}" in capsys.readouterr().err
     assert names(tmp_path) == ["out.partial/0.png", f"out.partial/{MARKER}", "out/before.png", f"out/{MARKER}"]
     write(tmp_path / "out", "after.png")
     assert names(tmp_path) == ["out/after.png", f"out/{MARKER}"]

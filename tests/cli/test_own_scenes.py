@@ -102,7 +102,7 @@ def test_nothing_usable_says_what_was_expected(project_root, tmp_path, monkeypat
     (empty / "letter.doc").write_text("Dear all")
     assert run(project_root, monkeypatch, empty, tmp_path / "out") == 1
     error = capsys.readouterr().err
-    assert "nothing to test on" in error
+    assert "no scene to score" in error
     assert "found 0 pictures and 1 other files" in error
     assert run(project_root, monkeypatch, tmp_path / "nowhere", tmp_path / "out") == 1
     assert "expected a folder of photographs or of measured polarization" in capsys.readouterr().err
@@ -154,7 +154,7 @@ def test_a_measured_scene_smaller_than_the_window_is_skipped_and_named(project_r
     (folder / "plate.npz").unlink()
     assert run(project_root, monkeypatch, folder, tmp_path / "none") == 1
     error = capsys.readouterr().err
-    assert "nothing to test on. none of 1 pictures can be used" in error
+    assert "no scene to score. none of 1 pictures can be used" in error
     assert "use larger pictures or a smaller sensor" in error
 
 

@@ -80,7 +80,7 @@ def test_a_typo_on_the_command_line_is_refused_with_the_keys_there_are(project_r
         ("experiment=smok", r"experiment: there is no 'smok'; conf/experiment has demo, paper, photographs, smoke$"),
         ("sensor=noizy", r"sensor: there is no 'noizy'; conf/sensor has clean, default, noisy$"),
         ("ablation=glob(moz*)", r"ablation: there is no 'moz\*'; conf/ablation has crop, "),
-        ("ablation=nothing,mozaic", r"ablation: there is no 'mozaic'; conf/ablation has crop, memories, mosaic, "),
+        ("ablation=nothing,panoramma", r"ablation: there is no 'panoramma'; conf/ablation has crop, memories, "),
     ],
 )
 def test_a_mistyped_group_choice_is_refused_with_the_choices_there_are(project_root, override, message):

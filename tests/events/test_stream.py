@@ -1,4 +1,4 @@
-"""What can be done to a stream of events."""
+"""Operations on a stream of events."""
 
 import numpy as np
 import pytest

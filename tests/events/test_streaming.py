@@ -23,7 +23,7 @@ CHANNELS = [random_events(seed) for seed in range(4)]
 
 
 def windows(rule, pieces=1):
-    """What the cutter gives where the stream comes in so many pieces."""
+    """Windows of the cutter for a stream that arrives in several pieces."""
     cutter = WindowCutter(rule, HEIGHT, WIDTH)
     edges = [DURATION_US * k // pieces for k in range(pieces + 1)]
     return [

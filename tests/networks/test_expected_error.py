@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.expected_error import LEAST_DISAGREEMENT, LEAST_ROOM, TELLING, ExpectedError, telling
+from polarnet.networks.expected_error import MIN_DISAGREEMENT, MIN_ROOM, TELLING, ExpectedError, telling
 
 EVEN = torch.full((1, 2, 4, 6), 0.5)
 
@@ -15,13 +15,13 @@ def told(candidates=EVEN, weights=EVEN, evidence=EVEN, dolp=0.5):
 def test_candidates_that_agree_say_the_least_and_the_others_how_far_they_are_apart():
     assert told().shape == (1, TELLING, 8, 12)
     apart, _, of_frame, _, _ = told()[0]
-    assert apart.unique().item() == of_frame.unique().item() == pytest.approx(math.log(LEAST_DISAGREEMENT))
+    assert apart.unique().item() == of_frame.unique().item() == pytest.approx(math.log(MIN_DISAGREEMENT))
     candidates = EVEN.clone()
     candidates[:, 0, :, 3:] = 0.9
     apart, _, of_frame, _, _ = told(candidates)[0]
-    disagree = math.log(0.2**2 + LEAST_DISAGREEMENT)
+    disagree = math.log(0.2**2 + MIN_DISAGREEMENT)
     assert apart[:, -1].unique().item() == pytest.approx(disagree)
-    assert of_frame.unique().item() == pytest.approx((disagree + math.log(LEAST_DISAGREEMENT)) / 2)
+    assert of_frame.unique().item() == pytest.approx((disagree + math.log(MIN_DISAGREEMENT)) / 2)
 
 
 def test_a_candidate_that_the_network_does_not_trust_does_not_count():
@@ -41,7 +41,7 @@ def test_much_evidence_hardly_any_and_none_in_a_frame_are_told_apart():
 
 
 def test_errors_of_middle_values_have_most_room():
-    assert told(dolp=0.2)[0, 4].unique().item() == pytest.approx(math.log(0.16 + LEAST_ROOM))
+    assert told(dolp=0.2)[0, 4].unique().item() == pytest.approx(math.log(0.16 + MIN_ROOM))
     assert told(dolp=-0.1)[0, 4].unique().item() == told(dolp=1.1)[0, 4].unique().item()
 
 

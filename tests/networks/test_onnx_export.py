@@ -36,7 +36,7 @@ CONFIGS = {
         memories=[0.0, 0.5],
         decays=[0.9],
         scales=[1, 3, 0],
-        mosaic_scale=5,
+        panorama_scale=5,
     ),
 }
 REPRESENTATIONS = {"paper": "event_tensor", "polarnet": "event_counts"}

@@ -21,7 +21,7 @@ CONFIG = replace(
     decays=[0.7, 0.9],
     scales=[1, 3, 0],
     reach=5,
-    mosaic_scale=5,
+    panorama_scale=5,
 )
 
 
@@ -137,7 +137,7 @@ def test_each_part_can_be_left_out_and_then_does_nothing():
 
 
 @torch.no_grad()
-def test_the_mosaic_is_averaged_in_where_the_scene_moves():
+def test_the_panorama_is_averaged_in_where_the_scene_moves():
     moving, blinking = moving_events(4, 48, 64), events(4, 1, 8, 48, 64)
     for windows, changes in ((moving, True), (blinking, False)):
         built = network()
@@ -146,7 +146,7 @@ def test_the_mosaic_is_averaged_in_where_the_scene_moves():
         assert ((built.unroll(windows)[0].dolp - before.dolp).abs().max() > 1e-3) == changes
 
 
-def test_the_mosaic_gives_the_pattern_and_the_network_the_level():
+def test_the_panorama_gives_the_pattern_and_the_network_the_level():
     torch.manual_seed(0)
     coarse = torch.randn(3, 1, 1, 6, 9)
     s0, dolp, aolp = (F.interpolate(image, size=(48, 72), mode="bicubic")[0] for image in coarse)
@@ -165,7 +165,7 @@ def test_the_mosaic_gives_the_pattern_and_the_network_the_level():
 
 def test_a_part_that_there_is_not_is_named():
     with pytest.raises(
-        ValueError, match="without: expected some of redundancy, slopes, sums, recurrence, mosaic, got attention"
+        ValueError, match="without: expected some of redundancy, slopes, sums, recurrence, panorama, got attention"
     ):
         network(without=["attention"])
 
@@ -183,5 +183,5 @@ def test_other_input_than_counts_of_events_is_refused():
 def test_a_neighbourhood_needs_a_middle():
     with pytest.raises(ValueError, match="scales: expected odd numbers"):
         replace(CONFIG, scales=[2])
-    with pytest.raises(ValueError, match="mosaic_scale: expected an odd number, got 4"):
-        replace(CONFIG, mosaic_scale=4)
+    with pytest.raises(ValueError, match="panorama_scale: expected an odd number, got 4"):
+        replace(CONFIG, panorama_scale=4)

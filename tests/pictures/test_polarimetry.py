@@ -57,7 +57,7 @@ def save_npz(path: Path, intensities: np.ndarray) -> None:
 
 
 def raw_mosaic(intensities: np.ndarray) -> np.ndarray:
-    """What a sensor with the Sony order sees."""
+    """Raw mosaic of a sensor in the Sony order."""
     raw = np.zeros(intensities.shape[1:], intensities.dtype)
     for row in (0, 1):
         for column in (0, 1):

@@ -140,7 +140,7 @@ def until(true: Callable[[], bool], still_worth_it: Callable[[], bool] = lambda:
 
 
 class Undisturbed(NamedTuple):
-    """What a run leaves that nothing interrupts, and its pace."""
+    """Output and pace of an uninterrupted run."""
 
     digests: dict[str, str]
     seconds_to_first: float

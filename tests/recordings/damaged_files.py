@@ -31,7 +31,7 @@ DAMAGE = st.lists(
     ),
     max_size=6,
 )
-"""What is done to a file, in order: kind, byte, and how."""
+"""Changes of a file in order: kind, byte, and value."""
 
 ENDINGS = ("read", "repaired", "refused")
 """The only three that reading a file may have: as it is, with repairs that are counted, or with the reason not to."""

@@ -70,7 +70,7 @@ def test_inspect_prints_the_findings_and_writes_a_picture_without_hot_pixels(
     assert (tmp_path / "hot.png").stat().st_size > 5000
     printed = capsys.readouterr().out
     assert "hot pixels  1 with 50.0% of the events (x 700 y 300: 100)" in printed
-    picture = cv2.imread(str(tmp_path / "capture.csv.png"))
+    picture = cv2.imread(str(tmp_path / "outputs" / "inspect" / "capture.csv.png"))
     assert picture.shape == (800, 1280, 3)
     coloured = np.argwhere((picture != 255).any(axis=-1))
     assert np.unique(coloured[:, 0]).tolist() == [20]

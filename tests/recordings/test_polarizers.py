@@ -39,7 +39,7 @@ def unpolarized():
 
 
 def mosaic_of(channels, order):
-    """What a sensor reports whose 2x2 pixels have polarizers in this order."""
+    """Events of a sensor whose 2x2 pixels have polarizers in this order."""
     parts = []
     for angle, events in zip(POLARIZER_ANGLES_DEG, channels, strict=True):
         row, column = next((r, c) for r in (0, 1) for c in (0, 1) if order[r][c] == angle)

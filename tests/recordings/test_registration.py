@@ -82,7 +82,7 @@ def test_recordings_of_other_scenes_are_named(images, tmp_path, capsys):
     assert main(["register", str(tmp_path / "a.txt"), str(tmp_path / "b.txt")]) == 0
     assert capsys.readouterr().err == ""
     assert main(["register", str(tmp_path / "a.txt"), str(tmp_path / "c.txt")]) == 0
-    assert "the edges of the two recordings do not meet" in capsys.readouterr().err
+    assert "the edges of the two recordings do not match" in capsys.readouterr().err
 
 
 def test_events_are_moved_to_the_reference_camera_and_those_it_does_not_see_left_out():

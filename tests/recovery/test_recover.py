@@ -240,12 +240,12 @@ def test_a_second_recovery_replaces_the_first_and_other_files_are_refused(store,
     assert main([*arguments, "png", "--window", "50ms"]) == 0
     assert sorted(path.name for path in out.iterdir()) == ["index.html", "png", "recovered.png", "run.json"]
     assert len(list((out / "png").iterdir())) == 2
-    assert f"the page: {out / 'index.html'}" in capsys.readouterr().out
+    assert f"page        {out / 'index.html'}" in capsys.readouterr().out
     assert main([*arguments, "png", "--window", "1s"]) == 1
     assert len(list((out / "png").iterdir())) == 2
     (tmp_path / "out" / "run.json").unlink()
     assert main([*arguments, "png", "--window", "50ms"]) == 1
-    assert "holds files that `polarnet recover` did not write; name another folder" in capsys.readouterr().err
+    assert "contains files that `polarnet recover` did not write; name another folder" in capsys.readouterr().err
 
 
 def test_a_mosaic_without_polarizers_is_named_on_the_terminal_and_on_the_page(tmp_path, at_root, capsys):

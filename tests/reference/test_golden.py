@@ -88,15 +88,15 @@ def test_v2e_case(golden, described, name):
     _, state = emulate(frames[:1], t_us[:1], config, key=1)
     maps = {MAPS[name][0]: np.load(golden / f"{MAPS[name][1]}.npy").ravel() for name in case["maps"]}
     state = with_arrays(state, **{array: values.astype(np.float32) for array, values in maps.items()})
-    (columns,), state = emulate_columns(frames[1:], t_us[1:], config, key=1, state=state, exact=True)
+    (columns,), state = emulate_columns(frames[1:], t_us[1:], config, key=1, state=state, unrounded_times=True)
 
     expected = np.load(golden / f"{name}.npz")
-    ours = np.lexsort((columns.p, columns.x, columns.y, columns.exact_us))
+    ours = np.lexsort((columns.p, columns.x, columns.y, columns.unrounded_us))
     theirs = np.lexsort((expected["p"], expected["x"], expected["y"], expected["t"]))
     assert len(columns.t) == len(expected["t"]) == case["n_events"]
     for column in ("x", "y", "p"):
         assert np.array_equal(getattr(columns, column)[ours], expected[column][theirs])
-    assert columns.exact_us[ours] == pytest.approx(1e6 * expected["t"][theirs], abs=STAMP_TOLERANCE_US)
+    assert columns.unrounded_us[ours] == pytest.approx(1e6 * expected["t"][theirs], abs=STAMP_TOLERANCE_US)
     assert np.array_equal(state.pixels[0].memory.reshape(SIZE), expected["final_base_log"])
     assert state.pixels[0].filtered.reshape(SIZE) == pytest.approx(expected["final_lp_log"], abs=1e-12)
 
@@ -142,9 +142,9 @@ def test_esim_case(golden, name, refractory_us):
     last_us = np.full(SIZE, -np.inf)
     np.maximum.at(last_us, (expected["y"][early], expected["x"][early]), theirs_us[early])
     state = with_arrays(state, last_event_us=last_us.ravel())
-    (columns,), _ = emulate_columns(frames[2:], t_us[2:], config, key=1, state=state, exact=True)
+    (columns,), _ = emulate_columns(frames[2:], t_us[2:], config, key=1, state=state, unrounded_times=True)
     theirs = by_pixel(*(values[~early] for values in (expected["x"], expected["y"], theirs_us, expected["p"])))
-    assert differing(by_pixel(columns.x, columns.y, columns.exact_us, columns.p), theirs) == []
+    assert differing(by_pixel(columns.x, columns.y, columns.unrounded_us, columns.p), theirs) == []
 
 
 @pytest.mark.parametrize("refractory_us", [0, 2000])
@@ -153,8 +153,8 @@ def test_esim_gpu_case(golden, name, refractory_us):
     frames = clip(golden, name)
     expected = np.load(golden / f"esim_torch_{name}_refr{refractory_us}us.npz")
     config = dataclasses.replace(CONFIG, model="esim_gpu", refractory_period_us=float(refractory_us))
-    (columns,), _ = emulate_columns(frames, times_us(golden, "t300"), config, key=1, exact=True)
-    ours = by_pixel(columns.x, columns.y, columns.exact_us, columns.p)
+    (columns,), _ = emulate_columns(frames, times_us(golden, "t300"), config, key=1, unrounded_times=True)
+    ours = by_pixel(columns.x, columns.y, columns.unrounded_us, columns.p)
     theirs = by_pixel(expected["x"], expected["y"], expected["t"] * 1e6, expected["p"])
     # It divides 0 by 0 where rounding leaves a level to a frame in which the pixel rests, and is silent from then on;
     # and one logarithm whose last bit differs decides an exact tie.

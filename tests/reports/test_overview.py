@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from polarnet.reports.artefacts import read_artefacts
-from polarnet.reports.overview import MOST_EVENTS, _oblique, overview_figure
+from polarnet.reports.overview import MAX_EVENTS, _oblique, overview_figure
 from polarnet.reports.png import png
 
 
@@ -18,7 +18,7 @@ def test_the_overview_has_the_same_bytes_each_time(overview):
 def test_every_event_of_a_sparse_stream_is_drawn(overview):
     clouds = [axes.collections[0] for axes in overview_figure(overview).axes if axes.collections]
     assert [len(cloud.get_offsets()) for cloud in clouds] == [len(stream) for stream in overview.streams]
-    assert max(len(stream) for stream in overview.streams) < MOST_EVENTS
+    assert max(len(stream) for stream in overview.streams) < MAX_EVENTS
 
 
 def test_the_space_time_box_fills_the_page_from_corner_to_corner():

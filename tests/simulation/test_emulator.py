@@ -1,4 +1,4 @@
-"""What every pixel model promises: hand-worked ramps, equal bytes however work is cut, errors that say what to do."""
+"""Properties of every pixel model: hand-worked ramps, equal bytes for any split of the work, clear errors."""
 
 import dataclasses
 import math
@@ -56,11 +56,11 @@ def test_a_log_ramp_of_three_and_a_half_thresholds_fires_three_events(model, sig
 @pytest.mark.parametrize("model", ["exact", "esim", "esim_gpu"])
 def test_events_of_a_log_ramp_are_stamped_where_it_crosses_the_thresholds(model):
     (columns,), _ = emulate_columns(
-        log_ramp(4.5, 5.2, 10), 7000 * torch.arange(11), of(model, esim_log_eps=1e-9), key=1, exact=True
+        log_ramp(4.5, 5.2, 10), 7000 * torch.arange(11), of(model, esim_log_eps=1e-9), key=1, unrounded_times=True
     )
     # 0.7 in 70 ms: 0.2 every 20 ms
-    assert columns.exact_us == pytest.approx([20_000, 40_000, 60_000], abs=0.5)
-    assert columns.t.tolist() == np.floor(columns.exact_us).astype(int).tolist()
+    assert columns.unrounded_us == pytest.approx([20_000, 40_000, 60_000], abs=0.5)
+    assert columns.t.tolist() == np.floor(columns.unrounded_us).astype(int).tolist()
 
 
 def test_v2e_spreads_events_over_a_step_as_its_busiest_pixel_asks():
@@ -81,20 +81,20 @@ def test_v2e_does_not_consume_what_its_refractory_period_suppresses():
 def test_exact_fires_a_delayed_event_when_the_refractory_period_ends():
     frames = torch.tensor([4.0, 4.61, 4.61]).exp().float().view(3, 1, 1, 1)
     (columns,), state = emulate_columns(
-        frames, torch.tensor([0, 6100, 9000]), of("exact", refractory_period_us=2500.0), key=1, exact=True
+        frames, torch.tensor([0, 6100, 9000]), of("exact", refractory_period_us=2500.0), key=1, unrounded_times=True
     )
     # crossings at 2, 4 and 6 ms; the second has to wait for 4.5, the third for 7 ms
-    assert columns.exact_us == pytest.approx([2000, 4500, 7000], abs=0.5)
+    assert columns.unrounded_us == pytest.approx([2000, 4500, 7000], abs=0.5)
     assert state.pixels[0].change[0] == pytest.approx(0.01, abs=1e-6)
 
 
 def test_exact_forgets_a_delayed_event_when_the_light_goes_back_in_time():
     frames = torch.tensor([4.0, 4.41, 4.21]).exp().float().view(3, 1, 1, 1)
     (columns,), _ = emulate_columns(
-        frames, torch.tensor([0, 4100, 6100]), of("exact", refractory_period_us=4000.0), key=1, exact=True
+        frames, torch.tensor([0, 4100, 6100]), of("exact", refractory_period_us=4000.0), key=1, unrounded_times=True
     )
     # crossings at 2 and 4 ms; at 6 ms, when the second may fire, only 0.22 - 0.2 of change is left
-    assert columns.exact_us == pytest.approx([2000], abs=0.5)
+    assert columns.unrounded_us == pytest.approx([2000], abs=0.5)
 
 
 @pytest.mark.parametrize("model", ["v2e", "exact"])

@@ -21,15 +21,15 @@ def still(config: EmulatorConfig, dn: float, seconds: float, fps: int, **wanted)
     """Events of 64 x 64 pixels that see a constant light."""
     t_us = torch.from_numpy(np.rint(np.arange(round(seconds * fps) + 1) * 1e6 / fps))
     frames = torch.full((1, 1, SIDE, SIDE), dn).expand(len(t_us), -1, -1, -1)
-    (columns,), _ = emulate_columns(frames, t_us, config, key=5, labels=True, exact=True, **wanted)
+    (columns,), _ = emulate_columns(frames, t_us, config, key=5, labels=True, unrounded_times=True, **wanted)
     return columns
 
 
 def intervals_s(columns) -> tuple[np.ndarray, np.ndarray]:
     """Seconds between successive events of a pixel, and to the first event of each pixel."""
     pixel = columns.y.astype(int) * SIDE + columns.x
-    order = np.lexsort((columns.exact_us, pixel))
-    pixel, t_s = pixel[order], columns.exact_us[order] * 1e-6
+    order = np.lexsort((columns.unrounded_us, pixel))
+    pixel, t_s = pixel[order], columns.unrounded_us[order] * 1e-6
     following = pixel[1:] == pixel[:-1]
     return np.diff(t_s)[following], t_s[np.concatenate([[True], ~following])]
 
@@ -47,7 +47,7 @@ def test_shot_noise_has_the_rate_of_its_light_and_equal_polarities(model, dn):
 def test_shot_noise_of_exact_is_a_poisson_process_at_any_frame_rate():
     config = dataclasses.replace(QUIET, shot_noise_rate_hz=5.0)
     fast, slow = still(config, 0.0, 2.0, 300), still(config, 0.0, 2.0, 10)
-    assert np.array_equal(fast.exact_us, slow.exact_us)
+    assert np.array_equal(fast.unrounded_us, slow.unrounded_us)
     rate = 5.0 * (1 - 0.75 * 20 / 275)
     first = intervals_s(fast)[1]  # of the pixels that fired within two seconds
     law = stats.truncexpon(2.0 * rate, scale=1 / rate)

@@ -79,7 +79,7 @@ def test_another_seed_gives_other_events(simulated, source):
 
 
 def test_an_unknown_sequence_and_an_empty_memory_are_refused(simulated, source):
-    with pytest.raises(ValueError, match="expected one of its sequences, got 'lake'"):
+    with pytest.raises(ValueError, match="expected the name of one of its sequences, got 'lake'"):
         source.read("lake")
     with pytest.raises(ValueError, match="at least one sequence to keep"):
         EmulatedEvents(SceneStore.open(simulated.scenes), simulated.emulate, simulated.seed, kept=0)

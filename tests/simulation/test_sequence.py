@@ -116,7 +116,7 @@ def test_an_argument_of_another_kind_is_named(unchecked_annotations, changes, me
     ("stokes", "message"),
     [
         (2 * scene_from_rgb(picture()).stokes, r"scene: expected S0 in \[0, 1\], got values up to"),
-        (torch.full((3, 60, 80), 0.5), r"scene: expected hypot\(S1, S2\) <= S0, got one that is 0\.2071"),
+        (torch.full((3, 60, 80), 0.5), r"scene: expected hypot\(S1, S2\) <= S0, got an excess of 0\.2071"),
         (with_gaps(), "scene: expected finite numbers, got 2"),
     ],
 )

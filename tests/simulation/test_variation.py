@@ -67,7 +67,7 @@ def test_an_even_variant_has_one_polarization_everywhere():
     assert max(angles) - min(angles) > 1
 
 
-def test_half_evened_is_half_as_varied():
+def test_a_weight_of_one_half_halves_the_variation_of_polarization():
     plain = replace(CONFIG, share=0.0)
     even = replace(plain, uniform_share=1.0, uniform_weight=[0.5, 0.5])
 
@@ -79,5 +79,5 @@ def test_half_evened_is_half_as_varied():
 
 
 def test_a_range_upside_down_is_refused():
-    with pytest.raises(ValueError, match="dolp_factor: expected a smaller and a greater number"):
+    with pytest.raises(ValueError, match="dolp_factor: expected \\[smaller, larger\\]"):
         replace(CONFIG, dolp_factor=[1.3, 0.1])

@@ -17,7 +17,7 @@ SIDE = 50
 
 
 def drift_and_noise(camera: str, before: float, after: float, dt_us: float) -> tuple[float, float]:
-    """Of the voltage, in thresholds per microsecond and per its square root (the paper's Eq. 10)."""
+    """Drift and diffusion of the voltage, in thresholds per us and per sqrt(us) (the paper's Eq. 10)."""
     k1, k2, k3, k4, k5, k6 = CAMERAS[camera]
     mean = (before + after) / 2
     drift = k1 * (after - before) / dt_us / (mean + k2) + k4 + k5 * mean
@@ -28,12 +28,12 @@ def first_events(before: float, after: float, dt_us: int, camera: str) -> tuple[
     """Microseconds and polarity of the first event of each of 2500 pixels in one long step."""
     frames = torch.tensor([before, after]).view(2, 1, 1, 1).expand(-1, -1, SIDE, SIDE)
     config = dataclasses.replace(CONFIG, voltmeter_camera=camera)
-    (columns,), _ = emulate_columns(frames, torch.tensor([0, dt_us]), config, key=11, exact=True)
+    (columns,), _ = emulate_columns(frames, torch.tensor([0, dt_us]), config, key=11, unrounded_times=True)
     pixel = columns.y.astype(int) * SIDE + columns.x
-    firsts = np.unique(pixel[np.argsort(columns.exact_us, kind="stable")], return_index=True)
+    firsts = np.unique(pixel[np.argsort(columns.unrounded_us, kind="stable")], return_index=True)
     assert len(firsts[0]) == SIDE**2
-    order = np.argsort(columns.exact_us, kind="stable")[firsts[1]]
-    return columns.exact_us[order], columns.p[order]
+    order = np.argsort(columns.unrounded_us, kind="stable")[firsts[1]]
+    return columns.unrounded_us[order], columns.p[order]
 
 
 @pytest.mark.parametrize(

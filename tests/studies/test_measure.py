@@ -4,10 +4,11 @@ import subprocess
 import pytest
 
 from polarnet.reports.provenance import git
-from studies.docs import benchmark_block
+from studies.blocks import BLOCKS
 from studies.measure import (
     BENCHMARK_KEYS,
     _timed,
+    ablation_about,
     machine_record,
     measure_ablation,
     measure_benchmark,
@@ -16,7 +17,6 @@ from studies.measure import (
     uncommitted,
     write_section,
 )
-from studies.study_tables import loss_sweep_block
 
 
 def test_the_minutes_of_a_target_are_those_of_its_stages(tmp_path):
@@ -97,11 +97,11 @@ def swept(root, write_trial, **mse):
     return root / "sweep"
 
 
-def test_an_ablation_is_what_a_sweep_found_with_what_each_job_leaves_out(tmp_path, write_trial):
+def test_an_ablation_has_the_scores_of_each_job_and_a_description_in_conf(tmp_path, write_trial):
     sweep = swept(tmp_path, write_trial, nothing=0.03, sums=0.05)
     found = json.loads(measure_ablation(tmp_path, sweep).read_text())
     assert found["ablation"]["overrides"] == ["train.epochs=1"]
-    assert found["ablation"]["rows"]["sums"]["about"] == "Without sums."
+    assert ablation_about(tmp_path, "sums") == "Without sums."
     assert {name: row["mse"] for name, row in found["ablation"]["rows"].items()} == {"nothing": 0.03, "sums": 0.05}
     assert found["records"]["ablation"]["commit"] == git(tmp_path, "rev-parse", "HEAD")
 
@@ -139,9 +139,9 @@ def test_a_loss_sweep_becomes_means_over_seeds_a_table_and_a_heat_map(tmp_path, 
     assert found["loss_weights"] == {"overrides": ["network=paper"], "lpips_backbone": "alex"}
     assert found["records"]["loss_weights"]["commit"] == git(tmp_path, "rev-parse", "HEAD")
     assert picture.read_bytes().startswith(b"\x89PNG")
-    lines = loss_sweep_block(found).splitlines()
+    lines = BLOCKS["sweep"].text(found).splitlines()
     assert lines[2].startswith("| 10 | 0 | 0 | 2 | 0.0800 ± 0.0283 | 14.00 ± 0.00 | 0.0400 ± 0.0141 |")
-    assert lines[3].startswith("| 10 | 1 | 0 | 1 | 0.0900 | 12.00 | 0.0200 | 17.00 | 0.600 | 0.300 | - |")
+    assert lines[3].startswith("| 10 | 1 | 0 | 1 | 0.0900 | 12.00 | 0.0200 | 17.00 | 0.6000 | 0.3000 | - |")
 
 
 def test_a_loss_sweep_is_complete_and_of_one_setting(tmp_path, write_trial):
@@ -189,9 +189,8 @@ def test_benchmark_results_are_sets_then_methods_then_figures(measured_project):
         assert set(results[name]["ours"]) == set(BENCHMARK_KEYS)
         assert results[name]["ours"]["params"] == 7
         assert results[name]["zeros"]["gflop"] is None
-    block = benchmark_block(results)
-    assert "**Simulated**: 6 scenes, 12 frames" in block
-    assert "**Measured polarization**" in block
+    block = BLOCKS["benchmark-measured"].text(results)
+    assert "6 scenes, 12 frames. On " in block
     assert "zeros: ours is better in 6 of 6 scenes (effect +1.00, p = 0.031)." in block
 
 

@@ -16,7 +16,7 @@ from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingEr
 
 MAGIC = b"#!AER-DAT2"
 LAST_LINE = b"#End Of ASCII Header"  # only in newer files; an event can begin with # too
-MOST_HEADER_BYTES = 2**20  # jAER writes its settings into the header
+MAX_HEADER_BYTES = 2**20  # jAER writes its settings into the header
 EVENT_BYTES = 8
 NO_EVENT = 1 << 31 | 1 << 10
 SENSORS = {b"346": (260, 346), b"240": (180, 240), b"128": None}
@@ -31,7 +31,7 @@ def matches(path: Path, head: bytes) -> bool:
 def open_aedat2(path: Path, choices: Choices) -> Source:
     """Open the events of a DAVIS; times that wrap after 71 minutes are unwrapped."""
     with path.open("rb") as file:
-        data = file.read(MOST_HEADER_BYTES)
+        data = file.read(MAX_HEADER_BYTES)
     start, ended = 0, False
     while not ended and data[start : start + 1] == b"#" and (end := data.find(b"\n", start)) >= 0:
         ended = data[start:end].strip() == LAST_LINE

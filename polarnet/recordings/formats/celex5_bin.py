@@ -34,7 +34,7 @@ STAMP_BITS = {1: 16, 2: 12}
 """Bits of a time stamp, by event format."""
 
 PICTURE_BYTES = HEIGHT * WIDTH * 3 // 2 + 1
-LARGEST_PACKAGE = 2_048_000  # bytes; the limit of the vendor's library
+MAX_PACKAGE = 2_048_000  # bytes; the limit of the vendor's library
 
 ROW, COLUMN, TIME = 2, 1, 3  # kinds of items
 
@@ -69,7 +69,7 @@ def matches(path: Path, head: bytes) -> bool:
         return False
     header = Header(*HEADER.unpack_from(head))
     length = LENGTH.unpack_from(head, HEADER.size)[0] if len(head) >= HEADER.size + LENGTH.size else 1
-    return _plausible(header) and 0 < length <= LARGEST_PACKAGE
+    return _plausible(header) and 0 < length <= MAX_PACKAGE
 
 
 def open_celex5_bin(path: Path, choices: Choices) -> Source:
@@ -163,10 +163,10 @@ def _packages(path: Path, counts: Counter[str]) -> Iterator[tuple[int | None, UI
         number = 0
         while start := file.read(LENGTH.size):
             length = LENGTH.unpack(start)[0] if len(start) == LENGTH.size else 1
-            if not 0 < length <= LARGEST_PACKAGE:
+            if not 0 < length <= MAX_PACKAGE:
                 raise RecordingError(
                     f"{path.name}: package {number} before byte {file.tell()} states a length of {length} bytes, "
-                    f"expected up to {LARGEST_PACKAGE}; the file is damaged there and what follows cannot be found"
+                    f"expected up to {MAX_PACKAGE}; the file is damaged there and what follows cannot be found"
                 )
             package = file.read(length)
             if len(start) < LENGTH.size or len(package) < length:
@@ -185,7 +185,7 @@ def _skip_imu(path: Path, file: BinaryIO) -> int | None:
     if len(stamp) < STAMP.size:
         return None
     t_ms, samples = STAMP.unpack(stamp)
-    if samples * IMU_SAMPLE_BYTES > LARGEST_PACKAGE or not abs(t_ms) < 2**43:
+    if samples * IMU_SAMPLE_BYTES > MAX_PACKAGE or not abs(t_ms) < 2**43:
         raise RecordingError(f"{path.name}: a package has {samples} IMU samples at {t_ms} ms; the file is damaged")
     file.seek(samples * IMU_SAMPLE_BYTES, 1)
     return t_ms

@@ -10,7 +10,7 @@ import numpy as np
 
 from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, running_on, sensor_size
 
-MOST_HEADER_BYTES = 2**16
+MAX_HEADER_BYTES = 2**16
 EVENT_BYTES = 8
 CHANGE_DETECTION = (0, 12)  # event types: 2D of the first sensors, CD of the later ones
 
@@ -56,7 +56,7 @@ def open_dat(path: Path, choices: Choices) -> Source:
 
 def _header(path: Path) -> Header:
     with path.open("rb") as file:
-        data = file.read(MOST_HEADER_BYTES)
+        data = file.read(MAX_HEADER_BYTES)
     start = 0
     while data[start : start + 2] == b"% " and (end := data.find(b"\n", start)) >= 0:
         start = end + 1

@@ -17,7 +17,7 @@ from polarnet.recordings.source import Block, Choices, RecordingError, Source, s
 
 LONGEST_HEADER = 2**16
 BLOCK_WORDS = 2**17
-MOST_PER_WORD = 12  # events per EVT3 word
+MAX_PER_WORD = 12  # events per EVT3 word
 SENSORS = {b"gen31": (480, 640), b"gen3": (480, 640), b"gen4": (720, 1280), b"imx636": (720, 1280),
            b"genx320": (320, 320)}  # fmt: skip
 """Height and width by the sensor's name in the header; files of 2020 state nothing else."""
@@ -52,7 +52,7 @@ def open_evt(path: Path, choices: Choices) -> Source:
             while data := file.read(BLOCK_WORDS * size):
                 counts["cut_tail"] += len(data) % size != 0
                 words = np.frombuffer(data[: len(data) // size * size], word)
-                columns = [np.empty(MOST_PER_WORD * len(words), t) for t in (np.int64, np.int16, np.int16, np.int8)]
+                columns = [np.empty(MAX_PER_WORD * len(words), t) for t in (np.int64, np.int16, np.int16, np.int8)]
                 found, orphans = decode(words, state, *columns)
                 counts["orphans"] += int(orphans)
                 yield Block(*(column[:found] for column in columns))

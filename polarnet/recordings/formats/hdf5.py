@@ -23,7 +23,7 @@ _library = IsolatedLibrary(
     "h5py",
     "hdf5",
     Path(__file__).with_name("hdf5_tasks.py"),
-    "the file is damaged, or compressed in a way that needs pip install 'polarnet[recordings]'",
+    "the file is damaged, or compressed with a filter that needs pip install hdf5plugin",
 )
 
 

@@ -10,7 +10,7 @@ SIGNAL, LEAK, SHOT = 0, 1, 2
 
 
 class Columns(NamedTuple):
-    """Events of one channel, one array per field. `label` and `exact_us` are empty unless requested."""
+    """Events of one channel, one array per field. `label` and `unrounded_us` are empty unless requested."""
 
     t: np.ndarray
     """int64, microseconds"""
@@ -22,14 +22,14 @@ class Columns(NamedTuple):
     """int8, +1 or -1"""
     label: np.ndarray
     """uint8, the process behind the event: SIGNAL, LEAK or SHOT"""
-    exact_us: np.ndarray
+    unrounded_us: np.ndarray
     """float64, microseconds before rounding to t"""
 
 
 EVENT_BYTES = 8 + 2 + 2 + 1
 
 
-def empty_columns(capacity: int, labels: bool, exact: bool) -> Columns:
+def empty_columns(capacity: int, labels: bool, unrounded_times: bool) -> Columns:
     """Columns with room for `capacity` events."""
     # One allocation for all four: the system gives large blocks as huge pages, which costs far fewer page faults.
     block = np.empty(capacity * EVENT_BYTES, np.uint8)
@@ -39,7 +39,7 @@ def empty_columns(capacity: int, labels: bool, exact: bool) -> Columns:
         block[10 * capacity : 12 * capacity].view(np.int16),
         block[12 * capacity :].view(np.int8),
         np.empty(capacity if labels else 0, np.uint8),
-        np.empty(capacity if exact else 0, np.float64),
+        np.empty(capacity if unrounded_times else 0, np.float64),
     )
 
 
@@ -67,7 +67,7 @@ def with_room(columns, used, more):
         _grown_column(columns.y, used, capacity),
         _grown_column(columns.p, used, capacity),
         _grown_column(columns.label, used, capacity) if columns.label.size else columns.label,
-        _grown_column(columns.exact_us, used, capacity) if columns.exact_us.size else columns.exact_us,
+        _grown_column(columns.unrounded_us, used, capacity) if columns.unrounded_us.size else columns.unrounded_us,
     )
 
 
@@ -77,7 +77,7 @@ def sort_ties(columns, start, stop):
     for i in range(start + 1, stop):
         t, x, y, p = columns.t[i], columns.x[i], columns.y[i], columns.p[i]
         label = columns.label[i] if columns.label.size else np.uint8(0)
-        exact_us = columns.exact_us[i] if columns.exact_us.size else 0.0
+        unrounded_us = columns.unrounded_us[i] if columns.unrounded_us.size else 0.0
         j = i
         while j > start and _after(columns, j - 1, t, y, x, p):
             columns.t[j], columns.x[j], columns.y[j], columns.p[j] = (
@@ -88,14 +88,14 @@ def sort_ties(columns, start, stop):
             )
             if columns.label.size:
                 columns.label[j] = columns.label[j - 1]
-            if columns.exact_us.size:
-                columns.exact_us[j] = columns.exact_us[j - 1]
+            if columns.unrounded_us.size:
+                columns.unrounded_us[j] = columns.unrounded_us[j - 1]
             j -= 1
         columns.t[j], columns.x[j], columns.y[j], columns.p[j] = t, x, y, p
         if columns.label.size:
             columns.label[j] = label
-        if columns.exact_us.size:
-            columns.exact_us[j] = exact_us
+        if columns.unrounded_us.size:
+            columns.unrounded_us[j] = unrounded_us
 
 
 @compiled

@@ -20,16 +20,16 @@ from polarnet.simulation.pixels.physics import PixelConfig
 from polarnet.simulation.pixels.strips import rows_of_strip
 
 EIGHT_BIT_VIDEO = False
-NO_CHANGE = 1e-6  # log intensity: the CPU variant takes a smaller change for rest
+NO_CHANGE = 1e-6  # log intensity; the CPU variant ignores smaller changes
 NEARLY = np.float32(0.99999)  # narrows a first look at thresholds by more than rounding
 
 
 @dataclass(frozen=True)
 class EsimConfig(PixelConfig):
-    """Parameters of ESIM's pixel; of the inherited ones it has thresholds and refractory period alone."""
+    """Parameters of ESIM's pixel; ESIM uses only thresholds and refractory period of the inherited ones."""
 
     esim_log_eps: float = field(metadata=allowed(above=0))
-    """Added to intensity in [0, 1] before its logarithm is taken."""
+    """Constant added to the intensity in [0, 1] before the logarithm."""
 
 
 class Physics(NamedTuple):
@@ -106,7 +106,7 @@ def advance(light, pixels, steps, columns):
     physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
     rows, table, used = rows_of_strip(h, w), _table(physics), 0
     strip = np.empty((2, rows * w), np.float32)
-    pending = pending_events(h * w, columns.exact_us.size > 0)
+    pending = pending_events(h * w, columns.unrounded_us.size > 0)
     for k in range(times_us.size - 1):
         n = 0
         for y in range(0, h, rows):
@@ -146,8 +146,8 @@ def _fire(pixels, physics, y, logarithm, start_us, stop_us, pending, n):
             if waited > physics.refractory_us or (waited == physics.refractory_us and not physics.gpu):
                 offset_us = min(np.int64(event_us), np.int64(math.ceil(stop_us)) - 1) - base_us
                 pending.events[n] = event_of(offset_us, place, on, SIGNAL)
-                if pending.exact_us.size:
-                    pending.exact_us[n] = event_us
+                if pending.unrounded_us.size:
+                    pending.unrounded_us[n] = event_us
                 pixels.last_event_us[i] = event_us
                 n += 1
         if physics.gpu:  # this variant computes the new reference in one fused operation

@@ -136,7 +136,7 @@ def advance(light, pixels, steps, columns):
     leak_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
     shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
     jitter = physics.leak_jitter if physics.leak_rate_hz > 0 else 0.0
-    pending = pending_events(h * w, columns.exact_us.size > 0)
+    pending = pending_events(h * w, columns.unrounded_us.size > 0)
     soonest_us = np.array([pixels.next_shot_us[y * w : (y + rows) * w].min() for y in range(0, h, rows)])
     used = 0
     for k in range(times_us.size - 1):
@@ -346,8 +346,8 @@ def _append_events(active, count, width, start_us, pending, n):
     for a in range(count):
         at = np.uint64(n)  # the entry of a pixel that does not fire is overwritten by the next
         pending.events[at] = active.event[a]
-        if pending.exact_us.size:
-            pending.exact_us[at] = start_us + active.next_now[a]
+        if pending.unrounded_us.size:
+            pending.unrounded_us[at] = start_us + active.next_now[a]
         n += active.fires[a]
     return n
 

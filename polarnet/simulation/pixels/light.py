@@ -35,7 +35,7 @@ def light_of_frames(frames: np.ndarray) -> Light:
 
 
 def light_of_scene(scene: np.ndarray, top: np.ndarray, left: np.ndarray) -> Light:
-    """Light on a sensor that moves over `scene` (float32 DN, padded as in `Light`) without turning or zooming."""
+    """Light on a sensor that drifts over `scene` (float32 DN, padded as in `Light`)."""
     return Light(scene[np.newaxis], top, left)
 
 

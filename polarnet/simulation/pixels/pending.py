@@ -22,25 +22,27 @@ class Pending(NamedTuple):
 
     events: np.ndarray
     """int64, see the module"""
-    exact_us: np.ndarray
+    unrounded_us: np.ndarray
     """float64, times before rounding; empty if not requested"""
     in_order: np.ndarray
     """int64, scratch"""
 
 
 @compiled
-def pending_events(capacity, exact):
-    """Room for `capacity` events."""
-    return Pending(np.empty(capacity, np.int64), np.empty(capacity if exact else 0), np.empty(capacity, np.int64))
+def pending_events(capacity, unrounded_times):
+    """Empty room for `capacity` events."""
+    return Pending(
+        np.empty(capacity, np.int64), np.empty(capacity if unrounded_times else 0), np.empty(capacity, np.int64)
+    )
 
 
 @compiled
 def roomier(pending):
     """The same events with room for twice as many."""
     n = pending.events.size
-    larger = pending_events(2 * n, pending.exact_us.size > 0)
+    larger = pending_events(2 * n, pending.unrounded_us.size > 0)
     larger.events[:n] = pending.events
-    larger.exact_us[: pending.exact_us.size] = pending.exact_us
+    larger.unrounded_us[: pending.unrounded_us.size] = pending.unrounded_us
     return larger
 
 
@@ -65,8 +67,10 @@ def write_in_order(pending, n, start_us, stop_us, columns, used):
     base_us = np.int64(math.floor(start_us))
     longest_us = np.int64(math.ceil(stop_us)) - base_us
     columns = with_room(columns, used, n)
-    if columns.exact_us.size:
-        columns.exact_us[used : used + n] = pending.exact_us[:n][np.argsort(pending.events[:n], kind="mergesort")]
+    if columns.unrounded_us.size:
+        columns.unrounded_us[used : used + n] = pending.unrounded_us[:n][
+            np.argsort(pending.events[:n], kind="mergesort")
+        ]
     _sort(pending.events[:n], longest_us, pending.in_order[:n])
     t, x, y, p = columns.t[used : used + n], columns.x[used:], columns.y[used:], columns.p[used:]
     for i in range(n):

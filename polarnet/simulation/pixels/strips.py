@@ -38,10 +38,10 @@ def flagged(words, pixels, positions, groups):
     for group in range((pixels + 7) // 8):
         groups[np.uint64(marked)] = group  # unsigned: numba checks other indices for being negative
         marked += words[group] != 0
-    flags, found = words.view(np.uint8), 0
+    flags, count = words.view(np.uint8), 0
     for m in range(marked):
         group = groups[m]
         for j in range(8 * group, 8 * group + 8):
-            positions[np.uint64(found)] = j
-            found += flags[np.uint64(j)]
-    return found
+            positions[np.uint64(count)] = j
+            count += flags[np.uint64(j)]
+    return count

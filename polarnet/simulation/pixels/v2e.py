@@ -230,14 +230,14 @@ def _emit(pixels, step, firing, n, most, columns, used):
         order[a] = a
     active = n
     for slot in range(1, most + 1):
-        exact_us = start_us + (stop_us - start_us) * slot / most
+        unrounded_us = start_us + (stop_us - start_us) * slot / most
         # torch.linspace, which v2e calls, counts from both ends
         stamp = (
             first + interval * np.float32(slot - 1) if slot <= most // 2 else last - interval * np.float32(most - slot)
         )
         columns = with_room(columns, used, active + 1)
         t, x, y, p = columns.t[used:], columns.x[used:], columns.y[used:], columns.p[used:]
-        t_us, written, remaining = np.int64(np.rint(exact_us)), 0, 0
+        t_us, written, remaining = np.int64(np.rint(unrounded_us)), 0, 0
         for a in range(active):  # without branches: an event that is suppressed is overwritten by the next
             e, at = np.uint64(order[a]), np.uint64(written)
             i, place, crossed = np.uint64(entries[e, PIXEL]), entries[e, PLACE], entries[e, CROSSED]
@@ -248,9 +248,9 @@ def _emit(pixels, step, firing, n, most, columns, used):
             t[at], x[at], y[at], p[at] = t_us, place & 0xFFFF, place >> 16, polarity
             entries[e, ACCEPTED] += polarity if accepted else np.int32(0)
             if columns.label.size and accepted:
-                columns.label[used + written] = _label(pixels, physics, i, exact_us, polarity)
-            if columns.exact_us.size:
-                columns.exact_us[used + written] = exact_us
+                columns.label[used + written] = _label(pixels, physics, i, unrounded_us, polarity)
+            if columns.unrounded_us.size:
+                columns.unrounded_us[used + written] = unrounded_us
             written += int(accepted)
             order[np.uint64(remaining)] = e
             remaining += abs(crossed) > slot
@@ -310,8 +310,8 @@ def _emit_shots(light, frame, pixels, step, w, columns, used):
         if columns.label.size:
             columns.label[used] = SHOT
             pixels.last_event_us[i] = step.stop_us
-        if columns.exact_us.size:
-            columns.exact_us[used] = step.stop_us
+        if columns.unrounded_us.size:
+            columns.unrounded_us[used] = step.stop_us
         pixels.memory[i] = pixels.filtered[i]
         used += 1
     tied = before

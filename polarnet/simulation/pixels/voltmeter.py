@@ -92,7 +92,7 @@ def advance(light, pixels, steps, columns):
     """Take the pixels through `steps`; returns the columns with the events, and the number of events."""
     times_us, h, w = steps.times_us, steps.height, steps.width
     passage_key, used, dn = key_for(steps.key, randomness.FIRST_PASSAGE, steps.channel), 0, np.empty(w, np.float32)
-    pending = pending_events(h * w, columns.exact_us.size > 0)
+    pending = pending_events(h * w, columns.unrounded_us.size > 0)
     for k in range(times_us.size - 1):
         n, key = 0, mixed(passage_key, steps.first_number + k)
         step = Step(steps.physics, times_us[k], times_us[k + 1] - times_us[k], key)
@@ -128,8 +128,8 @@ def _walk(pixels, step, y, dn, pending, n):
             if n == pending.events.size:
                 pending = roomier(pending)
             pending.events[n] = event_of(np.int64(start_us - base_us + now), place, on, SIGNAL)
-            if pending.exact_us.size:
-                pending.exact_us[n] = start_us + now
+            if pending.unrounded_us.size:
+                pending.unrounded_us[n] = start_us + now
             n += 1
         pixels.voltage[i] = voltage + (distance if on else -distance) * (dt - now) / wait
         pixels.dn[i] = dn[x]

@@ -25,9 +25,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
-MOST_EVENTS = 6.0  # limit per pixel and window in the motion search, so that a hot pixel cannot dominate
-LEAST_CORRELATION = 0.1  # smallest normalised correlation of two windows at which a motion counts as found
-LEAST_OVERLAP = 0.1  # lower limit of the overlap, along each axis, that the correlation is divided by
+MAX_EVENTS = 6.0  # limit per pixel and window in the motion search, so that a hot pixel cannot dominate
+MIN_CORRELATION = 0.1  # smallest normalised correlation of two windows at which a motion is accepted
+MIN_OVERLAP = 0.1  # lower limit of the overlap, along each axis, that the correlation is divided by
 ROUND = 16  # sizes are rounded up to multiples of this, for fast Fourier transforms
 
 
@@ -92,7 +92,7 @@ def displacements(images: Float[Tensor, "t1 b h w"], reach: int) -> Motion:
     precision.
     """
     height, width = images.shape[-2:]
-    images = images.clamp(-MOST_EVENTS, MOST_EVENTS)
+    images = images.clamp(-MAX_EVENTS, MAX_EVENTS)
     # large enough to avoid wrap-around and to hold every displacement of the search
     size = (_round(max(height, reach + 2) + reach + 1), _round(max(width, reach + 2) + reach + 1))
     spectrum = torch.fft.rfft2(images, s=size)
@@ -100,7 +100,7 @@ def displacements(images: Float[Tensor, "t1 b h w"], reach: int) -> Motion:
     correlation = torch.roll(correlation, (reach + 1, reach + 1), (-2, -1))
     side = 2 * reach + 1
     steps = torch.arange(-reach - 1, reach + 2, device=images.device).abs()
-    overlap = (1 - steps / height).clamp(min=LEAST_OVERLAP)[:, None] * (1 - steps / width).clamp(min=LEAST_OVERLAP)
+    overlap = (1 - steps / height).clamp(min=MIN_OVERLAP)[:, None] * (1 - steps / width).clamp(min=MIN_OVERLAP)
     correlation = correlation[..., : side + 2, : side + 2] / overlap
     best = correlation[..., 1:-1, 1:-1].flatten(-2).argmax(-1)
     at = (best // side + 1) * (side + 2) + best % side + 1
@@ -111,7 +111,7 @@ def displacements(images: Float[Tensor, "t1 b h w"], reach: int) -> Motion:
     x = (best % side - reach) + _vertex(left, middle, right)
     y = (best // side - reach) + _vertex(above, middle, below)
     energy = images.square().sum((-2, -1)).sqrt()
-    return Motion(torch.stack([x, y], dim=-1), middle > LEAST_CORRELATION * (energy[:-1] * energy[1:]).clamp(min=1e-6))
+    return Motion(torch.stack([x, y], dim=-1), middle > MIN_CORRELATION * (energy[:-1] * energy[1:]).clamp(min=1e-6))
 
 
 def _vertex(left: Float[Tensor, "*n"], middle: Float[Tensor, "*n"], right: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.mosaic import Memory, Motion, certainty, displacements, follow, nothing_seen
+from polarnet.networks.panorama import Memory, Motion, certainty, displacements, follow, nothing_seen
 
 MEMORY = Memory(prior=1.0, noise=0.01, drift=0.01, renewal=0.15, fade=0.95)
 HEIGHT, WIDTH, MARGIN = 44, 60, 16
@@ -18,7 +18,7 @@ def scene(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
 
 
 def views(places: list[tuple[float, float]]) -> torch.Tensor:
-    """What a sensor sees whose first pixel lies at these (x, y): [n, 4, h, w]."""
+    """Images [n, 4, h, w] of a sensor whose first pixel lies at these (x, y)."""
     rows, columns = torch.arange(HEIGHT).view(-1, 1), torch.arange(WIDTH)
     return torch.stack([scene(columns + x, rows + y) for x, y in places])
 

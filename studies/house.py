@@ -1,0 +1,148 @@
+"""Size and wording of the code base: python -m studies.house [--published RANGE] [--trained RANGE] [--write]
+
+Counts the files and lines of every folder, the lines of function bodies and the uses of retired words in this clone. A
+RANGE is a commit that added a baseline, or FROM..TO for a branch; git then says how many files it touched. --write puts
+the figures into docs/results/house.json.
+"""
+
+import argparse
+import ast
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from statistics import median, quantiles
+from typing import Any
+
+from polarnet.reports.provenance import git
+from studies.measure import machine_record, read_results, uncommitted, write_section
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("polarnet", "stages", "studies", "tests", "conf", "docs")
+BASELINE_FILES = ("polarnet", "params.yaml", "dvc.yaml", "conf", "stages")
+"""Where a baseline is added; its tests, documentation and weights are not counted."""
+TEXT = (".py", ".md", ".yaml", ".toml")
+RETIRED = {
+    "MOST_, LEAST_, LARGEST_, GREATEST_": r"\b_?(?:MOST|LEAST|LARGEST|GREATEST)_\w+",
+    "window for the sensor": r"\bwindow_(?:height|width)\b|\bsensor window\b",
+    "mosaic for the panorama": r"\bmosaic_(?:prior|noise|drift|renewal|scale|share)\b|\bablation=mosaic\b|\[mosaic\]",
+    "picture_of for scenes": r"\bpicture_of\b",
+    "evened for drawn towards one polarization": r"\b(?:un)?evened\b",
+    "private names": r"\b_shoot\w*|\b_settle\w*|\b_hand_back\w*|\b_check_taken\b|\bOF_LOG_VARIANCE\b"
+    r"|\bkept_in_memory\b",
+    "participles as names": r"\b(?:found|seen|told|shown|kept|made)\b(?=(?:: [^\"']*)? = )",
+    "what as a noun phrase": r"(?:\"\"\"|# )What (?!.*\?)",
+    "of before a noun": r"(?:\"\"\"|# )Of (?!.*\?)|help=f?\"(?:of|where) ",
+}
+"""Retired words of the glossary and the expression that finds each."""
+HERE = ("studies/house.py", "tests/studies/test_house.py", "docs/results", "CHANGELOG.md")
+"""Not searched: this list, its test, measured text, and the history of releases."""
+
+
+def body_lines(source: str) -> list[int]:
+    """Number of lines of every function body: from its first statement to its last, without the docstring.
+
+    Comments and blank lines inside the span count; a body that consists of its docstring alone has 0 lines. A nested
+    function counts by itself and as part of the function around it.
+    """
+    lengths = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            body = node.body[1:] if ast.get_docstring(node, clean=False) is not None else node.body
+            lengths.append(1 + (body[-1].end_lineno or 0) - body[0].lineno if body else 0)
+    return lengths
+
+
+def retired_uses(text: str) -> dict[str, int]:
+    """Number of uses of each retired word in a text."""
+    return {name: len(re.findall(pattern, text)) for name, pattern in RETIRED.items()}
+
+
+def folder_sizes(files: Mapping[str, str]) -> dict[str, dict[str, int]]:
+    """Files and lines of each folder and of each folder below polarnet/, by path of the file."""
+    sizes: dict[str, dict[str, int]] = {}
+    for path, text in sorted(files.items()):
+        top, *rest = path.split("/")
+        inner = [f"{top}/{rest[0]}"] if top == "polarnet" and len(rest) > 1 else []
+        for folder in (top, *inner):
+            size = sizes.setdefault(folder, {"files": 0, "lines": 0})
+            size["files"] += 1
+            size["lines"] += text.count("\n")
+    return sizes
+
+
+def touched_files(root: Path, commits: str) -> int:
+    """Number of files of the package and its configuration that a commit, or a range FROM..TO, changes or adds."""
+    ends = commits.split("..") if ".." in commits else [f"{commits}~1", commits]
+    paths = git(root, "diff", "--name-only", *ends, "--", *BASELINE_FILES, ":!*.safetensors", ":!*/weights/*.json")
+    if not paths:
+        raise ValueError(f"expected a commit or FROM..TO that changes {', '.join(BASELINE_FILES)}, got {commits}")
+    return len(paths.splitlines())
+
+
+def tracked_texts(root: Path) -> Iterator[tuple[str, str]]:
+    """Path and content of every tracked text file."""
+    for path in git(root, "ls-files").splitlines():
+        if path.endswith(TEXT) and not path.startswith(HERE) and (root / path).exists():
+            yield path, (root / path).read_text(encoding="utf-8")
+
+
+def figures(root: Path, published: str | None, trained: str | None) -> dict[str, Any]:
+    """Everything that docs/results/house.json holds; earlier figures stay for a baseline that is not named."""
+    texts = dict(tracked_texts(root))
+    package = {path: text for path, text in texts.items() if path.startswith("polarnet/") and path.endswith(".py")}
+    bodies = [length for text in package.values() for length in body_lines(text)]
+    known = read_results(root, "house").get("house", {})
+    baselines = {"files_per_published_baseline": published, "files_per_trained_baseline": trained}
+    uses = total(retired_uses(text) for text in texts.values())
+    return {
+        "package_lines": sum(text.count("\n") for text in package.values()),
+        "top_level_modules": sum(path.count("/") == 1 and not path.endswith("__.py") for path in package),
+        "dvc_yaml_lines": texts["dvc.yaml"].count("\n"),
+        "body_median": median(bodies),
+        "body_p90": round(quantiles(bodies, n=10)[-1]),
+        **{key: touched_files(root, commits) if commits else known.get(key) for key, commits in baselines.items()},
+        "retired_words": sum(uses.values()),
+        "retired": {name: count for name, count in uses.items() if count},
+        "test_minutes": read_results(root, "pipeline").get("test_minutes"),
+        "folders": folder_sizes({path: text for path, text in texts.items() if path.split("/")[0] in FOLDERS}),
+    }
+
+
+def total(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """Sums of several counts by key."""
+    sums = dict.fromkeys(RETIRED, 0)
+    for count in counts:
+        sums = {key: sums[key] + count[key] for key in sums}
+    return sums
+
+
+def main() -> None:
+    """Print the figures, and write them if asked."""
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.house", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--published", metavar="RANGE", help="commits that added a baseline with published weights")
+    parser.add_argument("--trained", metavar="RANGE", help="commits that added a trained baseline")
+    parser.add_argument(
+        "--uses", metavar="WORD", choices=[*RETIRED, "all"], help="list the lines that use a retired word"
+    )
+    parser.add_argument("--write", action="store_true", help="write docs/results/house.json; needs a committed tree")
+    options = parser.parse_args()
+    if options.uses:
+        for path, text in tracked_texts(ROOT):
+            for number, line in enumerate(text.splitlines(), 1):
+                words = [name for name, count in retired_uses(line).items() if count]
+                if options.uses in words or (words and options.uses == "all"):
+                    print(f"{path}:{number}: {line.strip()}")
+        return
+    if options.write and (changed := uncommitted(ROOT)):
+        parser.error(f"commit first, because the figures name a commit; changed:\n{changed}")
+    measured = figures(ROOT, options.published, options.trained)
+    print(json.dumps(measured, indent=2))
+    if options.write:
+        print(f"wrote {write_section(ROOT, 'house', 'house', measured, machine_record(ROOT))}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,79 @@
+"""One writer for every table of docs/results: a format string for each column, and a caption."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from statistics import fmean, stdev
+from typing import Any
+
+from polarnet.reports.provenance import origin
+
+Results = Mapping[str, Any]
+Row = Mapping[str, Any]
+Columns = Mapping[str, str]
+"""Format string of each column by its heading: {"PSNR": "{scores[psnr]:.2f} dB"}."""
+
+
+class Figure:
+    """A value as a format string prints it: "-" if missing, mean ± standard deviation for several trainings."""
+
+    def __init__(self, value: Any):
+        self.value = value
+
+    def __getitem__(self, key: str) -> "Figure":
+        return Figure(self.value.get(key) if isinstance(self.value, Mapping) else None)
+
+    def __format__(self, form: str) -> str:
+        value = self.value
+        if isinstance(value, list):
+            value = {"mean": fmean(value) if value else None, "std": stdev(value) if len(value) > 1 else None}
+        if isinstance(value, Mapping):
+            spread = "" if value["std"] is None else f" ± {format(value['std'], form.lstrip('+'))}"
+            return format(Figure(value["mean"]), form) + spread
+        return "-" if value is None else format(value, form)
+
+
+@dataclass(frozen=True)
+class Block:
+    """One generated block of a page: a table, lines below it, and a caption."""
+
+    file: str
+    """NAME of docs/results/NAME.json."""
+    section: str
+    """Key of the file without which the block has not been measured."""
+    module: str
+    """`python -m MODULE` measures it."""
+    rows: Callable[[Results], Iterable[Row] | str] = lambda results: ""
+    """Rows of the table; a string is a table in Markdown."""
+    columns: Columns | Callable[[Results], Columns] = lambda results: {}
+    caption: str = "{origin}"
+    """Format string over the file's entries; `{origin}` names machine, versions and commit of the measurement."""
+    lines: Callable[[Results], Iterable[str]] = lambda results: ()
+
+    def text(self, results: Results) -> str:
+        """The block's Markdown for the content of its file."""
+        table = self.rows(results)
+        if not isinstance(table, str):
+            table = markdown(self.columns(results) if callable(self.columns) else self.columns, table)
+        record = results.get("records", {}).get(self.section) or next(
+            (one for one in (results, results[self.section]) if "machine" in one), None
+        )
+        caption = self.caption.format_map({**results, "origin": record and origin(record)})
+        return "\n\n".join(part for part in (table, *self.lines(results), caption) if part)
+
+
+def markdown(columns: Columns, rows: Iterable[Row]) -> str:
+    """A GitHub table with numbers aligned to the right and text to the left."""
+    cells = [[form.format_map(_Figures(row)) for form in columns.values()] for row in rows]
+    numeric = [all(row[k][:1] in "+-0123456789" for row in cells) for k in range(len(columns))]
+    rule = "|".join("---:" if right else "---" for right in numeric)
+    return "\n".join([f"| {' | '.join(columns)} |", f"|{rule}|", *(f"| {' | '.join(row)} |" for row in cells)])
+
+
+def listed(figures: Mapping[str, float], form: str) -> str:
+    """Names and figures in one line: "ingest 0.1, train 3.4"."""
+    return ", ".join(f"{name} {form.format(value)}" for name, value in figures.items())
+
+
+class _Figures(dict[str, Any]):
+    def __getitem__(self, key: str) -> Figure:
+        return Figure(self.get(key))
