@@ -4,8 +4,7 @@ Each target is another picture: photographs of scikit-image and dead leaves. Its
 files with random delays, sensor noise and hot pixels, are imported and calibrated as the stages do it. Printed: errors
 of start times by the landmark (in pictures of the camera) and refined (in milliseconds, but for what all eight have in
 common, as the zero of their clock is a convention; that is `clock_zero_ms_max`), the root mean square difference of the
-DoLP from the scene's own, thresholds, and the benchmark's table, with the networks that `--data` has in train and
-train_baseline@e2v.
+DoLP from the scene's own, thresholds, and the benchmark's table, with the networks that `--data` has in train.
 
 The sensor is a quarter of a CeleX-5 in each direction (200 x 320, pictures of 30 x 45), with --full all of it (800 x
 1280, pictures of 120 x 180). `--write` merges the figures into docs/results/recordings.json as section `rig`, or
@@ -28,7 +27,7 @@ from skimage import data
 
 from polarnet.benchmark.rows import available
 from polarnet.benchmark.run import run_benchmark
-from polarnet.benchmark.score import summary
+from polarnet.benchmark.score import FrameScore, summary
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig, read_event_capture
 from polarnet.captures.imported import import_targets, shifted
 from polarnet.captures.targets import Calibrated, calibrate_targets, spread_us
@@ -129,13 +128,14 @@ def benchmarked(folder: Path, names: list[str], config: Config) -> dict[str, dic
     context = context_of(config, train_mean=None)
     methods, absent = available(config.benchmark.methods, context)
     benchmark = replace(config.benchmark, methods=methods, panel_scenes=0)
-    rows, costs = [], {}
+    rows: list[FrameScore] = []
+    costs: dict[str, dict[str, Any]] = {}
     for name in names:
-        one = run_benchmark(made_set(name, folder / name), context, benchmark, None, folder / "cache")
+        one = run_benchmark(made_set(name, folder / name), context, benchmark, None)
         rows += one.rows
         costs = {method: asdict(cost) for method, cost in one.costs.items()}
     scores = {m: {**s, **costs[m]} for m, s in summary(rows, benchmark.bootstrap_samples, config.seed).items()}
-    print(as_plain(score_table(scores, "not loaded here")))
+    print(as_plain(score_table(scores)))
     for method, reason in absent.items():
         print(f"{method} is left out: {reason}")
     return {method: {key: scores[method].get(key) for key in BENCHMARK_KEYS} for method in scores}
