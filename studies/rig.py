@@ -5,7 +5,11 @@ files with random delays, sensor noise and hot pixels, and then imported and cal
 prints errors of the start times from the landmark (in camera frames) and refined (in ms). The refined errors exclude
 the part common to all eight captures, because the zero of their clock is a convention; `clock_zero_ms_max` is that
 part. It also prints the RMS difference between the DoLP and the scene's own, the thresholds, and the benchmark's
-table, with the networks that `--data` has in train and train_baseline@e2v.
+table, with the networks that `--data` has in train.
+
+The sensor is a quarter of a CeleX-5 in each direction (200 x 320 pixels, images of 30 x 45); with --full it is a whole
+one (800 x 1280, images of 120 x 180). `--write` merges the figures into docs/results/recordings.json as section `rig` or
+`rig_full`. `--docs` draws the pictures of docs/recordings.md and docs/recordings-dot.md instead.
 """
 
 import argparse
@@ -128,7 +132,7 @@ def benchmarked(folder: Path, names: list[str], config: Config) -> dict[str, dic
     rows: list[FrameScore] = []
     costs: dict[str, dict[str, Any]] = {}
     for name in names:
-        one = run_benchmark(made_set(name, folder / name), context, benchmark, None, folder / "cache")
+        one = run_benchmark(made_set(name, folder / name), context, benchmark, None)
         rows += one.rows
         costs = {method: asdict(cost) for method, cost in one.costs.items()}
     scores = {m: {**s, **costs[m]} for m, s in summary(rows, benchmark.bootstrap_samples, config.seed).items()}
