@@ -184,7 +184,7 @@ def test_a_sequence_is_replayed_as_lines_at_its_own_pace(store, channels):
     assert out.getvalue() == head + lines
 
 
-def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channels, tmp_path, monkeypatch):
+def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channels, project_root, tmp_path, monkeypatch):
     """Import and calibration are replaced by a copy of the one file of each folder, its number of events."""
 
     def imported(root, out, config):
@@ -200,12 +200,13 @@ def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channel
 
     monkeypatch.setattr(recovery, "import_targets", imported)
     monkeypatch.setattr(recovery, "calibrate_targets", calibrated)
+    config = load(project_root).recordings
     for parent, count in (("first", 10), ("second", 20), ("first", 10)):
         folder = tmp_path / parent / "target"
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "events_0.bin").write_text(str(count))
         arrangement = Arrangement(None, None, None)
-        source = open_files([folder], arrangement, read_recording, None, tmp_path / "work", lambda: None)
+        source = open_files([folder], arrangement, read_recording, None, tmp_path / "work", lambda: config)
         assert sum(len(events) for piece in source.pieces for events in piece.channels) == 4 * count
 
 
