@@ -8,8 +8,8 @@ part. It also prints the RMS difference between the DoLP and the scene's own, th
 table, with the networks that `--data` has in train.
 
 The sensor is a quarter of a CeleX-5 in each direction (200 x 320 pixels, images of 30 x 45); with --full it is a whole
-one (800 x 1280, images of 120 x 180). `--write` merges the figures into docs/results/recordings.json as section `rig` or
-`rig_full`. `--docs` draws the pictures of docs/recordings.md and docs/recordings-dot.md instead.
+one (800 x 1280, images of 120 x 180). `--write` merges the figures into docs/results/recordings.json as section `rig`
+or `rig_full`. `--docs` draws the pictures of docs/recordings.md and docs/recordings-dot.md instead.
 """
 
 import argparse
