@@ -8,23 +8,23 @@ from importlib import import_module
 from typing import Any
 
 MODULE_OF = {
-    "BUILTIN_PHOTOS": "pictures.builtin",
-    "EmulatorConfig": "emulator",
-    "MOTIONS": "presets",
-    "MotionConfig": "motion",
-    "PolarizationScene": "scene",
-    "SENSORS": "presets",
-    "SensorState": "emulator",
-    "Simulation": "sequence",
-    "Trajectory": "motion",
-    "emulate": "emulator",
-    "random_trajectory": "motion",
-    "read_rgb": "pictures.images",
-    "scene_from_intensities": "scene",
-    "scene_from_polarization": "scene",
-    "scene_from_rgb": "scene",
-    "simulate": "sequence",
-    "emulate_motion": "moving_sensor",
+    "BUILTIN_PHOTOS": "polarnet.pictures.builtin",
+    "EmulatorConfig": "polarnet.simulation.emulator",
+    "MOTIONS": "polarnet.simulation.presets",
+    "MotionConfig": "polarnet.simulation.motion",
+    "PolarizationScene": "polarnet.simulation.scene",
+    "SENSORS": "polarnet.simulation.presets",
+    "SensorState": "polarnet.simulation.emulator",
+    "Simulation": "polarnet.simulation.sequence",
+    "Trajectory": "polarnet.simulation.motion",
+    "emulate": "polarnet.simulation.emulator",
+    "random_trajectory": "polarnet.simulation.motion",
+    "read_rgb": "polarnet.pictures.images",
+    "scene_from_intensities": "polarnet.simulation.scene",
+    "scene_from_polarization": "polarnet.simulation.scene",
+    "scene_from_rgb": "polarnet.simulation.scene",
+    "simulate": "polarnet.simulation.sequence",
+    "emulate_motion": "polarnet.simulation.moving_sensor",
 }
 """Module of each public name."""
 
@@ -34,7 +34,7 @@ __all__ = list(MODULE_OF)
 def __getattr__(name: str) -> Any:
     if name not in MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{MODULE_OF[name]}"), name)
+    return getattr(import_module(MODULE_OF[name]), name)
 
 
 def __dir__() -> list[str]:
