@@ -170,10 +170,12 @@ def project(project_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         "report": [*(f"benchmark/{file}" for file in REPORT_OUTS), "report"],
     }  # fmt: skip
     (tmp_path / "stages").mkdir()
+    (tmp_path / "stages" / "__init__.py").touch()  # else Python would take the project's package of this name
     for stage, paths in outs.items():
         code = STAND_IN.format(outs=[f"data/{path}" for path in paths])
         (tmp_path / "stages" / f"{stage}.py").write_text(code)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     Repo.init(str(tmp_path), no_scm=True).close()
     assert len(repro()) == len(stage_names(tmp_path))
