@@ -152,33 +152,50 @@ for out in {outs}:
 """A stage that reads nothing and always writes the same."""
 
 
-@pytest.fixture
-def project(project_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.fixture(scope="module")
+def finished(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """This project's dvc.yaml, params.yaml and code, with stand-ins for the stages, after one `dvc repro`."""
     from dvc.repo import Repo
 
+    folder = tmp_path_factory.mktemp("finished") / "project"
+    folder.mkdir()
     for name in ("dvc.yaml", "params.yaml", ".dvcignore"):
-        shutil.copy(project_root / name, tmp_path / name)
-    shutil.copytree(project_root / "polarnet", tmp_path / "polarnet", ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copy(project_root / name, folder / name)
+    shutil.copytree(project_root / "polarnet", folder / "polarnet", ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("measured", "photographs", "recordings"):
-        (tmp_path / "data" / name).mkdir(parents=True)
-        (tmp_path / "data" / name / "README.md").touch()
+        (folder / "data" / name).mkdir(parents=True)
+        (folder / "data" / name / "README.md").touch()
     outs = {
         "ingest": ["images"], "synthesize": ["scenes.zarr", "frames.zarr"], "emulate": ["events.zarr"],
         "weights": ["weights/loss.json", "weights/benchmark.json"], "train": ["train/NAME"], "sets": ["sets"],
         "import_recordings": ["imported"], "calibrate": ["calibrated"], "row": ["benchmark/rows/NAME"],
         "report": [*(f"benchmark/{file}" for file in REPORT_OUTS), "report"],
     }  # fmt: skip
-    (tmp_path / "stages").mkdir()
+    (folder / "stages").mkdir()
+    (folder / "stages" / "__init__.py").touch()  # else Python would take the project's package of this name
     for stage, paths in outs.items():
         code = STAND_IN.format(outs=[f"data/{path}" for path in paths])
-        (tmp_path / "stages" / f"{stage}.py").write_text(code)
-    monkeypatch.chdir(tmp_path)
+        (folder / "stages" / f"{stage}.py").write_text(code)
+    Repo.init(str(folder), no_scm=True).close()
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        enter(folder, monkeypatch)
+        assert repro() == set(stage_names(folder))
+    return folder
+
+
+@pytest.fixture
+def project(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the finished project, as the working directory."""
+    shutil.copytree(finished, tmp_path / "project")
+    enter(tmp_path / "project", monkeypatch)
+    return tmp_path / "project"
+
+
+def enter(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work in `folder`, whose stages run by this Python."""
+    monkeypatch.chdir(folder)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
-    Repo.init(str(tmp_path), no_scm=True).close()
-    assert len(repro()) == len(stage_names(tmp_path))
-    assert repro() == set()
-    return tmp_path
 
 
 def repro() -> set[str]:
@@ -198,6 +215,10 @@ def set_params(project: Path, change: Callable[[Any], None]) -> None:
 
 def append(file: Path) -> None:
     file.write_text(file.read_text() + "\nCHANGED = True\n" if file.exists() else "NEW = True\n")
+
+
+def test_a_second_run_has_nothing_to_do(project):
+    assert repro() == set()
 
 
 def test_a_new_method_runs_itself_and_the_report_and_nothing_else(project):
