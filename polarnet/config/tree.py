@@ -37,6 +37,7 @@ from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import MotionConfig
 from polarnet.simulation.sets import SetsConfig
 from polarnet.simulation.variation import VariationConfig
+from polarnet.storage.parts import StorageConfig
 from polarnet.training.baselines import BASELINES
 from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig
@@ -122,6 +123,7 @@ class Config:
     synthesize: MotionConfig
     variation: VariationConfig
     emulate: EmulatorConfig
+    storage: StorageConfig
     network: str
     networks: NetworksConfig
     loss: LossConfig

@@ -81,6 +81,7 @@ def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -
         "height": store.height,
         "width": store.width,
         "polarizer_angles_deg": POLARIZER_ANGLES_DEG,
+        "sequences_per_part": store.sequences_per_part,
         "duration_us": {sequence: store.duration_us(sequence) for sequence in store.sequences},
         "attributes": store.attributes,
     }
