@@ -85,7 +85,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--photographs", type=int, help="the first so many; default: all")
     options = parser.parse_args()
-    motion = dataclasses.replace(MOTIONS["default"], window_height=HEIGHT, window_width=WIDTH, duration_s=DURATION_S)
+    motion = dataclasses.replace(MOTIONS["default"], sensor_height=HEIGHT, sensor_width=WIDTH, duration_s=DURATION_S)
     results = defaultdict(list)
     for photo in BUILTIN_PHOTOS[: options.photographs]:
         rgb = interpolate(read_rgb(photo.path)[None], (400, 600), mode="bilinear", antialias=True)[0].clamp(0, 1)

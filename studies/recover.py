@@ -62,7 +62,7 @@ CPU = torch.device("cpu")
 def stream_of_events(config: Config, seconds: float) -> list[Events]:
     """Four channels of 120 x 180 pixels, `seconds` long, at `RATE`."""
     picture = torch.from_numpy(data.coffee()).permute(2, 0, 1).float() / 255
-    motion = replace(config.synthesize, duration_s=seconds, window_height=120, window_width=180)
+    motion = replace(config.synthesize, duration_s=seconds, sensor_height=120, sensor_width=180)
     channels = simulate(picture, motion, config.emulate, seed=1).events
     stretch = sum(map(len, channels)) / (RATE * seconds)
     stretched = [replace(events, t=(events.t * stretch).long()) for events in channels]

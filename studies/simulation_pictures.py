@@ -27,7 +27,7 @@ from polarnet.reports.maps import event_image
 from polarnet.reports.overview import OFF, ON
 from polarnet.reports.png import png
 from polarnet.simulation.emulator import EmulatorConfig, emulate
-from polarnet.simulation.motion import MotionConfig, Trajectory, random_trajectory, sensor_to_scene
+from polarnet.simulation.motion import SynthesizeConfig, Trajectory, random_trajectory, sensor_to_scene
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.presets import MOTIONS, SENSORS
 from polarnet.simulation.scene import scene_from_rgb
@@ -158,7 +158,7 @@ def crossings_figure() -> Figure:
 def window_figure() -> Figure:
     """Draw one thirtieth of a second of the coffee photograph's events, behind the polarizer at 0 degrees."""
     scene = scene_from_rgb(read_rgb(_photo()))
-    motion = replace(MOTIONS["default"], window_height=100, window_width=150, speed_min_px_s=150.0)
+    motion = replace(MOTIONS["default"], sensor_height=100, sensor_width=150, speed_min_px_s=150.0)
     trajectory = random_trajectory(motion, scene.height, scene.width, np.random.default_rng(4))
     columns, rows = 4, 3
     with matplotlib.rc_context(chart_style(LIGHT)):
@@ -197,11 +197,11 @@ def motion_figure() -> Figure:
     return figure
 
 
-def _way(axes: Axes, trajectory: Trajectory, motion: MotionConfig) -> None:
+def _way(axes: Axes, trajectory: Trajectory, motion: SynthesizeConfig) -> None:
     """Draw the path of the sensor's centre over a second, and its outline at five times, the last one strongest."""
     pose = trajectory.pose(np.linspace(0, motion.duration_s, 200))
     axes.plot(pose.x, pose.y, color="white", linewidth=1.6)
-    height, width = motion.window_height, motion.window_width
+    height, width = motion.sensor_height, motion.sensor_width
     for k, place in enumerate(np.linspace(0, 199, 5).astype(int)):
         left, top, along, across = sensor_to_scene(*(float(v[place]) for v in pose), height, width)
         columns, rows = np.array([[0, 1, 1, 0, 0], [0, 0, 1, 1, 0]]) * np.array([[width - 1], [height - 1]])

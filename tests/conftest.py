@@ -114,11 +114,11 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     folder = tmp_path_factory.mktemp("simulated")
     config = load(project_root)
     motion = dataclasses.replace(
-        config.synthesize, duration_s=0.2, window_height=18, window_width=24, acceleration_max_px_s2=4000.0
+        config.synthesize, duration_s=0.2, sensor_height=18, sensor_width=24, acceleration_max_px_s2=4000.0
     )
     emulate = dataclasses.replace(config.emulate, randomise=True, random_shot_noise_rate_hz=[20.0, 40.0])
     splits = {"a-0": "train", "b-0": "train", "c-0": "train", "d-0": "val"}
-    window, t_us = (motion.window_height, motion.window_width), frame_times_us(motion)
+    window, t_us = (motion.sensor_height, motion.sensor_width), frame_times_us(motion)
     scenes = SceneStore.create(
         folder / "scenes.zarr",
         {name: name[0] for name in splits},

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from polarnet.simulation.emulator import EmulatorConfig
-from polarnet.simulation.motion import MotionConfig
+from polarnet.simulation.motion import SynthesizeConfig
 
 NOT_COMPARED = ("synthesize.sequences_per_picture",)
 MODEL_ALONE = {"esim_log_eps": ("esim", "esim_gpu"), "voltmeter_camera": ("dvs_voltmeter",)}
@@ -32,14 +32,14 @@ class Conditions(NamedTuple):
         return {key: value for key, value in keyed.items() if key not in NOT_COMPARED}
 
 
-def configured(synthesize: MotionConfig, emulate: EmulatorConfig) -> Conditions:
+def configured(synthesize: SynthesizeConfig, emulate: EmulatorConfig) -> Conditions:
     """Conditions of sequences made with these sections."""
     return Conditions(dataclasses.asdict(synthesize), dataclasses.asdict(emulate))
 
 
 def stored(attributes: Mapping[str, Any], height: int, width: int) -> Conditions:
     """Conditions from the attributes of an event store; only the size if its events were not simulated."""
-    size = {"window_height": height, "window_width": width}
+    size = {"sensor_height": height, "sensor_width": width}
     return Conditions(attributes.get("scenes", {}).get("synthesize", {}) | size, attributes.get("emulate", {}))
 
 
@@ -54,7 +54,7 @@ def trained_on(metadata: Mapping[str, Any]) -> Conditions | None:
 def sentence(conditions: Conditions) -> str:
     """Size, duration, frame rate and sensor in words."""
     scene, sensor = conditions
-    text = f"Sequences of {scene['window_height']}x{scene['window_width']} pixels (height x width)"
+    text = f"Sequences of {scene['sensor_height']}x{scene['sensor_width']} pixels (height x width)"
     if "duration_s" in scene:
         text += f", {scene['duration_s']:g} s at {scene['frame_rate_hz']:g} frames a second"
     if not sensor:

@@ -11,7 +11,7 @@ from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import Events
 from polarnet.runtime.machine import generator_for, seed_for
 from polarnet.simulation.emulator import EmulatorConfig, randomised
-from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory
+from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.truth import frames_of, valid_frames
@@ -29,7 +29,7 @@ def sequence_at(scenes: SceneStore, sequence: str, events: Sequence[Events], t_u
 def resimulated(
     scenes: SceneStore,
     sequence: str,
-    motion: MotionConfig,
+    motion: SynthesizeConfig,
     emulate: Sequence[EmulatorConfig],
     seed: int,
     speed: float = 1.0,

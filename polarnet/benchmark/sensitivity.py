@@ -11,7 +11,7 @@ from polarnet.benchmark.resimulate import resimulated
 from polarnet.benchmark.rows import Context, predictions_of
 from polarnet.benchmark.score import FrameScore, scene_means, score_sequence
 from polarnet.simulation.emulator import EmulatorConfig
-from polarnet.simulation.motion import MotionConfig
+from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.storage.scenes import SceneStore
 
 CHANNEL_SIGNS = (1, -1, -1, 1)
@@ -57,7 +57,7 @@ def sensors(setting: str, value: float, emulate: EmulatorConfig) -> list[Emulato
 def sensitivity(
     scenes: SceneStore,
     sequences: Sequence[str],
-    motion: MotionConfig,
+    motion: SynthesizeConfig,
     emulate: EmulatorConfig,
     seed: int,
     warmup_windows: int,

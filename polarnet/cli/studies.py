@@ -56,7 +56,7 @@ def run_sensitivity(
 ) -> dict[str, Any]:
     """Write sensitivity.json and sensitivity.png to `out`."""
     sequences, context, _, scenes = _prepared(config, methods, limit, weights)
-    size = {"window_height": scenes.sensor_height, "window_width": scenes.sensor_width}
+    size = {"sensor_height": scenes.sensor_height, "sensor_width": scenes.sensor_width}
     motion = dataclasses.replace(config.synthesize, **size)  # emulated again at the scenes' sensor size
     conditions = _announced(configured(motion, config.emulate), methods, context)
     table = sensitivity(

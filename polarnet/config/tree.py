@@ -34,7 +34,7 @@ from polarnet.pictures.ingest import IngestConfig
 from polarnet.runtime.machine import RuntimeConfig, configure
 from polarnet.runtime.ranges import check_ranges
 from polarnet.simulation.emulator import EmulatorConfig
-from polarnet.simulation.motion import MotionConfig
+from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.sets import SetsConfig
 from polarnet.simulation.variation import VariationConfig
 from polarnet.storage.parts import StorageConfig
@@ -120,7 +120,7 @@ class Config:
 
     seed: int
     ingest: IngestConfig
-    synthesize: MotionConfig
+    synthesize: SynthesizeConfig
     variation: VariationConfig
     emulate: EmulatorConfig
     storage: StorageConfig
@@ -151,14 +151,14 @@ class Config:
             raise ValueError(f"network: expected one of {', '.join(known)}, got {self.network!r}")
         self._check_rows()
         self._check_baseline()
-        window = [self.synthesize.window_height, self.synthesize.window_width]
+        sensor = [self.synthesize.sensor_height, self.synthesize.sensor_width]
         sections = {name: getattr(self.baselines, name) for name in BASELINES}
         crops = {"train.crop": self.train.crop} | {
             f"baselines.{name}.crop": section.crop for name, section in sections.items()
         }
         for key, crop in crops.items():
-            if crop is not None and (crop[0] > window[0] or crop[1] > window[1]):
-                raise ValueError(f"{key}: expected at most the window of section synthesize, {window}, got {crop}")
+            if crop is not None and (crop[0] > sensor[0] or crop[1] > sensor[1]):
+                raise ValueError(f"{key}: expected at most the sensor of section synthesize, {sensor}, got {crop}")
         loss = self.lpips.backbone
         compared = [
             ("loss.lpips", self.loss.lpips > 0, loss, self.train.crop),
@@ -168,7 +168,7 @@ class Config:
             used = any(getattr(section, key) > 0 for key in BASELINES[name].lpips)
             compared.append((f"baselines.{name}.lpips", used, loss, section.crop))
         for key, used, backbone, crop in compared:
-            side, size = BACKBONES[backbone].least_side, crop or window
+            side, size = BACKBONES[backbone].least_side, crop or sensor
             if used and min(size) < side:
                 raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {size}")
 

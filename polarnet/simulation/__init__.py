@@ -11,7 +11,7 @@ MODULE_OF = {
     "BUILTIN_PHOTOS": "polarnet.pictures.builtin",
     "EmulatorConfig": "polarnet.simulation.emulator",
     "MOTIONS": "polarnet.simulation.presets",
-    "MotionConfig": "polarnet.simulation.motion",
+    "SynthesizeConfig": "polarnet.simulation.motion",
     "PolarizationScene": "polarnet.simulation.scene",
     "SENSORS": "polarnet.simulation.presets",
     "SensorState": "polarnet.simulation.emulator",

@@ -26,15 +26,15 @@ ATTEMPTS = 64
 
 
 @dataclass(frozen=True)
-class MotionConfig:
+class SynthesizeConfig:
     """Section `synthesize` of params.yaml. Speeds are in scene pixels and hold for every sensor pixel."""
 
     sequences_per_picture: int = field(metadata=allowed(low=1))
     duration_s: float = field(metadata=allowed(above=0))
     frame_rate_hz: float = field(metadata=allowed(above=0))
     """Rate of the ground-truth frames; the windows of events between frames are the network's inputs."""
-    window_height: int = field(metadata=allowed(low=2))
-    window_width: int = field(metadata=allowed(low=2))
+    sensor_height: int = field(metadata=allowed(low=2))
+    sensor_width: int = field(metadata=allowed(low=2))
     speed_min_px_s: float = field(metadata=allowed(above=0))
     """The peak speed of a sequence is drawn between this and speed_max_px_s."""
     speed_max_px_s: float = field(metadata=allowed(above=0))
@@ -119,7 +119,7 @@ class Trajectory:
 
 
 def random_trajectory(
-    config: MotionConfig, scene_height: int, scene_width: int, generator: np.random.Generator
+    config: SynthesizeConfig, scene_height: int, scene_width: int, generator: np.random.Generator
 ) -> Trajectory:
     """A smooth motion of a sensor inside a scene.
 
@@ -132,7 +132,7 @@ def random_trajectory(
     if room.min() <= 0:
         raise ValueError(
             f"a scene of {scene_height}x{scene_width} (height x width) is too small: a sensor of "
-            f"{config.window_height}x{config.window_width} rolled by up to {config.rotation_max_deg:g} degrees needs "
+            f"{config.sensor_height}x{config.sensor_width} rolled by up to {config.rotation_max_deg:g} degrees needs "
             f"more than {2 * reach_y + 1:.0f}x{2 * reach_x + 1:.0f}; use larger pictures or a smaller sensor"
         )
     speed = generator.uniform(config.speed_min_px_s, config.speed_max_px_s)
@@ -149,7 +149,7 @@ def random_trajectory(
         enough = shape.extent * (drift * shape.acceleration * config.speed_min_px_s**2 / config.acceleration_max_px_s2)
         width, height = np.array([scene_width, scene_height]) + np.maximum(enough - room, 0)
         raise ValueError(
-            f"a scene of {scene_height}x{scene_width} leaves a sensor of {config.window_height}x{config.window_width} "
+            f"a scene of {scene_height}x{scene_width} leaves a sensor of {config.sensor_height}x{config.sensor_width} "
             f"too little room to reach speed_min_px_s={config.speed_min_px_s:g} within "
             f"acceleration_max_px_s2={config.acceleration_max_px_s2:g} (about {highest:.0f} px/s can be reached); "
             f"use pictures of about {math.ceil(height)}x{math.ceil(width)}, a smaller sensor or a lower speed"
@@ -194,7 +194,7 @@ def _random_shape(generator: np.random.Generator) -> _Shape:
 
 
 def _placed(
-    config: MotionConfig,
+    config: SynthesizeConfig,
     shape: _Shape,
     rate: float,
     speed: float,
@@ -227,14 +227,14 @@ def _placed(
 
 
 def _turn(
-    amplitude: float, coupling: float, config: MotionConfig, speed: float, generator: np.random.Generator
+    amplitude: float, coupling: float, config: SynthesizeConfig, speed: float, generator: np.random.Generator
 ) -> Sine:
     """Roll or zoom slow enough to move the sensor's corners within its share of speed and acceleration.
 
     A pixel q away from the centre sees q exp(i roll) / zoom, whose second derivative is at most
     q (roll'' + 2 roll'^2 + zoom'' + 3 zoom'^2) since zoom >= 1 and 2 roll' zoom' <= roll'^2 + zoom'^2.
     """
-    corner = math.hypot(config.window_width - 1, config.window_height - 1) / 2
+    corner = math.hypot(config.sensor_width - 1, config.sensor_height - 1) / 2
     start, hurry = generator.uniform(0, 2 * math.pi), generator.uniform(0.3, 1)
     if amplitude == 0:
         return Sine(0.0, 0.0, 0.0)
@@ -244,9 +244,9 @@ def _turn(
     return Sine(amplitude, hurry * min(by_speed, by_acceleration, TURN_RATE_MAX), start)
 
 
-def _reach(config: MotionConfig) -> tuple[float, float]:
+def _reach(config: SynthesizeConfig) -> tuple[float, float]:
     """Largest distance of the sensor's corners from its centre along x and y, over all rolls, without zoom."""
-    half_width, half_height = (config.window_width - 1) / 2, (config.window_height - 1) / 2
+    half_width, half_height = (config.sensor_width - 1) / 2, (config.sensor_height - 1) / 2
     largest = math.radians(config.rotation_max_deg)
 
     def reach(along: float, across: float) -> float:
@@ -256,7 +256,7 @@ def _reach(config: MotionConfig) -> tuple[float, float]:
     return reach(half_width, half_height), reach(half_height, half_width)
 
 
-def frame_times_us(config: MotionConfig) -> list[int]:
+def frame_times_us(config: SynthesizeConfig) -> list[int]:
     """Microseconds of the N + 1 ground-truth frames that bound the N windows of a sequence."""
     windows = round(config.duration_s * config.frame_rate_hz)
     return [round(1e6 * k / config.frame_rate_hz) for k in range(windows + 1)]

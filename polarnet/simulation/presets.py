@@ -6,7 +6,7 @@
 from dataclasses import replace
 
 from polarnet.simulation.emulator import EmulatorConfig
-from polarnet.simulation.motion import MotionConfig
+from polarnet.simulation.motion import SynthesizeConfig
 
 _DEFAULT = EmulatorConfig(
     model="exact",
@@ -55,12 +55,12 @@ SENSORS = {
 """v2e's command-line defaults and its options `clean` and `noisy`; derive others with `dataclasses.replace`."""
 
 MOTIONS = {
-    "default": MotionConfig(
+    "default": SynthesizeConfig(
         sequences_per_picture=1,
         duration_s=1.0,
         frame_rate_hz=30.0,
-        window_height=120,
-        window_width=180,
+        sensor_height=120,
+        sensor_width=180,
         speed_min_px_s=40.0,
         speed_max_px_s=160.0,
         acceleration_max_px_s2=800.0,

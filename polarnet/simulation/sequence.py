@@ -10,7 +10,7 @@ from polarnet.events.stream import Events
 from polarnet.runtime.arrays import Array
 from polarnet.runtime.machine import generator_for, seed_for
 from polarnet.simulation.emulator import EmulatorConfig, randomised
-from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory
+from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb
 from polarnet.simulation.truth import frames_of
@@ -32,7 +32,7 @@ class Simulation(NamedTuple):
 
 
 def simulate(
-    picture: Float[Array, "3 h w"] | PolarizationScene, motion: MotionConfig, sensor: EmulatorConfig, seed: int
+    picture: Float[Array, "3 h w"] | PolarizationScene, motion: SynthesizeConfig, sensor: EmulatorConfig, seed: int
 ) -> Simulation:
     """Simulate an event camera whose sensor moves over a picture or a scene.
 
@@ -44,7 +44,7 @@ def simulate(
     too small for the sensor and its motion; the message gives the remedy.
     """
     for name, value, kind, example in (
-        ("motion", motion, MotionConfig, 'MOTIONS["default"]'),
+        ("motion", motion, SynthesizeConfig, 'MOTIONS["default"]'),
         ("sensor", sensor, EmulatorConfig, 'SENSORS["default"]'),
     ):
         if not isinstance(value, kind):
@@ -57,7 +57,7 @@ def simulate(
     else:
         scene = scene_from_rgb(picture)
     trajectory = random_trajectory(motion, scene.height, scene.width, generator_for(seed, "picture", "motion"))
-    t_us, size = frame_times_us(motion), (motion.window_height, motion.window_width)
+    t_us, size = frame_times_us(motion), (motion.sensor_height, motion.sensor_width)
     sensor = randomised(sensor, generator_for(seed, "picture", "sensor"))
     key = seed_for(seed, "picture", "emulate")
     events = emulate_motion(scene, trajectory, t_us[-1], *size, sensor, key)

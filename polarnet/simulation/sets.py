@@ -20,7 +20,7 @@ from polarnet.pictures.polarimetry import group_by_measurement
 from polarnet.runtime.ranges import allowed, check_ranges
 from polarnet.simulation.dataset import emulate_scenes
 from polarnet.simulation.emulator import EmulatorConfig
-from polarnet.simulation.motion import MotionConfig
+from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.truth import synthesize
 
 MADE = "made.json"
@@ -53,7 +53,7 @@ class Recipe:
     """Sections of params.yaml that determine how pictures become sequences."""
 
     ingest: IngestConfig
-    motion: MotionConfig
+    motion: SynthesizeConfig
     emulate: EmulatorConfig
     seed: int
     threads: int

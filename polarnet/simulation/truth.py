@@ -20,7 +20,7 @@ from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, listed,
 from polarnet.pictures.polarimetry import read_intensities
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import generator_for, one_thread
-from polarnet.simulation.motion import MotionConfig, Trajectory, frame_times_us, random_trajectory, render
+from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.scene import (
     PolarizationScene,
     polarization_from_rgb,
@@ -69,7 +69,7 @@ def synthesize(
     images: Path,
     scenes: Path,
     frames: Path,
-    config: MotionConfig,
+    config: SynthesizeConfig,
     seed: int,
     mapper: Callable[..., Iterable[Any]],
     sequences_per_part: int,
@@ -117,7 +117,7 @@ def synthesize(
 
 
 def motions_of(
-    manifest: Manifest, config: MotionConfig, seed: int, variation: VariationConfig | None = None
+    manifest: Manifest, config: SynthesizeConfig, seed: int, variation: VariationConfig | None = None
 ) -> tuple[dict[str, Motions], list[Skipped]]:
     """Motions by picture, and the pictures that are too small for the sensor and its motion."""
     motions, skipped = {}, []
@@ -129,7 +129,7 @@ def motions_of(
     return motions, skipped
 
 
-def _motions(entry: ManifestEntry, config: MotionConfig, seed: int, variation: VariationConfig | None) -> Motions:
+def _motions(entry: ManifestEntry, config: SynthesizeConfig, seed: int, variation: VariationConfig | None) -> Motions:
     variants = variation.scenes_per_picture if variation and entry.split == "train" else 0
     scenes = [entry.name, *(variant_name(entry.name, k) for k in range(1, variants + 1))]
     names = {scene: [f"{scene}-{number:02d}" for number in range(config.sequences_per_picture)] for scene in scenes}
@@ -148,7 +148,7 @@ def _create(
     images: Path,
     scenes: Path,
     frames: Path,
-    config: MotionConfig,
+    config: SynthesizeConfig,
     variation: VariationConfig | None,
     seed: int,
     sequences_per_part: int,
@@ -165,7 +165,7 @@ def _create(
         "seed": seed,
         "images_sha256": _digest(manifest, images),
     }
-    sensor = config.window_height, config.window_width
+    sensor = config.sensor_height, config.sensor_width
     largest = max(entry.height for entry in manifest.pictures), max(entry.width for entry in manifest.pictures)
     names = Trajectory.vector_names()
     masked = any(entry.masked_fraction for entry in manifest.pictures)  # null for photographs
@@ -194,7 +194,7 @@ def _synthesize_part(
     images: Path,
     scenes: SceneStore,
     frames: FrameStore,
-    config: MotionConfig,
+    config: SynthesizeConfig,
     variation: VariationConfig | None,
     seed: int,
 ) -> None:
@@ -208,10 +208,10 @@ def _synthesize_part(
         for sequence in sequences:
             trajectory = trajectories[sequence]
             scenes.write(sequence, planes, torch.from_numpy(trajectory.to_vector()), t_us[-1])
-            seen = frames_of(scene, trajectory, t_us, config.window_height, config.window_width)
+            seen = frames_of(scene, trajectory, t_us, config.sensor_height, config.sensor_width)
             known = None
             if planes.valid is not None:
-                known = valid_frames(planes.valid, trajectory, t_us, config.window_height, config.window_width)
+                known = valid_frames(planes.valid, trajectory, t_us, config.sensor_height, config.sensor_width)
             frames.write(sequence, torch.tensor(t_us), *seen, known)
 
 

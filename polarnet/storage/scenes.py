@@ -95,8 +95,8 @@ class SceneStore(SplitStore):
         super().__init__(path, header)
         self.picture_of: dict[str, str] = dict(zip(self.sequences, header["picture_of_sequence"], strict=True))
         self.pictures: list[str] = sorted(set(self.picture_of.values()))
-        self.sensor_height: int = header["window_height"]
-        self.sensor_width: int = header["window_width"]
+        self.sensor_height: int = header["sensor_height"]
+        self.sensor_width: int = header["sensor_width"]
         self.trajectory_names: list[str] = header["trajectory"]
         self.masked: bool = header["masked"]
         """Whether the store marks pixels whose light is unknown."""
@@ -134,8 +134,8 @@ class SceneStore(SplitStore):
             "picture_of_sequence": [picture_of[sequence] for sequence in sequences],
             "splits": [splits[sequence] for sequence in sequences],
             "largest_picture": list(largest_picture),
-            "window_height": sensor[0],
-            "window_width": sensor[1],
+            "sensor_height": sensor[0],
+            "sensor_width": sensor[1],
             "trajectory": list(trajectory_names),
             "masked": masked,
             "conventions": {**CONVENTIONS, "valid": MASK_CONVENTION} if masked else CONVENTIONS,

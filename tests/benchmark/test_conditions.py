@@ -16,7 +16,7 @@ def checkpoint(config, **synthesize):
     motion = dataclasses.replace(config.synthesize, **synthesize)
     scenes = {"synthesize": dataclasses.asdict(motion)}
     made = {"emulate": dataclasses.asdict(config.emulate), "scenes": scenes}
-    return {"data": {"height": motion.window_height, "width": motion.window_width, "events_from": made}}
+    return {"data": {"height": motion.sensor_height, "width": motion.sensor_width, "events_from": made}}
 
 
 def test_size_duration_rate_and_sensor_are_said(config):
@@ -43,10 +43,10 @@ def test_the_conditions_of_the_training_give_no_warning(config):
 
 
 def test_a_difference_is_said_with_both_values_and_what_to_set(config):
-    used = configured(dataclasses.replace(config.synthesize, window_height=60, duration_s=0.4), config.emulate)
+    used = configured(dataclasses.replace(config.synthesize, sensor_height=60, duration_s=0.4), config.emulate)
     assert warnings(used, {"ours": checkpoint(config), "e2v": checkpoint(config)}, "Set") == [
         "ours, e2v: these sequences differ from those of its training: synthesize.duration_s 0.4 (training: 1.0), "
-        "synthesize.window_height 60 (training: 120). Set synthesize.duration_s=1.0 synthesize.window_height=120"
+        "synthesize.sensor_height 60 (training: 120). Set synthesize.duration_s=1.0 synthesize.sensor_height=120"
     ]
 
 

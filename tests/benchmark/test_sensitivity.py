@@ -18,7 +18,7 @@ from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 
 SMALL = [
-    "synthesize.duration_s=0.2", "synthesize.window_height=60", "synthesize.window_width=90",
+    "synthesize.duration_s=0.2", "synthesize.sensor_height=60", "synthesize.sensor_width=90",
     "synthesize.speed_min_px_s=20.0", "synthesize.speed_max_px_s=40.0",
 ]  # fmt: skip
 

@@ -15,8 +15,8 @@ from polarnet.pictures.images import write_png
 from polarnet.runtime.machine import generator_for
 
 TINY = [
-    "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.2", "synthesize.window_height=60",
-    "synthesize.window_width=90", "benchmark.methods=[zeros,train_mean,oracle_mean,cf,ours]",
+    "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.2", "synthesize.sensor_height=60",
+    "synthesize.sensor_width=90", "benchmark.methods=[zeros,train_mean,oracle_mean,cf,ours]",
     "benchmark.warmup_windows=1", "benchmark.bootstrap_samples=10", "benchmark.panel_scenes=1", "runtime.threads=1",
 ]  # fmt: skip
 
@@ -86,7 +86,7 @@ def test_a_folder_of_photographs_is_scored_with_given_weights(
     assert run(project_root, monkeypatch, photographs, out) == 0  # by the shipped weights, on the same events
     warning = (
         "ours: these sequences differ from those of its training: synthesize.duration_s 0.2 (training: 1.0), "
-        "synthesize.window_height 60 (training: 120), synthesize.window_width 90 (training: 180)."
+        "synthesize.sensor_height 60 (training: 120), synthesize.sensor_width 90 (training: 180)."
     )
     assert f"WARNING: {warning}" in capsys.readouterr().out
     assert warning in (out / "index.html").read_text()

@@ -35,7 +35,7 @@ def config(project_root, simulated, tmp_path_factory):
         project_root,
         [
             f"paths.scenes={simulated.scenes}", f"paths.events={simulated.events}", f"paths.frames={path}",
-            f"synthesize.window_height={height}", f"synthesize.window_width={width}", "synthesize.duration_s=0.2",
+            f"synthesize.sensor_height={height}", f"synthesize.sensor_width={width}", "synthesize.duration_s=0.2",
             "synthesize.acceleration_max_px_s2=4000.0", "train.crop=null", "baselines.e2v.crop=null",
             "baselines.e2p.crop=null", "benchmark.warmup_windows=1",
             "loss.lpips=0.0", "baselines.e2v.lpips=0.0", "baselines.e2p.lpips=0.0", "baselines.e2p.intensity_lpips=0.0",

@@ -179,7 +179,7 @@ def test_every_preset_composes(project_root, group):
 def test_the_paper_experiment_holds_the_papers_values(project_root):
     config = load(project_root, ["experiment=paper"])
     assert (config.ingest.height, config.ingest.width) == (400, 600)
-    assert (config.synthesize.window_height, config.synthesize.window_width) == (120, 180)
+    assert (config.synthesize.sensor_height, config.synthesize.sensor_width) == (120, 180)
     assert (config.synthesize.duration_s, config.synthesize.frame_rate_hz) == (1.0, 30.0)
     assert (config.emulate.contrast_threshold_on, config.emulate.contrast_threshold_off) == (0.2, 0.2)
     assert config.emulate.model == "v2e"  # "we use V2E in our experiments", section 3.1

@@ -21,7 +21,7 @@ from polarnet.pictures.polarimetry import (
     shrink,
     write_intensities,
 )
-from polarnet.simulation.motion import MotionConfig
+from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.scene import scene_from_intensities
 from polarnet.simulation.truth import synthesize
 from polarnet.stokes import aolp, dolp, parse_mosaic
@@ -207,12 +207,12 @@ def test_intensities_survive_the_way_through_their_file(tmp_path):
     assert np.array_equal(valid.numpy(), measured.valid)
 
 
-MOTION = MotionConfig(
+MOTION = SynthesizeConfig(
     sequences_per_picture=1,
     duration_s=0.2,
     frame_rate_hz=30.0,
-    window_height=20,
-    window_width=30,
+    sensor_height=20,
+    sensor_width=30,
     speed_min_px_s=30.0,
     speed_max_px_s=60.0,
     acceleration_max_px_s2=2000.0,

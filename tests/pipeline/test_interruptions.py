@@ -44,12 +44,12 @@ class Running(NamedTuple):
 def folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data folder whose scenes are twenty motions of a window over the coffee photograph."""
     from polarnet.config.tree import load
-    from polarnet.simulation.motion import MotionConfig, Trajectory, random_trajectory
+    from polarnet.simulation.motion import SynthesizeConfig, Trajectory, random_trajectory
     from polarnet.simulation.scene import polarization_from_rgb
     from polarnet.storage.scenes import Scene, SceneStore
 
-    motion: MotionConfig = load(
-        project_root, ["synthesize.window_height=60", "synthesize.window_width=90", "synthesize.duration_s=0.5"]
+    motion: SynthesizeConfig = load(
+        project_root, ["synthesize.sensor_height=60", "synthesize.sensor_width=90", "synthesize.duration_s=0.5"]
     ).synthesize
     picture = torch.from_numpy(data.coffee()[100:300, 150:450]).permute(2, 0, 1).float() / 255
     folder = tmp_path_factory.mktemp("interrupted") / "data"
@@ -59,7 +59,7 @@ def folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
         dict.fromkeys(names, "coffee"),
         dict.fromkeys(names, "train"),
         largest_picture=(200, 300),
-        sensor=(motion.window_height, motion.window_width),
+        sensor=(motion.sensor_height, motion.sensor_width),
         trajectory_names=Trajectory.vector_names(),
         attributes={},
         sequences_per_part=SEQUENCES_PER_PART,

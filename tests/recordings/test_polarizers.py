@@ -24,7 +24,7 @@ def events_of(dolp_factor):
     """Four channels of a photograph whose DoLP is reduced by a factor."""
     (photo,) = (photo for photo in BUILTIN_PHOTOS if photo.file == "rocket.jpg")
     s0, dolp, aolp = polarization_from_rgb(read_rgb(photo.path)[:, :400, :600])
-    motion = dataclasses.replace(MOTIONS["default"], window_height=160, window_width=240, duration_s=DURATION_US * 1e-6)
+    motion = dataclasses.replace(MOTIONS["default"], sensor_height=160, sensor_width=240, duration_s=DURATION_US * 1e-6)
     return simulate(scene_from_polarization(s0, dolp_factor * dolp, aolp), motion, SENSORS["default"], seed=1).events
 
 

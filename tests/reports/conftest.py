@@ -14,7 +14,7 @@ from polarnet.events.stream import Events
 from polarnet.pictures.images import write_png
 from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, write_manifest
 from polarnet.reports.artefacts import ReportPaths
-from polarnet.simulation.motion import MotionConfig
+from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.truth import synthesize
 from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore
@@ -118,8 +118,8 @@ def paths(tmp_path_factory):
         data / "benchmark",
     )  # fmt: skip
     write_images(paths.images)
-    motion = MotionConfig(
-        sequences_per_picture=1, duration_s=0.2, frame_rate_hz=30.0, window_height=24, window_width=36,
+    motion = SynthesizeConfig(
+        sequences_per_picture=1, duration_s=0.2, frame_rate_hz=30.0, sensor_height=24, sensor_width=36,
         speed_min_px_s=10.0, speed_max_px_s=20.0, acceleration_max_px_s2=800.0, rotation_max_deg=0.0, zoom_max=1.0,
     )  # fmt: skip
     synthesize(paths.images, paths.scenes, paths.frames, motion, 1, map, 2)

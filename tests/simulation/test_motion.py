@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polarnet.simulation.motion import (
-    MotionConfig,
     Sine,
+    SynthesizeConfig,
     Trajectory,
     bilinear,
     frame_times_us,
@@ -22,12 +22,12 @@ from polarnet.simulation.motion import (
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.stokes import aolp, dolp, intensities_from_stokes
 
-CONFIG = MotionConfig(
+CONFIG = SynthesizeConfig(
     sequences_per_picture=1,
     duration_s=1.0,
     frame_rate_hz=30.0,
-    window_height=120,
-    window_width=180,
+    sensor_height=120,
+    sensor_width=180,
     speed_min_px_s=60.0,
     speed_max_px_s=200.0,
     acceleration_max_px_s2=800.0,
@@ -55,10 +55,10 @@ def still(x: float, y: float, roll: float = 0.0, zoom: float = 1.0) -> Trajector
     )
 
 
-def corners(trajectory: Trajectory, config: MotionConfig, t_s: np.ndarray) -> np.ndarray:
+def corners(trajectory: Trajectory, config: SynthesizeConfig, t_s: np.ndarray) -> np.ndarray:
     """Points of the scene, x + iy, under the four corner pixels of the window; the definition, written anew."""
     pose = trajectory.pose(t_s)
-    half_width, half_height = (config.window_width - 1) / 2, (config.window_height - 1) / 2
+    half_width, half_height = (config.sensor_width - 1) / 2, (config.sensor_height - 1) / 2
     offsets = np.array([sx * half_width + 1j * sy * half_height for sx in (-1, 1) for sy in (-1, 1)])
     return pose.x + 1j * pose.y + offsets[:, None] * np.exp(1j * pose.angle) / pose.zoom
 
@@ -71,7 +71,7 @@ configs = st.builds(
         acceleration_max_px_s2=acceleration,
         rotation_max_deg=roll,
         zoom_max=zoom,
-        window_width=width,
+        sensor_width=width,
     ),
     st.floats(10, 100),
     st.floats(1, 4),

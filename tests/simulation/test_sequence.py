@@ -20,7 +20,7 @@ from polarnet.events.stream import validate
 from polarnet.simulation import MOTIONS, SENSORS, PolarizationScene, Simulation, scene_from_rgb, simulate
 from polarnet.stokes import dolp, stokes_from_intensities
 
-MOTION = replace(MOTIONS["default"], window_height=20, window_width=30, duration_s=0.2, acceleration_max_px_s2=4000.0)
+MOTION = replace(MOTIONS["default"], sensor_height=20, sensor_width=30, duration_s=0.2, acceleration_max_px_s2=4000.0)
 
 
 def picture() -> torch.Tensor:
@@ -101,7 +101,7 @@ def test_a_picture_too_small_to_move_over_is_told_which_size_would_do():
     ("changes", "message"),
     [
         ({"picture": "coffee.png"}, "picture: expected a numpy array or torch tensor of real numbers, got str"),
-        ({"motion": "default"}, r'motion: expected MotionConfig such as MOTIONS\["default"\], got'),
+        ({"motion": "default"}, r'motion: expected SynthesizeConfig such as MOTIONS\["default"\], got'),
         ({"sensor": "noisy"}, r'sensor: expected EmulatorConfig such as SENSORS\["default"\], got'),
         ({"seed": None}, "seed: expected a whole number, got None"),
     ],
@@ -125,7 +125,7 @@ def test_a_scene_that_no_light_can_make_is_refused(stokes, message):
         simulate(PolarizationScene(stokes), MOTION, SENSORS["clean"], seed=1)
 
 
-SMALL = replace(MOTION, window_height=2, window_width=2, duration_s=0.01, frame_rate_hz=100.0, speed_min_px_s=1.0)
+SMALL = replace(MOTION, sensor_height=2, sensor_width=2, duration_s=0.01, frame_rate_hz=100.0, speed_min_px_s=1.0)
 SIDES = st.one_of(st.lists(st.integers(0, 9), max_size=4), st.tuples(st.just(3), st.integers(4, 9), st.integers(4, 9)))
 DTYPES = st.one_of(
     arrays.scalar_dtypes(), arrays.unicode_string_dtypes(), arrays.byte_string_dtypes(), st.just(np.dtype(object))

@@ -15,8 +15,8 @@ from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 
 SMALL = [
-    "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.1", "synthesize.window_height=60",
-    "synthesize.window_width=90", "synthesize.speed_min_px_s=10.0", "synthesize.speed_max_px_s=20.0",
+    "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.1", "synthesize.sensor_height=60",
+    "synthesize.sensor_width=90", "synthesize.speed_min_px_s=10.0", "synthesize.speed_max_px_s=20.0",
 ]  # fmt: skip
 
 

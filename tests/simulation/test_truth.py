@@ -15,8 +15,8 @@ from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.simulation.motion import (
     HARMONICS,
-    MotionConfig,
     Sine,
+    SynthesizeConfig,
     Trajectory,
     frame_times_us,
     random_trajectory,
@@ -29,12 +29,12 @@ from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 
 SEQUENCES_PER_PART = 2
-CONFIG = MotionConfig(
+CONFIG = SynthesizeConfig(
     sequences_per_picture=2,
     duration_s=0.2,
     frame_rate_hz=30.0,
-    window_height=24,
-    window_width=36,
+    sensor_height=24,
+    sensor_width=36,
     speed_min_px_s=60.0,
     speed_max_px_s=200.0,
     acceleration_max_px_s2=2000.0,
@@ -76,7 +76,7 @@ def images(tmp_path_factory) -> Path:
     return root / "images"
 
 
-def run(images: Path, folder: Path, config: MotionConfig = CONFIG, mapper=map) -> tuple[SceneStore, FrameStore]:
+def run(images: Path, folder: Path, config: SynthesizeConfig = CONFIG, mapper=map) -> tuple[SceneStore, FrameStore]:
     synthesize(images, folder / "scenes.zarr", folder / "frames.zarr", config, 1, mapper, SEQUENCES_PER_PART)
     return SceneStore.open(folder / "scenes.zarr"), FrameStore.open(folder / "frames.zarr")
 
@@ -110,7 +110,7 @@ def test_pictures_too_small_for_the_window_are_left_out(images, stores, tmp_path
     for sequence in scenes.sequences:
         assert frames.frames(sequence).dolp.equal(stores[1].frames(sequence).dolp)
     with pytest.raises(ValueError, match=r"none of 5 pictures can be used:\n  .*: a scene of 80x120 .* is too small"):
-        run(images, tmp_path / "none", dataclasses.replace(CONFIG, window_height=80))
+        run(images, tmp_path / "none", dataclasses.replace(CONFIG, sensor_height=80))
     assert not (tmp_path / "none").exists()
 
 
@@ -213,7 +213,7 @@ def test_photographs_have_no_mask(stores):
 
 
 def test_the_number_of_threads_changes_no_bit_of_a_frame(threads_as_they_were):
-    config = dataclasses.replace(CONFIG, window_height=121, window_width=179, duration_s=0.4)
+    config = dataclasses.replace(CONFIG, sensor_height=121, sensor_width=179, duration_s=0.4)
     generator = np.random.default_rng(0)
     s0, degree, angle = torch.rand(3, 300, 400, generator=torch.Generator().manual_seed(0))
     scene = scene_from_polarization(s0, degree, math.pi * angle)
