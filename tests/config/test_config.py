@@ -52,7 +52,7 @@ def test_the_committed_values_pass(project_root):
         ("network=resnet", r"network: expected one of paper"),
         ("lpips.backbone=resnet", r"lpips\.backbone: expected one of"),
         ("train.crop=[24,90]", r"loss\.lpips: LPIPS \(alex\) needs images of 31 pixels a side, got \[24, 90\]"),
-        ("train.crop=[240,90]", r"train\.crop: expected at most the window of section synthesize, \[120, 180\]"),
+        ("train.crop=[240,90]", r"train\.crop: expected at most the sensor of section synthesize, \[120, 180\]"),
     ],
 )
 def test_a_value_out_of_range_is_refused_with_its_key_and_what_is_allowed(project_root, override, message):
