@@ -36,6 +36,7 @@ from polarnet.runtime.ranges import allowed, check_ranges
 
 COMPRESSION_LEVEL = 1  # for zstd; higher levels cost 10-100 times the time for 6 % fewer bytes
 SHARD_BYTES = 2**25  # before compression; the writer of a part keeps about this much of each column in memory
+MAX_CHUNKS_PER_SHARD = 256  # a shard ends with an index of 16 bytes for each of its chunks, used or not
 REPAIR = "write this store again, or copy it again from where it is whole"
 
 Header = dict[str, Any]
@@ -66,7 +67,7 @@ class Column:
     def shard(self) -> int:
         """Rows in a file, a multiple of `chunk`."""
         chunk_bytes = self.chunk * int(np.prod(self.shape)) * np.dtype(self.dtype).itemsize
-        return self.chunk * max(1, SHARD_BYTES // chunk_bytes)
+        return self.chunk * min(max(1, SHARD_BYTES // chunk_bytes), MAX_CHUNKS_PER_SHARD)
 
 
 Columns = Mapping[str, Column]
