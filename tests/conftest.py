@@ -13,6 +13,7 @@ import pytest
 HERE = Path(__file__).parent
 SLOWEST_FIRST = (
     "pipeline/test_stages.py",
+    "pipeline/test_dvc.py",
     "networks/test_onnx_export.py",
     "pipeline/test_interruptions.py",
     "captures/test_rig.py",
