@@ -115,7 +115,7 @@ def test_methods_may_be_chosen_and_a_limit_is_refused(photographs, project_root,
     assert run(project_root, monkeypatch, photographs, out, "--methods", "magic") == 1
     assert "magic" in capsys.readouterr().err
     assert run(project_root, monkeypatch, photographs, out, "--limit", "1") == 1
-    assert "--limit is for --event-budget and --sensitivity" in capsys.readouterr().err
+    assert "--limit applies to --event-budget and --sensitivity only" in capsys.readouterr().err
 
 
 def test_weights_that_are_not_there_are_named(photographs, project_root, tmp_path, monkeypatch, capsys):

@@ -49,7 +49,7 @@ def test_findings_say_what_was_repaired_and_how_often(tmp_path):
     lines = "\n".join(findings(inspect_recording(open_recording(tmp_path / "e.txt"), FACTOR)))
     for words in (
         "format      text: lines `t x y p`",
-        "sensor      20 x 10 px",
+        "sensor      10 x 20 px (height x width)",
         "events      3: 2 ON, 1 OFF",
         "time        4 to 3,000,000 us, 2.999996 s",
         "time jumps  1 pauses of a second or more",

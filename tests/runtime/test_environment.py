@@ -13,6 +13,7 @@ from polarnet.runtime.environment import let_threads_sleep
 IMPORT_EVERYTHING = """
 import importlib, json, os, pkgutil, sys
 import torch, numba, cv2, zarr, hydra, matplotlib.figure, OpenImageIO, scipy.optimize  # they may set what they like
+torch.set_num_threads(2)  # until it is set, the number follows the load of the machine
 REMOVED = []
 sys.addaudithook(lambda event, arguments: event in ("os.remove", "os.rename", "os.rmdir") and REMOVED.append(arguments))
 

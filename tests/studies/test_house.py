@@ -37,7 +37,7 @@ def test_a_body_counts_from_its_first_statement_to_its_last_without_the_docstrin
     [
         ("MOST_EVENTS = 6.0", "MOST_, LEAST_, LARGEST_, GREATEST_"),
         ("motion.window_height", "window for the sensor"),
-        ("panorama_share: 0.5", "mosaic for the panorama"),
+        ("mosaic_share: 0.5", "mosaic for the panorama"),
         ("    found = search(images)", "participles as names"),
         ("    kept: dict[str, int] = {}", "participles as names"),
         ('"""What the camera saw."""', "what as a noun phrase"),
