@@ -14,8 +14,8 @@ def main(config: Config) -> None:
     """Make every requested set that does not exist yet."""
     folder = Path(config.paths.sets)
     folder.mkdir(parents=True, exist_ok=True)
-    threads = threads_of(config.runtime)
-    recipe = Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads)
+    threads, size = threads_of(config.runtime), config.storage.sequences_per_part
+    recipe = Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads, size)
 
     def mapper(label: str) -> functools.partial:
         return functools.partial(pmap, workers=config.runtime.workers, label=label, address=config.cluster.address)

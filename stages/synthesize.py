@@ -13,7 +13,8 @@ def main(config: Config) -> None:
     """Make a scene from every picture and move the sensor over it."""
     mapper = functools.partial(pmap, workers=config.runtime.workers, label="synthesize", address=config.cluster.address)
     images, scenes, frames = (Path(path) for path in (config.paths.images, config.paths.scenes, config.paths.frames))
-    count = synthesize(images, scenes, frames, config.synthesize, config.seed, mapper, config.variation)
+    size = config.storage.sequences_per_part
+    count = synthesize(images, scenes, frames, config.synthesize, config.seed, mapper, size, config.variation)
     print(f"{count} sequences")
 
 

@@ -109,7 +109,7 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     from polarnet.simulation.scene import scene_from_polarization
     from polarnet.simulation.truth import frames_of
     from polarnet.storage.frames import FrameStore
-    from polarnet.storage.scenes import SceneStore
+    from polarnet.storage.scenes import Scene, SceneStore, as_stored
 
     folder = tmp_path_factory.mktemp("simulated")
     config = load(project_root)
@@ -127,17 +127,17 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
         sensor=window,
         trajectory_names=Trajectory.vector_names(),
         attributes={},
+        sequences_per_part=2,
     )
     frames = FrameStore.create(folder / "frames.zarr", list(splits), splits, len(t_us), *window, {})
-    for number, (name, picture) in enumerate(scenes.picture_of.items()):
+    for number, name in enumerate(scenes.sequences):
         generator = np.random.default_rng(number)
         coarse = torch.from_numpy(generator.random((1, 3, 12, 16), dtype=np.float32))
         s0, dolp, fraction = torch.nn.functional.interpolate(coarse, (60, 80), mode="bilinear")[0]
         trajectory = random_trajectory(motion, 60, 80, generator)
-        scenes.write_picture(picture, s0, dolp, 3.14 * fraction)
-        scenes.write(name, torch.from_numpy(trajectory.to_vector()), t_us[-1])
-        record = scenes.read(name)
-        scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
+        stored = as_stored(Scene(s0, dolp, 3.14 * fraction))
+        scenes.write(name, stored, torch.from_numpy(trajectory.to_vector()), t_us[-1])
+        scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
         frames.write(name, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *window))
     scenes.finish()
     frames.finish()

@@ -51,7 +51,8 @@ def benchmark_folder(
     used = configured(config.synthesize, config.emulate)
     differences = warnings(used, metadata_used(methods, context), SET_THEM)
     print("\n".join([sentence(used), *(f"WARNING: {line}" for line in differences)]), flush=True)
-    recipe = Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads_of(config.runtime))
+    size, threads = config.storage.sequences_per_part, threads_of(config.runtime)
+    recipe = Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads, size)
     try:
         make_folder_set(root, kind, work, recipe, functools.partial(mapper_of, config))
     except ValueError as error:

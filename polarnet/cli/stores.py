@@ -26,15 +26,16 @@ def add_to(commands: Commands) -> None:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from polarnet.storage import events as store
-    from polarnet.storage import frames, scenes
-    from polarnet.storage.table import open_group
+    from polarnet.storage.events import EventStore
+    from polarnet.storage.frames import FrameStore
+    from polarnet.storage.parts import open_group
+    from polarnet.storage.scenes import SceneStore
 
-    checks = {store.FORMAT: store.verify, frames.FORMAT: frames.verify_frames, scenes.FORMAT: scenes.verify_scenes}
+    stores = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}
     form = open_group(options.store).attrs.get("format")
-    if form not in checks:
-        raise ValueError(f"{options.store}: expected a store of {', '.join(checks)}, its format is {form!r}")
-    problems = checks[form](options.store)
+    if form not in stores:
+        raise ValueError(f"{options.store}: expected a store of {', '.join(stores)}, its format is {form!r}")
+    problems = stores[form].verify(options.store)
     for problem in problems:
         print(problem)
     if not problems:

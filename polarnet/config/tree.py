@@ -36,6 +36,7 @@ from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import MotionConfig
 from polarnet.simulation.sets import SetsConfig
 from polarnet.simulation.variation import VariationConfig
+from polarnet.storage.parts import StorageConfig
 from polarnet.training.e2p import E2pConfig
 from polarnet.training.e2v import E2vConfig
 from polarnet.training.loop import TrainConfig
@@ -116,6 +117,7 @@ class Config:
     synthesize: MotionConfig
     variation: VariationConfig
     emulate: EmulatorConfig
+    storage: StorageConfig
     network: str
     networks: NetworksConfig
     loss: LossConfig

@@ -1,4 +1,4 @@
-"""Emulation of a scene store into an event store, sequence by sequence, so that a run can stop and resume."""
+"""Emulation of a scene store into an event store, part by part, so that a run can stop and resume."""
 
 import functools
 from collections.abc import Callable, Iterable
@@ -23,14 +23,15 @@ def emulate_scenes(
     """Emulate all sequences of a scene store into an event store; returns their number.
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks
-    emulates one sequence on `threads` threads. An interrupted run of the same scenes, configuration and seed resumes
-    where it stopped.
+    emulates one part on `threads` threads. The event store has the parts of the scene store. An interrupted run of the
+    same scenes, configuration and seed makes the missing parts.
     """
     source = SceneStore.open(scenes)
     attributes = origin_of(source, config, seed)
-    store = EventStore.create(events, source.sequences, source.sensor_height, source.sensor_width, attributes)
-    task = functools.partial(_emulate_into, scenes=source, events=store, config=config, seed=seed, threads=threads)
-    for _ in mapper(task, store.missing()):
+    size = source.sensor_height, source.sensor_width
+    store = EventStore.create(events, source.sequences, *size, attributes, source.sequences_per_part)
+    task = functools.partial(_emulate_part, scenes=source, events=store, config=config, seed=seed, threads=threads)
+    for _ in mapper(task, store.missing_parts()):
         pass
     store.finish()
     return len(store.sequences)
@@ -66,8 +67,9 @@ def emulate_sequence(
     )
 
 
-def _emulate_into(
-    sequence: str, scenes: SceneStore, events: EventStore, config: EmulatorConfig, seed: int, threads: int
+def _emulate_part(
+    part: str, scenes: SceneStore, events: EventStore, config: EmulatorConfig, seed: int, threads: int
 ) -> None:
-    duration_us = scenes.duration_us(sequence)
-    events.write(sequence, emulate_sequence(scenes, sequence, config, seed, threads), duration_us)
+    for sequence in events.parts[part]:
+        channels = emulate_sequence(scenes, sequence, config, seed, threads)
+        events.write(sequence, channels, scenes.duration_us(sequence))

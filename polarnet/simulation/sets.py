@@ -58,6 +58,8 @@ class Recipe:
     seed: int
     threads: int
     """Of each task; changes no result."""
+    sequences_per_part: int
+    """Sequences in a part of a store; changes no result."""
 
 
 def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Recipe, mapper: MakeMapper) -> bool:
@@ -120,7 +122,7 @@ def _make(
     if not (images / "manifest.json").exists():
         fill(recipe, images, mapper)
     if not (scenes.exists() and frames.exists()):
-        synthesize(images, scenes, frames, recipe.motion, recipe.seed, mapper("synthesize"))
+        synthesize(images, scenes, frames, recipe.motion, recipe.seed, mapper("synthesize"), recipe.sequences_per_part)
     if not events.exists():
         emulate_scenes(scenes, events, recipe.emulate, recipe.seed, mapper("emulate"), recipe.threads)
     note.write_text(json.dumps({"key": key, "complete": True}))

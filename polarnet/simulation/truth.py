@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import hashlib
+import itertools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -28,7 +29,7 @@ from polarnet.simulation.scene import (
 )
 from polarnet.simulation.variation import VariationConfig, varied
 from polarnet.storage.frames import FrameStore
-from polarnet.storage.scenes import SceneStore, made_from, variant_name
+from polarnet.storage.scenes import Scene, SceneStore, as_stored, made_from, variant_name
 
 logger = logging.getLogger(__name__)
 
@@ -67,14 +68,16 @@ def synthesize(
     config: MotionConfig,
     seed: int,
     mapper: Callable[..., Iterable[Any]],
+    sequences_per_part: int,
     variation: VariationConfig | None = None,
 ) -> int:
     """Fill both stores with `sequences_per_picture` sequences of every scene; how many there are.
 
     A scene is a picture of `images`, or a variant of one of the training split (`variation` None: there are none).
 
-    `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`. Every trajectory depends
-    on the seed and the sequence's name alone. An interrupted run goes on where it stopped.
+    `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks makes
+    one part of the stores, `sequences_per_part` sequences. Every trajectory depends on the seed and the sequence's name
+    alone. An interrupted run makes the missing parts.
 
     Warns about every picture too small for the sensor and its motion, and makes no scene of it; ValueError where none
     is left.
@@ -86,11 +89,16 @@ def synthesize(
     if not motions:
         raise ValueError(f"none of {len(skipped)} pictures can be used:{listed(skipped)}")
     manifest = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name in motions))
-    scene_store, frame_store = _create(manifest, motions, images, scenes, frames, config, variation, seed)
-    missing = {*scene_store.missing(), *frame_store.missing()}
-    pictures = {scene_store.picture_of[sequence] for sequence in missing} | set(scene_store.missing_pictures())
+    scene_store, frame_store = _create(
+        manifest, motions, images, scenes, frames, config, variation, seed, sequences_per_part
+    )
+    missing = {*scene_store.missing_parts(), *frame_store.missing_parts()}
+    trajectories = {
+        name: t for scenes_of in motions.values() for scene in scenes_of.values() for name, t in scene.items()
+    }
+    items = [{name: trajectories[name] for name in scene_store.parts[part]} for part in sorted(missing)]
     task = functools.partial(
-        _synthesize_scene,
+        _synthesize_part,
         images=images,
         scenes=scene_store,
         frames=frame_store,
@@ -98,8 +106,7 @@ def synthesize(
         variation=variation,
         seed=seed,
     )
-    trajectories = {scene: sequences for of in motions.values() for scene, sequences in of.items()}
-    for _ in mapper(task, [(picture, trajectories[picture]) for picture in sorted(pictures)]):
+    for _ in mapper(task, items):
         pass
     scene_store.finish()
     frame_store.finish()
@@ -141,6 +148,7 @@ def _create(
     config: MotionConfig,
     variation: VariationConfig | None,
     seed: int,
+    sequences_per_part: int,
 ) -> tuple[SceneStore, FrameStore]:
     """Two unfinished stores; their attributes say what they are made from, so that only the same is resumed."""
     picture_of, splits = {}, {}
@@ -167,16 +175,19 @@ def _create(
         trajectory_names=names,
         attributes=attributes,
         masked=masked,
+        sequences_per_part=sequences_per_part,
     )
     n_frames = len(frame_times_us(config))
     frame_attributes = {**attributes, "scenes": picture_of}
-    frame_store = FrameStore.create(frames, list(picture_of), splits, n_frames, *sensor, frame_attributes, masked)
+    frame_store = FrameStore.create(
+        frames, list(picture_of), splits, n_frames, *sensor, frame_attributes, masked, sequences_per_part
+    )
     return scene_store, frame_store
 
 
 @one_thread()
-def _synthesize_scene(
-    item: tuple[str, Mapping[str, Trajectory]],
+def _synthesize_part(
+    trajectories: Mapping[str, Trajectory],
     images: Path,
     scenes: SceneStore,
     frames: FrameStore,
@@ -184,24 +195,31 @@ def _synthesize_scene(
     variation: VariationConfig | None,
     seed: int,
 ) -> None:
-    """Write one picture, or a variant of it, and all its sequences, whose motions come with it."""
-    picture, trajectories = item
+    """Write the part of both stores that holds the sequences of these trajectories."""
+    t_us = frame_times_us(config)
+    for picture, sequences in itertools.groupby(trajectories, scenes.picture_of.__getitem__):
+        planes = _planes_of(picture, images, variation, seed)
+        if not scenes.masked:
+            planes = planes._replace(valid=None)
+        scene = scene_from_polarization(planes.s0, planes.dolp, planes.aolp)
+        for sequence in sequences:
+            trajectory = trajectories[sequence]
+            scenes.write(sequence, planes, torch.from_numpy(trajectory.to_vector()), t_us[-1])
+            seen = frames_of(scene, trajectory, t_us, config.window_height, config.window_width)
+            known = None
+            if planes.valid is not None:
+                known = valid_frames(planes.valid, trajectory, t_us, config.window_height, config.window_width)
+            frames.write(sequence, torch.tensor(t_us), *seen, known)
+
+
+def _planes_of(picture: str, images: Path, variation: VariationConfig | None, seed: int) -> Scene:
+    """A picture in polarization, or a variant of one, quantised: the scene that is emulated, and so the truth."""
     source = made_from(picture)
     polarization, valid = _read_polarization(images, source)
     if variation and source != picture:
         polarization = varied(polarization, variation, generator_for(seed, picture, "variation"))
     s0, dolp, aolp = polarization
-    scenes.write_picture(picture, s0, dolp, aolp, valid if scenes.masked else None)
-    t_us = frame_times_us(config)
-    for sequence, trajectory in trajectories.items():
-        scenes.write(sequence, torch.from_numpy(trajectory.to_vector()), t_us[-1])
-        record = scenes.read(sequence)  # quantised: the scene that is emulated, and so the truth
-        scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
-        seen = frames_of(scene, trajectory, t_us, config.window_height, config.window_width)
-        known = None
-        if record.valid is not None:
-            known = valid_frames(record.valid, trajectory, t_us, config.window_height, config.window_width)
-        frames.write(sequence, torch.tensor(t_us), *seen, known)
+    return as_stored(Scene(s0, dolp, aolp, valid))
 
 
 def _read_polarization(images: Path, picture: str) -> tuple[Float[Tensor, "3 h w"], Bool[Tensor, "h w"] | None]:

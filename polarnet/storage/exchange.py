@@ -115,6 +115,7 @@ def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -
         "height": store.height,
         "width": store.width,
         "polarizer_angles_deg": POLARIZER_ANGLES_DEG,
+        "sequences_per_part": store.sequences_per_part,
         "duration_us": {sequence: store.duration_us(sequence) for sequence in store.sequences},
         "attributes": store.attributes,
     }
@@ -133,7 +134,8 @@ def import_store(folder: str | os.PathLike[str], path: str | os.PathLike[str]) -
         raise FileNotFoundError(f"{folder}: expected a folder that export_store wrote, it has no {CONTENTS}") from None
     suffix, _, read = _form(contents["form"])
     durations = contents["duration_us"]
-    store = EventStore.create(path, list(durations), contents["height"], contents["width"], contents["attributes"])
+    size, attributes = (contents["height"], contents["width"]), contents["attributes"]
+    store = EventStore.create(path, list(durations), *size, attributes, contents["sequences_per_part"])
     for sequence in store.missing():
         store.write(sequence, [read(file) for file in _files(folder / sequence, suffix)], durations[sequence])
     store.finish()

@@ -20,10 +20,7 @@ from polarnet.runtime.arrays import (
     mask_of,
     whole_numbers,
 )
-from polarnet.storage.table import Column, Columns, Table, check_names, create_table, open_table, refuse_missing
-
-FORMAT = "polarnet.frames"
-VERSION = 1
+from polarnet.storage.parts import Column, Columns, Header, Store
 
 SPLITS = ("train", "val", "test")
 FRACTION_STEPS = 2**16 - 1
@@ -31,7 +28,7 @@ ANGLE_STEPS = 2**16
 FRAMES_A_CHUNK = 32
 
 CONVENTIONS = {
-    "t_us": "microseconds from the start of the sequence; -1 after its last frame",
+    "t_us": "microseconds from the start of the sequence",
     "intensity": "behind polarizers at 0, 45, 90 and 135 degrees (third axis), with I0 + I90 = S0: value / 65535",
     "dolp": "degree of linear polarization: value / 65535",
     "aolp": "angle of linear polarization in radians, [0, pi): value * pi / 65536",
@@ -86,20 +83,43 @@ def unpack_mask(packed: UInt8[np.ndarray, "*b h bytes"], width: int) -> Bool[Ten
     return torch.from_numpy(np.unpackbits(packed, axis=-1, count=width).astype(bool))
 
 
-class FrameStore:
+class SplitStore(Store):
+    """A store whose sequences are each in the split train, val or test."""
+
+    def __init__(self, path: str, header: Header):
+        super().__init__(path, header)
+        self.splits: dict[str, str] = dict(zip(self.sequences, header["splits"], strict=True))
+
+    def of_split(self, split: str) -> list[str]:
+        """The sequences of `train`, `val` or `test`, in the store's order; ValueError for another split."""
+        if split not in SPLITS:
+            raise ValueError(f"expected a split of {', '.join(SPLITS)}, got {split!r}")
+        return [name for name in self.sequences if self.splits[name] == split]
+
+
+class FrameStore(SplitStore):
     """Frames of sequences, each in the split train, val or test; see `create` and `open`."""
 
-    def __init__(self, table: Table):
-        self._table = table
-        self.path = table.path
-        self.sequences: list[str] = list(table.attributes["sequences"])
-        self.splits: dict[str, str] = dict(zip(self.sequences, table.attributes["splits"], strict=True))
-        self.height: int = table.attributes["height"]
-        self.width: int = table.attributes["width"]
-        self.masked: bool = "valid" in table.columns
+    FORMAT = "polarnet.frames"
+    VERSION = 2
+
+    def __init__(self, path: str, header: Header):
+        super().__init__(path, header)
+        self.height: int = header["height"]
+        self.width: int = header["width"]
+        self.masked: bool = header["masked"]
         """Whether the store marks pixels whose truth is unknown."""
-        self.attributes: dict[str, Any] = table.attributes["attributes"]
-        """Metadata given by the store's creator."""
+
+    @classmethod
+    def columns_of(cls, header: Header) -> Columns:
+        """Times and images; the masks only where some pixels are masked."""
+        height, width, chunk = header["height"], header["width"], min(header["n_frames"], FRAMES_A_CHUNK)
+        shapes = {"intensity": (4, height, width), "dolp": (height, width), "aolp": (height, width)}
+        columns = {name: Column("frames", "uint16", chunk, shape) for name, shape in shapes.items()}
+        columns["t_us"] = Column("frames", "int64", chunk)
+        if header["masked"]:
+            columns["valid"] = Column("frames", "uint8", chunk, (height, -(-width // 8)))
+        return columns
 
     @classmethod
     def create(
@@ -112,31 +132,23 @@ class FrameStore:
         width: int,
         attributes: Mapping[str, Any],
         masked: bool = False,
+        sequences_per_part: int = 1,
     ) -> "FrameStore":
         """Create a store for up to `n_frames` per sequence; it lies at PATH.tmp until it is finished.
 
         `splits` maps each sequence to train, val or test. A `masked` store records for every pixel whether its truth is
         known; other stores have no mask. Resumes as `EventStore.create` does.
         """
-        check_names(sequences)
         check_splits(sequences, splits)
         metadata = {
-            "sequences": list(sequences),
             "splits": [splits[sequence] for sequence in sequences],
             "n_frames": n_frames,
             "height": height,
             "width": width,
-            "conventions": CONVENTIONS,
-            "attributes": dict(attributes),
+            "masked": masked,
+            "conventions": {**CONVENTIONS, "valid": MASK_CONVENTION} if masked else CONVENTIONS,
         }
-        if masked:
-            metadata |= {"masked": True, "conventions": {**CONVENTIONS, "valid": MASK_CONVENTION}}
-        return cls(create_table(path, FORMAT, VERSION, metadata, _columns(metadata)))
-
-    @classmethod
-    def open(cls, path: str | os.PathLike[str]) -> "FrameStore":
-        """Open a finished store: a local folder, a zip, or an fsspec URL. See `polarnet.storage.table.open_table`."""
-        return cls(open_table(path, FORMAT, VERSION, _columns))
+        return cls.create_parts(path, sequences, attributes, sequences_per_part, **metadata)
 
     def write(
         self,
@@ -147,7 +159,7 @@ class FrameStore:
         aolp: Float[Array, "n h w"],
         valid: Bool[Array, "n h w"] | None = None,
     ) -> None:
-        """Write the frames of a sequence; a sequence that is already written stays unchanged.
+        """Write the frames of the next sequence of a part; a sequence that is already written stays unchanged.
 
         Arrays may be numpy or torch. TypeError for anything but an array. ValueError for values out of range or not
         finite, integer intensities, wrong shapes, times that do not increase, or a mask in a store without one. A mask
@@ -156,82 +168,50 @@ class FrameStore:
         t_us = self._checked_times(t_us)
         self._check_shapes(len(t_us), intensity, dolp, aolp)
         known = self._checked_mask(valid, dolp.shape)
-        if self._table.is_written("t_us", sequence):
-            return
-        values = {
+        columns = {
+            "t_us": t_us.numpy(),
             "intensity": quantise_fraction(intensity, "intensity"),
             "dolp": quantise_fraction(dolp, "dolp"),
             "aolp": quantise_angle(aolp, "aolp"),
+            **({"valid": pack_mask(known)} if self.masked else {}),
         }
-        for name, steps in values.items():
-            self._table.write(name, sequence, steps)
-        if self.masked:
-            self._table.write("valid", sequence, pack_mask(known))
-        self._table.write("t_us", sequence, t_us.numpy())
-
-    def missing(self) -> list[str]:
-        """Sequences not written yet."""
-        return [sequence for sequence in self.sequences if not self._table.is_written("t_us", sequence)]
-
-    def finish(self) -> None:
-        """Mark the store complete and move it from PATH.tmp to PATH; ValueError where sequences are missing."""
-        refuse_missing(self.path, self.missing())
-        self._table.finish({})
-
-    def of_split(self, split: str) -> list[str]:
-        """The sequences of `train`, `val` or `test`, in the store's order."""
-        return names_of_split(self.splits, split)
+        if not self.is_written(sequence):
+            self.append(sequence, columns, {})
 
     def t_us(self, sequence: str) -> Int64[Tensor, " n"]:
         """Times of a sequence's frames, in microseconds from its start."""
-        t_us = self._table.read("t_us", sequence)
-        return torch.from_numpy(t_us[t_us >= 0])
+        return torch.from_numpy(self.read_column("t_us", sequence))
 
     def intensity(self, sequence: str) -> Float[Tensor, "n 4 h w"]:
         """Intensities behind the polarizers at 0, 45, 90 and 135 degrees."""
-        return dequantise_fraction(self._read("intensity", sequence))
+        return dequantise_fraction(self.read_column("intensity", sequence))
 
     def dolp(self, sequence: str) -> Float[Tensor, "n h w"]:
         """Degree of linear polarization, [0, 1]."""
-        return dequantise_fraction(self._read("dolp", sequence))
+        return dequantise_fraction(self.read_column("dolp", sequence))
 
     def aolp(self, sequence: str) -> Float[Tensor, "n h w"]:
         """Angle of linear polarization in radians, [0, pi)."""
-        return dequantise_angle(self._read("aolp", sequence))
+        return dequantise_angle(self.read_column("aolp", sequence))
 
     def valid(self, sequence: str) -> Bool[Tensor, "n h w"] | None:
         """Where the truth is known; None: everywhere."""
-        return unpack_mask(self._read("valid", sequence), self.width) if self.masked else None
+        return unpack_mask(self.read_column("valid", sequence), self.width) if self.masked else None
 
     def frames(self, sequence: str) -> Frames:
         """All frames of a sequence."""
-        t_us = self.t_us(sequence)
-        window = (slice(len(t_us)),)
-        names = ["intensity", "dolp", "aolp", *(["valid"] if self.masked else [])]
-        intensity, dolp, aolp, *packed = self._table.read_together([(name, sequence, window) for name in names])
+        names = ["t_us", "intensity", "dolp", "aolp", *(["valid"] if self.masked else [])]
+        t_us, intensity, dolp, aolp, *packed = self.read_columns(sequence, [(name, 0, None) for name in names])
         return Frames(
-            t_us,
+            torch.from_numpy(t_us),
             dequantise_fraction(intensity),
             dequantise_fraction(dolp),
             dequantise_angle(aolp),
             unpack_mask(packed[0], self.width) if packed else None,
         )
 
-    def problems(self, sequence: str) -> list[str]:
-        """Messages about damaged or missing data of a sequence."""
-        problems = []
-        for read in (self.t_us, self.intensity, self.dolp, self.aolp, self.valid):
-            try:
-                read(sequence)
-            except ValueError as error:
-                problems.append(str(error))
-        return problems
-
-    def _read(self, name: str, sequence: str) -> np.ndarray:
-        return self._table.read(name, sequence, slice(len(self.t_us(sequence))))
-
     def _checked_times(self, t_us: Integer[Array, " n"]) -> Int64[Tensor, " n"]:
-        times, most = whole_numbers("t_us", t_us), self._table.columns["t_us"].shape[0]
+        times, most = whole_numbers("t_us", t_us), self.header["n_frames"]
         if times.ndim != 1 or not 0 < len(times) <= most or (times < 0).any() or (times.diff() <= 0).any():
             raise ValueError(f"expected 1 to {most} frame times, increasing from 0 or later, got {times.tolist()[:40]}")
         return times
@@ -253,59 +233,3 @@ def check_splits(names: Sequence[str], splits: Mapping[str, str]) -> None:
     for name in names:
         if splits.get(name) not in SPLITS:
             raise ValueError(f"expected {name} in one of the splits {', '.join(SPLITS)}, got {splits.get(name)!r}")
-
-
-def names_of_split(splits: Mapping[str, str], split: str) -> list[str]:
-    """The names in `split`, in their order; ValueError unless `split` is train, val or test."""
-    if split not in SPLITS:
-        raise ValueError(f"expected a split of {', '.join(SPLITS)}, got {split!r}")
-    return [name for name, its_split in splits.items() if its_split == split]
-
-
-def verify_frames(path: str | os.PathLike[str]) -> list[str]:
-    """All problems of a frame store, each with its sequence and column; empty when it is intact."""
-    try:
-        store = FrameStore.open(path)
-    except (FileNotFoundError, ValueError) as error:
-        return [str(error)]
-    return store._table.metadata_problems() + [problem for name in store.sequences for problem in store.problems(name)]
-
-
-def _columns(metadata: Mapping[str, Any]) -> Columns:
-    n, size = metadata["n_frames"], (metadata["height"], metadata["width"])
-    together = min(n, FRAMES_A_CHUNK)
-    whole = -(-n // together) * together
-
-    def pictures(*channels: int) -> Column:
-        return Column(
-            metadata["sequences"],
-            (n, *channels, *size),
-            (together, *channels, *size),
-            (whole, *channels, *size),
-            "uint16",
-            fill=0,
-            fill_is_data=True,
-            shuffle="bitshuffle",
-        )
-
-    columns = {
-        "intensity": pictures(4),
-        "dolp": pictures(),
-        "aolp": pictures(),
-        "t_us": Column(
-            metadata["sequences"], (n,), (n,), (n,), "int64", fill=-1, fill_is_data=False, shuffle="shuffle"
-        ),
-    }
-    if metadata.get("masked"):
-        row = (size[0], -(-size[1] // 8))
-        columns["valid"] = Column(
-            metadata["sequences"],
-            (n, *row),
-            (together, *row),
-            (whole, *row),
-            "uint8",
-            fill=0,
-            fill_is_data=True,
-            shuffle="bitshuffle",
-        )
-    return columns

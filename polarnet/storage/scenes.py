@@ -15,20 +15,19 @@ from torch import Tensor
 
 from polarnet.runtime.arrays import Array, as_tensor, check_same_shape, check_shape, mask_of
 from polarnet.storage.frames import (
+    SplitStore,
     check_splits,
     dequantise_angle,
     dequantise_fraction,
-    names_of_split,
     quantise_angle,
     quantise_fraction,
 )
-from polarnet.storage.table import Column, Columns, Table, check_names, create_table, open_table, refuse_missing
+from polarnet.storage.parts import Column, Columns, Header
 
-FORMAT = "polarnet.scenes"
-VERSION = 1
+CHUNK = 2**18  # pixels
 
 CONVENTIONS = {
-    "s0": "intensity of a picture in the upper left corner of its row: value / 65535",
+    "s0": "intensity of a picture, row by row: value / 65535",
     "dolp": "degree of linear polarization: value / 65535",
     "aolp": "angle of linear polarization in radians, [0, pi): value * pi / 65536",
     "picture_size": "height and width of a picture in pixels",
@@ -73,24 +72,40 @@ class SceneRecord(NamedTuple):
     """Where the light is known; None: everywhere."""
 
 
-class SceneStore:
-    """Pictures in polarization and the sequences that move over them; see `create` and `open`."""
+class Scene(NamedTuple):
+    """Polarization over an area larger than the sensor."""
 
-    def __init__(self, table: Table):
-        self._table = table
-        self.path = table.path
-        metadata = table.attributes
-        self.sequences: list[str] = list(metadata["sequences"])
-        self.picture_of: dict[str, str] = dict(zip(self.sequences, metadata["picture_of_sequence"], strict=True))
-        self.splits: dict[str, str] = dict(zip(self.sequences, metadata["splits"], strict=True))
-        self.pictures: list[str] = list(metadata["pictures"])
-        self.sensor_height: int = metadata["window_height"]
-        self.sensor_width: int = metadata["window_width"]
-        self.trajectory_names: list[str] = list(metadata["trajectory"])
-        self.masked: bool = "valid" in table.columns
-        """Whether there may be pixels whose light is not known."""
-        self.attributes: dict[str, Any] = metadata["attributes"]
-        """What whoever created the store said about it."""
+    s0: Float[Tensor, "h w"]
+    dolp: Float[Tensor, "h w"]
+    aolp: Float[Tensor, "h w"]
+    valid: Bool[Tensor, "h w"] | None = None
+    """Where the light is known; None: everywhere."""
+
+
+class SceneStore(SplitStore):
+    """Pictures in polarization and the sequences that move over them; see `create` and `open`.
+
+    A part holds the pictures of its sequences, each once.
+    """
+
+    FORMAT = "polarnet.scenes"
+    VERSION = 2
+
+    def __init__(self, path: str, header: Header):
+        super().__init__(path, header)
+        self.picture_of: dict[str, str] = dict(zip(self.sequences, header["picture_of_sequence"], strict=True))
+        self.pictures: list[str] = sorted(set(self.picture_of.values()))
+        self.sensor_height: int = header["window_height"]
+        self.sensor_width: int = header["window_width"]
+        self.trajectory_names: list[str] = header["trajectory"]
+        self.masked: bool = header["masked"]
+        """Whether the store marks pixels whose light is unknown."""
+
+    @classmethod
+    def columns_of(cls, header: Header) -> Columns:
+        """Planes of the pictures; the mask only where some pixels are masked."""
+        types = {"s0": "uint16", "dolp": "uint16", "aolp": "uint16", **({"valid": "uint8"} if header["masked"] else {})}
+        return {name: Column("pixels", dtype, CHUNK) for name, dtype in types.items()}
 
     @classmethod
     def create(
@@ -104,153 +119,122 @@ class SceneStore:
         trajectory_names: Sequence[str],
         attributes: Mapping[str, Any],
         masked: bool = False,
+        sequences_per_part: int = 1,
     ) -> "SceneStore":
-        """A store to write, at PATH.tmp until it is finished, with a row for each sequence and one for each picture.
+        """Create a store to write; it lies at PATH.tmp until it is finished.
 
         `picture_of` maps each sequence to its picture, `splits` each sequence to train, val or test; ValueError where
         two sequences of one picture are in different splits. `largest_picture` and `sensor` are (height, width) in
-        pixels. A `masked` store says of every pixel whether its light is known. Resumes as `EventStore.create` does.
+        pixels. A `masked` store records which pixels have known light. Resumes as `EventStore.create` does.
         """
         sequences = list(picture_of)
-        pictures = sorted(set(picture_of.values()))
-        check_names(sequences)
         check_splits(sequences, splits)
         _check_no_leak(picture_of, splits)
         metadata = {
-            "sequences": sequences,
             "picture_of_sequence": [picture_of[sequence] for sequence in sequences],
             "splits": [splits[sequence] for sequence in sequences],
-            "pictures": pictures,
             "largest_picture": list(largest_picture),
             "window_height": sensor[0],
             "window_width": sensor[1],
             "trajectory": list(trajectory_names),
-            "conventions": CONVENTIONS,
-            "attributes": dict(attributes),
+            "masked": masked,
+            "conventions": {**CONVENTIONS, "valid": MASK_CONVENTION} if masked else CONVENTIONS,
         }
-        if masked:
-            metadata |= {"masked": True, "conventions": {**CONVENTIONS, "valid": MASK_CONVENTION}}
-        return cls(create_table(path, FORMAT, VERSION, metadata, _columns(metadata)))
+        return cls.create_parts(path, sequences, attributes, sequences_per_part, **metadata)
 
-    @classmethod
-    def open(cls, path: str | os.PathLike[str]) -> "SceneStore":
-        """A finished store: a local folder, a zip, or an fsspec URL. See `polarnet.storage.table.open_table`."""
-        return cls(open_table(path, FORMAT, VERSION, _columns))
+    def write(self, sequence: str, scene: Scene, trajectory: Float64[Array, " k"], duration_us: int) -> None:
+        """Write the scene and the trajectory of the next sequence of a part; see `Store.append`.
 
-    def write_picture(
-        self,
-        picture: str,
-        s0: Float[Array, "h w"],
-        dolp: Float[Array, "h w"],
-        aolp: Float[Array, "h w"],
-        valid: Bool[Array, "h w"] | None = None,
-    ) -> None:
-        """Put a picture in its row; one that is there already stays as it is. `valid` None: all its light is known.
+        A sequence that is already written stays unchanged. Sequences of one picture share its pixels in a part.
 
-        Arrays may be numpy or torch. Raises TypeError for what is no array, and ValueError for values out of range or
-        not finite, integers, planes of different shapes, a picture of a size that cannot be, or a mask in a store that
-        has none.
+        Arrays may be numpy or torch. TypeError for anything but an array. ValueError for values out of range or not
+        finite, integers, planes of different shapes, a picture of an impossible size, or a mask in a store without one.
         """
-        planes = {name: as_tensor(name, plane) for name, plane in (("s0", s0), ("dolp", dolp), ("aolp", aolp))}
-        for name, plane in planes.items():
-            check_shape(name, plane, "height width")
-        check_same_shape(planes)
-        if valid is not None and (not self.masked or valid.shape != s0.shape):
-            raise ValueError(
-                f"{picture}: expected a mask of {tuple(s0.shape)} in a store created with masked=True, "
-                f"got one of {tuple(valid.shape)}, masked={self.masked}"
-            )
-        height, width = self._table.columns["s0"].shape
-        if not (self.sensor_height <= s0.shape[0] <= height and self.sensor_width <= s0.shape[1] <= width):
-            raise ValueError(
-                f"{picture}: expected a picture between the sensor's {self.sensor_height}x{self.sensor_width} px and "
-                f"{height}x{width} px, got {s0.shape[0]}x{s0.shape[1]}"
-            )
-        rows = {
-            "s0": quantise_fraction(s0, "s0"),
-            "dolp": quantise_fraction(dolp, "dolp"),
-            "aolp": quantise_angle(aolp, "aolp"),
-        }
-        if self._table.is_written("picture_size", picture):
-            return
-        if self.masked:
-            known = (
-                torch.ones(tuple(s0.shape), dtype=torch.bool) if valid is None else mask_of("valid", valid, s0.shape)
-            )
-            rows["valid"] = known.cpu().numpy().astype(np.uint8)
-        for name, steps in rows.items():
-            self._table.write(name, picture, steps)
-        self._table.write("picture_size", picture, np.array(s0.shape))
-
-    def write(self, sequence: str, trajectory: Float64[Array, " k"], duration_us: int) -> None:
-        """Put the trajectory of a sequence in its row, if it is not there yet; its picture may come before or after."""
         names, trajectory = self.trajectory_names, as_tensor("trajectory", trajectory)
         if len(trajectory) != len(names) or not trajectory.isfinite().all():
             raise ValueError(f"{sequence}: expected {len(names)} finite numbers ({', '.join(names)}), got {trajectory}")
         if duration_us <= 0:
             raise ValueError(f"{sequence}: expected a duration above 0 us, got {duration_us}")
-        if self._table.is_written("trajectory", sequence):
+        if self.is_written(sequence):
             return
-        self._table.write("duration_us", sequence, np.array(duration_us))
-        self._table.write("trajectory", sequence, trajectory.numpy())
-
-    def missing(self) -> list[str]:
-        """Sequences whose trajectory is not written yet."""
-        return [sequence for sequence in self.sequences if not self._table.is_written("trajectory", sequence)]
-
-    def missing_pictures(self) -> list[str]:
-        """Pictures that are not written yet."""
-        return [picture for picture in self.pictures if not self._table.is_written("picture_size", picture)]
-
-    def finish(self) -> None:
-        """Mark the store complete and move it from PATH.tmp to PATH; ValueError where anything is missing."""
-        refuse_missing(self.path, self.missing() + self.missing_pictures())
-        self._table.finish({})
-
-    def of_split(self, split: str) -> list[str]:
-        """The sequences of `train`, `val` or `test`, in the store's order."""
-        return names_of_split(self.splits, split)
+        record = {
+            "trajectory": trajectory.tolist(),
+            "duration_us": int(duration_us),
+            "picture_size": list(scene.s0.shape),
+        }
+        columns = {}
+        for name, written in self.records_so_far(sequence).items():
+            if self.picture_of[name] == self.picture_of[sequence]:
+                record["pixels"] = written["pixels"]
+        if "pixels" not in record:
+            columns = self._pixels(self.picture_of[sequence], scene)
+        self.append(sequence, columns, record)
 
     def read(self, sequence: str) -> SceneRecord:
         """Everything about one sequence; ValueError that names the column of damaged data."""
-        trajectory = torch.from_numpy(self._table.read("trajectory", sequence))
-        picture = self.picture_of[sequence]
-        height, width = self._table.read("picture_size", picture).tolist()
-        names = ["s0", "dolp", "aolp", *(["valid"] if self.masked else [])]
-        s0, dolp, aolp, *valid = (self._table.read(name, picture, slice(height), slice(width)) for name in names)
+        record, names = self.record(sequence), list(self.columns)
+        s0, dolp, aolp, *valid = (
+            pixels.reshape(record["picture_size"])
+            for pixels in self.read_columns(sequence, [(name, 0, None) for name in names])
+        )
         return SceneRecord(
             sequence,
-            picture,
+            self.picture_of[sequence],
             self.splits[sequence],
             dequantise_fraction(s0),
             dequantise_fraction(dolp),
             dequantise_angle(aolp),
-            trajectory,
-            self.duration_us(sequence),
+            torch.tensor(record["trajectory"], dtype=torch.float64),
+            record["duration_us"],
             torch.from_numpy(valid[0] == 1) if valid else None,
         )
 
     def duration_us(self, sequence: str) -> int:
         """Length of a sequence in microseconds."""
-        return int(self._table.read("duration_us", sequence))
+        return self.record(sequence)["duration_us"]
 
-    def problems(self, sequence: str) -> list[str]:
-        """Damaged or missing data of a sequence or of its picture: the first found."""
-        try:
-            self.read(sequence)
-        except ValueError as error:
-            return [str(error)]
-        return []
+    def _pixels(self, picture: str, scene: Scene) -> dict[str, np.ndarray]:
+        """The columns of a picture; ValueError for a scene that the store cannot hold."""
+        planes = {name: as_tensor(name, getattr(scene, name)) for name in ("s0", "dolp", "aolp")}
+        for name, plane in planes.items():
+            check_shape(name, plane, "height width")
+        check_same_shape(planes)
+        size, valid = tuple(scene.s0.shape), scene.valid
+        if valid is not None and (not self.masked or valid.shape != size):
+            raise ValueError(
+                f"{picture}: expected a mask of {size} in a store created with masked=True, "
+                f"got one of {tuple(valid.shape)}, masked={self.masked}"
+            )
+        height, width = self.header["largest_picture"]
+        if not (self.sensor_height <= size[0] <= height and self.sensor_width <= size[1] <= width):
+            raise ValueError(
+                f"{picture}: expected a picture between the sensor's {self.sensor_height}x{self.sensor_width} px and "
+                f"{height}x{width} px, got {size[0]}x{size[1]}"
+            )
+        rows = _quantised(scene)
+        if self.masked:
+            known = torch.ones(size, dtype=torch.bool) if valid is None else mask_of("valid", valid, size)
+            rows["valid"] = known.cpu().numpy().astype(np.uint8)
+        return {name: values.ravel() for name, values in rows.items()}
 
 
-def verify_scenes(path: str | os.PathLike[str]) -> list[str]:
-    """Everything that is wrong with a scene store, each with its sequence or picture and column; empty when whole."""
-    try:
-        store = SceneStore.open(path)
-    except (FileNotFoundError, ValueError) as error:
-        return [str(error)]
-    problems = [problem for name in store.sequences for problem in store.problems(name)]
-    return store._table.metadata_problems() + list(dict.fromkeys(problems))  # a picture has several sequences
+def as_stored(scene: Scene) -> Scene:
+    """The scene as a store gives it back, quantised."""
+    steps = _quantised(scene)
+    s0, dolp, aolp = (
+        dequantise_fraction(steps["s0"]),
+        dequantise_fraction(steps["dolp"]),
+        dequantise_angle(steps["aolp"]),
+    )
+    return Scene(s0, dolp, aolp, scene.valid)
+
+
+def _quantised(scene: Scene) -> dict[str, np.ndarray]:
+    return {
+        "s0": quantise_fraction(scene.s0, "s0"),
+        "dolp": quantise_fraction(scene.dolp, "dolp"),
+        "aolp": quantise_angle(scene.aolp, "aolp"),
+    }
 
 
 def _check_no_leak(picture_of: Mapping[str, str], splits: Mapping[str, str]) -> None:
@@ -261,24 +245,3 @@ def _check_no_leak(picture_of: Mapping[str, str], splits: Mapping[str, str]) -> 
                 f"picture {picture} would be in the splits {split_of_picture[picture]} and {splits[sequence]}; "
                 "put all sequences of a picture in one"
             )
-
-
-def _columns(metadata: Mapping[str, Any]) -> Columns:
-    size = tuple(metadata["largest_picture"])
-    numbers = (len(metadata["trajectory"]),)
-
-    def plane(dtype: str = "uint16") -> Column:
-        return Column(metadata["pictures"], size, size, size, dtype, fill=0, fill_is_data=True, shuffle="bitshuffle")
-
-    def row(names: Sequence[str], shape: tuple[int, ...], dtype: str, fill: int | float) -> Column:
-        return Column(names, shape, shape, shape, dtype, fill, fill_is_data=False, shuffle="shuffle")
-
-    return {
-        "s0": plane(),
-        "dolp": plane(),
-        "aolp": plane(),
-        **({"valid": plane("uint8")} if metadata.get("masked") else {}),
-        "picture_size": row(metadata["pictures"], (2,), "int64", -1),
-        "duration_us": row(metadata["sequences"], (), "int64", -1),
-        "trajectory": row(metadata["sequences"], numbers, "float64", float("nan")),
-    }

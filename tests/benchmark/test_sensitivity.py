@@ -39,7 +39,7 @@ def stores(tmp_path_factory, config):
         "leaf", "leaf.png", "test", "dead_leaves", "", None, None, "0" * 64, 8, 200, 300, 200, 300, None
     )
     write_manifest(Manifest((entry,), (), 0, 0), images)
-    synthesize(images, root / "scenes.zarr", root / "frames.zarr", config.synthesize, config.seed, map)
+    synthesize(images, root / "scenes.zarr", root / "frames.zarr", config.synthesize, config.seed, map, 2)
     emulate_scenes(root / "scenes.zarr", root / "events.zarr", config.emulate, config.seed, map, 1)
     opened = SceneStore.open(root / "scenes.zarr"), FrameStore.open(root / "frames.zarr")
     return *opened, EventStore.open(root / "events.zarr")

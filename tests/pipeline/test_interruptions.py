@@ -24,7 +24,9 @@ import torch
 from preloaded import FORKSERVER
 from skimage import data
 
-SEQUENCES = 10
+SEQUENCES = 20
+SEQUENCES_PER_PART = 2
+PARTS = 10
 KILLS = 10
 PATIENCE_S = 120.0
 SEED = 20
@@ -40,11 +42,11 @@ class Running(NamedTuple):
 
 @pytest.fixture(scope="module")
 def folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data folder whose scenes are ten motions of a window over the coffee photograph."""
+    """A data folder whose scenes are twenty motions of a window over the coffee photograph."""
     from polarnet.config.tree import load
     from polarnet.simulation.motion import MotionConfig, Trajectory, random_trajectory
     from polarnet.simulation.scene import polarization_from_rgb
-    from polarnet.storage.scenes import SceneStore
+    from polarnet.storage.scenes import Scene, SceneStore
 
     motion: MotionConfig = load(
         project_root, ["synthesize.window_height=60", "synthesize.window_width=90", "synthesize.duration_s=0.5"]
@@ -60,11 +62,12 @@ def folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
         sensor=(motion.window_height, motion.window_width),
         trajectory_names=Trajectory.vector_names(),
         attributes={},
+        sequences_per_part=SEQUENCES_PER_PART,
     )
-    scenes.write_picture("coffee", *polarization_from_rgb(picture))
     for number, name in enumerate(names):
         trajectory = random_trajectory(motion, 200, 300, np.random.default_rng(number))
-        scenes.write(name, torch.from_numpy(trajectory.to_vector()), round(1e6 * motion.duration_s))
+        vector, scene = torch.from_numpy(trajectory.to_vector()), Scene(*polarization_from_rgb(picture))
+        scenes.write(name, scene, vector, round(1e6 * motion.duration_s))
     scenes.finish()
     return folder
 
@@ -121,15 +124,15 @@ def digest(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def finished(unfinished: Path) -> set[int]:
-    """Numbers of the sequences that are whole: their offsets are written last."""
-    return {int(path.name) for path in (unfinished / "offsets" / "c").glob("[0-9]*") if any(path.rglob("0"))}
+def finished(unfinished: Path) -> set[str]:
+    """Names of the parts that are whole: a part gets its name last."""
+    return {path.name for path in unfinished.glob("part-[0-9][0-9][0-9][0-9][0-9]")}
 
 
-def identities(store: Path, numbers: set[int]) -> dict[str, tuple[int, int]]:
-    """Inode and time of every file of these sequences: another one if it is written again, even with equal bytes."""
-    chunks = [path for number in numbers for path in store.rglob(f"c/{number}/**/*") if path.is_file()]
-    return {str(path.relative_to(store)): (path.stat().st_ino, path.stat().st_mtime_ns) for path in chunks}
+def identities(store: Path) -> dict[str, tuple[int, int]]:
+    """Inode and time of every file of the finished parts: another one if written again, even with equal bytes."""
+    files = [path for part in finished(store) for path in (store / part).rglob("*") if path.is_file()]
+    return {str(path.relative_to(store)): (path.stat().st_ino, path.stat().st_mtime_ns) for path in files}
 
 
 def until(true: Callable[[], bool], still_worth_it: Callable[[], bool] = lambda: True) -> None:
@@ -156,14 +159,14 @@ def undisturbed(folder: Path, start_forked: Callable[[list[str]], Running]) -> U
     until(lambda: bool(finished(events.with_name("events.zarr.tmp"))))
     first = time.monotonic()
     assert running.wait() == 0
-    return Undisturbed(digest(events), first - start, (time.monotonic() - first) / (SEQUENCES - 1))
+    return Undisturbed(digest(events), first - start, (time.monotonic() - first) / (PARTS - 1))
 
 
 @pytest.mark.parametrize("start", ["start_forked", "start_cold"])
-def test_ten_deaths_at_random_moments_change_no_byte_and_no_finished_sequence(
+def test_ten_deaths_at_random_moments_change_no_byte_and_no_finished_part(
     folder, start, undisturbed, tmp_path, request
 ):
-    """Half of the deaths come before a run has finished anything, half up to 1.5 sequences after its first."""
+    """Half of the deaths come before a run has finished anything, half up to 1.5 parts after its first."""
     begin = request.getfixturevalue(start)
     events, unfinished = tmp_path / "events.zarr", tmp_path / "events.zarr.tmp"
     generator = np.random.default_rng(SEED)
@@ -181,17 +184,17 @@ def test_ten_deaths_at_random_moments_change_no_byte_and_no_finished_sequence(
             os.killpg(running.pid, signal.SIGKILL)
         status = running.wait()
         if events.exists():  # it was quicker than its death: begin anew
-            assert identities(events, set(range(SEQUENCES))).items() >= known.items()
+            assert identities(events).items() >= known.items()
             shutil.rmtree(events)
             known = {}
             continue
         assert status == -signal.SIGKILL
-        assert identities(unfinished, finished(unfinished)).items() >= known.items()
-        known = identities(unfinished, finished(unfinished))
+        assert identities(unfinished).items() >= known.items()
+        known = identities(unfinished)
         deaths.append(len(finished(unfinished)))
     assert max(deaths) > 0
     assert begin(overrides(folder, events)).wait() == 0
-    assert identities(events, set(range(SEQUENCES))).items() >= known.items()
+    assert identities(events).items() >= known.items()
     assert digest(events) == undisturbed.digests
     assert not unfinished.exists()
 
@@ -243,5 +246,5 @@ def test_one_and_three_dask_workers_and_one_killed_half_way_give_the_bytes_of_on
     killer.start()
     over_dask(folder, events, cluster)
     killer.join()
-    assert 2 <= done_at_death[0] < SEQUENCES
+    assert 2 <= done_at_death[0] < PARTS
     assert digest(events) == undisturbed.digests

@@ -123,7 +123,7 @@ def paths(tmp_path_factory):
         sequences_per_picture=1, duration_s=0.2, frame_rate_hz=30.0, window_height=24, window_width=36,
         speed_min_px_s=10.0, speed_max_px_s=20.0, acceleration_max_px_s2=800.0, rotation_max_deg=0.0, zoom_max=1.0,
     )  # fmt: skip
-    synthesize(paths.images, paths.scenes, paths.frames, motion, 1, map)
+    synthesize(paths.images, paths.scenes, paths.frames, motion, 1, map, 2)
     frames = FrameStore.open(paths.frames)
     write_events(paths.events, frames)
     run_methods(EventStore.open(paths.events), frames, paths.benchmark)

@@ -28,6 +28,7 @@ from polarnet.stokes import aolp, dolp, stokes_from_intensities
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 
+SEQUENCES_PER_PART = 2
 CONFIG = MotionConfig(
     sequences_per_picture=2,
     duration_s=0.2,
@@ -76,7 +77,7 @@ def images(tmp_path_factory) -> Path:
 
 
 def run(images: Path, folder: Path, config: MotionConfig = CONFIG, mapper=map) -> tuple[SceneStore, FrameStore]:
-    synthesize(images, folder / "scenes.zarr", folder / "frames.zarr", config, 1, mapper)
+    synthesize(images, folder / "scenes.zarr", folder / "frames.zarr", config, 1, mapper, SEQUENCES_PER_PART)
     return SceneStore.open(folder / "scenes.zarr"), FrameStore.open(folder / "frames.zarr")
 
 

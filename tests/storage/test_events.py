@@ -15,8 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import polarnet.storage.events as store_module
+import polarnet.storage.parts as parts_module
 from polarnet.events.stream import Events, slice_time
-from polarnet.storage.events import LONGEST_US, EventStore, verify
+from polarnet.storage.events import LONGEST_US, EventStore
 
 HEIGHT, WIDTH = 12, 18
 DURATIONS_US = {"coffee": 1_000_000, "leaves": 250_500, "still": 40_000}
@@ -35,7 +36,7 @@ def channels(make_random_events):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory, channels) -> Path:
     path = tmp_path_factory.mktemp("store") / "events.zarr"
-    store = EventStore.create(path, list(DURATIONS_US), HEIGHT, WIDTH, ATTRIBUTES)
+    store = EventStore.create(path, list(DURATIONS_US), HEIGHT, WIDTH, ATTRIBUTES, 2)
     for name, duration_us in DURATIONS_US.items():
         store.write(name, channels[name], duration_us)
     store.finish()
@@ -77,12 +78,14 @@ def test_the_store_says_what_is_needed_to_interpret_it(finished):
 
 
 def test_any_zarr_reader_finds_a_channel_by_its_offsets_and_a_millisecond_by_its_index(finished, channels):
-    raw = zarr.open_group(finished, mode="r")
-    start, stop = raw["offsets"][0, 2:4]
-    t = raw["events/t"][0, start:stop]
-    assert np.array_equal(t, channels["coffee"][2].t.numpy())
-    assert np.array_equal(raw["ms_to_idx"][0, 2] - start, np.searchsorted(t, 1000 * np.arange(1001)))
-    assert raw["events/x"].shape == (3, sum(COUNTS["coffee"]))
+    part = zarr.open_group(finished, mode="r")["part-00000"]
+    record = part.attrs["sequences"]["leaves"]
+    first, _ = record["events"]
+    start, stop = record["offsets"][2:4]
+    t = part["events/t"][first + start : first + stop]
+    assert np.array_equal(t, channels["leaves"][2].t.numpy())
+    index = part["ms_to_idx"][slice(*record["milliseconds"])]
+    assert np.array_equal(index[:, 2] - start, np.searchsorted(t, 1000 * np.arange(252)))
 
 
 @settings(max_examples=25, deadline=None)
@@ -104,7 +107,7 @@ def test_a_window_may_be_open_at_either_end(finished, channels):
 def test_a_window_reads_only_its_own_chunks(channels, tmp_path, monkeypatch):
     """One channel of 300,000 events in 1 s: 10 ms are 3000 of them, in one or two chunks of 4096 of the 74."""
     monkeypatch.setattr(store_module, "CHUNK", 2**12)
-    monkeypatch.setattr(store_module, "SHARD", 2**16)
+    monkeypatch.setattr(parts_module, "SHARD_BYTES", 2**17)
     store = EventStore.create(tmp_path / "events.zarr", ["coffee"], HEIGHT, WIDTH, {})
     store.write("coffee", channels["coffee"], DURATIONS_US["coffee"])
     store.finish()
@@ -126,17 +129,19 @@ def test_a_window_reads_only_its_own_chunks(channels, tmp_path, monkeypatch):
 
 
 def test_sequences_may_fill_several_shards_of_events_and_of_the_time_index(make_random_events, tmp_path, monkeypatch):
-    for name, value in {"CHUNK": 128, "SHARD": 512, "MILLISECOND_CHUNK": 8, "MILLISECOND_SHARD": 32}.items():
-        monkeypatch.setattr(store_module, name, value)
+    monkeypatch.setattr(store_module, "CHUNK", 128)
+    monkeypatch.setattr(store_module, "MILLISECOND_CHUNK", 8)
+    monkeypatch.setattr(parts_module, "SHARD_BYTES", 2048)
     long = [make_random_events(k, 300 * (k + 1), 99_500, HEIGHT, WIDTH) for k in range(4)]
     short = [make_random_events(k, 40, 9_000, HEIGHT, WIDTH) for k in range(4)]
-    store = EventStore.create(tmp_path / "events.zarr", ["long", "short"], HEIGHT, WIDTH, {})
+    store = EventStore.create(tmp_path / "events.zarr", ["long", "short"], HEIGHT, WIDTH, {}, 2)
     store.write("long", long, 99_500)
     store.write("short", short, 9_000)
     store.finish()
-    assert len(list((tmp_path / "events.zarr" / "events" / "t" / "c" / "0").iterdir())) == 6  # 3000 events
-    assert len(list((tmp_path / "events.zarr" / "ms_to_idx" / "c" / "0" / "0").iterdir())) == 4  # 101 entries
-    assert verify(tmp_path / "events.zarr") == []
+    part = tmp_path / "events.zarr" / "part-00000"
+    assert len(list((part / "events" / "t" / "c").iterdir())) == 7  # 3000 and 400 events, 512 in a shard
+    assert len(list((part / "ms_to_idx" / "c").iterdir())) == 2  # 101 and 10 entries, 64 in a shard
+    assert EventStore.verify(tmp_path / "events.zarr") == []
     store = EventStore.open(tmp_path / "events.zarr")
     for name, channels in (("long", long), ("short", short)):
         for start_us, stop_us in ((0, 200_000), (4_000, 5_001), (31_999, 32_001), (99_000, 100_000)):
@@ -151,16 +156,18 @@ def test_a_sequence_that_is_there_already_stays_as_it_is(channels, tmp_path):
     assert store.count("a") == COUNTS["leaves"]
 
 
-def write_one(arguments: tuple[EventStore, str, list[Events], int]) -> None:
-    store, name, streams, duration_us = arguments
-    store.write(name, streams, duration_us)
+def write_part(arguments: tuple[EventStore, str, dict[str, list[Events]]]) -> None:
+    store, part, channels = arguments
+    for name in store.parts[part]:
+        store.write(name, channels[name], DURATIONS_US[name])
 
 
 def test_several_processes_in_any_order_write_the_same_bytes(finished, channels, tmp_path):
-    store = EventStore.create(tmp_path / "events.zarr", list(DURATIONS_US), HEIGHT, WIDTH, ATTRIBUTES)
-    tasks = [(store, name, channels[name], DURATIONS_US[name]) for name in reversed(DURATIONS_US)]
+    store = EventStore.create(tmp_path / "events.zarr", list(DURATIONS_US), HEIGHT, WIDTH, ATTRIBUTES, 2)
+    tasks = [(store, part, channels) for part in reversed(store.missing_parts())]
+    assert len(tasks) == 2
     with ProcessPoolExecutor(2, get_context("fork"), torch.set_num_threads, (1,)) as pool:
-        list(pool.map(write_one, tasks))
+        list(pool.map(write_part, tasks))
     store.finish()
     assert digest(tmp_path / "events.zarr") == digest(finished)
 
@@ -214,29 +221,29 @@ def test_names_that_come_twice_and_sensors_too_large_are_refused(tmp_path):
 
 
 def test_a_whole_store_has_no_problems(finished):
-    assert verify(finished) == []
+    assert EventStore.verify(finished) == []
 
 
-def test_verify_names_sequence_and_column_of_a_flipped_byte(copy):
-    for number, name in enumerate(["coffee", "leaves"]):
-        for column in ("events/x", "events/y", "events/t", "events/p", "ms_to_idx", "offsets", "duration_us"):
-            chunk = next(f for f in [copy / column / "c" / str(number), *(copy / column / "c").rglob("*")]
-                         if f.is_file() and str(number) in f.relative_to(copy / column / "c").parts[:1])  # fmt: skip
-            content = chunk.read_bytes()
-            damaged = bytearray(content)
-            damaged[len(content) // 2] ^= 0x10
-            chunk.write_bytes(damaged)
-            problems = verify(copy)
-            assert len(problems) == 1
-            assert f"{name}, column {column} is unreadable" in problems[0]
-            chunk.write_bytes(content)
-    assert verify(copy) == []
+@pytest.mark.parametrize("column", ["events/x", "events/y", "events/t", "events/p", "ms_to_idx"])
+def test_verify_names_sequence_and_column_of_a_flipped_byte(copy, column):
+    """The chunks of `leaves` come after those of `coffee` in the only shard of a part's column."""
+    (shard,) = (file for file in (copy / "part-00000" / column / "c").rglob("*") if file.is_file())
+    content = bytearray(shard.read_bytes())
+    chunks = 3 if column.startswith("events") else 2
+    array = zarr.open_group(copy, mode="r")[f"part-00000/{column}"]
+    index = content[-4 - 16 * (array.shards[0] // array.chunks[0]) : -4]  # start and length of each chunk, then a CRC
+    start, length = np.frombuffer(index, "<u8").reshape(-1, 2)[chunks - 1]
+    content[int(start + length // 2)] ^= 0x10
+    shard.write_bytes(content)
+    (problem,) = EventStore.verify(copy)
+    assert f"leaves, column {column} is unreadable" in problem
 
 
 def test_verify_names_a_file_that_is_missing(copy):
-    (copy / "events" / "y" / "c" / "1" / "0").unlink()
-    (problem,) = verify(copy)
-    assert "leaves, column events/y is unreadable: there is no c/1/0" in problem
+    (copy / "part-00000" / "events" / "y" / "c" / "0").unlink()
+    coffee, leaves = EventStore.verify(copy)
+    assert "coffee, column events/y is unreadable: there is no part-00000/events/y/c/0" in coffee
+    assert "leaves, column events/y is unreadable: there is no part-00000/events/y/c/0" in leaves
     with pytest.raises(ValueError, match="leaves, column events/y"):
         EventStore.open(copy).read("leaves")
 
@@ -251,18 +258,20 @@ def test_verify_names_a_file_that_is_missing(copy):
     ],
 )
 def test_verify_names_events_that_a_foreign_writer_got_wrong(copy, column, place, value, message):
-    zarr.open_group(copy, mode="r+")[column][1, place] = value
+    part = zarr.open_group(copy, mode="r+")["part-00000"]
+    part[column][part.attrs["sequences"]["leaves"]["events"][0] + place] = value
     with pytest.raises(ValueError, match=message):
-        raise ValueError(verify(copy)[0])
+        raise ValueError(EventStore.verify(copy)[0])
 
 
 def test_verify_notices_a_time_index_that_does_not_fit(copy):
-    index = zarr.open_group(copy, mode="r+")["ms_to_idx"]
-    index[1, 2, 100] = index[1, 2, 100] + 1
-    assert verify(copy) == [f"{copy}: leaves, polarizer 90: ms_to_idx does not match events/t"]
+    part = zarr.open_group(copy, mode="r+")["part-00000"]
+    row = part.attrs["sequences"]["leaves"]["milliseconds"][0] + 100
+    part["ms_to_idx"][row, 2] = part["ms_to_idx"][row, 2] + 1
+    assert EventStore.verify(copy) == [f"{copy}: leaves, polarizer 90: ms_to_idx does not match events/t"]
 
 
 def test_verify_of_something_else_says_what_it_is(tmp_path):
     zarr.open_group(tmp_path / "other.zarr", mode="w")
-    assert "expected a store of format 'polarnet.events', got None" in verify(tmp_path / "other.zarr")[0]
-    assert "there is no Zarr v3 group" in verify(tmp_path / "nothing.zarr")[0]
+    assert "expected a store of format 'polarnet.events', got None" in EventStore.verify(tmp_path / "other.zarr")[0]
+    assert "there is no Zarr v3 group" in EventStore.verify(tmp_path / "nothing.zarr")[0]

@@ -25,8 +25,8 @@ HEIGHT, WIDTH = 12, 18
 @pytest.fixture(scope="module")
 def store(tmp_path_factory, make_random_events) -> EventStore:
     path = tmp_path_factory.mktemp("exchange") / "events.zarr"
-    store = EventStore.create(path, ["b", "a"], HEIGHT, WIDTH, {"seed": 1})
-    for i, name in enumerate(["a", "b"]):
+    store = EventStore.create(path, ["b", "a"], HEIGHT, WIDTH, {"seed": 1}, 2)
+    for i, name in enumerate(["b", "a"]):
         store.write(name, [make_random_events(4 * i + k, 300 * k, 90_500, HEIGHT, WIDTH) for k in range(4)], 90_500)
     store.finish()
     return EventStore.open(path)

@@ -13,7 +13,6 @@ from polarnet.storage.frames import (
     dequantise_fraction,
     quantise_angle,
     quantise_fraction,
-    verify_frames,
 )
 
 STEPS = np.arange(2**16, dtype=np.uint16)
@@ -35,6 +34,7 @@ def store_at(path, **changes) -> FrameStore:
         "height": HEIGHT,
         "width": WIDTH,
         "attributes": {"seed": 1},
+        "sequences_per_part": 2,
     }
     return FrameStore.create(path, **{**arguments, **changes})
 
@@ -107,7 +107,7 @@ def test_black_unpolarized_frames_are_not_taken_for_missing_ones(tmp_path):
     t_us, intensity, dolp, aolp = frames_of(1)
     store.write("a", t_us, 0 * intensity, 0 * dolp, 0 * aolp)
     store.finish()
-    assert verify_frames(tmp_path / "f.zarr") == []
+    assert FrameStore.verify(tmp_path / "f.zarr") == []
     assert FrameStore.open(tmp_path / "f.zarr").intensity("a").abs().max() == 0
 
 
@@ -115,10 +115,10 @@ def test_a_missing_file_is_an_error_and_not_a_black_frame(tmp_path):
     store = store_at(tmp_path / "f.zarr", sequences=["a"])
     store.write("a", *frames_of(1))
     store.finish()
-    (tmp_path / "f.zarr" / "dolp" / "c" / "0" / "0" / "0" / "0").unlink()
-    with pytest.raises(ValueError, match=r"a, column dolp is unreadable: there is no c/0/0/0/0"):
+    (tmp_path / "f.zarr" / "part-00000" / "dolp" / "c" / "0" / "0" / "0").unlink()
+    with pytest.raises(ValueError, match=r"a, column dolp is unreadable: there is no part-00000/dolp/c/0/0/0"):
         FrameStore.open(tmp_path / "f.zarr").dolp("a")
-    assert len(verify_frames(tmp_path / "f.zarr")) == 1
+    assert len(FrameStore.verify(tmp_path / "f.zarr")) == 1
 
 
 def test_frames_of_a_wrong_shape_range_or_order_are_refused(tmp_path):
@@ -140,11 +140,11 @@ def test_a_sequence_without_a_split_is_refused(tmp_path):
 
 def test_a_flipped_byte_is_found_and_named(finished, tmp_path):
     damaged = shutil.copytree(finished, tmp_path / "frames.zarr")
-    chunk = next(file for file in (damaged / "aolp" / "c" / "1").rglob("*") if file.is_file())
-    content = bytearray(chunk.read_bytes())
-    content[len(content) // 3] ^= 4
-    chunk.write_bytes(content)
-    (problem,) = verify_frames(damaged)
+    (shard,) = (file for file in (damaged / "part-00000" / "aolp" / "c").rglob("*") if file.is_file())
+    content = bytearray(shard.read_bytes())
+    content[3 * content.index(b"\xff" * 16) // 4] ^= 4  # b comes after a; the index of the shard's chunks comes last
+    shard.write_bytes(content)
+    (problem,) = FrameStore.verify(damaged)
     assert "b, column aolp is unreadable" in problem
 
 
@@ -163,10 +163,10 @@ def test_a_mask_comes_back_as_it_was_whatever_the_width(tmp_path):
     assert torch.equal(read.frames("a").valid, masks(1))
     assert read.frames("b").valid.shape == (33, HEIGHT, WIDTH)
     assert read.valid("b").all()
-    assert verify_frames(tmp_path / "frames.zarr") == []
-    (chunk,) = (file for file in (tmp_path / "frames.zarr" / "valid" / "c" / "0").rglob("*") if file.is_file())
+    assert FrameStore.verify(tmp_path / "frames.zarr") == []
+    (chunk,) = (file for file in (tmp_path / "frames.zarr" / "part-00000" / "valid").rglob("0") if file.is_file())
     chunk.write_bytes(chunk.read_bytes()[:-1])
-    assert any("a, column valid is unreadable" in problem for problem in verify_frames(tmp_path / "frames.zarr"))
+    assert any("a, column valid is unreadable" in problem for problem in FrameStore.verify(tmp_path / "frames.zarr"))
 
 
 def test_without_masks_nothing_is_stored_about_them(finished, tmp_path):
@@ -174,7 +174,7 @@ def test_without_masks_nothing_is_stored_about_them(finished, tmp_path):
     assert not store.masked
     assert store.valid("a") is None
     assert store.frames("a").valid is None
-    assert not (finished / "valid").exists()
+    assert not (finished / "part-00000" / "valid").exists()
     with pytest.raises(ValueError, match="got a mask for a store without one"):
         store_at(tmp_path / "frames.zarr").write("a", *frames_of(1), masks(1))
 

@@ -1,11 +1,12 @@
 """Scenes on disk."""
 
 import math
+import shutil
 
 import pytest
 import torch
 
-from polarnet.storage.scenes import SceneStore, verify_scenes
+from polarnet.storage.scenes import Scene, SceneStore, as_stored
 
 NAMES = ["centre_x", "centre_y", "speed"]
 
@@ -18,13 +19,18 @@ def create(path, **changes) -> SceneStore:
         "sensor": (8, 12),
         "trajectory_names": NAMES,
         "attributes": {"seed": 1},
+        "sequences_per_part": 2,
     }
     return SceneStore.create(path, **{**arguments, **changes})
 
 
-def planes(seed: int, height: int, width: int) -> list[torch.Tensor]:
+def scene(seed: int, height: int, width: int) -> Scene:
     s0, dolp, aolp = torch.rand(3, height, width, generator=torch.Generator().manual_seed(seed))
-    return [s0, dolp, 3.14 * aolp]
+    return Scene(s0, dolp, 3.14 * aolp)
+
+
+SCENES = {"coffee": scene(1, 20, 30), "leaves": scene(2, 10, 14)}
+STILL = torch.zeros(3, dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
@@ -32,38 +38,47 @@ def finished(tmp_path_factory):
     path = tmp_path_factory.mktemp("scenes") / "scenes.zarr"
     store = create(path)
     for i, name in enumerate(store.sequences):
-        store.write(name, torch.tensor([math.pi, i, -1e-300], dtype=torch.float64), 1_000_000 + i)
-    store.write_picture("coffee", *planes(1, 20, 30))
-    store.write_picture("leaves", *planes(2, 10, 14))
+        trajectory = torch.tensor([math.pi, i, -1e-300], dtype=torch.float64)
+        store.write(name, SCENES[store.picture_of[name]], trajectory, 1_000_000 + i)
     store.finish()
     return path
 
 
 def test_a_sequence_comes_back_with_its_picture_and_its_exact_trajectory(finished):
-    scene = SceneStore.open(finished).read("leaves-0")
-    s0, dolp, aolp = planes(2, 10, 14)
-    assert (scene.name, scene.picture, scene.split, scene.duration_us) == ("leaves-0", "leaves", "test", 1_000_002)
-    assert scene.trajectory.tolist() == [math.pi, 2.0, -1e-300]
-    torch.testing.assert_close(scene.s0, s0, atol=0.51 / 65535, rtol=0)
-    torch.testing.assert_close(scene.dolp, dolp, atol=0.51 / 65535, rtol=0)
-    torch.testing.assert_close(scene.aolp, aolp, atol=0.51 * math.pi / 65536, rtol=0)
+    read, (s0, dolp, aolp, _) = SceneStore.open(finished).read("leaves-0"), SCENES["leaves"]
+    assert (read.name, read.picture, read.split, read.duration_us) == ("leaves-0", "leaves", "test", 1_000_002)
+    assert read.trajectory.tolist() == [math.pi, 2.0, -1e-300]
+    torch.testing.assert_close(read.s0, s0, atol=0.51 / 65535, rtol=0)
+    torch.testing.assert_close(read.dolp, dolp, atol=0.51 / 65535, rtol=0)
+    torch.testing.assert_close(read.aolp, aolp, atol=0.51 * math.pi / 65536, rtol=0)
 
 
-def test_sequences_of_one_picture_share_its_planes(finished):
+def test_a_scene_is_known_before_it_is_stored(finished):
+    read, stored = SceneStore.open(finished).read("leaves-0"), as_stored(SCENES["leaves"])
+    for name in ("s0", "dolp", "aolp"):
+        assert torch.equal(getattr(read, name), getattr(stored, name))
+
+
+def test_sequences_of_one_picture_share_its_pixels_within_a_part(finished, tmp_path):
     store = SceneStore.open(finished)
     first, second = store.read("coffee-0"), store.read("coffee-1")
     assert torch.equal(first.s0, second.s0)
     assert first.trajectory[1] != second.trajectory[1]
-    assert len([file for file in (finished / "s0" / "c").rglob("*") if file.is_file()]) == 2
+    assert store.record("coffee-0")["pixels"] == store.record("coffee-1")["pixels"] == [0, 600]
+    alone = create(tmp_path / "scenes.zarr", sequences_per_part=1)
+    for name in alone.sequences:
+        alone.write(name, SCENES[alone.picture_of[name]], STILL, 1)
+    alone.finish()
+    assert torch.equal(SceneStore.open(tmp_path / "scenes.zarr").read("coffee-1").s0, second.s0)
 
 
-def test_what_is_stored_is_stored_again_without_a_change(finished, tmp_path):
-    store, again = SceneStore.open(finished), create(tmp_path / "scenes.zarr")
+def test_a_part_begun_again_holds_its_pictures(finished, tmp_path):
+    store = create(tmp_path / "scenes.zarr")
+    store.write("coffee-0", scene(3, 20, 30), STILL, 1)
     for name in store.sequences:
-        scene = store.read(name)
-        again.write(name, scene.trajectory, scene.duration_us)
-        again.write_picture(scene.picture, scene.s0, scene.dolp, scene.aolp)
-    again.finish()
+        read = SceneStore.open(finished).read(name)
+        store.write(name, Scene(read.s0, read.dolp, read.aolp), read.trajectory, read.duration_us)
+    store.finish()
     for file in finished.rglob("*"):
         if file.is_file():
             assert (tmp_path / "scenes.zarr" / file.relative_to(finished)).read_bytes() == file.read_bytes()
@@ -79,14 +94,13 @@ def test_the_store_says_what_it_holds(finished):
     assert store.attributes == {"seed": 1}
 
 
-def test_a_store_lacks_pictures_and_sequences_until_both_are_written(tmp_path):
+def test_a_store_lacks_the_sequences_of_a_part_until_all_are_written(tmp_path):
     store = create(tmp_path / "scenes.zarr")
-    store.write_picture("coffee", *planes(1, 20, 30))
-    store.write("coffee-1", torch.zeros(3, dtype=torch.float64), 1)
+    store.write("coffee-0", SCENES["coffee"], STILL, 1)
+    store.write("leaves-0", SCENES["leaves"], STILL, 1)
     again = create(tmp_path / "scenes.zarr")
-    assert again.missing() == ["coffee-0", "leaves-0"]
-    assert again.missing_pictures() == ["leaves"]
-    with pytest.raises(ValueError, match="3 not written yet: coffee-0, leaves-0, leaves"):
+    assert again.missing() == ["coffee-0", "coffee-1"]
+    with pytest.raises(ValueError, match="2 not written yet: coffee-0, coffee-1"):
         again.finish()
 
 
@@ -99,45 +113,43 @@ def test_a_picture_never_is_in_two_splits(tmp_path):
 def test_what_cannot_be_a_scene_is_refused(tmp_path):
     store = create(tmp_path / "scenes.zarr")
     with pytest.raises(ValueError, match=r"leaves: expected a picture between .* 8x12 px and 20x30 px, got 20x11"):
-        store.write_picture("leaves", *planes(1, 20, 11))
+        store.write("leaves-0", scene(1, 20, 11), STILL, 1)
     with pytest.raises(ValueError, match=r"s0: expected values in \[0, 1\]"):
-        store.write_picture("leaves", *(10 * plane for plane in planes(1, 20, 30)))
+        store.write("leaves-0", Scene(*(10 * plane for plane in scene(1, 20, 30)[:3])), STILL, 1)
     with pytest.raises(ValueError, match=r"expected 3 finite numbers \(centre_x, centre_y, speed\)"):
-        store.write("leaves-0", torch.tensor([0.0, math.nan, 0.0], dtype=torch.float64), 1000)
+        store.write("leaves-0", SCENES["leaves"], torch.tensor([0.0, math.nan, 0.0], dtype=torch.float64), 1000)
     with pytest.raises(ValueError, match="duration above 0"):
-        store.write("leaves-0", torch.zeros(3, dtype=torch.float64), 0)
+        store.write("leaves-0", SCENES["leaves"], STILL, 0)
     with pytest.raises(ValueError, match="there is no 'tea'"):
-        store.write_picture("tea", *planes(1, 20, 30))
+        store.write("tea", SCENES["leaves"], STILL, 1)
 
 
-def test_a_flipped_byte_is_found_and_named(finished):
-    assert verify_scenes(finished) == []
-    chunk = finished / "dolp" / "c" / "1" / "0" / "0"
-    content = chunk.read_bytes()
-    try:
-        chunk.write_bytes(content[:50] + bytes([content[50] ^ 1]) + content[51:])
-        (problem,) = verify_scenes(finished)
-        assert "leaves, column dolp is unreadable" in problem
-    finally:
-        chunk.write_bytes(content)
+def test_a_flipped_byte_is_found_and_named(finished, tmp_path):
+    assert SceneStore.verify(finished) == []
+    damaged = shutil.copytree(finished, tmp_path / "scenes.zarr")
+    shard = damaged / "part-00001" / "dolp" / "c" / "0"
+    content = shard.read_bytes()
+    shard.write_bytes(content[:50] + bytes([content[50] ^ 1]) + content[51:])
+    (problem,) = SceneStore.verify(damaged)
+    assert "leaves-0, column dolp is unreadable" in problem
 
 
 def test_a_mask_comes_back_with_its_picture_and_one_that_has_none_is_valid_everywhere(tmp_path):
     store = create(tmp_path / "scenes.zarr", masked=True)
-    for name in store.sequences:
-        store.write(name, torch.zeros(3, dtype=torch.float64), 1)
     valid = torch.rand(10, 14, generator=torch.Generator().manual_seed(1)) < 0.5
-    store.write_picture("coffee", *planes(1, 20, 30))
-    store.write_picture("leaves", *planes(2, 10, 14), valid)
+    masks = {"coffee": None, "leaves": valid}
+    for name, picture in store.picture_of.items():
+        store.write(name, SCENES[picture]._replace(valid=masks[picture]), STILL, 1)
     store.finish()
     read = SceneStore.open(tmp_path / "scenes.zarr")
     assert torch.equal(read.read("leaves-0").valid, valid)
     assert read.read("coffee-0").valid.all()
-    assert verify_scenes(tmp_path / "scenes.zarr") == []
+    assert SceneStore.verify(tmp_path / "scenes.zarr") == []
 
 
 def test_without_masks_nothing_is_stored_about_them(finished, tmp_path):
     assert SceneStore.open(finished).read("leaves-0").valid is None
-    assert not (finished / "valid").exists()
+    assert not (finished / "part-00000" / "valid").exists()
+    masked = SCENES["leaves"]._replace(valid=torch.ones(10, 14).bool())
     with pytest.raises(ValueError, match=r"a store created with masked=True, got one of .*masked=False"):
-        create(tmp_path / "scenes.zarr").write_picture("leaves", *planes(2, 10, 14), torch.ones(10, 14).bool())
+        create(tmp_path / "scenes.zarr").write("leaves-0", masked, STILL, 1)

@@ -35,7 +35,7 @@ def test_the_parts_are_named_where_none_is_chosen(store, part):
 
 
 def test_a_damaged_store_is_refused_with_the_sequence(store):
-    chunk = next(path for path in (store / "events" / "x" / "c" / "1").rglob("*") if path.is_file())
+    chunk = next(path for path in (store / "part-00001" / "events" / "x" / "c").rglob("*") if path.is_file())
     content = bytearray(chunk.read_bytes())
     content[len(content) // 3] ^= 1
     chunk.write_bytes(content)
