@@ -26,6 +26,7 @@ from polarnet.runtime.machine import usable_cores
 from studies.figures import loss_sweep_figure
 
 ROOT = Path(__file__).resolve().parents[1]
+DEMO_METRICS = "data/benchmark/metrics.json"
 VERSIONS_OF = ("torch", "numpy", "numba", "zarr", "dvc", "hydra-core")
 STAGE_STARTS = re.compile(r"Running stage '([\w@+]+)'")  # printed by dvc repro
 
@@ -82,7 +83,8 @@ def write_section(
 def measure_pipeline(root: Path) -> Path:
     """Clone HEAD of the project at `root`, time `make repro` and `make test` there; write docs/results/pipeline.json.
 
-    The overview picture of the README comes from the same run. If the tests fail, the file lacks only their minutes.
+    The overview picture of the README, `dvc.lock` and `data/benchmark/metrics.json` come from the same run, so that
+    `dvc metrics diff` has numbers to compare with in every clone. If the tests fail, the file lacks only their minutes.
 
     Raises RuntimeError if a command fails or a second `make repro` runs a stage. Uncommitted changes raise it too,
     because the figures would not belong to the commit they name.
@@ -101,6 +103,9 @@ def measure_pipeline(root: Path) -> Path:
         record["metrics"] = scores_and_costs(clone / "data" / "benchmark")
         record["lpips"] = json.loads((clone / "data" / "benchmark" / "details.json").read_text())["lpips"]
         shutil.copy(clone / "data" / "report" / "overview.png", root / "docs" / "pictures" / "overview.png")
+        (root / DEMO_METRICS).parent.mkdir(parents=True, exist_ok=True)
+        for name in ("dvc.lock", DEMO_METRICS):
+            shutil.copy(clone / name, root / name)
         path = root / "docs" / "results" / "pipeline.json"
         path.write_text(json.dumps(record, indent=2) + "\n")  # keeps the measurements if a test fails
         record["test_minutes"], _ = _timed("test", clone)
