@@ -210,7 +210,7 @@ def test_figures_are_kept_where_the_tests_fail(tmp_path):
     (root / "data" / "benchmark" / "cost.json").write_text('{"ours": {"params": 7}}')
     (root / "data" / "benchmark" / "details.json").write_text('{"lpips": {"backbone": "alex"}}')
     (root / "data" / "report" / "overview.png").write_bytes(b"picture")
-    (root / "Makefile").write_text("setup:\n\t@true\nrepro:\n\t@true\ntest:\n\t@false\n")
+    (root / "Makefile").write_text("setup:\n\t@true\nrepro:\n\t@echo stages > dvc.lock\ntest:\n\t@false\n")
     git(root, "init", "--quiet")
     git(root, "add", ".")
     git(root, "-c", "user.name=a", "-c", "user.email=a@b", "commit", "--quiet", "-m", "all")
@@ -220,4 +220,5 @@ def test_figures_are_kept_where_the_tests_fail(tmp_path):
     assert record["metrics"] == {"ours": {"mse": 0.1, "params": 7}}
     assert record["lpips"] == {"backbone": "alex"}
     assert "test_minutes" not in record
+    assert (root / "dvc.lock").read_text() == "stages\n"
     assert (root / "docs" / "pictures" / "overview.png").read_bytes() == b"picture"
