@@ -8,7 +8,7 @@ from polarnet.reports.png import png
 
 @pytest.fixture(scope="module")
 def overview(paths):
-    return read_artefacts(paths).overview
+    return read_artefacts(paths, []).overview
 
 
 def test_the_overview_has_the_same_bytes_each_time(overview):
