@@ -14,6 +14,7 @@ from studies.measure import (
     measure_benchmark,
     measure_pipeline,
     measure_sweep,
+    measure_tests,
     uncommitted,
     write_section,
 )
@@ -221,4 +222,11 @@ def test_figures_are_kept_where_the_tests_fail(tmp_path):
     assert record["lpips"] == {"backbone": "alex"}
     assert "test_minutes" not in record
     assert (root / "dvc.lock").read_text() == "stages\n"
+    (root / "Makefile").write_text("setup:\n\t@true\ntest:\n\t@true\n")
+    with pytest.raises(RuntimeError, match="uncommitted changes"):
+        measure_tests(root)
+    git(root, "add", ".")
+    git(root, "-c", "user.name=a", "-c", "user.email=a@b", "commit", "--quiet", "-m", "tests that pass")
+    later = json.loads(measure_tests(root).read_text())
+    assert later == record | {"test_minutes": later["test_minutes"], "test_commit": git(root, "rev-parse", "HEAD")}
     assert (root / "docs" / "pictures" / "overview.png").read_bytes() == b"picture"
