@@ -115,8 +115,8 @@ def measure_pipeline(root: Path) -> Path:
 def measure_tests(root: Path) -> Path:
     """Time `make test` in a fresh clone of HEAD; replace the minutes in docs/results/pipeline.json and name the commit.
 
-    It completes a run of `measure_pipeline` whose tests failed without timing `make repro` again. Raises RuntimeError if
-    the tests fail or the tree has uncommitted changes.
+    It completes a run of `measure_pipeline` whose tests failed, without timing `make repro` again. Raises RuntimeError
+    if the tests fail or the tree has uncommitted changes.
     """
     _refuse_changes(root)
     record = read_results(root, "pipeline")
