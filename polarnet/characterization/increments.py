@@ -1,0 +1,68 @@
+"""Increments of the filtered log light between consecutive events of a pixel: whole thresholds, without drift."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from polarnet.events.stream import Events
+
+
+class PixelEvents(NamedTuple):
+    """Events of one recording ordered by pixel, then time."""
+
+    pixel: Int64[np.ndarray, " n"]
+    t_us: Float64[np.ndarray, " n"]
+    on: Bool[np.ndarray, " n"]
+    pixels: int
+    """Number of pixels of the sensor."""
+
+
+class Intervals(NamedTuple):
+    """Pairs of consecutive events of one pixel. `start` and `stop` index `PixelEvents`."""
+
+    start: Int64[np.ndarray, " m"]
+    stop: Int64[np.ndarray, " m"]
+    pixel: Int64[np.ndarray, " m"]
+    on: Bool[np.ndarray, " m"]
+    """Polarity of the event at the end."""
+    duration_us: Float64[np.ndarray, " m"]
+
+
+def by_pixel(events: Events) -> PixelEvents:
+    """The events ordered by pixel, then time."""
+    pixel = events.y.numpy().astype(np.int64) * events.width + events.x.numpy()
+    order = np.argsort(pixel, kind="stable")  # events are in time order already
+    return PixelEvents(
+        pixel[order],
+        events.t.numpy()[order].astype(np.float64),
+        events.p.numpy()[order] > 0,
+        events.height * events.width,
+    )
+
+
+def chosen_pixels(events: PixelEvents, chosen: Bool[np.ndarray, " pixels"]) -> PixelEvents:
+    """The events of some pixels."""
+    kept = chosen[events.pixel]
+    return PixelEvents(events.pixel[kept], events.t_us[kept], events.on[kept], events.pixels)
+
+
+def intervals_of(events: PixelEvents) -> Intervals:
+    """All pairs of consecutive events of a pixel."""
+    start = np.flatnonzero(events.pixel[1:] == events.pixel[:-1])
+    stop = start + 1
+    return Intervals(start, stop, events.pixel[stop], events.on[stop], events.t_us[stop] - events.t_us[start])
+
+
+def undisturbed(intervals: Intervals, refractory_us: float, margin: float = 1.3) -> Intervals:
+    """Intervals longer than the refractory period by `margin`, after another such interval.
+
+    A crossing within the refractory period waits for its end: its increment exceeds one threshold, and the next
+    increment lacks the excess.
+    """
+    free = intervals.duration_us > margin * refractory_us
+    after_waiting = np.zeros(len(free), bool)
+    follows = intervals.start[1:] == intervals.stop[:-1]
+    after_waiting[1:] = follows & ~free[:-1]
+    kept = free & ~after_waiting
+    return Intervals(*(column[kept] for column in intervals))

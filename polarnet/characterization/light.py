@@ -1,0 +1,179 @@
+"""Known light on a camera: frames with their times, or a sinusoidal flicker, and the pixel's response to it.
+
+Light is in digital numbers (DN): 0 is dark, 255 white.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64
+
+from polarnet.pictures.images import picture_extensions, read_channels
+from polarnet.simulation.compilation import compiled
+from polarnet.simulation.pixels.light import FULL_SCALE, KNEE
+from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION
+
+TIMES_FILE = "timestamps.txt"
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # of sRGB's primaries (IEC 61966-2-1)
+STEPS_PER_CYCLE = 256  # linear pieces of a flicker's cycle: 3e-4 of the contrast off at most
+SETTLED = 12.0  # time constants of the photoreceptor after which a cycle repeats itself
+
+
+@dataclass(frozen=True)
+class MovingLight:
+    """Light on every pixel at successive times; linear in the pixel's response between two frames."""
+
+    frames: Float32[np.ndarray, "n h w"]
+    """DN"""
+    t_us: Float64[np.ndarray, " n"]
+    """Times of the frames on the recording's clock."""
+
+
+@dataclass(frozen=True)
+class Flicker:
+    """The same light on all pixels: level (1 + contrast sin(2 pi frequency t + phase))."""
+
+    level: float
+    """Mean, DN."""
+    contrast: float
+    """(brightest - darkest) / (brightest + darkest)"""
+    frequency_hz: float
+
+    def __post_init__(self):
+        if not 0 < self.contrast < 1:
+            raise ValueError(f"contrast: expected (max - min) / (max + min) between 0 and 1, got {self.contrast}")
+        if not self.frequency_hz > 0:
+            raise ValueError(f"frequency: expected Hz above 0, got {self.frequency_hz}")
+        if not 0 < self.level <= FULL_SCALE / (1 + self.contrast):
+            raise ValueError(
+                f"flicker light: expected a mean above 0 DN whose maximum, mean x (1 + contrast), is at most "
+                f"{FULL_SCALE:g} DN, got {self.level} DN at contrast {self.contrast}; lower the mean"
+            )
+
+
+def read_light(folder: Path, height: int, width: int) -> MovingLight:
+    """Frames of `folder` in the order of their names, with the times in its `timestamps.txt`.
+
+    Frames are 8- or 16-bit pictures (white becomes 255 DN; colour becomes luminance without linearisation) or .npy
+    files in DN. `timestamps.txt` has one time per line in microseconds of the recording's clock; further words of a
+    line and lines that start with # are ignored. ValueError where the frames do not fit the sensor or the times.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: there is no such folder; name the folder of the frames")
+    kinds = picture_extensions() | {"npy"}
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower().lstrip(".") in kinds)
+    t_us = _times(folder / TIMES_FILE)
+    if len(paths) != len(t_us) or len(paths) < 2:
+        raise ValueError(
+            f"{folder}: expected at least two frames and one time for each, got {len(paths)} frames and "
+            f"{len(t_us)} times; {TIMES_FILE} needs one line per frame, in the order of the names"
+        )
+    if not (np.diff(t_us) > 0).all():
+        raise ValueError(f"{folder / TIMES_FILE}: expected increasing times in microseconds; sort frames and times")
+    frames = np.empty((len(paths), height, width), np.float32)
+    for frame, path in zip(frames, paths, strict=True):
+        light = _read_frame(path)
+        if light.shape != (height, width):
+            raise ValueError(
+                f"{path.name}: expected a frame of the sensor's {height} x {width} px (height x width), got "
+                f"{light.shape[0]} x {light.shape[1]}; cut and scale the frames to the pixels of the sensor"
+            )
+        frame[:] = light
+    return MovingLight(frames, t_us)
+
+
+def _times(path: Path) -> Float64[np.ndarray, " n"]:
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file; write the time of each frame in microseconds into it")
+    lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+    try:
+        return np.array([float(words[0]) for words in lines if words and not words[0].startswith("#")])
+    except ValueError as error:
+        raise ValueError(f"{path}: expected a time in microseconds at the start of each line: {error}") from error
+
+
+def _read_frame(path: Path) -> Float[np.ndarray, "h w"]:
+    if path.suffix.lower() == ".npy":
+        light = np.load(path)
+    else:
+        pixels = read_channels(path)
+        white = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0
+        light = pixels.astype(np.float32) * (FULL_SCALE / white)
+        light = light @ np.float32(LUMINANCE) if light.shape[-1] >= 3 else light[..., 0]
+    if light.ndim != 2 or not np.isfinite(light).all() or light.min() < 0 or light.max() > FULL_SCALE * (1 + 1e-6):
+        raise ValueError(f"{path.name}: expected one value from 0 to {FULL_SCALE:g} DN per pixel, [height, width]")
+    return light
+
+
+def moving_responses(
+    light: MovingLight,
+    pixel: Int64[np.ndarray, " n"],
+    t_us: Float64[np.ndarray, " n"],
+    cutoff_hz: float,
+) -> Float64[np.ndarray, " n"]:
+    """Filtered response of each event's pixel at its time; NaN outside the frames' times.
+
+    Events are ordered by pixel, then time. The filter is that of `pixels.exact`: between two frames the response is
+    linear in time and the bandwidth that at their mean light. It starts adapted to the first frame.
+    """
+    frames = light.frames.reshape(len(light.frames), -1)
+    starts = np.searchsorted(pixel, np.arange(frames.shape[1] + 1))
+    return _responses(frames, light.t_us, starts, t_us, cutoff_hz)
+
+
+def flicker_cycle(flicker: Flicker, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
+    """Filtered response over one settled cycle, from phase 0 to 2 pi inclusive, in `STEPS_PER_CYCLE` steps."""
+    slowest_hz = cutoff_hz * (flicker.level * (1 - flicker.contrast) + DARK_OFFSET) / SATURATION
+    cycles = 2 + (math.ceil(SETTLED * flicker.frequency_hz / (2 * math.pi * slowest_hz)) if cutoff_hz > 0 else 0)
+    phase = np.arange(cycles * STEPS_PER_CYCLE + 1) * (2 * math.pi / STEPS_PER_CYCLE)
+    light = flicker.level * (1 + flicker.contrast * np.sin(phase))
+    t_us = phase / (2e-6 * math.pi * flicker.frequency_hz)
+    responses = _responses(
+        light.astype(np.float32)[:, None], t_us, np.array([0, len(t_us)]), np.minimum(t_us, t_us[-1] - 1e-3), cutoff_hz
+    )
+    return responses[-STEPS_PER_CYCLE - 1 :]
+
+
+def flicker_responses(
+    cycle: Float64[np.ndarray, " k"], frequency_hz: float, phase: float, t_us: Float64[np.ndarray, " n"]
+) -> Float64[np.ndarray, " n"]:
+    """Filtered response at the times of events, from `flicker_cycle`, for a flicker of `phase` at time 0."""
+    turns = (t_us * (1e-6 * frequency_hz) + phase / (2 * math.pi)) % 1.0
+    return np.interp(turns, np.linspace(0, 1, len(cycle)), cycle)
+
+
+@compiled
+def _response(dn):
+    return dn * (math.log(KNEE) / KNEE) if dn <= KNEE else math.log(dn)
+
+
+@compiled
+def _responses(frames, times_us, starts, t_us, cutoff_hz):
+    values = np.full(t_us.size, np.nan)
+    for i in range(starts.size - 1):
+        event, stop = starts[i], starts[i + 1]
+        while event < stop and t_us[event] < times_us[0]:
+            event += 1
+        lag, before = 0.0, _response(np.float64(frames[0, i]))
+        for k in range(times_us.size - 1):
+            if event >= stop:
+                break
+            duration = times_us[k + 1] - times_us[k]
+            after = _response(np.float64(frames[k + 1, i]))
+            slope = (after - before) / duration
+            mean = 0.5 * (np.float64(frames[k, i]) + np.float64(frames[k + 1, i]))
+            per_us = 2e-6 * math.pi * cutoff_hz * (mean + DARK_OFFSET) / SATURATION
+            while event < stop and t_us[event] < times_us[k + 1]:
+                since = t_us[event] - times_us[k]
+                values[event] = before + slope * since
+                if cutoff_hz > 0:
+                    decay = math.exp(-per_us * since)
+                    values[event] += lag * decay - slope * (1 - decay) / per_us
+                event += 1
+            if cutoff_hz > 0:
+                decay = math.exp(-per_us * duration)
+                lag = lag * decay - slope * (1 - decay) / per_us
+            before = after
+    return values

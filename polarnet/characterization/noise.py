@@ -1,0 +1,204 @@
+"""Leak, shot noise and hot pixels of a sensor under constant light.
+
+OFF events under constant light are shot noise, a Poisson process. ON events are shot noise or the leak, which fires a
+pixel at about the same time after each of its events: at age T = tau / (1 - jitter z) with z normal, where 1 / tau is
+log-normal over the pixels. Both processes start anew with each event of the pixel.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy.optimize import minimize
+
+from polarnet.characterization.increments import PixelEvents, chosen_pixels, intervals_of
+from polarnet.simulation.compilation import compiled
+from polarnet.simulation.pixels.physics import THRESHOLD_FLOOR, shot_noise_fraction
+
+HOT_FACTOR = 10.0  # times the median number of events of a pixel
+FEWEST_HOT_EVENTS = 10
+NODES = np.linspace(-3, 3, 61)  # leaks of the pixels, standard deviations from the median
+NODE_WEIGHTS = np.exp(-(NODES**2) / 2) / np.exp(-(NODES**2) / 2).sum()
+MAX_LEAKS, MAX_AGES = 20_000, 250_000  # the leak is fitted to as many pixels as hold so many
+PRIOR_SPREAD_DECADES, PRIOR_JITTER, PRIOR_WIDTH = 0.1, 0.1, 0.5  # v2e's values; standard deviation of the logarithm
+YOUNG = 0.4  # ages below this part of the mean leak interval see shot noise alone
+FAR = 6.0  # standard deviations beyond which the leak is certain not to have fired
+SHORTEST_S = 1e-6
+
+
+class Noise(NamedTuple):
+    """Noise of a sensor under constant light, events per pixel and second; errors are standard errors."""
+
+    leak_hz: float
+    """Median over the pixels."""
+    leak_error_hz: float
+    leak_spread_decades: float
+    leak_spread_error: float
+    leak_jitter: float
+    leak_jitter_error: float
+    shot_on_hz: float
+    """Mean over the pixels."""
+    shot_off_hz: float
+    shot_error_hz: float
+    """Of the sum of both."""
+    hot: Bool[np.ndarray, " pixels"]
+    duration_s: float
+
+
+class _Ages(NamedTuple):
+    """Times from one event of a pixel to the next, or to the end of the recording, ordered by pixel."""
+
+    starts: Int64[np.ndarray, " pixels_and_one"]
+    age_s: Float64[np.ndarray, " n"]
+    on: Bool[np.ndarray, " n"]
+
+
+def hot_under_constant_light(counts: Int64[np.ndarray, " pixels"]) -> Bool[np.ndarray, " pixels"]:
+    """Pixels with more than ten times the median number of events, and at least ten events more than it."""
+    return counts > HOT_FACTOR * np.median(counts) + FEWEST_HOT_EVENTS
+
+
+def estimate_noise(events: PixelEvents) -> Noise:
+    """Noise from a recording of constant light; ValueError with fewer than 100 events."""
+    if len(events.t_us) < 100:
+        raise ValueError(
+            f"expected at least 100 events under constant light, got {len(events.t_us)}; record for longer"
+        )
+    counts = np.bincount(events.pixel, minlength=events.pixels)
+    hot = hot_under_constant_light(counts)
+    good = int((~hot).sum())
+    duration_s = float(np.ptp(events.t_us)) * 1e-6
+    kept = chosen_pixels(events, ~hot)
+    off = np.bincount(kept.pixel[~kept.on], minlength=events.pixels)[~hot] / duration_s
+    ages = _ages(_few_enough(kept))
+    shot_off = float(off.mean())
+    fit, error = _fit_leak(ages, max(shot_off, 1 / (good * duration_s)))
+    shot_on = math.exp(fit[0])
+    poisson = math.sqrt((shot_on + shot_off) / (good * duration_s))
+    between = float(off.std()) / math.sqrt(good)
+    return Noise(
+        leak_hz=math.exp(fit[1]),
+        leak_error_hz=math.exp(fit[1]) * error[1],
+        leak_spread_decades=math.exp(fit[2]),
+        leak_spread_error=math.exp(fit[2]) * error[2],
+        leak_jitter=math.exp(fit[3]),
+        leak_jitter_error=math.exp(fit[3]) * error[3],
+        shot_on_hz=shot_on,
+        shot_off_hz=shot_off,
+        shot_error_hz=max(poisson, between),
+        hot=hot,
+        duration_s=duration_s,
+    )
+
+
+def nominal_shot_noise_hz(
+    rate_hz: float, light: float, relative_deviation_on: float, relative_deviation_off: float
+) -> float:
+    """`shot_noise_rate_hz` of a sensor whose pixels fire `rate_hz` (ON and OFF) on average at `light` DN.
+
+    The rate of a pixel is inversely proportional to its thresholds, so the mean exceeds that of a nominal pixel.
+    """
+    excess = 0.5 * (mean_inverse(relative_deviation_on) + mean_inverse(relative_deviation_off))
+    return rate_hz / (float(shot_noise_fraction(light)) * excess)
+
+
+def mean_inverse(relative_deviation: float) -> float:
+    """Mean of 1 / x over normally distributed x of mean 1, at least `THRESHOLD_FLOOR` of 0.2."""
+    z = np.linspace(-5, 5, 2001)
+    density = np.exp(-z * z / 2)
+    x = np.maximum(1 + relative_deviation * z, THRESHOLD_FLOOR / 0.2)
+    return float((density / x).sum() / density.sum())
+
+
+def _few_enough(events: PixelEvents) -> PixelEvents:
+    """The events of every k-th pixel, with k large enough for `MAX_LEAKS` and `MAX_AGES`."""
+    leaks = int(events.on.sum()) - int((~events.on).sum())
+    k = max(1, math.ceil(leaks / MAX_LEAKS), math.ceil(len(events.on) / MAX_AGES))
+    return chosen_pixels(events, np.arange(events.pixels) % k == 0)
+
+
+def _ages(events: PixelEvents) -> _Ages:
+    intervals = intervals_of(events)
+    last = np.flatnonzero(np.append(events.pixel[1:] != events.pixel[:-1], True))
+    pixel = np.concatenate([intervals.pixel, events.pixel[last]])
+    stop_us = events.t_us.max()
+    age_s = np.concatenate([intervals.duration_us, stop_us - events.t_us[last]]) * 1e-6
+    on = np.concatenate([intervals.on, np.zeros(len(last), bool)])
+    order = np.argsort(pixel, kind="stable")
+    pixel = pixel[order]
+    _, first = np.unique(pixel, return_index=True)
+    return _Ages(np.append(first, len(pixel)), np.maximum(age_s[order], SHORTEST_S), on[order])
+
+
+def _fit_leak(ages: _Ages, shot_guess_hz: float) -> tuple[Float64[np.ndarray, " 4"], Float64[np.ndarray, " 4"]]:
+    """Most likely logarithms of (ON shot noise, leak, its spread in decades, its jitter), and their errors."""
+    exposure_s, on = np.add.reduceat(ages.age_s, ages.starts[:-1]), np.add.reduceat(ages.on, ages.starts[:-1])
+    factor = np.ones(len(exposure_s))
+
+    def loss(x: Float64[np.ndarray, " 4"]) -> float:
+        priors = ((x[2] - math.log(PRIOR_SPREAD_DECADES)) ** 2 + (x[3] - math.log(PRIOR_JITTER)) ** 2) / PRIOR_WIDTH**2
+        rates = math.exp(x[0]) * factor
+        leaks_s = np.exp(-x[1] - math.log(10) * math.exp(x[2]) * NODES)
+        likelihood = _likelihoods(ages.starts, ages.age_s, ages.on, rates, leaks_s, math.exp(x[3]))
+        most = likelihood.max(axis=1)
+        total = most + np.log(np.exp(likelihood - most[:, None]) @ NODE_WEIGHTS)
+        return 0.5 * priors - float(total.sum())
+
+    priors = [math.log(PRIOR_SPREAD_DECADES), math.log(PRIOR_JITTER)]
+    excess_hz = max(on.sum() / exposure_s.sum() - shot_guess_hz, 0.02 * shot_guess_hz, 1e-4)
+    starts = [excess_hz, *(f * (shot_guess_hz + excess_hz) for f in (1.0, 0.3, 0.1))]
+    first = min(([math.log(shot_guess_hz), math.log(leak), *priors] for leak in starts), key=lambda x: loss(np.array(x)))
+    x = _minimised(loss, first)
+    # the shot noise of a pixel depends on its threshold: its share of young ON events, shrunk to the mean
+    young_s = YOUNG * math.exp(-x[1])
+    seen = np.add.reduceat(ages.on & (ages.age_s < young_s), ages.starts[:-1])
+    at_risk_s = np.add.reduceat(np.minimum(ages.age_s, young_s), ages.starts[:-1])
+    expected = math.exp(x[0]) * at_risk_s
+    excess_variance = ((seen - expected) ** 2 - expected).sum() / max((expected**2).sum(), 1e-12)
+    if excess_variance > 1e-3:
+        factor = (1 / excess_variance + seen) / (1 / excess_variance + expected)
+        x = _minimised(loss, x)
+    return x, _errors(loss, x)
+
+
+def _minimised(loss, start) -> Float64[np.ndarray, " 4"]:
+    options = {"xatol": 5e-3, "fatol": 0.05, "maxfev": 160}
+    simplex = np.array(start) + np.vstack([np.zeros(4), np.diag([0.1, 0.3, 0.3, 0.3])])
+    return minimize(loss, simplex[0], method="Nelder-Mead", options={**options, "initial_simplex": simplex}).x
+
+
+def _errors(loss, x) -> Float64[np.ndarray, " 4"]:
+    """Standard errors from the curvature of the loss; infinite where it has none."""
+    step, n = 0.03, len(x)
+    unit = np.eye(n) * step
+    curvature = np.empty((n, n))
+    for i in range(n):
+        for j in range(i, n):
+            four = [loss(x + a * unit[i] + b * unit[j]) for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
+            curvature[i, j] = curvature[j, i] = (four[0] - four[1] - four[2] + four[3]) / (4 * step * step)
+    values, vectors = np.linalg.eigh(curvature)
+    return np.sqrt((vectors**2 / np.maximum(values, 1e-6)).sum(axis=1))
+
+
+@compiled
+def _likelihoods(starts, age_s, on, rate_hz, leak_s, jitter):
+    """Log-likelihood of each pixel's ages for each mean leak interval, without the terms common to all."""
+    values = np.empty((starts.size - 1, leak_s.size))
+    for i in range(starts.size - 1):
+        for q in range(leak_s.size):
+            tau, total = leak_s[q], 0.0
+            never_before_s = tau / (1 + FAR * jitter)
+            log_rate = math.log(rate_hz[i])
+            for k in range(starts[i], starts[i + 1]):
+                age = age_s[k]
+                total -= rate_hz[i] * age
+                if age < never_before_s:
+                    total += log_rate if on[k] else 0.0
+                    continue
+                z = (tau / age - 1) / jitter
+                survival = max(0.5 * math.erfc(-z / math.sqrt(2.0)), 1e-12)
+                density = math.exp(-z * z / 2) / math.sqrt(2 * math.pi) * tau / (age * age * jitter)
+                total += math.log(rate_hz[i] * survival + density) if on[k] else math.log(survival)
+            values[i, q] = total
+    return values
