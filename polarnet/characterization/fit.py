@@ -120,7 +120,8 @@ def fit_sensor(
     shortest_us = dead_time.value if dead_time else 0.0
     first = 0 if static is None else 1
     sources = [
-        _source(one, events, shortest_us) for one, events in zip(known, ordered[first : first + len(known)], strict=True)
+        _source(one, events, shortest_us)
+        for one, events in zip(known, ordered[first : first + len(known)], strict=True)
     ]
     leak = _leak_of(noise)
     deviations = (0.0, 0.0)
@@ -356,9 +357,7 @@ def _cutoff(sources: Sequence[_Source], leak_hz: float) -> Estimate | None:
     flickers = [source for source in sources if not source.moves]
     sources = flickers or sources
     pixels = sources[0].events.pixels
-    busy = np.flatnonzero(
-        sum(np.bincount(source.intervals.pixel, minlength=pixels) for source in sources) >= 2 * BLOCK
-    )
+    busy = np.flatnonzero(sum(np.bincount(source.intervals.pixel, minlength=pixels) for source in sources) >= 2 * BLOCK)
     if len(busy) < GROUPS:
         return None
     chosen = busy[:: max(1, len(busy) // CUTOFF_PIXELS)]

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from polarnet.characterization.increments import PixelEvents, chosen_pixels, intervals_of
 from polarnet.simulation.compilation import compiled
-from polarnet.simulation.pixels.physics import THRESHOLD_FLOOR, shot_noise_fraction
+from polarnet.simulation.pixels.physics import shot_noise_fraction
 
 HOT_FACTOR = 10.0  # times the median number of events of a pixel
 FEWEST_HOT_EVENTS = 10
@@ -104,10 +104,11 @@ def nominal_shot_noise_hz(
 
 
 def mean_inverse(relative_deviation: float) -> float:
-    """Mean of 1 / x over normally distributed x of mean 1, at least `THRESHOLD_FLOOR` of 0.2."""
+    """Mean of 1 / x over normally distributed x of mean 1, without x below 0.1: those pixels are hot."""
     z = np.linspace(-5, 5, 2001)
+    x = 1 + relative_deviation * z
+    z, x = z[x >= 1 / HOT_FACTOR], x[x >= 1 / HOT_FACTOR]
     density = np.exp(-z * z / 2)
-    x = np.maximum(1 + relative_deviation * z, THRESHOLD_FLOOR / 0.2)
     return float((density / x).sum() / density.sum())
 
 
@@ -148,7 +149,9 @@ def _fit_leak(ages: _Ages, shot_guess_hz: float) -> tuple[Float64[np.ndarray, " 
     priors = [math.log(PRIOR_SPREAD_DECADES), math.log(PRIOR_JITTER)]
     excess_hz = max(on.sum() / exposure_s.sum() - shot_guess_hz, 0.02 * shot_guess_hz, 1e-4)
     starts = [excess_hz, *(f * (shot_guess_hz + excess_hz) for f in (1.0, 0.3, 0.1))]
-    first = min(([math.log(shot_guess_hz), math.log(leak), *priors] for leak in starts), key=lambda x: loss(np.array(x)))
+    first = min(
+        ([math.log(shot_guess_hz), math.log(leak), *priors] for leak in starts), key=lambda x: loss(np.array(x))
+    )
     x = _minimised(loss, first)
     # the shot noise of a pixel depends on its threshold: its share of young ON events, shrunk to the mean
     young_s = YOUNG * math.exp(-x[1])

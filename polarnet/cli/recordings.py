@@ -37,7 +37,7 @@ def _add_inspection(commands: Commands) -> None:
         "camera's file, and draws its busiest moment as a PNG.",
     )
     inspect.add_argument("file", type=Path, help="file of a camera, or an event store with --part")
-    _add_reading(inspect)
+    add_reading(inspect)
     inspect.add_argument("--part", metavar="SEQUENCE/ANGLE", help="sequence and channel of an event store: NAME/45")
     inspect.add_argument(
         "--hot-pixel-factor",
@@ -59,14 +59,14 @@ def _add_inspection(commands: Commands) -> None:
     )
     register.add_argument("reference", type=Path, help="recording of the first camera")
     register.add_argument("file", type=Path, help="recording of the second camera, of the same scene")
-    _add_reading(register)
+    add_reading(register)
     register.add_argument(
         "--picture", type=Path, help="PNG of both event images, before and after (default: not drawn)"
     )
     register.set_defaults(run=_register)
 
 
-def _add_reading(command: argparse.ArgumentParser) -> None:
+def add_reading(command: argparse.ArgumentParser) -> None:
     """Add `READING_OPTIONS`."""
     command.add_argument("--format", help="format if it cannot be recognised: text, celex5_csv, celex5_bin, dat, ...")
     command.add_argument("--height", type=int, help="rows of the sensor, if the file does not state them")
@@ -134,7 +134,7 @@ def _add_recovery(commands: Commands) -> None:
     recover.add_argument(
         "--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)"
     )
-    _add_reading(recover)
+    add_reading(recover)
     recover.set_defaults(run=_recover)
 
     replay = commands.add_parser(

@@ -1,0 +1,254 @@
+"""The simulated twin of a recording: the same light through the fitted sensor, and how alike the two are."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64
+from scipy.stats import ks_2samp
+
+from polarnet.characterization.fit import SensorFit
+from polarnet.characterization.increments import by_pixel, intervals_of
+from polarnet.characterization.light import Flicker, MovingLight
+from polarnet.events.stream import Events, concatenate, crop, slice_time
+from polarnet.pictures.dead_leaves import dead_leaves
+from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
+from polarnet.runtime.machine import generator_for, seed_for
+from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate
+from polarnet.simulation.pixels.light import FULL_SCALE
+
+MAX_SIDE = 240  # pixels of the part that is compared
+MAX_DURATION_US = 20_000_000
+CHUNK_PIXELS = 1 << 22  # frames times pixels of one piece of simulated light
+STATIC_STEP_US = 1_000_000
+STEPS_PER_CYCLE = 64
+LEAVES_RATE_HZ = 300.0
+LEAVES_MARGIN = 80  # pixels that the stand-in scene extends beyond the sensor
+LEAVES_BLUR = 1.0  # pixels, a lens's
+DARKEST_LEAF = 0.04
+FIRST_SPEED_PX_S = 60.0
+SPEED_ROUNDS = 4
+SPEED_TRIAL_US = 1_000_000
+HOT_PIXEL_FACTOR = 4.0  # as `polarnet inspect`
+MIN_RATIO = 1e-3
+RATE_BINS = 100
+INTERVAL_EDGES_US = np.geomspace(50, 1e8, 64)
+
+
+class Comparison(NamedTuple):
+    """Statistics of a recording and of its twin, over the same pixels and the same time."""
+
+    name: str
+    same_light: bool
+    """False: the light of the recording is not known, and its twin sees another scene."""
+    height: int
+    width: int
+    duration_s: float
+    hot: int
+    """Hot pixels of the recording, which are left out."""
+    time_s: Float64[np.ndarray, " bins"]
+    rate_hz: Mapping[str, Float64[np.ndarray, " bins"]]
+    """Events per pixel and second, of `recording` and `twin`."""
+    ratio: Mapping[str, float]
+    """ON events per OFF event."""
+    intervals: Mapping[str, Float64[np.ndarray, " edges"]]
+    """Share of a pixel's inter-event intervals in each bin of `INTERVAL_EDGES_US`."""
+    pixel_rates_hz: Mapping[str, Float64[np.ndarray, " pixels"]]
+    interval_distance: float
+    """Kolmogorov-Smirnov distance of the intervals: 0 for equal distributions, 1 for disjoint ones."""
+    pixel_rate_distance: float
+
+    @property
+    def verdict(self) -> str:
+        """One line that says how alike the two are."""
+        rate = {name: float(values.mean()) for name, values in self.rate_hz.items()}
+        return (
+            f"Twin to recording: event rate {rate['twin'] / max(rate['recording'], 1e-9):.2f} times, "
+            f"ON/OFF {self.ratio['twin']:.2f} against {self.ratio['recording']:.2f}, Kolmogorov-Smirnov distance "
+            f"{self.interval_distance:.3f} of the inter-event intervals and {self.pixel_rate_distance:.3f} of the "
+            f"pixels' rates (0: equal distributions, 1: disjoint ones)."
+        )
+
+
+def fitted_parameters(fit: SensorFit) -> dict[str, float]:
+    """Values for section `emulate` of params.yaml, rounded to four digits: only the estimated ones.
+
+    The emulator has one threshold deviation for ON and OFF: the root mean square of both.
+    """
+    values = {name: one.value for name, one in fit.estimates.items() if name in EMULATED}
+    deviations = [fit.estimates[name].value for name in DEVIATIONS if name in fit.estimates]
+    if deviations:
+        values["contrast_threshold_sigma"] = float(np.sqrt(np.mean(np.square(deviations))))
+    return {name: float(f"{value:.4g}") for name, value in values.items()}
+
+
+DEVIATIONS = ("threshold_deviation_on", "threshold_deviation_off")
+EMULATED = (
+    "contrast_threshold_on",
+    "contrast_threshold_off",
+    "cutoff_hz",
+    "leak_rate_hz",
+    "leak_jitter",
+    "noise_rate_cov_decades",
+    "shot_noise_rate_hz",
+    "refractory_period_us",
+)
+
+
+def fitted_sensor(fit: SensorFit, default: EmulatorConfig) -> EmulatorConfig:
+    """`default` with the estimated parameters, in continuous time."""
+    changed: dict[str, Any] = dict(fitted_parameters(fit))
+    return replace(default, **changed, model="exact", randomise=False)
+
+
+def compare(
+    name: str, recording: Events, light: MovingLight | Flicker | float | None, sensor: EmulatorConfig, seed: int
+) -> Comparison:
+    """Simulate the twin of `recording` under `light` and compare the two.
+
+    A number is constant light in DN. None: the light is not known, and the twin sees drifting dead leaves whose speed
+    gives the recording's event rate. At most the first 20 seconds and the middle 240 x 240 pixels are compared.
+    ValueError for a recording without events.
+    """
+    if len(recording) < 2:
+        raise ValueError(f"{name}: expected events to compare, got {len(recording)}; record for longer")
+    start_us, stop_us = int(recording.t[0]), int(recording.t[-1])
+    if isinstance(light, MovingLight):
+        start_us, stop_us = max(start_us, int(light.t_us[0])), min(stop_us, int(light.t_us[-1]))
+        if start_us >= stop_us:
+            raise ValueError(f"{name}: expected frames at the times of the events; put both on one clock")
+    stop_us = min(stop_us, start_us + MAX_DURATION_US)
+    part = _middle(slice_time(recording, start_us, stop_us))
+    counts = event_counts(part)
+    hot = hot_pixels(counts, (stop_us - start_us) * 1e-6, HOT_PIXEL_FACTOR)
+    twin = _twin(part, recording, light, start_us, stop_us, sensor, seed)
+    pair = {"recording": without_pixels(part, hot), "twin": without_pixels(twin, hot)}
+    intervals_us = {key: intervals_of(by_pixel(events)).duration_us for key, events in pair.items()}
+    rates = {key: event_counts(events)[~hot] * (1e6 / (stop_us - start_us)) for key, events in pair.items()}
+    edges = np.linspace(start_us, stop_us, RATE_BINS + 1)
+    per_bin = RATE_BINS * 1e6 / (stop_us - start_us) / max(int((~hot).sum()), 1)
+    return Comparison(
+        name=name,
+        same_light=light is not None,
+        height=part.height,
+        width=part.width,
+        duration_s=(stop_us - start_us) * 1e-6,
+        hot=int(hot.sum()),
+        time_s=(0.5 * (edges[1:] + edges[:-1]) - start_us) * 1e-6,
+        rate_hz={key: np.histogram(events.t.numpy(), edges)[0] * per_bin for key, events in pair.items()},
+        ratio={key: float((e.p > 0).sum()) / max(int((e.p < 0).sum()), 1) for key, e in pair.items()},
+        intervals={key: np.histogram(v, INTERVAL_EDGES_US)[0] / max(len(v), 1) for key, v in intervals_us.items()},
+        pixel_rates_hz=rates,
+        interval_distance=_distance(intervals_us["recording"], intervals_us["twin"]),
+        pixel_rate_distance=_distance(rates["recording"], rates["twin"]),
+    )
+
+
+def drifting_leaves(
+    height: int, width: int, t_us: Float64[np.ndarray, " n"], speed_px_s: float, generator: np.random.Generator
+) -> Iterator[Float32[np.ndarray, "k h w"]]:
+    """Light of dead leaves that drift along a slow Lissajous figure, in pieces of consecutive frames, DN."""
+    size = height + 2 * LEAVES_MARGIN, width + 2 * LEAVES_MARGIN
+    scene = cv2.GaussianBlur(dead_leaves(generator, *size).mean(axis=2), (0, 0), LEAVES_BLUR)
+    scene = (FULL_SCALE * np.clip(scene, DARKEST_LEAF, 1)).astype(np.float32)
+    reach = 0.75 * LEAVES_MARGIN
+    angle = t_us * 1e-6 * speed_px_s / reach
+    left = LEAVES_MARGIN + reach * np.sin(angle)
+    top = LEAVES_MARGIN + reach * np.sin(0.77 * angle + 1)
+    step = max(2, CHUNK_PIXELS // (height * width))
+    for k in range(0, len(t_us), step):
+        shifts = zip(left[k : k + step], top[k : k + step], strict=True)
+        yield np.stack(
+            [cv2.warpAffine(scene, np.float64([[1, 0, -x], [0, 1, -y]]), (width, height)) for x, y in shifts]
+        )
+
+
+def emulated(
+    pieces: Iterator[Float32[np.ndarray, "k h w"]], t_us: Float64[np.ndarray, " n"], sensor: EmulatorConfig, key: int
+) -> Events:
+    """Events of one channel under light that comes in pieces."""
+    state: SensorState | None = None
+    parts, position = [], 0
+    for frames in pieces:
+        times = t_us[position : position + len(frames)]
+        (events,), state = emulate(np.ascontiguousarray(frames)[:, None], times, sensor, key, state)
+        position += len(frames)
+        parts.append(events)
+    return concatenate(parts)
+
+
+def constant_frames(
+    light: Float64[np.ndarray, " n"], height: int, width: int
+) -> Iterator[Float32[np.ndarray, "k h w"]]:
+    """Light that is the same on all pixels, in pieces of consecutive frames."""
+    step = max(2, CHUNK_PIXELS // (height * width))
+    for k in range(0, len(light), step):
+        some = light[k : k + step].astype(np.float32)
+        yield np.broadcast_to(some[:, None, None], (len(some), height, width))
+
+
+def flicker_light(
+    flicker: Flicker, start_us: float, stop_us: float
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """Times and light of a flicker, 64 steps per cycle."""
+    steps = math.ceil((stop_us - start_us) * 1e-6 * flicker.frequency_hz * STEPS_PER_CYCLE)
+    t_us = np.linspace(start_us, stop_us, steps + 1)
+    phase = 2e-6 * math.pi * flicker.frequency_hz * (t_us - start_us)
+    return t_us, flicker.level * (1 + flicker.contrast * np.sin(phase))
+
+
+def _twin(
+    part: Events,
+    recording: Events,
+    light: MovingLight | Flicker | float | None,
+    start_us: int,
+    stop_us: int,
+    sensor: EmulatorConfig,
+    seed: int,
+) -> Events:
+    h, w, key = part.height, part.width, seed_for(seed, "twin", "sensor")
+    if isinstance(light, MovingLight):
+        top, left = _corner(recording)
+        kept = (light.t_us >= start_us) & (light.t_us <= stop_us)
+        frames, t_us = light.frames[kept, top : top + h, left : left + w], light.t_us[kept]
+        step = max(2, CHUNK_PIXELS // (h * w))
+        return emulated((frames[k : k + step] for k in range(0, len(frames), step)), t_us, sensor, key)
+    if isinstance(light, Flicker):
+        t_us, values = flicker_light(light, start_us, stop_us)
+        return emulated(constant_frames(values, h, w), t_us, sensor, key)
+    if light is not None:
+        t_us = np.append(np.arange(start_us, stop_us, STATIC_STEP_US, dtype=np.float64), stop_us)
+        return emulated(constant_frames(np.full(len(t_us), light), h, w), t_us, sensor, key)
+    return _stand_in(part, start_us, stop_us, sensor, seed)
+
+
+def _stand_in(part: Events, start_us: int, stop_us: int, sensor: EmulatorConfig, seed: int) -> Events:
+    """Twin under drifting leaves, whose speed gives the recording's rate; the rate grows with the speed."""
+    wanted = len(part) / (stop_us - start_us)
+
+    def under_leaves(speed_px_s: float, until_us: int) -> Events:
+        t_us = np.arange(start_us, until_us, 1e6 / LEAVES_RATE_HZ)
+        pieces = drifting_leaves(part.height, part.width, t_us, speed_px_s, generator_for(seed, "twin", "picture"))
+        return emulated(pieces, t_us, sensor, seed_for(seed, "twin", "sensor"))
+
+    speed, trial_us = FIRST_SPEED_PX_S, min(stop_us, start_us + SPEED_TRIAL_US)
+    for _ in range(SPEED_ROUNDS):
+        rate = len(under_leaves(speed, trial_us)) / (trial_us - start_us)
+        speed *= min(max(wanted / max(rate, MIN_RATIO * wanted), 0.1), 10.0)
+    return under_leaves(speed, stop_us)
+
+
+def _middle(events: Events) -> Events:
+    top, left = _corner(events)
+    return crop(events, top, left, min(events.height, MAX_SIDE), min(events.width, MAX_SIDE))
+
+
+def _corner(events: Events) -> tuple[int, int]:
+    return max(0, (events.height - MAX_SIDE) // 2), max(0, (events.width - MAX_SIDE) // 2)
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    return float(ks_2samp(a, b).statistic) if len(a) and len(b) else 1.0
