@@ -38,6 +38,7 @@ TRUSTED_LEAK = 0.1  # relative error below which the leak under constant light n
 LEAKED = 0.25  # intervals in which the leak alone makes this part of a threshold tell nothing of thresholds
 MIN_PIXELS = 50
 PILE_UP = 3.0  # times more intervals within 10 % of the shortest than in the next 10 %
+MIN_TICKS = 5  # of the recording's clock, in a refractory period that can be told from it
 PHASES = 48
 
 
@@ -155,7 +156,10 @@ def refractory_period_us(durations_us: Sequence[Float64[np.ndarray, " n"]]) -> E
     supported = max(5, int(1e-5 * len(durations)))
     if len(durations) <= supported:
         return None
+    tick_us = float(np.gcd.reduce(np.rint(durations).astype(np.int64)))
     shortest = durations[supported]
+    if shortest < MIN_TICKS * tick_us:
+        return None  # a coarse clock piles intervals up as well
     edges = np.searchsorted(durations, shortest * np.array([0.9, 1.1, 1.3]))
     piled, next_to = np.diff(edges)
     if piled < 20 or piled < PILE_UP * next_to:

@@ -49,6 +49,8 @@ class Comparison(NamedTuple):
     duration_s: float
     hot: int
     """Hot pixels of the recording, which are left out."""
+    tick_us: int
+    """Step of the recording's clock."""
     time_s: Float64[np.ndarray, " bins"]
     rate_hz: Mapping[str, Float64[np.ndarray, " bins"]]
     """Events per pixel and second, of `recording` and `twin`."""
@@ -137,6 +139,7 @@ def compare(
         width=part.width,
         duration_s=(stop_us - start_us) * 1e-6,
         hot=int(hot.sum()),
+        tick_us=int(np.gcd.reduce(np.diff(part.t.numpy()))),
         time_s=(0.5 * (edges[1:] + edges[:-1]) - start_us) * 1e-6,
         rate_hz={key: np.histogram(events.t.numpy(), edges)[0] * per_bin for key, events in pair.items()},
         ratio={key: float((e.p > 0).sum()) / max(int((e.p < 0).sum()), 1) for key, e in pair.items()},

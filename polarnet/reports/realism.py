@@ -63,6 +63,9 @@ def realism_figure(comparison: Comparison, theme: Theme) -> Figure:
             axes.set_ylabel(y)
         rate.set_ylim(bottom=0)
         intervals.set_xscale("log")
+        filled = np.flatnonzero(sum(comparison.intervals.values()))
+        if len(filled):
+            intervals.set_xlim(INTERVAL_EDGES_US[filled[0]] * 5e-4, INTERVAL_EDGES_US[filled[-1] + 1] * 2e-3)
         pixels.set_yscale("symlog", linthresh=max(1e-3, 1 / comparison.duration_s))
         pixels.set_ylim(bottom=0)
         rate.legend(frameon=False, fontsize=7, labelcolor=theme.text)

@@ -1,0 +1,162 @@
+"""Accuracy of `polarnet fit-sensor` on simulated sensors: python -m studies.sensor_fit [--sensors N] [--write]
+
+Each sensor is drawn from RANGES and recorded by the pixel model `exact`: under constant light, before drifting dead
+leaves whose light is rendered 1000 times a second, and before lamps that flicker. The fit gets the events and, for the
+leaves, 8-bit frames at --frame-rate. It knows nothing of the sensor. Two fits are made: `frames` (static, leaves) and
+`flicker` (static, lamps). `--write` puts the figures into docs/results/camera.json as section `sensor_fit`.
+"""
+
+import argparse
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polarnet.characterization.fit import KnownLight, SensorFit, fit_sensor
+from polarnet.characterization.light import Flicker, MovingLight
+from polarnet.characterization.twin import constant_frames, drifting_leaves, emulated, flicker_light
+from polarnet.events.stream import Events
+from polarnet.runtime.machine import generator_for
+from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.presets import SENSORS
+from studies.measure import machine_record, uncommitted, write_section
+
+ROOT = Path(__file__).resolve().parents[1]
+HEIGHT, WIDTH = 60, 80
+RANGES = {
+    "contrast_threshold_on": (0.08, 0.42),
+    "contrast_threshold_off": (0.08, 0.42),
+    "contrast_threshold_sigma": (0.02, 0.06),
+    "cutoff_hz": (30.0, 300.0),
+    "leak_rate_hz": (0.01, 0.3),
+    "shot_noise_rate_hz": (0.05, 5.0),
+    "refractory_period_us": (100.0, 1000.0),
+}
+"""Sensors are drawn uniformly, rates and the refractory period in their logarithm."""
+LINEAR = ("contrast_threshold_on", "contrast_threshold_off", "contrast_threshold_sigma")
+MAX_RELATIVE_SIGMA = 0.3  # of the smaller threshold
+STATIC_S, STATIC_LIGHT = 300, 200.0
+MOVING_S, RENDER_HZ, SPEED_PX_S = 10.0, 1000, 60.0
+FLICKERS = {2.0: 6.0, 20.0: 3.0, 60.0: 2.0}
+"""Seconds recorded at each frequency (Hz)."""
+CONTRAST, FLICKER_LIGHT = 0.8, 100.0
+ERRORS = {
+    "threshold_error_max": ("contrast_threshold_on", "contrast_threshold_off"),
+    "deviation_error_max": ("threshold_deviation_on", "threshold_deviation_off"),
+    "noise_error_max": ("leak_rate_hz", "shot_noise_rate_hz"),
+    "bandwidth_error_max": ("cutoff_hz",),
+}
+REPORTED = (*(name for names in ERRORS.values() for name in names), "refractory_period_us")
+
+
+def drawn_sensor(number: int) -> EmulatorConfig:
+    """Sensor `number` of the study."""
+    generator = generator_for(1, f"sensor {number}", "fit")
+    values = {}
+    for name, (low, high) in RANGES.items():
+        if name in LINEAR:
+            values[name] = float(generator.uniform(low, high))
+        else:
+            values[name] = math.exp(generator.uniform(math.log(low), math.log(high)))
+    smaller = min(values["contrast_threshold_on"], values["contrast_threshold_off"])
+    values["contrast_threshold_sigma"] = min(values["contrast_threshold_sigma"], MAX_RELATIVE_SIGMA * smaller)
+    return replace(SENSORS["default"], model="exact", **values)
+
+
+def truth_of(sensor: EmulatorConfig) -> dict[str, float]:
+    """The sensor's parameters by the names of the estimates."""
+    sigma = sensor.contrast_threshold_sigma
+    truth = {name: getattr(sensor, name) for name in REPORTED if hasattr(sensor, name)}
+    return {**truth, "threshold_deviation_on": sigma, "threshold_deviation_off": sigma}
+
+
+def static_recording(sensor: EmulatorConfig, key: int) -> Events:
+    """Five minutes of constant light."""
+    t_us = np.arange(0, STATIC_S + 1, 5) * 1e6
+    return emulated(constant_frames(np.full(len(t_us), STATIC_LIGHT), HEIGHT, WIDTH), t_us, sensor, key)
+
+
+def leaves(sensor: EmulatorConfig, key: int, frame_rate_hz: int) -> KnownLight:
+    """Drifting dead leaves, and the 8-bit frames of them that the fit gets."""
+    t_us = np.arange(round(MOVING_S * RENDER_HZ) + 1) * (1e6 / RENDER_HZ)
+    light = np.concatenate(list(drifting_leaves(HEIGHT, WIDTH, t_us, SPEED_PX_S, generator_for(1, "leaves", "fit"))))
+    step = RENDER_HZ // frame_rate_hz
+    events = emulated(iter([light]), t_us, sensor, key)
+    return KnownLight("moving", events, MovingLight(np.rint(light[::step]), t_us[::step]))
+
+
+def lamps(sensor: EmulatorConfig, key: int) -> list[KnownLight]:
+    """Flickering lamps of unknown phase."""
+    known = []
+    for frequency_hz, seconds in FLICKERS.items():
+        flicker = Flicker(FLICKER_LIGHT, CONTRAST, frequency_hz)
+        t_us, values = flicker_light(flicker, 0.0, seconds * 1e6)
+        events = emulated(constant_frames(values, HEIGHT, WIDTH), t_us, sensor, key)
+        known.append(KnownLight(f"flicker {frequency_hz:g} Hz", events, flicker))
+    return known
+
+
+def errors_of(fits: list[Mapping[str, Any]]) -> dict[str, Any]:
+    """Largest relative errors over the sensors, and how many values were not estimated."""
+    headlines: dict[str, Any] = {}
+    for key, names in ERRORS.items():
+        errors = [
+            abs(fit["estimate"][name] / fit["truth"][name] - 1)
+            for fit in fits
+            for name in names
+            if fit["estimate"][name] is not None
+        ]
+        headlines[key] = round(max(errors), 4) if errors else None
+    headlines["not_estimated"] = {
+        name: missing for name in REPORTED if (missing := sum(fit["estimate"][name] is None for fit in fits))
+    }
+    return headlines
+
+
+def row_of(sensor: EmulatorConfig, fit: SensorFit) -> dict[str, Any]:
+    """Truth and estimates of a sensor."""
+    estimate = {name: round(fit.estimates[name].value, 5) if name in fit.estimates else None for name in REPORTED}
+    return {"truth": {name: round(value, 5) for name, value in truth_of(sensor).items()}, "estimate": estimate}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sensors", type=int, default=12)
+    parser.add_argument("--frame-rate", type=int, default=100, help="frames per second that the fit gets")
+    parser.add_argument("--light", nargs="+", choices=("frames", "flicker"), default=["frames", "flicker"])
+    parser.add_argument("--write", action="store_true", help="write docs/results/camera.json")
+    arguments = parser.parse_args()
+    if arguments.write and (changed := uncommitted(ROOT)):
+        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    record = machine_record(ROOT)
+    rows: dict[str, list[dict[str, Any]]] = {kind: [] for kind in arguments.light}
+    for number in range(arguments.sensors):
+        sensor, key = drawn_sensor(number), 1000 + number
+        static = static_recording(sensor, key)
+        for kind in arguments.light:
+            known = [leaves(sensor, key, arguments.frame_rate)] if kind == "frames" else lamps(sensor, key)
+            rows[kind].append(row_of(sensor, fit_sensor(static, STATIC_LIGHT, known)))
+            print(number, kind, json.dumps(rows[kind][-1]), flush=True)
+    section: dict[str, Any] = {kind: {**errors_of(fits), "sensors": fits} for kind, fits in rows.items()}
+    section |= errors_of(next(iter(rows.values())))
+    section |= {
+        "height": HEIGHT,
+        "width": WIDTH,
+        "static_s": STATIC_S,
+        "moving_s": MOVING_S,
+        "frame_rate_hz": arguments.frame_rate,
+    }
+    print(json.dumps({key: value for key, value in section.items() if key not in rows}, indent=2))
+    for kind in rows:
+        print(kind, json.dumps({key: value for key, value in section[kind].items() if key != "sensors"}))
+    if arguments.write:
+        print(f"written to {write_section(ROOT, 'camera', 'sensor_fit', section, record).relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    main()
