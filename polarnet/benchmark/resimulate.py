@@ -78,4 +78,4 @@ def _test_sequence(
     intensity, dolp, aolp = (frames[1:] for frames in frames_of(scene, trajectory, t_us.tolist(), *size))
     valid = None if record.valid is None else valid_frames(record.valid, trajectory, t_us.tolist()[1:], *size)
     s0 = intensity[:, 0] + intensity[:, 2]
-    return TestSequence(record.name, record.picture, events, t_us, dolp, aolp, s0, valid)
+    return TestSequence(record.name, record.scene, events, t_us, dolp, aolp, s0, valid)

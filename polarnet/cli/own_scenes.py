@@ -78,7 +78,7 @@ def benchmark_folder(
 def _skipped(config: Config, work: Path) -> list[str]:
     """One line for each file of the folder that was skipped."""
     manifest = read_manifest(work / "images")
-    used = set(SceneStore.open(work / "scenes.zarr").picture_of.values())
+    used = set(SceneStore.open(work / "scenes.zarr").scene_of.values())
     unused = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name not in used))
     _, small = motions_of(unused, config.synthesize, config.seed)
     return [f"{skipped.file} was skipped: {skipped.reason}" for skipped in (*manifest.skipped, *small)]

@@ -141,12 +141,12 @@ def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
         EventStore.open(paths.events),
     )
     manifest = read_manifest(paths.images)
-    seen = set(scenes.picture_of.values())
-    pictures = [entry for entry in manifest.pictures if entry.name in seen]  # others are too small for the sensor
+    names = set(scenes.scene_of.values())  # pictures too small for the sensor have no scene
+    pictures = [entry for entry in manifest.pictures if entry.name in names]
     pictures.sort(key=lambda entry: entry.source == "dead_leaves")  # photographs first
     generated = {entry.name for entry in pictures if entry.source == "dead_leaves"}
     files = sorted((paths.benchmark / "panels").glob("*.npz"))
-    panels = [_panel(file, scenes.picture_of[file.stem] in generated) for file in files]
+    panels = [_panel(file, scenes.scene_of[file.stem] in generated) for file in files]
     panels.sort(key=lambda panel: panel.generated)
     return Artefacts(
         manifest=manifest,
@@ -233,7 +233,7 @@ def overview_of(panel: Panel, scenes: SceneStore, frames: FrameStore, events: Ev
 
 def thumbnails(pictures: Sequence[str], scenes: SceneStore) -> list[Thumbnail]:
     """Thumbnails of the first `MAX_THUMBNAILS` pictures, from the scenes made of them."""
-    sequence_of = {picture: sequence for sequence, picture in reversed(scenes.picture_of.items())}
+    sequence_of = {scene: sequence for sequence, scene in reversed(scenes.scene_of.items())}
     found = []
     for picture in pictures[:MAX_THUMBNAILS]:
         scene = scenes.read(sequence_of[picture])

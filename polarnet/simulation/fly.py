@@ -44,7 +44,7 @@ class EmulatedEvents:
         return [slice_time(events, start_us, stop_us) for events in channels]
 
     def _emulated(self, sequence: str) -> list[Events]:
-        if sequence not in self._scenes.picture_of:
+        if sequence not in self._scenes.scene_of:
             raise ValueError(f"{self.path}: expected the name of one of its sequences, got {sequence!r}")
         if sequence not in self._in_memory:
             while len(self._in_memory) >= self._kept:

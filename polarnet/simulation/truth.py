@@ -154,11 +154,11 @@ def _create(
     sequences_per_part: int,
 ) -> tuple[SceneStore, FrameStore]:
     """Two unfinished stores; their attributes record all inputs, so that only an equal run resumes them."""
-    picture_of, splits = {}, {}
+    scene_of, splits = {}, {}
     for entry in manifest.pictures:
         for scene, sequences in motions[entry.name].items():
             for sequence in sequences:
-                picture_of[sequence], splits[sequence] = scene, entry.split
+                scene_of[sequence], splits[sequence] = scene, entry.split
     attributes = {
         "synthesize": asdict(config),
         "variation": asdict(variation) if variation else None,
@@ -171,7 +171,7 @@ def _create(
     masked = any(entry.masked_fraction for entry in manifest.pictures)  # null for photographs
     scene_store = SceneStore.create(
         scenes,
-        picture_of,
+        scene_of,
         splits,
         largest_picture=largest,
         sensor=sensor,
@@ -181,9 +181,9 @@ def _create(
         sequences_per_part=sequences_per_part,
     )
     n_frames = len(frame_times_us(config))
-    frame_attributes = {**attributes, "scenes": picture_of}
+    frame_attributes = {**attributes, "scenes": scene_of}
     frame_store = FrameStore.create(
-        frames, list(picture_of), splits, n_frames, *sensor, frame_attributes, masked, sequences_per_part
+        frames, list(scene_of), splits, n_frames, *sensor, frame_attributes, masked, sequences_per_part
     )
     return scene_store, frame_store
 
@@ -200,8 +200,8 @@ def _synthesize_part(
 ) -> None:
     """Write the part of both stores that holds the sequences of these trajectories."""
     t_us = frame_times_us(config)
-    for picture, sequences in itertools.groupby(trajectories, scenes.picture_of.__getitem__):
-        planes = _planes_of(picture, images, variation, seed)
+    for scene_name, sequences in itertools.groupby(trajectories, scenes.scene_of.__getitem__):
+        planes = _planes_of(scene_name, images, variation, seed)
         if not scenes.masked:
             planes = planes._replace(valid=None)
         scene = scene_from_polarization(planes.s0, planes.dolp, planes.aolp)

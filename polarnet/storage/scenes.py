@@ -61,7 +61,8 @@ class SceneRecord(NamedTuple):
     """One sequence, ready to be rendered."""
 
     name: str
-    picture: str
+    scene: str
+    """Name of the scene; several sequences may show one."""
     split: str
     s0: Float[Tensor, "h w"]
     dolp: Float[Tensor, "h w"]
@@ -89,12 +90,11 @@ class SceneStore(SplitStore):
     """
 
     FORMAT = "polarnet.scenes"
-    VERSION = 2
+    VERSION = 3
 
     def __init__(self, path: str, header: Header):
         super().__init__(path, header)
-        self.picture_of: dict[str, str] = dict(zip(self.sequences, header["picture_of_sequence"], strict=True))
-        self.pictures: list[str] = sorted(set(self.picture_of.values()))
+        self.scene_of: dict[str, str] = dict(zip(self.sequences, header["scene_of_sequence"], strict=True))
         self.sensor_height: int = header["sensor_height"]
         self.sensor_width: int = header["sensor_width"]
         self.trajectory_names: list[str] = header["trajectory"]
@@ -111,7 +111,7 @@ class SceneStore(SplitStore):
     def create(
         cls,
         path: str | os.PathLike[str],
-        picture_of: Mapping[str, str],
+        scene_of: Mapping[str, str],
         splits: Mapping[str, str],
         *,
         largest_picture: tuple[int, int],
@@ -123,15 +123,15 @@ class SceneStore(SplitStore):
     ) -> "SceneStore":
         """Create a store to write; it lies at PATH.tmp until it is finished.
 
-        `picture_of` maps each sequence to its picture, `splits` each sequence to train, val or test; ValueError where
-        two sequences of one picture are in different splits. `largest_picture` and `sensor` are (height, width) in
+        `scene_of` maps each sequence to the name of its scene, `splits` each sequence to train, val or test; ValueError
+        if two sequences of one scene are in different splits. `largest_picture` and `sensor` are (height, width) in
         pixels. A `masked` store records which pixels have known light. Resumes as `EventStore.create` does.
         """
-        sequences = list(picture_of)
+        sequences = list(scene_of)
         check_splits(sequences, splits)
-        _check_no_leak(picture_of, splits)
+        _check_no_leak(scene_of, splits)
         metadata = {
-            "picture_of_sequence": [picture_of[sequence] for sequence in sequences],
+            "scene_of_sequence": [scene_of[sequence] for sequence in sequences],
             "splits": [splits[sequence] for sequence in sequences],
             "largest_picture": list(largest_picture),
             "sensor_height": sensor[0],
@@ -164,10 +164,10 @@ class SceneStore(SplitStore):
         }
         columns = {}
         for name, written in self.records_so_far(sequence).items():
-            if self.picture_of[name] == self.picture_of[sequence]:
+            if self.scene_of[name] == self.scene_of[sequence]:
                 record["pixels"] = written["pixels"]
         if "pixels" not in record:
-            columns = self._pixels(self.picture_of[sequence], scene)
+            columns = self._pixels(self.scene_of[sequence], scene)
         self.append(sequence, columns, record)
 
     def read(self, sequence: str) -> SceneRecord:
@@ -179,7 +179,7 @@ class SceneStore(SplitStore):
         )
         return SceneRecord(
             sequence,
-            self.picture_of[sequence],
+            self.scene_of[sequence],
             self.splits[sequence],
             dequantise_fraction(s0),
             dequantise_fraction(dolp),
@@ -237,11 +237,11 @@ def _quantised(scene: Scene) -> dict[str, np.ndarray]:
     }
 
 
-def _check_no_leak(picture_of: Mapping[str, str], splits: Mapping[str, str]) -> None:
-    split_of_picture: dict[str, str] = {}
-    for sequence, picture in picture_of.items():
-        if split_of_picture.setdefault(picture, splits[sequence]) != splits[sequence]:
+def _check_no_leak(scene_of: Mapping[str, str], splits: Mapping[str, str]) -> None:
+    split_of_scene: dict[str, str] = {}
+    for sequence, scene in scene_of.items():
+        if split_of_scene.setdefault(scene, splits[sequence]) != splits[sequence]:
             raise ValueError(
-                f"picture {picture} would be in the splits {split_of_picture[picture]} and {splits[sequence]}; "
-                "put all sequences of a picture in one"
+                f"scene {scene} would be in the splits {split_of_scene[scene]} and {splits[sequence]}; "
+                "put all sequences of a scene in one"
             )

@@ -106,7 +106,7 @@ def test_pictures_too_small_for_the_window_are_left_out(images, stores, tmp_path
     write_manifest(dataclasses.replace(manifest, pictures=(dataclasses.replace(first, height=24), *others)), smaller)
     scenes, frames = run(smaller, tmp_path)
     assert f"skipped {first.origin}: a scene of 24x120 (height x width) is too small" in caplog.text
-    assert set(scenes.picture_of.values()) == {entry.name for entry in others}
+    assert set(scenes.scene_of.values()) == {entry.name for entry in others}
     for sequence in scenes.sequences:
         assert frames.frames(sequence).dolp.equal(stores[1].frames(sequence).dolp)
     with pytest.raises(ValueError, match=r"none of 5 pictures can be used:\n  .*: a scene of 80x120 .* is too small"):
