@@ -29,7 +29,7 @@ from polarnet.simulation.scene import (
 )
 from polarnet.simulation.variation import VariationConfig, varied
 from polarnet.storage.frames import FrameStore
-from polarnet.storage.scenes import Scene, SceneStore, as_stored, made_from, variant_name
+from polarnet.storage.scenes import Scene, SceneStore, as_stored
 
 logger = logging.getLogger(__name__)
 
@@ -131,7 +131,7 @@ def motions_of(
 
 def _motions(entry: ManifestEntry, config: SynthesizeConfig, seed: int, variation: VariationConfig | None) -> Motions:
     variants = variation.scenes_per_picture if variation and entry.split == "train" else 0
-    scenes = [entry.name, *(variant_name(entry.name, k) for k in range(1, variants + 1))]
+    scenes = [entry.name, *(f"{entry.name}-variant{k:02d}" for k in range(1, variants + 1))]
     names = {scene: [f"{scene}-{number:02d}" for number in range(config.sequences_per_picture)] for scene in scenes}
     return {
         scene: {
@@ -154,11 +154,13 @@ def _create(
     sequences_per_part: int,
 ) -> tuple[SceneStore, FrameStore]:
     """Two unfinished stores; their attributes record all inputs, so that only an equal run resumes them."""
-    scene_of, splits = {}, {}
+    scene_of, splits, variant_of = {}, {}, {}
     for entry in manifest.pictures:
         for scene, sequences in motions[entry.name].items():
             for sequence in sequences:
                 scene_of[sequence], splits[sequence] = scene, entry.split
+                if scene != entry.name:
+                    variant_of[sequence] = entry.name
     attributes = {
         "synthesize": asdict(config),
         "variation": asdict(variation) if variation else None,
@@ -177,13 +179,14 @@ def _create(
         sensor=sensor,
         trajectory_names=names,
         attributes=attributes,
+        variant_of=variant_of,
         masked=masked,
         sequences_per_part=sequences_per_part,
     )
     n_frames = len(frame_times_us(config))
     frame_attributes = {**attributes, "scenes": scene_of}
     frame_store = FrameStore.create(
-        frames, list(scene_of), splits, n_frames, *sensor, frame_attributes, masked, sequences_per_part
+        frames, list(scene_of), splits, n_frames, *sensor, frame_attributes, masked, sequences_per_part, variant_of
     )
     return scene_store, frame_store
 
@@ -200,8 +203,9 @@ def _synthesize_part(
 ) -> None:
     """Write the part of both stores that holds the sequences of these trajectories."""
     t_us = frame_times_us(config)
-    for scene_name, sequences in itertools.groupby(trajectories, scenes.scene_of.__getitem__):
-        planes = _planes_of(scene_name, images, variation, seed)
+    for name, group in itertools.groupby(trajectories, scenes.scene_of.__getitem__):
+        sequences = list(group)
+        planes = _planes_of(name, scenes.variant_of.get(sequences[0], name), images, variation, seed)
         if not scenes.masked:
             planes = planes._replace(valid=None)
         scene = scene_from_polarization(planes.s0, planes.dolp, planes.aolp)
@@ -215,12 +219,11 @@ def _synthesize_part(
             frames.write(sequence, torch.tensor(t_us), *seen, known)
 
 
-def _planes_of(picture: str, images: Path, variation: VariationConfig | None, seed: int) -> Scene:
+def _planes_of(scene: str, picture: str, images: Path, variation: VariationConfig | None, seed: int) -> Scene:
     """A picture in polarization, or a variant of one, quantised: the scene that is emulated, and so the truth."""
-    source = made_from(picture)
-    polarization, valid = _read_polarization(images, source)
-    if variation and source != picture:
-        polarization = varied(polarization, variation, generator_for(seed, picture, "variation"))
+    polarization, valid = _read_polarization(images, picture)
+    if variation and scene != picture:
+        polarization = varied(polarization, variation, generator_for(seed, scene, "variation"))
     s0, dolp, aolp = polarization
     return as_stored(Scene(s0, dolp, aolp, valid))
 

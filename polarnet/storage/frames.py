@@ -89,6 +89,9 @@ class SplitStore(Store):
     def __init__(self, path: str, header: Header):
         super().__init__(path, header)
         self.splits: dict[str, str] = dict(zip(self.sequences, header["splits"], strict=True))
+        pictures = zip(self.sequences, header["variant_of"], strict=True)
+        self.variant_of: dict[str, str] = {name: picture for name, picture in pictures if picture is not None}
+        """Name of the picture, for each sequence over a variant of it."""
 
     def of_split(self, split: str) -> list[str]:
         """The sequences of `train`, `val` or `test`, in the store's order; ValueError for another split."""
@@ -101,7 +104,7 @@ class FrameStore(SplitStore):
     """Frames of sequences, each in the split train, val or test; see `create` and `open`."""
 
     FORMAT = "polarnet.frames"
-    VERSION = 2
+    VERSION = 3
 
     def __init__(self, path: str, header: Header):
         super().__init__(path, header)
@@ -133,15 +136,16 @@ class FrameStore(SplitStore):
         attributes: Mapping[str, Any],
         masked: bool = False,
         sequences_per_part: int = 1,
+        variant_of: Mapping[str, str] | None = None,
     ) -> "FrameStore":
         """Create a store for up to `n_frames` per sequence; it lies at PATH.tmp until it is finished.
 
-        `splits` maps each sequence to train, val or test. A `masked` store records for every pixel whether its truth is
+        `splits` maps each sequence to train, val or test, and `variant_of` each sequence over a variant to the name of
+        the variant's picture. A `masked` store records for every pixel whether its truth is
         known; other stores have no mask. Resumes as `EventStore.create` does.
         """
-        check_splits(sequences, splits)
         metadata = {
-            "splits": [splits[sequence] for sequence in sequences],
+            **split_columns(sequences, splits, variant_of or {}),
             "n_frames": n_frames,
             "height": height,
             "width": width,
@@ -228,8 +232,12 @@ class FrameStore(SplitStore):
         return mask_of("valid", valid, shape).cpu()
 
 
-def check_splits(names: Sequence[str], splits: Mapping[str, str]) -> None:
-    """ValueError for the first name without a split, or with one that is not train, val or test."""
+def split_columns(names: Sequence[str], splits: Mapping[str, str], variant_of: Mapping[str, str]) -> Header:
+    """Header of a `SplitStore`: the split of each sequence, and the picture of each sequence over a variant, else null.
+
+    ValueError for the first name without a split, or with one that is not train, val or test.
+    """
     for name in names:
         if splits.get(name) not in SPLITS:
             raise ValueError(f"expected {name} in one of the splits {', '.join(SPLITS)}, got {splits.get(name)!r}")
+    return {"splits": [splits[name] for name in names], "variant_of": [variant_of.get(name) for name in names]}

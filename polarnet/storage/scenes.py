@@ -4,7 +4,6 @@ Rendering starts from the stored, quantised scene, so that truth and events agre
 """
 
 import os
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -16,11 +15,11 @@ from torch import Tensor
 from polarnet.runtime.arrays import Array, as_tensor, check_same_shape, check_shape, mask_of
 from polarnet.storage.frames import (
     SplitStore,
-    check_splits,
     dequantise_angle,
     dequantise_fraction,
     quantise_angle,
     quantise_fraction,
+    split_columns,
 )
 from polarnet.storage.parts import Column, Columns, Header
 
@@ -35,26 +34,7 @@ CONVENTIONS = {
     "duration_us": "length of a sequence in microseconds",
 }
 
-_VARIANT = re.compile(r"(.+)-variant[0-9]+")
-
 MASK_CONVENTION = "1 where the light of a pixel is known, 0 where saturation hid it"
-
-
-def variant_name(picture: str, number: int) -> str:
-    """Of a scene that `polarnet.simulation.variation` makes of a picture."""
-    return f"{picture}-variant{number:02d}"
-
-
-def made_from(scene: str) -> str:
-    """The picture that a scene is, or a variant of."""
-    variant = _VARIANT.fullmatch(scene)
-    return variant[1] if variant else scene
-
-
-def without_variants(sequences: Sequence[str]) -> list[str]:
-    """The sequences whose scene is a picture as it is."""
-    scenes = {name: name.rpartition("-")[0] for name in sequences}
-    return [name for name, scene in scenes.items() if made_from(scene) == scene]
 
 
 class SceneRecord(NamedTuple):
@@ -118,21 +98,23 @@ class SceneStore(SplitStore):
         sensor: tuple[int, int],
         trajectory_names: Sequence[str],
         attributes: Mapping[str, Any],
+        variant_of: Mapping[str, str] | None = None,
         masked: bool = False,
         sequences_per_part: int = 1,
     ) -> "SceneStore":
         """Create a store to write; it lies at PATH.tmp until it is finished.
 
-        `scene_of` maps each sequence to the name of its scene, `splits` each sequence to train, val or test; ValueError
-        if two sequences of one scene are in different splits. `largest_picture` and `sensor` are (height, width) in
+        `scene_of` maps each sequence to the name of its scene, `splits` each sequence to train, val or test, and
+        `variant_of` each sequence over a variant to the name of the variant's picture. ValueError if two sequences of
+        one picture or its variants are in different splits. `largest_picture` and `sensor` are (height, width) in
         pixels. A `masked` store records which pixels have known light. Resumes as `EventStore.create` does.
         """
         sequences = list(scene_of)
-        check_splits(sequences, splits)
-        _check_no_leak(scene_of, splits)
+        columns = split_columns(sequences, splits, variant_of or {})
+        _check_no_leak({**scene_of, **(variant_of or {})}, splits)
         metadata = {
             "scene_of_sequence": [scene_of[sequence] for sequence in sequences],
-            "splits": [splits[sequence] for sequence in sequences],
+            **columns,
             "largest_picture": list(largest_picture),
             "sensor_height": sensor[0],
             "sensor_width": sensor[1],
@@ -237,11 +219,11 @@ def _quantised(scene: Scene) -> dict[str, np.ndarray]:
     }
 
 
-def _check_no_leak(scene_of: Mapping[str, str], splits: Mapping[str, str]) -> None:
-    split_of_scene: dict[str, str] = {}
-    for sequence, scene in scene_of.items():
-        if split_of_scene.setdefault(scene, splits[sequence]) != splits[sequence]:
+def _check_no_leak(picture_by_sequence: Mapping[str, str], splits: Mapping[str, str]) -> None:
+    split_of_picture: dict[str, str] = {}
+    for sequence, picture in picture_by_sequence.items():
+        if split_of_picture.setdefault(picture, splits[sequence]) != splits[sequence]:
             raise ValueError(
-                f"scene {scene} would be in the splits {split_of_scene[scene]} and {splits[sequence]}; "
-                "put all sequences of a scene in one"
+                f"picture {picture} would be in the splits {split_of_picture[picture]} and {splits[sequence]}; "
+                "put all sequences of a picture and its variants in one"
             )

@@ -14,7 +14,6 @@ from polarnet.events.representations import REPRESENTATIONS
 from polarnet.metrics.similarity import correlation, mse, psnr
 from polarnet.runtime.machine import precision_on
 from polarnet.runtime.ranges import allowed
-from polarnet.storage.scenes import without_variants
 from polarnet.storage.windows import WindowDataset
 from polarnet.training.calibration import Scene, fitted
 from polarnet.training.losses import known_frames
@@ -93,7 +92,7 @@ def train(
         recorder.keep(progress, network, optimizer, at_once=True)
     if task.expects is not None and recorder.writes:
         network.load_state_dict(progress.best)
-        names = without_variants(split.train.sequences)
+        names = [name for name in split.train.sequences if name not in split.train.frames.variant_of]
         scenes = WindowDataset(split.train.events, split.train.frames, names, split.train.encode)
         recorder.calibrated(progress, network, calibrate(task, scenes, config, device, workers))
     recorder.finish()

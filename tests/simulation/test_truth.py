@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from polarnet.config.tree import load
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.simulation.motion import (
@@ -96,6 +97,21 @@ def test_every_picture_gets_its_sequences_and_all_of_them_its_split(stores):
     assert [len(frames.of_split(split)) for split in ("train", "val", "test")] == [6, 2, 2]
     for split in ("train", "val", "test"):
         assert frames.of_split(split) == scenes.of_split(split)
+
+
+def test_each_training_sequence_over_a_variant_names_its_picture(images, stores, tmp_path, project_root):
+    variation = dataclasses.replace(load(project_root).variation, scenes_per_picture=1)
+    paths = tmp_path / "scenes.zarr", tmp_path / "frames.zarr"
+    synthesize(images, *paths, CONFIG, 1, map, SEQUENCES_PER_PART, variation)
+    scenes, frames = SceneStore.open(paths[0]), FrameStore.open(paths[1])
+    assert frames.variant_of == scenes.variant_of
+    assert sorted(scenes.variant_of.values()) == sorted(
+        stores[0].scene_of[name] for name in stores[0].of_split("train")
+    )
+    assert set(scenes.sequences) - set(scenes.variant_of) == set(stores[0].sequences)
+    variant, picture = next(iter(scenes.variant_of.items()))
+    assert scenes.scene_of[variant] == f"{picture}-variant01"
+    assert not torch.equal(scenes.read(variant).aolp, scenes.read(f"{picture}-00").aolp)
 
 
 def test_pictures_too_small_for_the_window_are_left_out(images, stores, tmp_path, caplog):

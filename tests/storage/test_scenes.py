@@ -103,10 +103,18 @@ def test_a_store_lacks_the_sequences_of_a_part_until_all_are_written(tmp_path):
         again.finish()
 
 
-def test_a_scene_never_is_in_two_splits(tmp_path):
+def test_a_picture_and_its_variants_are_never_in_two_splits(tmp_path):
     splits = {"coffee-0": "train", "coffee-1": "test", "leaves-0": "test"}
-    with pytest.raises(ValueError, match="scene coffee would be in the splits train and test"):
+    with pytest.raises(ValueError, match="picture coffee would be in the splits train and test"):
         create(tmp_path / "scenes.zarr", splits=splits)
+    with pytest.raises(ValueError, match="picture coffee would be in the splits train and test"):
+        create(tmp_path / "scenes.zarr", variant_of={"leaves-0": "coffee"})
+
+
+def test_the_store_says_which_sequences_show_a_variant_of_which_picture(finished, tmp_path):
+    variants = {"coffee-1": "coffee"}
+    store = create(tmp_path / "scenes.zarr", variant_of=variants)
+    assert (store.variant_of, SceneStore.open(finished).variant_of) == (variants, {})
 
 
 def test_what_cannot_be_a_scene_is_refused(tmp_path):

@@ -10,7 +10,7 @@ from polarnet.config.tree import load
 from polarnet.events.representations import event_tensor
 from polarnet.networks.checkpoint import load_network
 from polarnet.storage.events import EventStore
-from polarnet.storage.scenes import without_variants
+from polarnet.storage.frames import FrameStore
 from polarnet.training.calibration import RIDGES, Scene, fitted
 from polarnet.training.dolp import dolp_task
 from polarnet.training.loop import TrainConfig, calibrate
@@ -110,10 +110,24 @@ def test_of_what_it_has_seen_nothing_of_it_expects_the_errors_of_a_guess(stores,
     assert still[0] == pytest.approx(sum(errors) / len(errors), rel=0.25)
 
 
-def test_it_rests_on_pictures_as_they_are_without_their_variants():
-    pictures = ["a-variant1-0123abcd-00", "b-0123abcd-00", "b-0123abcd-01"]
-    variants = ["a-variant1-0123abcd-variant01-00", "b-0123abcd-variant12-01"]
-    assert without_variants([*pictures, *variants]) == pictures
+def test_it_rests_on_pictures_as_they_are_without_their_variants(stores, tmp_path, task_of):
+    source = FrameStore.open(stores[1])
+    frames = FrameStore.create(
+        tmp_path / "frames.zarr",
+        source.sequences,
+        source.splits,
+        len(source.t_us("a")),
+        source.height,
+        source.width,
+        {},
+        variant_of={"b": "a"},
+    )
+    for name in source.sequences:
+        frames.write(name, *source.frames(name))
+    frames.finish()
+    content = bytes_of(run(task_of(), (stores[0], tmp_path / "frames.zarr"), tmp_path / "run", TRAIN))
+    assert source.of_split("train") == ["a", "b", "c"]
+    assert json.loads(content["best.json"])["expected_errors"]["sequences"] == 2
 
 
 def test_a_training_ends_with_it_even_if_killed_in_its_midst(stores, tmp_path, task_of):
