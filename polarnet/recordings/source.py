@@ -91,7 +91,5 @@ def sensor_size(path: Path, choices: Choices, height: int | None = None, width: 
     if height is None or width is None:
         raise RecordingError(f"{path.name}: the file does not say how large the sensor is; give height and width")
     if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
-        raise RecordingError(
-            f"{path.name}: expected a sensor with sides of 1 to {MAX_SIDE} px, got {height}x{width}"
-        )
+        raise RecordingError(f"{path.name}: expected a sensor with sides of 1 to {MAX_SIDE} px, got {height}x{width}")
     return height, width

@@ -6,6 +6,7 @@ the end of the last, and `duration_us`, its length. `ms_to_idx` (DSEC's name) ho
 the index of the first event at or after it.
 """
 
+import functools
 import itertools
 import os
 from collections.abc import Mapping, Sequence
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from polarnet.events.stream import MAX_SIDE, Events, slice_count, slice_time, validate
 from polarnet.stokes import POLARIZER_ANGLES_DEG
-from polarnet.storage.parts import Column, Columns, Header, Store
+from polarnet.storage.parts import Column, Columns, Store
 
 CHANNELS = len(POLARIZER_ANGLES_DEG)
 MAX_DURATION_US = 2**32 - 1  # 71 minutes: t is uint32
@@ -40,15 +41,12 @@ class EventStore(Store):
 
     FORMAT = "polarnet.events"
     VERSION = 2
+    height: int
+    width: int
 
-    def __init__(self, path: str, header: Header):
-        super().__init__(path, header)
-        self.height: int = header["height"]
-        self.width: int = header["width"]
-
-    @classmethod
-    def columns_of(cls, header: Header) -> Columns:
-        """Those of the events, and the index of their times."""
+    @functools.cached_property
+    def columns(self) -> Columns:
+        """The events, and the index of their times."""
         types = {"x": "uint16", "y": "uint16", "t": "uint32", "p": "int8"}
         columns = {f"events/{name}": Column("events", dtype, CHUNK) for name, dtype in types.items()}
         return {**columns, "ms_to_idx": Column("milliseconds", "int64", MILLISECOND_CHUNK, (CHANNELS,))}
@@ -86,11 +84,8 @@ class EventStore(Store):
         offsets = np.cumsum([0, *map(len, channels)])
         columns = {}
         for name in "xytp":
-            pieces, dtype = (
-                [getattr(channel, name).numpy() for channel in channels],
-                self.columns[f"events/{name}"].dtype,
-            )
-            # checked above: the narrower types on disk hold every value
+            pieces = [getattr(channel, name).numpy() for channel in channels]
+            dtype = self.columns[f"events/{name}"].dtype  # narrower, but holds every value that `_check` accepts
             columns[f"events/{name}"] = np.concatenate(pieces, dtype=dtype, casting="unsafe")
         counts = [first_at_millisecond(channel.t, duration_us) for channel in channels]
         columns["ms_to_idx"] = np.stack(counts, axis=1) + offsets[:-1]
@@ -128,10 +123,8 @@ class EventStore(Store):
         if problems := super().problems(sequence):
             return problems
         offsets, duration_us = self.record(sequence)["offsets"], self.duration_us(sequence)
-        channels, index = (
-            self._events(sequence, list(itertools.pairwise(offsets))),
-            self.read_column("ms_to_idx", sequence),
-        )
+        channels = self._events(sequence, list(itertools.pairwise(offsets)))
+        index = self.read_column("ms_to_idx", sequence)
         for angle, start, channel, places in zip(POLARIZER_ANGLES_DEG, offsets, channels, index.T, strict=False):
             where = f"{self.path}: {sequence}, polarizer {angle}: "
             try:

@@ -34,8 +34,8 @@ class Numbers(Store):
     FORMAT = "test.numbers"
     VERSION = 3
 
-    @classmethod
-    def columns_of(cls, header):
+    @functools.cached_property
+    def columns(self):
         return {"group/value": Column("long", "uint16", 1024), "pair": Column("short", "int64", 4, (2,))}
 
 
