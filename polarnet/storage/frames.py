@@ -74,13 +74,8 @@ def dequantise_angle(steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*sha
     return torch.from_numpy(steps.astype(np.float32)).mul_(math.pi / ANGLE_STEPS)
 
 
-def pack_mask(valid: Bool[Tensor, "*b h w"]) -> UInt8[np.ndarray, "*b h bytes"]:
-    """Pack 8 pixels of a row into a byte."""
-    return np.packbits(valid.numpy(), axis=-1)
-
-
 def unpack_mask(packed: UInt8[np.ndarray, "*b h bytes"], width: int) -> Bool[Tensor, "*b h w"]:
-    """Invert `pack_mask`."""
+    """Mask from bytes of 8 pixels of a row each, the leftmost in the highest bit."""
     return torch.from_numpy(np.unpackbits(packed, axis=-1, count=width).astype(bool))
 
 
@@ -182,7 +177,7 @@ class FrameStore(SplitStore):
             "intensity": quantise_fraction(intensity, "intensity"),
             "dolp": quantise_fraction(dolp, "dolp"),
             "aolp": quantise_angle(aolp, "aolp"),
-            **({"valid": pack_mask(known)} if self.masked else {}),
+            **({"valid": np.packbits(known.numpy(), axis=-1)} if self.masked else {}),
         }
         if not self.is_written(sequence):
             self.append(sequence, columns, {})
