@@ -13,9 +13,9 @@ import numpy as np
 
 from polarnet.runtime.ranges import allowed
 from polarnet.simulation.compilation import compiled
-from polarnet.simulation.pixels.columns import SIGNAL
+from polarnet.simulation.pixels.columns import SIGNAL, event_of, place_of
 from polarnet.simulation.pixels.light import FULL_SCALE, intensity_rows, ln
-from polarnet.simulation.pixels.pending import event_of, pending_events, place_of, roomier, write_in_order
+from polarnet.simulation.pixels.pending import pending_events, roomier, write_in_order
 from polarnet.simulation.pixels.physics import PixelConfig
 from polarnet.simulation.pixels.strips import rows_of_strip
 
