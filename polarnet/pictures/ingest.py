@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from polarnet.pictures.builtin import BUILTIN_PHOTOS, BuiltinPhoto
+from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import (
     UnreadablePicture,
@@ -90,8 +90,8 @@ class Source:
     kind: str  # photograph, folder or polarization
     stem: str
     origin: str
-    licence: str | None
-    author: str | None
+    licence: str | None = None
+    author: str | None = None
 
 
 def ingest(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Manifest:
@@ -118,26 +118,16 @@ def ingest(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Man
 
 
 def _ingest_builtin(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Manifest:
-    photographs = list(mapper(functools.partial(_convert, config=config, folder=folder), list(enumerate(_builtin()))))
+    sources = [
+        Source((photo.path,), "photograph", photo.path.stem, photo.origin, photo.licence, photo.author)
+        for photo in BUILTIN_PHOTOS
+    ]
+    photographs = list(mapper(functools.partial(_convert, config=config, folder=folder), list(enumerate(sources))))
     make = functools.partial(_make_dead_leaves, config=config, seed=seed, folder=folder)
-    made = list(mapper(make, range(config.dead_leaves)))
-    kept, skipped = _without_duplicates([*photographs, *made])
-    groups = [[entry for entry in kept if entry.source == kind] for kind in ("photograph", "dead_leaves")]
+    generated = list(mapper(make, range(config.dead_leaves)))
+    entries, skipped = _without_duplicates([*photographs, *generated])
+    groups = [[entry for entry in entries if entry.source == kind] for kind in ("photograph", "dead_leaves")]
     return _manifest([entry for group in groups for entry in _split(config, group)], skipped, folder)
-
-
-def _builtin() -> list[Source]:
-    def source(photo: BuiltinPhoto) -> Source:
-        return Source(
-            files=(photo.path,),
-            kind="photograph",
-            stem=photo.path.stem,
-            origin=photo.origin,
-            licence=photo.licence,
-            author=photo.author,
-        )
-
-    return [source(photo) for photo in BUILTIN_PHOTOS]
 
 
 def _ingest_folder(config: IngestConfig, folder: Path, mapper: Mapper) -> Manifest:
@@ -146,16 +136,16 @@ def _ingest_folder(config: IngestConfig, folder: Path, mapper: Mapper) -> Manife
     if config.limit is not None:
         sources.sort(key=lambda source: _edge_hash(source.files))
     convert = functools.partial(_CONVERTERS[config.source], config=config, folder=folder)
-    kept: list[ManifestEntry] = []
+    entries: list[ManifestEntry] = []
     outcomes: list[ManifestEntry | Skipped] = []
-    while len(outcomes) < len(sources) and (config.limit is None or len(kept) < config.limit):
-        wanted = len(sources) if config.limit is None else config.limit - len(kept)
+    while len(outcomes) < len(sources) and (config.limit is None or len(entries) < config.limit):
+        wanted = len(sources) if config.limit is None else config.limit - len(entries)
         batch = list(enumerate(sources))[len(outcomes) : len(outcomes) + wanted]
         outcomes.extend(mapper(convert, batch))
-        kept, skipped = _without_duplicates(outcomes)
-    if not kept:
+        entries, skipped = _without_duplicates(outcomes)
+    if not entries:
         _refuse_folder(config, len(sources), ignored, [o for o in outcomes if isinstance(o, Skipped)])
-    manifest = _manifest(_split(config, kept), skipped, folder)
+    manifest = _manifest(_split(config, entries), skipped, folder)
     return dataclasses.replace(manifest, ignored_files=ignored, unread_files=len(sources) - len(outcomes))
 
 
@@ -172,8 +162,6 @@ def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int]:
             kind=kind,
             stem=group[0].stem if len(group) == 1 else group[0].stem.rpartition("_")[0],
             origin=", ".join(path.relative_to(root).as_posix() for path in group),
-            licence=None,
-            author=None,
         )
         for group in groups
     ]
@@ -212,7 +200,6 @@ def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> Ma
     return ManifestEntry(
         name=f"{_slug(source.stem)}-{picture.sha256[:8]}",
         file=file,
-        split="",
         source=source.kind,
         origin=source.origin,
         licence=source.licence or picture.licence,
@@ -247,18 +234,14 @@ def _convert_polarization(item: tuple[int, Source], config: IngestConfig, folder
     return ManifestEntry(
         name=f"{_slug(source.stem)}-{digest[:8]}",
         file=file,
-        split="",
         source=source.kind,
         origin=source.origin,
-        licence=None,
-        author=None,
         sha256=digest,
         bits=16,
         height=shrunk.valid.shape[0],
         width=shrunk.valid.shape[1],
         source_height=measured.valid.shape[0],
         source_width=measured.valid.shape[1],
-        colour_profile=None,
         residual=round(measured.residual, 6),
         saturated_fraction=round(measured.saturated, 6),
         masked_fraction=round(float(1 - shrunk.valid.mean()), 6),
@@ -276,7 +259,6 @@ def _make_dead_leaves(number: int, config: IngestConfig, seed: int, folder: Path
     return ManifestEntry(
         name=f"{stem}-{digest[:8]}",
         file=f"{stem}.png",
-        split="",
         source="dead_leaves",
         origin=f"generated from seed {seed}",
         licence="CC0-1.0",
@@ -287,7 +269,6 @@ def _make_dead_leaves(number: int, config: IngestConfig, seed: int, folder: Path
         width=config.width,
         source_height=config.height,
         source_width=config.width,
-        colour_profile=None,
     )
 
 
