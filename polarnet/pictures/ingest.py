@@ -1,4 +1,4 @@
-"""Source pictures -> data/images: RGB pictures of one size, each with a split, and a manifest of what was left out."""
+"""From source pictures to data/images: RGB pictures of one size, each with a split, and a manifest."""
 
 import dataclasses
 import functools
@@ -84,7 +84,7 @@ class IngestConfig:
 
 @dataclass(frozen=True)
 class Source:
-    """One picture to read, and what is known about it."""
+    """One picture to read, with its origin."""
 
     files: tuple[Path, ...]  # four of them where each polarizer has its own
     kind: str  # photograph, folder or polarization
@@ -95,11 +95,11 @@ class Source:
 
 
 def ingest(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Manifest:
-    """Fill `folder` with PNG pictures of config.height x config.width and their manifest, replacing what was there.
+    """Fill `folder` with PNG pictures of config.height x config.width and their manifest, replacing its content.
 
-    `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; like the order of the
-    files, it does not matter to the result. Writes beside `folder` first, so that it is never half full. Warns about
-    every file skipped; ValueError where no picture is left.
+    `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`. Neither the mapper nor
+    the order of the files changes the result. The pictures are written beside `folder` first, so that it is never half
+    full. Logs a warning for every file skipped; raises ValueError if no picture is left.
     """
     temporary = folder.with_name(folder.name + ".tmp")
     shutil.rmtree(temporary, ignore_errors=True)
@@ -131,7 +131,7 @@ def _ingest_builtin(config: IngestConfig, seed: int, folder: Path, mapper: Mappe
 
 
 def _ingest_folder(config: IngestConfig, folder: Path, mapper: Mapper) -> Manifest:
-    """Reads as many files, in the order of their hashes, as it takes to get `limit` pictures."""
+    """Read files in the order of their hashes until there are `limit` pictures."""
     sources, ignored = _find_pictures(Path(config.root), config.source)
     if config.limit is not None:
         sources.sort(key=lambda source: _edge_hash(source.files))
@@ -187,7 +187,7 @@ def _edge_hash(files: Sequence[Path]) -> str:
 
 
 def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> ManifestEntry | Skipped:
-    """Read, cut, scale and convert one file to `folder`/<number>.png; the reason where that cannot be done."""
+    """Read, cut, scale and convert one file to `folder`/source-<number>.png, or return the reason why not."""
     number, source = item
     try:
         picture = read_picture(source.files[0])
@@ -215,7 +215,7 @@ def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> Ma
 
 
 def _convert_polarization(item: tuple[int, Source], config: IngestConfig, folder: Path) -> ManifestEntry | Skipped:
-    """Read, check and shrink one measurement to `folder`/<number>.npz; the reason where that cannot be done."""
+    """Read, check and shrink one measurement to `folder`/source-<number>.npz, or return the reason why not."""
     number, source = item
     try:
         measured = read_measurement(source.files, parse_mosaic(config.mosaic))
@@ -275,7 +275,7 @@ def _make_dead_leaves(number: int, config: IngestConfig, seed: int, folder: Path
 def _without_duplicates(
     outcomes: Iterable[ManifestEntry | Skipped],
 ) -> tuple[list[ManifestEntry], list[Skipped]]:
-    """The first entry of each content; what was skipped, with the others."""
+    """The first entry of each content, and everything skipped, duplicates included."""
     first: dict[str, ManifestEntry] = {}
     skipped = []
     for outcome in outcomes:

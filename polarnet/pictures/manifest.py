@@ -66,7 +66,7 @@ class Manifest:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Pictures, also per split, and what was left out."""
+        """Numbers of pictures, in all and per split, and of files left out."""
         of_split = {split: sum(entry.split == split for entry in self.pictures) for split in SPLITS}
         return {
             "pictures": len(self.pictures),
@@ -78,7 +78,7 @@ class Manifest:
 
 
 def listed(skipped: Sequence[Skipped]) -> str:
-    """Lines for an error: the first of the files, each with its reason, and how many more there are."""
+    """Lines for an error: the first files, each with its reason, and the number of the others."""
     reasons = "".join(f"\n  {skip.file}: {skip.reason}" for skip in skipped[:REASONS_SHOWN])
     return reasons + (f"\n  and {len(skipped) - REASONS_SHOWN} more" if len(skipped) > REASONS_SHOWN else "")
 
@@ -110,7 +110,7 @@ def write_manifest(manifest: Manifest, folder: Path) -> None:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a folder that `ingest` wrote; FileNotFoundError or ValueError where there is none."""
+    """The manifest of a folder that `ingest` wrote; FileNotFoundError or ValueError if there is none."""
     path = folder / MANIFEST
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no manifest; run the stage ingest first (dvc repro ingest)")

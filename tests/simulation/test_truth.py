@@ -148,12 +148,12 @@ def test_the_stored_truth_is_what_the_stored_scene_and_trajectory_show(stores):
 
 def test_the_truth_follows_from_the_four_intensities_by_equations_1_to_3(stores):
     _, frames = stores
-    seen = frames.frames(frames.sequences[0])
-    stokes = stokes_from_intensities(seen.intensity)
+    truth = frames.frames(frames.sequences[0])
+    stokes = stokes_from_intensities(truth.intensity)
     bright = stokes[:, 0] > 0.2
-    torch.testing.assert_close(dolp(stokes)[bright], seen.dolp[bright], atol=3e-4, rtol=0)
-    polarized = bright & (seen.dolp > 0.3)
-    turn = (aolp(stokes) - seen.aolp + torch.pi / 2) % torch.pi - torch.pi / 2
+    torch.testing.assert_close(dolp(stokes)[bright], truth.dolp[bright], atol=3e-4, rtol=0)
+    polarized = bright & (truth.dolp > 0.3)
+    turn = (aolp(stokes) - truth.aolp + torch.pi / 2) % torch.pi - torch.pi / 2
     assert turn[polarized].abs().max() < 1e-3
 
 
@@ -214,12 +214,12 @@ def test_the_mask_of_a_turning_window_is_that_of_its_weights():
     light = torch.rand(3, 60, 80, generator=generator)
     valid = torch.rand(60, 80, generator=generator) < 0.98
     trajectory = random_trajectory(CONFIG, 60, 80, np.random.default_rng(4))
-    seen = valid_frames(valid, trajectory, [0, 50_000, 100_000], 24, 36)
+    rendered = valid_frames(valid, trajectory, [0, 50_000, 100_000], 24, 36)
     t_s = np.array([0, 0.05, 0.1])
     changed = torch.where(valid, light, light + 1)
     before, after = (render(PolarizationScene(planes), trajectory, t_s, 24, 36)[:, 0] for planes in (light, changed))
-    assert torch.equal(seen, before == after)
-    assert 0.8 < seen.float().mean() < 0.98
+    assert torch.equal(rendered, before == after)
+    assert 0.8 < rendered.float().mean() < 0.98
 
 
 def test_photographs_have_no_mask(stores):
@@ -237,9 +237,9 @@ def test_the_number_of_threads_changes_no_bit_of_a_frame(threads_as_they_were):
 
     def frames(threads):
         torch.set_num_threads(threads)
-        seen = frames_of(scene, trajectory, frame_times_us(config), 121, 179)
+        on_sensor = frames_of(scene, trajectory, frame_times_us(config), 121, 179)
         assert torch.get_num_threads() == threads
-        return seen
+        return on_sensor
 
     for one, several in zip(frames(1), frames(3), strict=True):
         assert torch.equal(one, several)
