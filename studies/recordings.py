@@ -335,8 +335,8 @@ def main() -> None:
         figures = measure(name, [*SIZES, *([LARGEST] if arguments.full else [])], arguments.repeats)
         if arguments.write:
             known = read_results(ROOT, "recordings").get("readers", {})
-            found = {reader: figure | {"commit": record["commit"]} for reader, figure in figures.items()}
-            path = write_section(ROOT, "recordings", "readers", known | found, record)
+            latest = {reader: figure | {"commit": record["commit"]} for reader, figure in figures.items()}
+            path = write_section(ROOT, "recordings", "readers", known | latest, record)
             print(f"written to {path.relative_to(ROOT)}", flush=True)
 
 

@@ -211,19 +211,19 @@ def main() -> None:
     record: dict[str, Any] = machine_record(ROOT)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        found = list(measured(folder, arguments.targets, rig, recordings, emulator, arguments.pictures))
-        scores = benchmarked(folder, [one.name for _, one, _ in found], config)
+        results = list(measured(folder, arguments.targets, rig, recordings, emulator, arguments.pictures))
+        scores = benchmarked(folder, [one.name for _, one, _ in results], config)
     figures = {
-        "captures": 8 * len(found),
+        "captures": 8 * len(results),
         "sensor": list(recordings.sensor),
         "photoreceptor_cutoff_hz": arguments.cutoff_hz,
-        "start_error_frames_max": round(max(landmark_frames(truth, one, rig) for truth, one, _ in found), 3),
+        "start_error_frames_max": round(max(landmark_frames(truth, one, rig) for truth, one, _ in results), 3),
         "refined_error_ms_max": round(
-            max(float(np.abs(spread_us(one.start_us, truth.start_us)).max()) for truth, one, _ in found) / 1000, 3
+            max(float(np.abs(spread_us(one.start_us, truth.start_us)).max()) for truth, one, _ in results) / 1000, 3
         ),
-        "clock_zero_ms_max": round(max(abs(clock_zero_us(truth, one)) for truth, one, _ in found) / 1000, 3),
-        "dolp_rms": round(float(np.mean([squared for _, _, squared in found])) ** 0.5, 5),
-        "dolp_rms_max": round(max(squared for _, _, squared in found) ** 0.5, 5),
+        "clock_zero_ms_max": round(max(abs(clock_zero_us(truth, one)) for truth, one, _ in results) / 1000, 3),
+        "dolp_rms": round(float(np.mean([squared for _, _, squared in results])) ** 0.5, 5),
+        "dolp_rms_max": round(max(squared for _, _, squared in results) ** 0.5, 5),
         "benchmark": scores,
     }
     print(json.dumps(figures, indent=2))

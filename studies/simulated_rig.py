@@ -120,11 +120,11 @@ def write_rig(
         noisy = merge([events, _hot_events(hot, total_us, height, width, generator)])
         begin_us = landmark_us - start_us[capture]
         later = noisy.t >= begin_us
-        seen = Events(
+        capture_events = Events(
             noisy.t[later] - begin_us, noisy.x[later], noisy.y[later], noisy.p[later], height, width
         )  # fmt: skip
         write = write_celex5_bin if config.file_type == "bin" else write_celex5_csv
-        write(folder / f"{capture}.{config.file_type}", seen)
+        write(folder / f"{capture}.{config.file_type}", capture_events)
     for polarizer, capture in enumerate(INTENSITY_CAPTURES):
         begin_us = landmark_us - start_us[capture]
         count = int((total_us - begin_us) * 1e-6 * config.picture_rate_hz)
@@ -168,8 +168,8 @@ def true_intensity(
     path = dataclasses.replace(truth.path, x=truth.path.x + right, y=truth.path.y + down)
     frames = []
     for t in t_us.tolist():
-        seen = render(truth.scene, path, np.array([(t + truth.landmark_us) * 1e-6]), height, width)[0]
-        planes = np.ascontiguousarray(stokes.intensities_from_stokes(seen).clamp(0, 1).permute(1, 2, 0).numpy())
+        stokes_frame = render(truth.scene, path, np.array([(t + truth.landmark_us) * 1e-6]), height, width)[0]
+        planes = np.ascontiguousarray(stokes.intensities_from_stokes(stokes_frame).clamp(0, 1).permute(1, 2, 0).numpy())
         small = cv2.resize(planes, tuple(recordings.size[::-1]), interpolation=cv2.INTER_AREA)
         frames.append(torch.from_numpy(small).permute(2, 0, 1))
     return torch.stack(frames)
@@ -202,8 +202,8 @@ def _pictures(
 ) -> Iterator[UInt16[np.ndarray, "800 1280"]]:
     height, width = recordings.sensor
     for t in t_us:
-        seen = render(scene, path, np.array([t * 1e-6]), height, width)[0]
-        light = stokes.intensities_from_stokes(seen)[polarizer].clamp(0, 1).numpy()
+        stokes_frame = render(scene, path, np.array([t * 1e-6]), height, width)[0]
+        light = stokes.intensities_from_stokes(stokes_frame)[polarizer].clamp(0, 1).numpy()
         electrons = light * config.full_well_electrons
         noise = np.hypot(np.sqrt(electrons) * (WHITE / config.full_well_electrons), config.read_noise)
         values = light * WHITE + noise * generator.standard_normal(light.shape, dtype=np.float32)

@@ -147,8 +147,8 @@ def crossings_figure() -> Figure:
         )
         curve.grid(axis="y", visible=False)
         for row, model in enumerate(("exact", "v2e")):
-            shown = slice_time(pixel_events(replace(QUIET, model=model), rate_hz), 0, int(1000 * t_ms[-1]))
-            _ticks(stamps, shown, row, 0.7)
+            drawn_events = slice_time(pixel_events(replace(QUIET, model=model), rate_hz), 0, int(1000 * t_ms[-1]))
+            _ticks(stamps, drawn_events, row, 0.7)
         stamps.set_yticks([0.35, 1.35], ["exact", "v2e"])
         stamps.set(ylim=(1.9, -0.2), xlabel="ms", xlim=(0, t_ms[-1]))
         stamps.grid(visible=False)

@@ -233,7 +233,7 @@ def test_the_lines_on_the_page_run_as_they_stand(of_each, monkeypatch, project_r
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         exec(snippet[1], names)
     assert len(printed.getvalue().split()) == 2
-    assert names["found"]["dolp"].shape == (1, HEIGHT, WIDTH)
+    assert names["results"]["dolp"].shape == (1, HEIGHT, WIDTH)
 
     columns = zip(("x", "y", "polarity"), (torch.int16, torch.int16, torch.int8), strict=True)
     x, y, p = (torch.from_numpy(names[name]).to(dtype) for name, dtype in columns)

@@ -47,15 +47,15 @@ def stages(project_root: Path) -> dict[str, dict[str, Any]]:
 
 def reached(starts: list[str], imports: grimp.ImportGraph, ends: set[str] = frozenset()) -> set[str]:
     """Modules that `starts` import, directly or not, with those in `ends` but not what these import."""
-    found: set[str] = set()
+    modules: set[str] = set()
     waiting = list(starts)
     while waiting:
         module = waiting.pop()
-        if module not in found | PLUMBING:
-            found.add(module)
+        if module not in modules | PLUMBING:
+            modules.add(module)
             if module not in ends:
                 waiting += imports.find_modules_directly_imported_by(module)
-    return found
+    return modules
 
 
 def modules_behind(stage: str, cmd: str, imports: grimp.ImportGraph) -> set[str]:
