@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.e2p import E2p, MosaicHead, coded_aolp, decoded_aolp, interleaved, own_names
+from polarnet.networks.e2p import E2p, MosaicHead, coded_aolp, decoded_aolp, interleaved
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_the_authors_names_are_understood(network, tmp_path):
         theirs[".".join(parts)] = tensor
     assert {"head_i.pattern1.0.weight", "G1_d.reset_gate.bias", "fusion_weight2.conv4.weight"} < theirs.keys()
     assert {"fusion_weight1.conv1.0.weight", "head_a.conv.bias", "pred_a.weight"} < theirs.keys()
-    assert own_names(theirs).keys() == network.state_dict().keys()
+    assert E2p.own_names(theirs).keys() == network.state_dict().keys()
     torch.save({"state_dict": theirs}, tmp_path / "e2p.pth")
     loaded = E2p.load(tmp_path / "e2p.pth").state_dict()
     assert all(torch.equal(loaded[name], tensor) for name, tensor in network.state_dict().items())
