@@ -52,9 +52,11 @@ class Task:
     scored: Callable[[Tensor], Float[Tensor, "t b h w"]] = lambda frames: frames
     """Function that picks the map to score from the predicted or true maps; its validation MSE selects the best
     epoch."""
-    expects: nn.Module | None = None
-    """Module that predicts the expected error of the `scored` map at half resolution; None: the network has none. A
-    network with this module has a method `expect(weight, bias)`."""
+    unroll_with_features: (
+        Callable[[Tensor, State], tuple[Float[Tensor, "t b h w"], Float[Tensor, "n c i j"], State]] | None
+    ) = None
+    """Same as `unroll`, but with the `scored` map alone and, at half resolution, features of its expected error. None:
+    the network expects no error. A network with this function has a method `expect(weight, bias)`."""
 
 
 @dataclass(frozen=True)
