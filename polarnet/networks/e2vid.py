@@ -133,9 +133,9 @@ class RecurrentEncoder(nn.Module):
 
 
 class ConvLstm(nn.Module):
-    """Convolutional LSTM with the gates i, f, o = sigmoid and g = tanh of conv[x, shown].
+    """Convolutional LSTM with the gates i, f, o = sigmoid and g = tanh of conv[x, output].
 
-    memory <- f memory + i g;  shown <- o tanh(memory), where `shown` is the output.
+    memory <- f memory + i g;  output <- o tanh(memory)
     """
 
     def __init__(self, channels: int):
@@ -146,8 +146,8 @@ class ConvLstm(nn.Module):
         self, x: Float[Tensor, "b c h w"], state: tuple[Tensor, Tensor] | None
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b c h w"]]:
         """Return the output and the memory; a `state` of None (at the start) counts as zeros."""
-        shown, memory = (torch.zeros_like(x), torch.zeros_like(x)) if state is None else state
-        i, f, o, g = self.Gates(torch.cat([x, shown.to(x.dtype)], dim=1)).chunk(4, dim=1)
+        output, memory = (torch.zeros_like(x), torch.zeros_like(x)) if state is None else state
+        i, f, o, g = self.Gates(torch.cat([x, output.to(x.dtype)], dim=1)).chunk(4, dim=1)
         memory = torch.sigmoid(f) * memory.to(f.dtype) + torch.sigmoid(i) * torch.tanh(g)
         return torch.sigmoid(o) * torch.tanh(memory), memory
 

@@ -43,9 +43,9 @@ def test_each_convolution_of_the_first_layer_is_centred_on_one_polarizer():
     torch.nn.init.zeros_(head.conv.weight)
     torch.nn.init.zeros_(head.conv.bias)  # every channel weighs sigmoid(0) = 1/2
     channels = torch.rand(1, 4, 1, 3, 4)
-    found = 2 * head(interleaved(channels))
+    features = 2 * head(interleaved(channels))
     for group, angle in enumerate((90, 45, 135, 0)):
-        torch.testing.assert_close(found[:, 8 * group], channels[:, angle // 45, 0])
+        torch.testing.assert_close(features[:, 8 * group], channels[:, angle // 45, 0])
 
 
 @torch.no_grad()

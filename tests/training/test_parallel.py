@@ -11,6 +11,7 @@ import torch.multiprocessing
 from test_loop import CPU, TRAIN, run, small_task
 
 from polarnet.networks.checkpoint import load_checkpoint
+from polarnet.training.history import read_history
 from polarnet.training.parallel import add_up, join, launched, place
 from polarnet.training.sequences import Batch, parts_of
 
