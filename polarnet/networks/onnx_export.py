@@ -19,8 +19,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from polarnet.events.representations import REPRESENTATIONS, channels_of
-from polarnet.events.stream import Events
-from polarnet.events.windows import encode_windows
 from polarnet.runtime.files import replaced
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
 
@@ -29,8 +27,7 @@ KEY = "polarnet"  # key of the JSON in the file's metadata_props
 OPSET = 20  # the first opset with GELU as one operator
 TOLERANCE = 1e-4  # absolute and relative difference of an output from torch's, far above that of float32 rounding
 CHECKED_WINDOWS = 5  # windows with events; one empty window follows
-CHECKED_WINDOW_US = 33_333  # used if the checkpoint does not give the length of its windows
-MAX_EVENTS = 10  # per pixel and channel, over all checked windows
+MAX_VALUE = 3  # of an input image
 SEED = 0
 MEANINGS = {
     "dolp": "degree of linear polarization, not clamped to [0, 1]",
@@ -73,7 +70,7 @@ def export_network(
     _check_path(path)
     if min(height, width) < 1:
         raise ValueError(f"expected a height and a width of at least 1 pixel, got {height}x{width}")
-    windows = random_windows(metadata, height, width)
+    windows = random_windows(metadata["in_channels"], height, width)
     program, description = _traced(network, metadata, windows[0])
     try:
         check_program(program, network, windows)
@@ -109,24 +106,11 @@ def check_program(
         torch.testing.assert_close(given, expected, atol=TOLERANCE, rtol=TOLERANCE)
 
 
-def random_windows(metadata: Mapping[str, Any], height: int, width: int) -> Float[Tensor, "t 1 c h w"]:
-    """Consecutive windows of random events in the representation of a checkpoint; the last window is empty.
-
-    The events are the same in every call. Their number differs between channels and falls from window to window.
-    """
+def random_windows(channels: int, height: int, width: int) -> Float[Tensor, "t 1 c h w"]:
+    """Consecutive windows of random whole numbers that move by a pixel each time; the last window is empty."""
     generator = torch.Generator().manual_seed(SEED)
-    window_us = _window_us(metadata) or CHECKED_WINDOW_US
-    channels = [_random_events(height, width, CHECKED_WINDOWS * window_us, generator) for _ in POLARIZER_ANGLES_DEG]
-    t_us = window_us * torch.arange(CHECKED_WINDOWS + 2)
-    return encode_windows(channels, t_us, REPRESENTATIONS[metadata["representation"]])[:, None]
-
-
-def _random_events(height: int, width: int, duration_us: int, generator: torch.Generator) -> Events:
-    count = int(torch.randint(1, MAX_EVENTS * height * width + 1, (), generator=generator))
-    early = torch.rand(count, generator=generator, dtype=torch.float64).square()
-    t = (early * duration_us).long().sort().values
-    x, y, positive = (torch.randint(n, (count,), generator=generator) for n in (width, height, 2))
-    return Events(t, x.short(), y.short(), (2 * positive - 1).to(torch.int8), height, width)
+    image = torch.randint(-MAX_VALUE, MAX_VALUE + 1, (1, channels, height, width), generator=generator).float()
+    return torch.stack([*(image.roll(k, dims=-1) for k in range(CHECKED_WINDOWS)), torch.zeros_like(image)])
 
 
 def _traced(

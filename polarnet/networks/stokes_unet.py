@@ -1,10 +1,9 @@
 """polarnet's own network: it solves the redundancy of four polarizers at many scales and refines it with a U-Net."""
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -43,6 +42,8 @@ PARTS = ("redundancy", "slopes", "sums", "recurrence", "panorama")
 MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate
 WIDE = (3, 9)  # widths in pixels of the neighbourhoods that contribute fine structure, besides the single pixel
 MAX_DOLP = 0.98  # largest DoLP passed to atanh, to keep it finite
+PANORAMA_TENSORS = 1 + len(Panorama._fields)  # events of the previous window, then the panorama
+NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window; the rest of the state is missing
 LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
 LOG_VARIANCE_OUTPUTS = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
 
@@ -103,21 +104,6 @@ class Candidates(NamedTuple):
     """Weighted number of events behind the solution; for the panorama, weighted energy of its slopes."""
 
 
-class UNetState(NamedTuple):
-    """State of a `StokesUNet` between windows; callers carry it as one list of tensors."""
-
-    sums: list[Float[Tensor, "b 4 h w"]]
-    """Event sum of each memory."""
-    moments: list[Float[Tensor, "b c h/4 w/4"]]
-    """Sums of second moments, of each decay."""
-    wide: list[Float[Tensor, "b m 2 h w"]]
-    """Sums of e0 - e90 and e45 - e135, averaged over each width of `WIDE`."""
-    panorama: list[Tensor]
-    """The previous window's events, summed over channels [b, h, w], then the fields of a `Panorama`."""
-    recurrent: list[Tensor]
-    """States of the recurrent layers, from quarter resolution down."""
-
-
 class StokesUNet(nn.Module):
     """Recurrent network from the events of four channels to DoLP, AoLP and DoLP's expected squared error.
 
@@ -130,6 +116,9 @@ class StokesUNet(nn.Module):
        constants are fitted to the result around each pixel. The panorama has no trained parameters; the U-Net receives
        it as an input and chooses its weight at each pixel.
     4. Correction: the U-Net sees the result and adds an unconstrained correction.
+
+    The state is a list: the event sums, the sums of moments, the sums averaged over each width of `WIDE`, the events of
+    the previous window with the panorama, and the states of the recurrent layers.
 
     DoLP is predicted separately from the length of (s1, s2). Where (s1, s2) are uncertain, their mean is too short,
     like any mean over angles. The outputs are linear, as in the paper's network.
@@ -204,19 +193,21 @@ class StokesUNet(nn.Module):
         t, b, _, height, width = inputs.shape
         inputs = F.pad(inputs, (0, -width % STRIDE, 0, -height % STRIDE))  # the padding holds no events
         polarity, count = inputs.unflatten(2, (4, IMAGES)).unbind(3)
-        before = self._split(state or self.initial_state(inputs[0]))
+        before_sums, before_moments, *others = state or NO_STATE
+        before_wide, others = others[: len(WIDE)], others[len(WIDE) :]
+        before_panorama, recurrent = others[:PANORAMA_TENSORS], others[PANORAMA_TENSORS:]
 
         keep = inputs.new_tensor(self.memories).view(-1, 1, 1, 1)
-        sums = faded(polarity.unsqueeze(2), keep, torch.stack(before.sums, dim=1))  # t, b, memory, polarizer
-        from_sums, moments = self._candidates(sums.flatten(0, 1), b, before.moments)
-        wide = _wide_differences(polarity, before.wide, keep)
-        images, certain, panorama = self._panorama(polarity, (height, width), before.panorama)
+        sums = faded(polarity.unsqueeze(2), keep, before_sums)  # t, b, memory, polarizer
+        from_sums, moments = self._candidates(sums.flatten(0, 1), b, before_moments)
+        wide = _wide_differences(polarity, before_wide, keep)
+        images, certain, panorama = self._panorama(polarity, (height, width), before_panorama)
         from_slopes = self._slope_candidates(images)
         candidates = Candidates(*(torch.cat(pair, dim=1) for pair in zip(from_sums, from_slopes, strict=True)))
 
         x2 = on_blocks(self.stem, _event_images(sums.flatten(0, 1), count.flatten(0, 1)))
         x2 = F.relu(x2 + self.from_mosaic(_panorama_images(images, certain)))
-        y4, recurrent = self._quarter(x2, candidates, before.recurrent)
+        y4, recurrent = self._quarter(x2, candidates, b, recurrent)
         y2 = self.at_half(self.up_half(y4, skip=x2))
 
         weights = self.choose(y4).float().softmax(1)
@@ -235,8 +226,7 @@ class StokesUNet(nn.Module):
         log_variance = LOG_VARIANCE + added[:, 3] + F.interpolate(self.expected(features), scale_factor=2)[:, 0]
         maps = [dolp[:, 0], aolp, log_variance, stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
-        after = UNetState([*sums[-1].unbind(1)], moments, [means[-1] for means in wide], panorama, recurrent)
-        return prediction, features, [*itertools.chain(*after)]
+        return prediction, features, [sums[-1], moments, *(means[-1] for means in wide), *panorama, *recurrent]
 
     @torch.no_grad()
     def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:
@@ -247,31 +237,9 @@ class StokesUNet(nn.Module):
         self.expected.weight.copy_(weight)
         self.expected.bias.fill_(bias - LOG_VARIANCE)
 
-    def initial_state(self, inputs: Float[Tensor, "b c h w"]) -> list[Tensor]:
-        """Return the initial `UNetState` as a list, all zeros; height and width of `inputs` must be multiples of 4."""
-        b, _, height, width = inputs.shape
-        quarter = inputs.new_zeros(b, height // 4, width // 4, self.gru_quarter.channels).permute(0, 3, 1, 2)
-        state = UNetState(
-            [inputs.new_zeros(b, 4, height, width) for _ in self.memories],
-            [inputs.new_zeros(b, len(self.memories) * MOMENTS, height // 4, width // 4) for _ in self.decays],
-            [inputs.new_zeros(b, len(self.memories), 2, height, width) for _ in WIDE],
-            [inputs.new_zeros(b, height, width), *empty_panorama(inputs[:, :4, ::2, ::2], self.margin)],
-            self._recurrent_zeros(quarter),
-        )
-        return [*itertools.chain(*state)]
-
-    def _split(self, state: list[Tensor]) -> UNetState:
-        """Name the parts of a state."""
-        tensors = iter(state)
-        sizes = (len(self.memories), len(self.decays), len(WIDE), 1 + len(Panorama._fields), len(state))
-        return UNetState(*([*itertools.islice(tensors, size)] for size in sizes))
-
-    def _recurrent_zeros(self, x4: Float[Tensor, "n c h w"]) -> list[Tensor]:
-        return [torch.zeros_like(x4), *self.smaller.initial_states(x4)]
-
     def _candidates(
-        self, events: Float[Tensor, "n m 4 h w"], streams: int, state: list[Tensor]
-    ) -> tuple[Candidates, list[Tensor]]:
+        self, events: Float[Tensor, "n m 4 h w"], streams: int, state: Float[Tensor, "b d c h4 w4"] | None
+    ) -> tuple[Candidates, Float[Tensor, "b d c h4 w4"]]:
         """Return the candidates from changes in time, and the sums of moments for the next window.
 
         Computed in float32, because the solution takes differences of similar numbers.
@@ -280,12 +248,12 @@ class StokesUNet(nn.Module):
             windows = self._unless("redundancy", events).split(streams)  # a single window fits into a core's cache
             moments = torch.stack([self.moments(window, pooled=4).flatten(1, 2) for window in windows]).unsqueeze(2)
             keep = moments.new_tensor(self.decays).view(-1, 1, 1, 1)
-            sums = faded(moments, keep, torch.stack(state, dim=1))
+            sums = faded(moments, keep, state)
             shape = (len(self.decays), len(self.memories), MOMENTS)
             near = neighbourhoods(sums.flatten(0, 1).flatten(1, 2), self.scales)
             stacked = torch.stack([mean.unflatten(1, shape).transpose(1, 2) for mean in near], dim=3)
             s1, s2, evidence = self.solve(stacked)
-            return Candidates(s1, s2, length(s1, s2), evidence), [*sums[-1].unbind(1)]
+            return Candidates(s1, s2, length(s1, s2), evidence), sums[-1]
 
     def _slope_candidates(self, images: Float[Tensor, "n 4 h w"]) -> Candidates:
         """Return the candidates from the panorama's differences between neighbouring pixels, at quarter resolution."""
@@ -308,6 +276,8 @@ class StokesUNet(nn.Module):
         The sensor covers the first rows and columns, `sensor` of them. Without the panorama (`without`), the images and
         the certainty are 0.
         """
+        if not state:
+            state = [torch.zeros_like(polarity[0, :, 0]), *empty_panorama(polarity[0, ..., ::2, ::2], self.margin)]
         before, level, own, explained = state
         if "panorama" in self.without:
             images = own.new_zeros(len(polarity) * len(own), *own.shape[1:])
@@ -327,17 +297,17 @@ class StokesUNet(nn.Module):
             return self.step * images, certain, [events[-1], panorama.level, own, panorama.explained]
 
     def _quarter(
-        self, x2: Float[Tensor, "n c h2 w2"], candidates: Candidates, state: list[Tensor]
+        self, x2: Float[Tensor, "n c h2 w2"], candidates: Candidates, streams: int, state: list[Tensor]
     ) -> tuple[Float[Tensor, "n d h w"], list[Tensor]]:
         """Return the U-Net's features at quarter resolution, and the recurrent states after the last window."""
         inputs = torch.cat([*candidates[:3], torch.log1p(candidates.evidence)], dim=1)
         inputs = inputs.contiguous(memory_format=torch.channels_last)
         x4 = F.relu(self.join(F.relu(self.to_quarter(x2) + self.from_candidates(inputs))))
-        restart = "recurrence" in self.without
-        first, *smaller = self._recurrent_zeros(x4) if restart else state
-        g4, first = self.gru_quarter(x4, first)
-        y4, smaller = self.smaller(g4, smaller)
-        return self.at_quarter(y4), state if restart else [first, *smaller]
+        if "recurrence" in self.without:
+            streams, state = len(x4), []
+        g4, first = self.gru_quarter(x4, streams, state[0] if state else None)
+        y4, smaller = self.smaller(g4, streams, state[1:])
+        return self.at_quarter(y4), [] if "recurrence" in self.without else [first, *smaller]
 
     def _mixed(self, candidates: Candidates, weights: Float[Tensor, "n c1 h w"]) -> Float[Tensor, "n 3 h w"]:
         """Mix the candidates to s1, s2 and DoLP. The last weight belongs to the constant, which adds to DoLP only."""
@@ -351,7 +321,7 @@ class StokesUNet(nn.Module):
 
 
 def _wide_differences(
-    polarity: Float[Tensor, "t b 4 h w"], before: Sequence[Tensor], keep: Float[Tensor, "m 1 1 1"]
+    polarity: Float[Tensor, "t b 4 h w"], before: Sequence[Tensor | None], keep: Float[Tensor, "m 1 1 1"]
 ) -> list[Float[Tensor, "t b m 2 h w"]]:
     """Update the sums `before` of e0 - e90 and e45 - e135, for each memory, averaged over each width of `WIDE`.
 

@@ -114,7 +114,7 @@ def test_onnx_runtime_gives_what_torch_gives_window_after_window(written):
     names = [output.name for output in session.get_outputs()]
     fed = {one.name: np.zeros(one.shape, np.float32) for one in session.get_inputs() if one.name != "events"}
     state = None
-    for events in random_windows(metadata, HEIGHT, WIDTH):
+    for events in random_windows(metadata["in_channels"], HEIGHT, WIDTH):
         given = dict(zip(names, session.run(names, {"events": events.numpy(), **fed}), strict=True))
         fed = {name: given[f"new_{name}"] for name in fed}
         prediction, state = network(events, state)
@@ -149,7 +149,7 @@ def program_in(path: Path) -> Callable[..., list[torch.Tensor]]:
 
 def test_the_check_detects_one_weight_that_is_off(written):
     network, metadata = load_network(written.checkpoint)
-    windows = random_windows(metadata, HEIGHT, WIDTH)
+    windows = random_windows(metadata["in_channels"], HEIGHT, WIDTH)
     check_program(program_in(written.path), network, windows)
     last = network.p1 if hasattr(network, "p1") else network.add
     with torch.no_grad():
