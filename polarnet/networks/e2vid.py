@@ -79,7 +79,7 @@ class E2vid(PublishedNetwork):
     @classmethod
     def published_tensors(cls, path: str | os.PathLike[str], content: Mapping[str, Any]) -> Mapping[str, Tensor]:
         """Check the network settings in the file as well, because several versions of E2VID share tensor names."""
-        if not isinstance(content, dict) or "state_dict" not in content:
+        if "state_dict" not in content:
             raise ValueError(f"{path} holds no E2VID: expected a dictionary with arch, model and state_dict")
         if content.get("arch", PUBLISHED_ARCH) != PUBLISHED_ARCH:
             raise ValueError(f"{path} holds no E2VID: its arch is {content['arch']!r}, expected {PUBLISHED_ARCH!r}")

@@ -42,7 +42,7 @@ class PublishedNetwork(nn.Module):
     def load(cls: type[Network], path: str | os.PathLike[str]) -> Network:
         """Load a published file without running code from it; ValueError if it belongs to another network."""
         content = torch.load(path, map_location="cpu", weights_only=True)
-        tensors = cls.own_names(cls.published_tensors(path, content))
+        tensors = cls.own_names(cls.published_tensors(path, content if isinstance(content, dict) else {}))
         first = tensors.get(cls.first_layer)
         if first is None:
             raise ValueError(f"{path} holds no {cls.label}: expected a tensor {cls.first_layer}")

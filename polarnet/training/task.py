@@ -108,14 +108,6 @@ def initialised(build: Callable[[], Network], seed: int) -> Network:
         return build()
 
 
-def lpips_of(folder: str, backbone: str, weight: float) -> Lpips | None:
-    """Load the LPIPS network of a loss from the outputs of stage `weights` in `folder`; None if its weight is 0.
-
-    ValueError if the folder has no weights for this backbone.
-    """
-    return Lpips.load(folder, "loss", backbone) if weight > 0 else None
-
-
 def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, device: torch.device) -> dict[str, Any]:
     """Collect everything that determines the weights, for a checkpoint's JSON and the running checkpoint's key.
 
