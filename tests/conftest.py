@@ -31,7 +31,7 @@ SLOWEST_FIRST = (
     "config/test_sweep.py",
 )
 """Files that take longest; the others follow, so no worker is left with a long one when the rest is done."""
-LARGE_PACKAGES = ("torch", "scipy.stats", "numba", "cv2", "zarr", "matplotlib.figure", "hydra", "dvclive")
+LARGE_PACKAGES = ("torch", "scipy.stats", "numba", "cv2", "zarr", "matplotlib.figure", "hydra")
 FUZZ_CASES = {"local": 50, "ci": 150}
 
 
@@ -177,7 +177,9 @@ def write_trial() -> Callable[..., None]:
         }
         if validation or test:
             scores = validation or {"mse": 0.5, "psnr": 3.0}
-            files["train/ours/history.json"] = json.dumps([{"train": loss, "val": scores}])
+            row = {f"train_{name}": value for name, value in loss.items()}
+            row |= {f"val_{name}": value for name, value in scores.items()}
+            files["train/ours/history.csv"] = f"epoch,{','.join(row)}\n0,{','.join(map(str, row.values()))}\n"
         if test:
             files["benchmark/metrics.json"] = json.dumps({"ours": test, "zeros": {}})
         if failure:

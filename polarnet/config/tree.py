@@ -168,7 +168,7 @@ class Config:
             used = any(getattr(section, key) > 0 for key in BASELINES[name].lpips)
             compared.append((f"baselines.{name}.lpips", used, loss, section.crop))
         for key, used, backbone, crop in compared:
-            side, size = BACKBONES[backbone].least_side, crop or sensor
+            side, size = BACKBONES[backbone].min_side, crop or sensor
             if used and min(size) < side:
                 raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {size}")
 

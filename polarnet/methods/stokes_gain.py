@@ -57,8 +57,8 @@ def last_gains(intensities: Float[Tensor, "n 4 h w"], config: GainConfig) -> Flo
     """Gains of the last frame, from all given frames."""
     frames, _, height, width = intensities.shape
     size = height * width
-    looked_at = torch.arange(0, frames * size, max(1, -(-frames * size // config.pixels)), device=intensities.device)
-    pixels = intensities.flatten(2)[looked_at // size, :, looked_at % size].double()
+    chosen = torch.arange(0, frames * size, max(1, -(-frames * size // config.pixels)), device=intensities.device)
+    pixels = intensities.flatten(2)[chosen // size, :, chosen % size].double()
     return solved(pixels * pixels.new_tensor(SIGNS), config)
 
 
@@ -79,8 +79,8 @@ def solved(residuals: Float[Tensor, "n 4"], config: GainConfig) -> Float[Tensor,
     for _ in range(config.rounds):
         misfit = (rows @ _smallest(rows.T @ (weights * rows), config.smallest, config.pull)).abs()[:, None]
         weights = 1 / (1 + (misfit / (TO_DEVIATION * misfit.median() + RIDGE)).square())
-    found = _smallest(rows.T @ (weights * rows), config.smallest, config.pull) / brightness
-    return found / found.log().mean().exp()
+    solution = _smallest(rows.T @ (weights * rows), config.smallest, config.pull) / brightness
+    return solution / solution.log().mean().exp()
 
 
 def _smallest(form: Float[Tensor, "4 4"], floor: float, pull: float) -> Float[Tensor, "4"]:

@@ -86,13 +86,13 @@ class DolpUNet(nn.Module):
         t, b, _, height, width = inputs.shape
         x = compressed(self.mix(inputs)).flatten(0, 1).contiguous(memory_format=torch.channels_last)
         x = F.pad(x, (0, -width % STRIDE, 0, -height % STRIDE))  # the padding holds no events
-        state1, state2 = state or self.initial_state(x[:b])
+        state1, state2 = state or (None, None)
 
         c1 = F.relu(self.c1(x))
         s1 = self.s1(c1)
-        g1, state1 = self.g1(s1, state1)
+        g1, state1 = self.g1(s1, b, state1)
         s2 = self.s2(g1)
-        g2, state2 = self.g2(s2, state2)
+        g2, state2 = self.g2(s2, b, state2)
         r = self.r(g2)
         d2 = self.d2(r, skip=g1)
         d1 = self.d1(d2, skip=c1)
@@ -100,14 +100,6 @@ class DolpUNet(nn.Module):
 
         dolp = dolp[:, 0, :height, :width].float().unflatten(0, (t, b))
         return Prediction(dolp), [state1, state2]
-
-    def initial_state(self, x: Float[Tensor, "b c h w"]) -> list[Tensor]:
-        """Return zero states at half and quarter resolution of x; its height and width must be multiples of 4."""
-        b, _, height, width = x.shape
-        return [
-            x.new_zeros(b, height // scale, width // scale, channels).permute(0, 3, 1, 2)
-            for scale, channels in ((2, self.g1.channels), (4, self.g2.channels))
-        ]
 
 
 INPUT_MIXINGS: dict[str, Callable[[Tensor], Tensor]] = {"polarizers": lambda events: events, "contrasts": contrasts}

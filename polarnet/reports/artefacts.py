@@ -20,6 +20,7 @@ from polarnet.simulation.motion import Pose, Trajectory, sensor_to_scene
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
+from polarnet.training.history import HISTORY, best_row, read_history
 
 OURS = "ours"  # folder of the DoLP network's training
 THUMBNAIL_WIDTH = 208  # pixels, twice the displayed size
@@ -45,8 +46,8 @@ class ReportPaths:
             self.scenes: "synthesize",
             self.frames: "synthesize",
             self.events: "emulate",
-            self.train / OURS / "history.json": "train",
-            **{self.train / name / "history.json": f"train_baseline@{name}" for name in baselines},
+            self.train / OURS / HISTORY: "train",
+            **{self.train / name / HISTORY: f"train_baseline@{name}" for name in baselines},
             self.benchmark / "metrics.json": "benchmark",
             self.benchmark / "cost.json": "benchmark",
             self.benchmark / "details.json": "benchmark",
@@ -154,8 +155,8 @@ def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
         details=_json(paths.benchmark / "details.json"),
         panels=panels,
         sets=[read_set(folder) for folder in sorted(paths.benchmark.glob("sets/*")) if folder.is_dir()],
-        ours=read_history(paths.train / OURS / "history.json"),
-        baselines={name: read_history(paths.train / name / "history.json") for name in baselines},
+        ours=training_history(paths.train / OURS),
+        baselines={name: training_history(paths.train / name) for name in baselines},
         rates=event_rates(events, frames),
         overview=next((overview_of(panel, scenes, frames, events) for panel in _telling(panels)), None),
         thumbnails={
@@ -174,19 +175,16 @@ def read_set(folder: Path) -> SetResults:
     return SetResults(details.get("set", folder.name), _scores_and_costs(folder), details, panels)
 
 
-def read_history(path: Path) -> History:
-    """Read a history.json, with mean loss terms and validation scores per epoch, and the name of its network."""
-    rows = _json(path)
-    if not rows:
-        raise ValueError(f"{path}: expected a row for each epoch, got none; train again")
+def training_history(folder: Path) -> History:
+    """Curves of a training, from its history, and the name of its network."""
+    rows = read_history(folder)
     epochs = [row["epoch"] for row in rows]
 
     def curves(split: str) -> dict[str, Curve]:
         return {name: Curve(name, epochs, [row[split][name] for row in rows]) for name in rows[0][split]}
 
-    best = min(rows, key=lambda row: row["val"]["mse"])
-    network = _json(path.with_name("best.json"))["network"]
-    return History(network, list(curves("train").values()), curves("val"), best["epoch"])
+    network = _json(folder / "best.json")["network"]
+    return History(network, list(curves("train").values()), curves("val"), best_row(rows)["epoch"])
 
 
 def _scores_and_costs(folder: Path) -> dict[str, dict[str, Any]]:

@@ -24,7 +24,10 @@ from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, l
 from polarnet.training.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
-LOOKED_AT = 10_000  # 2x2-pixel blocks per sequence in the expected-error fit; errors of neighbouring blocks are alike
+MAX_BLOCKS = 10_000  # 2x2-pixel blocks per sequence in the expected-error fit; errors of neighbouring blocks are alike
+
+Run = tuple[Tensor, Tensor, Tensor | None]
+"""Consecutive windows of a batch, their truth, and the mask of known truth (None: all known)."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,7 @@ def train(
             recorder.keep(progress, network, optimizer)
         recorder.end_epoch(progress, network, validate(task, split.val, config, device, workers))
         recorder.keep(progress, network, optimizer, at_once=True)
-    if task.expects is not None and recorder.writes:
+    if task.unroll_with_features is not None and recorder.writes:
         network.load_state_dict(progress.best)
         names = [name for name in split.train.sequences if name not in split.train.frames.variant_of]
         scenes = WindowDataset(split.train.events, split.train.frames, names, split.train.encode)
@@ -150,10 +153,8 @@ def gradients_of(network: nn.Module, processes: int) -> list[Tensor]:
     return [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
 
 
-def runs_of(
-    task: Task, batch: Batch, length: int, device: torch.device
-) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
-    """Input, truth and validity mask of the network, in runs of `length` windows."""
+def runs_of(task: Task, batch: Batch, length: int, device: torch.device) -> Iterator[Run]:
+    """Yield runs of `length` windows of a batch."""
     inputs, truth, valid = task.streams(batch)
     windows, frames = (tensor.to(device).split(length) for tensor in (inputs, truth))
     masks = [None] * len(frames) if valid is None else valid.to(device).split(length)
@@ -216,40 +217,39 @@ def calibrate(
     The fit also includes one frame of each sequence predicted without any events. Returns a record of the fit for the
     checkpoint. ValueError if the network has no error at all.
     """
-    if task.expects is None:
-        raise ValueError("expected a task whose network says how large its errors are")
     task.network.eval()
     scenes, mean_squared = [], []
-    seen: list[Tensor] = []
-
-    def looked_at(
-        windows: Tensor, frames: Tensor, valid: Tensor | None, state: State, every: int
-    ) -> tuple[Scene, State]:
-        with autocast(config.precision, device):
-            predicted, state = task.unroll(windows, state)
-        errors = (task.scored(predicted).clamp(0, 1) - task.scored(frames)).square()
-        known = torch.ones_like(errors) if valid is None else valid.to(errors)
-        of_four, all_known = (avg_pool2d(image.flatten(0, 1), 2)[:, ::every, ::every] for image in (errors, known))
-        height, width = (every * size for size in of_four.shape[-2:])
-        here = seen.pop()[..., :height:every, :width:every].permute(0, 2, 3, 1)[all_known == 1]
-        return Scene(here.double().cpu(), of_four[all_known == 1].double().cpu()), state
-
-    with task.expects.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0])):
-        for batch in batches_of(dataset, range(len(dataset)), 1, workers):
-            every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / LOOKED_AT)))  # along each axis
-            state: State = None
-            parts: list[Scene] = []
-            still: list[Scene] = []
-            for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
-                if not parts:
-                    mask = None if valid is None else valid[:1]
-                    still = [looked_at(torch.zeros_like(windows[:1]), frames[:1], mask, None, every)[0]]
-                part, state = looked_at(windows, frames, valid, state, every)
-                parts.append(part)
-            if any(len(part.squared) for part in parts):
-                mean_squared.append(torch.cat([part.squared for part in parts]).mean().item())
-                scenes.append(Scene(*(torch.cat(field) for field in zip(*parts, *still, strict=True))))
-    found = fitted(scenes)
-    task.network.expect(found.weight, found.bias)  # type: ignore[operator]
+    for batch in batches_of(dataset, range(len(dataset)), 1, workers):
+        every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / MAX_BLOCKS)))  # along each axis
+        runs = list(runs_of(task, batch, config.bptt_windows, device))
+        samples: list[Scene] = []
+        state: State = None
+        for run in runs:
+            sample, state = sampled_errors(task, run, state, every, config.precision)
+            samples.append(sample)
+        squared = torch.cat([sample.squared for sample in samples])
+        if len(squared):
+            windows, frames, valid = runs[0]
+            still = (torch.zeros_like(windows[:1]), frames[:1], None if valid is None else valid[:1])
+            samples.append(sampled_errors(task, still, None, every, config.precision)[0])
+            mean_squared.append(squared.mean().item())
+            scenes.append(Scene(*(torch.cat(field) for field in zip(*samples, strict=True))))
+    fit = fitted(scenes)
+    task.network.expect(fit.weight, fit.bias)  # type: ignore[operator]
     task.network.train()
-    return {"sequences": len(scenes), "mse": fmean(mean_squared), "ridge": found.ridge}
+    return {"sequences": len(scenes), "mse": fmean(mean_squared), "ridge": fit.ridge}
+
+
+def sampled_errors(task: Task, run: Run, state: State, every: int, precision: str) -> tuple[Scene, State]:
+    """Features and squared errors of one 2x2-pixel block in `every` along each axis, and the state after the run."""
+    if task.unroll_with_features is None:
+        raise ValueError("expected a task whose network predicts the size of its errors")
+    windows, frames, valid = run
+    with autocast(precision, windows.device):
+        predicted, features, state = task.unroll_with_features(windows, state)
+    errors = (predicted.clamp(0, 1) - task.scored(frames)).square()
+    known = torch.ones_like(errors) if valid is None else valid.to(errors)
+    squared, share_known = (avg_pool2d(image.flatten(0, 1), 2)[:, ::every, ::every] for image in (errors, known))
+    height, width = (every * size for size in squared.shape[-2:])
+    features = features[..., :height:every, :width:every].permute(0, 2, 3, 1)[share_known == 1]
+    return Scene(features.double().cpu(), squared[share_known == 1].double().cpu()), state

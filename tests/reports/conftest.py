@@ -19,6 +19,7 @@ from polarnet.simulation.truth import synthesize
 from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
+from polarnet.training.history import write_history
 
 SPLITS = {"park": "train", "lake": "val", "tree": "test", "leaf": "test"}
 HISTORY = [
@@ -128,6 +129,6 @@ def paths(tmp_path_factory):
     run_methods(EventStore.open(paths.events), frames, paths.benchmark)
     for folder, network in ((paths.train / "ours", "paper"), (paths.train / "e2v", "firenet")):
         folder.mkdir(parents=True)
-        (folder / "history.json").write_text(json.dumps(HISTORY))
+        write_history(folder, HISTORY)
         (folder / "best.json").write_text(json.dumps({"network": network}))
     return paths

@@ -5,7 +5,7 @@ import pytest
 import torch
 from matplotlib.colors import rgb_to_hsv
 
-from polarnet.reports.artefacts import event_rates, read_artefacts, read_history
+from polarnet.reports.artefacts import event_rates, read_artefacts, training_history
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 
@@ -17,7 +17,7 @@ def artefacts(paths):
 
 def test_everything_missing_is_named_with_the_stage_that_makes_it(paths, tmp_path):
     elsewhere = dataclasses.replace(paths, events=tmp_path / "events.zarr", train=tmp_path / "train")
-    with pytest.raises(FileNotFoundError, match=r"events\.zarr \(stage emulate\).*history\.json \(stage train\)"):
+    with pytest.raises(FileNotFoundError, match=r"events\.zarr \(stage emulate\).*history\.csv \(stage train\)"):
         read_artefacts(elsewhere, [])
 
 
@@ -76,13 +76,7 @@ def test_event_rates_count_every_event_of_a_split_once(paths):
 
 
 def test_the_best_epoch_is_the_one_with_the_lowest_validation_mse(paths):
-    history = read_history(paths.train / "ours" / "history.json")
+    history = training_history(paths.train / "ours")
     assert history.best_epoch == 1
     assert [curve.label for curve in history.loss] == ["total", "mse"]
     assert history.validation["psnr"].values == [10.0, 11.0, 12.0]
-
-
-def test_a_history_without_epochs_is_an_error(tmp_path):
-    (tmp_path / "history.json").write_text("[]")
-    with pytest.raises(ValueError, match="a row for each epoch"):
-        read_history(tmp_path / "history.json")
