@@ -3,13 +3,14 @@
 import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor
 
 from polarnet.benchmark.rows import ROWS
@@ -30,7 +31,7 @@ from polarnet.metrics.similarity import (
     with_truth_outside,
 )
 from polarnet.runtime.machine import generator_for
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import one_of, section
 from polarnet.stokes import Prediction
 
 METRICS = ("mse", "psnr", "ssim", "lpips", "corr", "grad", "level_mse", "pattern_mse", "aolp_deg", "skill")
@@ -41,30 +42,27 @@ INTERVAL = (0.025, 0.975)  # quantiles of the bootstrap: 95 %
 FRAMES_AT_ONCE = 8  # batch size of LPIPS, which bounds the memory of its features
 
 
-@dataclass(frozen=True)
+@section
 class BenchmarkConfig:
     """Section `benchmark` of params.yaml."""
 
-    methods: list[str]
+    methods: list[Annotated[str, one_of(ROWS)]]
     """Rows of the table: references and methods."""
-    sets: list[str] = field(metadata=allowed(choices=SETS))
+    sets: list[Annotated[str, one_of(SETS)]]
     """Test sets; must include simulated."""
-    warmup_windows: int = field(metadata=allowed(low=0))
+    warmup_windows: NonNegativeInt
     """Unscored windows at the start of a sequence, the same for all methods: nothing has moved far enough yet."""
-    precision: str = field(metadata=allowed(choices=("fp32", "bf16")))
+    precision: Annotated[str, one_of(("fp32", "bf16"))]
     """Precision of the networks; scores in fp32 do not depend on a processor's bf16 kernels."""
     lpips: bool
     """Whether to compute LPIPS."""
-    lpips_backbone: str = field(metadata=allowed(choices=tuple(BACKBONES)))
+    lpips_backbone: Annotated[str, one_of(BACKBONES)]
     """Backbone of LPIPS, always in fp32; the paper uses vgg."""
-    bootstrap_samples: int = field(metadata=allowed(low=1))
-    panel_scenes: int = field(metadata=allowed(low=0))
+    bootstrap_samples: PositiveInt
+    panel_scenes: NonNegativeInt
     """Number of scenes shown as panels."""
 
     def __post_init__(self):
-        check_ranges(self)
-        if unknown := [row for row in self.methods if row not in ROWS]:
-            raise ValueError(f"methods: expected some of {', '.join(ROWS)}, got {', '.join(unknown)}")
         if not self.methods or len(set(self.methods)) != len(self.methods):
             raise ValueError(f"methods: expected at least one and none twice, got {self.methods}")
         if SETS[0] not in self.sets or len(set(self.sets)) != len(self.sets):
