@@ -7,10 +7,7 @@ import sys
 from pathlib import Path
 
 from polarnet.cli.parsers import Commands
-
-INSTALLED_SETTINGS = Path(__file__).parents[1] / "config" / "settings"
-"""Copy of params.yaml and conf/ that setup.py puts into the wheel."""
-SOURCE_TREE = Path(__file__).parents[2]
+from polarnet.runtime.files import shipped_settings
 
 
 def add_to(commands: Commands) -> None:
@@ -43,15 +40,11 @@ def project_root(start: Path | None = None) -> Path:
 
 
 def settings_root() -> Path:
-    """The folder whose params.yaml and conf/ hold the settings, in this order.
-
-    The clone at or above the current folder; the copy in an installed wheel; the source tree of an editable
-    installation.
-    """
+    """Folder of params.yaml and conf/: the clone at or above the current folder, else those beside the code."""
     try:
         return project_root()
     except FileNotFoundError:
-        return INSTALLED_SETTINGS if INSTALLED_SETTINGS.is_dir() else SOURCE_TREE
+        return shipped_settings()
 
 
 def working_folder() -> Path:

@@ -69,3 +69,5 @@ def test_a_wheel_reads_its_own_settings_outside_a_clone_and_those_of_the_clone_i
     assert printed(f"print(settings_root()); {load}", tmp_path / "empty").split() == [
         str(tmp_path / "installed" / "polarnet" / "config" / "settings"), "7",
     ]  # fmt: skip
+    sensor = "from polarnet.simulation import SENSORS; print(SENSORS['noisy'].cutoff_hz)"
+    assert printed(sensor, tmp_path / "empty").strip() == "30.0"
