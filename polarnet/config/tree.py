@@ -27,11 +27,12 @@ from polarnet.metrics.lpips import BACKBONES, PURPOSES, Purpose, is_stored
 from polarnet.metrics.lpips_weights import LpipsConfig, local_source
 from polarnet.networks.registry import NETWORKS, NetworkConfig
 from polarnet.pictures.ingest import IngestConfig
-from polarnet.runtime.machine import RuntimeConfig, configure
+from polarnet.runtime.cluster import pmap
+from polarnet.runtime.machine import RuntimeConfig, configure, threads_of
 from polarnet.runtime.sections import one_of, section, unknown_key
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
-from polarnet.simulation.sets import SetsConfig
+from polarnet.simulation.sets import Recipe, SetsConfig
 from polarnet.simulation.variation import VariationConfig
 from polarnet.storage.parts import StorageConfig
 from polarnet.training.baselines import BASELINES
@@ -220,6 +221,16 @@ class Config:
     def network_config(self) -> NetworkConfig:
         """Settings of the network in use."""
         return getattr(self.networks, self.network)
+
+    @property
+    def recipe(self) -> Recipe:
+        """Settings that make sequences from pictures."""
+        threads, size = threads_of(self.runtime), self.storage.sequences_per_part
+        return Recipe(self.ingest, self.synthesize, self.emulate, self.seed, threads, size)
+
+    def mapper(self, label: str) -> functools.partial[list[Any]]:
+        """Parallel map with the workers and the cluster of this configuration; `label` names its progress bar."""
+        return functools.partial(pmap, workers=self.runtime.workers, label=label, address=self.cluster.address)
 
 
 def typed(node: DictConfig) -> Config:

@@ -208,7 +208,7 @@ def test_frames_are_written_one_a_line_with_empty_cells_for_what_is_not_known(tm
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"methods": ["zeros", "magic"]}, "methods: expected some of zeros, train_mean, .*, got magic"),
+        ({"methods": ["zeros", "magic"]}, r"methods\[0\]: expected one of zeros, train_mean, .*, got 'magic'"),
         ({"methods": ["zeros", "zeros"]}, "methods: expected at least one and none twice"),
         ({"methods": []}, "methods: expected at least one and none twice"),
         ({"sets": ["measured"]}, "sets: expected simulated and others, none twice"),
