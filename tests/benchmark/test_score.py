@@ -208,11 +208,11 @@ def test_frames_are_written_one_a_line_with_empty_cells_for_what_is_not_known(tm
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"methods": ["zeros", "magic"]}, r"methods\[0\]: expected one of zeros, train_mean, .*, got 'magic'"),
+        ({"methods": ["zeros", "magic"]}, r"methods\[1\]: expected one of zeros, train_mean, .*, got 'magic'"),
         ({"methods": ["zeros", "zeros"]}, "methods: expected at least one and none twice"),
         ({"methods": []}, "methods: expected at least one and none twice"),
         ({"sets": ["measured"]}, "sets: expected simulated and others, none twice"),
-        ({"sets": ["simulated", "real"]}, "sets: expected one of simulated, complex_motion, measured, got"),
+        ({"sets": ["simulated", "real"]}, r"sets\[1\]: expected one of simulated, complex_motion, measured, got"),
         ({"warmup_windows": -1}, "warmup_windows: expected >= 0, got -1"),
         ({"precision": "fp16"}, "precision: expected one of fp32, bf16, got 'fp16'"),
     ],
