@@ -155,8 +155,8 @@ def score_sequence(
         window = warmup_windows + int(known.logical_not().nonzero()[0])
         raise ValueError(f"{sequence.name}, window {window}: no pixel is valid; leave this measurement out")
     oracle_mse = spread_mse(truth, valid)
-    shown = {method: with_truth_outside(dolp, truth, valid) for method, (dolp, _) in counted.items()}
-    distances = _lpips_of(shown, truth, lpips)
+    compared = {method: with_truth_outside(dolp, truth, valid) for method, (dolp, _) in counted.items()}
+    distances = _lpips_of(compared, truth, lpips)
     rows = []
     for method, (dolp, aolp) in counted.items():
         per_frame: dict[str, Tensor | None] = {

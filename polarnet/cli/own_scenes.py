@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from polarnet.benchmark.conditions import configured, sentence, warnings
+from polarnet.benchmark.conditions import announced, configured
 from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.rows import available, metadata_used, weights_used
 from polarnet.benchmark.run import run_benchmark, train_mean_dolp
@@ -48,8 +48,7 @@ def benchmark_folder(
     context = context_of(config, train_mean, weights or shipped_weights())
     methods, left_out = available(wanted, context)
     used = configured(config.synthesize, config.emulate)
-    differences = warnings(used, metadata_used(methods, context), SET_THEM)
-    print("\n".join([sentence(used), *(f"WARNING: {line}" for line in differences)]), flush=True)
+    conditions = announced(used, metadata_used(methods, context), SET_THEM)
     try:
         make_folder_set(root, kind, work, config.recipe, config.mapper)
     except ValueError as error:
@@ -60,22 +59,22 @@ def benchmark_folder(
     benchmark = run_benchmark(test_set, context, settings, lpips, config.mapper("benchmark"))
     about = {
         "set": test_set.name,
-        "conditions": {"sentence": sentence(used), "warnings": differences, **used._asdict()},
+        "conditions": conditions,
         "lpips": NO_RECORD if lpips_weights is None else lpips_weights.record,
         "train_mean": train_mean,
         "left_out": notes,
         "weights": weights_used(methods, context),
     }
     metrics = write_benchmark(out, benchmark, settings, config.seed, about)
-    write_set_page(out, test_set.name, command, [*differences, *notes])
+    write_set_page(out, test_set.name, command, [*conditions["warnings"], *notes])
     return metrics, notes
 
 
 def _skipped(config: Config, work: Path) -> list[str]:
     """One line for each file of the folder that was skipped."""
     manifest = read_manifest(work / "images")
-    used = set(SceneStore.open(work / "scenes.zarr").picture_of.values())
-    unused = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name not in used))
+    simulated = set(SceneStore.open(work / "scenes.zarr").picture_of.values())
+    unused = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name not in simulated))
     _, small = motions_of(unused, config.synthesize, config.seed)
     return [f"{skipped.file} was skipped: {skipped.reason}" for skipped in (*manifest.skipped, *small)]
 

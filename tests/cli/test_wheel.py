@@ -35,8 +35,8 @@ def built(source, kind, folder):
     before = set(folder.iterdir())
     command = [sys.executable, "-c", BUILD.format(kind=kind, folder=str(folder))]
     subprocess.run(command, cwd=source, check=True, capture_output=True, env=os.environ | {"PYTHONPATH": ""})
-    (made,) = set(folder.iterdir()) - before
-    return made
+    (distribution,) = set(folder.iterdir()) - before
+    return distribution
 
 
 def test_the_wheel_holds_the_package_alone_with_the_settings(distributions, project_root):
