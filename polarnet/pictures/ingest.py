@@ -8,11 +8,12 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import numpy as np
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.dead_leaves import dead_leaves
@@ -40,7 +41,7 @@ from polarnet.pictures.polarimetry import (
 )
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import generator_for
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import one_of, section
 from polarnet.stokes import parse_mosaic
 
 logger = logging.getLogger(__name__)
@@ -50,31 +51,30 @@ EDGE_BYTES = 1 << 16  # of a file's start and end, hashed to choose `limit` file
 Mapper = Callable[..., Iterable[Any]]
 
 
-@dataclass(frozen=True)
+@section
 class IngestConfig:
     """Section `ingest` of params.yaml."""
 
-    source: str = field(metadata=allowed(choices=("builtin", "folder", "polarization")))
+    source: Annotated[str, one_of(("builtin", "folder", "polarization"))]
     root: str
     """Folder of the sources folder and polarization, searched recursively."""
-    limit: int | None = field(metadata=allowed(low=1))
+    limit: PositiveInt | None
     """At most this many pictures of the folder, chosen by content hash."""
-    dead_leaves: int = field(metadata=allowed(low=0))
+    dead_leaves: NonNegativeInt
     """Generated pictures beside the builtin photographs."""
-    height: int = field(metadata=allowed(low=16))
+    height: Annotated[int, Field(ge=16)]
     """Pixels of every picture after the centre crop."""
-    width: int = field(metadata=allowed(low=16))
-    max_upscale: float = field(metadata=allowed(low=1))
+    width: Annotated[int, Field(ge=16)]
+    max_upscale: Annotated[float, Field(ge=1)]
     """A picture that would have to be enlarged more is too small."""
-    val_fraction: float = field(metadata=allowed(low=0, high=1))
-    test_fraction: float = field(metadata=allowed(low=0, high=1))
+    val_fraction: Annotated[float, Field(ge=0, le=1)]
+    test_fraction: Annotated[float, Field(ge=0, le=1)]
     mosaic: str
     """Polarizer angles of the 2x2 pixels of a raw mosaic, even row / odd row (source=polarization)."""
-    residual_max: float = field(metadata=allowed(above=0))
+    residual_max: PositiveFloat
     """Largest accepted median of |I0 + I90 - I45 - I135| / S0 (source=polarization)."""
 
     def __post_init__(self):
-        check_ranges(self)
         parse_mosaic(self.mosaic)
         if self.val_fraction + self.test_fraction > 1:
             raise ValueError(

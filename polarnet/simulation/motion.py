@@ -2,16 +2,17 @@
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple, no_type_check
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple, no_type_check
 
 import numba
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
+from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 from polarnet.simulation.scene import PolarizationScene
 
 HARMONICS = 3  # number of sines in the motion along each axis
@@ -25,25 +26,24 @@ FASTEST_OVER_SLOWEST = 3.0  # factor by which the sensor may turn back faster th
 ATTEMPTS = 64
 
 
-@dataclass(frozen=True)
+@section
 class SynthesizeConfig:
     """Section `synthesize` of params.yaml. Speeds are in scene pixels and hold for every sensor pixel."""
 
-    sequences_per_picture: int = field(metadata=allowed(low=1))
-    duration_s: float = field(metadata=allowed(above=0))
-    frame_rate_hz: float = field(metadata=allowed(above=0))
+    sequences_per_picture: PositiveInt
+    duration_s: PositiveFloat
+    frame_rate_hz: PositiveFloat
     """Rate of the ground-truth frames; the windows of events between frames are the network's inputs."""
-    sensor_height: int = field(metadata=allowed(low=2))
-    sensor_width: int = field(metadata=allowed(low=2))
-    speed_min_px_s: float = field(metadata=allowed(above=0))
+    sensor_height: Annotated[int, Field(ge=2)]
+    sensor_width: Annotated[int, Field(ge=2)]
+    speed_min_px_s: PositiveFloat
     """The peak speed of a sequence is drawn between this and speed_max_px_s."""
-    speed_max_px_s: float = field(metadata=allowed(above=0))
-    acceleration_max_px_s2: float = field(metadata=allowed(above=0))
-    rotation_max_deg: float = field(metadata=allowed(low=0, high=90))
-    zoom_max: float = field(metadata=allowed(low=1, high=16))
+    speed_max_px_s: PositiveFloat
+    acceleration_max_px_s2: PositiveFloat
+    rotation_max_deg: Annotated[float, Field(ge=0, le=90)]
+    zoom_max: Annotated[float, Field(ge=1, le=16)]
 
     def __post_init__(self):
-        check_ranges(self)
         if self.speed_max_px_s < self.speed_min_px_s:
             raise ValueError(f"speed_max_px_s: expected >= speed_min_px_s {self.speed_min_px_s}, got {self}")
         if round(self.duration_s * self.frame_rate_hz) < 1:

@@ -8,16 +8,18 @@ import functools
 import json
 import shutil
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field, PositiveFloat
 
 from polarnet.pictures.images import picture_extensions
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.pictures.polarimetry import group_by_measurement
 from polarnet.runtime.files import sha256
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 from polarnet.simulation.dataset import emulate_scenes
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
@@ -29,21 +31,20 @@ MakeMapper = Callable[[str], Callable[..., Iterable[Any]]]
 """`polarnet.runtime.cluster.pmap` with its workers bound, for a label; or one that gives the built-in `map`."""
 
 
-@dataclass(frozen=True)
+@section
 class SetsConfig:
     """Section `sets` of params.yaml: how test sets beyond `simulated` differ from it."""
 
     measured_root: str
     """Folder of the measured polarization of `measured`, searched recursively."""
-    rotation_max_deg: float = field(metadata=allowed(low=0, high=90))
+    rotation_max_deg: Annotated[float, Field(ge=0, le=90)]
     """This field and the next four set the motion of `complex_motion`."""
-    zoom_max: float = field(metadata=allowed(low=1, high=16))
-    speed_min_px_s: float = field(metadata=allowed(above=0))
-    speed_max_px_s: float = field(metadata=allowed(above=0))
-    acceleration_max_px_s2: float = field(metadata=allowed(above=0))
+    zoom_max: Annotated[float, Field(ge=1, le=16)]
+    speed_min_px_s: PositiveFloat
+    speed_max_px_s: PositiveFloat
+    acceleration_max_px_s2: PositiveFloat
 
     def __post_init__(self):
-        check_ranges(self)
         if self.speed_max_px_s < self.speed_min_px_s:
             raise ValueError(f"speed_max_px_s: expected >= speed_min_px_s {self.speed_min_px_s}, got {self}")
 

@@ -22,18 +22,19 @@ import uuid
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import fsspec
 import numpy as np
 import zarr
+from pydantic import PositiveInt
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
 from zarr.storage import FsspecStore, LocalStore, WrapperStore, ZipStore
 
 from polarnet.runtime.files import sha256
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 
 COMPRESSION_LEVEL = 1  # for zstd; higher levels cost 10-100 times the time for 6 % fewer bytes
 SHARD_BYTES = 2**25  # before compression; the writer of a part keeps about this much of each column in memory
@@ -43,14 +44,11 @@ REPAIR = "write this store again, or copy it again from where it is whole"
 Header = dict[str, Any]
 
 
-@dataclass(frozen=True)
+@section
 class StorageConfig:
     """Section `storage` of params.yaml."""
 
-    sequences_per_part: int = field(metadata=allowed(low=1))
-
-    def __post_init__(self):
-        check_ranges(self)
+    sequences_per_part: PositiveInt
 
 
 @dataclass(frozen=True)

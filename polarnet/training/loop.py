@@ -3,17 +3,18 @@
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from statistics import fmean
+from typing import Annotated
 
 import torch
+from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from polarnet.events.representations import REPRESENTATIONS
 from polarnet.metrics.similarity import correlation, mse, psnr
 from polarnet.runtime.machine import precision_on
-from polarnet.runtime.ranges import allowed
+from polarnet.runtime.sections import one_of, section
 from polarnet.storage.windows import WindowDataset
 from polarnet.training.calibration import Scene, fitted
 from polarnet.training.losses import known_frames
@@ -30,39 +31,39 @@ Run = tuple[Tensor, Tensor, Tensor | None]
 """Consecutive windows of a batch, their truth, and the mask of known truth (None: all known)."""
 
 
-@dataclass(frozen=True)
+@section
 class LoopConfig(ViewConfig):
     """Training settings shared by the sections `train`, `baselines.e2v` and `baselines.e2p` of params.yaml."""
 
-    data: str = field(metadata=allowed(choices=("store", "fly")))
+    data: Annotated[str, one_of(("store", "fly"))]
     """store: read events from the store on disk; fly: emulate the same events in memory, from the scenes, on demand."""
-    epochs: int = field(metadata=allowed(low=1))
-    batch_size: int = field(metadata=allowed(low=1))
+    epochs: PositiveInt
+    batch_size: PositiveInt
     """Number of visits to sequences in one batch."""
-    accumulate: int = field(metadata=allowed(low=1))
+    accumulate: PositiveInt
     """Number of parts that a batch is split into to save memory. The steps stay the same up to rounding."""
-    bptt_windows: int = field(metadata=allowed(low=1))
+    bptt_windows: PositiveInt
     """Windows per optimizer step. The recurrent state passes from step to step, gradients do not."""
-    learning_rate: float = field(metadata=allowed(above=0))
+    learning_rate: PositiveFloat
     """Peak learning rate."""
-    schedule: str = field(metadata=allowed(choices=("constant", "cosine")))
+    schedule: Annotated[str, one_of(("constant", "cosine"))]
     """cosine: decay from the peak rate to 0 over the training."""
-    warmup: float = field(metadata=allowed(low=0, high=1))
+    warmup: Annotated[float, Field(ge=0, le=1)]
     """Fraction of the training over which the rate rises from 0."""
-    gradient_norm: float | None = field(metadata=allowed(above=0))
+    gradient_norm: PositiveFloat | None
     """Largest norm of all gradients together; longer gradients are scaled down to it. null: no limit."""
-    precision: str = field(metadata=allowed(choices=("auto", "fp32", "bf16")))
+    precision: Annotated[str, one_of(("auto", "fp32", "bf16"))]
     """Precision of autocast; weights and optimizer state are always float32. auto: bf16 if the device has units for
     it."""
 
 
-@dataclass(frozen=True)
+@section
 class TrainConfig(LoopConfig):
     """Section `train` of params.yaml."""
 
-    representation: str | None = field(metadata=allowed(choices=tuple(REPRESENTATIONS)))
+    representation: Annotated[str, one_of(REPRESENTATIONS)] | None
     """Representation of the events in a window; null: the network's own default."""
-    optimizer: str | None = field(metadata=allowed(choices=tuple(OPTIMIZERS)))
+    optimizer: Annotated[str, one_of(OPTIMIZERS)] | None
     """Name of the optimizer; null: the network's own default."""
 
 

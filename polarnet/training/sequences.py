@@ -2,18 +2,18 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import psutil
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field, PositiveInt
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from polarnet.runtime.machine import generator_for, memory_handed_back
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 from polarnet.storage.windows import WindowDataset, WindowSequence
 
 Sequences = WindowDataset | list[WindowSequence]
@@ -72,21 +72,20 @@ def apply_view(sequence: WindowSequence, view: View) -> WindowSequence:
     )
 
 
-@dataclass(frozen=True)
+@section
 class ViewConfig:
     """Augmentation settings; keys of `train`, `baselines.e2v` and `baselines.e2p` in params.yaml."""
 
-    visits: int = field(metadata=allowed(low=1))
+    visits: PositiveInt
     """Visits to each sequence per epoch, each with a new random view."""
-    windows: int | None = field(metadata=allowed(low=1))
+    windows: PositiveInt | None
     """Consecutive windows per visit, starting at a random window; null: all windows."""
-    crop: list[int] | None = field(metadata=allowed(low=16))
+    crop: list[Annotated[int, Field(ge=16)]] | None
     """Height and width in pixels of a visit's random crop; null: the whole image."""
     symmetries: bool
     """Mirror the image and renumber the polarizers at random. This does not change DoLP."""
 
     def __post_init__(self):
-        check_ranges(self)
         if self.crop is not None and len(self.crop) != 2:
             raise ValueError(f"crop: expected height and width, or null, got {self.crop}")
 

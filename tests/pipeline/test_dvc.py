@@ -15,7 +15,7 @@ from polarnet.config.experiments import stage_names
 from polarnet.methods import METHODS, module_of
 from polarnet.training.baselines import BASELINES
 
-# What starts a stage and checks its values decides no output; listing it would re-run everything at each new setting.
+# Code that starts a stage and checks its values decides no output; listed, it would re-run all at each new setting.
 PLUMBING = {"polarnet", "polarnet.config.tree", "polarnet.runtime.cluster"}
 ASSEMBLED = {"polarnet.methods", "polarnet.training.baselines", "polarnet.benchmark.references"}
 """Modules that collect entries by name; a row or a training depends on its own entry alone."""

@@ -92,13 +92,10 @@ def run_methods(events, frames, folder):
         answers["e2v"] = Prediction(dolp["e2v"], sequence.aolp)
         rows += score_sequence(sequence, answers, 1, None, torch.device("cpu"))
         k = 3
-        panels.append(
-            Panel(
-                sequence.name, sequence.scene, k, int(sequence.t_us[k + 1]), torch.randn(4, 24, 36), truth[k],
-                sequence.aolp[k], sequence.s0[k], {m: frames[k] for m, frames in dolp.items()},
-                {"e2v": sequence.aolp[k]},
-            )
-        )  # fmt: skip
+        maps = {"events": torch.randn(4, 24, 36), "truth_dolp": truth[k], "truth_aolp": sequence.aolp[k]}
+        maps |= {"truth_s0": sequence.s0[k], "aolp_e2v": sequence.aolp[k]}
+        maps |= {f"dolp_{method}": frames[k] for method, frames in dolp.items()}
+        panels.append(Panel(sequence.name, k, int(sequence.t_us[k + 1]), maps))
     about = {
         "lpips": {"backbone": None, "sha256": None, "source": None},
         "weights": {
