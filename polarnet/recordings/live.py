@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from jaxtyping import Int64
 
-from polarnet.events.stream import LARGEST_SIDE, Events
+from polarnet.events.stream import MAX_SIDE, Events
 from polarnet.recordings.arrangements import split_mosaic
 from polarnet.recordings.formats.lines import lines_of, numbers_of, rows_of
 from polarnet.recordings.repair import TOLERATED_COUNT, TOLERATED_SHARE
@@ -96,7 +96,7 @@ class LiveLines:
         for data, _ in self._whole_lines():
             line, _, rest = data.partition(b"\n")
             words = [word for one in numbers_of(line) for word in one.words]
-            if len(words) != 2 or not all(w.isdigit() and 0 < int(w) <= LARGEST_SIDE for w in words):
+            if len(words) != 2 or not all(w.isdigit() and 0 < int(w) <= MAX_SIDE for w in words):
                 break
             self._started_with = rest
             return int(words[1]), int(words[0])

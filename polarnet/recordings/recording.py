@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from polarnet.events.stream import LARGEST_SIDE, Events, concatenate
+from polarnet.events.stream import MAX_SIDE, Events, concatenate
 from polarnet.recordings.formats import aedat2, celex5_bin, celex5_csv, dat, evt, faery, hdf5, store, text
 from polarnet.recordings.formats.lines import HEAD_BYTES
 from polarnet.recordings.repair import repaired
@@ -101,8 +101,8 @@ def open_recording(
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     for name, side in (("height", height), ("width", width)):
-        if side is not None and not 0 < side <= LARGEST_SIDE:
-            raise ValueError(f"expected a {name} of 1 to {LARGEST_SIDE} px, got {side}")
+        if side is not None and not 0 < side <= MAX_SIDE:
+            raise ValueError(f"expected a {name} of 1 to {MAX_SIDE} px, got {side}")
     if chunk_events < 1:
         raise ValueError(f"expected at least one event in a chunk, got {chunk_events}")
     if clock_mhz is not None and not 0.001 <= clock_mhz <= 10_000:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.events.stream import LARGEST_SIDE
+from polarnet.events.stream import MAX_SIDE
 
 BLOCK_EVENTS = 2**18  # events that a format decodes at a time; chunks handed to a user are cut anew
 
@@ -90,8 +90,6 @@ def sensor_size(path: Path, choices: Choices, height: int | None = None, width: 
     width = choices.width if width is None else width
     if height is None or width is None:
         raise RecordingError(f"{path.name}: the file does not say how large the sensor is; give height and width")
-    if not (0 < height <= LARGEST_SIDE and 0 < width <= LARGEST_SIDE):
-        raise RecordingError(
-            f"{path.name}: expected a sensor with sides of 1 to {LARGEST_SIDE} px, got {height}x{width}"
-        )
+    if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
+        raise RecordingError(f"{path.name}: expected a sensor with sides of 1 to {MAX_SIDE} px, got {height}x{width}")
     return height, width

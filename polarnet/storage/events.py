@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from polarnet.events.stream import LARGEST_SIDE, Events, slice_count, slice_time, validate
+from polarnet.events.stream import MAX_SIDE, Events, slice_count, slice_time, validate
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.parts import Column, Columns, Header, Store
 
@@ -69,8 +69,8 @@ class EventStore(Store):
         metadata is resumed, one with other metadata is removed. One process creates the store. It can be pickled and
         sent to other processes, which may write different parts at the same time.
         """
-        if not (0 < height <= LARGEST_SIDE and 0 < width <= LARGEST_SIDE):
-            raise ValueError(f"expected a sensor with sides of 1 to {LARGEST_SIDE} px, got {height}x{width}")
+        if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
+            raise ValueError(f"expected a sensor with sides of 1 to {MAX_SIDE} px, got {height}x{width}")
         metadata = {"polarizer_angles_deg": list(POLARIZER_ANGLES_DEG), "conventions": CONVENTIONS}
         return cls.create_parts(path, sequences, attributes, sequences_per_part, height=height, width=width, **metadata)
 
