@@ -55,8 +55,6 @@ class Choices:
     """SEQUENCE/ANGLE of an event store."""
     clock_mhz: float | int | None = None
     """Clock of a CeleX-5 that did not run at its usual rate."""
-    assume_polarity: int | None = None
-    """Polarity, +1 or -1, of all events in a file that does not store it; None refuses such a file."""
 
 
 @dataclass(frozen=True)

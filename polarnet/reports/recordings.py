@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from polarnet.recordings.formats.celex5 import WHITE
+from polarnet.recordings.formats.celex5_bin import WHITE
 from polarnet.recordings.inspection import Inspection
 from polarnet.reports.maps import encode_png, event_full_scale, event_image, intensity_image
 
