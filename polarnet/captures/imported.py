@@ -20,6 +20,7 @@ from polarnet.captures.dot import (
 )
 from polarnet.captures.status import start_over
 from polarnet.events.stream import Events
+from polarnet.recordings.arrangements import shifted
 from polarnet.runtime.files import sha256
 from polarnet.storage.events import EventStore
 
@@ -83,8 +84,3 @@ def open_target(imported: Path, name: str) -> Target:
             pictures = np.load(folder / f"{capture}.npy", mmap_mode="r")
             intensities[capture] = IntensityCapture(times["t_us"], pictures, times["region"])
     return Target(name, events, intensities, clocks["given_us"])
-
-
-def shifted(events: Events, origin_us: int) -> Events:
-    """The same events, with `origin_us` as time 0."""
-    return Events(events.t - origin_us, events.x, events.y, events.p, events.height, events.width)

@@ -25,9 +25,10 @@ from polarnet.captures.dot import (
     reduced,
     region_negative_times_us,
 )
-from polarnet.captures.imported import Target, open_target, shifted
+from polarnet.captures.imported import Target, open_target
 from polarnet.captures.status import start_over
 from polarnet.events.stream import Events, crop, downscale, slice_time
+from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
 from polarnet.recordings.source import RecordingError
 from polarnet.storage.events import EventStore

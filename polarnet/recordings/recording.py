@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from polarnet.events.stream import MAX_SIDE, Events, concatenate
-from polarnet.recordings.formats import aedat2, celex5_bin, celex5_csv, dat, evt, faery, hdf5, store, text
+from polarnet.recordings.formats import aedat2, celex5_bin, celex5_csv, faery, hdf5, prophesee, store, text
 from polarnet.recordings.formats.lines import HEAD_BYTES
 from polarnet.recordings.repair import repaired
 from polarnet.recordings.source import Block, Choices, RecordingError, Source
@@ -35,8 +35,8 @@ FORMATS = {
     "aedat4": Format("AEDAT4 of iniVation", faery.matches_aedat4, faery.open_aedat4),
     "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", aedat2.matches, aedat2.open_aedat2),
     "event_stream": Format("Event Stream (.es)", faery.matches_event_stream, faery.open_event_stream),
-    "evt": Format("EVT2 and EVT3 of Prophesee", evt.matches, evt.open_evt),
-    "dat": Format("DAT of Prophesee", dat.matches, dat.open_dat),
+    "evt": Format("EVT2 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
+    "dat": Format("DAT of Prophesee", prophesee.matches_dat, prophesee.open_dat),
     "text": Format("lines `t x y p`", text.matches, text.open_text),
     "celex5_csv": Format("CSV of a CeleX-5", celex5_csv.matches, celex5_csv.open_celex5_csv),
     "celex5_bin": Format("BIN of a CeleX-5", celex5_bin.matches, celex5_bin.open_celex5_bin),

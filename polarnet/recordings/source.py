@@ -66,6 +66,19 @@ class Source:
     blocks: Callable[[Counter[str]], Iterator[Block]]
 
 
+def word_blocks(
+    path: Path, start: int, dtype: np.dtype | str, words: int, counts: Counter[str]
+) -> Iterator[np.ndarray]:
+    """The words of a file from byte `start` on, `words` at a time; a cut word at the end is counted as `cut_tail`."""
+    size = np.dtype(dtype).itemsize
+    with path.open("rb") as file:
+        file.seek(start)
+        while data := file.read(words * size):
+            counts["cut_tail"] += len(data) % size != 0
+            if len(data) >= size:
+                yield np.frombuffer(data[: len(data) // size * size], dtype)
+
+
 def running_on(t: np.ndarray, turns: int, before: int) -> tuple[np.ndarray, int, int]:
     """Unwrap 32-bit microseconds; returns the times, the number of wraps so far, and the last raw time.
 
