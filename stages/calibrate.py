@@ -6,7 +6,7 @@ from pathlib import Path
 from polarnet.captures.status import start_over
 from polarnet.captures.targets import calibrate_targets
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.reports.calibration import draw_calibration
+from polarnet.reports.recordings import draw_calibration
 
 
 @hydra_stage

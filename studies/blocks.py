@@ -8,14 +8,13 @@ from typing import Any
 
 from polarnet.methods import METHODS
 from polarnet.reports.curves import PAPER_EVENTS_PER_PIXEL
+from polarnet.reports.legend import LABELS, in_order
 from polarnet.reports.provenance import origin
 from polarnet.reports.tables import (
     COLUMNS,
     COSTS,
     ERROR_PARTS,
-    LABELS,
     as_markdown,
-    in_order,
     paired_lines,
     score_table,
     standing,

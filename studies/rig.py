@@ -40,8 +40,7 @@ from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.registration import event_image, register, warped
-from polarnet.reports.calibration import draw_calibration, draw_hot_pixels, draw_registration
-from polarnet.reports.recordings import recording_picture
+from polarnet.reports.recordings import draw_calibration, draw_hot_pixels, draw_registration, recording_picture
 from polarnet.reports.tables import as_plain, score_table
 from polarnet.runtime.machine import generator_for
 from polarnet.simulation.emulator import EmulatorConfig

@@ -162,7 +162,7 @@ def _inspect(options: argparse.Namespace) -> int:
     path.write_bytes(recording_picture(inspection))
     print(f"picture     {path}")
     if options.hot_pixels:
-        from polarnet.reports.calibration import draw_hot_pixels
+        from polarnet.reports.recordings import draw_hot_pixels
 
         draw_hot_pixels(inspection.counts, inspection.hot, options.hot_pixels)
         print(f"hot pixels  {options.hot_pixels}")
@@ -172,7 +172,7 @@ def _inspect(options: argparse.Namespace) -> int:
 def _register(options: argparse.Namespace) -> int:
     from polarnet.recordings.recording import read_recording
     from polarnet.recordings.registration import UNRELATED, event_image, register, warped
-    from polarnet.reports.calibration import draw_registration
+    from polarnet.reports.recordings import draw_registration
 
     files = options.reference, options.file
     reference, moving = (event_image(read_recording(path, **_reading(options)).events) for path in files)

@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from polarnet.reports.figures import Theme, chart_style
-from polarnet.reports.legend import GENERAL
-from polarnet.reports.tables import in_order
+from polarnet.reports.legend import GENERAL, in_order
 
 PAPER_EVENTS_PER_PIXEL = 1.04  # events per pixel at which the paper's recovery is good (section 5)
 SETTING_LABELS = {

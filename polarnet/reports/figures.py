@@ -1,6 +1,6 @@
 """Figures drawn with matplotlib: comparison panels, training curves, distributions of scores over scenes.
 
-Figures are returned, not shown; `polarnet.reports.png` writes them.
+Figures are returned, not shown; `polarnet.reports.maps.png` encodes them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,10 +20,9 @@ from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from torch import Tensor
 
 from polarnet.metrics.similarity import mse, psnr
-from polarnet.reports.legend import GENERAL, Legend
-from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image
-from polarnet.reports.png import png
-from polarnet.reports.tables import COLUMNS, in_order, with_structure
+from polarnet.reports.legend import GENERAL, Legend, in_order, with_structure
+from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image, png
+from polarnet.reports.tables import COLUMNS
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,12 @@ from polarnet.methods import METHODS
 from polarnet.pictures.manifest import SPLITS
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, SetResults, read_artefacts
 from polarnet.reports.figures import training_curves
-from polarnet.reports.legend import NAMED_BY_NETWORK, Legend, legend_of, network_label
-from polarnet.reports.maps import encode_jpeg
+from polarnet.reports.legend import LABELS, NAMED_BY_NETWORK, Legend, legend_of, network_label
+from polarnet.reports.maps import encode_jpeg, png
 from polarnet.reports.overview import overview_figure
-from polarnet.reports.png import png
 from polarnet.reports.provenance import Run
 from polarnet.reports.results import results_context, write_comparison
-from polarnet.reports.tables import COLUMNS, LABELS, SET_TITLES, Scores, score_table
+from polarnet.reports.tables import COLUMNS, SET_TITLES, Scores, score_table
 from polarnet.reports.tiles import Tile, TileRow, chart, data_uri, event_tiles, panel_tiles, template
 
 CARDS = {

@@ -1,11 +1,11 @@
 """Benchmark scores as tables: selected, rounded and ranked once, then written as Markdown, plain text or HTML."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
-from polarnet.reports.rows import REFERENCES, ROWS
+from polarnet.reports.legend import LABELS, LPIPS_BACKBONES, in_order
 
 Scores = Mapping[str, Mapping[str, Any]]
 """Method, then metric (data/benchmark/metrics.json). None marks a missing value; `<metric>_ci` holds an interval."""
@@ -57,12 +57,6 @@ COSTS = {
     "peak_mib": Column("peak MiB", 1, "low", False, " MiB"),
 }
 """Costs of a method on the machine of the run."""
-
-LABELS: Mapping[str, str] = MappingProxyType({name: row.label for name, row in ROWS.items()})
-"""Default labels of the rows, in table order, for results that do not name the networks."""
-
-BACKBONES = {"squeeze": "SqueezeNet 1.1", "alex": "AlexNet", "vgg": "VGG16, like the paper's"}
-"""Readable names of the LPIPS backbones."""
 
 SET_TITLES = {
     "simulated": "Simulated",
@@ -126,17 +120,6 @@ class Table(NamedTuple):
     notes: tuple[str, ...]
 
 
-def in_order(rows: Iterable[str]) -> list[str]:
-    """Rows in the order of every table and figure; unknown rows, from older results, come last."""
-    given = list(rows)
-    return [name for name in ROWS if name in given] + [name for name in given if name not in ROWS]
-
-
-def with_structure(rows: Iterable[str]) -> list[str]:
-    """Rows in order, without the references, which predict one value everywhere."""
-    return [name for name in in_order(rows) if name not in REFERENCES]
-
-
 def score_table(
     scores: Scores,
     columns: Mapping[str, Column] = MappingProxyType(COLUMNS),
@@ -165,7 +148,7 @@ def score_table(
         )
         for method in methods
     )
-    about = f"LPIPS ({backbone}): version 0.1 on the features of {BACKBONES[backbone]}." if backbone else ""
+    about = f"LPIPS ({backbone}): version 0.1 on the features of {LPIPS_BACKBONES[backbone]}." if backbone else ""
     notes = (about,) if about and "lpips" in keys else ()
     return Table(tuple(columns[key].heading for key in keys), rows, notes)
 

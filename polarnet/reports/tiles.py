@@ -12,17 +12,16 @@ from matplotlib.figure import Figure
 
 from polarnet.reports.artefacts import Panel
 from polarnet.reports.figures import DARK, LIGHT, Theme, reliability_figure, score_distribution, score_line
-from polarnet.reports.legend import Legend
+from polarnet.reports.legend import Legend, in_order, with_structure
 from polarnet.reports.maps import (
     dolp_image,
     encode_png,
     event_full_scale,
     event_image,
     intensity_image,
+    png,
     polarization_hsv,
 )
-from polarnet.reports.png import png
-from polarnet.reports.tables import in_order, with_structure
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 DISTRIBUTION_METRICS = ("mse", "psnr", "ssim", "corr")

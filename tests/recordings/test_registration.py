@@ -11,7 +11,7 @@ from polarnet.cli import main
 from polarnet.events.stream import Events
 from polarnet.recordings.registration import event_image, register, warp_events, warped
 from polarnet.recordings.source import RecordingError
-from polarnet.reports.calibration import draw_hot_pixels, draw_registration
+from polarnet.reports.recordings import draw_hot_pixels, draw_registration
 
 HEIGHT, WIDTH = 120, 160
 TRUE = np.array([[1.01, 0.015, 3.2], [-0.012, 0.99, -2.4], [2e-5, -3e-5, 1.0]])

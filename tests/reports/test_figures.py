@@ -15,7 +15,7 @@ from polarnet.reports.figures import (
     score_line,
     training_curves,
 )
-from polarnet.reports.png import png
+from polarnet.reports.maps import png
 
 TRUTH = torch.linspace(0, 1, 24 * 36).view(24, 36)
 CURVE = Curve("mse", [0, 1, 2], [0.3, 0.2, 0.1])
