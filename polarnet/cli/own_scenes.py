@@ -17,7 +17,7 @@ from polarnet.metrics.lpips_weights import find_weights
 from polarnet.metrics.similarity import Lpips
 from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest
-from polarnet.reports.set_page import write_set_page
+from polarnet.reports.page import write_set_page
 from polarnet.runtime.machine import threads_of
 from polarnet.simulation.sets import Recipe, make_folder_set
 from polarnet.simulation.truth import motions_of
