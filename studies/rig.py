@@ -31,7 +31,7 @@ from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.score import FrameScore, summary
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig, read_event_capture
 from polarnet.captures.imported import import_targets
-from polarnet.captures.targets import Calibrated, calibrate_targets, spread_us
+from polarnet.captures.targets import Calibrated, calibrate_targets
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, load
 from polarnet.events.stream import Events, slice_time

@@ -247,3 +247,9 @@ def _write_truth(folder: Path, truth: RigTruth, config: RigConfig, recordings: R
         "dolp": "truth.npz: t_us from the landmark on, dolp of each of these times",
     }
     (folder / "truth.json").write_text(json.dumps(content, indent=2) + "\n")
+
+
+def spread_us(starts: Mapping[str, int], others: Mapping[str, int]) -> list[float]:
+    """Differences between two sets of start times, minus their mean: the zero of the clock is a convention."""
+    differences = np.array([starts[c] - others[c] for c in (*EVENT_CAPTURES, *INTENSITY_CAPTURES)], float)
+    return (differences - differences.mean()).tolist()
