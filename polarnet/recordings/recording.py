@@ -122,14 +122,7 @@ def read_recording(
     clock_mhz: float | int | None = None,
 ) -> Recording:
     """Read a whole file, with the arguments and errors of `open_recording`."""
-    reader = open_recording(
-        path,
-        format,
-        height=height,
-        width=width,
-        part=part,
-        clock_mhz=clock_mhz,
-    )
+    reader = open_recording(path, format, height=height, width=width, part=part, clock_mhz=clock_mhz)
     chunks = list(reader)
     events = concatenate(chunks) if chunks else Events.empty(reader.height, reader.width)
     return Recording(events, reader.format, {kind: count for kind, count in reader.repairs.items() if count})
