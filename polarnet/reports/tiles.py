@@ -97,8 +97,8 @@ def event_tiles(panel: Panel) -> list[Tile]:
 def reliability_chart(details: Mapping[str, Any], legend: Legend) -> Chart | None:
     """Reliability of the methods in details.json that predict their error; None if there are none."""
     curves = {
-        method: [(predicted, measured, pixels) for predicted, measured, pixels in found["curve"]]
-        for method, found in details.get("reliability", {}).items()
+        method: [(predicted, measured, pixels) for predicted, measured, pixels in entry["curve"]]
+        for method, entry in details.get("reliability", {}).items()
     }
     if not curves:
         return None
@@ -109,12 +109,12 @@ def reliability_chart(details: Mapping[str, Any], legend: Legend) -> Chart | Non
 
 def distribution(scene_means: Mapping[str, Mapping[str, Mapping[str, float]]], legend: Legend) -> Chart:
     """Scores of every scene in a test set; `scene_means` is metric, then method, then scene."""
-    shown = {
+    scores = {
         metric: {method: list(scenes.values()) for method, scenes in scene_means[metric].items()}
         for metric in DISTRIBUTION_METRICS
         if metric in scene_means
     }
-    return chart(lambda theme: score_distribution(shown, theme, legend), "scores of each method, a dot a scene")
+    return chart(lambda theme: score_distribution(scores, theme, legend), "scores of each method, a dot a scene")
 
 
 def chart(draw: Callable[[Theme], Figure], alt: str) -> Chart:

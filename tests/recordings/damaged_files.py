@@ -71,9 +71,9 @@ class Sample:
         """Damage file `number`, counted round, read the recording, and put the file right again."""
         number %= len(self._files)
         self._files[number].write_bytes(damaged(self._sound[number], damage))
-        found = ending(self.path, self.form if says_format else None, chunk_events)
+        outcome = ending(self.path, self.form if says_format else None, chunk_events)
         self._files[number].write_bytes(self._sound[number])
-        return found
+        return outcome
 
 
 def write_sample(form: str, path: Path, events: Events) -> None:

@@ -67,9 +67,9 @@ def test_pictures_read_back_equal_but_for_the_pixel_that_holds_the_mode(tmp_path
     generator = np.random.default_rng(0)
     pictures = [generator.integers(0, 4096, (800, 1280)).astype(np.uint16) for _ in range(2)]
     write_celex5_pictures(tmp_path / "p.bin", pictures, [1_000_000, 1_033_000])
-    found = list(celex5_pictures(tmp_path / "p.bin"))
-    assert [picture.t_us for picture in found] == [1_000_000, 1_033_000]
-    for before, after in zip(pictures, found, strict=True):
+    read = list(celex5_pictures(tmp_path / "p.bin"))
+    assert [picture.t_us for picture in read] == [1_000_000, 1_033_000]
+    for before, after in zip(pictures, read, strict=True):
         assert np.flatnonzero(before != after.intensity).tolist() in ([], [0])
     assert len(read_recording(tmp_path / "p.bin").events) == 0
 
