@@ -84,7 +84,7 @@ def _lines(
         _line(axes, method, [scale * entry[x] for entry in entries], [entry[y] for entry in entries])
 
 
-def _line(axes: Axes, method: str, x: Sequence[float], y: Sequence[float]) -> None:
+def _line(axes: Axes, method: str, x: Sequence[float | int], y: Sequence[float | int]) -> None:
     axes.plot(x, y, marker="o", markersize=3, color=GENERAL.colour(method), label=GENERAL.label(method))
 
 
