@@ -3,10 +3,10 @@
 import dataclasses
 from pathlib import Path
 
-from polarnet.captures.status import start_over
+from polarnet.captures.imported import start_over
 from polarnet.captures.targets import calibrate_targets
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.reports.calibration import draw_calibration
+from polarnet.reports.recordings import draw_calibration
 
 
 @hydra_stage

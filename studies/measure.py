@@ -20,7 +20,7 @@ from typing import Any
 
 from polarnet.config.sweep import COLUMNS, mean_scores, sweep_points
 from polarnet.reports.figures import LIGHT
-from polarnet.reports.png import png
+from polarnet.reports.maps import png
 from polarnet.reports.provenance import git, processor
 from polarnet.runtime.machine import usable_cores
 from studies.figures import loss_sweep_figure

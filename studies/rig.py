@@ -30,17 +30,17 @@ from polarnet.benchmark.rows import available
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.score import FrameScore, summary
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig, read_event_capture
-from polarnet.captures.imported import import_targets, shifted
-from polarnet.captures.targets import Calibrated, calibrate_targets, spread_us
+from polarnet.captures.imported import import_targets
+from polarnet.captures.targets import Calibrated, calibrate_targets
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, load
 from polarnet.events.stream import Events, slice_time
 from polarnet.pictures.dead_leaves import dead_leaves
+from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.registration import event_image, register, warped
-from polarnet.reports.calibration import draw_calibration, draw_hot_pixels, draw_registration
-from polarnet.reports.recordings import recording_picture
+from polarnet.reports.recordings import draw_calibration, draw_hot_pixels, draw_registration, recording_picture
 from polarnet.reports.tables import as_plain, score_table
 from polarnet.runtime.machine import generator_for
 from polarnet.simulation.emulator import EmulatorConfig

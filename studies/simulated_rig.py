@@ -25,15 +25,14 @@ from torch import Tensor
 from polarnet import stokes
 from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
 from polarnet.events.stream import Events, merge
-from polarnet.recordings.formats.celex5 import HEIGHT, WHITE, WIDTH
-from polarnet.recordings.formats.celex5_csv import write_celex5_csv
+from polarnet.recordings.formats.celex5_bin import HEIGHT, WHITE, WIDTH
 from polarnet.runtime.machine import generator_for, seed_for
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory, render
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene
-from studies.celex5_bin_writer import write_celex5_bin, write_celex5_pictures
+from studies.celex5_writer import write_celex5_bin, write_celex5_csv, write_celex5_pictures
 
 STRIPE_S0, LANDMARK_S0 = 0.8, 0.04  # unpolarized
 SHORTEST_DELAY_S = 0.08  # from the start of a capture to the landmark
@@ -245,3 +244,9 @@ def _write_truth(folder: Path, truth: RigTruth, config: RigConfig, recordings: R
         "dolp": "truth.npz: t_us from the landmark on, dolp of each of these times",
     }
     (folder / "truth.json").write_text(json.dumps(content, indent=2) + "\n")
+
+
+def spread_us(starts: Mapping[str, int], others: Mapping[str, int]) -> list[float]:
+    """Differences between two sets of start times, minus their mean: the zero of the clock is a convention."""
+    differences = np.array([starts[c] - others[c] for c in (*EVENT_CAPTURES, *INTENSITY_CAPTURES)], float)
+    return (differences - differences.mean()).tolist()

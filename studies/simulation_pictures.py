@@ -23,9 +23,8 @@ from polarnet.events.stream import Events, slice_time
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import read_rgb
 from polarnet.reports.figures import LIGHT, chart_style, show_picture
-from polarnet.reports.maps import event_image
+from polarnet.reports.maps import event_image, png
 from polarnet.reports.overview import OFF, ON
-from polarnet.reports.png import png
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, random_trajectory, sensor_to_scene
 from polarnet.simulation.moving_sensor import emulate_motion

@@ -27,7 +27,7 @@ from statistics import fmean
 from typing import Any
 
 from polarnet.reports.figures import LIGHT
-from polarnet.reports.png import png
+from polarnet.reports.maps import png
 from studies.blocks import best_reconstruction, seeds_of
 from studies.figures import expected_errors_figure
 from studies.measure import ABLATION_KEYS, machine_record, measure_benchmark, read_results, uncommitted, write_section

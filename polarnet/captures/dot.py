@@ -97,7 +97,7 @@ def find_captures(folder: Path) -> dict[str, Path]:
 
     RecordingError where a capture has no file or more than one.
     """
-    found = {}
+    captures = {}
     for name in (*EVENT_CAPTURES, *INTENSITY_CAPTURES):
         files = sorted(path for path in folder.glob(f"{name}.*") if path.stem == name)
         if len(files) != 1:
@@ -106,8 +106,8 @@ def find_captures(folder: Path) -> dict[str, Path]:
                 f"target {folder.name}: expected one file {name}.bin (or another ending), got {there}; a target has "
                 f"{', '.join((*EVENT_CAPTURES, *INTENSITY_CAPTURES))}"
             )
-        found[name] = files[0]
-    return found
+        captures[name] = files[0]
+    return captures
 
 
 def given_starts(folder: Path) -> dict[str, int]:

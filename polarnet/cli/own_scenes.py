@@ -16,7 +16,7 @@ from polarnet.metrics.lpips_weights import find_weights
 from polarnet.metrics.similarity import Lpips
 from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest
-from polarnet.reports.set_page import write_set_page
+from polarnet.reports.page import write_set_page
 from polarnet.simulation.sets import make_folder_set
 from polarnet.simulation.truth import motions_of
 from polarnet.storage.frames import FrameStore

@@ -15,7 +15,7 @@ from polarnet.config.pipeline import context_of, pipeline_set
 from polarnet.config.tree import Config
 from polarnet.reports.curves import event_budget_figure, sensitivity_figure
 from polarnet.reports.figures import LIGHT
-from polarnet.reports.png import png
+from polarnet.reports.maps import png
 from polarnet.runtime.machine import threads_of
 from polarnet.storage.scenes import SceneStore
 
