@@ -9,7 +9,7 @@ leaves, 8-bit frames at --frame-rate. It knows nothing of the sensor. Two fits a
 import argparse
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -56,7 +56,7 @@ REPORTED = (*(name for names in ERRORS.values() for name in names), "refractory_
 def drawn_sensor(number: int) -> EmulatorConfig:
     """Sensor `number` of the study."""
     generator = generator_for(1, f"sensor {number}", "fit")
-    values = {}
+    values: dict[str, Any] = {}
     for name, (low, high) in RANGES.items():
         if name in LINEAR:
             values[name] = float(generator.uniform(low, high))
@@ -100,7 +100,7 @@ def lamps(sensor: EmulatorConfig, key: int) -> list[KnownLight]:
     return known
 
 
-def errors_of(fits: list[Mapping[str, Any]]) -> dict[str, Any]:
+def errors_of(fits: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Largest relative errors over the sensors, and how many values were not estimated."""
     headlines: dict[str, Any] = {}
     for key, names in ERRORS.items():

@@ -101,7 +101,7 @@ def _read_frame(path: Path) -> Float[np.ndarray, "h w"]:
         pixels = read_channels(path)
         white = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0
         light = pixels.astype(np.float32) * (FULL_SCALE / white)
-        light = light @ np.float32(LUMINANCE) if light.shape[-1] >= 3 else light[..., 0]
+        light = light[..., :3] @ np.array(LUMINANCE, np.float32) if light.shape[-1] >= 3 else light[..., 0]
     if light.ndim != 2 or not np.isfinite(light).all() or light.min() < 0 or light.max() > FULL_SCALE * (1 + 1e-6):
         raise ValueError(f"{path.name}: expected one value from 0 to {FULL_SCALE:g} DN per pixel, [height, width]")
     return light

@@ -71,10 +71,9 @@ def estimate_noise(events: PixelEvents) -> Noise:
     duration_s = float(np.ptp(events.t_us)) * 1e-6
     kept = chosen_pixels(events, ~hot)
     off = np.bincount(kept.pixel[~kept.on], minlength=events.pixels)[~hot] / duration_s
-    ages = _ages(_few_enough(kept))
     shot_off = float(off.mean())
-    fit, error = _fit_leak(ages, max(shot_off, 1 / (good * duration_s)))
-    shot_on = math.exp(fit[0])
+    fit, error = _fit_leak(_ages(_few_enough(kept)), max(shot_off, 1 / (good * duration_s)))
+    shot_on = _rate_of_young(_ages(kept), YOUNG * math.exp(-fit[1]))
     poisson = math.sqrt((shot_on + shot_off) / (good * duration_s))
     between = float(off.std()) / math.sqrt(good)
     return Noise(
@@ -110,6 +109,11 @@ def mean_inverse(relative_deviation: float) -> float:
     z, x = z[x >= 1 / HOT_FACTOR], x[x >= 1 / HOT_FACTOR]
     density = np.exp(-z * z / 2)
     return float((density / x).sum() / density.sum())
+
+
+def _rate_of_young(ages: _Ages, young_s: float) -> float:
+    """ON events per second at ages that the leak does not reach."""
+    return float((ages.on & (ages.age_s < young_s)).sum() / np.minimum(ages.age_s, young_s).sum())
 
 
 def _few_enough(events: PixelEvents) -> PixelEvents:

@@ -164,9 +164,8 @@ def drifting_leaves(
     step = max(2, CHUNK_PIXELS // (height * width))
     for k in range(0, len(t_us), step):
         shifts = zip(left[k : k + step], top[k : k + step], strict=True)
-        yield np.stack(
-            [cv2.warpAffine(scene, np.float64([[1, 0, -x], [0, 1, -y]]), (width, height)) for x, y in shifts]
-        )
+        moved = (np.array([[1, 0, -x], [0, 1, -y]]) for x, y in shifts)
+        yield np.stack([np.asarray(cv2.warpAffine(scene, matrix, (width, height))) for matrix in moved])
 
 
 def emulated(

@@ -1,6 +1,7 @@
 """The realism page of `polarnet fit-sensor`: each recording beside its simulated twin."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import matplotlib
@@ -33,8 +34,7 @@ class RealismSection(NamedTuple):
 def realism_page(name: str, rows: Sequence[FitRow], notes: Sequence[str], comparisons: Sequence[Comparison]) -> str:
     """The page as HTML; it needs no other file and no network."""
     sections = [
-        RealismSection(one, chart(lambda theme, one=one: realism_figure(one, theme), f"{one.name}: four statistics"))
-        for one in comparisons
+        RealismSection(one, chart(partial(realism_figure, one), f"{one.name}: four statistics")) for one in comparisons
     ]
     return template("realism.html.jinja").render(title=name, rows=rows, notes=notes, sections=sections)
 
