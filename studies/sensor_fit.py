@@ -41,7 +41,7 @@ LINEAR = ("contrast_threshold_on", "contrast_threshold_off", "contrast_threshold
 MAX_RELATIVE_SIGMA = 0.3  # of the smaller threshold
 STATIC_S, STATIC_LIGHT = 300, 200.0
 MOVING_S, RENDER_HZ, SPEED_PX_S = 10.0, 1000, 60.0
-FLICKERS = {2.0: 6.0, 20.0: 3.0, 60.0: 2.0}
+FLICKERS = {2.0: 4.0, 20.0: 1.0, 60.0: 0.5}
 """Seconds recorded at each frequency (Hz)."""
 CONTRAST, FLICKER_LIGHT = 0.8, 100.0
 ERRORS = {

@@ -149,7 +149,7 @@ KNOWN_LIGHT_PARAMETERS = (
 )
 
 
-def refractory_period_us(durations_us: Sequence[Float64[np.ndarray, " n"]]) -> Estimate | None:
+def refractory_period_us(durations_us: Sequence[Float64[np.ndarray, " _"]]) -> Estimate | None:
     """Shortest interval between events of a pixel, if intervals pile up there: crossings waited for its end."""
     durations = np.concatenate(durations_us) if durations_us else np.empty(0)
     durations = np.sort(durations[durations > 0])
@@ -353,7 +353,8 @@ def _grouped_error(function: Callable[[list[PixelThresholds]], float], threshold
         function([PixelThresholds(one.threshold[g::GROUPS], one.halves[:, g::GROUPS], one.scale) for one in thresholds])
         for g in range(GROUPS)
     ]
-    return float(np.nanstd(values, ddof=1)) / math.sqrt(GROUPS)
+    values = [value for value in values if math.isfinite(value)]
+    return float(np.std(values, ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
 
 
 def _cutoff(sources: Sequence[_Source], leak_hz: float) -> Estimate | None:

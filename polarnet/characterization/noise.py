@@ -152,7 +152,11 @@ def _fit_leak(ages: _Ages, shot_guess_hz: float) -> tuple[Float64[np.ndarray, " 
 
     priors = [math.log(PRIOR_SPREAD_DECADES), math.log(PRIOR_JITTER)]
     excess_hz = max(on.sum() / exposure_s.sum() - shot_guess_hz, 0.02 * shot_guess_hz, 1e-4)
-    starts = [excess_hz, *(f * (shot_guess_hz + excess_hz) for f in (1.0, 0.3, 0.1))]
+    starts = [
+        excess_hz,
+        1 / float(np.median(ages.age_s[ages.on] if ages.on.any() else ages.age_s)),
+        *(f * (shot_guess_hz + excess_hz) for f in (1.0, 0.3, 0.1)),
+    ]
     first = min(
         ([math.log(shot_guess_hz), math.log(leak), *priors] for leak in starts), key=lambda x: loss(np.array(x))
     )
@@ -170,7 +174,7 @@ def _fit_leak(ages: _Ages, shot_guess_hz: float) -> tuple[Float64[np.ndarray, " 
 
 
 def _minimised(loss, start) -> Float64[np.ndarray, " 4"]:
-    options = {"xatol": 5e-3, "fatol": 0.05, "maxfev": 160}
+    options = {"xatol": 5e-3, "fatol": 0.05, "maxfev": 220}
     simplex = np.array(start) + np.vstack([np.zeros(4), np.diag([0.1, 0.3, 0.3, 0.3])])
     return minimize(loss, simplex[0], method="Nelder-Mead", options={**options, "initial_simplex": simplex}).x
 

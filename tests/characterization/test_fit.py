@@ -1,0 +1,116 @@
+"""A sensor fitted blind to simulated recordings, and its twin."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from polarnet.characterization.fit import KnownLight, fit_sensor, refractory_period_us
+from polarnet.characterization.light import Flicker, MovingLight
+from polarnet.characterization.twin import (
+    compare,
+    constant_frames,
+    drifting_leaves,
+    emulated,
+    fitted_parameters,
+    fitted_sensor,
+    flicker_light,
+)
+from polarnet.simulation.presets import SENSORS
+
+TRUTH = dataclasses.replace(
+    SENSORS["default"],
+    contrast_threshold_on=0.18,
+    contrast_threshold_off=0.27,
+    contrast_threshold_sigma=0.03,
+    cutoff_hz=80.0,
+    leak_rate_hz=0.1,
+    shot_noise_rate_hz=1.0,
+)
+HEIGHT, WIDTH = 24, 32
+
+
+@pytest.fixture(scope="module")
+def static():
+    t_us = np.arange(0, 121, 5) * 1e6
+    return emulated(constant_frames(np.full(len(t_us), 200.0), HEIGHT, WIDTH), t_us, TRUTH, 3)
+
+
+@pytest.fixture(scope="module")
+def moving() -> KnownLight:
+    t_us = np.arange(2501) * 2e3
+    light = np.concatenate(list(drifting_leaves(HEIGHT, WIDTH, t_us, 60.0, np.random.default_rng(1))))
+    return KnownLight("moving", emulated(iter([light]), t_us, TRUTH, 3), MovingLight(light[::2], t_us[::2]))
+
+
+@pytest.fixture(scope="module")
+def fit(static, moving):
+    return fit_sensor(static, 200.0, [moving])
+
+
+def test_a_static_and_a_moving_recording_give_the_sensor(fit):
+    value = {name: one.value for name, one in fit.estimates.items()}
+    assert value["contrast_threshold_on"] == pytest.approx(0.18, rel=0.03)
+    assert value["contrast_threshold_off"] == pytest.approx(0.27, rel=0.03)
+    assert value["threshold_deviation_on"] == pytest.approx(0.03, rel=0.12)
+    assert value["threshold_deviation_off"] == pytest.approx(0.03, rel=0.12)
+    assert abs(value["threshold_correlation"]) < 0.15
+    assert value["cutoff_hz"] == pytest.approx(80, rel=0.1)
+    assert value["leak_rate_hz"] == pytest.approx(0.1, rel=0.15)
+    assert value["shot_noise_rate_hz"] == pytest.approx(1.0, rel=0.1)
+
+
+def test_a_flicker_of_unknown_phase_gives_thresholds_and_bandwidth():
+    flicker = Flicker(100.0, 0.8, 20.0)
+    t_us, values = flicker_light(flicker, 0.0, 2e6)
+    events = emulated(constant_frames(np.roll(values, 321), 12, 16), t_us, TRUTH, 3)
+    fit = fit_sensor(None, 127.5, [KnownLight("flicker", events, flicker)])
+    assert fit.estimates["contrast_threshold_on"].value == pytest.approx(0.18, rel=0.06)
+    assert fit.estimates["contrast_threshold_off"].value == pytest.approx(0.27, rel=0.06)
+    assert fit.estimates["cutoff_hz"].value == pytest.approx(80, rel=0.15)
+    assert fit.missing["shot_noise_rate_hz"] == "needs a static recording"
+
+
+def test_without_known_light_thresholds_are_missing_and_keep_the_default(static):
+    fit = fit_sensor(static, 200.0, [])
+    assert "moving recording with frames" in fit.missing["contrast_threshold_on"]
+    sensor = fitted_sensor(fit, SENSORS["default"])
+    assert sensor.contrast_threshold_on == SENSORS["default"].contrast_threshold_on
+    assert sensor.leak_rate_hz == pytest.approx(0.1, rel=0.1)
+
+
+def test_the_one_deviation_of_the_emulator_is_the_root_mean_square_of_both(fit):
+    on, off = (fit.estimates[f"threshold_deviation_{p}"].value for p in ("on", "off"))
+    expected = ((on**2 + off**2) / 2) ** 0.5
+    assert fitted_parameters(fit)["contrast_threshold_sigma"] == pytest.approx(expected, rel=1e-3)
+
+
+def test_the_twin_of_a_simulated_recording_is_like_it(fit, static, moving):
+    sensor = fitted_sensor(fit, SENSORS["default"])
+    for recording, light in ((moving.events, moving.light), (static, 200.0)):
+        comparison = compare("test", recording, light, sensor, seed=1)
+        assert comparison.interval_distance < 0.05
+        assert comparison.ratio["twin"] == pytest.approx(comparison.ratio["recording"], rel=0.1)
+        assert "Kolmogorov-Smirnov" in comparison.verdict
+
+
+def test_without_frames_the_twin_has_the_event_rate_of_the_recording(moving):
+    comparison = compare("test", moving.events, None, TRUTH, seed=1)
+    assert not comparison.same_light
+    assert comparison.rate_hz["twin"].mean() == pytest.approx(comparison.rate_hz["recording"].mean(), rel=0.5)
+
+
+def test_the_refractory_period_is_where_intervals_pile_up():
+    free = np.random.default_rng(1).uniform(5e3, 1e5, 1000).round()
+    assert refractory_period_us([np.append(free, np.full(200, 500.0))]).value == 500
+    assert refractory_period_us([free]) is None
+
+
+def test_intervals_that_pile_up_at_a_tick_of_the_clock_are_no_refractory_period():
+    assert refractory_period_us([np.repeat([1e3, 2e3, 3e3], [500, 50, 50])]) is None
+
+
+def test_recordings_of_two_sensors_are_refused(static, moving):
+    other = emulated(constant_frames(np.full(3, 200.0), 8, 8), np.arange(3) * 1e6, TRUTH, 3)
+    with pytest.raises(ValueError, match="one sensor"):
+        fit_sensor(other, 200.0, [moving])

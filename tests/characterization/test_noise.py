@@ -1,0 +1,61 @@
+"""Noise under constant light: Poisson rates, a regular leak, hot pixels."""
+
+import numpy as np
+import pytest
+
+from polarnet.characterization.increments import PixelEvents
+from polarnet.characterization.noise import (
+    estimate_noise,
+    hot_under_constant_light,
+    mean_inverse,
+    nominal_shot_noise_hz,
+)
+
+PIXELS, DURATION_S = 600, 60.0
+
+
+def recorded(times_s, on) -> PixelEvents:
+    """Events of pixels 0, 1, ... from lists of times and polarities."""
+    pixel = np.repeat(np.arange(len(times_s)), [len(t) for t in times_s])
+    return PixelEvents(pixel, 1e6 * np.concatenate(times_s), np.concatenate(on), len(times_s))
+
+
+def poisson(rate_hz: float, generator) -> tuple[list, list]:
+    times = [np.sort(generator.uniform(0, DURATION_S, generator.poisson(rate_hz * DURATION_S))) for _ in range(PIXELS)]
+    return times, [generator.random(len(t)) < 0.5 for t in times]
+
+
+def test_a_poisson_process_of_2_hz_gives_1_hz_of_each_polarity():
+    noise = estimate_noise(recorded(*poisson(2.0, np.random.default_rng(3))))
+    assert noise.shot_off_hz == pytest.approx(1.0, abs=0.03)  # 36,000 events: standard error 0.005
+    assert noise.shot_on_hz == pytest.approx(1.0, abs=0.03)
+    assert noise.leak_error_hz > 0.5 * noise.leak_hz or noise.leak_hz < 0.05
+
+
+def test_on_events_about_every_4_seconds_are_a_leak_of_a_quarter_hertz():
+    generator = np.random.default_rng(4)
+    ages = 4 / (1 - 0.1 * generator.standard_normal((PIXELS, 30)))
+    times = [t[t < DURATION_S] for t in np.cumsum(ages, axis=1) - generator.uniform(0, 4, (PIXELS, 1))]
+    noise = estimate_noise(recorded(times, [np.ones(len(t), bool) for t in times]))
+    assert noise.leak_hz == pytest.approx(0.25, rel=0.02)
+    assert noise.shot_off_hz == 0
+    assert noise.leak_error_hz < 0.01
+
+
+def test_shot_noise_is_referred_to_a_dark_pixel_of_nominal_threshold():
+    """At 80 DN the rate is 1 - 0.75 x 100 / 275 = 8 / 11 of the nominal one."""
+    assert nominal_shot_noise_hz(0.8, 80.0, 0.0, 0.0) == pytest.approx(1.1)
+    assert nominal_shot_noise_hz(0.8, 80.0, 0.1, 0.1) == pytest.approx(1.1 / mean_inverse(0.1))
+
+
+def test_the_mean_inverse_exceeds_1_by_the_squared_deviation():
+    assert mean_inverse(0.1) == pytest.approx(1 + 0.1**2 + 3 * 0.1**4, abs=2e-5)
+
+
+def test_a_pixel_is_hot_above_ten_times_the_median_and_ten_events():
+    assert hot_under_constant_light(np.array([2, 2, 2, 29, 31])).tolist() == [False, False, False, False, True]
+
+
+def test_too_few_events_are_refused():
+    with pytest.raises(ValueError, match="record for longer"):
+        estimate_noise(recorded([np.arange(5.0)], [np.ones(5, bool)]))

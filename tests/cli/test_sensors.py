@@ -1,0 +1,85 @@
+"""polarnet fit-sensor: table, sensor and page."""
+
+import numpy as np
+import pytest
+
+from polarnet.cli import main
+from polarnet.config.tree import load
+from polarnet.runtime.files import shipped_settings
+
+SIDE = 10
+
+
+@pytest.fixture
+def ramps(tmp_path, monkeypatch):
+    """Events of 100 pixels under light that swings between 40 and 160 DN in a second: thresholds of ln 4 / 8."""
+    monkeypatch.chdir(tmp_path)
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for k in range(61):
+        np.save(frames / f"{k:03d}.npy", np.full((SIDE, SIDE), 160.0 if k % 2 else 40.0))
+    (frames / "timestamps.txt").write_text("\n".join(str(1_000_000 * k) for k in range(61)))
+    rows = []
+    for k in range(1, 60):
+        for event in range(8):
+            t = 1_000_000 * k + 125_000 * event + 62_500
+            rows += [f"{t} {x} {y} {0 if k % 2 else 1}" for y in range(SIDE) for x in range(SIDE)]
+    (tmp_path / "moving.txt").write_text("\n".join(rows))
+    return tmp_path
+
+
+FIT = ["fit-sensor", "--format", "text", "--height", str(SIDE), "--width", str(SIDE)]
+
+
+def test_the_yaml_written_loads_as_a_sensor(ramps, capsys, monkeypatch):
+    assert main([*FIT, "--name", "mine", "--moving", "moving.txt", "--frames", "frames"]) == 0
+    printed = capsys.readouterr().out
+    assert "leak_rate_hz" in printed
+    assert "not estimated" in printed
+    written = (ramps / "conf" / "sensor" / "mine.yaml").read_text()
+    assert "contrast_threshold_on: 0.1733" in written  # ln 4 / 8
+    assert "contrast_threshold_off: 0.1733" in written
+    assert "leak_rate_hz" not in written
+    page = (ramps / "outputs" / "fit-sensor" / "mine.html").read_text()
+    assert "Kolmogorov-Smirnov" in page
+    assert "http" not in page.replace("http://www.w3.org", "")
+    project = ramps / "project"
+    (project / "conf").mkdir(parents=True)
+    for path in shipped_settings().glob("params.yaml"):
+        (project / path.name).write_text(path.read_text())
+    for path in (shipped_settings() / "conf").rglob("*.yaml"):
+        target = project / "conf" / path.relative_to(shipped_settings() / "conf")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(path.read_text())
+    (project / "conf" / "sensor" / "mine.yaml").write_text(written)
+    assert load(project, ["sensor=mine"]).emulate.contrast_threshold_on == pytest.approx(0.1733)
+
+
+def test_a_recording_without_frames_compares_only_statistics_and_says_so(ramps, capsys):
+    assert main([*FIT, "--name", "mine", "--moving", "moving.txt", "--page", "page.html"]) == 0
+    assert "not known" in (ramps / "page.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "remedy"),
+    [
+        ([], "give --static"),
+        (["--frames", "frames"], "give --static"),
+        (["--static", "moving.txt", "--frames", "frames"], "give --moving"),
+        (["--flicker", "moving.txt"], "--frequency"),
+        (["--flicker", "moving.txt", "--frequency", "2"], "--contrast"),
+        (["--static", "moving.txt", "--static-light", "300"], "white is 255"),
+        (["--moving", "moving.txt", "--frames", "nowhere"], "name the folder"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused_with_a_remedy(ramps, capsys, arguments, remedy):
+    assert main([*FIT, "--name", "mine", *arguments]) == 1
+    assert remedy in capsys.readouterr().err
+    assert not (ramps / "conf").exists()
+
+
+def test_a_sensor_that_fit_sensor_did_not_write_is_not_replaced(ramps, capsys):
+    (ramps / "conf" / "sensor").mkdir(parents=True)
+    (ramps / "conf" / "sensor" / "mine.yaml").write_text("emulate: {}\n")
+    assert main([*FIT, "--name", "mine", "--moving", "moving.txt"]) == 1
+    assert "choose another name" in capsys.readouterr().err
