@@ -271,7 +271,43 @@ HOUSE_FIGURES = {
 }
 SEVERAL = "Several trainings: mean ± standard deviation."
 
+
+def _sensor_fit(section: str, stimulus: str) -> Block:
+    """Truth and estimate of each simulated sensor."""
+    pairs = {
+        "threshold ON": "contrast_threshold_on", "OFF": "contrast_threshold_off",
+        "deviation ON": "threshold_deviation_on", "deviation OFF": "threshold_deviation_off",
+        "bandwidth, Hz": "cutoff_hz", "leak, Hz": "leak_rate_hz", "shot noise, Hz": "shot_noise_rate_hz",
+    }  # fmt: skip
+    errors = ", ".join(
+        f"{label} {{{section}[{key}]:.1%}}"
+        for label, key in (
+            ("thresholds", "threshold_error_max"), ("deviations", "deviation_error_max"),
+            ("leak and shot noise", "noise_error_max"), ("bandwidth", "bandwidth_error_max"),
+        )
+    )  # fmt: skip
+    return Block(
+        "camera", section, "studies.sensor_fit",
+        lambda results: [{"number": k + 1, **row} for k, row in enumerate(results[section]["sensors"])],
+        {"sensor": "{number}"} | {
+            heading: f"{{truth[{name}]:.3g}} / {{estimate[{name}]:.3g}}" for heading, name in pairs.items()
+        },
+        f"True value / estimate of simulated sensors, from {stimulus}; {{{section}[height]}} x {{{section}[width]}} "
+        f"pixels. Largest errors: {errors}. {{origin}}",
+    )  # fmt: skip
+
+
 BLOCKS = {
+    "sensor-fit": _sensor_fit(
+        "sensor_fit",
+        "{sensor_fit[static_s]} s of constant light and {sensor_fit[moving_s]:g} s of drifting leaves with "
+        "{sensor_fit[frame_rate_hz]} frames/s of 8 bits",
+    ),
+    "sensor-fit-flicker": _sensor_fit(
+        "sensor_fit_flicker",
+        "{sensor_fit_flicker[static_s]} s of constant light and lamps that flicker at 2, 20 and 60 Hz with contrast "
+        "{sensor_fit_flicker[contrast]:g}",
+    ),
     "headline": Block(
         "network", "seed_1", "studies.study", _headline_rows,
         {"": "{label}"} | {

@@ -3,7 +3,8 @@
 Each sensor is drawn from RANGES and recorded by the pixel model `exact`: under constant light, before drifting dead
 leaves whose light is rendered 1000 times a second, and before lamps that flicker. The fit gets the events and, for the
 leaves, 8-bit frames at --frame-rate. It knows nothing of the sensor. Two fits are made: `frames` (static, leaves) and
-`flicker` (static, lamps). `--write` puts the figures into docs/results/camera.json as section `sensor_fit`.
+`flicker` (static, lamps). `--write` puts the figures into docs/results/camera.json, sections `sensor_fit` and
+`sensor_fit_flicker`.
 """
 
 import argparse
@@ -44,6 +45,7 @@ MOVING_S, RENDER_HZ, SPEED_PX_S = 10.0, 1000, 60.0
 FLICKERS = {2.0: 4.0, 20.0: 1.0, 60.0: 0.5}
 """Seconds recorded at each frequency (Hz)."""
 CONTRAST, FLICKER_LIGHT = 0.8, 100.0
+SECTIONS = {"frames": "sensor_fit", "flicker": "sensor_fit_flicker"}
 ERRORS = {
     "threshold_error_max": ("contrast_threshold_on", "contrast_threshold_off"),
     "deviation_error_max": ("threshold_deviation_on", "threshold_deviation_off"),
@@ -123,6 +125,15 @@ def row_of(sensor: EmulatorConfig, fit: SensorFit) -> dict[str, Any]:
     return {"truth": {name: round(value, 5) for name, value in truth_of(sensor).items()}, "estimate": estimate}
 
 
+def fitted(number: int, kind: str, frame_rate_hz: int) -> dict[str, Any]:
+    """Simulate and fit sensor `number`; prints its row."""
+    sensor, key = drawn_sensor(number), 1000 + number
+    known = [leaves(sensor, key, frame_rate_hz)] if kind == "frames" else lamps(sensor, key)
+    row = row_of(sensor, fit_sensor(static_recording(sensor, key), STATIC_LIGHT, known))
+    print(number, kind, json.dumps(row), flush=True)
+    return row
+
+
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -134,28 +145,23 @@ def main() -> None:
     if arguments.write and (changed := uncommitted(ROOT)):
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
     record = machine_record(ROOT)
-    rows: dict[str, list[dict[str, Any]]] = {kind: [] for kind in arguments.light}
-    for number in range(arguments.sensors):
-        sensor, key = drawn_sensor(number), 1000 + number
-        static = static_recording(sensor, key)
-        for kind in arguments.light:
-            known = [leaves(sensor, key, arguments.frame_rate)] if kind == "frames" else lamps(sensor, key)
-            rows[kind].append(row_of(sensor, fit_sensor(static, STATIC_LIGHT, known)))
-            print(number, kind, json.dumps(rows[kind][-1]), flush=True)
-    section: dict[str, Any] = {kind: {**errors_of(fits), "sensors": fits} for kind, fits in rows.items()}
-    section |= errors_of(next(iter(rows.values())))
-    section |= {
-        "height": HEIGHT,
-        "width": WIDTH,
-        "static_s": STATIC_S,
-        "moving_s": MOVING_S,
-        "frame_rate_hz": arguments.frame_rate,
-    }
-    print(json.dumps({key: value for key, value in section.items() if key not in rows}, indent=2))
-    for kind in rows:
-        print(kind, json.dumps({key: value for key, value in section[kind].items() if key != "sensors"}))
-    if arguments.write:
-        print(f"written to {write_section(ROOT, 'camera', 'sensor_fit', section, record).relative_to(ROOT)}")
+    for kind in arguments.light:
+        rows = [fitted(number, kind, arguments.frame_rate) for number in range(arguments.sensors)]
+        settings: dict[str, Any] = {
+            "height": HEIGHT,
+            "width": WIDTH,
+            "static_s": STATIC_S,
+            "static_light_dn": STATIC_LIGHT,
+        }
+        if kind == "frames":
+            settings |= {"moving_s": MOVING_S, "frame_rate_hz": arguments.frame_rate, "speed_px_s": SPEED_PX_S}
+        else:
+            settings |= {"flicker_s": {f"{hz:g} Hz": s for hz, s in FLICKERS.items()}, "contrast": CONTRAST}
+        section = {**errors_of(rows), **settings, "sensors": rows}
+        print(SECTIONS[kind], json.dumps({key: value for key, value in section.items() if key != "sensors"}))
+        if arguments.write:
+            path = write_section(ROOT, "camera", SECTIONS[kind], section, record)
+            print(f"written to {path.relative_to(ROOT)}")
 
 
 if __name__ == "__main__":

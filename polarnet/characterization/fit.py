@@ -1,5 +1,6 @@
 """A sensor fitted to the recordings of one camera: every parameter with its standard error and its source."""
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -39,7 +40,8 @@ LEAKED = 0.25  # intervals in which the leak alone makes this part of a threshol
 MIN_PIXELS = 50
 PILE_UP = 3.0  # times more intervals within 10 % of the shortest than in the next 10 %
 MIN_TICKS = 5  # of the recording's clock, in a refractory period that can be told from it
-PHASES = 48
+PHASES = 32
+PHASE_INTERVALS = 6000  # that the phase of a flicker is fitted to
 
 
 class Estimate(NamedTuple):
@@ -187,9 +189,13 @@ def _source(known: KnownLight, events: PixelEvents, refractory_us: float) -> _So
     else:
         flicker = _exact_frequency(light, events)
 
-        def responses(some: PixelEvents, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
+        @functools.cache
+        def cycle_and_phase(cutoff_hz: float) -> tuple[Float64[np.ndarray, " k"], float]:
             cycle = flicker_cycle(flicker, cutoff_hz)
-            phase = flicker_phase(cycle, flicker.frequency_hz, events, intervals)
+            return cycle, flicker_phase(cycle, flicker.frequency_hz, events, intervals)
+
+        def responses(some: PixelEvents, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
+            cycle, phase = cycle_and_phase(cutoff_hz)
             return flicker_responses(cycle, flicker.frequency_hz, phase, some.t_us)
 
     return _Source(known.name, events, intervals, responses, isinstance(light, MovingLight))
@@ -214,7 +220,7 @@ def flicker_phase(
     cycle: Float64[np.ndarray, " k"], frequency_hz: float, events: PixelEvents, intervals: Intervals
 ) -> float:
     """Phase of the flicker at time 0: increments of one polarity are then most nearly equal."""
-    step = max(1, len(intervals.start) // 20_000)
+    step = max(1, len(intervals.start) // PHASE_INTERVALS)
     start_us, stop_us = events.t_us[intervals.start[::step]], events.t_us[intervals.stop[::step]]
     on = intervals.on[::step]
 
