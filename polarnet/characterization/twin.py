@@ -25,7 +25,9 @@ MAX_DURATION_US = 20_000_000
 CHUNK_PIXELS = 1 << 22  # frames times pixels of one piece of simulated light
 STATIC_STEP_US = 1_000_000
 STEPS_PER_CYCLE = 64
-LEAVES_RATE_HZ = 300.0
+LEAVES_RATE_HZ = 300.0  # at least; faster motion gets a frame for each pixel
+MAX_SPEED_PX_S = 3000.0
+WARM_UP_US = 100_000  # of the pixels before a stand-in scene is compared
 LEAVES_MARGIN = 80  # pixels that the stand-in scene extends beyond the sensor
 LEAVES_BLUR = 1.0  # pixels, a lens's
 DARKEST_LEAF = 0.04
@@ -232,14 +234,14 @@ def _stand_in(part: Events, start_us: int, stop_us: int, sensor: EmulatorConfig,
     wanted = len(part) / (stop_us - start_us)
 
     def under_leaves(speed_px_s: float, until_us: int) -> Events:
-        t_us = np.arange(start_us, until_us, 1e6 / LEAVES_RATE_HZ)
+        t_us = np.arange(start_us - WARM_UP_US, until_us, 1e6 / max(LEAVES_RATE_HZ, speed_px_s))
         pieces = drifting_leaves(part.height, part.width, t_us, speed_px_s, generator_for(seed, "twin", "picture"))
-        return emulated(pieces, t_us, sensor, seed_for(seed, "twin", "sensor"))
+        return slice_time(emulated(pieces, t_us, sensor, seed_for(seed, "twin", "sensor")), start_us, until_us)
 
     speed, trial_us = FIRST_SPEED_PX_S, min(stop_us, start_us + SPEED_TRIAL_US)
     for _ in range(SPEED_ROUNDS):
         rate = len(under_leaves(speed, trial_us)) / (trial_us - start_us)
-        speed *= min(max(wanted / max(rate, MIN_RATIO * wanted), 0.1), 10.0)
+        speed = min(speed * min(max(wanted / max(rate, MIN_RATIO * wanted), 0.1), 10.0), MAX_SPEED_PX_S)
     return under_leaves(speed, stop_us)
 
 
