@@ -234,7 +234,8 @@ def _stand_in(part: Events, start_us: int, stop_us: int, sensor: EmulatorConfig,
     wanted = len(part) / (stop_us - start_us)
 
     def under_leaves(speed_px_s: float, until_us: int) -> Events:
-        t_us = np.arange(start_us - WARM_UP_US, until_us, 1e6 / max(LEAVES_RATE_HZ, speed_px_s))
+        first_us, step_us = start_us - WARM_UP_US, 1e6 / max(LEAVES_RATE_HZ, speed_px_s)
+        t_us = np.linspace(first_us, until_us, 2 + math.ceil((until_us - first_us) / step_us))
         pieces = drifting_leaves(part.height, part.width, t_us, speed_px_s, generator_for(seed, "twin", "picture"))
         return slice_time(emulated(pieces, t_us, sensor, seed_for(seed, "twin", "sensor")), start_us, until_us)
 
