@@ -10,7 +10,6 @@ from polarnet.simulation.compilation import compiled, forget_stale_code
 from polarnet.simulation.motion import Pose, Trajectory, sensor_to_scene, stokes_seen
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_scene
 from polarnet.simulation.scene import PolarizationScene
-from polarnet.stokes import POLARIZER_ANGLES_DEG, behind_polarizer
 
 MIN_RATE_HZ = 30.0  # minimum of the adaptive rate, for a sensor at rest
 SAMPLES_PER_STEP = 8  # samples of the motion for each pixel of movement
@@ -106,15 +105,46 @@ def _render(stokes, x, y, angle, zoom, frames) -> None:  # pragma: no cover (com
                     frames[channel + 2, k, row, column] = max(half * (s0 - part), np.float32(0)) + rounding
 
 
-def lights_of_drift(scene: PolarizationScene, pose: Pose, height: int, width: int) -> list[Light]:
-    """Light behind the four polarizers of a drifting sensor, from the part of the scene that the sensor covers."""
+def render_behind(
+    scene: PolarizationScene, pose: Pose, maps: Float32[np.ndarray, "sensors 3 h w"]
+) -> Float32[np.ndarray, "sensors n h w"]:
+    """Digital numbers behind polarizers that differ between pixels (`analyzer_maps`), for any motion."""
+    forget_stale_code()
+    sensors, _, height, width = maps.shape
+    frames = np.empty((sensors, len(pose.x), height, width), np.float32)
+    _render_behind(np.ascontiguousarray(scene.stokes.numpy()), pose.x, pose.y, pose.angle, pose.zoom, maps, frames)
+    return frames
+
+
+@compiled
+def _render_behind(stokes, x, y, angle, zoom, maps, frames) -> None:  # pragma: no cover (compiled)
+    height, width = frames.shape[2:]
+    full_scale = np.float32(FULL_SCALE)
+    for k in range(len(x)):
+        left, top, along, across = sensor_to_scene(x[k], y[k], angle[k], zoom[k], height, width)
+        cos, sin = np.float32(math.cos(2 * angle[k])), np.float32(math.sin(2 * angle[k]))
+        for row in range(height):
+            for column in range(width):
+                at_x = left + column * along - row * across
+                at_y = top + column * across + row * along
+                s0, s1, s2 = stokes_seen(stokes, at_x, at_y, cos, sin)
+                for sensor in range(len(maps)):
+                    weights = maps[sensor, :, row, column]
+                    light = weights[0] * s0 + weights[1] * s1 + weights[2] * s2
+                    frames[sensor, k, row, column] = full_scale * max(light, np.float32(0))
+
+
+def lights_of_drift(
+    scene: PolarizationScene, pose: Pose, height: int, width: int, weights: Float64[np.ndarray, "4 3"]
+) -> list[Light]:
+    """Light behind the polarizers (`analyzers`) of a drifting sensor, from the part of the scene that it covers."""
     left, top = pose.x - (width - 1) / 2, pose.y - (height - 1) / 2
     rows, columns = _visible(top, height, scene.height), _visible(left, width, scene.width)
     # numpy, because idle torch threads would occupy the cores that the channels' threads need next
     s0, s1, s2 = scene.stokes[:, rows, columns].numpy()
     lights = []
-    for angle in POLARIZER_ANGLES_DEG:
-        intensity = np.maximum(behind_polarizer(s0, s1, s2, math.radians(angle)), 0) * FULL_SCALE
+    for a, b, c in weights.tolist():
+        intensity = np.maximum(a * s0 + b * s1 + c * s2, 0) * FULL_SCALE
         intensity = np.pad(intensity, (0, 1), mode="edge")
         lights.append(light_of_scene(intensity, top - rows.start, left - columns.start))
     return lights

@@ -1,0 +1,140 @@
+"""Polarizers of the simulated camera: extinction, angle errors, transmission, and the mosaic of a DoFP sensor.
+
+A linear polarizer weights the Stokes parameters (`polarnet.stokes.analyzer`), so that four numbers a channel describe
+film or wire grids before four sensors. The micropolarizers of a DoFP sensor differ from pixel to pixel, and a pixel
+receives some of its neighbours' light.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.simulation.pixels import randomness
+from polarnet.stokes import POLARIZER_ANGLES_DEG, analyzer, parse_mosaic
+
+CHANNELS = len(POLARIZER_ANGLES_DEG)
+MAX_CROSSTALK = 0.8  # share of a pixel's light from its four neighbours; at 0.8 all five count alike
+
+
+@dataclass(frozen=True)
+class PolarizersConfig:
+    """Section `polarizers` of params.yaml. Lists hold one value for each of 0, 45, 90 and 135 degrees."""
+
+    layout: str = field(metadata=allowed(choices=("four_sensors", "dofp")))
+    """four_sensors: each polarizer covers a sensor of its own; dofp: one sensor, one polarizer a pixel."""
+    mosaic: str
+    """Angles over 2x2 pixels of a DoFP sensor, even row / odd row."""
+    extinction_ratio: list[float | None] = field(metadata=allowed(low=1))
+    """Transmission along the axis over that across it; null: infinite."""
+    angle_error_deg: list[float] = field(metadata=allowed(low=-90, high=90))
+    transmission: list[float] = field(metadata=allowed(above=0, high=1))
+    """Of light polarized along the axis."""
+    extinction_spread: float = field(metadata=allowed(low=0))
+    """Standard deviation between pixels of the natural logarithm of the extinction ratio."""
+    angle_spread_deg: float = field(metadata=allowed(low=0))
+    """Standard deviation of the angle between pixels."""
+    transmission_spread: float = field(metadata=allowed(low=0))
+    """Relative standard deviation of the transmission between pixels."""
+    crosstalk: float = field(metadata=allowed(low=0, high=MAX_CROSSTALK))
+    """Share of a DoFP pixel's light that falls in through its four neighbours' polarizers."""
+
+    def __post_init__(self):
+        check_ranges(self)
+        parse_mosaic(self.mosaic)
+        for name in ("extinction_ratio", "angle_error_deg", "transmission"):
+            values = getattr(self, name)
+            if len(values) != CHANNELS:
+                raise ValueError(f"{name}: expected {CHANNELS} values, for 0, 45, 90 and 135 degrees, got {values}")
+        if self.crosstalk and self.layout != "dofp":
+            raise ValueError(
+                f"crosstalk: expected 0 with layout {self.layout}, got {self.crosstalk}; "
+                f"neighbours have different polarizers only with layout dofp"
+            )
+
+    @property
+    def uniform(self) -> bool:
+        """Whether each channel has a sensor of its own, all of whose pixels see through the same polarizer."""
+        spread = self.extinction_spread or self.angle_spread_deg or self.transmission_spread
+        return self.layout == "four_sensors" and not spread
+
+
+IDEAL = PolarizersConfig(
+    layout="four_sensors",
+    mosaic="90 45 / 135 0",
+    extinction_ratio=[None] * CHANNELS,
+    angle_error_deg=[0.0] * CHANNELS,
+    transmission=[1.0] * CHANNELS,
+    extinction_spread=0.0,
+    angle_spread_deg=0.0,
+    transmission_spread=0.0,
+    crosstalk=0.0,
+)
+
+
+def channel_size(polarizers: PolarizersConfig, height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of a channel of a sensor; ValueError for a DoFP sensor with an odd side."""
+    if polarizers.layout == "four_sensors":
+        return height, width
+    if height % 2 or width % 2:
+        raise ValueError(f"a DoFP sensor needs even sides, for whole cells of 2x2 pixels, got {height}x{width}")
+    return height // 2, width // 2
+
+
+def analyzers(polarizers: PolarizersConfig) -> Float64[np.ndarray, "4 3"]:
+    """Weights of (S0, S1, S2) of each channel, without differences between pixels."""
+    angles = np.radians(np.add(POLARIZER_ANGLES_DEG, polarizers.angle_error_deg))
+    return np.array(list(map(analyzer, angles.tolist(), _ratios(polarizers), polarizers.transmission)))
+
+
+def _ratios(polarizers: PolarizersConfig) -> list[float]:
+    return [math.inf if ratio is None else ratio for ratio in polarizers.extinction_ratio]
+
+
+def analyzer_maps(
+    polarizers: PolarizersConfig, height: int, width: int, key: int
+) -> Float32[np.ndarray, "sensors 3 h w"]:
+    """Weights of (S0, S1, S2) of every pixel: of four sensors, or of one DoFP sensor.
+
+    `key` (64 bits) seeds the differences between pixels.
+    """
+    if polarizers.layout == "four_sensors":
+        channels = np.broadcast_to(np.arange(CHANNELS)[:, None, None], (CHANNELS, height, width))
+    else:
+        channel_size(polarizers, height, width)
+        cell = np.searchsorted(POLARIZER_ANGLES_DEG, parse_mosaic(polarizers.mosaic))
+        channels = np.tile(cell, (1, height // 2, width // 2))
+    angles = np.radians(np.add(POLARIZER_ANGLES_DEG, polarizers.angle_error_deg))[channels]
+    angles = angles + math.radians(polarizers.angle_spread_deg) * _normal(randomness.POLARIZER_ANGLE, channels, key)
+    along = np.array(polarizers.transmission)[channels]
+    along = along * (1 + polarizers.transmission_spread * _normal(randomness.TRANSMISSION, channels, key))
+    along = along.clip(0, 1)
+    exponents = polarizers.extinction_spread * _normal(randomness.EXTINCTION, channels, key)
+    across = along / np.maximum(np.array(_ratios(polarizers))[channels] * np.exp(exponents), 1)
+    polarized = (along - across) / 2
+    weights = ((along + across) / 2, polarized * np.cos(2 * angles), polarized * np.sin(2 * angles))
+    return np.stack(weights, axis=1).astype(np.float32)
+
+
+def _normal(purpose: int, channels: np.ndarray, key: int) -> Float64[np.ndarray, "sensors h w"]:
+    """Standard normal values for the pixels of each sensor."""
+    pixels = channels[0].size
+    maps = [randomness.normal_map(np.uint64(key), purpose, sensor, pixels) for sensor in range(len(channels))]
+    return np.stack(maps).reshape(channels.shape).astype(np.float64)
+
+
+def mixed_with_neighbours(frames: Float32[np.ndarray, "n h w"], crosstalk: float) -> Float32[np.ndarray, "n h w"]:
+    """Light of a DoFP sensor's pixels with a share `crosstalk` from the four neighbours; the border repeats itself."""
+    if crosstalk == 0:
+        return frames
+    padded = np.pad(frames, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    neighbours = padded[:, :-2, 1:-1] + padded[:, 2:, 1:-1] + padded[:, 1:-1, :-2] + padded[:, 1:-1, 2:]
+    return np.float32(1 - crosstalk) * frames + np.float32(crosstalk / 4) * neighbours
+
+
+def split_cells(frames: Float32[np.ndarray, "n h w"], mosaic: str) -> Float32[np.ndarray, "4 n h2 w2"]:
+    """Channels at 0, 45, 90 and 135 degrees of a DoFP sensor's frames: each one pixel of every 2x2 cell."""
+    cells = np.argsort(np.ravel(parse_mosaic(mosaic)))  # 2 row + column of each angle
+    return np.stack([frames[:, cell // 2 :: 2, cell % 2 :: 2] for cell in cells])
