@@ -120,7 +120,7 @@ def test_each_channel_of_a_mosaic_sees_its_own_pixels():
 
 
 def test_a_mosaic_demosaicked_gives_the_dolp_of_a_scene_that_changes_evenly():
-    """S0 rises along the columns and DoLP along the rows, so that bilinear interpolation to the cells' centres is exact.
+    """S0 rises along the columns, DoLP along the rows; bilinear interpolation to the centres of cells is then exact.
 
     Without it, an unpolarized scene would look polarized: S0 changes by 2 % from one pixel of a cell to the next.
     """
