@@ -1,10 +1,9 @@
 """Events of a sensor behind four polarizers that moves over a scene; no clip of frames is stored in between."""
 
 import functools
-from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float32, Int64, UInt8
+from jaxtyping import Int64
 
 from polarnet.events.stream import Events
 from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, emulate_lights, events_of
@@ -24,7 +23,6 @@ from polarnet.simulation.rendering import (
     check_inside,
     drifts,
     lights_of_drift,
-    render_behind,
     render_intensities,
     render_times_us,
 )
@@ -86,38 +84,26 @@ def emulate_motion_steps(
     pose = trajectory.pose(t_us * 1e-6)
     check_inside(scene, pose, t_us, height, width)
     rows, columns = channel_size(polarizers, height, width)
+    eight_bit = MODELS[config.model].EIGHT_BIT_VIDEO
+    weights = analyzers(polarizers) if polarizers.uniform else analyzer_maps(polarizers, height, width, key)
     advance = functools.partial(
         emulate_lights, height=rows, width=columns, config=config, key=key, channels=CHANNELS, threads=threads
     )
     if drifts(pose) and polarizers.uniform:
-        lights = lights_of_drift(scene, pose, height, width, analyzers(polarizers))
-        columns_of, state = advance(lights, t_us.astype(np.float64), state=state)
-        return [events_of(c, rows, columns) for c in columns_of], state
-    rendered = renderer(scene, height, width, polarizers, key, MODELS[config.model].EIGHT_BIT_VIDEO)
+        lights = lights_of_drift(scene, pose, height, width, weights)
+        channels, state = advance(lights, t_us.astype(np.float64), state=state)
+        return [events_of(channel, rows, columns) for channel in channels], state
     pieces = []
     for first in range(0, len(t_us), CHUNK):
         chunk = slice(first, first + CHUNK)
-        frames = rendered(Pose(*(values[chunk] for values in pose)))
-        lights = [light_of_frames(frames[channel]) for channel in CHANNELS]
-        columns_of, state = advance(lights, t_us[chunk].astype(np.float64), state=state)
-        pieces.append(columns_of)
-    joined = [Columns(*map(np.concatenate, zip(*channel, strict=True))) for channel in zip(*pieces, strict=True)]
-    assert state is not None  # there was at least one time
-    return [events_of(c, rows, columns) for c in joined], state
-
-
-def renderer(
-    scene: PolarizationScene, height: int, width: int, polarizers: PolarizersConfig, key: int, eight_bit: bool
-) -> Callable[[Pose], UInt8[np.ndarray, "4 n h w"] | Float32[np.ndarray, "4 n h w"]]:
-    """A function from poses to the digital numbers of the four channels; uint8, rounded, if `eight_bit`."""
-    if polarizers == IDEAL:
-        return functools.partial(render_intensities, scene, height=height, width=width, eight_bit=eight_bit)
-    maps = analyzer_maps(polarizers, height, width, key)
-
-    def behind(pose: Pose) -> UInt8[np.ndarray, "4 n h w"] | Float32[np.ndarray, "4 n h w"]:
-        frames = render_behind(scene, pose, maps)
+        frames = render_intensities(scene, Pose(*(values[chunk] for values in pose)), height, width, weights)
         if polarizers.layout == "dofp":
             frames = split_cells(mixed_with_neighbours(frames[0], polarizers.crosstalk), polarizers.mosaic)
-        return (frames + np.float32(0.5)).astype(np.uint8) if eight_bit else frames
-
-    return behind
+        if eight_bit:
+            frames = (frames + np.float32(0.5)).astype(np.uint8)
+        lights = [light_of_frames(channel) for channel in frames]
+        channels, state = advance(lights, t_us[chunk].astype(np.float64), state=state)
+        pieces.append(channels)
+    joined = [Columns(*map(np.concatenate, zip(*channel, strict=True))) for channel in zip(*pieces, strict=True)]
+    assert state is not None  # there was at least one time
+    return [events_of(channel, rows, columns) for channel in joined], state

@@ -6,48 +6,48 @@ receives some of its neighbours' light.
 """
 
 import math
-from dataclasses import dataclass, field
+from typing import Annotated, TypeVar
 
 import numpy as np
 from jaxtyping import Float32, Float64
+from pydantic import Field, NonNegativeFloat
 
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.pixels import randomness
 from polarnet.stokes import POLARIZER_ANGLES_DEG, analyzer, parse_mosaic
 
 CHANNELS = len(POLARIZER_ANGLES_DEG)
+Value = TypeVar("Value")
 MAX_CROSSTALK = 0.8  # share of a pixel's light from its four neighbours; at 0.8 all five count alike
 
 
-@dataclass(frozen=True)
+FourValues = Annotated[list[Value], Field(min_length=CHANNELS, max_length=CHANNELS)]
+
+
+@section
 class PolarizersConfig:
     """Section `polarizers` of params.yaml. Lists hold one value for each of 0, 45, 90 and 135 degrees."""
 
-    layout: str = field(metadata=allowed(choices=("four_sensors", "dofp")))
+    layout: Annotated[str, one_of(("four_sensors", "dofp"))]
     """four_sensors: each polarizer covers a sensor of its own; dofp: one sensor, one polarizer a pixel."""
     mosaic: str
     """Angles over 2x2 pixels of a DoFP sensor, even row / odd row."""
-    extinction_ratio: list[float | None] = field(metadata=allowed(low=1))
+    extinction_ratio: FourValues[Annotated[float, Field(ge=1)] | None]
     """Transmission along the axis over that across it; null: infinite."""
-    angle_error_deg: list[float] = field(metadata=allowed(low=-90, high=90))
-    transmission: list[float] = field(metadata=allowed(above=0, high=1))
+    angle_error_deg: FourValues[Annotated[float, Field(ge=-90, le=90)]]
+    transmission: FourValues[Annotated[float, Field(gt=0, le=1)]]
     """Of light polarized along the axis."""
-    extinction_spread: float = field(metadata=allowed(low=0))
+    extinction_spread: NonNegativeFloat
     """Standard deviation between pixels of the natural logarithm of the extinction ratio."""
-    angle_spread_deg: float = field(metadata=allowed(low=0))
+    angle_spread_deg: NonNegativeFloat
     """Standard deviation of the angle between pixels."""
-    transmission_spread: float = field(metadata=allowed(low=0))
+    transmission_spread: NonNegativeFloat
     """Relative standard deviation of the transmission between pixels."""
-    crosstalk: float = field(metadata=allowed(low=0, high=MAX_CROSSTALK))
+    crosstalk: Annotated[float, Field(ge=0, le=MAX_CROSSTALK)]
     """Share of a DoFP pixel's light that falls in through its four neighbours' polarizers."""
 
     def __post_init__(self):
-        check_ranges(self)
         parse_mosaic(self.mosaic)
-        for name in ("extinction_ratio", "angle_error_deg", "transmission"):
-            values = getattr(self, name)
-            if len(values) != CHANNELS:
-                raise ValueError(f"{name}: expected {CHANNELS} values, for 0, 45, 90 and 135 degrees, got {values}")
         if self.crosstalk and self.layout != "dofp":
             raise ValueError(
                 f"crosstalk: expected 0 with layout {self.layout}, got {self.crosstalk}; "
@@ -83,10 +83,11 @@ def channel_size(polarizers: PolarizersConfig, height: int, width: int) -> tuple
     return height // 2, width // 2
 
 
-def analyzers(polarizers: PolarizersConfig) -> Float64[np.ndarray, "4 3"]:
+def analyzers(polarizers: PolarizersConfig) -> Float32[np.ndarray, "4 3"]:
     """Weights of (S0, S1, S2) of each channel, without differences between pixels."""
     angles = np.radians(np.add(POLARIZER_ANGLES_DEG, polarizers.angle_error_deg))
-    return np.array(list(map(analyzer, angles.tolist(), _ratios(polarizers), polarizers.transmission)))
+    weights = list(map(analyzer, angles.tolist(), _ratios(polarizers), polarizers.transmission))
+    return np.array(weights, np.float32)
 
 
 def _ratios(polarizers: PolarizersConfig) -> list[float]:

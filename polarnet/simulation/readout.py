@@ -5,33 +5,29 @@ carries a limited number of events a second. An event gets its time when it leav
 lost, as in sensors whose event rate exceeds what their readout carries.
 """
 
-from dataclasses import dataclass, field
-
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
+from pydantic import NonNegativeFloat, PositiveFloat
 
 from polarnet.events.stream import Events
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import compiled, forget_stale_code
 from polarnet.simulation.pixels import randomness
 
 
-@dataclass(frozen=True)
+@section
 class ReadoutConfig:
     """Section `readout` of params.yaml: how events leave the sensor."""
 
-    row_latency_us: float = field(metadata=allowed(low=0))
+    row_latency_us: NonNegativeFloat
     """Delay of each row behind the row above it."""
-    jitter_us: float = field(metadata=allowed(low=0))
+    jitter_us: NonNegativeFloat
     """Standard deviation of an event's time."""
-    max_events_per_s: float | None = field(metadata=allowed(above=0))
+    max_events_per_s: PositiveFloat | None
     """Events that the bus of a sensor carries per second; null: no limit."""
-    max_wait_us: float = field(metadata=allowed(low=0))
+    max_wait_us: NonNegativeFloat
     """Longest time that a row waits for the bus; a row that would wait longer is lost."""
-
-    def __post_init__(self):
-        check_ranges(self)
 
     @property
     def perfect(self) -> bool:

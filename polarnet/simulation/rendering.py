@@ -4,11 +4,10 @@ import itertools
 import math
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Float32, Float64, Int64
 
-from polarnet.simulation.compilation import compiled, forget_stale_code
-from polarnet.simulation.motion import Pose, Trajectory, sensor_to_scene, stokes_seen
-from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_scene
+from polarnet.simulation.motion import Pose, Trajectory, render_poses
+from polarnet.simulation.pixels.light import FULL_SCALE, Light
 from polarnet.simulation.scene import PolarizationScene
 
 MIN_RATE_HZ = 30.0  # minimum of the adaptive rate, for a sensor at rest
@@ -79,75 +78,30 @@ def drifts(pose: Pose) -> bool:
 
 
 def render_intensities(
-    scene: PolarizationScene, pose: Pose, height: int, width: int, eight_bit: bool
-) -> UInt8[np.ndarray, "4 n h w"] | Float32[np.ndarray, "4 n h w"]:
-    """Digital numbers behind the four polarizers for any motion; uint8, rounded, if `eight_bit`."""
-    forget_stale_code()
-    frames = np.empty((4, len(pose.x), height, width), np.uint8 if eight_bit else np.float32)
-    _render(np.ascontiguousarray(scene.stokes.numpy()), pose.x, pose.y, pose.angle, pose.zoom, frames)
-    return frames
-
-
-@compiled
-def _render(stokes, x, y, angle, zoom, frames) -> None:  # pragma: no cover (compiled)
-    height, width = frames.shape[2:]
-    half, rounding = np.float32(FULL_SCALE / 2), np.float32(0.5 if frames.itemsize == 1 else 0.0)
-    for k in range(len(x)):
-        left, top, along, across = sensor_to_scene(x[k], y[k], angle[k], zoom[k], height, width)
-        cos, sin = np.float32(math.cos(2 * angle[k])), np.float32(math.sin(2 * angle[k]))
-        for row in range(height):
-            for column in range(width):
-                at_x = left + column * along - row * across
-                at_y = top + column * across + row * along
-                s0, s1, s2 = stokes_seen(stokes, at_x, at_y, cos, sin)  # the polarizers roll with the camera
-                for channel, part in enumerate((s1, s2)):
-                    frames[channel, k, row, column] = max(half * (s0 + part), np.float32(0)) + rounding
-                    frames[channel + 2, k, row, column] = max(half * (s0 - part), np.float32(0)) + rounding
-
-
-def render_behind(
-    scene: PolarizationScene, pose: Pose, maps: Float32[np.ndarray, "sensors 3 h w"]
+    scene: PolarizationScene, pose: Pose, height: int, width: int, weights: Float32[np.ndarray, "sensors 3 *pixels"]
 ) -> Float32[np.ndarray, "sensors n h w"]:
-    """Digital numbers behind polarizers that differ between pixels (`analyzer_maps`), for any motion."""
-    forget_stale_code()
-    sensors, _, height, width = maps.shape
-    frames = np.empty((sensors, len(pose.x), height, width), np.float32)
-    _render_behind(np.ascontiguousarray(scene.stokes.numpy()), pose.x, pose.y, pose.angle, pose.zoom, maps, frames)
-    return frames
+    """Digital numbers behind polarizers of these `weights` for any motion; the polarizers turn with the camera."""
+    return behind_polarizers(render_poses(scene, pose, height, width).transpose(1, 0, 2, 3), weights)
 
 
-@compiled
-def _render_behind(stokes, x, y, angle, zoom, maps, frames) -> None:  # pragma: no cover (compiled)
-    height, width = frames.shape[2:]
-    full_scale = np.float32(FULL_SCALE)
-    for k in range(len(x)):
-        left, top, along, across = sensor_to_scene(x[k], y[k], angle[k], zoom[k], height, width)
-        cos, sin = np.float32(math.cos(2 * angle[k])), np.float32(math.sin(2 * angle[k]))
-        for row in range(height):
-            for column in range(width):
-                at_x = left + column * along - row * across
-                at_y = top + column * across + row * along
-                s0, s1, s2 = stokes_seen(stokes, at_x, at_y, cos, sin)
-                for sensor in range(len(maps)):
-                    weights = maps[sensor, :, row, column]
-                    light = weights[0] * s0 + weights[1] * s1 + weights[2] * s2
-                    frames[sensor, k, row, column] = full_scale * max(light, np.float32(0))
+def behind_polarizers(
+    stokes: Float32[np.ndarray, "3 *shape"], weights: Float32[np.ndarray, "sensors 3 *pixels"]
+) -> Float32[np.ndarray, "sensors *shape"]:
+    """Digital numbers behind polarizers that weight S0, S1 and S2: alike at all pixels, or with a weight for each."""
+    s0, s1, s2 = stokes
+    return np.maximum(np.stack([a * s0 + b * s1 + c * s2 for a, b, c in weights]), 0) * FULL_SCALE
 
 
 def lights_of_drift(
-    scene: PolarizationScene, pose: Pose, height: int, width: int, weights: Float64[np.ndarray, "4 3"]
+    scene: PolarizationScene, pose: Pose, height: int, width: int, weights: Float32[np.ndarray, "sensors 3"]
 ) -> list[Light]:
-    """Light behind the polarizers (`analyzers`) of a drifting sensor, from the part of the scene that it covers."""
+    """Light behind the polarizers of a drifting sensor, from the part of the scene that the sensor covers."""
     left, top = pose.x - (width - 1) / 2, pose.y - (height - 1) / 2
     rows, columns = _visible(top, height, scene.height), _visible(left, width, scene.width)
     # numpy, because idle torch threads would occupy the cores that the channels' threads need next
-    s0, s1, s2 = scene.stokes[:, rows, columns].numpy()
-    lights = []
-    for a, b, c in weights.tolist():
-        intensity = np.maximum(a * s0 + b * s1 + c * s2, 0) * FULL_SCALE
-        intensity = np.pad(intensity, (0, 1), mode="edge")
-        lights.append(light_of_scene(intensity, top - rows.start, left - columns.start))
-    return lights
+    intensities = behind_polarizers(scene.stokes[:, rows, columns].numpy(), weights)
+    intensities = np.pad(intensities, ((0, 0), (0, 1), (0, 1)), "edge")
+    return [Light(intensity[np.newaxis], top - rows.start, left - columns.start) for intensity in intensities]
 
 
 def _visible(first: Float64[np.ndarray, " n"], size: int, limit: int) -> slice:
