@@ -17,8 +17,10 @@ from polarnet.simulation.polarizers import (
     analyzers,
     channel_size,
     mixed_with_neighbours,
+    places_of,
     split_cells,
 )
+from polarnet.simulation.readout import PERFECT, ReadoutConfig, as_channels, as_one_sensor, read_out
 from polarnet.simulation.rendering import (
     check_inside,
     drifts,
@@ -42,6 +44,7 @@ def emulate_motion(
     key: int,
     threads: int = 1,
     polarizers: PolarizersConfig = IDEAL,
+    readout: ReadoutConfig = PERFECT,
 ) -> list[Events]:
     """Events of the four channels of a sensor of height x width pixels that moves over a scene for `duration_us`.
 
@@ -50,7 +53,19 @@ def emulate_motion(
     """
     t_us = emulation_times_us(trajectory, duration_us, height, width, config)
     events, _ = emulate_motion_steps(scene, trajectory, t_us, height, width, config, key, None, threads, polarizers)
-    return events
+    return _read_out(events, polarizers, readout, key, duration_us)
+
+
+def _read_out(
+    channels: list[Events], polarizers: PolarizersConfig, readout: ReadoutConfig, key: int, duration_us: int
+) -> list[Events]:
+    """The channels as they leave their sensors: each its own, or all four one DoFP sensor."""
+    if readout.perfect:
+        return channels
+    if polarizers.layout == "dofp":
+        places = places_of(polarizers.mosaic)
+        return as_channels(read_out(as_one_sensor(channels, places), readout, key, duration_us)[0], places)
+    return [read_out(channel, readout, key + number, duration_us)[0] for number, channel in enumerate(channels)]
 
 
 def emulation_times_us(
@@ -83,7 +98,7 @@ def emulate_motion_steps(
         raise ValueError(f"expected at least one time, and strictly increasing times, got {t_us[:5].tolist()}...")
     pose = trajectory.pose(t_us * 1e-6)
     check_inside(scene, pose, t_us, height, width)
-    rows, columns = channel_size(polarizers, height, width)
+    rows, columns = channel_size(polarizers.layout, height, width)
     eight_bit = MODELS[config.model].EIGHT_BIT_VIDEO
     weights = analyzers(polarizers) if polarizers.uniform else analyzer_maps(polarizers, height, width, key)
     advance = functools.partial(

@@ -74,13 +74,19 @@ IDEAL = PolarizersConfig(
 )
 
 
-def channel_size(polarizers: PolarizersConfig, height: int, width: int) -> tuple[int, int]:
+def channel_size(layout: str, height: int, width: int) -> tuple[int, int]:
     """Rows and columns of a channel of a sensor; ValueError for a DoFP sensor with an odd side."""
-    if polarizers.layout == "four_sensors":
+    if layout == "four_sensors":
         return height, width
     if height % 2 or width % 2:
         raise ValueError(f"a DoFP sensor needs even sides, for whole cells of 2x2 pixels, got {height}x{width}")
     return height // 2, width // 2
+
+
+def grid(layout: str, height: int, width: int) -> tuple[int, int, int]:
+    """Rows and columns of a sensor's channel, and the distance of its pixels in pixels of the sensor."""
+    rows, columns = channel_size(layout, height, width)
+    return rows, columns, height // rows
 
 
 def analyzers(polarizers: PolarizersConfig) -> Float32[np.ndarray, "4 3"]:
@@ -104,7 +110,7 @@ def analyzer_maps(
     if polarizers.layout == "four_sensors":
         channels = np.broadcast_to(np.arange(CHANNELS)[:, None, None], (CHANNELS, height, width))
     else:
-        channel_size(polarizers, height, width)
+        channel_size(polarizers.layout, height, width)
         cell = np.searchsorted(POLARIZER_ANGLES_DEG, parse_mosaic(polarizers.mosaic))
         channels = np.tile(cell, (1, height // 2, width // 2))
     angles = np.radians(np.add(POLARIZER_ANGLES_DEG, polarizers.angle_error_deg))[channels]
@@ -135,7 +141,11 @@ def mixed_with_neighbours(frames: Float32[np.ndarray, "n h w"], crosstalk: float
     return np.float32(1 - crosstalk) * frames + np.float32(crosstalk / 4) * neighbours
 
 
+def places_of(mosaic: str) -> list[tuple[int, int]]:
+    """(row, column) in a 2x2 cell of the pixels at 0, 45, 90 and 135 degrees."""
+    return [divmod(int(cell), 2) for cell in np.argsort(np.ravel(parse_mosaic(mosaic)))]
+
+
 def split_cells(frames: Float32[np.ndarray, "n h w"], mosaic: str) -> Float32[np.ndarray, "4 n h2 w2"]:
     """Channels at 0, 45, 90 and 135 degrees of a DoFP sensor's frames: each one pixel of every 2x2 cell."""
-    cells = np.argsort(np.ravel(parse_mosaic(mosaic)))  # 2 row + column of each angle
-    return np.stack([frames[:, cell // 2 :: 2, cell % 2 :: 2] for cell in cells])
+    return np.stack([frames[:, row::2, column::2] for row, column in places_of(mosaic)])
