@@ -168,10 +168,10 @@ class Config:
         }
         if self.benchmark.lpips:
             compared["benchmark.lpips"] = (self.benchmark.lpips_backbone, channel)
-        for key, (backbone, size) in compared.items():
+        for key, (backbone, image) in compared.items():
             side = BACKBONES[backbone].min_side
-            if min(size) < side:
-                raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {size}")
+            if min(image) < side:
+                raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {image}")
 
     def _check_rows(self) -> None:
         """ValueError for a row whose entry in `rows` differs from the record of its method."""
@@ -267,8 +267,8 @@ def load(root: Path, overrides: list[str] | None = None) -> Config:
 def check_overrides(root: Path, overrides: list[str]) -> None:
     """Raise ValueError for an override of a key that is not a setting, or of a group that has no such choice.
 
-    The groups are `experiment`, `sensor`, `polarizers` and `ablation`. Hydra refuses both as well, but this message lists the
-    available keys and choices.
+    The groups are `experiment`, `sensor`, `polarizers` and `ablation`. Hydra refuses both as well, but this message
+    lists the available keys and choices.
     """
     groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
     for override in overrides:

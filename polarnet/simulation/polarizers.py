@@ -79,7 +79,9 @@ def channel_size(layout: str, height: int, width: int) -> tuple[int, int]:
     if layout == "four_sensors":
         return height, width
     if height % 2 or width % 2:
-        raise ValueError(f"a DoFP sensor needs even sides, for whole cells of 2x2 pixels, got {height}x{width}")
+        raise ValueError(
+            f"polarizers.layout dofp: expected a sensor with even sides, for whole cells of 2x2 pixels, got {height}x{width}"
+        )
     return height // 2, width // 2
 
 
