@@ -298,16 +298,6 @@ def _sensor_fit(section: str, stimulus: str) -> Block:
 
 
 BLOCKS = {
-    "sensor-fit": _sensor_fit(
-        "sensor_fit",
-        "{sensor_fit[static_s]} s of constant light and {sensor_fit[moving_s]:g} s of drifting leaves with "
-        "{sensor_fit[frame_rate_hz]} frames/s of 8 bits",
-    ),
-    "sensor-fit-flicker": _sensor_fit(
-        "sensor_fit_flicker",
-        "{sensor_fit_flicker[static_s]} s of constant light and lamps that flicker at 2, 20 and 60 Hz with contrast "
-        "{sensor_fit_flicker[contrast]:g}",
-    ),
     "headline": Block(
         "network", "seed_1", "studies.study", _headline_rows,
         {"": "{label}"} | {
@@ -476,6 +466,16 @@ BLOCKS = {
         "house", "house", "studies.house --write",
         lambda results: [{"name": name, **one} for name, one in results["house"]["folders"].items()],
         {"folder": "`{name}`", "files": "{files:,}", "lines": "{lines:,}"}, caption="",
+    ),
+    "sensor-fit": _sensor_fit(
+        "sensor_fit",
+        "{sensor_fit[static_s]} s of constant light and {sensor_fit[moving_s]:g} s of drifting leaves with "
+        "{sensor_fit[frame_rate_hz]} frames/s",
+    ),
+    "sensor-fit-flicker": _sensor_fit(
+        "sensor_fit_flicker",
+        "{sensor_fit_flicker[static_s]} s of constant light and lamps that flicker with contrast "
+        "{sensor_fit_flicker[contrast]:g}",
     ),
 }  # fmt: skip
 """Every block by the name that its markers have."""
