@@ -1,0 +1,214 @@
+"""DoLP and AoLP from the events of one sensor behind a rotating polarizer, without calibration or training.
+
+Behind a polarizer at angle theta the light of a pixel is l (1 + DoLP cos 2 (theta - AoLP)). Between two consecutive
+events of a pixel the response F to that light, delayed by the photoreceptor, changes by one contrast threshold:
+
+    F(t_i) - F(t_(i-1)) = +threshold_on (ON) or -threshold_off (OFF),
+
+and up to the next event it stays within both thresholds. Each pixel fits DoLP, AoLP, its two thresholds and l to these
+equations by least squares (Levenberg-Marquardt with a robust loss). The residuals are relative to the thresholds:
+absolute residuals would vanish for DoLP and thresholds of 0. The thresholds have a prior, the mismatch of the sensor.
+Their ratio to DoLP follows from the number of events, their size from the shape of the logarithm.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from polarnet.events.rotation import Rotation
+from polarnet.events.stream import Events, merge, slice_time
+from polarnet.events.streaming import EventWindow
+from polarnet.methods.method import Recoverer
+from polarnet.methods.modulation import UNKNOWNS, Pixels, fit_pixels, response_model
+from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.stokes import Prediction
+
+INITIAL_RATIO_MAX = 0.7  # DoLP 0.94
+SILENT_DOLPS = 400  # nodes of the integral over DoLP of silent pixels
+SPREADS = np.linspace(-3, 3, 25)  # nodes of the integral over thresholds, in standard deviations
+
+
+@dataclass(frozen=True)
+class ModulationConfig:
+    """Section `modulation` of params.yaml: the sensor and the noise that the fit expects."""
+
+    threshold_on: float = field(metadata=allowed(above=0))
+    """Mean contrast thresholds, in natural-log intensity."""
+    threshold_off: float = field(metadata=allowed(above=0))
+    threshold_spread: float = field(metadata=allowed(above=0))
+    """Relative standard deviation of the thresholds between pixels."""
+    cutoff_hz: float = field(metadata=allowed(low=0))
+    """Bandwidth of the photoreceptor at full brightness, as in section `emulate`; 0: infinite."""
+    knee_dn: float = field(metadata=allowed(low=0))
+    """Light below which the response is linear instead of logarithmic; 0: logarithmic throughout."""
+    level_dn: float = field(metadata=allowed(above=0))
+    """Typical mean light behind the polarizer, 0 to 255 DN; matters only with a cutoff or a knee."""
+    level_spread: float = field(metadata=allowed(above=0))
+    """Standard deviation of the natural logarithm of the mean light between pixels."""
+    noise: float = field(metadata=allowed(above=0))
+    """Standard deviation of the change between two events, relative to the threshold."""
+    silence_noise: float = field(metadata=allowed(above=0))
+    """The same for the largest change between two events, which must not exceed the threshold."""
+    extinction_ratio: float | None = field(metadata=allowed(above=1))
+    """Transmission of the polarizer along its axis over that across it; null: infinite."""
+    window_turns: float = field(metadata=allowed(above=0))
+    """Turns of the polarizer whose events make one frame; there is a frame for each half turn."""
+    variance_scale: float = field(metadata=allowed(above=0))
+    """Squared error of DoLP over the variance of the fit, measured in simulation (python -m studies.rotating)."""
+    variance_floor: float = field(metadata=allowed(above=0))
+    """Smallest expected squared error of DoLP."""
+
+    def __post_init__(self):
+        check_ranges(self)
+
+    @property
+    def polarizer_contrast(self) -> float:
+        """DoLP that the polarizer makes of fully polarized light."""
+        return 1.0 if self.extinction_ratio is None else (self.extinction_ratio - 1) / (self.extinction_ratio + 1)
+
+
+class ModulationState(NamedTuple):
+    """Memory of the pixels [h w] between windows: their thresholds, which outlast the scene, and their last events."""
+
+    log_thresholds: Float64[np.ndarray, "2 h w"]
+    """Natural logarithm of the ON and OFF threshold over its mean."""
+    variances: Float64[np.ndarray, "2 h w"]
+    last_us: Float64[np.ndarray, "h w"]
+    """NaN before the first event."""
+
+
+def initial_state(height: int, width: int, config: ModulationConfig) -> ModulationState:
+    """State before the first event: mean thresholds, with the sensor's mismatch."""
+    variances = np.full((2, height, width), config.threshold_spread**2)
+    return ModulationState(np.zeros((2, height, width)), variances, np.full((height, width), np.nan))
+
+
+def fit_modulation(
+    events: Events,
+    rotation: Rotation,
+    start_us: int,
+    stop_us: int,
+    config: ModulationConfig,
+    state: ModulationState | None = None,
+) -> tuple[Prediction, ModulationState]:
+    """DoLP, AoLP and expected error from the events with start_us <= t < stop_us, and the state after them.
+
+    Maps are float32 [h, w]. A pixel with fewer than two events (the last one before the window counts) gets the mean
+    DoLP of silent pixels, AoLP 0 and the variance of that DoLP.
+    """
+    height, width = events.height, events.width
+    state = initial_state(height, width, config) if state is None else state
+    pixels, last_us = _pixels_of(slice_time(events, start_us, stop_us), rotation, stop_us, state.last_us.ravel())
+    thresholds = config.threshold_on, config.threshold_off
+    phase_rate = 4 * math.pi * rotation.rate_hz
+    model = response_model(*thresholds, phase_rate, config.cutoff_hz, config.knee_dn, config.silence_noise)
+    count = height * width
+    mean, precision = np.zeros((count, UNKNOWNS)), np.ones((count, UNKNOWNS))
+    mean[:, 2:4], precision[:, 2:4] = state.log_thresholds.reshape(2, -1).T, 1 / state.variances.reshape(2, -1).T
+    mean[:, 4], precision[:, 4] = math.log(config.level_dn), config.level_spread**-2
+    start = _initial_g(pixels, config, rotation, stop_us - start_us)
+    fitted, covariance, cost = fit_pixels(pixels, start, mean, precision, model, config.noise)
+    intervals = np.maximum(np.diff(pixels.first) - 1, 0)
+    # residuals above the expected noise make the errors larger in proportion
+    covariance *= np.maximum(1, 2 * cost / np.maximum(intervals, 1))[:, None, None]
+    active = intervals > 0
+    prediction = _prediction(fitted, covariance, active, config, (height, width))
+    thresholds = np.where(active[:, None], fitted[:, 2:4], mean[:, 2:4])
+    variances = np.where(active[:, None], np.diagonal(covariance, axis1=1, axis2=2)[:, 2:4], 1 / precision[:, 2:4])
+    maps = (values.T.reshape(2, height, width) for values in (thresholds, np.minimum(variances, 1 / precision[:, 2:4])))
+    return prediction, ModulationState(*maps, last_us.reshape(height, width))
+
+
+def rotating_recoverer(config: ModulationConfig, rotation: Rotation) -> Recoverer:
+    """The fit as a method of `recover`: the sensor's events may be in any channel, the other channels are empty."""
+
+    def start(height: int, width: int) -> ModulationState:
+        return initial_state(height, width, config)
+
+    def predict(state: ModulationState, windows: Sequence[EventWindow]) -> tuple[ModulationState, Prediction]:
+        predictions = []
+        for window in windows:
+            events = merge(window.channels)
+            prediction, state = fit_modulation(events, rotation, window.start_us, window.stop_us, config, state)
+            predictions.append(prediction)
+        maps = [torch.stack([getattr(one, name) for one in predictions]) for name in ("dolp", "aolp", "log_variance")]
+        return state, Prediction(*maps)
+
+    return Recoverer(start, predict)
+
+
+def silent_dolp(config: ModulationConfig) -> tuple[float, float]:
+    """Mean and variance of the DoLP of a pixel that never fires, if all DoLP are equally probable.
+
+    The light swings by ln((1 + DoLP) / (1 - DoLP)). The pixel stays silent if this swing fits between its thresholds,
+    and its reference level may lie anywhere between them.
+    """
+    dolp = np.linspace(0, 1, SILENT_DOLPS, endpoint=False)
+    swing = 2 * np.arctanh(dolp * config.polarizer_contrast)
+    room = config.threshold_on + config.threshold_off
+    spread = config.threshold_spread * math.hypot(config.threshold_on, config.threshold_off)
+    rooms = np.maximum(room + spread * SPREADS, spread)
+    weights = np.exp(-(SPREADS**2) / 2)
+    silent = (np.maximum(0, 1 - swing[:, None] / rooms) * weights).sum(axis=1)
+    mean = float((silent * dolp).sum() / silent.sum())
+    return mean, float((silent * (dolp - mean) ** 2).sum() / silent.sum())
+
+
+def _prediction(
+    fitted: np.ndarray, covariance: np.ndarray, active: np.ndarray, config: ModulationConfig, size: tuple[int, int]
+) -> Prediction:
+    g = np.hypot(fitted[:, 0], fitted[:, 1])
+    modulation = np.tanh(g)
+    direction = fitted[:, :2] / np.maximum(g, 1e-9)[:, None]
+    along = np.einsum("ni,nij,nj->n", direction, covariance[:, :2, :2], direction)
+    contrast = config.polarizer_contrast
+    variance = along * ((1 - modulation**2) / contrast) ** 2
+    silent, silent_variance = silent_dolp(config)
+    dolp = np.where(active, np.minimum(modulation / contrast, 1), silent)
+    expected = np.minimum(config.variance_scale * variance, 1) + config.variance_floor
+    log_variance = np.log(np.where(active, expected, silent_variance))
+    aolp = np.where(active, np.arctan2(fitted[:, 1], fitted[:, 0]) / 2 % math.pi, 0).astype(np.float32)
+    aolp = np.where(aolp >= np.float32(math.pi), np.float32(0), aolp)
+    return Prediction(*(torch.from_numpy(x.astype(np.float32).reshape(size)) for x in (dolp, aolp, log_variance)))
+
+
+def _pixels_of(
+    events: Events, rotation: Rotation, stop_us: int, last_us: Float64[np.ndarray, " n"]
+) -> tuple[Pixels, Float64[np.ndarray, " n"]]:
+    """The events sorted by pixel, each pixel's last event before them in front; and each pixel's last event now."""
+    pixel = events.y.numpy().astype(np.int64) * events.width + events.x.numpy()
+    remembered = np.flatnonzero(~np.isnan(last_us))
+    t_us = np.concatenate([last_us[remembered], events.t.numpy().astype(np.float64)])
+    p = np.concatenate([np.zeros(len(remembered), np.int8), events.p.numpy()])
+    pixel = np.concatenate([remembered, pixel])
+    order = np.argsort(pixel, kind="stable")
+    first = np.searchsorted(pixel[order], np.arange(len(last_us) + 1))
+    phase = 2 * rotation.at(t_us[order])
+    latest = last_us.copy()
+    filled = np.flatnonzero(np.diff(first))
+    latest[filled] = t_us[order][first[1:][filled] - 1]
+    stop = float(2 * rotation.at(np.array([stop_us]))[0])
+    return Pixels(first, phase, np.cos(phase), np.sin(phase), p[order], stop), latest
+
+
+def _initial_g(
+    pixels: Pixels, config: ModulationConfig, rotation: Rotation, duration_us: int
+) -> Float64[np.ndarray, "n 2"]:
+    """g of each pixel from the first Fourier coefficient of its events.
+
+    ln(1 + m cos x) has the coefficient 2 q with m = 2 q / (1 + q^2).
+    """
+    count = len(pixels.first) - 1
+    owner = np.repeat(np.arange(count), np.diff(pixels.first))
+    step = np.select([pixels.p > 0, pixels.p < 0], [config.threshold_on, -config.threshold_off], 0.0)
+    periods = max(duration_us / rotation.half_turn_us, 0.5)
+    sine, cosine = (np.bincount(owner, step * f, count) for f in (pixels.sin, pixels.cos))
+    phase = np.arctan2(cosine, -sine) if rotation.rate_hz > 0 else np.arctan2(-cosine, sine)
+    q = np.minimum(np.hypot(sine, cosine) / (2 * math.pi * periods), INITIAL_RATIO_MAX)
+    g = np.arctanh(2 * q / (1 + q * q))
+    return np.stack([g * np.cos(phase), g * np.sin(phase)], axis=1)
