@@ -7,7 +7,7 @@ from setuptools import setup
 from setuptools.command.build_py import build_py
 
 SETTINGS = ("params.yaml", "conf")
-INSTALLED = Path("polarnet", "config", "settings")  # polarnet.cli.project reads it
+INSTALLED = Path("polarnet", "config", "settings")  # polarnet.runtime.files.shipped_settings reads it
 
 
 class BuildWithSettings(build_py):

@@ -3,10 +3,10 @@
 import dataclasses
 from pathlib import Path
 
-from polarnet.captures.status import start_over
+from polarnet.captures.imported import start_over
 from polarnet.captures.targets import calibrate_targets
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.reports.calibration import draw_calibration
+from polarnet.reports.recordings import draw_calibration
 
 
 @hydra_stage
@@ -19,10 +19,10 @@ def main(config: Config) -> None:
         return
     about = {"recordings": dataclasses.asdict(config.recordings)}
     try:
-        found = calibrate_targets(Path(config.paths.imported), out, config.recordings, about)
+        targets = calibrate_targets(Path(config.paths.imported), out, config.recordings, about)
     except ValueError as error:
         raise SystemExit(str(error)) from None
-    for target in found:
+    for target in targets:
         draw_calibration(target, config.recordings, out / f"{target.name}.png")
         print(f"{target.name}: {target.duration_us * 1e-6:.2f} s, hot pixels {sum(target.hot.values())}")
 

@@ -1,10 +1,8 @@
 """data/scenes.zarr -> data/events.zarr: events of a camera behind each of the four polarizers."""
 
-import functools
 from pathlib import Path
 
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.runtime.cluster import pmap
 from polarnet.runtime.machine import threads_of
 from polarnet.simulation.dataset import emulate_scenes
 
@@ -12,9 +10,8 @@ from polarnet.simulation.dataset import emulate_scenes
 @hydra_stage
 def main(config: Config) -> None:
     """Emulate every sequence that is missing from the event store."""
-    mapper = functools.partial(pmap, workers=config.runtime.workers, label="emulate", address=config.cluster.address)
     scenes, events = Path(config.paths.scenes), Path(config.paths.events)
-    threads = threads_of(config.runtime)
+    mapper, threads = config.mapper("emulate"), threads_of(config.runtime)
     count = emulate_scenes(scenes, events, config.emulate, config.seed, mapper, threads)
     print(f"{count} sequences")
 

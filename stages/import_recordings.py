@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from polarnet.captures.imported import import_targets
-from polarnet.captures.status import start_over
+from polarnet.captures.imported import import_targets, start_over
 from polarnet.config.tree import Config, hydra_stage, input_folder
 
 

@@ -1,21 +1,18 @@
 """Photographs and generated pictures -> data/images: RGB pictures of one size, assigned to splits."""
 
-import functools
 from pathlib import Path
 
 from polarnet.config.tree import Config, hydra_stage, input_folder
 from polarnet.pictures.ingest import ingest
-from polarnet.runtime.cluster import pmap
 
 
 @hydra_stage
 def main(config: Config) -> None:
     """Fill data/images and print a summary of its content."""
-    mapper = functools.partial(pmap, workers=config.runtime.workers, label="ingest", address=config.cluster.address)
     if config.ingest.source != "builtin":
         input_folder("ingest.root", config.ingest.root)
     try:
-        manifest = ingest(config.ingest, config.seed, Path(config.paths.images), mapper)
+        manifest = ingest(config.ingest, config.seed, Path(config.paths.images), config.mapper("ingest"))
     except ValueError as error:
         raise SystemExit(str(error)) from None
     print(", ".join(f"{count} {name.replace('_', ' ')}" for name, count in manifest.counts.items()))

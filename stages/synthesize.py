@@ -1,19 +1,16 @@
 """data/images -> data/scenes.zarr, data/frames.zarr: polarized scenes, sensor motions and exact frames."""
 
-import functools
 from pathlib import Path
 
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.runtime.cluster import pmap
 from polarnet.simulation.truth import synthesize
 
 
 @hydra_stage
 def main(config: Config) -> None:
     """Make a scene from every picture and move the sensor over it."""
-    mapper = functools.partial(pmap, workers=config.runtime.workers, label="synthesize", address=config.cluster.address)
     images, scenes, frames = (Path(path) for path in (config.paths.images, config.paths.scenes, config.paths.frames))
-    size = config.storage.sequences_per_part
+    mapper, size = config.mapper("synthesize"), config.storage.sequences_per_part
     count = synthesize(images, scenes, frames, config.synthesize, config.seed, mapper, size, config.variation)
     print(f"{count} sequences")
 

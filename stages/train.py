@@ -14,7 +14,7 @@ from polarnet.training.dolp import dolp_task
 from polarnet.training.loop import LoopConfig, train
 from polarnet.training.parallel import join, launched
 from polarnet.training.recorder import Recorder
-from polarnet.training.task import Task, describe, lpips_of, open_events, open_split
+from polarnet.training.task import Task, describe, open_events, open_split
 
 
 @hydra_stage
@@ -37,7 +37,7 @@ def _task(config: Config) -> tuple[LoopConfig, Task]:
     """Settings and task of the training; ValueError if LPIPS weights that it needs are missing."""
 
     def lpips(weight: float) -> Lpips | None:
-        return lpips_of(config.paths.weights, config.lpips.backbone, weight)
+        return Lpips.load(config.paths.weights, "loss", config.lpips.backbone) if weight > 0 else None
 
     if config.baseline is None:
         loss = config.loss

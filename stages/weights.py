@@ -11,12 +11,12 @@ from polarnet.metrics.lpips_weights import find_weights, write_weights
 def main(config: Config) -> None:
     """Search for the weights, refuse if they are missing, and record their source."""
     find = functools.cache(find_weights)  # both purposes may share a backbone
-    searched = or_exit(lambda: {purpose: with_lpips(config, purpose, find) for purpose in PURPOSES})
-    found = {purpose: weights for purpose, weights in searched.items() if weights is not None}
-    write_weights(config.paths.weights, found)
-    for purpose, weights in found.items():
+    every = or_exit(lambda: {purpose: with_lpips(config, purpose, find) for purpose in PURPOSES})
+    required = {purpose: weights for purpose, weights in every.items() if weights is not None}
+    write_weights(config.paths.weights, required)
+    for purpose, weights in required.items():
         print(f"LPIPS of the {purpose}: {weights.backbone}, from {weights.source}")
-    if not found:
+    if not required:
         print("no LPIPS: no loss has a weight for it, and benchmark.lpips is false")
 
 

@@ -8,14 +8,11 @@ from typing import Any
 
 from polarnet.methods import METHODS
 from polarnet.reports.curves import PAPER_EVENTS_PER_PIXEL
-from polarnet.reports.provenance import origin
+from polarnet.reports.legend import LABELS, in_order
 from polarnet.reports.tables import (
     COLUMNS,
     COSTS,
     ERROR_PARTS,
-    LABELS,
-    as_markdown,
-    in_order,
     paired_lines,
     score_table,
     standing,
@@ -23,7 +20,7 @@ from polarnet.reports.tables import (
 from studies.designs import DESIGNS
 from studies.measure import ABLATION_KEYS, ablation_about
 from studies.scenes import CHOICES
-from studies.tables import Block, Columns, Results, Row, listed
+from studies.tables import Block, Columns, Results, Row, as_markdown, listed, origin
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAINING_FLOPS = 3  # relative to a forward pass: backward multiplies once for the inputs and once for the weights

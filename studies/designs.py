@@ -52,13 +52,13 @@ def main() -> None:
     for design in DESIGNS:
         results = json.loads(git(ROOT, "show", f"{design.commit}:docs/results/network.json"))
         commit = git(ROOT, "rev-parse", "--short=10", design.commit)
-        found = [results[section]["rows"] for section in design.sections]
-        simulated = [one["simulated"] for one in found]
+        studies_at_commit = [results[section]["rows"] for section in design.sections]
+        simulated = [one["simulated"] for one in studies_at_commit]
         rows.append({
             "commit": commit,
             "seeds": [{key: one["ours"][key] for key in ABLATION_KEYS} for one in simulated],
             "mse_over_oracle_mean": [one["ours"]["mse"] / one["oracle_mean"]["mse"] for one in simulated],
-            "measured_mse": [one["measured"]["ours"]["mse"] for one in found],
+            "measured_mse": [one["measured"]["ours"]["mse"] for one in studies_at_commit],
         })  # fmt: skip
     print(write_section(ROOT, "designs", "rows", {"designs": rows}, machine_record(ROOT)))
 

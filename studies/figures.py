@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from polarnet.reports.figures import ReliabilityLine, Theme, chart_style, draw_reliability
+from polarnet.reports.figures import Theme, chart_style, draw_reliability
 from polarnet.reports.tables import SET_TITLES
 
 SWEEP_SCORES = {
@@ -26,14 +26,14 @@ def expected_errors_figure(seeds: Mapping[str, Mapping[str, Any]], theme: Theme)
 
     `seeds` are the entries of docs/results/expected_errors.json by seed number.
     """
-    sets = list(dict.fromkeys(name for found in seeds.values() for name in found["sets"]))
+    sets = list(dict.fromkeys(name for results in seeds.values() for name in results["sets"]))
     with matplotlib.rc_context(chart_style(theme)):
         figure = Figure(figsize=(3.5 * len(sets), 3.2), layout="constrained", facecolor="none")
         colours = matplotlib.rcParams["axes.prop_cycle"].by_key()["color"]
         for axes, name in zip(figure.subplots(1, len(sets), squeeze=False)[0], sets, strict=True):
             lines = [
-                ReliabilityLine(f"seed {seed}", colour, found["sets"][name]["curve"])
-                for (seed, found), colour in zip(seeds.items(), itertools.cycle(colours), strict=False)
+                (f"seed {seed}", colour, results["sets"][name]["curve"])
+                for (seed, results), colour in zip(seeds.items(), itertools.cycle(colours), strict=False)
             ]
             draw_reliability(axes, lines, theme)
             axes.set_title(SET_TITLES[name], loc="left", fontsize=9)

@@ -75,24 +75,24 @@ def fuzz(form: str, cases: int, state: str) -> dict[str, Any]:
 
     Exits with what the reader's process said where it ended in another way.
     """
-    kept = KEPT / f"{form}.json"
-    found = json.loads(kept.read_text()) if kept.exists() else {}
-    if found.get("state") != state or found["cases"] > cases or found["cases"] % BATCH:
-        found = {"state": state, "batches": 0, "cases": 0, "seconds": 0.0, "endings": {}}
-    command = [sys.executable, "-m", "studies.fuzz_recordings", "--one", form, str(found["batches"]), str(cases)]
-    start, before_s = time.monotonic(), found["seconds"]
+    results_file = KEPT / f"{form}.json"
+    progress = json.loads(results_file.read_text()) if results_file.exists() else {}
+    if progress.get("state") != state or progress["cases"] > cases or progress["cases"] % BATCH:
+        progress = {"state": state, "batches": 0, "cases": 0, "seconds": 0.0, "endings": {}}
+    command = [sys.executable, "-m", "studies.fuzz_recordings", "--one", form, str(progress["batches"]), str(cases)]
+    start, before_s = time.monotonic(), progress["seconds"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
             one = json.loads(line)
-            endings = Counter(found["endings"]) + Counter(one["endings"])
-            found |= {"batches": one["batches"], "cases": endings.total(), "endings": dict(sorted(endings.items()))}
-            found["seconds"] = round(before_s + time.monotonic() - start, 1)
-            kept.write_text(json.dumps(found))
+            endings = Counter(progress["endings"]) + Counter(one["endings"])
+            progress |= {"batches": one["batches"], "cases": endings.total(), "endings": dict(sorted(endings.items()))}
+            progress["seconds"] = round(before_s + time.monotonic() - start, 1)
+            results_file.write_text(json.dumps(progress))
             print(f"{form:14s} {found['cases']:6d} cases in {found['seconds']:6.1f} s: {found['endings']}", flush=True)
     if process.returncode:
         sys.exit(f"{form}: after {found['cases']} cases its process ended with status {process.returncode}")
-    return found
+    return progress
 
 
 def main() -> None:
@@ -112,12 +112,12 @@ def main() -> None:
     if arguments.write and changed:
         parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
     record = machine_record(ROOT)
-    found = {form: fuzz(form, arguments.cases, f"{record['commit']} {changed}") for form in arguments.readers}
+    results = {form: fuzz(form, arguments.cases, f"{record['commit']} {changed}") for form in arguments.readers}
     print(f"{min(one['cases'] for one in found.values())} cases a reader passed, of {len(found)} readers")
     if arguments.write:
         readers = read_results(ROOT, "recordings").get("fuzz", {}).get("readers", {}) | {
             form: {key: one[key] for key in ("cases", "endings", "seconds")} | {"commit": record["commit"]}
-            for form, one in found.items()
+            for form, one in results.items()
         }
         least = min(readers[form]["cases"] if form in readers else 0 for form in FORMATS)
         path = write_section(ROOT, "recordings", "fuzz", {"cases_per_reader": least, "readers": readers}, record)

@@ -46,7 +46,7 @@ WITHOUT = "none"
 
 def networks(squeeze: str | None) -> dict[str, Lpips]:
     """LPIPS on every backbone whose weights are here; says which are not."""
-    found = {}
+    losses = {}
     for backbone in BACKBONES:
         path = squeeze if backbone == "squeeze" else None
         try:
@@ -56,8 +56,8 @@ def networks(squeeze: str | None) -> dict[str, Lpips]:
                 raise
             print(f"squeeze is left out: {error}")
             continue
-        found[backbone] = Lpips.of(backbone, find_weights(backbone, path).tensors)
-    return found
+        losses[backbone] = Lpips.of(backbone, find_weights(backbone, path).tensors)
+    return losses
 
 
 def largest_error(lpips: Lpips) -> float:

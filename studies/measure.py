@@ -20,7 +20,7 @@ from typing import Any
 
 from polarnet.config.sweep import COLUMNS, mean_scores, sweep_points
 from polarnet.reports.figures import LIGHT
-from polarnet.reports.png import png
+from polarnet.reports.maps import png
 from polarnet.reports.provenance import git, processor
 from polarnet.runtime.machine import usable_cores
 from studies.figures import loss_sweep_figure
@@ -167,18 +167,18 @@ def measure_benchmark(root: Path, benchmark: Path, record: Mapping[str, Any] | N
             f"{benchmark} has no results of {' and '.join(missing)}; run `dvc repro` with "
             f"benchmark.sets=[simulated,measured] and sets.measured_root=FOLDER first"
         )
-    found: dict[str, Any] = {**(record or machine_record(root)), "paired": {}, "about": {}}
+    section: dict[str, Any] = {**(record or machine_record(root)), "paired": {}, "about": {}}
     for name, folder in folders.items():
         metrics, details = scores_and_costs(folder), json.loads((folder / "details.json").read_text())
-        found[name] = {method: {key: scores.get(key) for key in BENCHMARK_KEYS} for method, scores in metrics.items()}
-        found["paired"][name] = details["paired"]
-        found["about"][name] = {key: details[key] for key in ("frames", "warmup_windows", "precision")} | {
+        section[name] = {method: {key: scores.get(key) for key in BENCHMARK_KEYS} for method, scores in metrics.items()}
+        section["paired"][name] = details["paired"]
+        section["about"][name] = {key: details[key] for key in ("frames", "warmup_windows", "precision")} | {
             "scenes": len(details["scenes"]),
             "lpips": details["lpips"],
         }
     path = root / "docs" / "results" / "benchmark.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(found, indent=2, allow_nan=False) + "\n")
+    path.write_text(json.dumps(section, indent=2, allow_nan=False) + "\n")
     return path
 
 
@@ -209,8 +209,8 @@ def measure_ablation(root: Path, sweep: Path) -> Path:
         overrides |= {f"{key}={value}" for key, value in given.items() if not key.startswith(("paths.", "ingest.root"))}
     if "nothing" not in rows:
         raise RuntimeError(f"{sweep}: expected a finished job with ablation=nothing, got {', '.join(rows) or 'no job'}")
-    found = {"overrides": sorted(overrides), "rows": rows}
-    return write_section(root, "network", "ablation", found, machine_record(root))
+    section = {"overrides": sorted(overrides), "rows": rows}
+    return write_section(root, "network", "ablation", section, machine_record(root))
 
 
 def ablation_about(root: Path, name: str) -> str:

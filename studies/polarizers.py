@@ -92,10 +92,10 @@ def main() -> None:
         s0, dolp, aolp = polarization_from_rgb(rgb)
         for sensor, config in SENSORS_CHECKED.items():
             for factor in FACTORS:
-                seen = simulate(scene_from_polarization(s0, factor * dolp, aolp), motion, config, seed=1)
-                case = f"{photo.path.stem}, {sensor}, x {factor:g}", float(seen.dolp.mean())
-                results["four channels"].append(result_of(*case, seen.events, mosaic=False))
-                cells = split_mosaic(mosaic_of(seen.events, ORDER), ORDER)
+                simulation = simulate(scene_from_polarization(s0, factor * dolp, aolp), motion, config, seed=1)
+                case = f"{photo.path.stem}, {sensor}, x {factor:g}", float(simulation.dolp.mean())
+                results["four channels"].append(result_of(*case, simulation.events, mosaic=False))
+                cells = split_mosaic(mosaic_of(simulation.events, ORDER), ORDER)
                 results["mosaic"].append(result_of(*case, cells, mosaic=True))
         print(f"{photo.path.stem} done", flush=True)
     print(

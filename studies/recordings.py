@@ -33,7 +33,7 @@ from polarnet.events.stream import Events
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.recording import open_recording
 from polarnet.storage.events import EventStore
-from studies.celex5_bin_writer import write_celex5_bin
+from studies.celex5_writer import write_celex5_bin
 from studies.measure import machine_record, read_results, uncommitted, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -75,16 +75,13 @@ def events_of(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> Eve
     return Events(t_us, column, row, polarity, HEIGHT, WIDTH)
 
 
-def write_bin(event_format: int) -> Callable[[Path, int], None]:
-    def write(path: Path, count: int) -> None:
-        t, x, y, p = next(parts(count))
-        write_celex5_bin(path, events_of(t, x, y, p), event_format)
-        content = path.read_bytes()
-        with path.open("ab") as file:
-            for _ in range(PART, count, PART):
-                file.write(content[12:])  # its time stamps begin again: a turn of their few bits
-
-    return write
+def write_bin(path: Path, count: int) -> None:
+    t, x, y, p = next(parts(count))
+    write_celex5_bin(path, events_of(t, x, y, p))
+    content = path.read_bytes()
+    with path.open("ab") as file:
+        for _ in range(PART, count, PART):
+            file.write(content[12:])  # its time stamps begin again: a turn of their few bits
 
 
 def write_dsec(path: Path, count: int) -> None:
@@ -166,7 +163,7 @@ def write_by_faery(ending: str) -> Callable[[Path, int], None]:
 
 def read_own(path: Path) -> int:
     height, width = (HEIGHT, WIDTH) if path.suffix == ".text" else (None, None)
-    reader = open_recording(path, height=height, width=width, part="0", assume_polarity=1)
+    reader = open_recording(path, height=height, width=width, part="0")
     return sum(map(len, reader))
 
 
@@ -225,8 +222,7 @@ def read_numpy(path: Path) -> int:
 
 FILES: dict[str, Callable[[Path, int], None]] = {
     "celex5_csv": write_csv,
-    "celex5_bin": write_bin(1),
-    "celex5_bin_format_2": write_bin(2),
+    "celex5_bin": write_bin,
     "text": write_lines,
     "dsec": write_dsec,
     "e2p": write_e2p,
@@ -335,8 +331,8 @@ def main() -> None:
         figures = measure(name, [*SIZES, *([LARGEST] if arguments.full else [])], arguments.repeats)
         if arguments.write:
             known = read_results(ROOT, "recordings").get("readers", {})
-            found = {reader: figure | {"commit": record["commit"]} for reader, figure in figures.items()}
-            path = write_section(ROOT, "recordings", "readers", known | found, record)
+            latest = {reader: figure | {"commit": record["commit"]} for reader, figure in figures.items()}
+            path = write_section(ROOT, "recordings", "readers", known | latest, record)
             print(f"written to {path.relative_to(ROOT)}", flush=True)
 
 

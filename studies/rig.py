@@ -30,17 +30,17 @@ from polarnet.benchmark.rows import available
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.score import FrameScore, summary
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig, read_event_capture
-from polarnet.captures.imported import import_targets, shifted
-from polarnet.captures.targets import Calibrated, calibrate_targets, spread_us
+from polarnet.captures.imported import import_targets
+from polarnet.captures.targets import Calibrated, calibrate_targets
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, load
 from polarnet.events.stream import Events, slice_time
 from polarnet.pictures.dead_leaves import dead_leaves
+from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.registration import event_image, register, warped
-from polarnet.reports.calibration import draw_calibration, draw_hot_pixels, draw_registration
-from polarnet.reports.recordings import recording_picture
+from polarnet.reports.recordings import draw_calibration, draw_hot_pixels, draw_registration, recording_picture
 from polarnet.reports.tables import as_plain, score_table
 from polarnet.runtime.machine import generator_for
 from polarnet.simulation.emulator import EmulatorConfig
@@ -211,19 +211,19 @@ def main() -> None:
     record: dict[str, Any] = machine_record(ROOT)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        found = list(measured(folder, arguments.targets, rig, recordings, emulator, arguments.pictures))
-        scores = benchmarked(folder, [one.name for _, one, _ in found], config)
+        results = list(measured(folder, arguments.targets, rig, recordings, emulator, arguments.pictures))
+        scores = benchmarked(folder, [one.name for _, one, _ in results], config)
     figures = {
-        "captures": 8 * len(found),
+        "captures": 8 * len(results),
         "sensor": list(recordings.sensor),
         "photoreceptor_cutoff_hz": arguments.cutoff_hz,
-        "start_error_frames_max": round(max(landmark_frames(truth, one, rig) for truth, one, _ in found), 3),
+        "start_error_frames_max": round(max(landmark_frames(truth, one, rig) for truth, one, _ in results), 3),
         "refined_error_ms_max": round(
-            max(float(np.abs(spread_us(one.start_us, truth.start_us)).max()) for truth, one, _ in found) / 1000, 3
+            max(float(np.abs(spread_us(one.start_us, truth.start_us)).max()) for truth, one, _ in results) / 1000, 3
         ),
-        "clock_zero_ms_max": round(max(abs(clock_zero_us(truth, one)) for truth, one, _ in found) / 1000, 3),
-        "dolp_rms": round(float(np.mean([squared for _, _, squared in found])) ** 0.5, 5),
-        "dolp_rms_max": round(max(squared for _, _, squared in found) ** 0.5, 5),
+        "clock_zero_ms_max": round(max(abs(clock_zero_us(truth, one)) for truth, one, _ in results) / 1000, 3),
+        "dolp_rms": round(float(np.mean([squared for _, _, squared in results])) ** 0.5, 5),
+        "dolp_rms_max": round(max(squared for _, _, squared in results) ** 0.5, 5),
         "benchmark": scores,
     }
     print(json.dumps(figures, indent=2))

@@ -98,16 +98,16 @@ def main() -> None:
     arguments = parsed()
     record = machine_record(ROOT)
     photographs = without_test_split(arguments)
-    found: dict[str, Any] = {}
+    choices: dict[str, Any] = {}
     for seed in range(1, arguments.seeds + 1):
         for name in CHOICES:
             scores = scored(name, seed, photographs, arguments)
-            row = found.setdefault(name, {"seeds": []})
+            row = choices.setdefault(name, {"seeds": []})
             row["seeds"].append(scores["ours"])
-            found["oracle_mean"] = {"seeds": [scores["oracle_mean"]]}
+            choices["oracle_mean"] = {"seeds": [scores["oracle_mean"]]}
             print(name, seed, json.dumps(scores["ours"]), flush=True)
     if arguments.write:
-        print(write_section(ROOT, "scenes", "choices", {"overrides": SHORT, "rows": found}, record))
+        print(write_section(ROOT, "scenes", "choices", {"overrides": SHORT, "rows": choices}, record))
 
 
 if __name__ == "__main__":

@@ -12,28 +12,27 @@ import dataclasses
 import json
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64, UInt16
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 from torch import Tensor
 
 from polarnet import stokes
 from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
 from polarnet.events.stream import Events, merge
-from polarnet.recordings.formats.celex5 import HEIGHT, WHITE, WIDTH
-from polarnet.recordings.formats.celex5_csv import write_celex5_csv
+from polarnet.recordings.formats.celex5_bin import HEIGHT, WHITE, WIDTH
 from polarnet.runtime.machine import generator_for, seed_for
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory, render
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene
-from studies.celex5_bin_writer import write_celex5_bin, write_celex5_pictures
+from studies.celex5_writer import write_celex5_bin, write_celex5_csv, write_celex5_pictures
 
 STRIPE_S0, LANDMARK_S0 = 0.8, 0.04  # unpolarized
 SHORTEST_DELAY_S = 0.08  # from the start of a capture to the landmark
@@ -42,28 +41,25 @@ BORDER = 2  # margin of the scene around the area that the sensor sees, in pixel
 _STILL = Sine(0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
+@section
 class RigConfig:
     """Motion of the rig and noise of its camera; RecordingsConfig gives sensor, region, crop and size."""
 
-    speed_px_s: float = field(metadata=allowed(above=0))
+    speed_px_s: PositiveFloat
     """Speed of the image on the sensor, in sensor pixels per second."""
-    longest_delay_s: float = field(metadata=allowed(above=SHORTEST_DELAY_S))
+    longest_delay_s: Annotated[float, Field(gt=SHORTEST_DELAY_S)]
     """Maximum time from the random start of a capture to the landmark."""
-    duration_s: float = field(metadata=allowed(above=0))
+    duration_s: PositiveFloat
     """Duration of a capture after the landmark."""
-    picture_rate_hz: float = field(metadata=allowed(above=0))
-    full_well_electrons: float = field(metadata=allowed(above=0))
+    picture_rate_hz: PositiveFloat
+    full_well_electrons: PositiveFloat
     """Electrons collected by a white pixel of an intensity capture; sets the shot noise."""
-    read_noise: float = field(metadata=allowed(low=0))
+    read_noise: NonNegativeFloat
     """Read noise of an intensity image, in steps of 12 bits."""
-    hot_pixels: int = field(metadata=allowed(low=0))
+    hot_pixels: NonNegativeInt
     """Number of hot pixels, the same in all four event captures; each fires a few thousand times a second."""
-    file_type: str = field(metadata=allowed(choices=("bin", "csv")))
+    file_type: Annotated[str, one_of(("bin", "csv"))]
     """File type of the event captures; intensity captures are always BIN."""
-
-    def __post_init__(self):
-        check_ranges(self)
 
 
 class RigTruth(NamedTuple):
@@ -120,11 +116,11 @@ def write_rig(
         noisy = merge([events, _hot_events(hot, total_us, height, width, generator)])
         begin_us = landmark_us - start_us[capture]
         later = noisy.t >= begin_us
-        seen = Events(
+        capture_events = Events(
             noisy.t[later] - begin_us, noisy.x[later], noisy.y[later], noisy.p[later], height, width
         )  # fmt: skip
         write = write_celex5_bin if config.file_type == "bin" else write_celex5_csv
-        write(folder / f"{capture}.{config.file_type}", seen)
+        write(folder / f"{capture}.{config.file_type}", capture_events)
     for polarizer, capture in enumerate(INTENSITY_CAPTURES):
         begin_us = landmark_us - start_us[capture]
         count = int((total_us - begin_us) * 1e-6 * config.picture_rate_hz)
@@ -168,8 +164,8 @@ def true_intensity(
     path = dataclasses.replace(truth.path, x=truth.path.x + right, y=truth.path.y + down)
     frames = []
     for t in t_us.tolist():
-        seen = render(truth.scene, path, np.array([(t + truth.landmark_us) * 1e-6]), height, width)[0]
-        planes = np.ascontiguousarray(stokes.intensities_from_stokes(seen).clamp(0, 1).permute(1, 2, 0).numpy())
+        stokes_frame = render(truth.scene, path, np.array([(t + truth.landmark_us) * 1e-6]), height, width)[0]
+        planes = np.ascontiguousarray(stokes.intensities_from_stokes(stokes_frame).clamp(0, 1).permute(1, 2, 0).numpy())
         small = cv2.resize(planes, tuple(recordings.size[::-1]), interpolation=cv2.INTER_AREA)
         frames.append(torch.from_numpy(small).permute(2, 0, 1))
     return torch.stack(frames)
@@ -202,8 +198,8 @@ def _pictures(
 ) -> Iterator[UInt16[np.ndarray, "800 1280"]]:
     height, width = recordings.sensor
     for t in t_us:
-        seen = render(scene, path, np.array([t * 1e-6]), height, width)[0]
-        light = stokes.intensities_from_stokes(seen)[polarizer].clamp(0, 1).numpy()
+        stokes_frame = render(scene, path, np.array([t * 1e-6]), height, width)[0]
+        light = stokes.intensities_from_stokes(stokes_frame)[polarizer].clamp(0, 1).numpy()
         electrons = light * config.full_well_electrons
         noise = np.hypot(np.sqrt(electrons) * (WHITE / config.full_well_electrons), config.read_noise)
         values = light * WHITE + noise * generator.standard_normal(light.shape, dtype=np.float32)
@@ -248,3 +244,9 @@ def _write_truth(folder: Path, truth: RigTruth, config: RigConfig, recordings: R
         "dolp": "truth.npz: t_us from the landmark on, dolp of each of these times",
     }
     (folder / "truth.json").write_text(json.dumps(content, indent=2) + "\n")
+
+
+def spread_us(starts: Mapping[str, int], others: Mapping[str, int]) -> list[float]:
+    """Differences between two sets of start times, minus their mean: the zero of the clock is a convention."""
+    differences = np.array([starts[c] - others[c] for c in (*EVENT_CAPTURES, *INTENSITY_CAPTURES)], float)
+    return (differences - differences.mean()).tolist()

@@ -23,9 +23,8 @@ from polarnet.events.stream import Events, slice_time
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import read_rgb
 from polarnet.reports.figures import LIGHT, chart_style, show_picture
-from polarnet.reports.maps import event_image
+from polarnet.reports.maps import event_image, png
 from polarnet.reports.overview import OFF, ON
-from polarnet.reports.png import png
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, random_trajectory, sensor_to_scene
 from polarnet.simulation.moving_sensor import emulate_motion
@@ -147,8 +146,8 @@ def crossings_figure() -> Figure:
         )
         curve.grid(axis="y", visible=False)
         for row, model in enumerate(("exact", "v2e")):
-            shown = slice_time(pixel_events(replace(QUIET, model=model), rate_hz), 0, int(1000 * t_ms[-1]))
-            _ticks(stamps, shown, row, 0.7)
+            drawn_events = slice_time(pixel_events(replace(QUIET, model=model), rate_hz), 0, int(1000 * t_ms[-1]))
+            _ticks(stamps, drawn_events, row, 0.7)
         stamps.set_yticks([0.35, 1.35], ["exact", "v2e"])
         stamps.set(ylim=(1.9, -0.2), xlabel="ms", xlim=(0, t_ms[-1]))
         stamps.grid(visible=False)

@@ -27,7 +27,7 @@ from statistics import fmean
 from typing import Any
 
 from polarnet.reports.figures import LIGHT
-from polarnet.reports.png import png
+from polarnet.reports.maps import png
 from studies.blocks import best_reconstruction, seeds_of
 from studies.figures import expected_errors_figure
 from studies.measure import ABLATION_KEYS, machine_record, measure_benchmark, read_results, uncommitted, write_section
@@ -176,7 +176,7 @@ def main() -> None:
         {name: json.loads((path / file).read_text()) for name, path in folders_of.items()}
         for file in ("metrics.json", "details.json")
     )
-    found: dict[str, Any] = {
+    contents: dict[str, Any] = {
         "minutes_trained": {row: json.loads((path / "minutes.json").read_text()) for row, path in folders.items()},
         "threads": arguments.threads,
         "overrides": arguments.override,
@@ -187,8 +187,8 @@ def main() -> None:
     }
     both = {"ours", "paper"} <= set(arguments.rows)
     if both:
-        found |= headlines(tables)
-    print(json.dumps({key: value for key, value in found.items() if key != "rows"}, indent=2))
+        contents |= headlines(tables)
+    print(json.dumps({key: value for key, value in contents.items() if key != "rows"}, indent=2))
     if not arguments.write:
         return
     if "ours" in arguments.rows and not arguments.ours:
@@ -196,10 +196,12 @@ def main() -> None:
             name: {"mse": tables[name]["ours"]["mse"], **about["reliability"]["ours"]}
             for name, about in details.items()
         }
-        expected_errors(section, {"minutes_trained": found["minutes_trained"]["ours"], "sets": sets_of}, record)
+        expected_errors(section, {"minutes_trained": contents["minutes_trained"]["ours"], "sets": sets_of}, record)
     if both:
-        seeds = seeds_of(read_results(ROOT, "network") | {section: found})
-        print(write_section(ROOT, "network", section, found, record, over_seeds([*seeds.values()]) if seeds else None))
+        seeds = seeds_of(read_results(ROOT, "network") | {section: contents})
+        print(
+            write_section(ROOT, "network", section, contents, record, over_seeds([*seeds.values()]) if seeds else None)
+        )
     if set(arguments.rows) == set(TRAININGS):
         print(measure_benchmark(ROOT, results, record))
         print(event_budget(arguments, best["ours"], record))

@@ -202,13 +202,13 @@ def measure(names: list[str], settings: list[str], rounds: int, threads: int, de
 
 def headlines(networks: dict[str, Any]) -> dict[str, Any]:
     """The figures of docs/results/network.json that stand above its sections."""
-    found: dict[str, Any] = {}
+    figures: dict[str, Any] = {}
     if "paper" in networks:
-        found["train_speedup_over_eager_fp32"] = networks["paper"]["shipped_over_naive"]["train_frames_per_s"]
-        found["infer_windows_per_s"] = networks["paper"]["shipped"]["infer_windows_per_s"]
+        figures["train_speedup_over_eager_fp32"] = networks["paper"]["shipped_over_naive"]["train_frames_per_s"]
+        figures["infer_windows_per_s"] = networks["paper"]["shipped"]["infer_windows_per_s"]
     if "polarnet" in networks:
-        found["ours"] = {"infer_windows_per_s": networks["polarnet"]["shipped"]["infer_windows_per_s"]}
-    return found
+        figures["ours"] = {"infer_windows_per_s": networks["polarnet"]["shipped"]["infer_windows_per_s"]}
+    return figures
 
 
 def main() -> None:

@@ -14,16 +14,24 @@ HERE = Path(__file__).parent
 SLOWEST_FIRST = (
     "pipeline/test_stages.py",
     "pipeline/test_dvc.py",
+    "training/test_loop.py",
     "networks/test_onnx_export.py",
-    "pipeline/test_interruptions.py",
-    "captures/test_rig.py",
     "reference/test_golden.py",
-    "recordings/test_fuzz.py",
     "config/test_config.py",
-    "simulation/test_emulator.py",
+    "runtime/test_cluster.py",
+    "pipeline/test_interruptions.py",
+    "training/test_parallel.py",
+    "cli/test_own_scenes.py",
+    "benchmark/test_benchmark.py",
+    "training/test_calibration.py",
+    "recovery/test_recover.py",
+    "storage/test_parts.py",
+    "methods/test_methods.py",
+    "reports/test_page.py",
+    "config/test_sweep.py",
 )
 """Files that take longest; the others follow, so no worker is left with a long one when the rest is done."""
-LARGE_PACKAGES = ("torch", "scipy.stats", "numba", "cv2", "zarr", "matplotlib.figure", "hydra", "dvclive")
+LARGE_PACKAGES = ("torch", "scipy.stats", "numba", "cv2", "zarr", "matplotlib.figure", "hydra")
 FUZZ_CASES = {"local": 50, "ci": 150}
 
 
@@ -169,7 +177,9 @@ def write_trial() -> Callable[..., None]:
         }
         if validation or test:
             scores = validation or {"mse": 0.5, "psnr": 3.0}
-            files["train/ours/history.json"] = json.dumps([{"train": loss, "val": scores}])
+            row = {f"train_{name}": value for name, value in loss.items()}
+            row |= {f"val_{name}": value for name, value in scores.items()}
+            files["train/ours/history.csv"] = f"epoch,{','.join(row)}\n0,{','.join(map(str, row.values()))}\n"
         if test:
             files["benchmark/metrics.json"] = json.dumps({"ours": test, "zeros": {}})
         if failure:

@@ -7,7 +7,7 @@ from polarnet.benchmark.rows import Context
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import Events
 from polarnet.methods import METHODS
-from polarnet.methods.complementary_filter import ComplementaryFilterConfig, HighPassConfig
+from polarnet.methods.complementary_filter import FilterConfig
 from polarnet.methods.method import Setup
 from polarnet.methods.postprocessing import PostprocessingConfig
 from polarnet.methods.stokes_gain import GainConfig
@@ -29,8 +29,8 @@ NETWORK = {
     "input_mixing": "contrasts",
 }
 SECTIONS = {
-    "cf": ComplementaryFilterConfig(0.5, 0.1, -0.1, [-0.1, 1.2]),
-    "highpass": HighPassConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5]),
+    "cf": FilterConfig(0.5, 0.0, 0.1, -0.1, [-0.1, 1.2]),
+    "highpass": FilterConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5]),
 }
 
 

@@ -86,6 +86,13 @@ def warnings(used: Conditions, checkpoints: Mapping[str, Mapping[str, Any]], adv
     return [f"{', '.join(of)}: {text}" for text, of in rows.items() if text]
 
 
+def announced(used: Conditions, checkpoints: Mapping[str, Mapping[str, Any]], advice: str) -> dict[str, Any]:
+    """Print size, duration and sensor, and the `warnings`; returns both and the sections for details.json."""
+    differences = warnings(used, checkpoints, advice)
+    print("\n".join([sentence(used), *(f"WARNING: {line}" for line in differences)]), flush=True)
+    return {"sentence": sentence(used), "warnings": differences, **used._asdict()}
+
+
 def _warning(used: Conditions, trained: Conditions | None, advice: str) -> str:
     if trained is None:
         return "the checkpoint does not say what it was trained on, so size and sensor were not compared."

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from polarnet.benchmark.resimulate import sequence_at
 from polarnet.benchmark.rows import Context, opened, predictions_of
-from polarnet.benchmark.score import FrameScore, scene_means, score_sequence
+from polarnet.benchmark.score import FrameScore, mean_scores, score_sequence
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import Events, slice_count
 from polarnet.events.streaming import EventWindow
@@ -63,7 +63,7 @@ def since_start(sequences: Iterable[TestSequence], methods: Sequence[str], conte
                 "from": BIN_EDGES[k],
                 "to": BIN_EDGES[k + 1] if math.isfinite(BIN_EDGES[k + 1]) else None,
                 "events_per_pixel": float(np.mean(rates[k])),
-                **_means([row for row in rows[k] if row.method == method]),
+                **_means(rows[k], method),
             }
             for k in sorted(rows)
         ]
@@ -101,16 +101,15 @@ def by_window_length(
             rows += score_sequence(test, predictions, warmup, None, context.device)
             per_window.append(float(events_per_pixel(test.events, t_us).diff().mean()))
         for method in methods:
-            of_method = [row for row in rows if row.method == method]
-            entry = {"window_us": length_us, "events_per_pixel": float(np.mean(per_window)), **_means(of_method)}
+            entry = {"window_us": length_us, "events_per_pixel": float(np.mean(per_window)), **_means(rows, method)}
             table[method].append(entry)
     return table
 
 
-def _means(rows: Sequence[FrameScore]) -> dict[str, Any]:
-    means = {metric: scene_means(rows, metric) for metric in SHOWN}
-    scores = {metric: float(np.mean([*next(iter(of.values())).values()])) for metric, of in means.items() if of}
-    return {"frames": len(rows), "scenes": len({row.scene for row in rows}), **scores}
+def _means(rows: Sequence[FrameScore], method: str) -> dict[str, Any]:
+    of_method = [row for row in rows if row.method == method]
+    scenes = {row.scene for row in of_method}
+    return {"frames": len(of_method), "scenes": len(scenes), **mean_scores(of_method, SHOWN)[method]}
 
 
 @torch.no_grad()

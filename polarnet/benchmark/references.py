@@ -13,7 +13,7 @@ from polarnet.stokes import Prediction
 
 @dataclass(frozen=True)
 class Reference:
-    """A row beside the methods, with constant DoLP over a frame; `polarnet.reports.rows` has its label."""
+    """A row beside the methods, with constant DoLP over a frame; `polarnet.reports.legend` has its label."""
 
     name: str
     predict: Callable[[TestSequence, float | None], Prediction]

@@ -52,17 +52,11 @@ def resimulated(
         )
         trajectory = random_trajectory(quicker, scene.height, scene.width, generator_for(seed, sequence, "motion"))
     t_us = torch.tensor(frame_times_us(motion))
-    events: list[Events] = []
-    made: list[tuple[EmulatorConfig, list[Events]]] = []
-    for polarizer, config in enumerate(emulate):
-        sensor = randomised(config, generator_for(seed, sequence, "sensor"))
-        seen = next((of_all for known, of_all in made if known == sensor), None)
-        if seen is None:
-            key = seed_for(seed, sequence, "emulate")
-            size = scenes.sensor_height, scenes.sensor_width
-            seen = emulate_motion(scene, trajectory, int(t_us[-1]), *size, sensor, key, threads)
-            made.append((sensor, seen))
-        events.append(seen[polarizer])
+    sensors = [randomised(config, generator_for(seed, sequence, "sensor")) for config in emulate]
+    distinct = [sensor for i, sensor in enumerate(sensors) if sensor not in sensors[:i]]
+    size, key = (scenes.sensor_height, scenes.sensor_width), seed_for(seed, sequence, "emulate")
+    channels = [emulate_motion(scene, trajectory, int(t_us[-1]), *size, one, key, threads) for one in distinct]
+    events = [channels[distinct.index(sensor)][polarizer] for polarizer, sensor in enumerate(sensors)]
     return _test_sequence(scenes, record, scene, trajectory, events, t_us)
 
 
@@ -78,4 +72,4 @@ def _test_sequence(
     intensity, dolp, aolp = (frames[1:] for frames in frames_of(scene, trajectory, t_us.tolist(), *size))
     valid = None if record.valid is None else valid_frames(record.valid, trajectory, t_us.tolist()[1:], *size)
     s0 = intensity[:, 0] + intensity[:, 2]
-    return TestSequence(record.name, record.picture, events, t_us, dolp, aolp, s0, valid)
+    return TestSequence(record.name, record.scene, events, t_us, dolp, aolp, s0, valid)

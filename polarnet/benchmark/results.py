@@ -46,5 +46,5 @@ def write_benchmark(
         (folder / f"{name}.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
     write_frames(folder / "frames.csv", benchmark.rows)
     for panel in benchmark.panels:
-        write_panel(folder / "panels" / f"{panel.sequence}.npz", panel)
+        write_panel(folder / "panels", panel)
     return {method: {**metrics[method], **costs[method]} for method in metrics}

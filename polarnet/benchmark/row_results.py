@@ -20,7 +20,6 @@ from polarnet.benchmark.score import Cost, FrameScore
 from polarnet.metrics.reliability import Reliability
 
 MADE_BY = "run `dvc repro`, or `python -m stages.benchmark` for all rows"
-DOLP, AOLP = "dolp_", "aolp_"  # prefixes of the predictions of a method in a panel's file
 
 
 class RowRecord(NamedTuple):
@@ -46,9 +45,7 @@ def write_row(folder: Path, row: str, record: RowRecord, sets: Mapping[str, Benc
         }
         (folder / name / "results.json").write_text(json.dumps(results) + "\n")
         for panel in benchmark.panels:
-            aolp = {row: panel.aolp[row]} if row in panel.aolp else {}
-            of_row = dataclasses.replace(panel, dolp={row: panel.dolp[row]}, aolp=aolp)
-            write_panel(folder / name / "panels" / f"{panel.sequence}.npz", of_row)
+            write_panel(folder / name / "panels", panel.of_row(row))
     (folder / "row.json").write_text(json.dumps(record._asdict(), indent=2) + "\n")
 
 
@@ -78,9 +75,7 @@ def read_rows(folders: Mapping[str, Path], test_set: str) -> Benchmark:
         costs[row] = Cost(**results["cost"])
         if results["reliability"] is not None:
             sums[row] = Reliability(*(torch.tensor(sum_, dtype=torch.float64) for sum_ in results["reliability"]))
-        scene_of = {score.sequence: score.scene for score in frames[row]}
-        files = sorted((folder / test_set / "panels").glob("*.npz"))
-        panels[row] = {file.stem: read_panel(file, scene_of[file.stem]) for file in files}
+        panels[row] = {file.stem: read_panel(file) for file in (folder / test_set / "panels").glob("*.npz")}
     first = next(iter(folders))
     sequences = _sequences(frames[first])
     for row in folders:
@@ -93,33 +88,18 @@ def read_rows(folders: Mapping[str, Path], test_set: str) -> Benchmark:
     return Benchmark(ordered, costs, together, sums)
 
 
-def write_panel(path: Path, panel: Panel) -> None:
-    """Write a panel as arrays `events`, `truth_dolp`, ..., `dolp_METHOD` and `aolp_METHOD`."""
-    frames = {
-        "events": panel.events,
-        "truth_dolp": panel.truth_dolp,
-        "truth_aolp": panel.truth_aolp,
-        "truth_s0": panel.truth_s0,
-        **{f"{DOLP}{method}": frame for method, frame in panel.dolp.items()},
-        **{f"{AOLP}{method}": frame for method, frame in panel.aolp.items()},
-    }
-    arrays: dict[str, Any] = {name: frame.numpy() for name, frame in frames.items()}
-    np.savez(path, window=np.int64(panel.window), t_us=np.int64(panel.t_us), **arrays)
+def write_panel(folder: Path, panel: Panel) -> None:
+    """Write SEQUENCE.npz: `window`, `t_us` and the maps of a panel by their names."""
+    arrays: dict[str, Any] = {name: frame.numpy() for name, frame in panel.maps.items()}
+    np.savez(folder / f"{panel.sequence}.npz", window=np.int64(panel.window), t_us=np.int64(panel.t_us), **arrays)
 
 
-def read_panel(path: Path, scene: str) -> Panel:
-    """Read a file of `write_panel`, whose name is that of a sequence over `scene`."""
+def read_panel(path: Path) -> Panel:
+    """Read a file of `write_panel`."""
     with np.load(path) as file:
-        arrays = {name: file[name] for name in file.files}
-    maps = {name: torch.from_numpy(array) for name, array in arrays.items() if array.dtype == np.float32}
-
-    def by_method(prefix: str) -> dict[str, torch.Tensor]:
-        return {name.removeprefix(prefix): frame for name, frame in maps.items() if name.startswith(prefix)}
-
-    return Panel(
-        path.stem, scene, int(arrays["window"]), int(arrays["t_us"]), maps["events"],
-        maps["truth_dolp"], maps["truth_aolp"], maps["truth_s0"], by_method(DOLP), by_method(AOLP),
-    )  # fmt: skip
+        arrays = dict(file)
+    window, t_us = int(arrays.pop("window")), int(arrays.pop("t_us"))
+    return Panel(path.stem, window, t_us, {name: torch.from_numpy(array) for name, array in arrays.items()})
 
 
 def _sequences(frames: Sequence[FrameScore]) -> list[str]:
@@ -128,6 +108,4 @@ def _sequences(frames: Sequence[FrameScore]) -> list[str]:
 
 def _together(panels: Sequence[Panel]) -> Panel:
     """One panel with the predictions of all of `panels`, which show the same window."""
-    dolp = {method: frame for panel in panels for method, frame in panel.dolp.items()}
-    aolp = {method: frame for panel in panels for method, frame in panel.aolp.items()}
-    return dataclasses.replace(panels[0], dolp=dolp, aolp=aolp)
+    return dataclasses.replace(panels[0], maps={name: frame for panel in panels for name, frame in panel.maps.items()})

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -30,40 +30,31 @@ from polarnet.storage.frames import (
 
 @dataclass(frozen=True)
 class Panel:
-    """One window of one scene: its events, the truth, and the prediction of each method."""
+    """One window of one sequence: its events, the truth, and the predictions of rows."""
 
     sequence: str
-    scene: str
     window: int
     t_us: int
-    events: Float[Tensor, "4 h w"]
-    """The window's event tensors (Eq. 5)."""
-    truth_dolp: Float[Tensor, "h w"]
-    truth_aolp: Float[Tensor, "h w"]
-    truth_s0: Float[Tensor, "h w"]
-    dolp: Mapping[str, Float[Tensor, "h w"]]
-    aolp: Mapping[str, Float[Tensor, "h w"]]
-    """AoLP by method, for the methods that predict it."""
+    maps: Mapping[str, Float[Tensor, "*channel h w"]]
+    """`events` (the four event tensors, Eq. 5), `truth_dolp`, `truth_aolp`, `truth_s0`; `dolp_ROW` and, if the row
+    predicts it, `aolp_ROW`."""
+
+    def of_row(self, row: str) -> "Panel":
+        """The same window with the predictions of one row."""
+        names = [name for name in self.maps if not name.startswith(("dolp_", "aolp_"))]
+        maps = {name: self.maps[name] for name in (*names, f"dolp_{row}", f"aolp_{row}") if name in self.maps}
+        return replace(self, maps=maps)
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Results of one test set."""
+    """Results of one test set, or of one of its sequences."""
 
     rows: Sequence[FrameScore]
     costs: Mapping[str, Cost]
     panels: Sequence[Panel]
     reliability: Mapping[str, Reliability] = field(default_factory=dict)
     """Reliability of the expected errors, for the methods that predict them."""
-
-
-@dataclass(frozen=True)
-class SequenceResult:
-    """Results of one sequence, from one pass over it."""
-
-    rows: Sequence[FrameScore]
-    reliability: Mapping[str, Reliability]
-    panel: Panel | None
 
 
 @dataclass(frozen=True)
@@ -129,7 +120,7 @@ def run_benchmark(
     task = functools.partial(
         _measured, test_set=test_set, context=context, config=config, lpips=lpips, panel_sequences=panels
     )
-    results: list[SequenceResult] = list(mapper(task, names))
+    results: list[Benchmark] = list(mapper(task, names))
     first = test_set.sequence(names[0])
     costs = {row: cost_of(row, first, context) for row in config.methods}
     sums: dict[str, Reliability] = {}
@@ -137,7 +128,7 @@ def run_benchmark(
         for method, here in result.reliability.items():
             sums[method] = sums[method] + here if method in sums else here
     rows = [row for result in results for row in result.rows]
-    return Benchmark(rows, costs, [result.panel for result in results if result.panel is not None], sums)
+    return Benchmark(rows, costs, [panel for result in results for panel in result.panels], sums)
 
 
 def _measured(
@@ -147,16 +138,16 @@ def _measured(
     config: BenchmarkConfig,
     lpips: Lpips | None,
     panel_sequences: Collection[str],
-) -> SequenceResult:
-    """Run and score every row on one sequence, which is read once."""
+) -> Benchmark:
+    """Run and score every row on one sequence, which is read once; without costs."""
     sequence = test_set.sequence(name)
     predictions = {
         row: at_stored_precision(row, name, prediction)
         for row, prediction in predictions_of(config.methods, sequence, context).items()
     }
     rows = score_sequence(sequence, predictions, config.warmup_windows, lpips, context.device)
-    panel = _panel(sequence, predictions, config.warmup_windows) if name in panel_sequences else None
-    return SequenceResult(rows, _reliability(sequence, predictions, config.warmup_windows), panel)
+    panels = [_panel(sequence, predictions, config.warmup_windows)] if name in panel_sequences else []
+    return Benchmark(rows, {}, panels, _reliability(sequence, predictions, config.warmup_windows))
 
 
 def at_stored_precision(row: str, sequence: str, prediction: Prediction) -> Prediction:
@@ -204,15 +195,14 @@ def _panel(sequence: TestSequence, predictions: Mapping[str, Prediction], warmup
     """Panel of the middle scored window."""
     windows = scored_windows(sequence, warmup_windows)
     k = windows[len(windows) // 2]
-    return Panel(
-        sequence.name,
-        sequence.scene,
-        k,
-        int(sequence.t_us[k + 1]),
-        encode_windows(sequence.events, sequence.t_us[k : k + 2], event_tensor)[0],
-        sequence.dolp[k],
-        sequence.aolp[k],
-        sequence.s0[k],
-        {method: prediction.dolp[k] for method, prediction in predictions.items()},
-        {method: prediction.aolp[k] for method, prediction in predictions.items() if prediction.aolp is not None},
-    )
+    maps = {
+        "events": encode_windows(sequence.events, sequence.t_us[k : k + 2], event_tensor)[0],
+        "truth_dolp": sequence.dolp[k],
+        "truth_aolp": sequence.aolp[k],
+        "truth_s0": sequence.s0[k],
+    }
+    for row, prediction in predictions.items():
+        maps[f"dolp_{row}"] = prediction.dolp[k]
+        if prediction.aolp is not None:
+            maps[f"aolp_{row}"] = prediction.aolp[k]
+    return Panel(sequence.name, k, int(sequence.t_us[k + 1]), maps)

@@ -3,13 +3,14 @@
 import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor
 
 from polarnet.benchmark.rows import ROWS
@@ -30,7 +31,7 @@ from polarnet.metrics.similarity import (
     with_truth_outside,
 )
 from polarnet.runtime.machine import generator_for
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import one_of, section
 from polarnet.stokes import Prediction
 
 METRICS = ("mse", "psnr", "ssim", "lpips", "corr", "grad", "level_mse", "pattern_mse", "aolp_deg", "skill")
@@ -41,30 +42,27 @@ INTERVAL = (0.025, 0.975)  # quantiles of the bootstrap: 95 %
 FRAMES_AT_ONCE = 8  # batch size of LPIPS, which bounds the memory of its features
 
 
-@dataclass(frozen=True)
+@section
 class BenchmarkConfig:
     """Section `benchmark` of params.yaml."""
 
-    methods: list[str]
+    methods: list[Annotated[str, one_of(ROWS)]]
     """Rows of the table: references and methods."""
-    sets: list[str] = field(metadata=allowed(choices=SETS))
+    sets: list[Annotated[str, one_of(SETS)]]
     """Test sets; must include simulated."""
-    warmup_windows: int = field(metadata=allowed(low=0))
+    warmup_windows: NonNegativeInt
     """Unscored windows at the start of a sequence, the same for all methods: nothing has moved far enough yet."""
-    precision: str = field(metadata=allowed(choices=("fp32", "bf16")))
+    precision: Annotated[str, one_of(("fp32", "bf16"))]
     """Precision of the networks; scores in fp32 do not depend on a processor's bf16 kernels."""
     lpips: bool
     """Whether to compute LPIPS."""
-    lpips_backbone: str = field(metadata=allowed(choices=tuple(BACKBONES)))
+    lpips_backbone: Annotated[str, one_of(BACKBONES)]
     """Backbone of LPIPS, always in fp32; the paper uses vgg."""
-    bootstrap_samples: int = field(metadata=allowed(low=1))
-    panel_scenes: int = field(metadata=allowed(low=0))
+    bootstrap_samples: PositiveInt
+    panel_scenes: NonNegativeInt
     """Number of scenes shown as panels."""
 
     def __post_init__(self):
-        check_ranges(self)
-        if unknown := [row for row in self.methods if row not in ROWS]:
-            raise ValueError(f"methods: expected some of {', '.join(ROWS)}, got {', '.join(unknown)}")
         if not self.methods or len(set(self.methods)) != len(self.methods):
             raise ValueError(f"methods: expected at least one and none twice, got {self.methods}")
         if SETS[0] not in self.sets or len(set(self.sets)) != len(self.sets):
@@ -157,8 +155,8 @@ def score_sequence(
         window = warmup_windows + int(known.logical_not().nonzero()[0])
         raise ValueError(f"{sequence.name}, window {window}: no pixel is valid; leave this measurement out")
     oracle_mse = spread_mse(truth, valid)
-    shown = {method: with_truth_outside(dolp, truth, valid) for method, (dolp, _) in counted.items()}
-    distances = _lpips_of(shown, truth, lpips)
+    compared = {method: with_truth_outside(dolp, truth, valid) for method, (dolp, _) in counted.items()}
+    distances = _lpips_of(compared, truth, lpips)
     rows = []
     for method, (dolp, aolp) in counted.items():
         per_frame: dict[str, Tensor | None] = {
@@ -208,6 +206,15 @@ def scene_means(rows: Iterable[FrameScore], metric: str) -> dict[str, dict[str, 
             raise ValueError(f"{method} has no {metric} for {missing} of its frames; a metric leaves no frame out")
         means[method] = {scene: math.fsum(values) / len(values) for scene, values in sorted(scenes.items())}  # type: ignore[arg-type]
     return means
+
+
+def mean_scores(rows: Sequence[FrameScore], metrics: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Mean over scenes by method and metric; a method lacks the metrics that were not computed for it."""
+    means = {metric: scene_means(rows, metric) for metric in metrics}
+    return {
+        method: {name: float(np.mean([*of[method].values()])) for name, of in means.items() if method in of}
+        for method in dict.fromkeys(row.method for row in rows)
+    }
 
 
 def summary(

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from polarnet.benchmark.resimulate import resimulated
 from polarnet.benchmark.rows import Context, predictions_of
-from polarnet.benchmark.score import FrameScore, scene_means, score_sequence
+from polarnet.benchmark.score import FrameScore, mean_scores, score_sequence
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.storage.scenes import SceneStore
@@ -97,12 +97,7 @@ def sensitivity(
                 "sequences": len(rates),
                 "left_out": left_out,
                 "events_per_pixel_second": float(np.mean(rates)),
-                "scores": {method: _means(rows, method) for method in methods},
+                "scores": mean_scores(rows, SHOWN),
             }
             table.setdefault(setting, []).append(entry)
     return table
-
-
-def _means(rows: Sequence[FrameScore], method: str) -> dict[str, float]:
-    of_method = [row for row in rows if row.method == method]
-    return {metric: float(np.mean([*scene_means(of_method, metric)[method].values()])) for metric in SHOWN}

@@ -12,6 +12,7 @@ from typing import NamedTuple, no_type_check
 import numba
 import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int64, UInt16
+from scipy.optimize import minimize_scalar
 
 from polarnet.events.stream import Events
 
@@ -21,7 +22,6 @@ MAX_CHANGE = 1.0  # natural-log intensity; a larger change between two events is
 MAX_STEPS = 300_000
 STEP_US = 2_000  # of the first, coarse search
 FINEST_US = 20.0
-GOLDEN = (5**0.5 - 1) / 2
 
 
 class Steps(NamedTuple):
@@ -57,11 +57,10 @@ class Lag(NamedTuple):
 
 def steps(events: Events, corner: tuple[int, int], crop: tuple[int, int], start_us: int, stop_us: int) -> Steps:
     """All pairs between two times, thinned evenly to at most 300,000."""
-    found = _steps(events.t.numpy(), events.x.numpy(), events.y.numpy(), events.p.numpy(), *corner, *crop)
-    inside = (found[0] >= start_us) & (found[1] < stop_us)
-    sample = np.flatnonzero(inside)
+    pairs = Steps(*_steps(events.t.numpy(), events.x.numpy(), events.y.numpy(), events.p.numpy(), *corner, *crop))
+    sample = np.flatnonzero((pairs.before_us >= start_us) & (pairs.after_us < stop_us))
     sample = sample[:: max(1, -(-len(sample) // MAX_STEPS))]
-    return Steps(*(column[sample] for column in found))
+    return Steps(*(column[sample] for column in pairs))
 
 
 def logarithms(pictures: UInt16[np.ndarray, "n h w"]) -> Float32[np.ndarray, "n hw"]:
@@ -72,14 +71,14 @@ def logarithms(pictures: UInt16[np.ndarray, "n h w"]) -> Float32[np.ndarray, "n 
 
 
 def changes(
-    found: Steps, lag_us: float | int, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"]
+    pairs: Steps, lag_us: float | int, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"]
 ) -> Float64[np.ndarray, " m"]:
     """Change of log intensity over each step, read from the pictures taken at `t_us` with a delay of `lag_us`.
 
     Intensities between pictures are interpolated. The change is NaN where a step is not between the pictures, or too
     dark.
     """
-    return _changes(found.before_us, found.after_us, found.pixel, float(lag_us), t_us.astype(np.float64), logs)
+    return _changes(pairs.before_us, pairs.after_us, pairs.pixel, float(lag_us), t_us.astype(np.float64), logs)
 
 
 def agreement(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) -> float:
@@ -110,37 +109,27 @@ def thresholds(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n
 
 
 def best_lag(
-    found: Steps, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"], within_us: float | int
+    pairs: Steps, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"], within_us: float | int
 ) -> Lag:
     """Delay of the pictures' clock relative to the events' clock: the lag at which they agree best.
 
-    A coarse search every 2 ms maximises the agreement; a golden-section search then minimises the spread, to 20 us.
+    A coarse search every 2 ms maximises the agreement; Brent's method then minimises the spread, to 20 us.
     """
-
-    def spread_at(lag_us: float) -> float:
-        return spread(found.polarity, changes(found, lag_us, t_us, logs))
-
     searched = np.arange(-within_us, within_us + STEP_US / 2, STEP_US)
-    agreements = np.array([agreement(found.polarity, changes(found, lag, t_us, logs)) for lag in searched.tolist()])
+    agreements = np.array([agreement(pairs.polarity, changes(pairs, lag, t_us, logs)) for lag in searched.tolist()])
     best = float(searched[int(agreements.argmax())])
-    low, high = best - 2 * STEP_US, best + 2 * STEP_US
-    a, b = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-    at_a, at_b = spread_at(a), spread_at(b)
-    while high - low > FINEST_US:
-        if at_a < at_b:
-            high, b, at_b = b, a, at_a
-            a = high - GOLDEN * (high - low)
-            at_a = spread_at(a)
-        else:
-            low, a, at_a = a, b, at_b
-            b = low + GOLDEN * (high - low)
-            at_b = spread_at(b)
-    lag_us = (low + high) / 2
-    change = changes(found, lag_us, t_us, logs)
-    of_bright = changes(found, lag_us, t_us, np.where(logs < np.log(np.float32(BRIGHT)), np.float32(np.nan), logs))
+    minimum = minimize_scalar(
+        lambda lag_us: spread(pairs.polarity, changes(pairs, lag_us, t_us, logs)),
+        bounds=(best - 2 * STEP_US, best + 2 * STEP_US),
+        method="bounded",
+        options={"xatol": FINEST_US},
+    )
+    lag_us = float(minimum.x)
+    change = changes(pairs, lag_us, t_us, logs)
+    bright = changes(pairs, lag_us, t_us, np.where(logs < np.log(np.float32(BRIGHT)), np.float32(np.nan), logs))
     # steps shorter than the frame interval are left out: the light did not change evenly between two pictures
-    of_bright[found.after_us - found.before_us < np.median(np.diff(t_us))] = np.nan
-    return Lag(lag_us, agreement(found.polarity, change), searched, agreements, thresholds(found.polarity, of_bright))
+    bright[pairs.after_us - pairs.before_us < np.median(np.diff(t_us))] = np.nan
+    return Lag(lag_us, agreement(pairs.polarity, change), searched, agreements, thresholds(pairs.polarity, bright))
 
 
 @numba.njit(nogil=True, cache=True)

@@ -13,13 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from polarnet.captures.alignment import Lag, best_lag, logarithms, steps
-from polarnet.captures.dot import (
-    EVENT_CAPTURES,
-    INTENSITY_CAPTURES,
-    IntensityCapture,
-    RecordingsConfig,
-    reduced,
-)
+from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, IntensityCapture, RecordingsConfig, reduced
 from polarnet.events.stream import Events
 from polarnet.recordings.source import RecordingError
 
@@ -87,9 +81,7 @@ def redundancy_shifts(
         left = sum(s * v[0].reshape(-1) for s, v in zip(POLARIZER_SIGNS, values, strict=True))
         weight = REDUNDANCY_SHARE / max(float(np.mean(left**2)), 1e-12)
         prior = np.eye(4) / LANDMARK_ERROR_US**2
-        shifts = np.linalg.solve(
-            weight * slopes.T @ slopes + prior, weight * slopes.T @ (slopes @ shifts - left)
-        )  # fmt: skip
+        shifts = np.linalg.solve(weight * slopes.T @ slopes + prior, weight * slopes.T @ (slopes @ shifts - left))
         shifts -= shifts.mean()
     level = np.sqrt(np.mean(sum(v[0] for v in values) ** 2)) / 4
     return shifts, float(np.sqrt(np.mean(left**2)) / level)
@@ -125,6 +117,5 @@ def _lag(
     """Delay of the pictures relative to the events, from these starts."""
     chosen = pictures_after(capture, picture_start_us)
     t_us = capture.t_us[chosen] - picture_start_us + event_start_us
-    found = steps(events, config.crop_corner, (config.crop[0], config.crop[1]), int(t_us[0]), int(t_us[-1]))
-    logs = logarithms(capture.pictures[chosen])
-    return best_lag(found, t_us, logs, 1000 * config.refine_within_ms)
+    pairs = steps(events, config.crop_corner, (config.crop[0], config.crop[1]), int(t_us[0]), int(t_us[-1]))
+    return best_lag(pairs, t_us, logarithms(capture.pictures[chosen]), 1000 * config.refine_within_ms)

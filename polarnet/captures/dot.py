@@ -6,20 +6,20 @@ landmark enters a region of the picture. That moment is time 0 of the clock that
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt16
+from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from polarnet.events.stream import Events, concatenate, crop
 from polarnet.recordings.formats.celex5_bin import Picture, celex5_pictures
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import one_of, section
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 EVENT_CAPTURES = tuple(f"events_{angle}" for angle in POLARIZER_ANGLES_DEG)
@@ -30,42 +30,41 @@ STAMP_US = 1000  # resolution of the computer's picture times, which are rounded
 IRREGULAR_US = 3000.0  # larger deviations from a regular clock mean that the pictures were not taken by one
 
 
-@dataclass(frozen=True)
+@section
 class RecordingsConfig:
     """Section `recordings` of params.yaml. Sizes are [height, width] in pixels."""
 
     enabled: bool
     root: str
     """Folder with one folder for each target."""
-    sensor: list[int] = field(metadata=allowed(low=8, high=1280))
+    sensor: list[Annotated[int, Field(ge=8, le=1280)]]
     """The part of the sensor in use, from its upper left corner."""
-    region: list[int] = field(metadata=allowed(low=1, high=1280))
+    region: list[Annotated[int, Field(ge=1, le=1280)]]
     """Size of the landmark's region, in the upper right corner of the part in use."""
-    dark_level: float = field(metadata=allowed(above=0, high=255))
+    dark_level: Annotated[float, Field(gt=0, le=255)]
     """An intensity capture starts with the first picture whose mean in the region is below this level, of 255."""
-    negative_events: int = field(metadata=allowed(low=1))
+    negative_events: PositiveInt
     """Number of negative events in the region at which an event capture starts."""
-    crop: list[int] = field(metadata=allowed(low=2, high=1280))
+    crop: list[Annotated[int, Field(ge=2, le=1280)]]
     """Size of the central crop."""
-    size: list[int] = field(metadata=allowed(low=2, high=1280))
+    size: list[Annotated[int, Field(ge=2, le=1280)]]
     """Size to which the crop is reduced."""
     keep_event_rate: bool
     """true: a reduced pixel fires as often as one sensor pixel; false: as often as all those it covers together."""
-    picture_rate_hz: float | None = field(metadata=allowed(above=0))
+    picture_rate_hz: PositiveFloat | None
     """Rate of the pictures in intensity captures whose files have no times."""
-    hot_pixel_factor: float | None = field(metadata=allowed(above=1))
+    hot_pixel_factor: Annotated[float, Field(gt=1)] | None
     """A pixel is hot, and left out, above this multiple of the third busiest of the 5 x 5 around it; null: none is."""
-    alignment: str = field(metadata=allowed(choices=("landmark", "refined")))
+    alignment: Annotated[str, one_of(("landmark", "refined"))]
     """landmark: start times by the landmark alone (the paper); refined: refined over the whole picture."""
-    refine_within_ms: float = field(metadata=allowed(above=0))
+    refine_within_ms: PositiveFloat
     """Search range of the refined start times around the landmark's."""
-    frame_rate_hz: float = field(metadata=allowed(above=0))
+    frame_rate_hz: PositiveFloat
     """Frame rate of the sequence's ground truth."""
-    duration_s: float | None = field(metadata=allowed(above=0))
+    duration_s: PositiveFloat | None
     """Length of the sequence, from the landmark on; null: as long as all captures last."""
 
     def __post_init__(self):
-        check_ranges(self)
         for name in ("sensor", "region", "crop", "size"):
             if len(getattr(self, name)) != 2:
                 raise ValueError(f"{name}: expected [height, width], got {list(getattr(self, name))}")
@@ -98,7 +97,7 @@ def find_captures(folder: Path) -> dict[str, Path]:
 
     RecordingError where a capture has no file or more than one.
     """
-    found = {}
+    captures = {}
     for name in (*EVENT_CAPTURES, *INTENSITY_CAPTURES):
         files = sorted(path for path in folder.glob(f"{name}.*") if path.stem == name)
         if len(files) != 1:
@@ -107,8 +106,8 @@ def find_captures(folder: Path) -> dict[str, Path]:
                 f"target {folder.name}: expected one file {name}.bin (or another ending), got {there}; a target has "
                 f"{', '.join((*EVENT_CAPTURES, *INTENSITY_CAPTURES))}"
             )
-        found[name] = files[0]
-    return found
+        captures[name] = files[0]
+    return captures
 
 
 def given_starts(folder: Path) -> dict[str, int]:

@@ -1,6 +1,7 @@
 """Decode division-of-time captures once, for later steps that read them repeatedly, whatever the file format."""
 
 import json
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -18,10 +19,12 @@ from polarnet.captures.dot import (
     read_intensity_capture,
     targets_of,
 )
-from polarnet.captures.status import start_over
 from polarnet.events.stream import Events
+from polarnet.recordings.arrangements import shifted
 from polarnet.runtime.files import sha256
 from polarnet.storage.events import EventStore
+
+STATUS_FILE = "status.json"
 
 
 class Target(NamedTuple):
@@ -85,6 +88,8 @@ def open_target(imported: Path, name: str) -> Target:
     return Target(name, events, intensities, clocks["given_us"])
 
 
-def shifted(events: Events, origin_us: int) -> Events:
-    """The same events, with `origin_us` as time 0."""
-    return Events(events.t - origin_us, events.x, events.y, events.p, events.height, events.width)
+def start_over(out: Path, *, enabled: bool) -> None:
+    """Empty a stage's output folder and write status.json, which says whether real recordings are in use."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    (out / STATUS_FILE).write_text(json.dumps({"enabled": enabled}) + "\n")

@@ -3,9 +3,8 @@
 The stores `events.zarr` and `frames.zarr` have the layout of simulated sequences; all targets are in the split `test`.
 """
 
-import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,9 +24,9 @@ from polarnet.captures.dot import (
     reduced,
     region_negative_times_us,
 )
-from polarnet.captures.imported import Target, open_target, shifted
-from polarnet.captures.status import start_over
+from polarnet.captures.imported import Target, open_target, start_over
 from polarnet.events.stream import Events, crop, downscale, slice_time
+from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
 from polarnet.recordings.source import RecordingError
 from polarnet.storage.events import EventStore
@@ -65,30 +64,23 @@ def calibrate_targets(
     source = EventStore.open(imported / "events.zarr")
     names, (height, width) = source.sequences, config.size
     start_over(out, enabled=True)
-    longest_us = max(source.duration_us(name) for name in names)
+    frames_max = len(frame_times_us(max(source.duration_us(name) for name in names), config))
     events = EventStore.create(out / "events.zarr", names, height, width, about)
-    frames = FrameStore.create(
-        out / "frames.zarr",
-        names,
-        dict.fromkeys(names, "test"),
-        len(frame_times_us(longest_us, config)),
-        height,
-        width,
-        about,
-    )
-    found = []
+    splits = dict.fromkeys(names, "test")
+    frames = FrameStore.create(out / "frames.zarr", names, splits, frames_max, height, width, about)
+    targets = []
     for name in names:
         target = open_target(imported, name)
         one, clean = calibrate_target(target, config)
         channels, t_us, intensity = aligned(target._replace(events=clean), one, config)
-        seen = stokes.stokes_from_intensities(intensity)
+        vectors = stokes.stokes_from_intensities(intensity)
         events.write(name, channels, int(t_us[-1]))
-        frames.write(name, t_us, intensity, stokes.dolp(seen).clamp(0, 1), stokes.aolp(seen))
-        found.append(one)
+        frames.write(name, t_us, intensity, stokes.dolp(vectors).clamp(0, 1), stokes.aolp(vectors))
+        targets.append(one)
     events.finish()
     frames.finish()
-    (out / "calibration.json").write_text(json.dumps({one.name: _record(one) for one in found}, indent=2) + "\n")
-    return found
+    (out / "calibration.json").write_text(json.dumps({one.name: _record(one) for one in targets}, indent=2) + "\n")
+    return targets
 
 
 def calibrate_target(target: Target, config: RecordingsConfig) -> tuple[Calibrated, dict[str, Events]]:
@@ -119,7 +111,7 @@ def calibrate_target(target: Target, config: RecordingsConfig) -> tuple[Calibrat
     late = [c for c in INTENSITY_CAPTURES if target.intensities[c].t_us[0] > used[c]]
     if late:
         raise RecordingError(f"target {target.name}: {', '.join(late)} has no picture before its start; record earlier")
-    found = Calibrated(
+    calibrated = Calibrated(
         target.name,
         starts,
         used,
@@ -129,25 +121,25 @@ def calibrate_target(target: Target, config: RecordingsConfig) -> tuple[Calibrat
         {capture: (pictures.t_us, pictures.region) for capture, pictures in target.intensities.items()},
         duration_us,
     )
-    return found, clean
+    return calibrated, clean
 
 
 def aligned(
-    target: Target, found: Calibrated, config: RecordingsConfig
+    target: Target, calibrated: Calibrated, config: RecordingsConfig
 ) -> tuple[list[Events], Int64[Tensor, " n"], Float32[Tensor, "n 4 h w"]]:
     """The sequence of a target without hot pixels: events of its four channels, frame times, intensities in [0, 1].
 
     The events are those of the crop from the common start on, reduced by `downscale` with the rule `keep_event_rate`.
     The intensities come from the reduced pictures before and after each frame's time, interpolated.
     """
-    t_us = frame_times_us(found.duration_us, config)
+    t_us = frame_times_us(calibrated.duration_us, config)
     channels = []
     for capture in EVENT_CAPTURES:
-        events, start = target.events[capture], found.start_us[capture]
+        events, start = target.events[capture], calibrated.start_us[capture]
         during = shifted(slice_time(events, start, start + int(t_us[-1]) + 1), start)
         part = crop(during, *config.crop_corner, *config.crop)
         channels.append(downscale(part, config.size[0], config.size[1], keep_rate=config.keep_event_rate))
-    planes = [interpolated(target.intensities[c], t_us + found.start_us[c], config) for c in INTENSITY_CAPTURES]
+    planes = [interpolated(target.intensities[c], t_us + calibrated.start_us[c], config) for c in INTENSITY_CAPTURES]
     return channels, torch.from_numpy(t_us), torch.stack(planes, dim=1)
 
 
@@ -170,22 +162,16 @@ def frame_times_us(duration_us: int, config: RecordingsConfig) -> Int64[np.ndarr
     return np.rint(np.arange(count) * 1e6 / config.frame_rate_hz).astype(np.int64)
 
 
-def _record(found: Calibrated) -> dict[str, Any]:
+def _record(calibrated: Calibrated) -> dict[str, Any]:
     record: dict[str, Any] = {
-        "landmark_us": dict(found.landmark_us),
-        "start_us": dict(found.start_us),
-        "duration_us": found.duration_us,
-        "hot_pixels": dict(found.hot),
+        "landmark_us": dict(calibrated.landmark_us),
+        "start_us": dict(calibrated.start_us),
+        "duration_us": calibrated.duration_us,
+        "hot_pixels": dict(calibrated.hot),
     }
-    if found.alignment is not None:
-        record["redundancy_residual"] = found.alignment.residual
-        for capture, lag in zip(EVENT_CAPTURES, found.alignment.lags, strict=True):
+    if calibrated.alignment is not None:
+        record["redundancy_residual"] = calibrated.alignment.residual
+        for capture, lag in zip(EVENT_CAPTURES, calibrated.alignment.lags, strict=True):
             known = {key: None if np.isnan(value) else value for key, value in lag.thresholds._asdict().items()}
             record[capture] = {"agreement": lag.agreement, "thresholds": known}
     return record
-
-
-def spread_us(starts: Mapping[str, int], others: Mapping[str, int]) -> Sequence[float]:
-    """Differences between two sets of start times, minus their mean: the zero of the clock is a convention."""
-    differences = np.array([starts[c] - others[c] for c in itertools.chain(EVENT_CAPTURES, INTENSITY_CAPTURES)], float)
-    return (differences - differences.mean()).tolist()

@@ -51,7 +51,7 @@ def add_to(commands: Commands) -> None:
 
 
 def _benchmark(options: argparse.Namespace) -> int:
-    from polarnet.config.tree import check_keys, load
+    from polarnet.config.tree import load
     from polarnet.runtime.machine import configure
 
     if options.scenes and options.limit is not None:
@@ -66,7 +66,6 @@ def _benchmark(options: argparse.Namespace) -> int:
     weights = options.weights.resolve() if options.weights else None
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
         chosen = [f"benchmark.methods=[{options.methods}]"] if scenes and options.methods else []
-        check_keys(settings, options.overrides)
         config = load(settings, [*options.overrides, *chosen])
         configure(config.runtime, config.seed)
         if scenes is None:

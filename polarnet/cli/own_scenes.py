@@ -1,15 +1,14 @@
 """The benchmark on a user's own folder of photographs or measured polarization, without training."""
 
 import dataclasses
-import functools
 from pathlib import Path
 from typing import Any
 
-from polarnet.benchmark.conditions import configured, sentence, warnings
+from polarnet.benchmark.conditions import announced, configured
 from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.rows import available, metadata_used, weights_used
 from polarnet.benchmark.run import run_benchmark, train_mean_dolp
-from polarnet.config.pipeline import context_of, made_set, mapper_of
+from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, with_lpips
 from polarnet.methods import METHODS
 from polarnet.metrics.lpips import NO_RECORD
@@ -17,9 +16,8 @@ from polarnet.metrics.lpips_weights import find_weights
 from polarnet.metrics.similarity import Lpips
 from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest
-from polarnet.reports.set_page import write_set_page
-from polarnet.runtime.machine import threads_of
-from polarnet.simulation.sets import Recipe, make_folder_set
+from polarnet.reports.page import write_set_page
+from polarnet.simulation.sets import make_folder_set
 from polarnet.simulation.truth import motions_of
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
@@ -50,36 +48,33 @@ def benchmark_folder(
     context = context_of(config, train_mean, weights or shipped_weights())
     methods, left_out = available(wanted, context)
     used = configured(config.synthesize, config.emulate)
-    differences = warnings(used, metadata_used(methods, context), SET_THEM)
-    print("\n".join([sentence(used), *(f"WARNING: {line}" for line in differences)]), flush=True)
-    size, threads = config.storage.sequences_per_part, threads_of(config.runtime)
-    recipe = Recipe(config.ingest, config.synthesize, config.emulate, config.seed, threads, size)
+    conditions = announced(used, metadata_used(methods, context), SET_THEM)
     try:
-        make_folder_set(root, kind, work, recipe, functools.partial(mapper_of, config))
+        make_folder_set(root, kind, work, config.recipe, config.mapper)
     except ValueError as error:
         raise ValueError(f"--scenes {root}: no scene to score. {error}") from error
     notes = [*_skipped(config, work), *(_left_out(row, reason) for row, reason in left_out.items())]
     settings = dataclasses.replace(config.benchmark, methods=methods)
     test_set = made_set(root.resolve().name, work)
-    benchmark = run_benchmark(test_set, context, settings, lpips, mapper_of(config, "benchmark"))
+    benchmark = run_benchmark(test_set, context, settings, lpips, config.mapper("benchmark"))
     about = {
         "set": test_set.name,
-        "conditions": {"sentence": sentence(used), "warnings": differences, **used._asdict()},
+        "conditions": conditions,
         "lpips": NO_RECORD if lpips_weights is None else lpips_weights.record,
         "train_mean": train_mean,
         "left_out": notes,
         "weights": weights_used(methods, context),
     }
     metrics = write_benchmark(out, benchmark, settings, config.seed, about)
-    write_set_page(out, test_set.name, command, [*differences, *notes])
+    write_set_page(out, test_set.name, command, [*conditions["warnings"], *notes])
     return metrics, notes
 
 
 def _skipped(config: Config, work: Path) -> list[str]:
     """One line for each file of the folder that was skipped."""
     manifest = read_manifest(work / "images")
-    used = set(SceneStore.open(work / "scenes.zarr").picture_of.values())
-    unused = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name not in used))
+    simulated = set(SceneStore.open(work / "scenes.zarr").scene_of.values())
+    unused = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name not in simulated))
     _, small = motions_of(unused, config.synthesize, config.seed)
     return [f"{skipped.file} was skipped: {skipped.reason}" for skipped in (*manifest.skipped, *small)]
 

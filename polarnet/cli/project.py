@@ -7,10 +7,7 @@ import sys
 from pathlib import Path
 
 from polarnet.cli.parsers import Commands
-
-INSTALLED_SETTINGS = Path(__file__).parents[1] / "config" / "settings"
-"""Copy of params.yaml and conf/ that setup.py puts into the wheel."""
-SOURCE_TREE = Path(__file__).parents[2]
+from polarnet.runtime.files import shipped_settings
 
 
 def add_to(commands: Commands) -> None:
@@ -30,36 +27,30 @@ def add_to(commands: Commands) -> None:
     stages.set_defaults(run=_stages)
 
 
-def project_root(start: Path | None = None) -> Path:
-    """The nearest folder at or above `start` (default: here) that holds params.yaml and dvc.yaml."""
-    start = (start or Path.cwd()).resolve()
-    for folder in [start, *start.parents]:
-        if (folder / "params.yaml").exists() and (folder / "dvc.yaml").exists():
-            return folder
+def project_root() -> Path:
+    """The nearest folder at or above the current one with params.yaml and dvc.yaml; FileNotFoundError if none has."""
+    if clone := _clone():
+        return clone
     raise FileNotFoundError(
-        f"expected a clone of polarnet, found no params.yaml beside a dvc.yaml in {start} or above; "
+        f"expected a clone of polarnet, found no params.yaml beside a dvc.yaml in {Path.cwd()} or above; "
         f"run this command inside a clone"
     )
 
 
-def settings_root() -> Path:
-    """The folder whose params.yaml and conf/ hold the settings, in this order.
+def _clone() -> Path | None:
+    here = Path.cwd().resolve()
+    files = ("params.yaml", "dvc.yaml")
+    return next((path for path in (here, *here.parents) if all((path / file).exists() for file in files)), None)
 
-    The clone at or above the current folder; the copy in an installed wheel; the source tree of an editable
-    installation.
-    """
-    try:
-        return project_root()
-    except FileNotFoundError:
-        return INSTALLED_SETTINGS if INSTALLED_SETTINGS.is_dir() else SOURCE_TREE
+
+def settings_root() -> Path:
+    """Folder of params.yaml and conf/: the clone at or above the current folder, else those beside the code."""
+    return _clone() or shipped_settings()
 
 
 def working_folder() -> Path:
     """The folder that the paths of conf/config.yaml start from: the clone at or above the current folder, or that."""
-    try:
-        return project_root()
-    except FileNotFoundError:
-        return Path.cwd()
+    return _clone() or Path.cwd()
 
 
 def _doctor(options: argparse.Namespace) -> int:

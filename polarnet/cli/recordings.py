@@ -11,7 +11,7 @@ from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.parsers import Commands
 from polarnet.cli.project import settings_root
 
-READING_OPTIONS = ("format", "height", "width", "clock_mhz", "assume_polarity")
+READING_OPTIONS = ("format", "height", "width", "clock_mhz")
 """Options that describe a camera's file where the file itself does not."""
 
 OPTIONS_BY_INPUT = {
@@ -72,7 +72,6 @@ def _add_reading(command: argparse.ArgumentParser) -> None:
     command.add_argument("--height", type=int, help="rows of the sensor, if the file does not state them")
     command.add_argument("--width", type=int, help="columns of the sensor, if the file does not state them")
     command.add_argument("--clock-mhz", type=float, help="clock of a CeleX-5 (default: 100)")
-    command.add_argument("--assume-polarity", type=int, choices=(1, -1), help="polarity of events that have none")
 
 
 def _reading(options: argparse.Namespace) -> dict[str, Any]:
@@ -163,7 +162,7 @@ def _inspect(options: argparse.Namespace) -> int:
     path.write_bytes(recording_picture(inspection))
     print(f"picture     {path}")
     if options.hot_pixels:
-        from polarnet.reports.calibration import draw_hot_pixels
+        from polarnet.reports.recordings import draw_hot_pixels
 
         draw_hot_pixels(inspection.counts, inspection.hot, options.hot_pixels)
         print(f"hot pixels  {options.hot_pixels}")
@@ -173,7 +172,7 @@ def _inspect(options: argparse.Namespace) -> int:
 def _register(options: argparse.Namespace) -> int:
     from polarnet.recordings.recording import read_recording
     from polarnet.recordings.registration import UNRELATED, event_image, register, warped
-    from polarnet.reports.calibration import draw_registration
+    from polarnet.reports.recordings import draw_registration
 
     files = options.reference, options.file
     reference, moving = (event_image(read_recording(path, **_reading(options)).events) for path in files)

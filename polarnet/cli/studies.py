@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from polarnet.benchmark.conditions import Conditions, configured, sentence, stored, warnings
+from polarnet.benchmark.conditions import announced, configured, stored
 from polarnet.benchmark.event_budget import by_sliding_window, by_window_length, since_start
-from polarnet.benchmark.rows import ROWS, Context, metadata_used, why_left_out
+from polarnet.benchmark.rows import ROWS, metadata_used, why_left_out
 from polarnet.benchmark.run import train_mean_dolp
 from polarnet.benchmark.sensitivity import sensitivity
 from polarnet.config.pipeline import context_of, pipeline_set
 from polarnet.config.tree import Config
 from polarnet.reports.curves import event_budget_figure, sensitivity_figure
 from polarnet.reports.figures import LIGHT
-from polarnet.reports.png import png
+from polarnet.reports.maps import png
 from polarnet.runtime.machine import threads_of
 from polarnet.storage.scenes import SceneStore
 
@@ -34,7 +34,8 @@ def run_event_budget(
     if reason := why_left_out("ours", context):
         raise ValueError(f"the event budget needs the DoLP network: {reason}; give --weights FILE")
     events = tests.events
-    conditions = _announced(stored(events.attributes, events.height, events.width), methods, context)
+    used = stored(events.attributes, events.height, events.width)
+    conditions = announced(used, metadata_used(methods, context), SET_THEM)
     end_us = min(scenes.duration_us(name) for name in sequences)
     settle_us = round(config.benchmark.warmup_windows * 1e6 / config.synthesize.frame_rate_hz)
     lengths = [length for length in WINDOW_LENGTHS_US if settle_us + length <= end_us]
@@ -58,7 +59,7 @@ def run_sensitivity(
     sequences, context, _, scenes = _prepared(config, methods, limit, weights)
     size = {"sensor_height": scenes.sensor_height, "sensor_width": scenes.sensor_width}
     motion = dataclasses.replace(config.synthesize, **size)  # emulated again at the scenes' sensor size
-    conditions = _announced(configured(motion, config.emulate), methods, context)
+    conditions = announced(configured(motion, config.emulate), metadata_used(methods, context), SET_THEM)
     table = sensitivity(
         scenes, sequences, config.synthesize, config.emulate, config.seed, config.benchmark.warmup_windows, methods,
         context, threads=threads_of(config.runtime),
@@ -75,13 +76,6 @@ def _prepared(config: Config, methods: Sequence[str], limit: int | None, weights
     scenes = SceneStore.open(config.paths.scenes)
     context = context_of(config, train_mean_dolp(tests.frames, config.benchmark.warmup_windows), weights)
     return tests.sequences[:limit], context, tests, scenes
-
-
-def _announced(used: Conditions, methods: Sequence[str], context: Context) -> dict[str, Any]:
-    """Print size, duration and sensor, with warnings if a network was trained with others; return them for the JSON."""
-    differences = warnings(used, metadata_used(methods, context), SET_THEM)
-    print("\n".join([sentence(used), *(f"WARNING: {line}" for line in differences)]), flush=True)
-    return {"sentence": sentence(used), "warnings": differences, **used._asdict()}
 
 
 def _written(out: Path, name: str, results: dict[str, Any], picture: bytes) -> dict[str, Any]:

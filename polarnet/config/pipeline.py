@@ -1,10 +1,8 @@
 """The benchmark of a configuration: the inputs of the methods, the test sets, and running rows on them."""
 
 import dataclasses
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from polarnet.benchmark.references import REFERENCES
 from polarnet.benchmark.row_results import RowRecord, write_row
@@ -14,7 +12,6 @@ from polarnet.config.tree import Config, or_exit
 from polarnet.methods import METHODS
 from polarnet.methods.method import Method, Setup
 from polarnet.metrics.similarity import Lpips
-from polarnet.runtime.cluster import pmap
 from polarnet.runtime.machine import device_of
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
@@ -49,11 +46,6 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
         device=device_of(config.runtime),
         precision=config.benchmark.precision,
     )
-
-
-def mapper_of(config: Config, label: str) -> Callable[..., list[Any]]:
-    """Parallel map over sequences with the workers and cluster of the configuration."""
-    return functools.partial(pmap, workers=config.runtime.workers, label=label, address=config.cluster.address)
 
 
 def pipeline_set(config: Config, name: str) -> BenchmarkSet:
@@ -102,7 +94,7 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
     lpips = or_exit(lambda: lpips_of(config))
     settings = dataclasses.replace(config.benchmark, methods=methods)
     results = {
-        name: run_benchmark(pipeline_set(config, name), context, settings, lpips, mapper_of(config, name))
+        name: run_benchmark(pipeline_set(config, name), context, settings, lpips, config.mapper(name))
         for name in set_names(config)
     }
     for row in methods:

@@ -11,6 +11,8 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
+from polarnet.training.history import HISTORY, best_row, read_history
+
 FAILURE = "failure.txt"
 """File in the folder of a failed job with the reason in one line."""
 COLUMNS = {
@@ -129,7 +131,8 @@ def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 def _point(job: Path) -> dict[str, Any]:
     config: Any = OmegaConf.load(job / ".hydra" / "config.yaml")
-    history = _read(job / "train" / "ours" / "history.json")
+    training = job / "train" / "ours"
+    history = read_history(training) if (training / HISTORY).exists() else []
     metrics = _read(job / "benchmark" / "metrics.json")
     unfinished = None if metrics else "it did not finish"
     failure = (job / FAILURE).read_text().strip() if (job / FAILURE).exists() else unfinished
@@ -140,7 +143,7 @@ def _point(job: Path) -> dict[str, Any]:
         "seed": config.seed,
         "weights": weights,
         "lpips_backbone": config.benchmark.get("lpips_backbone") or config.lpips.backbone,
-        "validation": min((row["val"] for row in history), key=lambda scores: scores["mse"]) if history else None,
+        "validation": best_row(history)["val"] if history else None,
         "test": metrics["ours"] if metrics else None,
         "notes": [*(_dropped_terms(weights, history[-1]["train"]) if history else []), *_warnings(job / "logs")],
         "failure": failure,

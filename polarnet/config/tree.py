@@ -8,13 +8,11 @@ import os
 import re
 import sys
 import typing
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path, PurePath
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import hydra
-from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
@@ -27,15 +25,14 @@ from polarnet.methods.postprocessing import PostprocessingConfig
 from polarnet.methods.stokes_gain import GainConfig
 from polarnet.metrics.lpips import BACKBONES, PURPOSES, Purpose, is_stored
 from polarnet.metrics.lpips_weights import LpipsConfig, local_source
-from polarnet.networks.dolp_unet import DolpUNetConfig
-from polarnet.networks.registry import NetworkConfig
-from polarnet.networks.stokes_unet import StokesUNetConfig
+from polarnet.networks.registry import NETWORKS, NetworkConfig
 from polarnet.pictures.ingest import IngestConfig
-from polarnet.runtime.machine import RuntimeConfig, configure
-from polarnet.runtime.ranges import check_ranges
+from polarnet.runtime.cluster import pmap
+from polarnet.runtime.machine import RuntimeConfig, configure, threads_of
+from polarnet.runtime.sections import one_of, section, unknown_key
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
-from polarnet.simulation.sets import SetsConfig
+from polarnet.simulation.sets import Recipe, SetsConfig
 from polarnet.simulation.variation import VariationConfig
 from polarnet.storage.parts import StorageConfig
 from polarnet.training.baselines import BASELINES
@@ -44,50 +41,50 @@ from polarnet.training.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
 EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # subfolder of the project in which DVC runs queued experiments
-ROW_KEYS = ("module", "needs", "settings")
-"""Keys of a row in section `rows`: its method's file, what else it is computed from, its section of params.yaml."""
 DOLP_TRAINING = "ours"
 """Training of the DoLP network, in data/train beside the baselines."""
 CHOICES = re.compile(r"(?:glob\()?([^()=]*)\)?")
 
 Stage = Callable[["Config"], None]
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class NetworksConfig:
-    """Section `networks` of params.yaml: one entry per network; `network` names the network in use."""
-
-    paper: DolpUNetConfig
-    polarnet: StokesUNetConfig
+RowName = Annotated[str, one_of(ROWS)]
+BaselineName = Annotated[str, one_of(BASELINES)]
 
 
 if typing.TYPE_CHECKING:
+    NetworksConfig = Any
     MethodsConfig = Any
-else:
-    MethodsConfig = dataclasses.make_dataclass(
-        "MethodsConfig", [(m.name, m.config) for m in METHODS.values() if m.config is not None], frozen=True
-    )
-    """Section `methods` of params.yaml: one section for each method whose record declares settings."""
-
-
-if typing.TYPE_CHECKING:
     BaselinesConfig = Any
 else:
-    BaselinesConfig = dataclasses.make_dataclass(
+
+    def _assembled(name: str, fields: Mapping[str, Any]) -> type:
+        return section(dataclasses.make_dataclass(name, fields.items(), frozen=True))
+
+    NetworksConfig = _assembled("NetworksConfig", {name: config for name, (_, config) in NETWORKS.items()})
+    """Section `networks` of params.yaml: one section for each network; `network` names the network in use."""
+    MethodsConfig = _assembled("MethodsConfig", {m.name: m.config for m in METHODS.values() if m.config is not None})
+    """Section `methods` of params.yaml: one section for each method whose record declares settings."""
+    BaselinesConfig = _assembled(
         "BaselinesConfig",
-        [
-            ("trained", list[str]),
-            ("postprocessing", PostprocessingConfig),
-            ("gain", GainConfig),
-            *((name, record.config) for name, record in BASELINES.items()),
-        ],
-        frozen=True,
+        {"trained": list[BaselineName], "postprocessing": PostprocessingConfig, "gain": GainConfig}
+        | {name: record.config for name, record in BASELINES.items()},
     )
     """Section `baselines` of params.yaml: those to train, and one section for each."""
 
 
-@dataclass(frozen=True)
+@section
+class RowConfig:
+    """Entry of section `rows` of params.yaml, from which dvc.yaml makes the stage of a row."""
+
+    module: str
+    """File of the row's method."""
+    needs: str
+    """Path of what else the row is computed from."""
+    settings: str
+    """Section of params.yaml that the row depends on."""
+
+
+@section
 class ClusterConfig:
     """Section `cluster` of conf/config.yaml."""
 
@@ -95,7 +92,7 @@ class ClusterConfig:
     """Address of a Dask scheduler (tcp://host:port); null runs processes on this machine."""
 
 
-@dataclass(frozen=True)
+@section
 class Paths:
     """Section `paths` of conf/config.yaml: the location of each artefact. dvc.yaml names the same locations."""
 
@@ -114,7 +111,7 @@ class Paths:
     resume: str
 
 
-@dataclass(frozen=True)
+@section
 class Config:
     """All settings of a stage: those of params.yaml, then the paths and runtime settings of conf/config.yaml."""
 
@@ -124,7 +121,7 @@ class Config:
     variation: VariationConfig
     emulate: EmulatorConfig
     storage: StorageConfig
-    network: str
+    network: Annotated[str, one_of(NETWORKS)]
     networks: NetworksConfig
     loss: LossConfig
     train: TrainConfig
@@ -132,60 +129,53 @@ class Config:
     methods: MethodsConfig
     baselines: BaselinesConfig
     benchmark: BenchmarkConfig
-    rows: dict[str, dict[str, str]]
-    """Rows of the tables, each with what it is computed from (`ROW_KEYS`); read by dvc.yaml."""
+    rows: dict[RowName, RowConfig]
+    """Rows of the tables."""
     sets: SetsConfig
     recordings: RecordingsConfig
-    row: str | None
+    row: RowName | None
     """Row that stage row runs."""
-    baseline: str | None
+    baseline: BaselineName | None
     """Baseline that stage train trains; None: the DoLP network."""
     paths: Paths
     runtime: RuntimeConfig
     cluster: ClusterConfig
 
     def __post_init__(self):
-        check_ranges(self)
-        known = [field.name for field in dataclasses.fields(NetworksConfig)]
-        if self.network not in known:
-            raise ValueError(f"network: expected one of {', '.join(known)}, got {self.network!r}")
         self._check_rows()
         self._check_baseline()
+        self._check_sizes()
+
+    def _check_sizes(self) -> None:
+        """ValueError for a crop larger than the sensor, and for images too small for LPIPS."""
         sensor = [self.synthesize.sensor_height, self.synthesize.sensor_width]
-        sections = {name: getattr(self.baselines, name) for name in BASELINES}
-        crops = {"train.crop": self.train.crop} | {
-            f"baselines.{name}.crop": section.crop for name, section in sections.items()
-        }
-        for key, crop in crops.items():
+        crops = {f"baselines.{name}": getattr(self.baselines, name).crop for name in BASELINES}
+        for training, crop in {"train": self.train.crop, **crops}.items():
             if crop is not None and (crop[0] > sensor[0] or crop[1] > sensor[1]):
-                raise ValueError(f"{key}: expected at most the sensor of section synthesize, {sensor}, got {crop}")
-        loss = self.lpips.backbone
-        compared = [
-            ("loss.lpips", self.loss.lpips > 0, loss, self.train.crop),
-            ("benchmark.lpips", self.benchmark.lpips, self.benchmark.lpips_backbone, None),
-        ]
-        for name, section in sections.items():
-            used = any(getattr(section, key) > 0 for key in BASELINES[name].lpips)
-            compared.append((f"baselines.{name}.lpips", used, loss, section.crop))
-        for key, used, backbone, crop in compared:
-            side, size = BACKBONES[backbone].least_side, crop or sensor
-            if used and min(size) < side:
+                raise ValueError(
+                    f"{training}.crop: expected at most the sensor of section synthesize, {sensor}, got {crop}"
+                )
+        compared = {
+            key: (self.lpips.backbone, crops.get(key.rpartition(".")[0], self.train.crop) or sensor)
+            for key, weight in self.lpips_losses.items()
+            if weight > 0
+        }
+        if self.benchmark.lpips:
+            compared["benchmark.lpips"] = (self.benchmark.lpips_backbone, sensor)
+        for key, (backbone, size) in compared.items():
+            side = BACKBONES[backbone].min_side
+            if min(size) < side:
                 raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {size}")
 
     def _check_rows(self) -> None:
-        """ValueError for an unknown row, and for one whose entry in `rows` differs from the record of its method."""
-        unknown = [name for name in (*self.rows, *([self.row] if self.row is not None else [])) if name not in ROWS]
-        if unknown:
-            raise ValueError(f"rows: expected some of {', '.join(ROWS)}, got {', '.join(unknown)}")
-        if unknown := [name for name in self.baselines.trained if name not in BASELINES]:
-            raise ValueError(f"baselines.trained: expected some of {', '.join(BASELINES)}, got {', '.join(unknown)}")
-        for row, keys in self.rows.items():
-            if set(keys) != set(ROW_KEYS):
-                raise ValueError(f"rows.{row}: expected the keys {', '.join(ROW_KEYS)}, got {', '.join(keys)}")
+        """ValueError for a row whose entry in `rows` differs from the record of its method."""
+        for row, entry in self.rows.items():
             for key, value in self._row_entry(row).items():
-                if keys[key] != value:
-                    raise ValueError(f"rows.{row}.{key}: expected {value}, as in the row's record, got {keys[key]}")
-            needs = PurePath(keys["needs"])
+                if getattr(entry, key) != value:
+                    raise ValueError(
+                        f"rows.{row}.{key}: expected {value}, as in the row's record, got {getattr(entry, key)}"
+                    )
+            needs = PurePath(entry.needs)
             if needs.parent == PurePath("data/train") and needs.name not in (DOLP_TRAINING, *self.baselines.trained):
                 raise ValueError(f"rows.{row}.needs: no stage makes {needs}; add {needs.name} to baselines.trained")
 
@@ -203,13 +193,9 @@ class Config:
         return entry
 
     def _check_baseline(self) -> None:
-        """ValueError for an unknown baseline, and for one to train whose weights no row uses."""
+        """ValueError for a baseline to train whose weights no row uses."""
         name = self.baseline
-        if name is None:
-            return
-        if name not in BASELINES:
-            raise ValueError(f"baseline: expected one of {', '.join(BASELINES)}, got {name!r}")
-        if name not in self.used_baselines:
+        if name is not None and name not in self.used_baselines:
             raise ValueError(
                 f"baseline: no row of benchmark.methods uses the weights of baselines.{name}, so it is not trained; "
                 f"add {' or '.join(trained_rows(name))} to the rows, or remove {name} from baselines.trained"
@@ -223,54 +209,64 @@ class Config:
         return [name for name in BASELINES if (sections - given).intersection(trained_rows(name))]
 
     @property
+    def lpips_losses(self) -> dict[str, float]:
+        """Weights of LPIPS in the losses of all trainings, by key."""
+        return {"loss.lpips": self.loss.lpips} | {
+            f"baselines.{name}.{key}": getattr(getattr(self.baselines, name), key)
+            for name, baseline in BASELINES.items()
+            for key in baseline.lpips
+        }
+
+    @property
     def network_config(self) -> NetworkConfig:
         """Settings of the network in use."""
         return getattr(self.networks, self.network)
 
+    @property
+    def recipe(self) -> Recipe:
+        """Settings that make sequences from pictures."""
+        threads, size = threads_of(self.runtime), self.storage.sequences_per_part
+        return Recipe(self.ingest, self.synthesize, self.emulate, self.seed, threads, size)
+
+    def mapper(self, label: str) -> functools.partial[list[Any]]:
+        """Parallel map with the workers and the cluster of this configuration; `label` names its progress bar."""
+        return functools.partial(pmap, workers=self.runtime.workers, label=label, address=self.cluster.address)
+
 
 def typed(node: DictConfig) -> Config:
-    """Build the frozen, range-checked configuration; ValueError names the full key of the first invalid value."""
-    values = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
-    return _built(Config, values, "")
+    """Build the frozen, checked configuration; ValueError names every unknown key and invalid value by its full key."""
+    values: Any = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
+    return Config(**values)
 
 
 def load(root: Path, overrides: list[str] | None = None) -> Config:
     """Load the configuration of the project at `root`, outside any Hydra application.
 
-    Raises ValueError for an unknown key (see `check_keys`), a value out of range, or an ablation that changes nothing.
+    Raises ValueError for an unknown key, an invalid value, or an ablation that changes nothing.
     """
     overrides = overrides or []
-    check_keys(root, overrides)
+    check_overrides(root, overrides)
     os.environ[ROOT_VARIABLE] = str(root)
-    register_schema()
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(root / "conf")):
         config = typed(hydra.compose("config", overrides=overrides))
         _check_ablation(root, config, overrides)
     return config
 
 
-def register_schema() -> None:
-    """Register the schema with Hydra under the first name in the defaults list of conf/config.yaml."""
-    ConfigStore.instance().store(name="schema", node=_schema_of(Config))
+def check_overrides(root: Path, overrides: list[str]) -> None:
+    """Raise ValueError for an override of a key that is not a setting, or of a group that has no such choice.
 
-
-def check_keys(root: Path, overrides: list[str]) -> None:
-    """Raise ValueError for the first key in params.yaml or `overrides` that is not a setting.
-
-    A choice for a group (`experiment`, `sensor`, `ablation`) without a file in conf/ raises ValueError too. Hydra
-    refuses both as well, but this message lists the available keys and choices.
+    The groups are `experiment`, `sensor` and `ablation`. Hydra refuses both as well, but this message lists the
+    available keys and choices.
     """
-    params = OmegaConf.to_container(OmegaConf.load(root / "params.yaml"))
-    for key in _leaves(params):
-        _check_key(key, "params.yaml")
     groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
     for override in overrides:
         key, _, value = override.partition("=")
         key = key.lstrip("+~").split("@")[0]
         if key in groups:
             _check_choices(root, key, value)
-        elif not key.startswith(("hydra.", "hydra/", "paths.data")):
-            _check_key(key, "command line")
+        elif not key.startswith(("hydra.", "hydra/")) and (refusal := unknown_key(Config, key.split("."))):
+            raise ValueError(refusal)
 
 
 def hydra_stage(main: Stage) -> Callable[[], None]:
@@ -303,9 +299,8 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
 
     def command_line() -> None:
         os.environ[ROOT_VARIABLE] = str(root)
-        register_schema()
         overrides = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
-        or_exit(lambda: check_keys(root, overrides))
+        or_exit(lambda: check_overrides(root, overrides))
         logging.captureWarnings(True)
         run()
 
@@ -345,13 +340,9 @@ def with_lpips(config: Config, purpose: Purpose, use: Callable[[str, str | None]
     The message of a ValueError from `use` is preceded by the keys that request LPIPS and followed by the overrides
     that turn it off.
     """
-    weights = {"loss.lpips": config.loss.lpips} | {
-        f"baselines.{name}.{key}": getattr(getattr(config.baselines, name), key)
-        for name, baseline in BASELINES.items()
-        for key in baseline.lpips
-    }
     if purpose == "loss":
-        backbone, asking, off = config.lpips.backbone, [key for key, weight in weights.items() if weight > 0], "0"
+        backbone, off = config.lpips.backbone, "0"
+        asking = [key for key, weight in config.lpips_losses.items() if weight > 0]
     else:
         backbone, off = config.benchmark.lpips_backbone, "false"
         asking = ["benchmark.lpips"] if config.benchmark.lpips else []
@@ -416,29 +407,9 @@ def _in_use(config: Config) -> tuple[Any, ...]:
     return (*sections, config.network_config)
 
 
-def _check_key(key: str, where: str) -> None:
-    section: Any = Config
-    path = key.split(".")
-    for depth, name in enumerate(path):
-        if typing.get_origin(section) is dict:  # section `rows`, whose keys `Config` checks
-            return
-        names = sorted(field.name for field in dataclasses.fields(section)) if dataclasses.is_dataclass(section) else []
-        if name not in names:
-            inside = ".".join(path[:depth]) or "the configuration"
-            allowed = f"{inside} has {', '.join(names)}" if names else f"{inside} is a value, not a section"
-            raise ValueError(f"{where}: {key} is not a setting; {allowed}")
-        section = typing.get_type_hints(section)[name]
-
-
 def _file_of_module(module: str) -> str:
     """Path of a module's file from the root of the project."""
     return f"{module.replace('.', '/')}.py"
-
-
-def _leaves(values: Any, prefix: str = "") -> list[str]:
-    if not isinstance(values, dict):
-        return [prefix]
-    return [leaf for key, value in values.items() for leaf in _leaves(value, f"{prefix}.{key}" if prefix else str(key))]
 
 
 def or_exit(check: Callable[[], T]) -> T:
@@ -447,24 +418,3 @@ def or_exit(check: Callable[[], T]) -> T:
         return check()
     except ValueError as error:
         raise SystemExit(f"configuration error: {error}") from None
-
-
-@functools.cache
-def _schema_of(config_class: type) -> type:
-    """Copy of `config_class` that is not frozen, because OmegaConf cannot merge into frozen dataclasses."""
-    hints = typing.get_type_hints(config_class)
-    twin = [(f.name, _schema_of(hints[f.name]) if dataclasses.is_dataclass(hints[f.name]) else hints[f.name])
-            for f in dataclasses.fields(config_class)]  # fmt: skip
-    return dataclasses.make_dataclass(config_class.__name__, twin)
-
-
-def _built(config_class: type, values: Any, key: str) -> Any:
-    hints = typing.get_type_hints(config_class)
-    arguments = {
-        name: _built(hints[name], value, f"{key}{name}.") if dataclasses.is_dataclass(hints[name]) else value
-        for name, value in values.items()
-    }
-    try:
-        return config_class(**arguments)
-    except ValueError as error:
-        raise ValueError(str(error) if str(error).startswith(key) else f"{key}{error}") from None

@@ -71,10 +71,10 @@ def time_surface(events: Events, window_us: int) -> Float[Tensor, "h w"]:
     size = events.height * events.width
     number = torch.arange(1, len(events) + 1, device=events.t.device)
     latest = number.new_zeros(size).scatter_reduce_(0, _pixel(events), number, "amax")  # 0: no event
-    seen = latest > 0
-    last = latest[seen] - 1
+    fired = latest > 0
+    last = latest[fired] - 1
     surface = torch.zeros(size, device=events.t.device)
-    surface[seen] = events.p[last] * torch.exp((events.t[last] - events.t[-1:]) / window_us)
+    surface[fired] = events.p[last] * torch.exp((events.t[last] - events.t[-1:]) / window_us)
     return surface.view(events.height, events.width)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from polarnet.runtime.arrays import Array, whole_numbers
 
-LARGEST_SIDE = 2**15 - 1  # pixels; coordinates are int16
+MAX_SIDE = 2**15 - 1  # pixels; coordinates are int16
 
 _COLUMNS = {"t": torch.int64, "x": torch.int16, "y": torch.int16, "p": torch.int8}
 
@@ -40,8 +40,8 @@ class Events:
                     f"events: expected {name} as {dtype} of shape ({len(self.t)},), "
                     f"got {column.dtype} of shape {tuple(column.shape)}"
                 )
-        if not (0 < self.height <= LARGEST_SIDE and 0 < self.width <= LARGEST_SIDE):
-            raise ValueError(f"events: expected sides of 1 to {LARGEST_SIDE} px, got {self.height}x{self.width}")
+        if not (0 < self.height <= MAX_SIDE and 0 < self.width <= MAX_SIDE):
+            raise ValueError(f"events: expected sides of 1 to {MAX_SIDE} px, got {self.height}x{self.width}")
 
     def __len__(self) -> int:
         return len(self.t)

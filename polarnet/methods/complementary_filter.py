@@ -4,146 +4,100 @@ The module holds two filters by these authors: the complementary filter without 
 their events-only package. "CF with default parameters" can mean either, and their DoLP differs by decibels.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple, no_type_check
+from typing import Annotated, NamedTuple, no_type_check
 
 import numba
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.intensities import from_intensities, with_gain
 from polarnet.methods.method import Method, Recoverer, Setup, State
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
-HIGHPASS_GAIN = 1.5  # output gain of the high-pass filter, I = 1.5 exp(L) - 1, from the package's source
+HIGHPASS_GAIN = 1.5  # output gain of the high-pass filter, from the package's source
 
-Step = Callable[..., tuple[Tensor, "FilterState"]]
+Image = Float64[np.ndarray, "c h w"]
 
 
-@dataclass(frozen=True)
-class ComplementaryFilterConfig:
-    """Section `methods.cf` of params.yaml; the published defaults."""
+@section
+class FilterConfig:
+    """Sections `methods.cf` (published defaults) and `methods.highpass` (the package's defaults) of params.yaml."""
 
-    cutoff_hz: float = field(metadata=allowed(low=0))
+    cutoff_hz: NonNegativeFloat
     """Cutoff frequency, below which the scene fades to grey; 0: never."""
-    contrast_on: float = field(metadata=allowed(above=0))
+    decay_per_event: NonNegativeFloat
+    """Natural logarithm of a pixel's decay at each of its events, independent of time."""
+    contrast_on: PositiveFloat
     """Step in log intensity per ON event."""
-    contrast_off: float = field(metadata=allowed(high=0))
+    contrast_off: Annotated[float, Field(le=0)]
     intensity_range: list[float]
     """Intensities mapped to 0 and 1, in all four channels."""
 
     def __post_init__(self):
-        check_ranges(self)
-        _check_intensity_range(self.intensity_range)
+        if len(self.intensity_range) != 2 or not self.intensity_range[0] < self.intensity_range[1]:
+            raise ValueError(f"intensity_range: expected [low, high] with low < high, got {self.intensity_range}")
 
-
-@dataclass(frozen=True)
-class HighPassConfig:
-    """Section `methods.highpass` of params.yaml; the package's defaults, with a fixed range."""
-
-    cutoff_hz: float = field(metadata=allowed(low=0))
-    decay_per_event: float = field(metadata=allowed(low=0))
-    """Natural logarithm of a pixel's decay at each of its events, independent of time."""
-    contrast_on: float = field(metadata=allowed(above=0))
-    contrast_off: float = field(metadata=allowed(high=0))
-    intensity_range: list[float]
-
-    def __post_init__(self):
-        check_ranges(self)
-        _check_intensity_range(self.intensity_range)
-
-
-class LeakyIntegrator(NamedTuple):
-    """State of the pixels of one channel."""
-
-    log_intensity: Float64[np.ndarray, "h w"]
-    """Log intensity at the last event of each pixel."""
-    updated_us: Int64[np.ndarray, "h w"]
-    """Time of that event; 0 before the first."""
-
-
-class Decay(NamedTuple):
-    """Decay of a pixel and the step that each event adds."""
-
-    rate_per_us: float
-    per_event: float
-    contrast_on: float
-    contrast_off: float
-
-
-def at_rest(height: int, width: int) -> LeakyIntegrator:
-    """The state before any event: log intensity 0 at time 0."""
-    return LeakyIntegrator(np.zeros((height, width)), np.zeros((height, width), dtype=np.int64))
-
-
-def integrate(state: LeakyIntegrator, events: Events, decay: Decay) -> LeakyIntegrator:
-    """State after `events`, each of which sets L <- exp(-omega dt - k) L + c; ValueError if one precedes the state."""
-    log_intensity, updated_us = state.log_intensity.copy(), state.updated_us.copy()
-    t, x, y, p = (column.numpy() for column in (events.t, events.x, events.y, events.p))
-    in_order = _integrate(log_intensity, updated_us, t, x, y, p, *decay)
-    if not in_order:
-        raise ValueError("an event is older than one its pixel has seen; sort the events by time")
-    return LeakyIntegrator(log_intensity, updated_us)
-
-
-def log_intensity_at(state: LeakyIntegrator, t_us: int, decay: Decay) -> Float64[np.ndarray, "h w"]:
-    """Log intensity at `t_us`: every pixel decays from its own last event, which must be earlier."""
-    return state.log_intensity * np.exp(-decay.rate_per_us * (t_us - state.updated_us))
+    @property
+    def rate_per_us(self) -> float:
+        """Rate of the decay over time."""
+        return 2 * math.pi * self.cutoff_hz * 1e-6
 
 
 class FilterState(NamedTuple):
-    """State of a filter between images."""
+    """Leaky integrators: one for each pixel of each channel."""
 
-    pixels: Sequence[LeakyIntegrator]
-    """Integrator of each channel."""
+    log_intensity: Image
+    """Log intensity at the last event of each pixel."""
+    updated_us: Int64[np.ndarray, "c h w"]
+    """Time of that event; 0 before the first."""
     t_us: int
-    """Time of the last image."""
+    """Time of the state, at least that of its last event."""
 
 
-def filter_at_rest(channels: int, height: int, width: int) -> FilterState:
-    """State of a filter at time 0, before any event."""
-    return FilterState([at_rest(height, width)] * channels, 0)
+def at_rest(channels: int, height: int, width: int) -> FilterState:
+    """State at time 0, before any event: log intensity 0."""
+    size = (channels, height, width)
+    return FilterState(np.zeros(size), np.zeros(size, dtype=np.int64), 0)
 
 
-def step_cf(
-    state: FilterState, channels: Sequence[Events], t_us: int, config: ComplementaryFilterConfig
-) -> tuple[Float64[Tensor, "c h w"], FilterState]:
-    """Intensity at `t_us` from the events since the last image: I = exp(L) - 1, scaled to [0, 1].
+def integrate(state: FilterState, channels: Sequence[Events], t_us: int, config: FilterConfig) -> FilterState:
+    """State at `t_us`, after the events since `state`, each of which sets L <- exp(-omega dt - k) L + c.
 
-    Each of the c channels is filtered independently. `config.intensity_range` becomes [0, 1]; intensities outside are
-    clipped.
+    The channels are filtered independently. ValueError if an event precedes the last event of its pixel.
     """
-    decay = Decay(_rate_per_us(config.cutoff_hz), 0.0, config.contrast_on, config.contrast_off)
-    logs, pixels = _log_intensities(state, channels, t_us, decay)
-    return _scaled(np.expm1(logs), config.intensity_range), FilterState(pixels, t_us)
+    log_intensity, updated_us = state.log_intensity.copy(), state.updated_us.copy()
+    settings = config.rate_per_us, config.decay_per_event, config.contrast_on, config.contrast_off
+    for number, events in enumerate(channels):
+        columns = (column.numpy() for column in (events.t, events.x, events.y, events.p))
+        if not _integrate(log_intensity[number], updated_us[number], *columns, *settings):
+            raise ValueError("an event is older than the last event of its pixel; sort the events by time")
+    return FilterState(log_intensity, updated_us, t_us)
 
 
-def step_highpass(
-    state: FilterState, channels: Sequence[Events], t_us: int, config: HighPassConfig
-) -> tuple[Float64[Tensor, "c h w"], FilterState]:
-    """Like `step_cf`, with a decay per event and I = 1.5 exp(L) - 1."""
-    decay = Decay(_rate_per_us(config.cutoff_hz), config.decay_per_event, config.contrast_on, config.contrast_off)
-    logs, pixels = _log_intensities(state, channels, t_us, decay)
-    return _scaled(HIGHPASS_GAIN * np.exp(logs) - 1, config.intensity_range), FilterState(pixels, t_us)
+def cf_intensity(log_intensity: Image) -> Image:
+    """I = exp(L) - 1, the complementary filter's intensity."""
+    return np.expm1(log_intensity)
 
 
-def _log_intensities(
-    state: FilterState, channels: Sequence[Events], t_us: int, decay: Decay
-) -> tuple[Float64[np.ndarray, "c h w"], list[LeakyIntegrator]]:
-    pixels = [integrate(before, events, decay) for before, events in zip(state.pixels, channels, strict=True)]
-    return np.stack([log_intensity_at(after, t_us, decay) for after in pixels]), pixels
+def highpass_intensity(log_intensity: Image) -> Image:
+    """I = 1.5 exp(L) - 1, the high-pass filter's intensity."""
+    return HIGHPASS_GAIN * np.exp(log_intensity) - 1
 
 
-def _scaled(intensity: Float64[np.ndarray, "c h w"], intensity_range: Sequence[float]) -> Float64[Tensor, "c h w"]:
-    low, high = intensity_range
-    return torch.from_numpy(((intensity - low) / (high - low)).clip(0, 1))
+def image_of(state: FilterState, config: FilterConfig, intensity: Callable[[Image], Image]) -> Float64[Tensor, "c h w"]:
+    """Intensity at the time of the state; `config.intensity_range` becomes [0, 1], intensities outside are clipped."""
+    logs = state.log_intensity * np.exp(-config.rate_per_us * (state.t_us - state.updated_us))
+    low, high = config.intensity_range
+    return torch.from_numpy(((intensity(logs) - low) / (high - low)).clip(0, 1))
 
 
 @numba.njit(nogil=True, cache=True)
@@ -155,54 +109,32 @@ def _integrate(log_intensity, updated_us, t, x, y, p, rate_per_us, per_event, co
         if elapsed < 0:
             return False
         step = contrast_on if p[i] > 0 else contrast_off
-        kept = math.exp(-rate_per_us * elapsed - per_event)
-        log_intensity[row, column] = kept * log_intensity[row, column] + step
+        decay = math.exp(-rate_per_us * elapsed - per_event)
+        log_intensity[row, column] = decay * log_intensity[row, column] + step
         updated_us[row, column] = t[i]
     return True
 
 
-def _rate_per_us(cutoff_hz: float) -> float:
-    return 2 * math.pi * cutoff_hz * 1e-6
-
-
-def _check_intensity_range(intensity_range: Sequence[float]) -> None:
-    if len(intensity_range) != 2 or not intensity_range[0] < intensity_range[1]:
-        raise ValueError(f"intensity_range: expected [low, high] with low < high, got {intensity_range}")
-
-
-def filtered(step: Step, config: ComplementaryFilterConfig | HighPassConfig) -> Recoverer:
-    """Wrap a filter as a method: `step` runs once per window, on the events that no earlier window held."""
-
-    def start(height: int, width: int) -> State:
-        return filter_at_rest(4, height, width)
+def open_filter(setup: Setup, intensity: Callable[[Image], Image]) -> Recoverer:
+    """Filter as a method, which integrates in each window the events that no earlier window held."""
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
         images = []
         for window in windows:
             new = [slice_time(events, state.t_us, window.stop_us) for events in window.channels]
-            image, state = step(state, new, window.stop_us, config)
-            images.append(image)
+            state = integrate(state, new, window.stop_us, setup.config)
+            images.append(image_of(state, setup.config, intensity))
         return state, from_intensities(torch.stack(images))
 
-    return Recoverer(start, predict, takes_events_once=True)
-
-
-def open_cf(setup: Setup) -> Recoverer:
-    """The complementary filter, events only."""
-    return filtered(step_cf, setup.config)
-
-
-def open_highpass(setup: Setup) -> Recoverer:
-    """The high-pass filter."""
-    return filtered(step_highpass, setup.config)
+    return Recoverer(functools.partial(at_rest, 4), predict, takes_events_once=True)
 
 
 CF = Method(
     name="cf",
     label="CF",
     colour="#e08a1e",
-    open=open_cf,
-    config=ComplementaryFilterConfig,
+    open=functools.partial(open_filter, intensity=cf_intensity),
+    config=FilterConfig,
     reconstructs=True,
     about="The complementary filter without frames (Scheerlinck et al. 2018): intensity from events, one polarizer at "
     "a time, then DoLP by the Stokes formula.",
@@ -211,8 +143,8 @@ HIGHPASS = Method(
     name="highpass",
     label="high-pass",
     colour="#b0851f",
-    open=open_highpass,
-    config=HighPassConfig,
+    open=functools.partial(open_filter, intensity=highpass_intensity),
+    config=FilterConfig,
     reconstructs=True,
     about="The high-pass filter (Scheerlinck et al. 2018): intensity from events, one polarizer at a time, then DoLP "
     "by the Stokes formula.",

@@ -13,7 +13,7 @@ from polarnet.stokes import Prediction
 
 def open_e2p(setup: Setup) -> Recoverer:
     """Open E2P, which takes the four channels interleaved as a mosaic of twice the height and width."""
-    network = load_baseline(E2p, "e2p", weights_file(setup)).to(setup.device)
+    network = load_baseline({"e2p": E2p}, weights_file(setup)).to(setup.device)
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
         frames = []

@@ -4,30 +4,23 @@ FireNet+ (Stoffregen et al., ECCV 2020) takes voxel grids that are not normalise
 """
 
 from polarnet.methods.intensity_network import intensity_methods
-from polarnet.methods.method import Weights
 from polarnet.networks.firenet import FireNet
 
 COLOUR = "#3d8fd9"
+NETWORKS = {"firenet": FireNet}
 METHODS = (
     *intensity_methods(
         "firenet",
         "FireNet",
         COLOUR,
-        FireNet,
-        Weights(("firenet",), trained_by="e2v", remedy="train one with baselines.e2v.arch=firenet"),
+        NETWORKS,
+        trained_by="e2v",
+        remedy="train one with baselines.e2v.arch=firenet",
         about="FireNet (Scheerlinck et al. 2020), a recurrent network from events to intensity, one polarizer at a "
         "time, then DoLP by the Stokes formula.",
     ),
+    *intensity_methods("firenet_published", "FireNet, published weights", COLOUR, NETWORKS, sharpened=True),
     *intensity_methods(
-        "firenet_published", "FireNet, published weights", COLOUR, FireNet, Weights(("firenet",)), published=True
-    ),
-    *intensity_methods(
-        "firenetplus_published",
-        "FireNet+, published weights",
-        COLOUR,
-        FireNet,
-        Weights(("firenet",)),
-        normalised=False,
-        published=True,
+        "firenetplus_published", "FireNet+, published weights", COLOUR, NETWORKS, normalised=False, sharpened=True
     ),
 )

@@ -31,10 +31,10 @@ def with_gain(method: Method) -> Method:
         intensities = prediction.intensities
         if intensities is None:
             raise ValueError(f"{method.name} reconstructs no intensities, so that it has no gains to solve")
-        kept = intensities[:0] if before is None else before
-        seen = torch.cat([kept, intensities])
-        solved = from_intensities(consistent(seen, setup.gain, len(kept)))
-        return seen[max(0, len(seen) + 1 - setup.gain.window_frames) :], solved
+        earlier = intensities[:0] if before is None else before
+        images = torch.cat([earlier, intensities])
+        solved = from_intensities(consistent(images, setup.gain, len(earlier)))
+        return images[max(0, len(images) + 1 - setup.gain.window_frames) :], solved
 
     def open_both(setup: Setup) -> Recoverer:
         inner = method.open(setup)

@@ -1,7 +1,6 @@
 """Networks that reconstruct intensity from events, as methods; the four channels form one batch."""
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +16,19 @@ from polarnet.methods.postprocessing import postprocessed
 from polarnet.networks.checkpoint import load_checkpoint, load_tensors
 from polarnet.stokes import Prediction
 
+Networks = Mapping[str, Any]
+"""Class of each network that a method accepts, by the name in its checkpoints."""
 
-def load_baseline(build: Any, name: str, path: Path) -> Any:
-    """Load the network `name` from a checkpoint of polarnet or a published file; ValueError for another network."""
-    if path.suffix != ".safetensors":
+
+def load_baseline(networks: Networks, path: Path) -> Any:
+    """Load a checkpoint of polarnet, or the published file of a single network; ValueError for another network."""
+    if path.suffix != ".safetensors" and len(networks) == 1:
+        (build,) = networks.values()
         return build.load(path)
     tensors, metadata = load_checkpoint(path)
-    if metadata["network"] != name:
-        raise ValueError(f"{path} holds a {metadata['network']}, expected a {name}")
-    network = build(**metadata["config"])
+    if metadata["network"] not in networks:
+        raise ValueError(f"{path} holds a {metadata['network']}, expected a {' or '.join(networks)}")
+    network = networks[metadata["network"]](**metadata["config"])
     load_tensors(network, tensors, path)
     return network.eval()
 
@@ -34,22 +37,22 @@ def intensity_methods(
     name: str,
     label: str,
     colour: str,
-    build: Any,
-    weights: Weights,
+    networks: Networks,
     *,
+    trained_by: str | None = None,
+    remedy: str = "",
     about: str = "",
     normalised: bool = True,
-    published: bool = False,
+    sharpened: bool = False,
 ) -> tuple[Method, Method]:
-    """The method NAME that runs a network of the class `build`, and NAME+gain.
+    """The method NAME that runs one of `networks`, and NAME+gain.
 
-    `weights` names that network alone; see `intensity_network` for `normalised` and `published`.
+    `trained_by` and `remedy` are those of `Weights`; see `intensity_network` for `normalised` and `sharpened`.
     """
-    (network,) = weights.networks
-    load = functools.partial(load_baseline, build, network)
 
     def open_network(setup: Setup) -> Recoverer:
-        return intensity_network(load, setup, normalised=normalised, published=published)
+        network = load_baseline(networks, weights_file(setup))
+        return intensity_network(network, setup, normalised=normalised, sharpened=sharpened)
 
     method = Method(
         name=name,
@@ -57,22 +60,20 @@ def intensity_methods(
         colour=colour,
         open=open_network,
         config=WeightsConfig,
-        weights=weights,
+        weights=Weights(tuple(networks), trained_by, remedy),
         reconstructs=True,
         about=about,
     )
     return method, with_gain(method)
 
 
-def intensity_network(
-    load: Callable[[Path], Any], setup: Setup, *, normalised: bool = True, published: bool = False
-) -> Recoverer:
-    """Load a network from the setup's weights and wrap it as a method that reconstructs intensities.
+def intensity_network(network: Any, setup: Setup, *, normalised: bool = True, sharpened: bool = False) -> Recoverer:
+    """Wrap a network as a method that reconstructs intensities.
 
-    `normalised` scales voxel grids to mean 0 and standard deviation 1, as in E2VID. `published` applies the
-    post-processing of published weights; otherwise intensities are on their true scale and only clipped.
+    `normalised` scales voxel grids to mean 0 and standard deviation 1, as in E2VID. `sharpened` applies the
+    post-processing of E2VID's authors; otherwise intensities are on their true scale and only clipped.
     """
-    network = load(weights_file(setup)).to(setup.device)
+    network = network.to(setup.device)
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
         images = []
@@ -82,7 +83,7 @@ def intensity_network(
                 intensity, state = network(normalise_nonzero(grids) if normalised else grids, state)
             images.append(intensity.float())
         raw = torch.stack(images)
-        return state, from_intensities(postprocessed(raw, setup.postprocessing) if published else raw.clamp(0, 1))
+        return state, from_intensities(postprocessed(raw, setup.postprocessing) if sharpened else raw.clamp(0, 1))
 
     return Recoverer(lambda height, width: None, predict, network=network)
 

@@ -13,13 +13,14 @@ from polarnet.methods.postprocessing import PostprocessingConfig
 from polarnet.methods.stokes_gain import GainConfig
 from polarnet.networks.checkpoint import load_checkpoint
 from polarnet.runtime.files import sha256
+from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
 State = Any
 """State of a method before a window: tensors, or None at the start."""
 
 
-@dataclass(frozen=True)
+@section
 class WeightsConfig:
     """Section `methods.NAME` of params.yaml for a method whose only setting is its weights."""
 

@@ -3,30 +3,27 @@
 The authors then round images to 8 bits; polarnet does not.
 """
 
-from dataclasses import dataclass, field
 from statistics import NormalDist
 
 import torch
 from jaxtyping import Float
+from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 from torch.nn import functional as F
 
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 
 KERNEL_SIZE = 5  # blur kernel of the unsharp mask, pixels
 
 
-@dataclass(frozen=True)
+@section
 class PostprocessingConfig:
     """Section `baselines.postprocessing` of params.yaml; the published defaults."""
 
-    unsharp_amount: float = field(metadata=allowed(low=0))
+    unsharp_amount: NonNegativeFloat
     """Factor on the difference between image and blurred copy, which is added to the image; 0: off."""
-    unsharp_sigma: float = field(metadata=allowed(above=0))
+    unsharp_sigma: PositiveFloat
     """Width of the blur, in the units of the published kernel."""
-
-    def __post_init__(self):
-        check_ranges(self)
 
 
 def postprocessed(images: Float[Tensor, "t c h w"], config: PostprocessingConfig) -> Float[Tensor, "t c h w"]:

@@ -6,13 +6,14 @@ which cancels in DoLP.
 """
 
 import itertools
-from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor
 
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 
 SIGNS = (1.0, -1.0, 1.0, -1.0)  # signs of I0, I45, I90 and I135 in I0 + I90 - I45 - I135
 DARK = 0.05  # brightness relative to the mean at which a pixel has half weight: dark pixels are noisier
@@ -20,23 +21,20 @@ TO_DEVIATION = 1.4826  # from median absolute value to standard deviation, for a
 RIDGE = 1e-9  # keeps the system solvable if all channels are equal
 
 
-@dataclass(frozen=True)
+@section
 class GainConfig:
     """Section `baselines.gain` of params.yaml."""
 
-    window_frames: int = field(metadata=allowed(low=1))
+    window_frames: PositiveInt
     """Number of frames that determine the gains of a frame: the frame and those before it."""
-    rounds: int = field(metadata=allowed(low=0))
+    rounds: NonNegativeInt
     """Number of reweighting rounds by how well pixels fit; 0: equal weights."""
-    pixels: int = field(metadata=allowed(low=4))
+    pixels: Annotated[int, Field(ge=4)]
     """Maximum number of pixels used from these frames, evenly spread."""
-    smallest: float = field(metadata=allowed(above=0, high=1))
+    smallest: Annotated[float, Field(gt=0, le=1)]
     """Lower bound of a gain, as a fraction of the gain that makes all four channels equally bright."""
-    pull: float = field(metadata=allowed(low=0))
+    pull: NonNegativeFloat
     """Regularisation towards equal brightness, relative to the pixels' mean square, for poorly determined gains."""
-
-    def __post_init__(self):
-        check_ranges(self)
 
 
 def consistent(intensities: Float[Tensor, "n 4 h w"], config: GainConfig, known: int = 0) -> Float[Tensor, "m 4 h w"]:
@@ -57,8 +55,8 @@ def last_gains(intensities: Float[Tensor, "n 4 h w"], config: GainConfig) -> Flo
     """Gains of the last frame, from all given frames."""
     frames, _, height, width = intensities.shape
     size = height * width
-    looked_at = torch.arange(0, frames * size, max(1, -(-frames * size // config.pixels)), device=intensities.device)
-    pixels = intensities.flatten(2)[looked_at // size, :, looked_at % size].double()
+    chosen = torch.arange(0, frames * size, max(1, -(-frames * size // config.pixels)), device=intensities.device)
+    pixels = intensities.flatten(2)[chosen // size, :, chosen % size].double()
     return solved(pixels * pixels.new_tensor(SIGNS), config)
 
 
@@ -79,8 +77,8 @@ def solved(residuals: Float[Tensor, "n 4"], config: GainConfig) -> Float[Tensor,
     for _ in range(config.rounds):
         misfit = (rows @ _smallest(rows.T @ (weights * rows), config.smallest, config.pull)).abs()[:, None]
         weights = 1 / (1 + (misfit / (TO_DEVIATION * misfit.median() + RIDGE)).square())
-    found = _smallest(rows.T @ (weights * rows), config.smallest, config.pull) / brightness
-    return found / found.log().mean().exp()
+    solution = _smallest(rows.T @ (weights * rows), config.smallest, config.pull) / brightness
+    return solution / solution.log().mean().exp()
 
 
 def _smallest(form: Float[Tensor, "4 4"], floor: float, pull: float) -> Float[Tensor, "4"]:

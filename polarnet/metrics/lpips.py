@@ -86,7 +86,7 @@ class Backbone(NamedTuple):
     """1-based indices of the layers whose outputs are compared."""
     channels: tuple[int, ...]
     """Number of channels at each tap."""
-    least_side: int
+    min_side: int
     """Minimum side of an image in pixels; below it the last tap has no output."""
 
 
@@ -155,8 +155,8 @@ class Lpips(nn.Module):
         """
         check_range("truth", as_tensor("truth", truth), 0, 1, "images")
         with torch.no_grad():
-            of_truth = self.features(truth)
-        return self.distance(self.features(images), of_truth)
+            truth_features = self.features(truth)
+        return self.distance(self.features(images), truth_features)
 
     def features(self, images: Float[Array, "b h w"] | Float[Array, "b 3 h w"]) -> list[Float[Tensor, "b _c _h _w"]]:
         """Unit-length features of images in [0, 1] at each tap; keep them for a truth that is compared often.
@@ -165,10 +165,10 @@ class Lpips(nn.Module):
         """
         images = as_tensor("images", images)
         check_floating("images", images)
-        least = BACKBONES[self.backbone].least_side
-        if min(images.shape[-2:]) < least:
+        min_side = BACKBONES[self.backbone].min_side
+        if min(images.shape[-2:]) < min_side:
             raise ValueError(
-                f"LPIPS ({self.backbone}) needs images of {least} pixels a side, got {tuple(images.shape)}"
+                f"LPIPS ({self.backbone}) needs images of {min_side} pixels a side, got {tuple(images.shape)}"
             )
         if images.ndim == 3:
             images = images[:, None].expand(-1, 3, -1, -1)

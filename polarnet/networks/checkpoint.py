@@ -80,12 +80,12 @@ def load_network(path: str | os.PathLike[str]) -> tuple[nn.Module, dict[str, Any
 def load_tensors(network: nn.Module, tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> None:
     """Copy the tensors of a file into `network`; ValueError names a missing, surplus or differently shaped tensor."""
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-    found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    wrong = sorted(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    wrong = sorted(name for name in expected.keys() | shapes.keys() if expected.get(name) != shapes.get(name))
     if wrong:
         raise ValueError(
             f"{path} does not fit the network it is for: {wrong[0]} should be {expected.get(wrong[0], 'absent')}, "
-            f"is {found.get(wrong[0], 'absent')} ({len(wrong)} tensors differ)"
+            f"is {shapes.get(wrong[0], 'absent')} ({len(wrong)} tensors differ)"
         )
     network.load_state_dict(tensors)
 

@@ -3,7 +3,6 @@
 `CistaTc.load` reads the published file cista_tc.pth.tar.
 """
 
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -12,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polarnet.networks.e2vid import ConvLstm, reflected
+from polarnet.networks.published import PublishedNetwork
 
 CHANNELS = 64  # features at half resolution
 ATOMS = 128  # channels of the sparse code
@@ -29,16 +29,18 @@ class CistaState(NamedTuple):
     """State of the ConvLSTM; None at the start."""
 
 
-class CistaTc(nn.Module):
+class CistaTc(PublishedNetwork):
     """Iterative soft thresholding with a learned dictionary and a pull towards the previous window's code.
 
     The input is a voxel grid of one channel, normalised by `normalise_nonzero`. Layers have the names of the published
     file. All five iterations share one block, which the published file stores five times.
     """
 
+    label = "CISTA-TC"
+    first_layer = "We.conv2d.weight"
+
     def __init__(self, bins: int):
-        super().__init__()
-        self.bins = bins
+        super().__init__(bins)
         self.We = Convolution(bins, CHANNELS // 2)
         self.Wi = Convolution(1, CHANNELS // 2)
         self.W0 = Convolution(CHANNELS, CHANNELS, stride=2)
@@ -59,8 +61,7 @@ class CistaTc(nn.Module):
 
         The input is padded by reflection to multiples of 8, and the result is cropped to the original size.
         """
-        if voxels.shape[1] != self.bins:
-            raise ValueError(f"this CISTA-TC takes {self.bins} bins, got {voxels.shape[1]}")
+        self.check_bins(voxels)
         top, left, padded = reflected(voxels)
         image = torch.zeros_like(padded[:, :1]) if state is None else state.image
         features = self.W0(torch.cat([self.We(padded), self.Wi(image.to(padded.dtype))], dim=1))
@@ -75,21 +76,6 @@ class CistaTc(nn.Module):
         image = torch.sigmoid(self.final_conv(self.upsamp_conv(upsampled)).float())
         height, width = voxels.shape[-2:]
         return image[:, 0, top : top + height, left : left + width], CistaState(image, code, memory)
-
-    @classmethod
-    def load(cls, path: Path) -> "CistaTc":
-        """Load the published file without running code from it; ValueError if it belongs to another network."""
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        tensors = content.get("state_dict", content)
-        first = tensors.get("We.conv2d.weight")
-        if first is None:
-            raise ValueError(f"{path} holds no CISTA-TC: expected a tensor We.conv2d.weight")
-        network = cls(bins=first.shape[1])
-        try:
-            network.load_state_dict(tensors)
-        except RuntimeError as error:
-            raise ValueError(f"{path} holds no CISTA-TC: {error}") from None
-        return network.eval()
 
 
 class Convolution(nn.Module):

@@ -1,41 +1,41 @@
 """The paper's end-to-end DoLP recovery network (section 3.3, Fig. 6)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
+from pydantic import Field, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polarnet.networks.blocks import ConvGRU, ResidualBlock, UpBlock, compressed, contrasts, conv3x3
 from polarnet.networks.swin import SwinStage
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import one_of, section
 from polarnet.stokes import Prediction
 
 STRIDE = 4  # two stages halve the resolution; height and width are padded to multiples of 4
 MIDDLE_DOLP = 0.5  # initial bias of the output; DoLP lies in [0, 1]
 
 
-@dataclass(frozen=True)
+@section
 class DolpUNetConfig:
     """Section `networks.paper` of params.yaml."""
 
-    channels: list[int] = field(metadata=allowed(low=1))
+    channels: list[PositiveInt]
     """Channels of C1; of S1 and G1; of S2, G2, R1 and R2. The paper has 32, 64, 128."""
-    swin_depth: int = field(metadata=allowed(low=1))
+    swin_depth: PositiveInt
     """Blocks per stage; every second block has shifted tiles."""
-    swin_window: int = field(metadata=allowed(low=2))
+    swin_window: Annotated[int, Field(ge=2)]
     """Side of an attention tile in pixels."""
-    swin_heads: list[int] = field(metadata=allowed(low=1))
+    swin_heads: list[PositiveInt]
     """Attention heads of S1 and S2."""
-    residual_blocks: int = field(metadata=allowed(low=0))
+    residual_blocks: NonNegativeInt
     """Number of residual blocks; the paper has two, R1 and R2."""
-    input_mixing: str = field(metadata=allowed(choices=("polarizers", "contrasts")))
+    input_mixing: Annotated[str, one_of(("polarizers", "contrasts"))]
     """Input of C1. polarizers: the four channels, as in the paper; contrasts: their sum and differences."""
 
     def __post_init__(self):
-        check_ranges(self)
         if len(self.channels) != 3 or len(self.swin_heads) != 2:
             raise ValueError(f"channels, swin_heads: expected 3 and 2 numbers, got {self.channels}, {self.swin_heads}")
         for channels, heads in zip(self.channels[1:], self.swin_heads, strict=True):
@@ -86,13 +86,13 @@ class DolpUNet(nn.Module):
         t, b, _, height, width = inputs.shape
         x = compressed(self.mix(inputs)).flatten(0, 1).contiguous(memory_format=torch.channels_last)
         x = F.pad(x, (0, -width % STRIDE, 0, -height % STRIDE))  # the padding holds no events
-        state1, state2 = state or self.initial_state(x[:b])
+        state1, state2 = state or (None, None)
 
         c1 = F.relu(self.c1(x))
         s1 = self.s1(c1)
-        g1, state1 = self.g1(s1, state1)
+        g1, state1 = self.g1(s1, b, state1)
         s2 = self.s2(g1)
-        g2, state2 = self.g2(s2, state2)
+        g2, state2 = self.g2(s2, b, state2)
         r = self.r(g2)
         d2 = self.d2(r, skip=g1)
         d1 = self.d1(d2, skip=c1)
@@ -100,14 +100,6 @@ class DolpUNet(nn.Module):
 
         dolp = dolp[:, 0, :height, :width].float().unflatten(0, (t, b))
         return Prediction(dolp), [state1, state2]
-
-    def initial_state(self, x: Float[Tensor, "b c h w"]) -> list[Tensor]:
-        """Return zero states at half and quarter resolution of x; its height and width must be multiples of 4."""
-        b, _, height, width = x.shape
-        return [
-            x.new_zeros(b, height // scale, width // scale, channels).permute(0, 3, 1, 2)
-            for scale, channels in ((2, self.g1.channels), (4, self.g2.channels))
-        ]
 
 
 INPUT_MIXINGS: dict[str, Callable[[Tensor], Tensor]] = {"polarizers": lambda events: events, "contrasts": contrasts}

@@ -6,7 +6,6 @@ stay as published, and the result has the size of the channels.
 """
 
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polarnet.networks.firenet import ConvGRU, ResidualBlock
+from polarnet.networks.published import PublishedNetwork
 
 CHANNELS = 32
 BRANCHES = ("intensity", "aolp", "dolp")
@@ -28,12 +28,14 @@ MIN_SIDE = 2 * GATE_POOL  # smallest height and width of the result: the gate ha
 PUBLISHED_NAME = re.compile(r"(head|G1|G2|R1|R2|pred)_([iad])\.(.*)")
 
 
-class E2p(nn.Module):
+class E2p(PublishedNetwork):
     """Three identical branches for intensity, AoLP and DoLP, coupled by two gates."""
 
+    label = "E2P"
+    first_layer = "branches.dolp.head.pattern1.weight"
+
     def __init__(self, bins: int):
-        super().__init__()
-        self.bins = bins
+        super().__init__(bins)
         self.branches = nn.ModuleDict({name: Branch(bins) for name in BRANCHES})
         self.fusion_weight1 = CrossBranchGate()
         self.fusion_weight2 = CrossBranchGate()
@@ -59,33 +61,17 @@ class E2p(nn.Module):
         maps = torch.cat([branch.pred(y) for branch, y in zip(branches, x, strict=True)], dim=1)
         return maps.float(), [*first, *second]
 
-    def unroll(
-        self, mosaics: Float[Tensor, "t b bins h w"], state: list[Tensor] | None = None
-    ) -> tuple[Float[Tensor, "t b 3 h//2 w//2"], list[Tensor]]:
-        """Process t windows of b streams, one window after the other."""
-        maps = []
-        for window in mosaics:
-            frame, state = self(window, state)
-            maps.append(frame)
-        return torch.stack(maps), state or []
-
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> "E2p":
-        """Load a checkpoint with the authors' tensor names, without running code from it.
-
-        ValueError if it belongs to another network.
-        """
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        tensors = own_names(content.get("state_dict", content))
-        head = tensors.get("branches.dolp.head.pattern1.weight")
-        if head is None:
-            raise ValueError(f"{path} holds no E2P: expected a tensor head_d.pattern1.0.weight")
-        network = cls(bins=head.shape[1])
-        try:
-            network.load_state_dict(tensors)
-        except RuntimeError as error:
-            raise ValueError(f"{path} holds no E2P of the published size: {error}") from None
-        return network.eval()
+    def own_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Rename head_d.pattern1.0.weight to branches.dolp.head.pattern1.weight, and so on; keep our names."""
+        branch_of = {name[0]: name for name in BRANCHES}
+        renamed = {}
+        for name, tensor in tensors.items():
+            if match := PUBLISHED_NAME.fullmatch(name):
+                layer, letter, rest = match.groups()
+                name = f"branches.{branch_of[letter]}.{layer}.{rest}"
+            renamed[re.sub(r"(pattern\d|fusion_weight\d\.conv\d)\.0\.", r"\1.", name)] = tensor
+        return renamed
 
 
 class Branch(nn.Module):
@@ -161,15 +147,3 @@ def decoded_aolp(code: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
     """Invert `coded_aolp`: radians in [0, pi) for any code."""
     angle = math.pi * torch.remainder(code - 0.5, 1.0)
     return torch.where(angle >= math.pi, 0.0, angle)
-
-
-def own_names(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Rename the authors' tensors, head_d.pattern1.0.weight to branches.dolp.head.pattern1.weight; keep our names."""
-    branch_of = {name[0]: name for name in BRANCHES}
-    renamed = {}
-    for name, tensor in tensors.items():
-        if match := PUBLISHED_NAME.fullmatch(name):
-            layer, letter, rest = match.groups()
-            name = f"branches.{branch_of[letter]}.{layer}.{rest}"
-        renamed[re.sub(r"(pattern\d|fusion_weight\d\.conv\d)\.0\.", r"\1.", name)] = tensor
-    return renamed

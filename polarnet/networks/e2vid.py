@@ -6,12 +6,15 @@ This is the network of the published "lightweight" checkpoint. `E2vid.load` read
 import itertools
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from polarnet.networks.published import PublishedNetwork
 
 HEAD_CHANNELS = 32
 ENCODER_CHANNELS = (64, 128, 256)
@@ -30,16 +33,18 @@ PUBLISHED_SETTINGS = {
 }
 
 
-class E2vid(nn.Module):
+class E2vid(PublishedNetwork):
     """U-Net with three recurrent encoders (a stride-2 convolution, then a ConvLSTM); the intensity is in [0, 1].
 
     The input is a voxel grid of one channel, normalised by `normalise_nonzero`. Skip connections are added, not
     concatenated. Layers have the names of the published checkpoint.
     """
 
+    label = "E2VID"
+    first_layer = "head.conv2d.weight"
+
     def __init__(self, bins: int):
-        super().__init__()
-        self.bins = bins
+        super().__init__(bins)
         sizes = (HEAD_CHANNELS, *ENCODER_CHANNELS)
         steps = list(itertools.pairwise(sizes))
         self.head = Convolution(bins, HEAD_CHANNELS, 5, normalised=False)
@@ -55,8 +60,7 @@ class E2vid(nn.Module):
 
         The input is padded by reflection to multiples of 8, and the result is cropped to the original size.
         """
-        if voxels.shape[1] != self.bins:
-            raise ValueError(f"this E2VID takes {self.bins} bins, got {voxels.shape[1]}")
+        self.check_bins(voxels)
         top, left, padded = reflected(voxels)
         head = self.head(padded.contiguous(memory_format=torch.channels_last))
         x, skips, after = head, [], []
@@ -72,33 +76,26 @@ class E2vid(nn.Module):
         height, width = voxels.shape[-2:]
         return intensity[:, 0, top : top + height, left : left + width], after
 
-    def unroll(
-        self, voxels: Float[Tensor, "t b bins h w"], state: list[Tensor] | None = None
-    ) -> tuple[Float[Tensor, "t b h w"], list[Tensor]]:
-        """Process t windows of b streams, one window after the other."""
-        frames = []
-        for window in voxels:
-            frame, state = self(window, state)
-            frames.append(frame)
-        return torch.stack(frames), state or []
+    @classmethod
+    def published_tensors(cls, path: str | os.PathLike[str], content: Mapping[str, Any]) -> Mapping[str, Tensor]:
+        """Check the network settings in the file as well, because several versions of E2VID share tensor names."""
+        if "state_dict" not in content:
+            raise ValueError(f"{path} holds no E2VID: expected a dictionary with arch, model and state_dict")
+        if content.get("arch", PUBLISHED_ARCH) != PUBLISHED_ARCH:
+            raise ValueError(f"{path} holds no E2VID: its arch is {content['arch']!r}, expected {PUBLISHED_ARCH!r}")
+        settings = content.get("model") or content.get("config", {}).get("model", {})
+        for key, expected in PUBLISHED_SETTINGS.items():
+            if key in settings and settings[key] != expected:
+                raise ValueError(
+                    f"{path} holds another E2VID: its {key} is {settings[key]!r}, expected {expected!r}; "
+                    f"the published file is E2VID_lightweight.pth.tar"
+                )
+        return content["state_dict"]
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> "E2vid":
-        """Load the published checkpoint without running code from it; ValueError if it belongs to another network."""
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(content, dict) or "state_dict" not in content:
-            raise ValueError(f"{path} holds no E2VID: expected a dictionary with arch, model and state_dict")
-        _check_settings(path, content)
-        tensors = {name.removeprefix(PUBLISHED_PREFIX): tensor for name, tensor in content["state_dict"].items()}
-        head = tensors.get("head.conv2d.weight")
-        if head is None:
-            raise ValueError(f"{path} holds no E2VID: expected a tensor {PUBLISHED_PREFIX}head.conv2d.weight")
-        network = cls(bins=head.shape[1])
-        try:
-            network.load_state_dict(tensors)
-        except RuntimeError as error:
-            raise ValueError(f"{path} holds no E2VID of the published size: {error}") from None
-        return network.eval()
+    def own_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Remove the authors' prefix."""
+        return {name.removeprefix(PUBLISHED_PREFIX): tensor for name, tensor in tensors.items()}
 
 
 class Convolution(nn.Module):
@@ -136,9 +133,9 @@ class RecurrentEncoder(nn.Module):
 
 
 class ConvLstm(nn.Module):
-    """Convolutional LSTM with the gates i, f, o = sigmoid and g = tanh of conv[x, shown].
+    """Convolutional LSTM with the gates i, f, o = sigmoid and g = tanh of conv[x, output].
 
-    memory <- f memory + i g;  shown <- o tanh(memory), where `shown` is the output.
+    memory <- f memory + i g;  output <- o tanh(memory)
     """
 
     def __init__(self, channels: int):
@@ -149,8 +146,8 @@ class ConvLstm(nn.Module):
         self, x: Float[Tensor, "b c h w"], state: tuple[Tensor, Tensor] | None
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b c h w"]]:
         """Return the output and the memory; a `state` of None (at the start) counts as zeros."""
-        shown, memory = (torch.zeros_like(x), torch.zeros_like(x)) if state is None else state
-        i, f, o, g = self.Gates(torch.cat([x, shown.to(x.dtype)], dim=1)).chunk(4, dim=1)
+        output, memory = (torch.zeros_like(x), torch.zeros_like(x)) if state is None else state
+        i, f, o, g = self.Gates(torch.cat([x, output.to(x.dtype)], dim=1)).chunk(4, dim=1)
         memory = torch.sigmoid(f) * memory.to(f.dtype) + torch.sigmoid(i) * torch.tanh(g)
         return torch.sigmoid(o) * torch.tanh(memory), memory
 
@@ -190,16 +187,3 @@ def reflected(images: Float[Tensor, "b c h w"]) -> tuple[int, int, Float[Tensor,
     rows, columns = (-side % SIZE_MULTIPLE for side in images.shape[-2:])
     top, left = math.ceil(rows / 2), math.ceil(columns / 2)
     return top, left, F.pad(images, (left, columns - left, top, rows - top), mode="reflect")
-
-
-def _check_settings(path: str | os.PathLike[str], content: dict) -> None:
-    """Check the network settings in the file, because several versions of E2VID share tensor names."""
-    if content.get("arch", PUBLISHED_ARCH) != PUBLISHED_ARCH:
-        raise ValueError(f"{path} holds no E2VID: its arch is {content['arch']!r}, expected {PUBLISHED_ARCH!r}")
-    settings = content.get("model") or content.get("config", {}).get("model", {})
-    for key, expected in PUBLISHED_SETTINGS.items():
-        if key in settings and settings[key] != expected:
-            raise ValueError(
-                f"{path} holds another E2VID: its {key} is {settings[key]!r}, expected {expected!r}; "
-                f"the published file is E2VID_lightweight.pth.tar"
-            )

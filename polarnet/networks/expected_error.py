@@ -14,11 +14,11 @@ from torch.nn import functional as F
 
 from polarnet.networks.redundancy import block_means
 
-TELLING = 5
+FEATURES = 5
 MIN_DISAGREEMENT = 1e-3  # squared DoLP, added because candidates that agree may share an error
 MIN_WEIGHT = 1e-6  # lower limit of the candidates' total weight
 MIN_ROOM = 0.05  # added to dolp * (1 - dolp)
-HARDLY_ANY = 0.1  # a frame with this mean evidence has a silence of 1/2
+LITTLE_EVIDENCE = 0.1  # mean evidence of a frame with a silence of 1/2
 
 
 class ExpectedError(nn.Module):
@@ -32,16 +32,16 @@ class ExpectedError(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.register_buffer("weight", torch.zeros(TELLING))
+        self.register_buffer("weight", torch.zeros(FEATURES))
         self.register_buffer("bias", torch.zeros(()))
 
-    def forward(self, telling: Float[Tensor, "n k h w"]) -> Float[Tensor, "n 1 h w"]:
-        """Return the correction for the features from `telling`."""
-        return (self.weight.view(-1, 1, 1) * telling).sum(1, keepdim=True) + self.bias
+    def forward(self, features: Float[Tensor, "n k h w"]) -> Float[Tensor, "n 1 h w"]:
+        """Return the correction for features from `error_features`."""
+        return (self.weight.view(-1, 1, 1) * features).sum(1, keepdim=True) + self.bias
 
 
 @torch.no_grad()
-def telling(
+def error_features(
     candidates: Float[Tensor, "n c h w"],
     weights: Float[Tensor, "n c h w"],
     evidence: Float[Tensor, "n c h w"],
@@ -57,14 +57,14 @@ def telling(
     - silence: lack of evidence in the frame, from 0 to 1,
     - log of the room for errors, dolp * (1 - dolp).
     """
-    whole = weights.sum(1, keepdim=True).clamp(min=MIN_WEIGHT)
-    mean = (weights * candidates).sum(1, keepdim=True) / whole
-    apart = (weights * (candidates - mean).square()).sum(1, keepdim=True) / whole
-    apart = torch.log(apart + MIN_DISAGREEMENT)
-    at_place = torch.cat([apart, torch.log1p(evidence).mean(1, keepdim=True)], dim=1)
-    silence = 1 / (1 + evidence.mean((1, 2, 3)) / HARDLY_ANY)
-    of_frame = [apart.mean((-1, -2), keepdim=True), silence[:, None, None, None]]
+    total = weights.sum(1, keepdim=True).clamp(min=MIN_WEIGHT)
+    mean = (weights * candidates).sum(1, keepdim=True) / total
+    variance = (weights * (candidates - mean).square()).sum(1, keepdim=True) / total
+    disagreement = torch.log(variance + MIN_DISAGREEMENT)
+    of_pixels = torch.cat([disagreement, torch.log1p(evidence).mean(1, keepdim=True)], dim=1)
+    silence = 1 / (1 + evidence.mean((1, 2, 3)) / LITTLE_EVIDENCE)
+    of_frame = [disagreement.mean((-1, -2), keepdim=True), silence[:, None, None, None]]
     bounded = block_means(dolp, 2).clamp(0, 1)
     room = torch.log(bounded * (1 - bounded) + MIN_ROOM)
-    fine = F.interpolate(at_place, scale_factor=2, mode="bilinear")
+    fine = F.interpolate(of_pixels, scale_factor=2, mode="bilinear")
     return torch.cat([fine, *(one.expand_as(room) for one in of_frame), room], dim=1)

@@ -3,12 +3,14 @@
 `FireNet.load` reads the published checkpoints of FireNet and of FireNet+ (Stoffregen et al., ECCV 2020).
 """
 
-import os
+from collections.abc import Mapping
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from polarnet.networks.published import PublishedNetwork
 
 CHANNELS = 16
 MIDDLE_INTENSITY = 0.25  # initial bias of the output: a polarizer passes half of S0 = 0.5
@@ -21,15 +23,17 @@ PUBLISHED_NAMES = {
 }
 
 
-class FireNet(nn.Module):
+class FireNet(PublishedNetwork):
     """conv - ConvGRU - residual - ConvGRU - residual - 1x1 conv at full resolution, without output activation.
 
     The input is a voxel grid of one channel, normalised by `normalise_nonzero` for FireNet, unnormalised for FireNet+.
     """
 
+    label = "FireNet"
+    first_layer = "head.conv2d.weight"
+
     def __init__(self, bins: int):
-        super().__init__()
-        self.bins = bins
+        super().__init__(bins)
         self.head = Convolution(bins, CHANNELS, kernel_size=3)
         self.G1 = ConvGRU(CHANNELS)
         self.R1 = ResidualBlock(CHANNELS)
@@ -43,8 +47,7 @@ class FireNet(nn.Module):
         self, voxels: Float[Tensor, "b bins h w"], state: list[Tensor] | None = None
     ) -> tuple[Float[Tensor, "b h w"], list[Tensor]]:
         """Return the unclamped intensity at the end of one window, and the next state; `state` is None at the start."""
-        if voxels.shape[1] != self.bins:
-            raise ValueError(f"this FireNet takes {self.bins} bins, got {voxels.shape[1]}")
+        self.check_bins(voxels)
         before1, before2 = state or (None, None)
         x = F.relu(self.head(voxels.contiguous(memory_format=torch.channels_last)))
         after1 = self.G1(x, before1)
@@ -52,33 +55,13 @@ class FireNet(nn.Module):
         intensity = self.pred(self.R2(after2))
         return intensity[:, 0].float(), [after1, after2]
 
-    def unroll(
-        self, voxels: Float[Tensor, "t b bins h w"], state: list[Tensor] | None = None
-    ) -> tuple[Float[Tensor, "t b h w"], list[Tensor]]:
-        """Process t windows of b streams, one window after the other."""
-        state, frames = state or [], []
-        for window in voxels:
-            frame, state = self(window, state)
-            frames.append(frame)
-        return torch.stack(frames), state
-
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> "FireNet":
-        """Load a published checkpoint of FireNet or FireNet+ without running code from it.
+    def own_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Rename FireNet's tensors, whose names hold the block of E2VID's code that each layer was in.
 
-        ValueError if the file belongs to another network.
+        FireNet+ uses our names.
         """
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        tensors = {_own_name(name): tensor for name, tensor in content.get("state_dict", content).items()}
-        head = tensors.get("head.conv2d.weight")
-        if head is None:
-            raise ValueError(f"{path} holds no FireNet: expected tensors head.conv2d.weight, G1..., R1..., pred...")
-        network = cls(bins=head.shape[1])
-        try:
-            network.load_state_dict(tensors)
-        except RuntimeError as error:
-            raise ValueError(f"{path} holds no FireNet: {error}") from None
-        return network.eval()
+        return {_own_name(name): tensor for name, tensor in tensors.items()}
 
 
 class Convolution(nn.Module):
@@ -128,10 +111,6 @@ class ResidualBlock(nn.Module):
 
 
 def _own_name(name: str) -> str:
-    """Map the name of a published tensor to ours.
-
-    FireNet+ already uses our names. FireNet's names contain the block of E2VID's code that each layer was in.
-    """
     name = name.removeprefix("net.")
     for theirs, ours in PUBLISHED_NAMES.items():
         if name.startswith(theirs):

@@ -44,8 +44,8 @@ class Memory(NamedTuple):
     renewal: float
     """Loss of certainty, over the whole image, per fraction of the image that a displacement replaces."""
     fade: float
-    """Factor per window for parts of the panorama that are out of sight, and for the certainty if no motion was
-    found."""
+    """Factor per window for parts of the panorama that are out of sight, and for the certainty without a reliable
+    motion."""
 
 
 class Motion(NamedTuple):
@@ -53,11 +53,11 @@ class Motion(NamedTuple):
 
     displacement: Float[Tensor, "*n 2"]
     """(x, y): the point now at p was at p + displacement one window earlier."""
-    found: Bool[Tensor, "*n"]
+    reliable: Bool[Tensor, "*n"]
     """Whether the correlation of the two windows confirms the motion."""
 
 
-class Picture(NamedTuple):
+class Panorama(NamedTuple):
     """State of the filter `follow`; all zeros at the start.
 
     `level` is larger than the sensor's image and wraps around. Parts of the scene that leave the sensor fade in the
@@ -73,12 +73,12 @@ class Picture(NamedTuple):
     and imaginary part of their covariance."""
 
 
-def nothing_seen(like: Float[Tensor, "b c h w"], margin: int) -> Picture:
+def empty_panorama(like: Float[Tensor, "b c h w"], margin: int) -> Panorama:
     """Return the initial state for images of the size of `like`, with a margin of at least `margin` pixels."""
     b, c, h, w = like.shape
     height, width = _round(h + margin), _round(w + margin)
     explained = like.new_zeros(b, 4, height, width // 2 + 1)
-    return Picture(like.new_zeros(b, c, height, width), like.new_zeros(b, c, h, w), explained)
+    return Panorama(like.new_zeros(b, c, height, width), like.new_zeros(b, c, h, w), explained)
 
 
 def _round(size: int) -> int:
@@ -120,29 +120,29 @@ def _vertex(left: Float[Tensor, "*n"], middle: Float[Tensor, "*n"], right: Float
     return ((right - left) / (2 * bend)).clamp(-0.5, 0.5)
 
 
-def follow(changes: Float[Tensor, "b c h w"], motion: Motion, picture: Picture, memory: Memory) -> Picture:
-    """Advance the panorama by one window. If no motion was found, all changes are attributed to the scene.
+def follow(changes: Float[Tensor, "b c h w"], motion: Motion, panorama: Panorama, memory: Memory) -> Panorama:
+    """Advance the panorama by one window. Without a reliable motion, all changes are attributed to the scene.
 
     Let m = exp(i f d), let L and O be the variances of `level` and `own`, and C their covariance. First, `level` and C
     are multiplied by m. Then, with the difference r = own - level and S = L + O - 2 Re C + noise, the update adds
     (L - C) / S r to `level` and subtracts (O - C*) / S r from `own`.
     """
     height, width = changes.shape[-2:]
-    size = (picture.level.shape[-2], picture.level.shape[-1])
+    size = (panorama.level.shape[-2], panorama.level.shape[-1])
     beyond = (0, size[1] - width, 0, size[0] - height)
-    move, found = _move(motion, size), motion.found[:, None, None, None]
+    shift, reliable = _shift(motion, size), motion.reliable[:, None, None, None]
     expected = _expected(size, memory, changes)
-    level = torch.fft.irfft2(torch.fft.rfft2(picture.level) * move, s=size)
+    level = torch.fft.irfft2(torch.fft.rfft2(panorama.level) * shift, s=size)
     level = level * F.pad(level.new_ones(height, width), beyond, value=memory.fade)
-    own = picture.own + changes
+    own = panorama.own + changes
 
     frame = motion.displacement.new_tensor([width, height])
     entered = (motion.displacement.abs() / frame).sum(-1).clamp(max=1)[:, None, None, None]
-    kept = 1 - memory.renewal * entered
-    of_level, of_own, real, imaginary = (expected - picture.explained).split(1, dim=1)
-    of_level = expected[0] + kept.square() * (of_level - expected[0])
+    remaining = 1 - memory.renewal * entered
+    of_level, of_own, real, imaginary = (expected - panorama.explained).split(1, dim=1)
+    of_level = expected[0] + remaining.square() * (of_level - expected[0])
     of_own = of_own + memory.drift
-    of_both = torch.complex(real, imaginary) * move * kept
+    of_both = torch.complex(real, imaginary) * shift * remaining
     level_alone, own_alone = of_level - of_both, of_own - of_both  # `own` is corrected with the conjugate of own_alone
     spread = level_alone.real + own_alone.real + memory.noise
 
@@ -159,23 +159,22 @@ def follow(changes: Float[Tensor, "b c h w"], motion: Motion, picture: Picture, 
     ]
     explained = expected - torch.cat(variances, dim=1)
 
-    alike = memory.fade * picture.explained[:, 1:2]
-    still = Picture(
-        level + F.pad(difference, beyond), own, torch.cat([alike, alike, alike, torch.zeros_like(alike)], dim=1)
-    )
-    followed = Picture(level + to_level, own - to_own, explained)
-    return Picture(*(torch.where(found, a, b) for a, b in zip(followed, still, strict=True)))
+    own_explained = memory.fade * panorama.explained[:, 1:2]
+    still_explained = torch.cat([*[own_explained] * 3, torch.zeros_like(own_explained)], dim=1)
+    still = Panorama(level + F.pad(difference, beyond), own, still_explained)
+    followed = Panorama(level + to_level, own - to_own, explained)
+    return Panorama(*(torch.where(reliable, a, b) for a, b in zip(followed, still, strict=True)))
 
 
-def certainty(picture: Picture, memory: Memory) -> Float[Tensor, "b 1 1 1"]:
+def certainty(panorama: Panorama, memory: Memory) -> Float[Tensor, "b 1 1 1"]:
     """Return the share of the prior variance that is explained, from 0 to 1, as a mean over all frequencies."""
-    size = (picture.level.shape[-2], picture.level.shape[-1])
-    share = picture.explained[:, :1] / _expected(size, memory, picture.level)[:1]
+    size = (panorama.level.shape[-2], panorama.level.shape[-1])
+    share = panorama.explained[:, :1] / _expected(size, memory, panorama.level)[:1]
     return share.clamp(0, 1).mean((-1, -2), keepdim=True)
 
 
 def _expected(size: tuple[int, int], memory: Memory, like: Tensor) -> Float[Tensor, "4 H F"]:
-    """Return the initial error variances and covariance of each frequency, which `Picture.explained` is relative to.
+    """Return the initial error variances and covariance of each frequency, which `Panorama.explained` is relative to.
 
     At the start both images are 0, so both errors equal minus the scene.
     """
@@ -192,9 +191,9 @@ def _frequencies(size: tuple[int, int], like: Tensor) -> tuple[Float[Tensor, "H 
     return down, 2 * math.pi / size[1] * columns
 
 
-def _move(motion: Motion, size: tuple[int, int]) -> Tensor:
-    """Return exp(i f d) for every frequency f, complex [b, 1, H, F]; 1 if no motion was found."""
-    d = torch.where(motion.found[:, None], motion.displacement, 0.0)[:, :, None, None, None]
+def _shift(motion: Motion, size: tuple[int, int]) -> Tensor:
+    """Return exp(i f d) for every frequency f, complex [b, 1, H, F]; 1 without a reliable motion."""
+    d = torch.where(motion.reliable[:, None], motion.displacement, 0.0)[:, :, None, None, None]
     down, across = _frequencies(size, d)
     angle = across * d[:, 0] + down * d[:, 1]
     return torch.complex(angle.cos(), angle.sin())

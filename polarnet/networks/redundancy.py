@@ -28,12 +28,14 @@ MIN_EVIDENCE = 1e-2  # squared events, added to AA and BB: without events the so
 MAX_CORRELATION = 0.95  # limit on the correlation of A and B, which bias correction can push beyond 1
 
 
-def faded(x: Float[Tensor, "t *b"], keep: Float[Tensor, "*k"], state: Float[Tensor, "*s"]) -> Float[Tensor, "t *s"]:
+def faded(
+    x: Float[Tensor, "t *b"], keep: Float[Tensor, "*k"], state: Float[Tensor, "*s"] | None
+) -> Float[Tensor, "t *s"]:
     """Return running sums after each of t windows; each window multiplies earlier contributions by `keep`.
 
-    `x` and `keep` are broadcast to the shape of `state`.
+    `state` is the last sum of the previous windows; None at the start. `x` and `keep` are broadcast to its shape.
     """
-    sums = []
+    state, sums = x.new_zeros(()) if state is None else state, []
     for now in x:
         state = torch.addcmul(now, state, keep)
         sums.append(state)

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from jaxtyping import Float
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -20,8 +20,8 @@ from polarnet.networks.blocks import (
     conv3x3,
     on_blocks,
 )
-from polarnet.networks.expected_error import ExpectedError, telling
-from polarnet.networks.panorama import Memory, Motion, Picture, certainty, displacements, follow, nothing_seen
+from polarnet.networks.expected_error import ExpectedError, error_features
+from polarnet.networks.panorama import Memory, Motion, Panorama, certainty, displacements, empty_panorama, follow
 from polarnet.networks.redundancy import (
     MOMENTS,
     LeastSquares,
@@ -33,7 +33,7 @@ from polarnet.networks.redundancy import (
     length,
     neighbourhoods,
 )
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
 STRIDE = 4  # stride of the largest recurrent layer; height and width are padded to multiples of it
@@ -42,38 +42,40 @@ PARTS = ("redundancy", "slopes", "sums", "recurrence", "panorama")
 MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate
 WIDE = (3, 9)  # widths in pixels of the neighbourhoods that contribute fine structure, besides the single pixel
 MAX_DOLP = 0.98  # largest DoLP passed to atanh, to keep it finite
+PANORAMA_TENSORS = 1 + len(Panorama._fields)  # events of the previous window, then the panorama
+NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window; the rest of the state is missing
 LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
 LOG_VARIANCE_OUTPUTS = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
 
 
-@dataclass(frozen=True)
+@section
 class StokesUNetConfig:
     """Section `networks.polarnet` of params.yaml."""
 
-    channels: list[int] = field(metadata=allowed(low=1))
+    channels: list[PositiveInt]
     """Channels at 1/2, 1/4, 1/8, ... of the resolution; at least three numbers."""
-    memories: list[float] = field(metadata=allowed(low=0, high=0.999))
+    memories: list[Annotated[float, Field(ge=0, le=0.999)]]
     """Decay per window of each event sum that feeds the redundancy solver (0: present window only)."""
-    decays: list[float] = field(metadata=allowed(low=0, high=0.999))
+    decays: list[Annotated[float, Field(ge=0, le=0.999)]]
     """Decay per window of each sum of second moments."""
-    scales: list[int] = field(metadata=allowed(low=0))
+    scales: list[NonNegativeInt]
     """Widths of the neighbourhoods solved together, in pixels at quarter resolution, odd; 0: the whole image."""
-    reach: int = field(metadata=allowed(low=1))
+    reach: PositiveInt
     """Search range in pixels along each axis for the scene's motion from window to window."""
-    panorama_margin: int = field(metadata=allowed(low=1))
+    panorama_margin: PositiveInt
     """Margin of the panorama beyond the image, in pixels at half resolution."""
-    panorama_prior: float = field(metadata=allowed(above=0))
+    panorama_prior: PositiveFloat
     """This field and the next four set the panorama filter: see `polarnet.networks.panorama.Memory`."""
-    panorama_noise: float = field(metadata=allowed(above=0))
-    panorama_drift: float = field(metadata=allowed(low=0))
-    panorama_renewal: float = field(metadata=allowed(low=0, high=1))
-    panorama_fade: float = field(metadata=allowed(low=0, high=1))
-    panorama_step: float = field(metadata=allowed(above=0))
+    panorama_noise: PositiveFloat
+    panorama_drift: NonNegativeFloat
+    panorama_renewal: Annotated[float, Field(ge=0, le=1)]
+    panorama_fade: Annotated[float, Field(ge=0, le=1)]
+    panorama_step: PositiveFloat
     """Change of natural-log intensity per event."""
-    panorama_scale: int = field(metadata=allowed(low=1))
+    panorama_scale: PositiveInt
     """Width of the neighbourhood whose mean comes from the network instead of the panorama, in pixels at quarter
     resolution, odd."""
-    panorama_share: float = field(metadata=allowed(low=0.01, high=0.99))
+    panorama_share: Annotated[float, Field(ge=0.01, le=0.99)]
     """Initial weight of the panorama where it is certain. The U-Net learns a weight for each pixel."""
     without: list[str]
     """Parts (of PARTS) to ablate. redundancy: all candidates are 0; slopes: the panorama's candidates are 0; sums: the
@@ -81,7 +83,6 @@ class StokesUNetConfig:
     panorama."""
 
     def __post_init__(self):
-        check_ranges(self)
         if len(self.channels) < 3 or not (self.memories and self.decays and self.scales):
             raise ValueError(f"channels, memories, decays, scales: expected at least 3, 1, 1, 1 numbers, got {self}")
         if any(scale and scale % 2 == 0 for scale in self.scales):
@@ -115,6 +116,9 @@ class StokesUNet(nn.Module):
        it as an input and chooses its weight at each pixel.
     4. Correction: the U-Net sees the result and adds an unconstrained correction.
 
+    The state is a list: the event sums, the sums of moments, the sums averaged over each width of `WIDE`, the events of
+    the previous window with the panorama, and the states of the recurrent layers.
+
     DoLP is predicted separately from the length of (s1, s2). Where (s1, s2) are uncertain, their mean is too short,
     like any mean over angles. The outputs are linear, as in the paper's network.
     """
@@ -133,13 +137,7 @@ class StokesUNet(nn.Module):
         self.memories, self.decays, self.scales = config.memories, config.decays, config.scales
         self.without = frozenset(config.without)
         self.reach, self.margin = config.reach, config.panorama_margin
-        self.memory = Memory(
-            config.panorama_prior,
-            config.panorama_noise,
-            config.panorama_drift,
-            config.panorama_renewal,
-            config.panorama_fade,
-        )
+        self.memory = Memory(*(getattr(config, f"panorama_{name}") for name in Memory._fields))
         self.step, self.around = config.panorama_step, config.panorama_scale
         memories, scales = len(config.memories), len(config.scales)
         solved = (memories * len(config.decays) + 1) * scales
@@ -155,7 +153,6 @@ class StokesUNet(nn.Module):
         self.join = conv3x3(quarter, quarter)
         self.gru_quarter = ConvGRU(quarter)
         self.smaller = Level(quarter, smaller)
-        self.recurrent = 1 + len(smaller)
         self.at_quarter = ResidualBlock(quarter)
         self.choose = nn.Conv2d(quarter, solved + 1, kernel_size=1)
         self.up_half = UpBlock(quarter, half)
@@ -185,58 +182,54 @@ class StokesUNet(nn.Module):
         self, inputs: Float[Tensor, "t b 8 h w"], state: list[Tensor] | None = None
     ) -> tuple[Prediction, list[Tensor]]:
         """Process t windows of b streams at once: same result as `forward` per window, in fewer operations."""
+        prediction, _, state = self.unroll_with_features(inputs, state)
+        return prediction, state
+
+    def unroll_with_features(
+        self, inputs: Float[Tensor, "t b 8 h w"], state: list[Tensor] | None = None
+    ) -> tuple[Prediction, Float[Tensor, "n k h2 w2"], list[Tensor]]:
+        """Same as `unroll`, with the `error_features` of the n = t * b padded images at half resolution."""
         t, b, _, height, width = inputs.shape
         inputs = F.pad(inputs, (0, -width % STRIDE, 0, -height % STRIDE))  # the padding holds no events
         polarity, count = inputs.unflatten(2, (4, IMAGES)).unbind(3)
-        state = state or self.initial_state(inputs[0])
-        memories, decays = len(self.memories), len(self.decays)
+        before_sums, before_moments, *others = state or NO_STATE
+        before_wide, others = others[: len(WIDE)], others[len(WIDE) :]
+        before_panorama, recurrent = others[:PANORAMA_TENSORS], others[PANORAMA_TENSORS:]
 
         keep = inputs.new_tensor(self.memories).view(-1, 1, 1, 1)
-        summed = faded(polarity.unsqueeze(2), keep, torch.stack(state[:memories], dim=1))  # t, b, memory, polarizer
-        events = summed.flatten(0, 1)
-        of_events, moments = self._candidates(events, b, state[memories : memories + decays])
+        sums = faded(polarity.unsqueeze(2), keep, before_sums)  # t, b, memory, polarizer
+        from_sums, moments = self._candidates(sums.flatten(0, 1), b, before_moments)
+        wide = _wide_differences(polarity, before_wide, keep)
+        images, certain, panorama = self._panorama(polarity, (height, width), before_panorama)
+        from_slopes = self._slope_candidates(images)
+        candidates = Candidates(*(torch.cat(pair, dim=1) for pair in zip(from_sums, from_slopes, strict=True)))
 
-        panorama = memories + decays + len(WIDE)  # index where the state of the panorama begins
-        around = _around(polarity, state[memories + decays : panorama], keep)
-
-        shown, certain, carried = self._panorama(polarity, (height, width), state[panorama : -self.recurrent])
-        of_slopes = self._of_slopes(shown)
-        candidates = Candidates(*(torch.cat(pair, dim=1) for pair in zip(of_events, of_slopes, strict=True)))
-        x2 = on_blocks(self.stem, _images(events, count.flatten(0, 1)))
-        x2 = F.relu(x2 + self.from_mosaic(_pattern(shown, certain)))
-        solved = torch.cat([candidates.s1, candidates.s2, candidates.dolp, torch.log1p(candidates.evidence)], dim=1)
-        solved = solved.contiguous(memory_format=torch.channels_last)
-        x4 = F.relu(self.join(F.relu(self.to_quarter(x2) + self.from_candidates(solved))))
-        recurrent = state[-self.recurrent :]
-        began = self._nothing_held(x4) if "recurrence" in self.without else recurrent
-        g4, held = self.gru_quarter(x4, began[0])
-        y4, others = self.smaller(g4, began[1:])
-        recurrent = recurrent if "recurrence" in self.without else [held, *others]
-        y4 = self.at_quarter(y4)
-        weights = self.choose(y4).float().softmax(1)
-        mixed = self._mixed(candidates, weights)
+        x2 = on_blocks(self.stem, _event_images(sums.flatten(0, 1), count.flatten(0, 1)))
+        x2 = F.relu(x2 + self.from_mosaic(_panorama_images(images, certain)))
+        y4, recurrent = self._quarter(x2, candidates, b, recurrent)
         y2 = self.at_half(self.up_half(y4, skip=x2))
+
+        weights = self.choose(y4).float().softmax(1)
+        coarse = F.interpolate(self._mixed(candidates, weights), scale_factor=4, mode="bilinear")
         gains = self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float())
-        coarse = F.interpolate(mixed, scale_factor=4, mode="bilinear")
-        moved = _moved(coarse[:, :2], [_differences(summed), *around], gains)
+        moved = _moved(coarse[:, :2], [_differences(sums), *wide], gains)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
-        trusted = F.interpolate(torch.sigmoid(self.trust(y2).float()), scale_factor=2, mode="bilinear")
-        fine = torch.cat(averaged(moved, dolp, shown[:, 1:3], certain * trusted, self.around), dim=1)
-        seen = torch.cat([y2, F.pixel_unshuffle(fine, 2).to(y2.dtype)], dim=1)
-        added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(seen)))), 2).float()
+        share = certain * F.interpolate(torch.sigmoid(self.trust(y2).float()), scale_factor=2, mode="bilinear")
+        fine = torch.cat(averaged(moved, dolp, images[:, 1:3], share, self.around), dim=1)
+        features = torch.cat([y2, F.pixel_unshuffle(fine, 2).to(y2.dtype)], dim=1)
+        added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(features)))), 2).float()
 
         stokes, dolp = (fine + added[:, :3]).split([2, 1], dim=1)
         aolp = torch.remainder(torch.atan2(stokes[:, 1], stokes[:, 0]) / 2, math.pi)
-        expected = self.expected(telling(candidates.dolp, weights[:, :-1], candidates.evidence, dolp))
-        log_variance = LOG_VARIANCE + added[:, 3] + F.interpolate(expected, scale_factor=2)[:, 0]
+        features = error_features(candidates.dolp, weights[:, :-1], candidates.evidence, dolp)
+        log_variance = LOG_VARIANCE + added[:, 3] + F.interpolate(self.expected(features), scale_factor=2)[:, 0]
         maps = [dolp[:, 0], aolp, log_variance, stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
-        carried = [*(sums[-1] for sums in around), *carried]
-        return prediction, [*summed[-1].unbind(1), *moments, *carried, *recurrent]
+        return prediction, features, [sums[-1], moments, *(means[-1] for means in wide), *panorama, *recurrent]
 
     @torch.no_grad()
     def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:
-        """Set the log-variance to weight @ x + bias, where x is the input of `expected`; keep other outputs."""
+        """Set the log-variance to weight @ features + bias; keep other outputs."""
         assert self.add.bias is not None
         self.add.weight[LOG_VARIANCE_OUTPUTS] = 0
         self.add.bias[LOG_VARIANCE_OUTPUTS] = 0
@@ -244,8 +237,8 @@ class StokesUNet(nn.Module):
         self.expected.bias.fill_(bias - LOG_VARIANCE)
 
     def _candidates(
-        self, events: Float[Tensor, "n m 4 h w"], streams: int, state: list[Tensor]
-    ) -> tuple[Candidates, list[Tensor]]:
+        self, events: Float[Tensor, "n m 4 h w"], streams: int, state: Float[Tensor, "b d c h4 w4"] | None
+    ) -> tuple[Candidates, Float[Tensor, "b d c h4 w4"]]:
         """Return the candidates from changes in time, and the sums of moments for the next window.
 
         Computed in float32, because the solution takes differences of similar numbers.
@@ -254,25 +247,24 @@ class StokesUNet(nn.Module):
             windows = self._unless("redundancy", events).split(streams)  # a single window fits into a core's cache
             moments = torch.stack([self.moments(window, pooled=4).flatten(1, 2) for window in windows]).unsqueeze(2)
             keep = moments.new_tensor(self.decays).view(-1, 1, 1, 1)
-            sums = faded(moments, keep, torch.stack(state, dim=1))
+            sums = faded(moments, keep, state)
             shape = (len(self.decays), len(self.memories), MOMENTS)
             near = neighbourhoods(sums.flatten(0, 1).flatten(1, 2), self.scales)
             stacked = torch.stack([mean.unflatten(1, shape).transpose(1, 2) for mean in near], dim=3)
             s1, s2, evidence = self.solve(stacked)
-            return Candidates(s1, s2, length(s1, s2), evidence), [*sums[-1].unbind(1)]
+            return Candidates(s1, s2, length(s1, s2), evidence), sums[-1]
 
-    def _of_slopes(self, shown: Float[Tensor, "n 4 h w"]) -> Candidates:
+    def _slope_candidates(self, images: Float[Tensor, "n 4 h w"]) -> Candidates:
         """Return the candidates from the panorama's differences between neighbouring pixels, at quarter resolution."""
-        with torch.autocast(shown.device.type, enabled=False):
-            pictures = self._unless("redundancy", self._unless("slopes", 2 / self.step * shown))
-            moments = self.slopes(pictures)
+        with torch.autocast(images.device.type, enabled=False):
+            moments = self.slopes(self._unless("redundancy", self._unless("slopes", 2 / self.step * images)))
             stacked = torch.stack([*neighbourhoods(moments, self.scales)], dim=1)
             s1, s2, _ = self.solve_slopes(stacked[:, None, None, :, :-1])
             return Candidates(s1, s2, length(s1, s2), stacked[:, :, -1])
 
     @torch.no_grad()
     def _panorama(
-        self, polarity: Float[Tensor, "t b 4 h w"], seen: tuple[int, int], state: list[Tensor]
+        self, polarity: Float[Tensor, "t b 4 h w"], sensor: tuple[int, int], state: list[Tensor]
     ) -> tuple[Float[Tensor, "n 4 h/2 w/2"], Float[Tensor, "n 1 1 1"], list[Tensor]]:
         """Follow the panorama over t windows; return its four images, its certainty from 0 to 1, and the next state.
 
@@ -280,61 +272,55 @@ class StokesUNet(nn.Module):
         ((log I0 + log I90) - (log I45 + log I135)) / 2. They are given after each window at half resolution, each up to
         an additive constant.
 
-        The sensor covers the first `seen` rows and columns. `state` holds the events of the previous window, summed
-        over channels, and the fields of a `Picture`. Without the panorama (`without`), the images and the certainty
-        are 0.
+        The sensor covers the first rows and columns, `sensor` of them. Without the panorama (`without`), the images and
+        the certainty are 0.
         """
+        if not state:
+            state = [torch.zeros_like(polarity[0, :, 0]), *empty_panorama(polarity[0, ..., ::2, ::2], self.margin)]
         before, level, own, explained = state
         if "panorama" in self.without:
-            shown = own.new_zeros(len(polarity) * len(own), *own.shape[1:])
-            return shown, shown.new_zeros(len(shown), 1, 1, 1), state
+            images = own.new_zeros(len(polarity) * len(own), *own.shape[1:])
+            return images, images.new_zeros(len(images), 1, 1, 1), state
         with torch.autocast(polarity.device.type, enabled=False):
-            images = torch.cat([before[None], polarity.sum(2)])
-            motion = displacements(images, self.reach)
-            height, width = (size // 2 for size in seen)
+            events = torch.cat([before[None], polarity.sum(2)])
+            motion = displacements(events, self.reach)
+            height, width = (size // 2 for size in sensor)
             changes = block_means(contrasts(polarity) / 2, 2)[..., :height, :width]
-            picture, pictures = Picture(level, own[..., :height, :width], explained), []
-            for change, displacement, found in zip(changes, motion.displacement / 2, motion.found, strict=True):
-                picture = follow(change, Motion(displacement, found), picture, self.memory)
-                pictures.append(picture)
-            shown = torch.cat([one.level[..., : own.shape[-2], : own.shape[-1]] for one in pictures])
-            certain = torch.cat([certainty(one, self.memory) for one in pictures])
-            own = F.pad(picture.own, (0, own.shape[-1] - width, 0, own.shape[-2] - height))
-            return self.step * shown, certain, [images[-1], picture.level, own, picture.explained]
+            panorama, panoramas = Panorama(level, own[..., :height, :width], explained), []
+            for change, displacement, reliable in zip(changes, motion.displacement / 2, motion.reliable, strict=True):
+                panorama = follow(change, Motion(displacement, reliable), panorama, self.memory)
+                panoramas.append(panorama)
+            images = torch.cat([one.level[..., : own.shape[-2], : own.shape[-1]] for one in panoramas])
+            certain = torch.cat([certainty(one, self.memory) for one in panoramas])
+            own = F.pad(panorama.own, (0, own.shape[-1] - width, 0, own.shape[-2] - height))
+            return self.step * images, certain, [events[-1], panorama.level, own, panorama.explained]
+
+    def _quarter(
+        self, x2: Float[Tensor, "n c h2 w2"], candidates: Candidates, streams: int, state: list[Tensor]
+    ) -> tuple[Float[Tensor, "n d h w"], list[Tensor]]:
+        """Return the U-Net's features at quarter resolution, and the recurrent states after the last window."""
+        inputs = torch.cat([*candidates[:3], torch.log1p(candidates.evidence)], dim=1)
+        inputs = inputs.contiguous(memory_format=torch.channels_last)
+        x4 = F.relu(self.join(F.relu(self.to_quarter(x2) + self.from_candidates(inputs))))
+        if "recurrence" in self.without:
+            streams, state = len(x4), []
+        g4, first = self.gru_quarter(x4, streams, state[0] if state else None)
+        y4, smaller = self.smaller(g4, streams, state[1:])
+        return self.at_quarter(y4), [] if "recurrence" in self.without else [first, *smaller]
 
     def _mixed(self, candidates: Candidates, weights: Float[Tensor, "n c1 h w"]) -> Float[Tensor, "n 3 h w"]:
         """Mix the candidates to s1, s2 and DoLP. The last weight belongs to the constant, which adds to DoLP only."""
-        of_solved, of_constant = weights[:, :-1], weights[:, -1:]
-        mixed = [(of_solved * field).sum(1, keepdim=True) for field in candidates[:3]]
-        mixed[2] = mixed[2] + of_constant * self.constant
+        mixed = [(weights[:, :-1] * field).sum(1, keepdim=True) for field in candidates[:3]]
+        mixed[2] = mixed[2] + weights[:, -1:] * self.constant
         return torch.cat(mixed, dim=1)
 
     def _unless(self, part: str, x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """Return `x`, or 0 * x if this part is left out (which keeps the gradient path)."""
         return 0 * x if part in self.without else x
 
-    def _nothing_held(self, x4: Float[Tensor, "n c h w"]) -> list[Tensor]:
-        """Initial states of the recurrent layers: zeros."""
-        return [torch.zeros_like(x4), *self.smaller.initial_states(x4)]
 
-    def initial_state(self, inputs: Float[Tensor, "b c h w"]) -> list[Tensor]:
-        """Return the initial state, all zeros; height and width of `inputs` must be multiples of 4.
-
-        The state holds sums of events and of moments, neighbourhood means of the event sums, the last window's
-        polarities, the panorama, and the states of the recurrent layers.
-        """
-        b, _, height, width = inputs.shape
-        quarter = inputs.new_zeros(b, height // 4, width // 4, self.gru_quarter.channels).permute(0, 3, 1, 2)
-        events = [inputs.new_zeros(b, 4, height, width) for _ in self.memories]
-        moments = [inputs.new_zeros(b, len(self.memories) * MOMENTS, height // 4, width // 4) for _ in self.decays]
-        wide = [inputs.new_zeros(b, len(self.memories), 2, height, width) for _ in WIDE]
-        panorama = nothing_seen(inputs[:, :4, ::2, ::2], self.margin)
-        before = inputs.new_zeros(b, height, width)
-        return [*events, *moments, *wide, before, *panorama, *self._nothing_held(quarter)]
-
-
-def _around(
-    polarity: Float[Tensor, "t b 4 h w"], before: Sequence[Tensor], keep: Float[Tensor, "m 1 1 1"]
+def _wide_differences(
+    polarity: Float[Tensor, "t b 4 h w"], before: Sequence[Tensor | None], keep: Float[Tensor, "m 1 1 1"]
 ) -> list[Float[Tensor, "t b m 2 h w"]]:
     """Update the sums `before` of e0 - e90 and e45 - e135, for each memory, averaged over each width of `WIDE`.
 
@@ -363,31 +349,31 @@ def _moved(
 def averaged(
     stokes: Float[Tensor, "n 2 h w"],
     dolp: Float[Tensor, "n 1 h w"],
-    shown: Float[Tensor, "n 2 h/2 w/2"],
+    panorama: Float[Tensor, "n 2 h/2 w/2"],
     share: Float[Tensor, "n 1 #h #w"],
     around: int,
 ) -> tuple[Float[Tensor, "n 2 h w"], Float[Tensor, "n 1 h w"]]:
     """Interpolate (s1, s2) and DoLP towards a panorama, with weight `share`.
 
-    The panorama `shown` holds atanh(s1) and atanh(s2) up to additive constants. The constants are chosen so that its
-    mean over `around` pixels at quarter resolution matches that of (s1, s2).
+    `panorama` holds atanh(s1) and atanh(s2) up to additive constants. The constants are chosen so that its mean over
+    `around` pixels at quarter resolution matches that of (s1, s2).
     """
     short = length(*stokes.unbind(1))[:, None]
     own = torch.atanh(stokes / short * torch.maximum(short, dolp).clamp(max=MAX_DOLP))
-    constants = box_means(block_means(own, 4) - block_means(shown, 2), around)
-    shown = shown + F.interpolate(constants, scale_factor=2, mode="bilinear")
-    panorama = torch.tanh(F.interpolate(shown, scale_factor=2, mode="bilinear"))
-    return torch.lerp(stokes, panorama, share), torch.lerp(dolp, length(*panorama.unbind(1))[:, None], share)
+    constants = box_means(block_means(own, 4) - block_means(panorama, 2), around)
+    panorama = panorama + F.interpolate(constants, scale_factor=2, mode="bilinear")
+    aligned = torch.tanh(F.interpolate(panorama, scale_factor=2, mode="bilinear"))
+    return torch.lerp(stokes, aligned, share), torch.lerp(dolp, length(*aligned.unbind(1))[:, None], share)
 
 
-def _pattern(shown: Float[Tensor, "n 4 h w"], certain: Float[Tensor, "n 1 1 1"]) -> Float[Tensor, "n 5 h w"]:
+def _panorama_images(images: Float[Tensor, "n 4 h w"], certain: Float[Tensor, "n 1 1 1"]) -> Float[Tensor, "n 5 h w"]:
     """Stack the U-Net's input from the panorama: the images minus their means, and the certainty."""
-    images = [shown - shown.mean((-1, -2), keepdim=True), certain.expand_as(shown[:, :1])]
-    return torch.cat(images, dim=1).contiguous(memory_format=torch.channels_last)
+    inputs = [images - images.mean((-1, -2), keepdim=True), certain.expand_as(images[:, :1])]
+    return torch.cat(inputs, dim=1).contiguous(memory_format=torch.channels_last)
 
 
-def _images(events: Float[Tensor, "n m 4 h w"], count: Float[Tensor, "n 4 h w"]) -> Float[Tensor, "n c h w"]:
+def _event_images(sums: Float[Tensor, "n m 4 h w"], count: Float[Tensor, "n 4 h w"]) -> Float[Tensor, "n c h w"]:
     """Stack the U-Net's input from the events: contrasts of every event sum, and the number of events."""
-    windows = zip(events.split(1), count.split(1), strict=True)  # a single window fits into a core's cache
-    seen = (torch.cat([contrasts(sums).flatten(1, 2), each.sum(1, keepdim=True) / 2], dim=1) for sums, each in windows)
-    return torch.cat([compressed(images).contiguous(memory_format=torch.channels_last) for images in seen])
+    windows = zip(sums.split(1), count.split(1), strict=True)  # a single window fits into a core's cache
+    inputs = (torch.cat([contrasts(one).flatten(1, 2), each.sum(1, keepdim=True) / 2], dim=1) for one, each in windows)
+    return torch.cat([compressed(images).contiguous(memory_format=torch.channels_last) for images in inputs])

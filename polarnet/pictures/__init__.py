@@ -1,1 +1,1 @@
-"""Pictures from files, wheels and seeds, made alike and split by source."""
+"""Pictures from files, from scikit-image and from seeds: one size, one colour space, split by source picture."""

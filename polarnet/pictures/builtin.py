@@ -1,4 +1,4 @@
-"""Colour photographs that lie in scikit-image's wheel, so that a fresh clone has real pictures without a network."""
+"""Colour photographs from scikit-image's wheel, so that a fresh clone has real pictures without a network."""
 
 from dataclasses import dataclass
 from importlib import resources
@@ -7,7 +7,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class BuiltinPhoto:
-    """One file of scikit-image's data folder, with what scikit-image says about where it comes from."""
+    """One file of scikit-image's data folder, with its origin as scikit-image states it."""
 
     file: str
     origin: str
@@ -16,7 +16,7 @@ class BuiltinPhoto:
 
     @property
     def path(self) -> Path:
-        """Where the installed scikit-image keeps the file; FileNotFoundError where it does not."""
+        """Path in the installed scikit-image; FileNotFoundError if the file is missing."""
         path = Path(str(resources.files("skimage"))) / "data" / self.file
         if not path.is_file():
             raise FileNotFoundError(

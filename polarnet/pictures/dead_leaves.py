@@ -62,7 +62,7 @@ def dead_leaves(generator: np.random.Generator, height: int, width: int) -> Floa
 
 
 def _draw_leaves(generator: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """Leaves of one picture, in the order in which they fall; every octave of sizes covers the same area."""
+    """Draw the leaves of one picture in the order in which they fall; every octave of sizes covers the same area."""
     smallest = math.exp(generator.uniform(*np.log(RADIUS_MIN_PX)))
     largest = max(RADIUS_MAX * min(height, width), 2 * smallest)
     mean_square = 2 * math.log(largest / smallest) / (smallest**-2 - largest**-2)
@@ -151,7 +151,7 @@ def _paint(
 ) -> None:
     """Add the leaves to a black picture from the topmost, the last, down; rims are blended over one pixel.
 
-    `uncovered` is what share of each pixel still shows what lies below; where it is 0, nothing is left to paint.
+    `uncovered` is the share of each pixel that no leaf covers yet; at 0 the pixel is complete.
     """
     height, width = uncovered.shape
     for i in range(len(leaves) - 1, -1, -1):
@@ -159,18 +159,18 @@ def _paint(
         reach = leaf.radius + 1
         for row in range(max(0, math.ceil(leaf.y - reach)), min(height, math.floor(leaf.y + reach) + 1)):
             for column in range(max(0, math.ceil(leaf.x - reach)), min(width, math.floor(leaf.x + reach) + 1)):
-                seen = uncovered[row, column]
-                if seen == 0:
+                visible = uncovered[row, column]
+                if visible == 0:
                     continue
                 dx, dy = column - leaf.x, row - leaf.y
                 cover = min(1.0, 0.5 - _outside_px(leaf, dx, dy))
                 if cover <= 0:
                     continue
                 red, green, blue = _colour(leaf, dx, dy, noise)
-                picture[row, column, 0] += seen * cover * red
-                picture[row, column, 1] += seen * cover * green
-                picture[row, column, 2] += seen * cover * blue
-                uncovered[row, column] = seen - seen * cover if seen * (1 - cover) > HIDDEN else 0
+                picture[row, column, 0] += visible * cover * red
+                picture[row, column, 1] += visible * cover * green
+                picture[row, column, 2] += visible * cover * blue
+                uncovered[row, column] = visible - visible * cover if visible * (1 - cover) > HIDDEN else 0
 
 
 @no_type_check

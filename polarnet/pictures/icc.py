@@ -1,7 +1,7 @@
 """Embedded ICC colour profiles: from a device's RGB to sRGB, in floating point.
 
-Little CMS as Pillow offers it works on 8 bits only, so profiles made of a matrix and three curves (sRGB, Adobe RGB,
-Display P3, ProPhoto: nearly all there are) are evaluated here; the few made of tables go through Pillow.
+Pillow's Little CMS works on 8 bits only. Profiles of a matrix and three curves (sRGB, Adobe RGB, Display P3, ProPhoto:
+nearly all) are therefore evaluated here; the few profiles of tables go through Pillow.
 """
 
 import io
@@ -61,7 +61,7 @@ def read_tags(profile: bytes) -> dict[str, bytes]:
 
 
 def encode_srgb(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Linear light in [0, 1] to sRGB code values (IEC 61966-2-1); what is outside is clipped."""
+    """Linear light in [0, 1] to sRGB code values (IEC 61966-2-1); other values are clipped."""
     light = np.clip(linear, 0, 1)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 

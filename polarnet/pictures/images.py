@@ -49,12 +49,12 @@ NO_PICTURES = frozenset(
 
 
 class UnreadablePicture(ValueError):
-    """This file gives no RGB picture; the message says why."""
+    """A file without a usable RGB picture; the message gives the reason."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture as its file holds it, but upright."""
+    """A picture in the encoding of its file, turned upright."""
 
     pixels: Shaped[np.ndarray, "h w 3"]  # uint8, uint16 or float32; float: 1.0 is white
     profile: bytes | None  # embedded ICC profile
@@ -102,13 +102,13 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
 
 
 def read_channels(path: str | os.PathLike[str]) -> Shaped[np.ndarray, "h w c"]:
-    """The upright code values of all channels but alpha, whatever they mean; raises as `read_picture` does."""
+    """The upright code values of all channels except alpha; raises as `read_picture` does."""
     pixels, spec, _ = _read(Path(path))
     return pixels[..., [i for i in range(spec.nchannels) if i != spec.alpha_channel]]
 
 
 def upright(pixels: Shaped[np.ndarray, "h w c"], orientation: int) -> Shaped[np.ndarray, "a b c"]:
-    """Pixels as they should be shown, by the EXIF orientation 1 to 8; others are taken as 1."""
+    """Pixels turned upright by the EXIF orientation, 1 to 8; other numbers count as 1."""
     if orientation in (5, 6, 7, 8):  # stored with rows and columns swapped
         pixels = pixels.transpose(1, 0, 2)
     if orientation in (2, 3, 6, 7):
@@ -121,8 +121,8 @@ def upright(pixels: Shaped[np.ndarray, "h w c"], orientation: int) -> Shaped[np.
 def srgb_of(pixels: Float32[np.ndarray, "h w 3"], picture: Picture) -> Float32[np.ndarray, "h w 3"]:
     """Pixels in the colours of `picture` as sRGB code values in [0, 1], out of range clipped.
 
-    By the embedded profile; without one, by the encoding that the file names (linear light, a gamma, Display P3);
-    without that, they are sRGB already. UnreadablePicture where the profile or encoding cannot be used.
+    The embedded profile decides; without one, the encoding that the file names (linear light, a gamma, Display P3).
+    Pixels with neither are sRGB already. UnreadablePicture if the profile or encoding cannot be used.
     """
     if picture.profile is not None:
         try:
@@ -211,7 +211,7 @@ def _refuse_by_extension(path: Path) -> None:
 
 
 def _rgb_channels(names: Sequence[str], alpha: int) -> list[int]:
-    """Where R, G and B lie; the first three channels beside alpha where nothing is called so."""
+    """Indices of R, G and B; without these names, the first three channels except alpha."""
     capitals = [name.upper() for name in names]
     if all(name in capitals for name in "RGB"):
         return [capitals.index(name) for name in "RGB"]

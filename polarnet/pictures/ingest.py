@@ -1,4 +1,4 @@
-"""Source pictures -> data/images: RGB pictures of one size, each with a split, and a manifest of what was left out."""
+"""From source pictures to data/images: RGB pictures of one size, each with a split, and a manifest."""
 
 import dataclasses
 import functools
@@ -8,13 +8,14 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import numpy as np
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
-from polarnet.pictures.builtin import BUILTIN_PHOTOS, BuiltinPhoto
+from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import (
     UnreadablePicture,
@@ -40,7 +41,7 @@ from polarnet.pictures.polarimetry import (
 )
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import generator_for
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import one_of, section
 from polarnet.stokes import parse_mosaic
 
 logger = logging.getLogger(__name__)
@@ -50,31 +51,30 @@ EDGE_BYTES = 1 << 16  # of a file's start and end, hashed to choose `limit` file
 Mapper = Callable[..., Iterable[Any]]
 
 
-@dataclass(frozen=True)
+@section
 class IngestConfig:
     """Section `ingest` of params.yaml."""
 
-    source: str = field(metadata=allowed(choices=("builtin", "folder", "polarization")))
+    source: Annotated[str, one_of(("builtin", "folder", "polarization"))]
     root: str
     """Folder of the sources folder and polarization, searched recursively."""
-    limit: int | None = field(metadata=allowed(low=1))
+    limit: PositiveInt | None
     """At most this many pictures of the folder, chosen by content hash."""
-    dead_leaves: int = field(metadata=allowed(low=0))
+    dead_leaves: NonNegativeInt
     """Generated pictures beside the builtin photographs."""
-    height: int = field(metadata=allowed(low=16))
+    height: Annotated[int, Field(ge=16)]
     """Pixels of every picture after the centre crop."""
-    width: int = field(metadata=allowed(low=16))
-    max_upscale: float = field(metadata=allowed(low=1))
+    width: Annotated[int, Field(ge=16)]
+    max_upscale: Annotated[float, Field(ge=1)]
     """A picture that would have to be enlarged more is too small."""
-    val_fraction: float = field(metadata=allowed(low=0, high=1))
-    test_fraction: float = field(metadata=allowed(low=0, high=1))
+    val_fraction: Annotated[float, Field(ge=0, le=1)]
+    test_fraction: Annotated[float, Field(ge=0, le=1)]
     mosaic: str
     """Polarizer angles of the 2x2 pixels of a raw mosaic, even row / odd row (source=polarization)."""
-    residual_max: float = field(metadata=allowed(above=0))
+    residual_max: PositiveFloat
     """Largest accepted median of |I0 + I90 - I45 - I135| / S0 (source=polarization)."""
 
     def __post_init__(self):
-        check_ranges(self)
         parse_mosaic(self.mosaic)
         if self.val_fraction + self.test_fraction > 1:
             raise ValueError(
@@ -84,22 +84,22 @@ class IngestConfig:
 
 @dataclass(frozen=True)
 class Source:
-    """One picture to read, and what is known about it."""
+    """One picture to read, with its origin."""
 
     files: tuple[Path, ...]  # four of them where each polarizer has its own
     kind: str  # photograph, folder or polarization
     stem: str
     origin: str
-    licence: str | None
-    author: str | None
+    licence: str | None = None
+    author: str | None = None
 
 
 def ingest(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Manifest:
-    """Fill `folder` with PNG pictures of config.height x config.width and their manifest, replacing what was there.
+    """Fill `folder` with PNG pictures of config.height x config.width and their manifest, replacing its content.
 
-    `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; like the order of the
-    files, it does not matter to the result. Writes beside `folder` first, so that it is never half full. Warns about
-    every file skipped; ValueError where no picture is left.
+    `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`. Neither the mapper nor
+    the order of the files changes the result. The pictures are written beside `folder` first, so that it is never half
+    full. Logs a warning for every file skipped; raises ValueError if no picture is left.
     """
     temporary = folder.with_name(folder.name + ".tmp")
     shutil.rmtree(temporary, ignore_errors=True)
@@ -118,44 +118,34 @@ def ingest(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Man
 
 
 def _ingest_builtin(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Manifest:
-    photographs = list(mapper(functools.partial(_convert, config=config, folder=folder), list(enumerate(_builtin()))))
+    sources = [
+        Source((photo.path,), "photograph", photo.path.stem, photo.origin, photo.licence, photo.author)
+        for photo in BUILTIN_PHOTOS
+    ]
+    photographs = list(mapper(functools.partial(_convert, config=config, folder=folder), list(enumerate(sources))))
     make = functools.partial(_make_dead_leaves, config=config, seed=seed, folder=folder)
-    made = list(mapper(make, range(config.dead_leaves)))
-    kept, skipped = _without_duplicates([*photographs, *made])
-    groups = [[entry for entry in kept if entry.source == kind] for kind in ("photograph", "dead_leaves")]
+    generated = list(mapper(make, range(config.dead_leaves)))
+    entries, skipped = _without_duplicates([*photographs, *generated])
+    groups = [[entry for entry in entries if entry.source == kind] for kind in ("photograph", "dead_leaves")]
     return _manifest([entry for group in groups for entry in _split(config, group)], skipped, folder)
 
 
-def _builtin() -> list[Source]:
-    def source(photo: BuiltinPhoto) -> Source:
-        return Source(
-            files=(photo.path,),
-            kind="photograph",
-            stem=photo.path.stem,
-            origin=photo.origin,
-            licence=photo.licence,
-            author=photo.author,
-        )
-
-    return [source(photo) for photo in BUILTIN_PHOTOS]
-
-
 def _ingest_folder(config: IngestConfig, folder: Path, mapper: Mapper) -> Manifest:
-    """Reads as many files, in the order of their hashes, as it takes to get `limit` pictures."""
+    """Read files in the order of their hashes until there are `limit` pictures."""
     sources, ignored = _find_pictures(Path(config.root), config.source)
     if config.limit is not None:
         sources.sort(key=lambda source: _edge_hash(source.files))
     convert = functools.partial(_CONVERTERS[config.source], config=config, folder=folder)
-    kept: list[ManifestEntry] = []
+    entries: list[ManifestEntry] = []
     outcomes: list[ManifestEntry | Skipped] = []
-    while len(outcomes) < len(sources) and (config.limit is None or len(kept) < config.limit):
-        wanted = len(sources) if config.limit is None else config.limit - len(kept)
+    while len(outcomes) < len(sources) and (config.limit is None or len(entries) < config.limit):
+        wanted = len(sources) if config.limit is None else config.limit - len(entries)
         batch = list(enumerate(sources))[len(outcomes) : len(outcomes) + wanted]
         outcomes.extend(mapper(convert, batch))
-        kept, skipped = _without_duplicates(outcomes)
-    if not kept:
+        entries, skipped = _without_duplicates(outcomes)
+    if not entries:
         _refuse_folder(config, len(sources), ignored, [o for o in outcomes if isinstance(o, Skipped)])
-    manifest = _manifest(_split(config, kept), skipped, folder)
+    manifest = _manifest(_split(config, entries), skipped, folder)
     return dataclasses.replace(manifest, ignored_files=ignored, unread_files=len(sources) - len(outcomes))
 
 
@@ -172,8 +162,6 @@ def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int]:
             kind=kind,
             stem=group[0].stem if len(group) == 1 else group[0].stem.rpartition("_")[0],
             origin=", ".join(path.relative_to(root).as_posix() for path in group),
-            licence=None,
-            author=None,
         )
         for group in groups
     ]
@@ -199,7 +187,7 @@ def _edge_hash(files: Sequence[Path]) -> str:
 
 
 def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> ManifestEntry | Skipped:
-    """Read, cut, scale and convert one file to `folder`/<number>.png; the reason where that cannot be done."""
+    """Read, cut, scale and convert one file to `folder`/source-<number>.png, or return the reason why not."""
     number, source = item
     try:
         picture = read_picture(source.files[0])
@@ -212,7 +200,6 @@ def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> Ma
     return ManifestEntry(
         name=f"{_slug(source.stem)}-{picture.sha256[:8]}",
         file=file,
-        split="",
         source=source.kind,
         origin=source.origin,
         licence=source.licence or picture.licence,
@@ -228,7 +215,7 @@ def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> Ma
 
 
 def _convert_polarization(item: tuple[int, Source], config: IngestConfig, folder: Path) -> ManifestEntry | Skipped:
-    """Read, check and shrink one measurement to `folder`/<number>.npz; the reason where that cannot be done."""
+    """Read, check and shrink one measurement to `folder`/source-<number>.npz, or return the reason why not."""
     number, source = item
     try:
         measured = read_measurement(source.files, parse_mosaic(config.mosaic))
@@ -247,18 +234,14 @@ def _convert_polarization(item: tuple[int, Source], config: IngestConfig, folder
     return ManifestEntry(
         name=f"{_slug(source.stem)}-{digest[:8]}",
         file=file,
-        split="",
         source=source.kind,
         origin=source.origin,
-        licence=None,
-        author=None,
         sha256=digest,
         bits=16,
         height=shrunk.valid.shape[0],
         width=shrunk.valid.shape[1],
         source_height=measured.valid.shape[0],
         source_width=measured.valid.shape[1],
-        colour_profile=None,
         residual=round(measured.residual, 6),
         saturated_fraction=round(measured.saturated, 6),
         masked_fraction=round(float(1 - shrunk.valid.mean()), 6),
@@ -276,7 +259,6 @@ def _make_dead_leaves(number: int, config: IngestConfig, seed: int, folder: Path
     return ManifestEntry(
         name=f"{stem}-{digest[:8]}",
         file=f"{stem}.png",
-        split="",
         source="dead_leaves",
         origin=f"generated from seed {seed}",
         licence="CC0-1.0",
@@ -287,14 +269,13 @@ def _make_dead_leaves(number: int, config: IngestConfig, seed: int, folder: Path
         width=config.width,
         source_height=config.height,
         source_width=config.width,
-        colour_profile=None,
     )
 
 
 def _without_duplicates(
     outcomes: Iterable[ManifestEntry | Skipped],
 ) -> tuple[list[ManifestEntry], list[Skipped]]:
-    """The first entry of each content; what was skipped, with the others."""
+    """The first entry of each content, and everything skipped, duplicates included."""
     first: dict[str, ManifestEntry] = {}
     skipped = []
     for outcome in outcomes:

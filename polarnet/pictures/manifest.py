@@ -11,7 +11,7 @@ SPLITS = ("train", "val", "test")
 REASONS_SHOWN = 5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ManifestEntry:
     """One picture of data/images."""
 
@@ -19,14 +19,14 @@ class ManifestEntry:
     """Name of the source and the first 8 digits of `sha256`; sequence names begin with it."""
     file: str
     """In the folder of the manifest."""
-    split: str
-    """train, val or test; every sequence made of this picture belongs to it."""
+    split: str = ""
+    """train, val or test, once it is drawn; every sequence made of this picture belongs to it."""
     source: str
     """photograph, dead_leaves, folder or polarization."""
     origin: str
     """Where the picture comes from: an address, a file relative to ingest.root, or the seed it was made from."""
-    licence: str | None
-    author: str | None
+    licence: str | None = None
+    author: str | None = None
     sha256: str
     """Hash of the source's upright pixels, before cropping, scaling and conversion."""
     bits: int
@@ -34,7 +34,7 @@ class ManifestEntry:
     width: int
     source_height: int
     source_width: int
-    colour_profile: str | None
+    colour_profile: str | None = None
     """Colour space of the source, if it was converted to sRGB."""
     residual: float | None = None
     """Median of |I0 + I90 - I45 - I135| / S0 (measured polarization)."""
@@ -55,7 +55,7 @@ class Skipped:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Everything that ingest wants to tell later stages and people; the same for the same pictures and settings."""
+    """The pictures of a folder and the files left out; equal for equal pictures and settings."""
 
     pictures: tuple[ManifestEntry, ...]
     skipped: tuple[Skipped, ...]
@@ -66,7 +66,7 @@ class Manifest:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Pictures, also per split, and what was left out."""
+        """Numbers of pictures, in all and per split, and of files left out."""
         of_split = {split: sum(entry.split == split for entry in self.pictures) for split in SPLITS}
         return {
             "pictures": len(self.pictures),
@@ -78,7 +78,7 @@ class Manifest:
 
 
 def listed(skipped: Sequence[Skipped]) -> str:
-    """Lines for an error: the first of the files, each with its reason, and how many more there are."""
+    """Lines for an error: the first files, each with its reason, and the number of the others."""
     reasons = "".join(f"\n  {skip.file}: {skip.reason}" for skip in skipped[:REASONS_SHOWN])
     return reasons + (f"\n  and {len(skipped) - REASONS_SHOWN} more" if len(skipped) > REASONS_SHOWN else "")
 
@@ -110,7 +110,7 @@ def write_manifest(manifest: Manifest, folder: Path) -> None:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a folder that `ingest` wrote; FileNotFoundError or ValueError where there is none."""
+    """The manifest of a folder that `ingest` wrote; FileNotFoundError or ValueError if there is none."""
     path = folder / MANIFEST
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no manifest; run the stage ingest first (dvc repro ingest)")

@@ -36,7 +36,7 @@ class Measurement:
 
 
 def group_by_measurement(files: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, ...]]:
-    """Files NAME_0, NAME_45, NAME_90, NAME_135 of one folder together, as far as they are there; others alone."""
+    """Group the files NAME_0, NAME_45, NAME_90, NAME_135 of a folder; every other file is a group of its own."""
     groups: dict[Path, list[Path]] = {}
     for file in map(Path, files):
         match = ANGLE_SUFFIX.fullmatch(file.stem) if file.suffix.lower() != ".npz" else None
@@ -47,8 +47,8 @@ def group_by_measurement(files: Sequence[str | os.PathLike[str]]) -> list[tuple[
 def read_measurement(files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], mosaic: Mosaic) -> Measurement:
     """The measurement in a group of files: four pictures, one .npz with I0, I45, I90, I135, or one raw mosaic.
 
-    Where one angle is saturated it follows from the other three, I0 + I90 = I45 + I135; where more are, the pixel is
-    not valid. UnreadablePicture where files are missing, damaged, or do not belong together.
+    A single saturated angle follows from the other three, I0 + I90 = I45 + I135; a pixel with more is not valid.
+    Raises UnreadablePicture if files are missing, damaged, or do not belong together.
     """
     paths = [Path(files)] if isinstance(files, (str, os.PathLike)) else [Path(file) for file in files]
     if not paths:
@@ -87,9 +87,9 @@ def demosaic(raw: Float64[np.ndarray, "h w"], mosaic: Mosaic) -> Float64[np.ndar
 
 
 def shrink(measurement: Measurement, height: int, width: int) -> Measurement:
-    """The centre of shape height:width scaled down to that size by averaging; as it is where it would be enlarged.
+    """The centre of shape height:width, scaled down to that size by averaging; unchanged if it would be enlarged.
 
-    A pixel is valid where all pixels are that it averages.
+    A pixel is valid if all pixels that it averages are valid.
     """
     rows, columns = measurement.valid.shape
     part_height, part_width = min(rows, round(columns * height / width)), min(columns, round(rows * width / height))
@@ -110,7 +110,7 @@ def shrink(measurement: Measurement, height: int, width: int) -> Measurement:
 
 
 def write_intensities(path: str | os.PathLike[str], measurement: Measurement) -> None:
-    """As .npz with I0, I45, I90, I135 (uint16, 65535 is S0 = 1) and valid; equal measurements give equal bytes."""
+    """Write .npz with I0, I45, I90, I135 (uint16, 65535 is S0 = 1) and valid; equal measurements give equal bytes."""
     steps = np.round(np.clip(measurement.intensities, 0, 1) * STEPS).astype(np.uint16)
     np.savez_compressed(path, **dict(zip(NPZ_KEYS, steps, strict=True)), valid=measurement.valid)
 
@@ -143,7 +143,8 @@ def _measurement(values: Float64[np.ndarray, "4 h w"], saturated: Bool[np.ndarra
 def _scaled(values: Shaped[np.ndarray, "n h w"]) -> tuple[Float64[np.ndarray, "n h w"], float]:
     """Values as floats, and the level at which they saturate.
 
-    Of 16-bit files the lowest of 10, 12, 14 and 16 bits that holds them all: cameras often leave the upper bits empty.
+    16-bit files saturate at the lowest of 10, 12, 14 and 16 bits that holds all values, because cameras often leave the
+    upper bits empty.
     """
     if values.dtype == np.uint8:
         return values.astype(np.float64), 255.0

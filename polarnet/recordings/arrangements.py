@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, slice_count
 from polarnet.recordings.recording import Recording, read_recording
 from polarnet.recordings.registration import warp_events
 from polarnet.recordings.source import RecordingError
@@ -52,9 +52,8 @@ def read_four(
     if len(sizes) > 1:
         raise RecordingError(f"expected four files of one size of sensor, got {sorted(sizes)} (height, width)")
     if start_us is None:
-        first = first_time_us(channels)
-        return [since(channel, first) for channel in channels]
-    return [since(c, start_us[by_angle[a]]) for c, a in zip(channels, POLARIZER_ANGLES_DEG, strict=True)]
+        return _from_first_event(channels)
+    return [_since(c, start_us[by_angle[a]]) for c, a in zip(channels, POLARIZER_ANGLES_DEG, strict=True)]
 
 
 def split_mosaic(events: Events, mosaic: Mosaic) -> list[Events]:
@@ -85,27 +84,23 @@ def read_mosaic(
     read: Callable[[Path], Recording] = read_recording,
 ) -> list[Events]:
     """The four channels of one file of a camera with a mosaic; time starts with its first event."""
-    channels = split_mosaic(read(Path(path)).events, mosaic)
-    first = first_time_us(channels)
-    return [since(channel, first) for channel in channels]
+    return _from_first_event(split_mosaic(read(Path(path)).events, mosaic))
 
 
-def first_time_us(channels: Sequence[Events]) -> int:
-    """Time of the first event in any channel; 0 without events."""
-    return min((int(channel.t[0]) for channel in channels if len(channel)), default=0)
+def shifted(events: Events, origin_us: int) -> Events:
+    """The same events, with `origin_us` as time 0."""
+    return Events(events.t - origin_us, events.x, events.y, events.p, events.height, events.width)
 
 
-def since(events: Events, start_us: int) -> Events:
-    """The events from `start_us` on, with `start_us` as their time 0."""
+def _from_first_event(channels: Sequence[Events]) -> list[Events]:
+    """The channels on a clock that starts with the first event of all."""
+    start_us = min((int(channel.t[0]) for channel in channels if len(channel)), default=0)
+    return [shifted(channel, start_us) for channel in channels]
+
+
+def _since(events: Events, start_us: int) -> Events:
     first = int(torch.searchsorted(events.t, torch.tensor(start_us)))
-    return Events(
-        events.t[first:] - start_us,
-        events.x[first:],
-        events.y[first:],
-        events.p[first:],
-        events.height,
-        events.width,
-    )
+    return shifted(slice_count(events, first, len(events)), start_us)
 
 
 def write_store(path: str | os.PathLike[str], sequences: Mapping[str, Sequence[Events]]) -> None:

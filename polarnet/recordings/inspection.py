@@ -13,7 +13,7 @@ from polarnet.recordings.recording import FORMATS, RecordingReader
 from polarnet.recordings.source import REPAIRS, RecordingError
 
 MAX_PIXELS = 2**25
-SHORTEST_US = 1000  # shortest time over which a rate is taken
+MIN_SPAN_US = 1000  # shortest time over which a rate is taken
 EVENTS_PER_PIXEL = 0.15  # in the part shown: enough to see edges, few enough not to smear them
 
 
@@ -72,7 +72,7 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
             first_picture = picture.intensity if pictures == 0 else first_picture
             pictures += 1
     shape = reader.height, reader.width
-    signed, rate_hz = busiest.found()
+    signed, rate_hz = busiest.result()
     return Inspection(
         format=reader.format,
         height=reader.height,
@@ -162,8 +162,8 @@ class _Busiest:
                 self._image[:] = 0
                 self._count = 0
 
-    def found(self) -> tuple[np.ndarray, float]:
+    def result(self) -> tuple[np.ndarray, float]:
         """The signed image and the events per second; both cover all events if there were too few for one part."""
         if self._best is not None:
-            return self._best, self._size / max(SHORTEST_US, self._best_us) * 1e6
-        return self._image, self._count / max(SHORTEST_US, self._stop_us - self._start_us) * 1e6
+            return self._best, self._size / max(MIN_SPAN_US, self._best_us) * 1e6
+        return self._image, self._count / max(MIN_SPAN_US, self._stop_us - self._start_us) * 1e6

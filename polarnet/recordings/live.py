@@ -16,10 +16,9 @@ from threading import Thread
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Int64
 
-from polarnet.events.stream import LARGEST_SIDE, Events
+from polarnet.events.stream import MAX_SIDE, Events
 from polarnet.recordings.arrangements import split_mosaic
 from polarnet.recordings.formats.lines import lines_of, numbers_of, rows_of
 from polarnet.recordings.repair import TOLERATED_COUNT, TOLERATED_SHARE
@@ -60,7 +59,7 @@ class LiveLines:
     def __init__(self, source: BinaryIO, name: str, mosaic: Mosaic | None, idle_s: float):
         self.name, self.mosaic = name, mosaic
         self.counts: Counter[str] = Counter()
-        self.seen = 0
+        self.lines = 0
         self._source, self._idle_s = source, idle_s
         self._grows = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
         self._rest, self._started_with, self._read_at = b"", b"", 0.0
@@ -77,7 +76,7 @@ class LiveLines:
         for data, read_at in self._whole_lines():
             rows = [*rows_of(data, shift, self.counts, "unreadable_lines")]
             table = self._usable(np.concatenate(rows)) if rows else np.empty((0, len(shift)), np.int64)
-            self.seen += data.count(b"\n")
+            self.lines += data.count(b"\n")
             self._refuse_damage(columns)
             if len(table) == 0:
                 continue
@@ -96,7 +95,7 @@ class LiveLines:
         for data, _ in self._whole_lines():
             line, _, rest = data.partition(b"\n")
             words = [word for one in numbers_of(line) for word in one.words]
-            if len(words) != 2 or not all(w.isdigit() and 0 < int(w) <= LARGEST_SIDE for w in words):
+            if len(words) != 2 or not all(w.isdigit() and 0 < int(w) <= MAX_SIDE for w in words):
                 break
             self._started_with = rest
             return int(words[1]), int(words[0])
@@ -160,9 +159,9 @@ class LiveLines:
 
     def _refuse_damage(self, columns: str) -> None:
         for kind, words in DAMAGE.items():
-            if kind != "late" and self.counts[kind] > max(TOLERATED_COUNT, TOLERATED_SHARE * self.seen):
+            if kind != "late" and self.counts[kind] > max(TOLERATED_COUNT, TOLERATED_SHARE * self.lines):
                 raise RecordingError(
-                    f"{self.name}: {self.counts[kind]} of the first {self.seen} lines are "
+                    f"{self.name}: {self.counts[kind]} of the first {self.lines} lines are "
                     f"{words.format(columns=f'`{columns}`')}; is the format right, and the size in the first line?"
                 )
 
@@ -186,7 +185,4 @@ def live_lines(channels: Sequence[Events]) -> tuple[bytes, Int64[np.ndarray, " n
 
 def _events(table: Int64[np.ndarray, "n columns"], height: int, width: int) -> Events:
     t, x, y, p = table[:, :4].T
-    sign = np.where(p > 0, 1, -1)
-    x16, y16, p8 = x.astype(np.int16), y.astype(np.int16), sign.astype(np.int8)
-    tensors = [torch.from_numpy(column) for column in (t.copy(), x16, y16, p8)]
-    return Events(tensors[0], tensors[1], tensors[2], tensors[3], height, width)
+    return Events.from_columns(t, x, y, np.where(p > 0, 1, -1), height, width)

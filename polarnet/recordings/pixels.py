@@ -7,8 +7,8 @@ from jaxtyping import Bool, Int
 from polarnet.events.stream import Events
 
 NEIGHBOURHOOD = 5  # side of a square, in pixels
-SLOWEST_HOT_HZ = 20.0  # slower pixels are harmless
-FEWEST_EVENTS = 8  # fewer events are no evidence
+MIN_HOT_HZ = 20.0  # slower pixels are harmless
+MIN_EVENTS = 8  # fewer events are no evidence
 
 
 def event_counts(events: Events) -> Int[np.ndarray, "h w"]:
@@ -26,7 +26,7 @@ def hot_pixels(counts: Int[np.ndarray, "h w"], duration_s: float, factor: float 
     """
     border = NEIGHBOURHOOD // 2
     around = np.lib.stride_tricks.sliding_window_view(np.pad(counts, border), (NEIGHBOURHOOD, NEIGHBOURHOOD))
-    hot = (counts >= FEWEST_EVENTS) & (counts > SLOWEST_HOT_HZ * duration_s)
+    hot = (counts >= MIN_EVENTS) & (counts > MIN_HOT_HZ * duration_s)
     third = np.partition(around[hot].reshape(-1, NEIGHBOURHOOD**2), -3, axis=-1)[:, -3]
     hot[hot] = counts[hot] > factor * third
     return hot

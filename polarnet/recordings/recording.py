@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from polarnet.events.stream import LARGEST_SIDE, Events, concatenate
-from polarnet.recordings.formats import aedat2, celex5_bin, celex5_csv, dat, evt, faery, hdf5, store, text
+from polarnet.events.stream import MAX_SIDE, Events, concatenate
+from polarnet.recordings.formats import aedat2, celex5_bin, celex5_csv, faery, hdf5, prophesee, store, text
 from polarnet.recordings.formats.lines import HEAD_BYTES
 from polarnet.recordings.repair import repaired
 from polarnet.recordings.source import Block, Choices, RecordingError, Source
@@ -35,8 +35,8 @@ FORMATS = {
     "aedat4": Format("AEDAT4 of iniVation", faery.matches_aedat4, faery.open_aedat4),
     "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", aedat2.matches, aedat2.open_aedat2),
     "event_stream": Format("Event Stream (.es)", faery.matches_event_stream, faery.open_event_stream),
-    "evt": Format("EVT2 and EVT3 of Prophesee", evt.matches, evt.open_evt),
-    "dat": Format("DAT of Prophesee", dat.matches, dat.open_dat),
+    "evt": Format("EVT2 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
+    "dat": Format("DAT of Prophesee", prophesee.matches_dat, prophesee.open_dat),
     "text": Format("lines `t x y p`", text.matches, text.open_text),
     "celex5_csv": Format("CSV of a CeleX-5", celex5_csv.matches, celex5_csv.open_celex5_csv),
     "celex5_bin": Format("BIN of a CeleX-5", celex5_bin.matches, celex5_bin.open_celex5_bin),
@@ -86,30 +86,26 @@ def open_recording(
     width: int | None = None,
     part: str | None = None,
     clock_mhz: float | int | None = None,
-    assume_polarity: int | None = None,
     chunk_events: int = CHUNK_EVENTS,
 ) -> RecordingReader:
     """Open a file to read it chunk by chunk.
 
     `format` is a key of FORMATS; None detects it from the content. `height` and `width` are needed where the file does
     not state them. `part` is SEQUENCE/ANGLE of an event store. `clock_mhz` is the clock of a CeleX-5 whose BIN file
-    counts its ticks. `assume_polarity` (+1 or -1) sets the polarity of all events in a file without polarity, which is
-    refused otherwise. RecordingError where the format is unknown or the content cannot be events; RuntimeError naming
+    counts its ticks. RecordingError where the format is unknown or the content cannot be events; RuntimeError naming
     the package to install where an optional one is missing.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     for name, side in (("height", height), ("width", width)):
-        if side is not None and not 0 < side <= LARGEST_SIDE:
-            raise ValueError(f"expected a {name} of 1 to {LARGEST_SIDE} px, got {side}")
+        if side is not None and not 0 < side <= MAX_SIDE:
+            raise ValueError(f"expected a {name} of 1 to {MAX_SIDE} px, got {side}")
     if chunk_events < 1:
         raise ValueError(f"expected at least one event in a chunk, got {chunk_events}")
     if clock_mhz is not None and not 0.001 <= clock_mhz <= 10_000:
         raise ValueError(f"expected a clock of 0.001 to 10000 MHz, got {clock_mhz}")
-    if assume_polarity not in (None, 1, -1):
-        raise ValueError(f"expected a polarity of 1 or -1 to assume, got {assume_polarity}")
-    choices = Choices(height, width, part, clock_mhz, assume_polarity)
+    choices = Choices(height, width, part, clock_mhz)
     form = detect_format(path) if format is None else format
     if form not in FORMATS:
         raise ValueError(f"expected a format of {', '.join(FORMATS)}, got {form!r}")
@@ -124,18 +120,9 @@ def read_recording(
     width: int | None = None,
     part: str | None = None,
     clock_mhz: float | int | None = None,
-    assume_polarity: int | None = None,
 ) -> Recording:
     """Read a whole file, with the arguments and errors of `open_recording`."""
-    reader = open_recording(
-        path,
-        format,
-        height=height,
-        width=width,
-        part=part,
-        clock_mhz=clock_mhz,
-        assume_polarity=assume_polarity,
-    )
+    reader = open_recording(path, format, height=height, width=width, part=part, clock_mhz=clock_mhz)
     chunks = list(reader)
     events = concatenate(chunks) if chunks else Events.empty(reader.height, reader.width)
     return Recording(events, reader.format, {kind: count for kind, count in reader.repairs.items() if count})

@@ -106,13 +106,7 @@ def warp_events(events: Events, homography: Float64[np.ndarray, "3 3"]) -> Event
     xy = np.stack([events.x.numpy(), events.y.numpy(), np.ones(len(events))])
     x, y, w = homography @ xy
     column, row = np.rint(x / w), np.rint(y / w)
-    seen = (w > 0) & (column >= 0) & (column < events.width) & (row >= 0) & (row < events.height)
-    keep = torch.from_numpy(seen)
-    return Events(
-        events.t[keep],
-        torch.from_numpy(column[seen].astype(np.int16)),
-        torch.from_numpy(row[seen].astype(np.int16)),
-        events.p[keep],
-        events.height,
-        events.width,
-    )
+    inside = (w > 0) & (column >= 0) & (column < events.width) & (row >= 0) & (row < events.height)
+    x16, y16 = (torch.from_numpy(side[inside].astype(np.int16)) for side in (column, row))
+    keep = torch.from_numpy(inside)
+    return Events(events.t[keep], x16, y16, events.p[keep], events.height, events.width)

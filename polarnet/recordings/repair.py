@@ -32,19 +32,19 @@ def repaired(name: str, source: Source, counts: Counter[str]) -> Iterator[Block]
     """
     clock = _Clock(name)
     darker: int | None = None
-    seen = 0
+    events = 0
     for block in source.blocks(counts):
-        seen += len(block.t)
+        events += len(block.t)
         if darker is None:
             darker = _darker(block.p)
-        kept = _on_sensor(name, _with_sign(block, darker, counts), source, counts)
-        yield from _filled(clock.ordered(kept, counts, last=False))
-        _refuse_much_damage(name, counts, seen)
+        usable = _on_sensor(name, _with_sign(block, darker, counts), source, counts)
+        yield from _filled(clock.ordered(usable, counts, last=False))
+        _refuse_much_damage(name, counts, events)
     nothing = Block(np.empty(0, np.int64), *(np.empty(0, dtype) for dtype in (np.int16, np.int16, np.int8)))
     yield from _filled(clock.ordered(nothing, counts, last=True))
-    _refuse_much_damage(name, counts, seen)
+    _refuse_much_damage(name, counts, events)
     damage = {kind: count for kind, count in counts.items() if count and kind not in HARMLESS}
-    if damage and seen == 0:
+    if damage and events == 0:
         raise RecordingError(f"{name}: no event can be read in it: {damage}; is the format right?")
 
 
@@ -86,11 +86,11 @@ def _on_sensor(name: str, block: Block, source: Source, counts: Counter[str]) ->
     )
 
 
-def _refuse_much_damage(name: str, counts: Counter[str], seen: int) -> None:
+def _refuse_much_damage(name: str, counts: Counter[str], events: int) -> None:
     for kind, words in REPAIRS.items():
-        if kind not in SAFE and counts[kind] > max(TOLERATED_COUNT, TOLERATED_SHARE * seen):
+        if kind not in SAFE and counts[kind] > max(TOLERATED_COUNT, TOLERATED_SHARE * events):
             raise RecordingError(
-                f"{name}: {counts[kind]} among the first {seen} events: {words.split(':')[0]}; "
+                f"{name}: {counts[kind]} among the first {events} events: {words.split(':')[0]}; "
                 f"so much damage is not repaired. Is the format right, and the size of the sensor?"
             )
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.events.stream import LARGEST_SIDE
+from polarnet.events.stream import MAX_SIDE
 
 BLOCK_EVENTS = 2**18  # events that a format decodes at a time; chunks handed to a user are cut anew
 
@@ -55,8 +55,6 @@ class Choices:
     """SEQUENCE/ANGLE of an event store."""
     clock_mhz: float | int | None = None
     """Clock of a CeleX-5 that did not run at its usual rate."""
-    assume_polarity: int | None = None
-    """Polarity, +1 or -1, of all events in a file that does not store it; None refuses such a file."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +64,19 @@ class Source:
     height: int
     width: int
     blocks: Callable[[Counter[str]], Iterator[Block]]
+
+
+def word_blocks(
+    path: Path, start: int, dtype: np.dtype | str, words: int, counts: Counter[str]
+) -> Iterator[np.ndarray]:
+    """The words of a file from byte `start` on, `words` at a time; a cut word at the end is counted as `cut_tail`."""
+    size = np.dtype(dtype).itemsize
+    with path.open("rb") as file:
+        file.seek(start)
+        while data := file.read(words * size):
+            counts["cut_tail"] += len(data) % size != 0
+            if len(data) >= size:
+                yield np.frombuffer(data[: len(data) // size * size], dtype)
 
 
 def running_on(t: np.ndarray, turns: int, before: int) -> tuple[np.ndarray, int, int]:
@@ -90,8 +101,6 @@ def sensor_size(path: Path, choices: Choices, height: int | None = None, width: 
     width = choices.width if width is None else width
     if height is None or width is None:
         raise RecordingError(f"{path.name}: the file does not say how large the sensor is; give height and width")
-    if not (0 < height <= LARGEST_SIDE and 0 < width <= LARGEST_SIDE):
-        raise RecordingError(
-            f"{path.name}: expected a sensor with sides of 1 to {LARGEST_SIDE} px, got {height}x{width}"
-        )
+    if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
+        raise RecordingError(f"{path.name}: expected a sensor with sides of 1 to {MAX_SIDE} px, got {height}x{width}")
     return height, width

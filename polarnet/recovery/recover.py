@@ -267,8 +267,8 @@ def recover(source: Input, rule: WindowRule, recoverer: Recoverer, writer: Recov
             latencies.append(frame.latency_s)
             bar.update(frame.window.stop_us - last_us)
             last_us = frame.window.stop_us
-            shown = {"latency": f"{1000 * frame.latency_s:.1f} ms"} if live else {}
-            bar.set_postfix(frames=len(steps), step=f"{1000 * frame.step_s:.1f} ms", refresh=False, **shown)
+            latency = {"latency": f"{1000 * frame.latency_s:.1f} ms"} if live else {}
+            bar.set_postfix(frames=len(steps), step=f"{1000 * frame.step_s:.1f} ms", refresh=False, **latency)
     if not steps:
         raise ValueError(_too_short(source, rule))
     return Summary(

@@ -41,11 +41,11 @@ FILM_FRAMES = 24
 PNG_STORED, NO_FILTER = 0, 8  # no compression, libpng's PNG_FILTER_NONE: larger files, but fast to write
 FRAMES_PER_CHUNK = 32
 ZARR_CODEC = BloscCodec(cname="lz4", shuffle="shuffle")
-MAX_WAITING = 64  # frames queued for writing
+MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, the network needs all cores: a concurrent writing thread delays every operation
-SHOWN_ON_PAGE = 6
+PAGE_PICTURES = 6
 GAP = 4  # pixels between the maps of a picture
-SCALE_KEPT = 0.9  # share of the previous picture's full scale of events, which prevents flicker
+SCALE_INERTIA = 0.9  # share of the previous picture's full scale of events, which prevents flicker
 ZARR_CONVENTIONS = {
     "t_us": "time, microseconds from the first event: the end of the window that a frame was recovered from",
     "dolp": "degree of linear polarization, divided by 65535",
@@ -54,32 +54,23 @@ ZARR_CONVENTIONS = {
 }
 
 
-class Film(NamedTuple):
-    """Pictures stacked into one image, through which the page's style moves."""
-
-    source: str
-    frames: int
-    height: int
-    width: int
-
-
-class Shown(NamedTuple):
-    """A picture on the page."""
+class Picture(NamedTuple):
+    """The maps of one frame side by side, and the end of its window."""
 
     t_us: int
-    picture: UInt8[np.ndarray, "h w 3"]
+    pixels: UInt8[np.ndarray, "h w 3"]
 
 
 @dataclass
-class _Kept:
+class _Sample:
     """A sample of the pictures, evenly spread over a stream of unknown length."""
 
-    pictures: list[Shown]
+    pictures: list[Picture]
     every: int = 1
 
-    def offer(self, number: int, shown: Shown) -> None:
+    def offer(self, number: int, picture: Picture) -> None:
         if number % self.every == 0:
-            self.pictures.append(shown)
+            self.pictures.append(picture)
         if len(self.pictures) > 2 * FILM_FRAMES:
             self.pictures, self.every = self.pictures[::2], 2 * self.every
 
@@ -95,7 +86,7 @@ class RecoveryWriter:
     def __init__(self, folder: Path, outputs: Collection[str], video_rate_hz: float):
         self.folder, self.outputs, self.video_rate_hz = folder, outputs, video_rate_hz
         self.frames = 0
-        self._kept = _Kept([])
+        self._sample = _Sample([])
         self._scale: float | None = None
         self._arrays: dict[str, zarr.Array] = {}
         self._buffer: dict[str, list[np.ndarray]] = {}
@@ -120,25 +111,28 @@ class RecoveryWriter:
             if self._video is not None:
                 self._video.release()
 
-    def add(self, window: EventWindow, found: Prediction) -> None:
+    def add(self, window: EventWindow, prediction: Prediction) -> None:
         """Add a frame on the CPU; returns before it is written, unless the queue is long or cores are few."""
-        self._waiting.append(self._thread.submit(self._write, self.frames, window, found))
-        self._wait(MAX_WAITING if usable_cores() > FEW_CORES else 0)
+        self._waiting.append(self._thread.submit(self._write, self.frames, window, prediction))
+        self._wait(MAX_QUEUED if usable_cores() > FEW_CORES else 0)
         self.frames += 1
 
     def write_page(self, title: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:
         """Write index.html and recovered.png; call it after the `with` block."""
-        some = _spread(self._kept.pictures, SHOWN_ON_PAGE)
-        if some:
-            sheet = np.concatenate([_with_margin(shown.picture) for shown in some[1::2] or some])
-            (self.folder / "recovered.png").write_bytes(encode_png(sheet))
+        pictures = self._sample.pictures
+        places = np.linspace(0, len(pictures) - 1, min(PAGE_PICTURES, len(pictures))).round().astype(int)
+        large = [pictures[k] for k in places]
+        if large:
+            margin = ((GAP, GAP), (GAP, GAP), (0, 0))
+            sheet = [np.pad(one.pixels, margin, constant_values=255) for one in large[1::2] or large]
+            (self.folder / "recovered.png").write_bytes(encode_png(np.concatenate(sheet)))
         page = template("recovery.html.jinja").render(
             title=title,
             facts=facts,
             notes=notes,
             video=VIDEO if self._video is not None else None,
-            film=_film([shown.picture for shown in self._kept.pictures]),
-            pictures=[(shown.t_us / 1000, data_uri(encode_png(shown.picture), "png")) for shown in some],
+            film=_film([one.pixels for one in pictures]) if pictures else None,
+            pictures=[(one.t_us / 1000, data_uri(encode_png(one.pixels), "png")) for one in large],
             dolp_bar=chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
             wheel=data_uri(encode_png(hue_wheel(192)), "png"),
         )
@@ -150,16 +144,16 @@ class RecoveryWriter:
         while len(self._waiting) > most:
             self._waiting.popleft().result()
 
-    def _write(self, number: int, window: EventWindow, found: Prediction) -> None:
+    def _write(self, number: int, window: EventWindow, prediction: Prediction) -> None:
         if "zarr" in self.outputs:
-            self._add_to_zarr(window, found)
+            self._add_to_zarr(window, prediction)
         if "exr" in self.outputs:
-            _write_exr(self.folder / "exr" / f"{number:06d}.exr", found)
+            _write_exr(self.folder / "exr" / f"{number:06d}.exr", prediction)
         drawn = {"png", "mp4"} & set(self.outputs)
-        if not drawn and number % self._kept.every:
+        if not drawn and number % self._sample.every:
             return
-        picture = self._picture(window, found)
-        self._kept.offer(number, Shown(window.stop_us, picture))
+        picture = self._picture(window, prediction)
+        self._sample.offer(number, Picture(window.stop_us, picture))
         if "png" in self.outputs:
             _write_png(self.folder / "png" / f"{number:06d}.png", picture)
         if "mp4" in self.outputs:
@@ -167,25 +161,25 @@ class RecoveryWriter:
                 self._video = _open_video(self.folder / VIDEO, self.video_rate_hz, *picture.shape[:2])
             self._video.write(np.ascontiguousarray(picture[..., ::-1]))
 
-    def _picture(self, window: EventWindow, found: Prediction) -> UInt8[np.ndarray, "h w 3"]:
+    def _picture(self, window: EventWindow, prediction: Prediction) -> UInt8[np.ndarray, "h w 3"]:
         events = signed_events(window)
         present = event_full_scale(events)
-        self._scale = present if self._scale is None else SCALE_KEPT * self._scale + (1 - SCALE_KEPT) * present
-        maps = [dolp_image(found.dolp)]
-        if found.aolp is not None:
-            maps.append(polarization_hsv(torch.ones_like(found.dolp), found.dolp, found.aolp))
+        self._scale = present if self._scale is None else SCALE_INERTIA * self._scale + (1 - SCALE_INERTIA) * present
+        maps = [dolp_image(prediction.dolp)]
+        if prediction.aolp is not None:
+            maps.append(polarization_hsv(torch.ones_like(prediction.dolp), prediction.dolp, prediction.aolp))
         maps.append(event_image(events, self._scale))
         gap = np.full((maps[0].shape[0], GAP, 3), 255, np.uint8)
         side_by_side = np.concatenate([part for one in maps for part in (one, gap)][:-1], axis=1)
         height, width = side_by_side.shape[:2]
         return np.pad(side_by_side, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")  # codecs want even sides
 
-    def _add_to_zarr(self, window: EventWindow, found: Prediction) -> None:
-        frame = {"t_us": np.array(window.stop_us, np.int64), "dolp": _quantised(found.dolp * 65535, 65535)}
-        if found.aolp is not None:
-            frame["aolp"] = _quantised(found.aolp * (65536 / np.pi) % 65536, 65535)
-        if found.log_variance is not None:
-            frame["log_variance"] = found.log_variance.numpy().astype(np.float32)
+    def _add_to_zarr(self, window: EventWindow, prediction: Prediction) -> None:
+        frame = {"t_us": np.array(window.stop_us, np.int64), "dolp": _quantised(prediction.dolp * 65535, 65535)}
+        if prediction.aolp is not None:
+            frame["aolp"] = _quantised(prediction.aolp * (65536 / np.pi) % 65536, 65535)
+        if prediction.log_variance is not None:
+            frame["log_variance"] = prediction.log_variance.numpy().astype(np.float32)
         for name, values in frame.items():
             self._buffer.setdefault(name, []).append(values)
         if len(self._buffer["t_us"]) == FRAMES_PER_CHUNK:
@@ -220,16 +214,11 @@ def _quantised(values: Tensor, largest: int) -> np.ndarray:
     return values.round().clamp(0, largest).numpy().astype(np.uint16)
 
 
-def _spread(items: Sequence[Shown], count: int) -> list[Shown]:
-    places = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
-    return [items[k] for k in places]
-
-
-def _film(pictures: Sequence[np.ndarray]) -> Film | None:
-    if not pictures:
-        return None
+def _film(pictures: Sequence[np.ndarray]) -> dict[str, Any]:
+    """Pictures stacked into one image, through which the page's style moves."""
     height, width = pictures[0].shape[:2]
-    return Film(data_uri(encode_jpeg(np.concatenate(pictures)), "jpeg"), len(pictures), height, width)
+    source = data_uri(encode_jpeg(np.concatenate(pictures)), "jpeg")
+    return {"source": source, "frames": len(pictures), "height": height, "width": width}
 
 
 def _open_video(path: Path, rate_hz: float, height: int, width: int) -> cv2.VideoWriter:
@@ -239,10 +228,6 @@ def _open_video(path: Path, rate_hz: float, height: int, width: int) -> cv2.Vide
     return video
 
 
-def _with_margin(picture: np.ndarray) -> np.ndarray:
-    return np.pad(picture, ((GAP, GAP), (GAP, GAP), (0, 0)), constant_values=255)
-
-
 def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
     spec = oiio.ImageSpec(picture.shape[1], picture.shape[0], 3, oiio.UINT8)
     spec["png:compressionLevel"] = PNG_STORED  # thousands of files are written while a camera runs
@@ -250,11 +235,11 @@ def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
     _write_picture(path, spec, picture)
 
 
-def _write_exr(path: Path, found: Prediction) -> None:
+def _write_exr(path: Path, prediction: Prediction) -> None:
     """Write the channels DoLP and, if present, AoLP (radians) and log_variance, as half floats."""
-    maps = {"DoLP": found.dolp, "AoLP": found.aolp, "log_variance": found.log_variance}
+    maps = {"DoLP": prediction.dolp, "AoLP": prediction.aolp, "log_variance": prediction.log_variance}
     known: dict[str, Any] = {name: values for name, values in maps.items() if values is not None}
-    height, width = found.dolp.shape
+    height, width = prediction.dolp.shape
     spec = oiio.ImageSpec(width, height, len(known), oiio.HALF)
     spec.channelnames = tuple(known)
     _write_picture(path, spec, torch.stack([*known.values()], dim=-1).float().numpy())

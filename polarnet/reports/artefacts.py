@@ -1,7 +1,7 @@
 """Read the pipeline's outputs for the report."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,14 +12,14 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from polarnet.events.stream import Events
 from polarnet.pictures.manifest import SPLITS, Manifest, read_manifest
-from polarnet.reports.figures import Curve
 from polarnet.reports.maps import polarization_hsv
-from polarnet.reports.overview import Overview
 from polarnet.simulation.motion import Pose, Trajectory, sensor_to_scene
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
+from polarnet.training.history import HISTORY, best_row, read_history
 
 OURS = "ours"  # folder of the DoLP network's training
 THUMBNAIL_WIDTH = 208  # pixels, twice the displayed size
@@ -45,8 +45,8 @@ class ReportPaths:
             self.scenes: "synthesize",
             self.frames: "synthesize",
             self.events: "emulate",
-            self.train / OURS / "history.json": "train",
-            **{self.train / name / "history.json": f"train_baseline@{name}" for name in baselines},
+            self.train / OURS / HISTORY: "train",
+            **{self.train / name / HISTORY: f"train_baseline@{name}" for name in baselines},
             self.benchmark / "metrics.json": "benchmark",
             self.benchmark / "cost.json": "benchmark",
             self.benchmark / "details.json": "benchmark",
@@ -60,8 +60,6 @@ class Panel(NamedTuple):
     """One window of one test sequence, as stored by the benchmark; `dolp` and `aolp` by method."""
 
     sequence: str
-    generated: bool
-    """Whether its picture is a generated dead-leaves image."""
     window: int
     t_us: int
     events: Float[Tensor, "4 h w"]
@@ -72,11 +70,23 @@ class Panel(NamedTuple):
     aolp: Mapping[str, Float[Tensor, "h w"]]
 
 
-class Thumbnail(NamedTuple):
-    """A small picture from data/images; measured polarization appears as hue, saturation and value."""
+class Overview(NamedTuple):
+    """One test sequence, from the picture that the sensor moved over to the DoLP recovered from one window."""
 
     name: str
-    picture: UInt8[np.ndarray, "h w 3"]
+    picture: UInt8[np.ndarray, "height width 3"]
+    path: Float[np.ndarray, "2 times"]
+    """Path of the sensor's centre over the sequence: x and y in fractions of the picture's width and height."""
+    outline: Float[np.ndarray, "2 corners"]
+    """Outline of the sensor at the end, in the same fractions."""
+    intensity: Float[Tensor, "4 h w"]
+    dolp: Float[Tensor, "h w"]
+    aolp: Float[Tensor, "h w"]
+    streams: Sequence[Events]
+    """Events of the four channels, from `start_us` on."""
+    start_us: int
+    duration_us: int
+    recovered: Float[Tensor, "h w"]
 
 
 class EventRate(NamedTuple):
@@ -95,18 +105,21 @@ class History(NamedTuple):
 
     network: str
     """Name of the network in its checkpoint."""
-    loss: Sequence[Curve]
-    validation: Mapping[str, Curve]
+    loss: Mapping[str, Sequence[float]]
+    """Mean of each loss term in each epoch."""
+    validation: Mapping[str, Sequence[float]]
+    """Validation scores of each epoch."""
     best_epoch: int
 
 
-class SetResults(NamedTuple):
-    """Benchmark results on a test set."""
+class Results(NamedTuple):
+    """Benchmark results on one test set."""
 
     name: str
     metrics: Mapping[str, Mapping[str, Any]]
     """Scores and costs by row."""
     details: Mapping[str, Any]
+    """Content of details.json: the test data scored, and each scene's mean."""
     panels: Sequence[Panel]
 
 
@@ -115,84 +128,65 @@ class Artefacts:
     """All data shown on the page."""
 
     manifest: Manifest
-    metrics: Mapping[str, Mapping[str, Any]]
-    """Scores and costs by row."""
-    details: Mapping[str, Any]
-    """Content of data/benchmark/details.json: the test data scored, and each scene's mean."""
-    panels: Sequence[Panel]
-    sets: Sequence[SetResults]
-    """Test sets besides the simulated one."""
+    results: Results
+    """Results on the simulated test set, panels of photographs first."""
+    sets: Sequence[Results]
+    """Results on the other test sets."""
     ours: History
     baselines: Mapping[str, History]
     """Trained baselines by name."""
     rates: Sequence[EventRate]
     overview: Overview | None
     """None if the benchmark stored no panel of the network."""
-    thumbnails: Mapping[str, Sequence[Thumbnail]]
-    """The first `MAX_THUMBNAILS` of each split, photographs first."""
+    thumbnails: Mapping[str, Mapping[str, UInt8[np.ndarray, "h w 3"]]]
+    """The first `MAX_THUMBNAILS` pictures of each split by name, photographs first."""
 
 
 def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
     """Read everything under `paths`, with the trainings of `baselines`; FileNotFoundError names the stage to run."""
     paths.check(baselines)
-    scenes, frames, events = (
-        SceneStore.open(paths.scenes),
-        FrameStore.open(paths.frames),
-        EventStore.open(paths.events),
-    )
-    manifest = read_manifest(paths.images)
-    seen = set(scenes.picture_of.values())
-    pictures = [entry for entry in manifest.pictures if entry.name in seen]  # others are too small for the sensor
+    scenes, frames = SceneStore.open(paths.scenes), FrameStore.open(paths.frames)
+    events = EventStore.open(paths.events)
+    manifest, results = read_manifest(paths.images), read_results(paths.benchmark)
+    names = set(scenes.scene_of.values())
+    pictures = [entry for entry in manifest.pictures if entry.name in names]  # others are too small for the sensor
     pictures.sort(key=lambda entry: entry.source == "dead_leaves")  # photographs first
     generated = {entry.name for entry in pictures if entry.source == "dead_leaves"}
-    files = sorted((paths.benchmark / "panels").glob("*.npz"))
-    panels = [_panel(file, scenes.picture_of[file.stem] in generated) for file in files]
-    panels.sort(key=lambda panel: panel.generated)
+    panels = sorted(results.panels, key=lambda panel: scenes.scene_of[panel.sequence] in generated)
     return Artefacts(
         manifest=manifest,
-        metrics=_scores_and_costs(paths.benchmark),
-        details=_json(paths.benchmark / "details.json"),
-        panels=panels,
-        sets=[read_set(folder) for folder in sorted(paths.benchmark.glob("sets/*")) if folder.is_dir()],
-        ours=read_history(paths.train / OURS / "history.json"),
-        baselines={name: read_history(paths.train / name / "history.json") for name in baselines},
+        results=results._replace(panels=panels),
+        sets=[read_results(folder) for folder in sorted(paths.benchmark.glob("sets/*")) if folder.is_dir()],
+        ours=training_history(paths.train / OURS),
+        baselines={name: training_history(paths.train / name) for name in baselines},
         rates=event_rates(events, frames),
-        overview=next((overview_of(panel, scenes, frames, events) for panel in _telling(panels)), None),
+        overview=_overview(panels, generated, scenes, frames, events),
         thumbnails={
             split: thumbnails([entry.name for entry in pictures if entry.split == split], scenes) for split in SPLITS
         },
     )
 
 
-def read_set(folder: Path) -> SetResults:
+def read_results(folder: Path) -> Results:
     """Read a folder written by `write_benchmark`; the set's name comes from details.json, or from the folder."""
     for name in ("metrics.json", "cost.json", "details.json"):
         if not (folder / name).exists():
             raise FileNotFoundError(f"{folder / name} is missing; run the benchmark of this test set again")
-    details = _json(folder / "details.json")
-    panels = [_panel(file, generated=False) for file in sorted((folder / "panels").glob("*.npz"))]
-    return SetResults(details.get("set", folder.name), _scores_and_costs(folder), details, panels)
+    details, costs = _json(folder / "details.json"), _json(folder / "cost.json")
+    metrics = {row: {**scores, **costs[row]} for row, scores in _json(folder / "metrics.json").items()}
+    return Results(
+        details.get("set", folder.name), metrics, details, [*map(_panel, sorted((folder / "panels").glob("*.npz")))]
+    )
 
 
-def read_history(path: Path) -> History:
-    """Read a history.json, with mean loss terms and validation scores per epoch, and the name of its network."""
-    rows = _json(path)
-    if not rows:
-        raise ValueError(f"{path}: expected a row for each epoch, got none; train again")
-    epochs = [row["epoch"] for row in rows]
-
-    def curves(split: str) -> dict[str, Curve]:
-        return {name: Curve(name, epochs, [row[split][name] for row in rows]) for name in rows[0][split]}
-
-    best = min(rows, key=lambda row: row["val"]["mse"])
-    network = _json(path.with_name("best.json"))["network"]
-    return History(network, list(curves("train").values()), curves("val"), best["epoch"])
-
-
-def _scores_and_costs(folder: Path) -> dict[str, dict[str, Any]]:
-    """Content of metrics.json and cost.json, by row."""
-    costs = _json(folder / "cost.json")
-    return {row: {**scores, **costs[row]} for row, scores in _json(folder / "metrics.json").items()}
+def training_history(folder: Path) -> History:
+    """Mean loss terms and validation scores per epoch of a training, and the name of its network."""
+    rows = read_history(folder)
+    loss, validation = (
+        {name: [row[split][name] for row in rows] for name in rows[0][split]} for split in ("train", "val")
+    )
+    best_epoch = rows.index(best_row(rows))
+    return History(_json(folder / "best.json")["network"], loss, validation, best_epoch)
 
 
 def event_rates(events: EventStore, frames: FrameStore) -> list[EventRate]:
@@ -208,45 +202,45 @@ def event_rates(events: EventStore, frames: FrameStore) -> list[EventRate]:
     return rates
 
 
-def overview_of(panel: Panel, scenes: SceneStore, frames: FrameStore, events: EventStore) -> Overview:
-    """Data of a panel's sequence, from its picture to the DoLP recovered from the events of its window."""
-    record = scenes.read(panel.sequence)
+def thumbnails(pictures: Sequence[str], scenes: SceneStore) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
+    """Thumbnails of the first `MAX_THUMBNAILS` pictures, from the scenes made of them."""
+    sequence_of = {picture: sequence for sequence, picture in reversed(scenes.scene_of.items())}
+    small = {}
+    for picture in pictures[:MAX_THUMBNAILS]:
+        scene = scenes.read(sequence_of[picture])
+        rgb = polarization_hsv(scene.s0, scene.dolp, scene.aolp)
+        size = (THUMBNAIL_WIDTH, round(THUMBNAIL_WIDTH * rgb.shape[0] / rgb.shape[1]))
+        small[picture] = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    return small
+
+
+def _overview(
+    panels: Sequence[Panel], generated: Collection[str], scenes: SceneStore, frames: FrameStore, events: EventStore
+) -> Overview | None:
+    """Data of the panel with the largest variation of the true DoLP, from a photograph if there is one."""
+    panels = [panel for panel in panels if OURS in panel.dolp]
+    if not panels:
+        return None
+    panel = min(panels, key=lambda p: (scenes.scene_of[p.sequence] in generated, -float(p.truth_dolp.std())))
+    scene = scenes.read(panel.sequence)
     start_us = int(frames.t_us(panel.sequence)[panel.window])
-    trajectory = Trajectory.from_vector(record.trajectory.numpy())
-    path = trajectory.pose(np.linspace(0, record.duration_us / 1e6, 200))
-    size = np.array([[record.s0.shape[1]], [record.s0.shape[0]]])
+    trajectory = Trajectory.from_vector(scene.trajectory.numpy())
+    path = trajectory.pose(np.linspace(0, scene.duration_us / 1e6, 200))
+    outline = _outline(trajectory.pose(np.array([panel.t_us / 1e6])), scenes.sensor_height, scenes.sensor_width)
+    size = np.array([[scene.s0.shape[1]], [scene.s0.shape[0]]])
     return Overview(
         name=panel.sequence,
-        picture=polarization_hsv(record.s0, record.dolp, record.aolp),
+        picture=polarization_hsv(scene.s0, scene.dolp, scene.aolp),
         path=np.stack([path.x, path.y]) / size,
-        outline=_outline(trajectory.pose(np.array([panel.t_us / 1e6])), scenes.sensor_height, scenes.sensor_width)
-        / size,
+        outline=outline / size,
         intensity=frames.intensity(panel.sequence)[panel.window + 1],
         dolp=panel.truth_dolp,
         aolp=panel.truth_aolp,
         streams=events.read(panel.sequence, start_us, panel.t_us),
         start_us=start_us,
         duration_us=panel.t_us - start_us,
-        recovered=panel.dolp["ours"],
+        recovered=panel.dolp[OURS],
     )
-
-
-def thumbnails(pictures: Sequence[str], scenes: SceneStore) -> list[Thumbnail]:
-    """Thumbnails of the first `MAX_THUMBNAILS` pictures, from the scenes made of them."""
-    sequence_of = {picture: sequence for sequence, picture in reversed(scenes.picture_of.items())}
-    found = []
-    for picture in pictures[:MAX_THUMBNAILS]:
-        scene = scenes.read(sequence_of[picture])
-        rgb = polarization_hsv(scene.s0, scene.dolp, scene.aolp)
-        size = (THUMBNAIL_WIDTH, round(THUMBNAIL_WIDTH * rgb.shape[0] / rgb.shape[1]))
-        found.append(Thumbnail(picture, cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).astype(np.uint8)))
-    return found
-
-
-def _telling(panels: Sequence[Panel]) -> list[Panel]:
-    """Panels with the network's prediction: photographs before dead leaves, then by variation of the true DoLP."""
-    shown = [panel for panel in panels if "ours" in panel.dolp]
-    return sorted(shown, key=lambda panel: (panel.generated, -float(panel.truth_dolp.std())))
 
 
 def _outline(pose: Pose, height: int, width: int) -> Float[np.ndarray, "2 corners"]:
@@ -256,25 +250,16 @@ def _outline(pose: Pose, height: int, width: int) -> Float[np.ndarray, "2 corner
     return np.stack([left + columns * along - rows * across, top + columns * across + rows * along])
 
 
-def _panel(file: Path, generated: bool) -> Panel:
+def _panel(file: Path) -> Panel:
     with np.load(file) as arrays:
         tensors = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
 
     def by_method(kind: str) -> dict[str, Tensor]:
         return {name.removeprefix(kind): frame for name, frame in tensors.items() if name.startswith(kind)}
 
-    return Panel(
-        sequence=file.stem,
-        generated=generated,
-        window=int(tensors["window"]),
-        t_us=int(tensors["t_us"]),
-        events=tensors["events"],
-        truth_dolp=tensors["truth_dolp"],
-        truth_aolp=tensors["truth_aolp"],
-        truth_s0=tensors["truth_s0"],
-        dolp=by_method("dolp_"),
-        aolp=by_method("aolp_"),
-    )
+    truth = {name: tensors[name] for name in ("events", "truth_dolp", "truth_aolp", "truth_s0")}
+    window, t_us = int(tensors["window"]), int(tensors["t_us"])
+    return Panel(file.stem, window, t_us, **truth, dolp=by_method("dolp_"), aolp=by_method("aolp_"))
 
 
 def _json(path: Path) -> Any:

@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from polarnet.reports.figures import Theme, chart_style
-from polarnet.reports.legend import GENERAL
-from polarnet.reports.tables import in_order
+from polarnet.reports.legend import GENERAL, in_order
 
 PAPER_EVENTS_PER_PIXEL = 1.04  # events per pixel at which the paper's recovery is good (section 5)
 SETTING_LABELS = {
@@ -67,14 +66,8 @@ def sensitivity_figure(results: Mapping[str, Sequence[Mapping[str, Any]]], theme
         for column, (setting, entries) in enumerate(results.items()):
             for row, metric in enumerate(("psnr", "corr")):
                 for method in in_order(entries[0]["scores"]):
-                    axes[row][column].plot(
-                        range(len(entries)),
-                        [entry["scores"][method][metric] for entry in entries],
-                        marker="o",
-                        markersize=3,
-                        color=GENERAL.colour(method),
-                        label=GENERAL.label(method),
-                    )
+                    values = [entry["scores"][method][metric] for entry in entries]
+                    _line(axes[row][column], method, range(len(entries)), values)
                 axes[row][column].set_xticks(range(len(entries)), [f"{entry['value']:g}" for entry in entries])
             axes[1][column].set_xlabel(SETTING_LABELS.get(setting, setting), fontsize=7)
         axes[0][0].set_ylabel("PSNR, dB")
@@ -88,25 +81,22 @@ def _lines(
 ) -> None:
     for method in in_order(of_methods):
         entries = of_methods[method]
-        axes.plot(
-            [scale * entry[x] for entry in entries],
-            [entry[y] for entry in entries],
-            marker="o",
-            markersize=3,
-            color=GENERAL.colour(method),
-            label=GENERAL.label(method),
-        )
+        _line(axes, method, [scale * entry[x] for entry in entries], [entry[y] for entry in entries])
+
+
+def _line(axes: Axes, method: str, x: Sequence[float | int], y: Sequence[float | int]) -> None:
+    axes.plot(x, y, marker="o", markersize=3, color=GENERAL.colour(method), label=GENERAL.label(method))
 
 
 def _log_ticks(axes: Axes, values: Sequence[float]) -> None:
     """Make the axis logarithmic, with ticks at the points where there is room."""
     axes.set_xscale("log")
-    shown = [value for value in values if value > 0]
-    kept: list[float] = []
-    for value in shown:
-        if not kept or np.log(value / kept[-1]) > np.log(shown[-1] / shown[0]) / 9:
-            kept.append(value)
-    axes.set_xticks(kept, [f"{value:.3g}" if value >= 100 else f"{value:.2g}" for value in kept])
+    positive = [value for value in values if value > 0]
+    ticks: list[float] = []
+    for value in positive:
+        if not ticks or np.log(value / ticks[-1]) > np.log(positive[-1] / positive[0]) / 9:
+            ticks.append(value)
+    axes.set_xticks(ticks, [f"{value:.3g}" if value >= 100 else f"{value:.2g}" for value in ticks])
     axes.xaxis.set_minor_locator(NullLocator())
 
 

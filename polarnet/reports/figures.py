@@ -1,12 +1,12 @@
 """Figures drawn with matplotlib: comparison panels, training curves, distributions of scores over scenes.
 
-Figures are returned, not shown; `polarnet.reports.png` writes them.
+Figures are returned, not shown; `polarnet.reports.maps.png` encodes them.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -20,10 +20,10 @@ from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from torch import Tensor
 
 from polarnet.metrics.similarity import mse, psnr
-from polarnet.reports.legend import GENERAL, Legend
-from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image
-from polarnet.reports.png import png
-from polarnet.reports.tables import COLUMNS, in_order, with_structure
+from polarnet.reports.artefacts import Panel
+from polarnet.reports.legend import GENERAL, Legend, in_order, with_structure
+from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image, png
+from polarnet.reports.tables import COLUMNS
 
 
 @dataclass(frozen=True)
@@ -53,84 +53,68 @@ TERMS = {
 BRANCHES = {"intensity": "intensity", "aolp": "AoLP", "dolp": "DoLP"}
 """Outputs of a network with one loss per output; their terms are named BRANCH_TERM."""
 
-
-class PanelScene(NamedTuple):
-    """One row of a comparison: a window of one test scene, its truth and each method's prediction."""
-
-    name: str
-    events: Float[Tensor, "4 h w"]
-    truth: Float[Tensor, "h w"]
-    recovered: Mapping[str, Float[Tensor, "h w"]]
+ReliabilityCurve = Sequence[tuple[float, float, int]]
+"""Predicted squared error, measured squared error and number of pixels of each bin."""
 
 
-class Curve(NamedTuple):
-    """One line of a training figure; `values` holds NaN for epochs without a value."""
-
-    label: str
-    epochs: Sequence[int]
-    values: Sequence[float]
-
-
-class ReliabilityLine(NamedTuple):
-    """One line of a reliability plot; `curve` holds predicted error, measured error and pixels of each bin."""
-
-    label: str
-    colour: str
-    curve: Sequence[tuple[float, float, int]]
-
-
-def comparison_panel(rows: Sequence[PanelScene], path: Path, legend: Legend = GENERAL, theme: Theme = LIGHT) -> None:
-    """Write a picture like the paper's Fig. 10, with a row per scene.
+def comparison_panel(panels: Sequence[Panel], path: Path, legend: Legend = GENERAL, theme: Theme = LIGHT) -> None:
+    """Write a picture like the paper's Fig. 10, with a row per panel.
 
     A row shows events, truth and each method, with MSE and PSNR below. Methods that predict one value everywhere are
     left out.
     """
-    if not rows:
-        raise ValueError("a comparison panel needs at least one scene, got none")
-    methods = with_structure(rows[0].recovered)
-    height, width = rows[0].truth.shape
-    grid = _TileGrid(len(rows), 2 + len(methods), tile_width=1.35, aspect=height / width)
-    figure = _figure(grid.size, theme)
-    figure.patch.set_facecolor(theme.face)
-    for i, row in enumerate(rows):
-        full_scale = event_full_scale(row.events)
-        tiles = [(event_image(row.events[0], full_scale), ""), (dolp_image(row.truth), "")]
-        tiles += [(dolp_image(row.recovered[m]), score_line(row.recovered[m], row.truth)) for m in methods]
-        headings = ["events, 0°", "true DoLP", *map(legend.label, methods)]
-        for j, ((picture, below), heading) in enumerate(zip(tiles, headings, strict=True)):
-            axes = figure.add_axes(grid.rectangle(i, j))
-            show_picture(axes, picture, theme)
-            axes.set_xlabel(below, color=theme.quiet, fontsize=6, labelpad=2.5)
-            if i == 0:
-                axes.set_title(heading, color=theme.text, fontsize=8, pad=4)
-            if j == 0:
-                axes.set_ylabel(_short(row.name), color=theme.quiet, fontsize=6)
-    bar_axes = figure.add_axes(grid.beside())
-    _colour_bar(figure, bar_axes, theme, "vertical", label_size=6.0)
+    if not panels:
+        raise ValueError("a comparison needs at least one panel, got none")
+    methods = with_structure(panels[0].dolp)
+    headings = ["events, 0°", "true DoLP", *map(legend.label, methods)]
+    with matplotlib.rc_context(chart_style(theme)):
+        figure, grid = _tile_grid(len(panels), len(headings), panels[0].truth_dolp.shape, theme)
+        for panel, row in zip(panels, grid, strict=True):
+            full_scale = event_full_scale(panel.events)
+            tiles = [(event_image(panel.events[0], full_scale), ""), (dolp_image(panel.truth_dolp), "")]
+            tiles += [(dolp_image(panel.dolp[m]), score_line(panel.dolp[m], panel.truth_dolp)) for m in methods]
+            for axes, (picture, below) in zip(row, tiles, strict=True):
+                show_picture(axes, picture, theme)
+                axes.set_xlabel(below, color=theme.quiet, fontsize=6, labelpad=2.5)
+            row[0].set_ylabel(_short(panel.sequence), color=theme.quiet, fontsize=6)
+        for axes, heading in zip(grid[0], headings, strict=True):
+            axes.set_title(heading, color=theme.text, fontsize=8, pad=4)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(png(figure))
 
 
-def training_curves(loss: Sequence[Curve], validation: Sequence[Curve], validation_label: str, theme: Theme) -> Figure:
+def _tile_grid(rows: int, columns: int, shape: Sequence[int], theme: Theme) -> tuple[Figure, np.ndarray]:
+    """A figure and its axes for pictures of `shape`, with a colour bar of DoLP beside the first row."""
+    tile, gap, left, right, top, below = 1.35, 0.06, 0.22, 0.5, 0.26, 0.2  # inches
+    tile_height = tile * shape[0] / shape[1]
+    width, height = left + columns * (tile + gap) + right, top + rows * (tile_height + below)
+    figure = Figure(figsize=(width, height), facecolor=theme.face)
+    grid = figure.subplots(rows, columns, squeeze=False)
+    figure.subplots_adjust(
+        left / width, below / height, 1 - (right + gap) / width, 1 - top / height, gap / tile, below / tile_height
+    )
+    place = grid[0, -1].get_position()
+    bar = figure.add_axes((place.x1 + (gap + 0.04) / width, place.y0, 0.09 / width, place.height))
+    _colour_bar(figure, bar, theme, "vertical", label_size=6.0)
+    return figure, grid
+
+
+def training_curves(
+    loss: Mapping[str, Sequence[float]], validation: Sequence[float], validation_label: str, theme: Theme
+) -> Figure:
     """Loss terms of training on the left (logarithmic), a validation score on the right, over epochs from 1."""
     with matplotlib.rc_context(chart_style(theme)):
         figure = Figure(figsize=(5.7, 2.5), layout="constrained", facecolor="none")
         left, right = figure.subplots(1, 2)
-        for axes, curves, label in ((left, loss, "training loss"), (right, validation, validation_label)):
-            for curve in curves:
-                axes.plot(
-                    [e + 1 for e in curve.epochs],
-                    curve.values,
-                    marker="o",
-                    markersize=3,
-                    label=_term(curve.label),
-                )
+        for axes, curves, label in ((left, loss, "training loss"), (right, {"": validation}, validation_label)):
+            for term, values in curves.items():
+                axes.plot(range(1, len(values) + 1), values, marker="o", markersize=3, label=_term(term))
             axes.set_xlabel("epoch")
             axes.set_title(label, loc="left", fontsize=9)
             axes.xaxis.get_major_locator().set_params(integer=True)
             if len(curves) > 1:
                 axes.legend(frameon=False, fontsize=7, labelcolor=theme.text)
-        if all(value > 0 for curve in loss for value in curve.values):
+        if all(value > 0 for values in loss.values() for value in values):
             left.set_yscale("log")
             _plain_log_ticks(left.yaxis)
     return figure
@@ -166,26 +150,22 @@ def score_distribution(
     return figure
 
 
-def reliability_figure(
-    curves: Mapping[str, Sequence[tuple[float, float, int]]], theme: Theme, legend: Legend = GENERAL
-) -> Figure:
+def reliability_figure(curves: Mapping[str, ReliabilityCurve], theme: Theme, legend: Legend = GENERAL) -> Figure:
     """Measured against predicted squared error of DoLP, a line per method; calibrated errors lie on the diagonal.
 
     `curves` are those of `polarnet.metrics.reliability`: predicted, measured, pixels. Dots grow with the pixels.
     """
-    figure = _figure((3.4, 3.2), theme)
     with matplotlib.rc_context(chart_style(theme)):
-        lines = [
-            ReliabilityLine(legend.label(method), legend.colour(method), curve) for method, curve in curves.items()
-        ]
+        figure = Figure(figsize=(3.4, 3.2), facecolor="none")
+        lines = [(legend.label(method), legend.colour(method), curve) for method, curve in curves.items()]
         draw_reliability(figure.add_subplot(), lines, theme)
     figure.tight_layout()
     return figure
 
 
-def draw_reliability(axes: Axes, lines: Sequence[ReliabilityLine], theme: Theme) -> None:
-    """Draw measured against predicted squared error, and the diagonal; dots grow with the number of pixels."""
-    ends = [value for line in lines for predicted, measured, _ in line.curve for value in (predicted, measured)]
+def draw_reliability(axes: Axes, lines: Sequence[tuple[str, str, ReliabilityCurve]], theme: Theme) -> None:
+    """Draw measured against predicted squared error, and the diagonal; a line has label, colour and curve."""
+    ends = [value for _, _, curve in lines for predicted, measured, _ in curve for value in (predicted, measured)]
     diagonal = [min(value for value in ends if value > 0), max(ends)]
     axes.plot(diagonal, diagonal, color=theme.quiet, linewidth=0.8)
     for label, colour, curve in lines:
@@ -206,49 +186,10 @@ def score_line(recovered: Float[Tensor, "h w"], truth: Float[Tensor, "h w"]) -> 
 
 def dolp_bar(theme: Theme) -> Figure:
     """Colour bar of `maps.dolp_image`."""
-    figure = _figure((2.1, 0.32), theme)
-    axes = figure.add_axes((0.06, 0.6, 0.88, 0.38))
-    _colour_bar(figure, axes, theme, "horizontal", label_size=8.0)
-    return figure
-
-
-@dataclass(frozen=True)
-class _TileGrid:
-    """Layout of a panel's pictures in inches; every tile keeps its aspect ratio."""
-
-    rows: int
-    columns: int
-    tile_width: float
-    aspect: float
-    gap: float = 0.06
-    left: float = 0.22
-    right: float = 0.5
-    top: float = 0.26
-    below: float = 0.2
-
-    @property
-    def tile_height(self) -> float:
-        return self.tile_width * self.aspect
-
-    @property
-    def size(self) -> tuple[float, float]:
-        width = self.left + self.columns * (self.tile_width + self.gap) + self.right
-        return width, self.top + self.rows * (self.tile_height + self.below)
-
-    def rectangle(self, row: int, column: int) -> tuple[float, float, float, float]:
-        width, height = self.size
-        x = self.left + column * (self.tile_width + self.gap)
-        y = height - self.top - row * (self.tile_height + self.below) - self.tile_height
-        return x / width, y / height, self.tile_width / width, self.tile_height / height
-
-    def beside(self) -> tuple[float, float, float, float]:
-        x, y, _, height = self.rectangle(0, self.columns)
-        return x + 0.04 / self.size[0], y, 0.09 / self.size[0], height
-
-
-def _figure(size: tuple[float, float], theme: Theme) -> Figure:
     with matplotlib.rc_context(chart_style(theme)):
-        return Figure(figsize=size, facecolor="none")
+        figure = Figure(figsize=(2.1, 0.32), facecolor="none")
+    _colour_bar(figure, figure.add_axes((0.06, 0.6, 0.88, 0.38)), theme, "horizontal", label_size=8.0)
+    return figure
 
 
 def chart_style(theme: Theme) -> dict[Any, Any]:

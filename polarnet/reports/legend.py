@@ -1,12 +1,46 @@
-"""Names, colours and explanations of a benchmark's rows; the networks of `ours` and `E2V` depend on the weights."""
+"""Order, labels, colours and descriptions of a benchmark's rows, which are methods and references.
 
+The networks behind `ours` and `E2V` depend on the weights.
+"""
+
+from collections import ChainMap
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from polarnet.methods import METHODS
 from polarnet.methods.intensities import GAIN
-from polarnet.reports.rows import ROWS
-from polarnet.reports.tables import LABELS, in_order
+from polarnet.methods.method import Method
+
+GREY = "#98a2b3"
+
+
+class ReferenceRow(NamedTuple):
+    """A row of `polarnet.benchmark.references`, whose DoLP is constant over a frame."""
+
+    label: str
+    colour: str
+    about: str
+    """Glossary sentence of the HTML pages."""
+
+
+REFERENCES = {
+    "zeros": ReferenceRow("zeros", GREY, "A constant: no polarization anywhere."),
+    "train_mean": ReferenceRow("training mean", GREY, "A constant: the mean DoLP of the training split."),
+    "oracle_mean": ReferenceRow(
+        "oracle mean",
+        GREY,
+        "Each true frame's own mean, the best constant there is. It looks at the truth, so it is no method; what does "
+        "not beat it shows little spatial skill in MSE.",
+    ),
+}
+"""Reference by name."""
+
+ROWS: Mapping[str, ReferenceRow | Method] = ChainMap(METHODS, REFERENCES)  # type: ignore[arg-type]
+"""Reference or method by name, in the order of all tables: references first."""
+
+LABELS: Mapping[str, str] = MappingProxyType({name: row.label for name, row in ROWS.items()})
+"""Default labels of the rows, in table order, for results that do not name the networks."""
 
 
 class Network(NamedTuple):
@@ -62,6 +96,17 @@ class Legend(NamedTuple):
 
 GENERAL = Legend(LABELS, {name: row.colour for name, row in ROWS.items()})
 """Legend for results that do not name the networks behind the rows."""
+
+
+def in_order(rows: Iterable[str]) -> list[str]:
+    """Rows in the order of every table and figure; unknown rows, from older results, come last."""
+    given = list(rows)
+    return [name for name in ROWS if name in given] + [name for name in given if name not in ROWS]
+
+
+def with_structure(rows: Iterable[str]) -> list[str]:
+    """Rows in order, without the references, which predict one value everywhere."""
+    return [name for name in in_order(rows) if name not in REFERENCES]
 
 
 def legend_of(weights: Mapping[str, Mapping[str, Any]]) -> Legend:

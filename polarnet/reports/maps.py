@@ -1,12 +1,15 @@
-"""Convert tensors to colour pictures: events, DoLP, and polarization as hue, saturation and value."""
+"""Pictures of tensors (events, DoLP, polarization as hue, saturation and value), and picture files of them."""
 
+import io
 import math
 
 import cv2
 import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap, LinearSegmentedColormap, hsv_to_rgb
+from matplotlib.figure import Figure
 from torch import Tensor
 
 DOLP_COLOURS = "viridis"  # perceptually uniform, and still monotonic in grey
@@ -15,6 +18,7 @@ EVENT_COLOURS = LinearSegmentedColormap.from_list(
     ["#0b3c8c", "#3f83d6", "#ffffff", "#e8604c", "#9c0f1b"],
     N=257,  # odd, so that the middle is white
 )
+DOTS_PER_INCH = 160  # of figures
 FULL_SCALE_QUANTILE = 0.99  # of the pixels with events, so that a few hot pixels do not bleach a picture
 
 
@@ -23,11 +27,9 @@ def event_full_scale(events: Float[Tensor, "*b h w"]) -> float:
 
     Pass the four channels together, so that their pictures share one scale.
     """
-    magnitude = events.abs().flatten()
-    seen = magnitude[magnitude > 0]
-    if len(seen) == 0:
-        return 1.0
-    return float(np.quantile(seen.numpy(force=True), FULL_SCALE_QUANTILE))
+    magnitude = events.abs()
+    active = magnitude[magnitude > 0].numpy(force=True)
+    return float(np.quantile(active, FULL_SCALE_QUANTILE)) if len(active) else 1.0
 
 
 def event_image(events: Float[Tensor, "h w"], full_scale: float) -> UInt8[np.ndarray, "h w 3"]:
@@ -73,17 +75,28 @@ def hue_wheel(size: int) -> UInt8[np.ndarray, "size size 4"]:
     return np.concatenate([_bytes(rgb), _bytes(edge)[..., None]], axis=-1)
 
 
+def png(figure: Figure) -> bytes:
+    """Encode a figure as a PNG without a date or software name: the same figure gives the same bytes."""
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure)
+    compression = {"compress_level": 9}
+    figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None}, pil_kwargs=compression)
+    return buffer.getvalue()
+
+
 def encode_png(picture: UInt8[np.ndarray, "h w channels"]) -> bytes:
     """Encode RGB or RGBA bytes as a PNG without metadata: the same picture gives the same bytes."""
-    order = [2, 1, 0, 3][: picture.shape[-1]]
-    done, data = cv2.imencode(".png", picture[..., order], [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    assert done, f"OpenCV could not encode a picture of {picture.shape}"
-    return data.tobytes()
+    return _encoded(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
 def encode_jpeg(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
     """Encode RGB bytes as a small JPEG, for thumbnails of photographs."""
-    done, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
+    return _encoded(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
+
+
+def _encoded(kind: str, picture: UInt8[np.ndarray, "h w channels"], options: list[int]) -> bytes:
+    order = [2, 1, 0, 3][: picture.shape[-1]]  # OpenCV writes BGR
+    done, data = cv2.imencode(kind, picture[..., order], options)
     assert done, f"OpenCV could not encode a picture of {picture.shape}"
     return data.tobytes()
 

@@ -1,18 +1,16 @@
 """The whole pipeline in one figure: photograph, polarization, four polarizers, four event streams, recovered DoLP."""
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
-from torch import Tensor
 
 from polarnet.events.stream import Events
+from polarnet.reports.artefacts import Overview
 from polarnet.reports.figures import LIGHT, chart_style, show_picture
 from polarnet.reports.maps import dolp_image, hue_wheel, intensity_image, polarization_hsv
 from polarnet.stokes import POLARIZER_ANGLES_DEG
@@ -28,25 +26,6 @@ MARGIN = 0.15
 ARROW = 0.68
 PICTURE_WIDTH = 2.0
 STREAM_WIDTH = 2.1
-
-
-class Overview(NamedTuple):
-    """One test sequence, from the picture that the sensor moved over to the DoLP recovered from one window."""
-
-    name: str
-    picture: UInt8[np.ndarray, "height width 3"]
-    path: Float[np.ndarray, "2 times"]
-    """Path of the sensor's centre over the sequence: x and y in fractions of the picture's width and height."""
-    outline: Float[np.ndarray, "2 corners"]
-    """Outline of the sensor at the end, in the same fractions."""
-    intensity: Float[Tensor, "4 h w"]
-    dolp: Float[Tensor, "h w"]
-    aolp: Float[Tensor, "h w"]
-    streams: Sequence[Events]
-    """Events of the four channels, from `start_us` on."""
-    start_us: int
-    duration_us: int
-    recovered: Float[Tensor, "h w"]
 
 
 def overview_figure(overview: Overview) -> Figure:

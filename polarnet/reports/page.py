@@ -1,4 +1,4 @@
-"""data/report/index.html: one self-contained page with all results of a run."""
+"""Self-contained HTML pages: the report of a pipeline run, and the page of one test set (`polarnet benchmark`)."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -7,16 +7,43 @@ from typing import Any, NamedTuple
 
 from polarnet.methods import METHODS
 from polarnet.pictures.manifest import SPLITS
-from polarnet.reports.artefacts import Artefacts, History, ReportPaths, SetResults, read_artefacts
-from polarnet.reports.figures import training_curves
-from polarnet.reports.legend import NAMED_BY_NETWORK, Legend, legend_of, network_label
-from polarnet.reports.maps import encode_jpeg
+from polarnet.reports.artefacts import Artefacts, History, ReportPaths, Results, read_artefacts, read_results
+from polarnet.reports.figures import comparison_panel, dolp_bar, training_curves
+from polarnet.reports.legend import (
+    LABELS,
+    NAMED_BY_NETWORK,
+    Legend,
+    glossary,
+    legend_of,
+    lpips_about,
+    network_label,
+)
+from polarnet.reports.maps import encode_jpeg, encode_png, hue_wheel, png
 from polarnet.reports.overview import overview_figure
-from polarnet.reports.png import png
 from polarnet.reports.provenance import Run
-from polarnet.reports.results import results_context, write_comparison
-from polarnet.reports.tables import COLUMNS, LABELS, SET_TITLES, Scores, score_table
-from polarnet.reports.tiles import Tile, TileRow, chart, data_uri, event_tiles, panel_tiles, template
+from polarnet.reports.tables import (
+    COLUMNS,
+    COSTS,
+    ERROR_PARTS,
+    SET_TITLES,
+    Scores,
+    paired_lines,
+    paper_table,
+    score_table,
+    standing,
+)
+from polarnet.reports.tiles import (
+    Tile,
+    TileRow,
+    chart,
+    data_uri,
+    distribution,
+    event_tiles,
+    panel_tiles,
+    polarization_tiles,
+    reliability_chart,
+    template,
+)
 
 CARDS = {
     "psnr": "PSNR",
@@ -54,25 +81,72 @@ def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder:
     The page needs no other file and no network. FileNotFoundError names missing artefacts and the stage to run.
     """
     artefacts = read_artefacts(paths, baselines)
-    legend = legend_of(artefacts.details["weights"])
+    legend = legend_of(artefacts.results.details["weights"])
     folder.mkdir(parents=True, exist_ok=True)
     overview = None
     if artefacts.overview is not None:
         overview = png(overview_figure(artefacts.overview))
         (folder / "overview.png").write_bytes(overview)
-    write_comparison(folder / "comparison.png", artefacts, legend)
-    page = template("page.html.jinja").render(_context(artefacts, run, overview, legend))
+    context = _context(artefacts, legend) | {
+        "run": run,
+        "sections": _sections(run.parameters),
+        "overview": None if overview is None else data_uri(overview, "png"),
+    }
+    return _write_page(folder, "page.html.jinja", artefacts.results, legend, context)
+
+
+def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str]) -> Path:
+    """Write index.html and comparison.png beside the metrics.json, details.json and panels of one test set.
+
+    `notes` are sentences for the reader of the table, such as the methods that did not run and the reasons.
+    """
+    results = read_results(folder)
+    legend = legend_of(results.details["weights"])
+    context = {"title": title, "command": command, "notes": notes, "labels": legend.labels}
+    return _write_page(folder, "set.html.jinja", results, legend, _results_context(results, legend) | context)
+
+
+def _write_page(folder: Path, name: str, results: Results, legend: Legend, context: Mapping[str, Any]) -> Path:
+    """Fill a template into index.html, and write the panels as comparison.png; no such file without panels."""
+    if results.panels:
+        comparison_panel(results.panels, folder / "comparison.png", legend)
     path = folder / "index.html"
-    path.write_text(page, encoding="utf-8")
+    path.write_text(template(name).render(context), encoding="utf-8")
     return path
 
 
-def _context(artefacts: Artefacts, run: Run, overview: bytes | None, legend: Legend) -> dict[str, Any]:
-    manifest, context = artefacts.manifest, results_context(artefacts, legend)
+def _results_context(results: Results, legend: Legend) -> dict[str, Any]:
+    """Template values of the results on the test set."""
+    metrics, details, labels = results.metrics, results.details, legend.labels
     return {
-        **context,
-        "cards": _cards(artefacts.metrics, legend),
-        "overview": None if overview is None else data_uri(overview, "png"),
+        "metrics": metrics,
+        "details": details,
+        "scores": score_table(metrics, labels=labels),
+        "error_parts": score_table(metrics, columns=ERROR_PARTS, labels=labels),
+        "costs": score_table(metrics, columns=COSTS, labels=labels),
+        "standing": standing(metrics, labels),
+        "paired": paired_lines(details.get("paired", {}), labels=labels),
+        "rows": glossary(metrics, details["weights"]),
+        "lpips_about": lpips_about(details["lpips"]),
+        "paper_simulated": paper_table("simulated"),
+        "paper_real": paper_table("real"),
+        "distribution": distribution(details["scene_means"], legend),
+        "reliability": reliability_chart(details, legend),
+        "dolp_bar": chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
+        "wheel": data_uri(encode_png(hue_wheel(192)), "png"),
+        "panels": [TileRow(panel.sequence, panel_tiles(panel, legend)) for panel in results.panels],
+        "polarization": [TileRow(panel.sequence, polarization_tiles(panel, legend)) for panel in results.panels],
+    }
+
+
+def _context(artefacts: Artefacts, legend: Legend) -> dict[str, Any]:
+    """Template values of a pipeline's data, trainings and results on all test sets."""
+    manifest, results = artefacts.manifest, artefacts.results
+    context = _results_context(results, legend)
+    networks = [("ours: ", artefacts.ours, "DoLP")]
+    networks += [_baseline(name, history) for name, history in artefacts.baselines.items()]
+    return context | {
+        "cards": _cards(results.metrics, legend),
         "overview_name": None if artefacts.overview is None else artefacts.overview.name,
         "sets": [_set(one, legend) for one in artefacts.sets],
         "panels": context["panels"]
@@ -81,27 +155,22 @@ def _context(artefacts: Artefacts, run: Run, overview: bytes | None, legend: Leg
             for one in artefacts.sets
             for panel in one.panels
         ],
-        "events": [TileRow(panel.sequence, event_tiles(panel)) for panel in artefacts.panels[:MAX_EVENT_ROWS]],
+        "events": [TileRow(panel.sequence, event_tiles(panel)) for panel in results.panels[:MAX_EVENT_ROWS]],
         "rates": artefacts.rates,
         "training": {
-            f"{row}{network_label(history.network)}, events to {of}": _training(history, of)
-            for row, history, of in (
-                ("ours: ", artefacts.ours, "DoLP"),
-                *(_baseline(name, history) for name, history in artefacts.baselines.items()),
-            )
+            f"{row}{network_label(history.network)}, events to {output}": _training(history, output)
+            for row, history, output in networks
         },
         "ours": legend.labels["ours"],
-        "ours_has_aolp": any("ours" in panel.aolp for panel in artefacts.panels),
+        "ours_has_aolp": any("ours" in panel.aolp for panel in results.panels),
         "manifest": manifest,
         "source_names": SOURCE_NAMES,
         "sources": Counter(entry.source for entry in manifest.pictures),
         "splits": [_thumbnails(artefacts, split) for split in SPLITS],
-        "run": run,
-        "sections": _sections(run.parameters),
     }
 
 
-def _set(one: SetResults, legend: Legend) -> dict[str, Any]:
+def _set(one: Results, legend: Legend) -> dict[str, Any]:
     """Template values of a test set other than the simulated one."""
     return {
         "title": SET_TITLES.get(one.name, one.name),
@@ -126,8 +195,7 @@ def _cards(metrics: Scores, legend: Legend) -> list[Card]:
 
 
 def _thumbnails(artefacts: Artefacts, split: str) -> TileRow:
-    thumbnails = artefacts.thumbnails[split]
-    tiles = [Tile(data_uri(encode_jpeg(picture), "jpeg"), name) for name, picture in thumbnails]
+    tiles = [Tile(data_uri(encode_jpeg(small), "jpeg"), name) for name, small in artefacts.thumbnails[split].items()]
     return TileRow(split, tiles, artefacts.manifest.counts[split] - len(tiles))
 
 
@@ -137,35 +205,33 @@ def _baseline(name: str, history: History) -> tuple[str, History, str]:
     return row, history, "intensity" if METHODS[name].reconstructs else "polarization"
 
 
-def _training(history: History, of: str) -> dict[str, Any]:
-    validation = [history.validation["psnr"]]
+def _training(history: History, output: str) -> dict[str, Any]:
+    psnr = history.validation["psnr"]
     curves = chart(
-        lambda theme: training_curves(history.loss, validation, f"validation PSNR of {of}, dB", theme),
+        lambda theme: training_curves(history.loss, psnr, f"validation PSNR of {output}, dB", theme),
         "training loss and validation PSNR over epochs",
     )
     return {
         "chart": curves,
-        "epochs": len(history.loss[0].epochs),
+        "epochs": len(psnr),
         "best_epoch": history.best_epoch + 1,
-        "of": of,
-        "best_psnr": history.validation["psnr"].values[history.best_epoch],
+        "of": output,
+        "best_psnr": psnr[history.best_epoch],
     }
 
 
 def _sections(parameters: Mapping[str, Any]) -> dict[str, list[tuple[str, Any]]]:
     """Dotted keys and values by top-level section; single values are under general."""
     sections: dict[str, list[tuple[str, Any]]] = {"general": []}
-    for name, value in parameters.items():
-        if isinstance(value, Mapping):
-            sections[name] = list(_flat(value, name))
-        else:
-            sections["general"].append((name, value))
+    for key, value in _flat(parameters):
+        section, dot, _ = key.partition(".")
+        sections.setdefault(section if dot else "general", []).append((key, value))
     return sections
 
 
-def _flat(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for name, value in values.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}.{name}")
+            yield from _flat(value, f"{prefix}{name}.")
         else:
-            yield f"{prefix}.{name}", value
+            yield f"{prefix}{name}", value

@@ -35,23 +35,6 @@ def facts(root: Path) -> dict[str, str]:
     }
 
 
-def measured_with(record: Mapping[str, Any]) -> str:
-    """Machine, load, versions and commit of a record in docs/results (`studies.measure.machine_record`), as text."""
-    versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
-    where = f"{record['machine']}, load {record['load']:.1f} before the start"
-    return f"{where}; {versions}; commit `{record['commit'][:10]}`"
-
-
-def origin(record: Mapping[str, Any]) -> str:
-    """The sentence below a table of docs/results: number of cores, machine and versions of the measurement."""
-    return f"On {cores(record)} ({measured_with(record)})."
-
-
-def cores(record: Mapping[str, Any]) -> str:
-    """Number of cores used, in words."""
-    return "one core" if record["cores"] == 1 else f"{record['cores']} cores"
-
-
 def _commit(root: Path) -> str:
     commit = git(root, "rev-parse", "HEAD")
     if not commit:

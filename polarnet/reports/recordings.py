@@ -1,11 +1,21 @@
-"""The picture of a recording that `polarnet inspect` writes."""
+"""Pictures of recordings and of their calibration: start times, thresholds, hot pixels, registered cameras."""
+
+from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float32
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from polarnet.recordings.formats.celex5 import WHITE
+from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
+from polarnet.captures.targets import Calibrated
+from polarnet.recordings.formats.celex5_bin import WHITE
 from polarnet.recordings.inspection import Inspection
-from polarnet.reports.maps import encode_png, event_full_scale, event_image, intensity_image
+from polarnet.reports.maps import encode_png, event_full_scale, event_image, intensity_image, png
+
+COLOURS = ("#d6336c", "#e08a1e", "#3d8fd9", "#4aa37c")
+SPAN_MS = 60.0  # on each side of the start
 
 
 def recording_picture(inspection: Inspection) -> bytes:
@@ -14,3 +24,86 @@ def recording_picture(inspection: Inspection) -> bytes:
         return encode_png(intensity_image(torch.from_numpy(inspection.first_picture / np.float32(WHITE))))
     signed = torch.from_numpy(np.where(inspection.hot, 0, inspection.busiest)).float()
     return encode_png(event_image(signed, event_full_scale(signed)))
+
+
+def draw_calibration(target: Calibrated, config: RecordingsConfig, path: Path) -> None:
+    """Write a picture of one target: the landmark in events and in pictures, agreement against lag, thresholds."""
+    figure = Figure(figsize=(10, 6.4), layout="constrained")
+    events, pictures, lags, levels = figure.subplots(2, 2).reshape(-1).tolist()
+    _draw_landmark_events(events, target, config)
+    _draw_landmark_pictures(pictures, target, config)
+    _draw_lags(lags, target)
+    _draw_thresholds(levels, target)
+    figure.suptitle(
+        f"{target.name}: {target.duration_us * 1e-6:.2f} s, hot pixels {', '.join(map(str, target.hot.values()))}"
+    )
+    path.write_bytes(png(figure))
+
+
+def draw_hot_pixels(counts: np.ndarray, hot: Bool[np.ndarray, "h w"], path: Path) -> None:
+    """Write a picture of each pixel's event count, with the hot pixels circled."""
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.subplots()
+    image = axes.imshow(np.log1p(counts), cmap="gray")
+    rows, columns = np.nonzero(hot)
+    axes.scatter(columns, rows, s=60, facecolors="none", edgecolors=COLOURS[0])
+    axes.set_title(f"{len(rows)} hot pixels")
+    figure.colorbar(image, ax=axes, label="log(1 + events)")
+    path.write_bytes(png(figure))
+
+
+def draw_registration(
+    reference: Float32[np.ndarray, "h w"],
+    before: Float32[np.ndarray, "h w"],
+    after: Float32[np.ndarray, "h w"],
+    path: Path,
+) -> None:
+    """Write two cameras' event images overlaid before and after registration: one red, one cyan, grey where equal."""
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    for axes, moving, title in zip(figure.subplots(1, 2), (before, after), ("before", "after"), strict=True):
+        scale = max(float(reference.max()), float(moving.max()), 1e-6)
+        axes.imshow(np.stack([reference, moving, moving], axis=-1) / scale)
+        axes.set_title(title)
+        axes.set_axis_off()
+    path.write_bytes(png(figure))
+
+
+def _draw_landmark_events(axes: Axes, target: Calibrated, config: RecordingsConfig) -> None:
+    for capture, colour in zip(EVENT_CAPTURES, COLOURS, strict=True):
+        t_ms = (target.region_events_us[capture] - target.start_us[capture]) / 1000
+        axes.step(t_ms, np.arange(1, len(t_ms) + 1), where="post", color=colour, label=capture)
+    axes.axhline(config.negative_events, color="0.6", linewidth=0.8)
+    axes.set(xlim=(-SPAN_MS, SPAN_MS), xlabel="ms from the start", ylabel="negative events in the region")
+    axes.legend(fontsize=8)
+
+
+def _draw_landmark_pictures(axes: Axes, target: Calibrated, config: RecordingsConfig) -> None:
+    for capture, colour in zip(INTENSITY_CAPTURES, COLOURS, strict=True):
+        t_us, region = target.region_pictures[capture]
+        axes.plot((t_us - target.start_us[capture]) / 1000, region, ".-", color=colour, label=capture)
+    axes.axhline(config.dark_level, color="0.6", linewidth=0.8)
+    axes.set(xlim=(-SPAN_MS, SPAN_MS), xlabel="ms from the start", ylabel="mean in the region, of 255")
+    axes.legend(fontsize=8)
+
+
+def _draw_lags(axes: Axes, target: Calibrated) -> None:
+    axes.set(xlabel="lag of pictures against events, ms from the landmark's", ylabel="agreement")
+    if target.alignment is None:
+        axes.set_title("not refined")
+        return
+    for lag, colour in zip(target.alignment.lags, COLOURS, strict=True):
+        axes.plot(lag.searched_us / 1000, lag.agreements, color=colour)
+        axes.axvline(lag.lag_us / 1000, color=colour, linewidth=0.8)
+    axes.set_title(f"I0 - I45 + I90 - I135: {100 * target.alignment.residual:.2f} % of their mean")
+
+
+def _draw_thresholds(axes: Axes, target: Calibrated) -> None:
+    axes.set(ylabel="contrast threshold, log intensity")
+    if target.alignment is None:
+        return
+    place = np.arange(len(EVENT_CAPTURES))
+    for offset, name in ((-0.2, "on"), (0.2, "off")):
+        values = [getattr(lag.thresholds, name) for lag in target.alignment.lags]
+        axes.bar(place + offset, values, 0.38, label=name.upper(), color=COLOURS[0] if name == "on" else COLOURS[2])
+    axes.set_xticks(place, EVENT_CAPTURES)
+    axes.legend(fontsize=8)

@@ -1,11 +1,11 @@
 """Benchmark scores as tables: selected, rounded and ranked once, then written as Markdown, plain text or HTML."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
-from polarnet.reports.rows import REFERENCES, ROWS
+from polarnet.reports.legend import LABELS, LPIPS_BACKBONES, in_order
 
 Scores = Mapping[str, Mapping[str, Any]]
 """Method, then metric (data/benchmark/metrics.json). None marks a missing value; `<metric>_ci` holds an interval."""
@@ -58,12 +58,6 @@ COSTS = {
 }
 """Costs of a method on the machine of the run."""
 
-LABELS: Mapping[str, str] = MappingProxyType({name: row.label for name, row in ROWS.items()})
-"""Default labels of the rows, in table order, for results that do not name the networks."""
-
-BACKBONES = {"squeeze": "SqueezeNet 1.1", "alex": "AlexNet", "vgg": "VGG16, like the paper's"}
-"""Readable names of the LPIPS backbones."""
-
 SET_TITLES = {
     "simulated": "Simulated",
     "complex_motion": "Complex motion",
@@ -72,9 +66,8 @@ SET_TITLES = {
 }
 """Test sets, in the order of every page."""
 
-PAPER_SOURCE = "Yan et al., Photonics 2024, 11(5), 481, Table 2"
 PAPER_LABELS = {**LABELS, "e2v": "E2V, default parameters", "cf": "CF, default parameters"}
-PAPER_TABLE_2: Mapping[str, Scores] = {
+PAPER_TABLE_2: Mapping[str, Scores] = {  # Yan et al., Photonics 2024, 11(5), 481
     "simulated": {
         "cf": {"mse": 0.1371, "psnr": 10.60, "ssim": 0.1667, "lpips": 0.5890},
         "e2v": {"mse": 0.0778, "psnr": 12.74, "ssim": 0.3068, "lpips": 0.4140},
@@ -86,18 +79,6 @@ PAPER_TABLE_2: Mapping[str, Scores] = {
         "paper": {"mse": 0.0026, "psnr": 27.48, "ssim": 0.5189, "lpips": 0.1369},
     },
 }
-PAPER_COMPARABILITY = (
-    "Both tables ask the same question of different pictures: compare how the methods rank and how far apart they "
-    "lie, not the numbers themselves. The paper's simulated test set is 50 sequences from photographs of the same "
-    "collection as its training set (MIT-Adobe FiveK); its network saw 1000 sequences for 250 epochs; its CF and E2V "
-    "ran with their default parameters. It does not say which of the two published CF filters it means, whose defaults "
-    "differ by several dB, which windows were scored, how reconstructed intensities were scaled before the Stokes "
-    "formula, or with which settings SSIM and LPIPS were computed; and it shows no constant to beat. Its real "
-    "experiment is another task again: 32 targets that turn in front of a camera; errors so low for all three methods "
-    "suggest that most of each picture is hardly polarized. Measured polarization here has measured DoLP and AoLP, but "
-    "simulated events: it is not that experiment either. What the default parameters share with the paper: contrast "
-    "thresholds of 0.2, 120 by 180 pixels, 30 windows a second, photographs read as hue, saturation and value."
-)
 
 
 class Cell(NamedTuple):
@@ -124,17 +105,6 @@ class Table(NamedTuple):
     headings: tuple[str, ...]
     rows: tuple[Row, ...]
     notes: tuple[str, ...]
-
-
-def in_order(rows: Iterable[str]) -> list[str]:
-    """Rows in the order of every table and figure; unknown rows, from older results, come last."""
-    given = list(rows)
-    return [name for name in ROWS if name in given] + [name for name in given if name not in ROWS]
-
-
-def with_structure(rows: Iterable[str]) -> list[str]:
-    """Rows in order, without the references, which predict one value everywhere."""
-    return [name for name in in_order(rows) if name not in REFERENCES]
 
 
 def score_table(
@@ -165,7 +135,7 @@ def score_table(
         )
         for method in methods
     )
-    about = f"LPIPS ({backbone}): version 0.1 on the features of {BACKBONES[backbone]}." if backbone else ""
+    about = f"LPIPS ({backbone}): version 0.1 on the features of {LPIPS_BACKBONES[backbone]}." if backbone else ""
     notes = (about,) if about and "lpips" in keys else ()
     return Table(tuple(columns[key].heading for key in keys), rows, notes)
 
@@ -173,19 +143,6 @@ def score_table(
 def paper_table(experiment: Literal["simulated", "real"]) -> Table:
     """Published figures: one of the two experiments in the paper's Table 2."""
     return score_table(PAPER_TABLE_2[experiment], labels=PAPER_LABELS)
-
-
-def as_markdown(table: Table) -> str:
-    """A GitHub table: best values in bold, intervals small below their values, notes at the end."""
-    lines = ["| | " + " | ".join(table.headings) + " |", "|---|" + "---:|" * len(table.headings)]
-    for row in table.rows:
-        cells = (
-            (f"**{cell.text}**" if cell.best else cell.text)
-            + (f"<br><sub>{cell.interval}</sub>" if cell.interval else "")
-            for cell in row.cells
-        )
-        lines.append(f"| {row.label} | " + " | ".join(cells) + " |")
-    return "\n".join(lines + [f"\n{note}" for note in table.notes])
 
 
 def as_plain(table: Table) -> str:

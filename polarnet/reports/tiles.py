@@ -12,17 +12,16 @@ from matplotlib.figure import Figure
 
 from polarnet.reports.artefacts import Panel
 from polarnet.reports.figures import DARK, LIGHT, Theme, reliability_figure, score_distribution, score_line
-from polarnet.reports.legend import Legend
+from polarnet.reports.legend import Legend, in_order, with_structure
 from polarnet.reports.maps import (
     dolp_image,
     encode_png,
     event_full_scale,
     event_image,
     intensity_image,
+    png,
     polarization_hsv,
 )
-from polarnet.reports.png import png
-from polarnet.reports.tables import in_order, with_structure
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 DISTRIBUTION_METRICS = ("mse", "psnr", "ssim", "corr")
@@ -98,8 +97,8 @@ def event_tiles(panel: Panel) -> list[Tile]:
 def reliability_chart(details: Mapping[str, Any], legend: Legend) -> Chart | None:
     """Reliability of the methods in details.json that predict their error; None if there are none."""
     curves = {
-        method: [(predicted, measured, pixels) for predicted, measured, pixels in found["curve"]]
-        for method, found in details.get("reliability", {}).items()
+        method: [(predicted, measured, pixels) for predicted, measured, pixels in entry["curve"]]
+        for method, entry in details.get("reliability", {}).items()
     }
     if not curves:
         return None
@@ -110,12 +109,12 @@ def reliability_chart(details: Mapping[str, Any], legend: Legend) -> Chart | Non
 
 def distribution(scene_means: Mapping[str, Mapping[str, Mapping[str, float]]], legend: Legend) -> Chart:
     """Scores of every scene in a test set; `scene_means` is metric, then method, then scene."""
-    shown = {
+    scores = {
         metric: {method: list(scenes.values()) for method, scenes in scene_means[metric].items()}
         for metric in DISTRIBUTION_METRICS
         if metric in scene_means
     }
-    return chart(lambda theme: score_distribution(shown, theme, legend), "scores of each method, a dot a scene")
+    return chart(lambda theme: score_distribution(scores, theme, legend), "scores of each method, a dot a scene")
 
 
 def chart(draw: Callable[[Theme], Figure], alt: str) -> Chart:

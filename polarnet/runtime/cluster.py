@@ -96,7 +96,7 @@ def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], addres
             "cluster.address needs Dask on this machine and on the workers: pip install dask distributed"
         ) from None
     with Client(address, timeout="30s") as client:
-        futures = client.map(_guarded(function), items, retries=ATTEMPTS - 1, pure=False)
+        futures = client.map(functools.partial(_on_one_thread, function), items, retries=ATTEMPTS - 1, pure=False)
         order: dict[Any, int] = {future.key: i for i, future in enumerate(futures)}
         results: dict[int, Result] = {}
         for future, result in dask_as_completed(futures, with_results=True):
@@ -105,11 +105,6 @@ def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], addres
     return [results[i] for i in range(len(items))]
 
 
-def _guarded(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
-    """`function` on one thread, since Dask runs several tasks of one worker side by side."""
-    return functools.partial(_on_one_thread, function)
-
-
 def _on_one_thread(function: Callable[[Item], Result], item: Item) -> Result:
-    limit_threads(1)
+    limit_threads(1)  # Dask runs several tasks of one worker side by side
     return function(item)

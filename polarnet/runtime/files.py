@@ -1,4 +1,4 @@
-"""The hash of contents, and files that are written whole or not at all."""
+"""The hash of contents, files that are written whole or not at all, and the settings that came with the package."""
 
 import hashlib
 from collections.abc import Iterator
@@ -16,6 +16,13 @@ def sha256(*parts: bytes | memoryview | Path) -> str:
         else:
             digest.update(part)
     return digest.hexdigest()
+
+
+def shipped_settings() -> Path:
+    """Folder of params.yaml and conf/ beside the code: the copy that setup.py puts into a wheel, or the source tree."""
+    package = Path(__file__).parents[1]
+    installed = package / "config" / "settings"
+    return installed if installed.is_dir() else package.parent
 
 
 @contextmanager

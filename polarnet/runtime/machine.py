@@ -6,38 +6,35 @@ import os
 import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 
 import numba
 import numpy as np
 import torch
+from pydantic import NonNegativeInt, PositiveInt
 
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
 MAX_KEPT = 2**30  # bytes
 MAX_MIXED = 2**20  # bytes; larger tensors get separate memory while long-lived ones are allocated
 
 
-@dataclass(frozen=True)
+@section
 class RuntimeConfig:
     """Section `runtime` of conf/config.yaml: settings that change no result."""
 
     device: str
     """auto (CUDA where there is one), cpu, cuda or cuda:N."""
-    threads: int = field(metadata=allowed(low=0))
+    threads: NonNegativeInt
     """Threads of torch and numba in each process; 0: one per core."""
-    workers: int = field(metadata=allowed(low=1))
+    workers: PositiveInt
     """Number of processes that share the sequences."""
-    devices: int = field(metadata=allowed(low=1))
+    devices: PositiveInt
     """Number of processes on this machine that share a training, each on its own GPU, or all on the processor."""
-    nodes: int = field(metadata=allowed(low=1))
+    nodes: PositiveInt
     """Number of machines that share a training; the same command starts on each."""
     rendezvous: str
     """Address at which the machines meet: host:port of one of them."""
-
-    def __post_init__(self):
-        check_ranges(self)
 
 
 def seed_for(seed: int, name: str, purpose: str) -> int:

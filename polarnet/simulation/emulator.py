@@ -3,17 +3,18 @@
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64, Shaped
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from polarnet.events.stream import Events
 from polarnet.runtime.arrays import Array, as_tensor, check_range, check_shape
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.compilation import forget_stale_code
 from polarnet.simulation.pixels import esim, esim_gpu, exact, v2e, voltmeter
 from polarnet.simulation.pixels.columns import Columns, empty_columns, trimmed
@@ -54,27 +55,26 @@ MODELS: dict[str, PixelModel] = {
 }
 
 
-@dataclass(frozen=True)
+@section
 class EmulatorConfig(EsimConfig, VoltmeterConfig):
     """Section `emulate` of params.yaml: the parameters of all pixel models, and which model is in use.
 
     A model ignores the parameters that it does not have.
     """
 
-    model: str = field(metadata=allowed(choices=tuple(MODELS)))
-    render_rate_hz: float | None = field(metadata=allowed(above=0))
+    model: Annotated[str, one_of(MODELS)]
+    render_rate_hz: PositiveFloat | None
     """Rate at which the light is rendered; null: one frame for each pixel of motion."""
     randomise: bool
     """Draw the parameters below for each sequence, uniformly (rates and cutoff: uniformly in their logarithm)."""
-    random_threshold_on: list[float] = field(metadata=allowed(low=0.01, high=10))
-    random_threshold_off: list[float] = field(metadata=allowed(low=0.01, high=10))
-    random_threshold_sigma: list[float] = field(metadata=allowed(low=0))
-    random_cutoff_hz: list[float] = field(metadata=allowed(above=0))
-    random_leak_rate_hz: list[float] = field(metadata=allowed(above=0))
-    random_shot_noise_rate_hz: list[float] = field(metadata=allowed(above=0))
+    random_threshold_on: list[Annotated[float, Field(ge=0.01, le=10)]]
+    random_threshold_off: list[Annotated[float, Field(ge=0.01, le=10)]]
+    random_threshold_sigma: list[NonNegativeFloat]
+    random_cutoff_hz: list[PositiveFloat]
+    random_leak_rate_hz: list[PositiveFloat]
+    random_shot_noise_rate_hz: list[PositiveFloat]
 
     def __post_init__(self):
-        check_ranges(self)
         for name in (name for name in vars(self) if name.startswith("random_")):
             bounds = getattr(self, name)
             if len(bounds) != 2 or bounds[0] > bounds[1]:

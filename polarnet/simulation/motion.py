@@ -2,16 +2,17 @@
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple, no_type_check
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple, no_type_check
 
 import numba
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
+from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 from polarnet.simulation.scene import PolarizationScene
 
 HARMONICS = 3  # number of sines in the motion along each axis
@@ -25,25 +26,24 @@ FASTEST_OVER_SLOWEST = 3.0  # factor by which the sensor may turn back faster th
 ATTEMPTS = 64
 
 
-@dataclass(frozen=True)
+@section
 class SynthesizeConfig:
     """Section `synthesize` of params.yaml. Speeds are in scene pixels and hold for every sensor pixel."""
 
-    sequences_per_picture: int = field(metadata=allowed(low=1))
-    duration_s: float = field(metadata=allowed(above=0))
-    frame_rate_hz: float = field(metadata=allowed(above=0))
+    sequences_per_picture: PositiveInt
+    duration_s: PositiveFloat
+    frame_rate_hz: PositiveFloat
     """Rate of the ground-truth frames; the windows of events between frames are the network's inputs."""
-    sensor_height: int = field(metadata=allowed(low=2))
-    sensor_width: int = field(metadata=allowed(low=2))
-    speed_min_px_s: float = field(metadata=allowed(above=0))
+    sensor_height: Annotated[int, Field(ge=2)]
+    sensor_width: Annotated[int, Field(ge=2)]
+    speed_min_px_s: PositiveFloat
     """The peak speed of a sequence is drawn between this and speed_max_px_s."""
-    speed_max_px_s: float = field(metadata=allowed(above=0))
-    acceleration_max_px_s2: float = field(metadata=allowed(above=0))
-    rotation_max_deg: float = field(metadata=allowed(low=0, high=90))
-    zoom_max: float = field(metadata=allowed(low=1, high=16))
+    speed_max_px_s: PositiveFloat
+    acceleration_max_px_s2: PositiveFloat
+    rotation_max_deg: Annotated[float, Field(ge=0, le=90)]
+    zoom_max: Annotated[float, Field(ge=1, le=16)]
 
     def __post_init__(self):
-        check_ranges(self)
         if self.speed_max_px_s < self.speed_min_px_s:
             raise ValueError(f"speed_max_px_s: expected >= speed_min_px_s {self.speed_min_px_s}, got {self}")
         if round(self.duration_s * self.frame_rate_hz) < 1:
@@ -270,11 +270,14 @@ def render(
     `sensor_to_scene` maps sensor pixel (row, column) to a point of the scene; pixel centres are at integers in both.
     A camera rolled by a measures angles from its own axes, so that its AoLP is the scene's minus a.
     """
-    out = np.empty((len(t_s), 3, height, width), dtype=np.float32)
-    stokes = np.ascontiguousarray(scene.stokes.numpy(), dtype=np.float32)
-    pose = trajectory.pose(np.asarray(t_s, dtype=np.float64))
-    _render(stokes, pose.x, pose.y, pose.angle, pose.zoom, out)
-    return torch.from_numpy(out)
+    return torch.from_numpy(render_poses(scene, trajectory.pose(np.asarray(t_s, dtype=np.float64)), height, width))
+
+
+def render_poses(scene: PolarizationScene, pose: Pose, height: int, width: int) -> Float32[np.ndarray, "n 3 h w"]:
+    """As `render`, for a sensor in n poses."""
+    frames = np.empty((len(pose.x), 3, height, width), dtype=np.float32)
+    _render(np.ascontiguousarray(scene.stokes.numpy()), pose.x, pose.y, pose.angle, pose.zoom, frames)
+    return frames
 
 
 @no_type_check
@@ -309,17 +312,9 @@ def bilinear(image: Float32[np.ndarray, "h w"], x: float, y: float) -> float:
 
 
 @no_type_check
-@numba.njit(cache=True, nogil=True, inline="always")
-def stokes_seen(stokes: Float32[np.ndarray, "3 h w"], x: float, y: float, cos: float, sin: float) -> tuple:
-    """(S0, S1, S2) at a point (x, y), by the axes of a camera rolled by a; `cos` and `sin` are those of 2 a."""
-    s1, s2 = bilinear(stokes[1], x, y), bilinear(stokes[2], x, y)
-    return bilinear(stokes[0], x, y), s1 * cos + s2 * sin, s2 * cos - s1 * sin
-
-
-@no_type_check
 @numba.njit(cache=True, nogil=True)
-def _render(stokes, x, y, angle, zoom, out) -> None:
-    height, width = out.shape[2:]
+def _render(stokes, x, y, angle, zoom, frames) -> None:
+    height, width = frames.shape[2:]
     for k in range(len(x)):
         left, top, along, across = sensor_to_scene(x[k], y[k], angle[k], zoom[k], height, width)
         cos, sin = np.float32(math.cos(2 * angle[k])), np.float32(math.sin(2 * angle[k]))
@@ -327,7 +322,7 @@ def _render(stokes, x, y, angle, zoom, out) -> None:
             for column in range(width):
                 at_x = left + column * along - row * across
                 at_y = top + column * across + row * along
-                s0, s1, s2 = stokes_seen(stokes, at_x, at_y, cos, sin)
-                out[k, 0, row, column] = s0
-                out[k, 1, row, column] = s1
-                out[k, 2, row, column] = s2
+                s1, s2 = bilinear(stokes[1], at_x, at_y), bilinear(stokes[2], at_x, at_y)
+                frames[k, 0, row, column] = bilinear(stokes[0], at_x, at_y)
+                frames[k, 1, row, column] = s1 * cos + s2 * sin
+                frames[k, 2, row, column] = s2 * cos - s1 * sin

@@ -6,9 +6,8 @@ import math
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from polarnet.simulation.compilation import compiled, forget_stale_code
-from polarnet.simulation.motion import Pose, Trajectory, sensor_to_scene, stokes_seen
-from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_scene
+from polarnet.simulation.motion import Pose, Trajectory, render_poses
+from polarnet.simulation.pixels.light import FULL_SCALE, Light
 from polarnet.simulation.scene import PolarizationScene
 from polarnet.stokes import POLARIZER_ANGLES_DEG, behind_polarizer
 
@@ -83,27 +82,15 @@ def render_intensities(
     scene: PolarizationScene, pose: Pose, height: int, width: int, eight_bit: bool
 ) -> UInt8[np.ndarray, "4 n h w"] | Float32[np.ndarray, "4 n h w"]:
     """Digital numbers behind the four polarizers for any motion; uint8, rounded, if `eight_bit`."""
-    forget_stale_code()
-    frames = np.empty((4, len(pose.x), height, width), np.uint8 if eight_bit else np.float32)
-    _render(np.ascontiguousarray(scene.stokes.numpy()), pose.x, pose.y, pose.angle, pose.zoom, frames)
-    return frames
+    frames = behind_polarizers(render_poses(scene, pose, height, width).transpose(1, 0, 2, 3))
+    return (frames + np.float32(0.5)).astype(np.uint8) if eight_bit else frames
 
 
-@compiled
-def _render(stokes, x, y, angle, zoom, frames) -> None:  # pragma: no cover (compiled)
-    height, width = frames.shape[2:]
-    half, rounding = np.float32(FULL_SCALE / 2), np.float32(0.5 if frames.itemsize == 1 else 0.0)
-    for k in range(len(x)):
-        left, top, along, across = sensor_to_scene(x[k], y[k], angle[k], zoom[k], height, width)
-        cos, sin = np.float32(math.cos(2 * angle[k])), np.float32(math.sin(2 * angle[k]))
-        for row in range(height):
-            for column in range(width):
-                at_x = left + column * along - row * across
-                at_y = top + column * across + row * along
-                s0, s1, s2 = stokes_seen(stokes, at_x, at_y, cos, sin)  # the polarizers roll with the camera
-                for channel, part in enumerate((s1, s2)):
-                    frames[channel, k, row, column] = max(half * (s0 + part), np.float32(0)) + rounding
-                    frames[channel + 2, k, row, column] = max(half * (s0 - part), np.float32(0)) + rounding
+def behind_polarizers(stokes: Float32[np.ndarray, "3 *shape"]) -> Float32[np.ndarray, "4 *shape"]:
+    """Digital numbers behind ideal polarizers at 0, 45, 90 and 135 degrees that see the same Stokes parameters."""
+    s0, s1, s2 = stokes
+    intensities = [behind_polarizer(s0, s1, s2, math.radians(angle)) for angle in POLARIZER_ANGLES_DEG]
+    return np.maximum(np.stack(intensities), 0) * FULL_SCALE
 
 
 def lights_of_drift(scene: PolarizationScene, pose: Pose, height: int, width: int) -> list[Light]:
@@ -111,13 +98,8 @@ def lights_of_drift(scene: PolarizationScene, pose: Pose, height: int, width: in
     left, top = pose.x - (width - 1) / 2, pose.y - (height - 1) / 2
     rows, columns = _visible(top, height, scene.height), _visible(left, width, scene.width)
     # numpy, because idle torch threads would occupy the cores that the channels' threads need next
-    s0, s1, s2 = scene.stokes[:, rows, columns].numpy()
-    lights = []
-    for angle in POLARIZER_ANGLES_DEG:
-        intensity = np.maximum(behind_polarizer(s0, s1, s2, math.radians(angle)), 0) * FULL_SCALE
-        intensity = np.pad(intensity, (0, 1), mode="edge")
-        lights.append(light_of_scene(intensity, top - rows.start, left - columns.start))
-    return lights
+    intensities = np.pad(behind_polarizers(scene.stokes[:, rows, columns].numpy()), ((0, 0), (0, 1), (0, 1)), "edge")
+    return [Light(intensity[np.newaxis], top - rows.start, left - columns.start) for intensity in intensities]
 
 
 def _visible(first: Float64[np.ndarray, " n"], size: int, limit: int) -> slice:

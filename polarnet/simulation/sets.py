@@ -5,19 +5,21 @@ A set is a folder with images, scenes.zarr, frames.zarr and events.zarr, made by
 
 import dataclasses
 import functools
-import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field, PositiveFloat
 
 from polarnet.pictures.images import picture_extensions
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.pictures.polarimetry import group_by_measurement
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.files import sha256
+from polarnet.runtime.sections import section
 from polarnet.simulation.dataset import emulate_scenes
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
@@ -29,21 +31,20 @@ MakeMapper = Callable[[str], Callable[..., Iterable[Any]]]
 """`polarnet.runtime.cluster.pmap` with its workers bound, for a label; or one that gives the built-in `map`."""
 
 
-@dataclass(frozen=True)
+@section
 class SetsConfig:
     """Section `sets` of params.yaml: how test sets beyond `simulated` differ from it."""
 
     measured_root: str
     """Folder of the measured polarization of `measured`, searched recursively."""
-    rotation_max_deg: float = field(metadata=allowed(low=0, high=90))
+    rotation_max_deg: Annotated[float, Field(ge=0, le=90)]
     """This field and the next four set the motion of `complex_motion`."""
-    zoom_max: float = field(metadata=allowed(low=1, high=16))
-    speed_min_px_s: float = field(metadata=allowed(above=0))
-    speed_max_px_s: float = field(metadata=allowed(above=0))
-    acceleration_max_px_s2: float = field(metadata=allowed(above=0))
+    zoom_max: Annotated[float, Field(ge=1, le=16)]
+    speed_min_px_s: PositiveFloat
+    speed_max_px_s: PositiveFloat
+    acceleration_max_px_s2: PositiveFloat
 
     def __post_init__(self):
-        check_ranges(self)
         if self.speed_max_px_s < self.speed_min_px_s:
             raise ValueError(f"speed_max_px_s: expected >= speed_min_px_s {self.speed_min_px_s}, got {self}")
 
@@ -64,10 +65,9 @@ class Recipe:
 
 def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Recipe, mapper: MakeMapper) -> bool:
     """The test pictures of `images` again, under the motion of `sets`. False if the folder is complete already."""
-    names = ("rotation_max_deg", "zoom_max", "speed_min_px_s", "speed_max_px_s", "acceleration_max_px_s2")
-    motion = dataclasses.replace(recipe.motion, **{name: getattr(sets, name) for name in names})
-    fill = functools.partial(_held_out, images)
-    return _make(folder, dataclasses.replace(recipe, motion=motion), mapper, fill, _content(images))
+    harder = {name: value for name, value in asdict(sets).items() if name != "measured_root"}
+    recipe = dataclasses.replace(recipe, motion=dataclasses.replace(recipe.motion, **harder))
+    return _make(folder, recipe, mapper, functools.partial(_hold_out, images), _content(images))
 
 
 def make_folder_set(root: Path, kind: str, folder: Path, recipe: Recipe, mapper: MakeMapper) -> bool:
@@ -84,7 +84,7 @@ def make_folder_set(root: Path, kind: str, folder: Path, recipe: Recipe, mapper:
         recipe.ingest, source=source, root=str(root), limit=None, val_fraction=0.0, test_fraction=1.0
     )
     recipe = dataclasses.replace(recipe, ingest=chosen)
-    return _make(folder, recipe, mapper, lambda recipe, images, m: _ingested(recipe, images, m), _content(root))
+    return _make(folder, recipe, mapper, lambda to: ingest(chosen, recipe.seed, to, mapper("ingest")), _content(root))
 
 
 def kind_of(root: Path) -> str:
@@ -99,20 +99,14 @@ def kind_of(root: Path) -> str:
     return "polarization" if any(len(group) == 4 for group in group_by_measurement(pictures)) else "photographs"
 
 
-def _make(
-    folder: Path,
-    recipe: Recipe,
-    mapper: MakeMapper,
-    fill: Callable[[Recipe, Path, MakeMapper], None],
-    source: str,
-) -> bool:
+def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path], Any], source: str) -> bool:
     """Fill `folder`, resuming a stopped run with the same settings, seed and source pictures.
 
-    A folder made with others is emptied first. The code is not compared: DVC does that for the pipeline's sets.
+    `fill` writes the pictures into a folder, and `source` is the hash of those that it reads. A folder made with others
+    is emptied first. The code is not compared: DVC does that for the pipeline's sets.
     """
     sections = {name: asdict(getattr(recipe, name)) for name in ("ingest", "motion", "emulate")}
-    settings = json.dumps(sections | {"seed": recipe.seed, "source": source}, sort_keys=True)
-    key = hashlib.sha256(settings.encode()).hexdigest()
+    key = sha256(json.dumps(sections | {"seed": recipe.seed, "source": source}, sort_keys=True).encode())
     note = folder / MADE
     if note.exists():
         known = json.loads(note.read_text())
@@ -124,7 +118,7 @@ def _make(
     note.write_text(json.dumps({"key": key, "complete": False}))
     images, scenes, frames, events = (folder / name for name in ("images", "scenes.zarr", "frames.zarr", "events.zarr"))
     if not (images / "manifest.json").exists():
-        fill(recipe, images, mapper)
+        fill(images)
     if not (scenes.exists() and frames.exists()):
         synthesize(images, scenes, frames, recipe.motion, recipe.seed, mapper("synthesize"), recipe.sequences_per_part)
     if not events.exists():
@@ -135,28 +129,20 @@ def _make(
 
 def _content(folder: Path) -> str:
     """Hash of the names and bytes of all files in a folder."""
-    files = hashlib.sha256()
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        with path.open("rb") as file:
-            content = hashlib.file_digest(file, "sha256").hexdigest()
-        files.update(f"{path.relative_to(folder)} {content}\n".encode())
-    return files.hexdigest()
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return sha256(*(f"{path.relative_to(folder)} {sha256(path)}\n".encode() for path in files))
 
 
-def _ingested(recipe: Recipe, images: Path, mapper: MakeMapper) -> None:
-    ingest(recipe.ingest, recipe.seed, images, mapper("ingest"))
-
-
-def _held_out(source: Path, recipe: Recipe, images: Path, mapper: MakeMapper) -> None:
-    """The test pictures of `source` and a manifest of them alone."""
+def _hold_out(source: Path, images: Path) -> None:
+    """Copy the test pictures of `source`, with a manifest of them alone."""
     manifest = read_manifest(source)
-    kept = tuple(entry for entry in manifest.pictures if entry.split == "test")
-    if not kept:
+    held_out = tuple(entry for entry in manifest.pictures if entry.split == "test")
+    if not held_out:
         raise ValueError(f"{source} has no test picture; raise ingest.test_fraction or ingest more pictures")
     temporary = images.with_name(f"{images.name}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir()
-    for entry in kept:
+    for entry in held_out:
         shutil.copy(source / entry.file, temporary / entry.file)
-    write_manifest(dataclasses.replace(manifest, pictures=kept), temporary)
+    write_manifest(dataclasses.replace(manifest, pictures=held_out), temporary)
     temporary.rename(images)

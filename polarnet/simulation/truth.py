@@ -1,13 +1,12 @@
 """Synthesis: from pictures to scenes, trajectories and exact frames of an ideal camera."""
 
-import dataclasses
 import functools
 import itertools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,12 +28,20 @@ from polarnet.simulation.scene import (
 )
 from polarnet.simulation.variation import VariationConfig, varied
 from polarnet.storage.frames import FrameStore
-from polarnet.storage.scenes import Scene, SceneStore, as_stored, made_from, variant_name
+from polarnet.storage.scenes import Scene, SceneStore, as_stored
 
 logger = logging.getLogger(__name__)
 
-Motions: TypeAlias = Mapping[str, Mapping[str, Trajectory]]
-"""Trajectories of one picture by scene and sequence."""
+
+class Motion(NamedTuple):
+    """The motion of the sensor in one sequence."""
+
+    sequence: str
+    scene: str
+    picture: str
+    """Name of the picture that the scene is, or a variant of."""
+    split: str
+    trajectory: Trajectory
 
 
 @one_thread()
@@ -91,136 +98,114 @@ def synthesize(
         logger.warning("skipped %s: %s", picture.file, picture.reason)
     if not motions:
         raise ValueError(f"none of {len(skipped)} pictures can be used:{listed(skipped)}")
-    manifest = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name in motions))
-    scene_store, frame_store = _create(
-        manifest, motions, images, scenes, frames, config, variation, seed, sequences_per_part
-    )
-    missing = {*scene_store.missing_parts(), *frame_store.missing_parts()}
-    trajectories = {
-        name: t for scenes_of in motions.values() for scene in scenes_of.values() for name, t in scene.items()
+    used = {motion.picture for motion in motions}
+    entries = [entry for entry in manifest.pictures if entry.name in used]
+    attributes = {
+        "synthesize": asdict(config),
+        "variation": asdict(variation) if variation else None,
+        "seed": seed,
+        "images_sha256": _digest(entries, images),
     }
-    items = [{name: trajectories[name] for name in scene_store.parts[part]} for part in sorted(missing)]
-    task = functools.partial(
-        _synthesize_part,
-        images=images,
-        scenes=scene_store,
-        frames=frame_store,
-        config=config,
-        variation=variation,
-        seed=seed,
-    )
-    for _ in mapper(task, items):
+    scene_store, frame_store = _create(scenes, frames, entries, motions, config, attributes, sequences_per_part)
+    motion_of = {motion.sequence: motion for motion in motions}
+    missing = sorted({*scene_store.missing_parts(), *frame_store.missing_parts()})
+    task = functools.partial(_synthesize_part, scene_store, frame_store, images, config, variation, seed)
+    for _ in mapper(task, [[motion_of[sequence] for sequence in scene_store.parts[part]] for part in missing]):
         pass
     scene_store.finish()
     frame_store.finish()
-    return len(scene_store.sequences)
+    return len(motions)
 
 
 def motions_of(
     manifest: Manifest, config: SynthesizeConfig, seed: int, variation: VariationConfig | None = None
-) -> tuple[dict[str, Motions], list[Skipped]]:
-    """Motions by picture, and the pictures that are too small for the sensor and its motion."""
-    motions, skipped = {}, []
+) -> tuple[list[Motion], list[Skipped]]:
+    """Motions over all scenes, and the pictures that are too small for the sensor and its motion."""
+    motions, skipped = [], []
     for entry in manifest.pictures:
         try:
-            motions[entry.name] = _motions(entry, config, seed, variation)
+            motions.extend(_motions(entry, config, seed, variation))
         except ValueError as error:
             skipped.append(Skipped(entry.origin, str(error)))
     return motions, skipped
 
 
-def _motions(entry: ManifestEntry, config: SynthesizeConfig, seed: int, variation: VariationConfig | None) -> Motions:
+def _motions(
+    entry: ManifestEntry, config: SynthesizeConfig, seed: int, variation: VariationConfig | None
+) -> list[Motion]:
     variants = variation.scenes_per_picture if variation and entry.split == "train" else 0
-    scenes = [entry.name, *(variant_name(entry.name, k) for k in range(1, variants + 1))]
-    names = {scene: [f"{scene}-{number:02d}" for number in range(config.sequences_per_picture)] for scene in scenes}
-    return {
-        scene: {
-            sequence: random_trajectory(config, entry.height, entry.width, generator_for(seed, sequence, "motion"))
-            for sequence in sequences
-        }
-        for scene, sequences in names.items()
-    }
+    scenes = [entry.name, *(f"{entry.name}-variant{k:02d}" for k in range(1, variants + 1))]
+    names = [(f"{scene}-{number:02d}", scene) for scene in scenes for number in range(config.sequences_per_picture)]
+    motions = []
+    for sequence, scene in names:
+        generator = generator_for(seed, sequence, "motion")
+        trajectory = random_trajectory(config, entry.height, entry.width, generator)
+        motions.append(Motion(sequence, scene, entry.name, entry.split, trajectory))
+    return motions
 
 
 def _create(
-    manifest: Manifest,
-    motions: Mapping[str, Motions],
-    images: Path,
     scenes: Path,
     frames: Path,
+    entries: Sequence[ManifestEntry],
+    motions: Sequence[Motion],
     config: SynthesizeConfig,
-    variation: VariationConfig | None,
-    seed: int,
+    attributes: Mapping[str, Any],
     sequences_per_part: int,
 ) -> tuple[SceneStore, FrameStore]:
     """Two unfinished stores; their attributes record all inputs, so that only an equal run resumes them."""
-    picture_of, splits = {}, {}
-    for entry in manifest.pictures:
-        for scene, sequences in motions[entry.name].items():
-            for sequence in sequences:
-                picture_of[sequence], splits[sequence] = scene, entry.split
-    attributes = {
-        "synthesize": asdict(config),
-        "variation": asdict(variation) if variation else None,
-        "seed": seed,
-        "images_sha256": _digest(manifest, images),
-    }
+    scene_of = {motion.sequence: motion.scene for motion in motions}
+    splits = {motion.sequence: motion.split for motion in motions}
+    variant_of = {motion.sequence: motion.picture for motion in motions if motion.scene != motion.picture}
+    masked = any(entry.masked_fraction for entry in entries)  # null for photographs
     sensor = config.sensor_height, config.sensor_width
-    largest = max(entry.height for entry in manifest.pictures), max(entry.width for entry in manifest.pictures)
-    names = Trajectory.vector_names()
-    masked = any(entry.masked_fraction for entry in manifest.pictures)  # null for photographs
     scene_store = SceneStore.create(
         scenes,
-        picture_of,
+        scene_of,
         splits,
-        largest_picture=largest,
+        largest_picture=(max(entry.height for entry in entries), max(entry.width for entry in entries)),
         sensor=sensor,
-        trajectory_names=names,
+        trajectory_names=Trajectory.vector_names(),
         attributes=attributes,
+        variant_of=variant_of,
         masked=masked,
         sequences_per_part=sequences_per_part,
     )
-    n_frames = len(frame_times_us(config))
-    frame_attributes = {**attributes, "scenes": picture_of}
+    n_frames, attributes = len(frame_times_us(config)), {**attributes, "scenes": scene_of}
     frame_store = FrameStore.create(
-        frames, list(picture_of), splits, n_frames, *sensor, frame_attributes, masked, sequences_per_part
+        frames, list(scene_of), splits, n_frames, *sensor, attributes, masked, sequences_per_part, variant_of
     )
     return scene_store, frame_store
 
 
 @one_thread()
 def _synthesize_part(
-    trajectories: Mapping[str, Trajectory],
-    images: Path,
     scenes: SceneStore,
     frames: FrameStore,
+    images: Path,
     config: SynthesizeConfig,
     variation: VariationConfig | None,
     seed: int,
+    motions: Sequence[Motion],
 ) -> None:
-    """Write the part of both stores that holds the sequences of these trajectories."""
-    t_us = frame_times_us(config)
-    for picture, sequences in itertools.groupby(trajectories, scenes.picture_of.__getitem__):
-        planes = _planes_of(picture, images, variation, seed)
+    """Write the part of both stores that holds the sequences of these motions."""
+    t_us, size = frame_times_us(config), (config.sensor_height, config.sensor_width)
+    for (name, picture), over_scene in itertools.groupby(motions, lambda motion: (motion.scene, motion.picture)):
+        planes = _planes_of(name, picture, images, variation, seed)
         if not scenes.masked:
             planes = planes._replace(valid=None)
         scene = scene_from_polarization(planes.s0, planes.dolp, planes.aolp)
-        for sequence in sequences:
-            trajectory = trajectories[sequence]
+        for sequence, *_, trajectory in over_scene:
             scenes.write(sequence, planes, torch.from_numpy(trajectory.to_vector()), t_us[-1])
-            seen = frames_of(scene, trajectory, t_us, config.sensor_height, config.sensor_width)
-            known = None
-            if planes.valid is not None:
-                known = valid_frames(planes.valid, trajectory, t_us, config.sensor_height, config.sensor_width)
-            frames.write(sequence, torch.tensor(t_us), *seen, known)
+            valid = None if planes.valid is None else valid_frames(planes.valid, trajectory, t_us, *size)
+            frames.write(sequence, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *size), valid)
 
 
-def _planes_of(picture: str, images: Path, variation: VariationConfig | None, seed: int) -> Scene:
+def _planes_of(scene: str, picture: str, images: Path, variation: VariationConfig | None, seed: int) -> Scene:
     """A picture in polarization, or a variant of one, quantised: the scene that is emulated, and so the truth."""
-    source = made_from(picture)
-    polarization, valid = _read_polarization(images, source)
-    if variation and source != picture:
-        polarization = varied(polarization, variation, generator_for(seed, picture, "variation"))
+    polarization, valid = _read_polarization(images, picture)
+    if variation and scene != picture:
+        polarization = varied(polarization, variation, generator_for(seed, scene, "variation"))
     s0, dolp, aolp = polarization
     return as_stored(Scene(s0, dolp, aolp, valid))
 
@@ -235,7 +220,7 @@ def _read_polarization(images: Path, picture: str) -> tuple[Float[Tensor, "3 h w
     return torch.stack([s[0].clamp(max=1), stokes.dolp(s).clamp(max=1), stokes.aolp(s)]), valid
 
 
-def _digest(manifest: Manifest, images: Path) -> str:
+def _digest(entries: Sequence[ManifestEntry], images: Path) -> str:
     """Hash of all picture files."""
-    files = [entry.file for entry in manifest.pictures]
+    files = [entry.file for entry in entries]
     return sha256(*(part for name in files for part in (name.encode(), b"\0", bytes.fromhex(sha256(images / name)))))

@@ -7,40 +7,40 @@ left is the pixel's response to dim and bright light. `uniform_share` makes more
 """
 
 import math
-from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from pydantic import Field, NonNegativeFloat, NonNegativeInt
 from torch import Tensor
 
 from polarnet import stokes
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 
 MAX_DOLP = 0.99
 
 
-@dataclass(frozen=True)
+@section
 class VariationConfig:
     """Section `variation` of params.yaml."""
 
-    scenes_per_picture: int = field(metadata=allowed(low=0))
+    scenes_per_picture: NonNegativeInt
     """Variants of each training picture, beside the picture itself; other splits have none."""
-    share: float = field(metadata=allowed(low=0, high=1))
+    share: Annotated[float, Field(ge=0, le=1)]
     """Share of variants with changed DoLP, and share with changed S0; AoLP is rotated in all."""
-    dolp_factor: list[float] = field(metadata=allowed(low=0))
+    dolp_factor: list[NonNegativeFloat]
     """DoLP is multiplied by a number drawn uniformly between these two ..."""
-    dolp_exponent_spread: float = field(metadata=allowed(low=0))
+    dolp_exponent_spread: NonNegativeFloat
     """... after being raised to a power whose logarithm is normal with this standard deviation."""
-    s0_factor: list[float] = field(metadata=allowed(above=0, high=1))
-    s0_exponent_spread: float = field(metadata=allowed(low=0))
-    uniform_share: float = field(metadata=allowed(low=0, high=1))
+    s0_factor: list[Annotated[float, Field(gt=0, le=1)]]
+    s0_exponent_spread: NonNegativeFloat
+    uniform_share: Annotated[float, Field(ge=0, le=1)]
     """Share of variants whose polarization is drawn towards one uniform value of any DoLP and AoLP ..."""
-    uniform_weight: list[float] = field(metadata=allowed(low=0, high=1))
+    uniform_weight: list[Annotated[float, Field(ge=0, le=1)]]
     """... by a weight between these two; 1: DoLP and AoLP are constant."""
 
     def __post_init__(self):
-        check_ranges(self)
         for name in ("dolp_factor", "s0_factor", "uniform_weight"):
             values = getattr(self, name)
             if len(values) != 2 or values[0] > values[1]:

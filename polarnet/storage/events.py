@@ -6,6 +6,7 @@ the end of the last, and `duration_us`, its length. `ms_to_idx` (DSEC's name) ho
 the index of the first event at or after it.
 """
 
+import functools
 import itertools
 import os
 from collections.abc import Mapping, Sequence
@@ -15,12 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from polarnet.events.stream import LARGEST_SIDE, Events, slice_count, slice_time, validate
+from polarnet.events.stream import MAX_SIDE, Events, slice_count, slice_time, validate
 from polarnet.stokes import POLARIZER_ANGLES_DEG
-from polarnet.storage.parts import Column, Columns, Header, Store
+from polarnet.storage.parts import Column, Columns, Store
 
 CHANNELS = len(POLARIZER_ANGLES_DEG)
-LONGEST_US = 2**32 - 1  # 71 minutes: t is uint32
+MAX_DURATION_US = 2**32 - 1  # 71 minutes: t is uint32
 CHUNK = 2**18  # events; smaller chunks make Zarr slower, for a window as well as for a whole sequence
 MILLISECOND_CHUNK = 2**12
 
@@ -40,15 +41,12 @@ class EventStore(Store):
 
     FORMAT = "polarnet.events"
     VERSION = 2
+    height: int
+    width: int
 
-    def __init__(self, path: str, header: Header):
-        super().__init__(path, header)
-        self.height: int = header["height"]
-        self.width: int = header["width"]
-
-    @classmethod
-    def columns_of(cls, header: Header) -> Columns:
-        """Those of the events, and the index of their times."""
+    @functools.cached_property
+    def columns(self) -> Columns:
+        """The events, and the index of their times."""
         types = {"x": "uint16", "y": "uint16", "t": "uint32", "p": "int8"}
         columns = {f"events/{name}": Column("events", dtype, CHUNK) for name, dtype in types.items()}
         return {**columns, "ms_to_idx": Column("milliseconds", "int64", MILLISECOND_CHUNK, (CHANNELS,))}
@@ -69,8 +67,8 @@ class EventStore(Store):
         metadata is resumed, one with other metadata is removed. One process creates the store. It can be pickled and
         sent to other processes, which may write different parts at the same time.
         """
-        if not (0 < height <= LARGEST_SIDE and 0 < width <= LARGEST_SIDE):
-            raise ValueError(f"expected a sensor with sides of 1 to {LARGEST_SIDE} px, got {height}x{width}")
+        if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
+            raise ValueError(f"expected a sensor with sides of 1 to {MAX_SIDE} px, got {height}x{width}")
         metadata = {"polarizer_angles_deg": list(POLARIZER_ANGLES_DEG), "conventions": CONVENTIONS}
         return cls.create_parts(path, sequences, attributes, sequences_per_part, height=height, width=width, **metadata)
 
@@ -86,11 +84,8 @@ class EventStore(Store):
         offsets = np.cumsum([0, *map(len, channels)])
         columns = {}
         for name in "xytp":
-            pieces, dtype = (
-                [getattr(channel, name).numpy() for channel in channels],
-                self.columns[f"events/{name}"].dtype,
-            )
-            # checked above: the narrower types on disk hold every value
+            pieces = [getattr(channel, name).numpy() for channel in channels]
+            dtype = self.columns[f"events/{name}"].dtype  # narrower, but holds every value that `_check` accepts
             columns[f"events/{name}"] = np.concatenate(pieces, dtype=dtype, casting="unsafe")
         counts = [first_at_millisecond(channel.t, duration_us) for channel in channels]
         columns["ms_to_idx"] = np.stack(counts, axis=1) + offsets[:-1]
@@ -115,7 +110,7 @@ class EventStore(Store):
             (events,) = self._events(sequence, [(0, offsets[-1])])
             return [slice_count(events, start, stop) for start, stop in itertools.pairwise(offsets)]
         start_us = max(0, start_us or 0)
-        stop_us = LONGEST_US + 1 if stop_us is None else max(start_us, stop_us)
+        stop_us = MAX_DURATION_US + 1 if stop_us is None else max(start_us, stop_us)
         rows = _milliseconds(self.duration_us(sequence))
         first, after = min(start_us // 1000, rows - 1), -(-stop_us // 1000)
         index = self.read_column("ms_to_idx", sequence, first, after + 1)
@@ -128,10 +123,8 @@ class EventStore(Store):
         if problems := super().problems(sequence):
             return problems
         offsets, duration_us = self.record(sequence)["offsets"], self.duration_us(sequence)
-        channels, index = (
-            self._events(sequence, list(itertools.pairwise(offsets))),
-            self.read_column("ms_to_idx", sequence),
-        )
+        channels = self._events(sequence, list(itertools.pairwise(offsets)))
+        index = self.read_column("ms_to_idx", sequence)
         for angle, start, channel, places in zip(POLARIZER_ANGLES_DEG, offsets, channels, index.T, strict=False):
             where = f"{self.path}: {sequence}, polarizer {angle}: "
             try:
@@ -160,8 +153,8 @@ class EventStore(Store):
     def _check(self, channels: Sequence[Events], duration_us: int) -> None:
         if len(channels) != CHANNELS:
             raise ValueError(f"expected a stream for each of {CHANNELS} polarizers, got {len(channels)}")
-        if not 0 < duration_us <= LONGEST_US:
-            raise ValueError(f"expected a duration of 1 to {LONGEST_US} us, got {duration_us}; cut the sequence")
+        if not 0 < duration_us <= MAX_DURATION_US:
+            raise ValueError(f"expected a duration of 1 to {MAX_DURATION_US} us, got {duration_us}; cut the sequence")
         for angle, channel in zip(POLARIZER_ANGLES_DEG, channels, strict=True):
             if (channel.height, channel.width) != (self.height, self.width):
                 raise ValueError(

@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from polarnet.events.stream import Events
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore, first_at_millisecond
 
-CONTENTS = "store.json"
 HDF5_CHUNK = 2**16  # events
 
 
@@ -24,7 +23,7 @@ def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -
 
     Polarity is 1 or 0 there. The attributes height and width add the sensor's size. Needs h5py.
     """
-    columns: dict[str, np.ndarray] = {
+    columns = {
         "x": events.x.numpy().astype(np.uint16),
         "y": events.y.numpy().astype(np.uint16),
         "t": events.t.numpy().astype(np.uint32),
@@ -50,14 +49,11 @@ def write_text(path: str | os.PathLike[str], events: Events, duration_us: int) -
         file.writelines(f"{t // 1_000_000}.{t % 1_000_000:06d} {x} {y} {int(p > 0)}\n" for t, x, y, p in rows)
 
 
-class Form(NamedTuple):
-    """Suffix and writer of one file format."""
-
-    suffix: str
-    write: Callable[[Path, Events, int], None]
-
-
-FORMS = {"hdf5": Form(".h5", write_hdf5), "text": Form(".txt", write_text)}
+FORMS: dict[str, tuple[str, Callable[[Path, Events, int], None]]] = {
+    "hdf5": (".h5", write_hdf5),
+    "text": (".txt", write_text),
+}
+"""Suffix and writer of each file format."""
 
 
 def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -> None:
@@ -74,8 +70,8 @@ def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -
             raise ValueError(f"{store.path}: {sequence!r} cannot be the name of a folder")
         duration_us = store.duration_us(sequence)
         (folder / sequence).mkdir(parents=True, exist_ok=True)
-        for path, events in zip(_files(folder / sequence, suffix), store.read(sequence), strict=True):
-            write(path, events, duration_us)
+        for angle, events in zip(POLARIZER_ANGLES_DEG, store.read(sequence), strict=True):
+            write(folder / sequence / f"polarizer_{angle:03d}{suffix}", events, duration_us)
     contents = {
         "form": form,
         "height": store.height,
@@ -85,11 +81,7 @@ def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -
         "duration_us": {sequence: store.duration_us(sequence) for sequence in store.sequences},
         "attributes": store.attributes,
     }
-    (folder / CONTENTS).write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
-
-
-def _files(folder: Path, suffix: str) -> list[Path]:
-    return [folder / f"polarizer_{angle:03d}{suffix}" for angle in POLARIZER_ANGLES_DEG]
+    (folder / "store.json").write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
 
 
 def _h5py() -> Any:

@@ -1,5 +1,6 @@
 """Ground truth of event sequences: exact frames of intensity, DoLP and AoLP, quantised to 16 bits, in Zarr v3."""
 
+import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -20,12 +21,12 @@ from polarnet.runtime.arrays import (
     mask_of,
     whole_numbers,
 )
-from polarnet.storage.parts import Column, Columns, Header, Store
+from polarnet.storage.parts import Column, Columns, Store
 
 SPLITS = ("train", "val", "test")
 FRACTION_STEPS = 2**16 - 1
 ANGLE_STEPS = 2**16
-FRAMES_A_CHUNK = 32
+FRAMES_PER_CHUNK = 32
 
 CONVENTIONS = {
     "t_us": "microseconds from the start of the sequence",
@@ -73,22 +74,20 @@ def dequantise_angle(steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*sha
     return torch.from_numpy(steps.astype(np.float32)).mul_(math.pi / ANGLE_STEPS)
 
 
-def pack_mask(valid: Bool[Tensor, "*b h w"]) -> UInt8[np.ndarray, "*b h bytes"]:
-    """Pack 8 pixels of a row into a byte."""
-    return np.packbits(valid.numpy(), axis=-1)
-
-
 def unpack_mask(packed: UInt8[np.ndarray, "*b h bytes"], width: int) -> Bool[Tensor, "*b h w"]:
-    """Invert `pack_mask`."""
+    """Mask from bytes of 8 pixels of a row each, the leftmost in the highest bit."""
     return torch.from_numpy(np.unpackbits(packed, axis=-1, count=width).astype(bool))
 
 
 class SplitStore(Store):
     """A store whose sequences are each in the split train, val or test."""
 
-    def __init__(self, path: str, header: Header):
-        super().__init__(path, header)
-        self.splits: dict[str, str] = dict(zip(self.sequences, header["splits"], strict=True))
+    splits: dict[str, str]
+    """Split of each sequence."""
+    variant_of: dict[str, str]
+    """Name of the picture, for each sequence over a variant of it."""
+    masked: bool
+    """Whether the store marks pixels whose light is unknown."""
 
     def of_split(self, split: str) -> list[str]:
         """The sequences of `train`, `val` or `test`, in the store's order; ValueError for another split."""
@@ -101,25 +100,24 @@ class FrameStore(SplitStore):
     """Frames of sequences, each in the split train, val or test; see `create` and `open`."""
 
     FORMAT = "polarnet.frames"
-    VERSION = 2
+    VERSION = 3
+    n_frames: int
+    """Maximum number of frames of a sequence."""
+    height: int
+    width: int
 
-    def __init__(self, path: str, header: Header):
-        super().__init__(path, header)
-        self.height: int = header["height"]
-        self.width: int = header["width"]
-        self.masked: bool = header["masked"]
-        """Whether the store marks pixels whose truth is unknown."""
-
-    @classmethod
-    def columns_of(cls, header: Header) -> Columns:
+    @functools.cached_property
+    def columns(self) -> Columns:
         """Times and images; the masks only where some pixels are masked."""
-        height, width, chunk = header["height"], header["width"], min(header["n_frames"], FRAMES_A_CHUNK)
-        shapes = {"intensity": (4, height, width), "dolp": (height, width), "aolp": (height, width)}
-        columns = {name: Column("frames", "uint16", chunk, shape) for name, shape in shapes.items()}
-        columns["t_us"] = Column("frames", "int64", chunk)
-        if header["masked"]:
-            columns["valid"] = Column("frames", "uint8", chunk, (height, -(-width // 8)))
-        return columns
+        image, chunk = (self.height, self.width), min(self.n_frames, FRAMES_PER_CHUNK)
+        columns = {
+            "intensity": Column("frames", "uint16", chunk, (4, *image)),
+            "dolp": Column("frames", "uint16", chunk, image),
+            "aolp": Column("frames", "uint16", chunk, image),
+            "t_us": Column("frames", "int64", chunk),
+        }
+        mask = {"valid": Column("frames", "uint8", chunk, (self.height, -(-self.width // 8)))}
+        return columns | mask if self.masked else columns
 
     @classmethod
     def create(
@@ -133,22 +131,27 @@ class FrameStore(SplitStore):
         attributes: Mapping[str, Any],
         masked: bool = False,
         sequences_per_part: int = 1,
+        variant_of: Mapping[str, str] | None = None,
     ) -> "FrameStore":
         """Create a store for up to `n_frames` per sequence; it lies at PATH.tmp until it is finished.
 
-        `splits` maps each sequence to train, val or test. A `masked` store records for every pixel whether its truth is
+        `splits` maps each sequence to train, val or test, and `variant_of` each sequence over a variant to the name of
+        the variant's picture. A `masked` store records for every pixel whether its truth is
         known; other stores have no mask. Resumes as `EventStore.create` does.
         """
-        check_splits(sequences, splits)
-        metadata = {
-            "splits": [splits[sequence] for sequence in sequences],
-            "n_frames": n_frames,
-            "height": height,
-            "width": width,
-            "masked": masked,
-            "conventions": {**CONVENTIONS, "valid": MASK_CONVENTION} if masked else CONVENTIONS,
-        }
-        return cls.create_parts(path, sequences, attributes, sequences_per_part, **metadata)
+        return cls.create_parts(
+            path,
+            sequences,
+            attributes,
+            sequences_per_part,
+            splits=splits_of(sequences, splits),
+            variant_of=dict(variant_of or {}),
+            n_frames=n_frames,
+            height=height,
+            width=width,
+            masked=masked,
+            conventions={**CONVENTIONS, "valid": MASK_CONVENTION} if masked else CONVENTIONS,
+        )
 
     def write(
         self,
@@ -166,14 +169,15 @@ class FrameStore(SplitStore):
         of None marks all pixels valid.
         """
         t_us = self._checked_times(t_us)
-        self._check_shapes(len(t_us), intensity, dolp, aolp)
+        for name, frames, channels in (("intensity", intensity, "4 "), ("dolp", dolp, ""), ("aolp", aolp, "")):
+            check_shape(name, as_tensor(name, frames), f"{len(t_us)} {channels}{self.height} {self.width}")
         known = self._checked_mask(valid, dolp.shape)
         columns = {
             "t_us": t_us.numpy(),
             "intensity": quantise_fraction(intensity, "intensity"),
             "dolp": quantise_fraction(dolp, "dolp"),
             "aolp": quantise_angle(aolp, "aolp"),
-            **({"valid": pack_mask(known)} if self.masked else {}),
+            **({"valid": np.packbits(known.numpy(), axis=-1)} if self.masked else {}),
         }
         if not self.is_written(sequence):
             self.append(sequence, columns, {})
@@ -211,14 +215,12 @@ class FrameStore(SplitStore):
         )
 
     def _checked_times(self, t_us: Integer[Array, " n"]) -> Int64[Tensor, " n"]:
-        times, most = whole_numbers("t_us", t_us), self.header["n_frames"]
-        if times.ndim != 1 or not 0 < len(times) <= most or (times < 0).any() or (times.diff() <= 0).any():
-            raise ValueError(f"expected 1 to {most} frame times, increasing from 0 or later, got {times.tolist()[:40]}")
+        times = whole_numbers("t_us", t_us)
+        if times.ndim != 1 or not 0 < len(times) <= self.n_frames or (times < 0).any() or (times.diff() <= 0).any():
+            raise ValueError(
+                f"expected 1 to {self.n_frames} frame times, increasing from 0 or later, got {times.tolist()[:40]}"
+            )
         return times
-
-    def _check_shapes(self, n: int, intensity: Array, dolp: Array, aolp: Array) -> None:
-        for name, frames, channels in (("intensity", intensity, "4 "), ("dolp", dolp, ""), ("aolp", aolp, "")):
-            check_shape(name, as_tensor(name, frames), f"{n} {channels}{self.height} {self.width}")
 
     def _checked_mask(self, valid: Bool[Array, "n h w"] | None, shape: Sequence[int]) -> Bool[Tensor, "n h w"]:
         if valid is None:
@@ -228,8 +230,9 @@ class FrameStore(SplitStore):
         return mask_of("valid", valid, shape).cpu()
 
 
-def check_splits(names: Sequence[str], splits: Mapping[str, str]) -> None:
-    """ValueError for the first name without a split, or with one that is not train, val or test."""
+def splits_of(names: Sequence[str], splits: Mapping[str, str]) -> dict[str, str]:
+    """Split of each name; ValueError for the first name without one, or with one that is not train, val or test."""
     for name in names:
         if splits.get(name) not in SPLITS:
             raise ValueError(f"expected {name} in one of the splits {', '.join(SPLITS)}, got {splits.get(name)!r}")
+    return {name: splits[name] for name in names}

@@ -14,7 +14,7 @@ the parts.
 """
 
 import contextlib
-import hashlib
+import functools
 import json
 import os
 import shutil
@@ -22,17 +22,19 @@ import uuid
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import fsspec
 import numpy as np
 import zarr
+from pydantic import PositiveInt
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
 from zarr.storage import FsspecStore, LocalStore, WrapperStore, ZipStore
 
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.files import sha256
+from polarnet.runtime.sections import section
 
 COMPRESSION_LEVEL = 1  # for zstd; higher levels cost 10-100 times the time for 6 % fewer bytes
 SHARD_BYTES = 2**25  # before compression; the writer of a part keeps about this much of each column in memory
@@ -42,14 +44,11 @@ REPAIR = "write this store again, or copy it again from where it is whole"
 Header = dict[str, Any]
 
 
-@dataclass(frozen=True)
+@section
 class StorageConfig:
     """Section `storage` of params.yaml."""
 
-    sequences_per_part: int = field(metadata=allowed(low=1))
-
-    def __post_init__(self):
-        check_ranges(self)
+    sequences_per_part: PositiveInt
 
 
 @dataclass(frozen=True)
@@ -75,28 +74,28 @@ S = TypeVar("S", bound="Store")
 
 
 class Store:
-    """Named sequences in parts. A subclass declares format, version and columns, and what it writes and reads.
+    """Named sequences in parts. A subclass declares format, version, columns, and the keys that it adds to the header.
 
-    A store can be sent to other processes.
+    Every key of the header is an attribute of the store. A store can be sent to other processes.
     """
 
     FORMAT: ClassVar[str]
     VERSION: ClassVar[int]
+    sequences: list[str]
+    sequences_per_part: int
+    attributes: dict[str, Any]
+    """Metadata given by the store's creator."""
 
     def __init__(self, path: str, header: Header):
         self.path = path
         self.header = header
-        self.sequences: list[str] = header["sequences"]
-        self.attributes: dict[str, Any] = header["attributes"]
-        """Metadata given by the store's creator."""
-        self.sequences_per_part: int = header["sequences_per_part"]
+        vars(self).update(header)
         starts = range(0, len(self.sequences), self.sequences_per_part)
         self.parts: dict[str, list[str]] = {
             f"part-{number:05d}": self.sequences[start : start + self.sequences_per_part]
             for number, start in enumerate(starts)
         }
         """Names of the sequences in each part."""
-        self.columns = self.columns_of(header)
         self._part_of = {sequence: part for part, names in self.parts.items() for sequence in names}
         self._opened: dict[str, Any] = {}
         self._records: dict[str, Header] = {}
@@ -105,9 +104,9 @@ class Store:
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.path, self.header)
 
-    @classmethod
-    def columns_of(cls, header: Header) -> Columns:
-        """The columns of a store with this header."""
+    @functools.cached_property
+    def columns(self) -> Columns:
+        """The arrays of each part."""
         raise NotImplementedError
 
     @classmethod
@@ -205,11 +204,11 @@ class Store:
         The sequences of a part come in the store's order, from one process. A part begins anew with its first sequence.
         ValueError for another order.
         """
-        part, written = self._part(sequence), self.records_so_far(sequence)
+        part, written = self._part(sequence), len(self.records_so_far(sequence))
         names = self.parts[part]
-        if sequence != names[len(written)]:
+        if sequence != names[written]:
             raise ValueError(
-                f"{self.path}: {part} takes its sequences in order, expected {names[len(written)]}, got {sequence}"
+                f"{self.path}: {part} takes its sequences in order, expected {names[written]}, got {sequence}"
             )
         if not written:
             self._unfinished[part] = _Part(Path(self.path, part), self.columns)
@@ -283,7 +282,7 @@ class Store:
             with contextlib.suppress(ValueError):  # the problem of every sequence of the part
                 store.record(first)
                 for name, digest in store._open(part).attrs["metadata_sha256"].items():
-                    if hashlib.sha256(files.get(f"{part}/{name}", b"")).hexdigest() != digest:
+                    if sha256(files.get(f"{part}/{name}", b"")) != digest:
                         problems.append(f"{path}: {part}/{name} is not as it was written; {REPAIR}")
         return problems
 
@@ -309,33 +308,30 @@ class _Part:
         self._group = zarr.open_group(self._temporary, mode="w", zarr_format=3)
         self._columns = columns
         self._arrays = {name: _create_array(self._group, name, column) for name, column in columns.items()}
-        self._pending: dict[str, list[np.ndarray]] = {name: [] for name in columns}
-        self._rows = {column.axis: 0 for column in columns.values()}
+        self._pending = {name: np.empty((0, *column.shape), column.dtype) for name, column in columns.items()}
 
     def append(self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
         """Take the rows and the record of a sequence; whole shards go to disk."""
-        self.records[sequence] = dict(record)
-        taken = {}
+        rows = {}
         for name, values in columns.items():
-            column = self._columns[name]
+            column, array, pending = self._columns[name], self._arrays[name], self._pending[name]
+            start = array.shape[0] + len(pending)
+            rows[column.axis] = [start, start + len(values)]
             padding = np.zeros((-len(values) % column.chunk, *column.shape), column.dtype)
-            self._pending[name] += [values, padding]
-            self._write_shards(name, column.shard)
-            start = self._rows[column.axis]
-            self.records[sequence][column.axis] = [start, start + len(values)]
-            taken[column.axis] = len(values) + len(padding)
-        for axis, rows in taken.items():
-            self._rows[axis] += rows
+            pending = np.concatenate([pending, values, padding])
+            whole = len(pending) - len(pending) % column.shard
+            if whole:
+                array.append(pending[:whole])
+            self._pending[name] = pending[whole:]
+        self.records[sequence] = {**record, **rows}
 
     def finish(self) -> None:
         """Write the attributes last, then give the part its name, unless another process did so first."""
-        for name, column in self._columns.items():
-            self._write_shards(name, column.chunk)
+        for name, pending in self._pending.items():
+            if len(pending):
+                self._arrays[name].append(pending)
         files = sorted(self._temporary.glob("*/**/zarr.json"))
-        digests = {
-            file.relative_to(self._temporary).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
-            for file in files
-        }
+        digests = {file.relative_to(self._temporary).as_posix(): sha256(file) for file in files}
         self._group.attrs.put(_signed({"sequences": self.records, "metadata_sha256": digests}))
         try:
             os.rename(self._temporary, self.path)
@@ -343,16 +339,6 @@ class _Part:
             if not self.path.exists():
                 raise
             shutil.rmtree(self._temporary)
-
-    def _write_shards(self, name: str, unit: int) -> None:
-        """Write the pending rows of a column in multiples of `unit`."""
-        pending = self._pending[name]
-        rows = sum(map(len, pending))
-        if rows >= unit:
-            values = np.concatenate(pending)
-            whole = rows - rows % unit
-            self._arrays[name].append(values[:whole])
-            self._pending[name] = [values[whole:]]
 
 
 class _WholeStore(WrapperStore[Any]):
@@ -406,7 +392,7 @@ def _create_array(group: zarr.Group, name: str, column: Column) -> zarr.Array:
 
 def _signed(header: Header) -> Header:
     """The header with a checksum of the rest."""
-    return {**header, "checksum": hashlib.sha256(json.dumps(header, sort_keys=True).encode()).hexdigest()}
+    return {**header, "checksum": sha256(json.dumps(header, sort_keys=True).encode())}
 
 
 def _is_signed(header: Header) -> bool:

@@ -3,8 +3,8 @@
 Rendering starts from the stored, quantised scene, so that truth and events agree to the last bit.
 """
 
+import functools
 import os
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -16,53 +16,40 @@ from torch import Tensor
 from polarnet.runtime.arrays import Array, as_tensor, check_same_shape, check_shape, mask_of
 from polarnet.storage.frames import (
     SplitStore,
-    check_splits,
     dequantise_angle,
     dequantise_fraction,
     quantise_angle,
     quantise_fraction,
+    splits_of,
 )
-from polarnet.storage.parts import Column, Columns, Header
+from polarnet.storage.parts import Column, Columns
 
 CHUNK = 2**18  # pixels
 
 CONVENTIONS = {
-    "s0": "intensity of a picture, row by row: value / 65535",
+    "s0": "intensity of a scene, row by row: value / 65535",
     "dolp": "degree of linear polarization: value / 65535",
     "aolp": "angle of linear polarization in radians, [0, pi): value * pi / 65536",
-    "picture_size": "height and width of a picture in pixels",
-    "trajectory": "how the window of a sequence moves: numbers named by the attribute trajectory",
+    "picture_size": "height and width of a scene in pixels",
+    "trajectory": "how the sensor moves in a sequence: numbers named by the attribute trajectory_names",
     "duration_us": "length of a sequence in microseconds",
 }
 
-_VARIANT = re.compile(r"(.+)-variant[0-9]+")
+QUANTISERS = {
+    "s0": (quantise_fraction, dequantise_fraction),
+    "dolp": (quantise_fraction, dequantise_fraction),
+    "aolp": (quantise_angle, dequantise_angle),
+}
 
 MASK_CONVENTION = "1 where the light of a pixel is known, 0 where saturation hid it"
-
-
-def variant_name(picture: str, number: int) -> str:
-    """Of a scene that `polarnet.simulation.variation` makes of a picture."""
-    return f"{picture}-variant{number:02d}"
-
-
-def made_from(scene: str) -> str:
-    """The picture that a scene is, or a variant of."""
-    variant = _VARIANT.fullmatch(scene)
-    return variant[1] if variant else scene
-
-
-def without_variants(sequences: Sequence[str]) -> list[str]:
-    """The sequences whose scene is a picture as it is."""
-    scenes = {name: name.rpartition("-")[0] for name in sequences}
-    return [name for name, scene in scenes.items() if made_from(scene) == scene]
 
 
 class SceneRecord(NamedTuple):
     """One sequence, ready to be rendered."""
 
     name: str
-    picture: str
-    split: str
+    scene: str
+    """Name of the scene; several sequences may show one."""
     s0: Float[Tensor, "h w"]
     dolp: Float[Tensor, "h w"]
     aolp: Float[Tensor, "h w"]
@@ -83,72 +70,75 @@ class Scene(NamedTuple):
 
 
 class SceneStore(SplitStore):
-    """Pictures in polarization and the sequences that move over them; see `create` and `open`.
+    """Scenes and the sequences that move over them; see `create` and `open`.
 
-    A part holds the pictures of its sequences, each once.
+    A part holds the scenes of its sequences, each once.
     """
 
     FORMAT = "polarnet.scenes"
-    VERSION = 2
+    VERSION = 3
+    scene_of: dict[str, str]
+    """Name of the scene of each sequence."""
+    largest_picture: list[int]
+    """Height and width that no scene exceeds, pixels."""
+    sensor_height: int
+    sensor_width: int
+    trajectory_names: list[str]
 
-    def __init__(self, path: str, header: Header):
-        super().__init__(path, header)
-        self.picture_of: dict[str, str] = dict(zip(self.sequences, header["picture_of_sequence"], strict=True))
-        self.pictures: list[str] = sorted(set(self.picture_of.values()))
-        self.sensor_height: int = header["sensor_height"]
-        self.sensor_width: int = header["sensor_width"]
-        self.trajectory_names: list[str] = header["trajectory"]
-        self.masked: bool = header["masked"]
-        """Whether the store marks pixels whose light is unknown."""
-
-    @classmethod
-    def columns_of(cls, header: Header) -> Columns:
-        """Planes of the pictures; the mask only where some pixels are masked."""
-        types = {"s0": "uint16", "dolp": "uint16", "aolp": "uint16", **({"valid": "uint8"} if header["masked"] else {})}
+    @functools.cached_property
+    def columns(self) -> Columns:
+        """Planes of the scenes; the mask only where some pixels are masked."""
+        types = {"s0": "uint16", "dolp": "uint16", "aolp": "uint16", **({"valid": "uint8"} if self.masked else {})}
         return {name: Column("pixels", dtype, CHUNK) for name, dtype in types.items()}
 
     @classmethod
     def create(
         cls,
         path: str | os.PathLike[str],
-        picture_of: Mapping[str, str],
+        scene_of: Mapping[str, str],
         splits: Mapping[str, str],
         *,
         largest_picture: tuple[int, int],
         sensor: tuple[int, int],
         trajectory_names: Sequence[str],
         attributes: Mapping[str, Any],
+        variant_of: Mapping[str, str] | None = None,
         masked: bool = False,
         sequences_per_part: int = 1,
     ) -> "SceneStore":
         """Create a store to write; it lies at PATH.tmp until it is finished.
 
-        `picture_of` maps each sequence to its picture, `splits` each sequence to train, val or test; ValueError where
-        two sequences of one picture are in different splits. `largest_picture` and `sensor` are (height, width) in
+        `scene_of` maps each sequence to the name of its scene, `splits` each sequence to train, val or test, and
+        `variant_of` each sequence over a variant to the name of the variant's picture. ValueError if two sequences of
+        one picture or its variants are in different splits. `largest_picture` and `sensor` are (height, width) in
         pixels. A `masked` store records which pixels have known light. Resumes as `EventStore.create` does.
         """
-        sequences = list(picture_of)
-        check_splits(sequences, splits)
-        _check_no_leak(picture_of, splits)
-        metadata = {
-            "picture_of_sequence": [picture_of[sequence] for sequence in sequences],
-            "splits": [splits[sequence] for sequence in sequences],
-            "largest_picture": list(largest_picture),
-            "sensor_height": sensor[0],
-            "sensor_width": sensor[1],
-            "trajectory": list(trajectory_names),
-            "masked": masked,
-            "conventions": {**CONVENTIONS, "valid": MASK_CONVENTION} if masked else CONVENTIONS,
-        }
-        return cls.create_parts(path, sequences, attributes, sequences_per_part, **metadata)
+        sequences, variants = list(scene_of), dict(variant_of or {})
+        splits = splits_of(sequences, splits)
+        _check_no_leak({**scene_of, **variants}, splits)
+        return cls.create_parts(
+            path,
+            sequences,
+            attributes,
+            sequences_per_part,
+            scene_of=dict(scene_of),
+            splits=splits,
+            variant_of=variants,
+            largest_picture=list(largest_picture),
+            sensor_height=sensor[0],
+            sensor_width=sensor[1],
+            trajectory_names=list(trajectory_names),
+            masked=masked,
+            conventions={**CONVENTIONS, "valid": MASK_CONVENTION} if masked else CONVENTIONS,
+        )
 
     def write(self, sequence: str, scene: Scene, trajectory: Float64[Array, " k"], duration_us: int) -> None:
         """Write the scene and the trajectory of the next sequence of a part; see `Store.append`.
 
-        A sequence that is already written stays unchanged. Sequences of one picture share its pixels in a part.
+        A sequence that is already written stays unchanged. Sequences over one scene share its pixels in a part.
 
         Arrays may be numpy or torch. TypeError for anything but an array. ValueError for values out of range or not
-        finite, integers, planes of different shapes, a picture of an impossible size, or a mask in a store without one.
+        finite, integers, planes of different shapes, a scene of an impossible size, or a mask in a store without one.
         """
         names, trajectory = self.trajectory_names, as_tensor("trajectory", trajectory)
         if len(trajectory) != len(names) or not trajectory.isfinite().all():
@@ -162,86 +152,70 @@ class SceneStore(SplitStore):
             "duration_us": int(duration_us),
             "picture_size": list(scene.s0.shape),
         }
-        columns = {}
-        for name, written in self.records_so_far(sequence).items():
-            if self.picture_of[name] == self.picture_of[sequence]:
-                record["pixels"] = written["pixels"]
-        if "pixels" not in record:
-            columns = self._pixels(self.picture_of[sequence], scene)
-        self.append(sequence, columns, record)
+        name = self.scene_of[sequence]
+        rows = [one["pixels"] for other, one in self.records_so_far(sequence).items() if self.scene_of[other] == name]
+        if rows:
+            self.append(sequence, {}, {**record, "pixels": rows[0]})
+        else:
+            self.append(sequence, self._pixels(name, scene), record)
 
     def read(self, sequence: str) -> SceneRecord:
         """Everything about one sequence; ValueError that names the column of damaged data."""
-        record, names = self.record(sequence), list(self.columns)
-        s0, dolp, aolp, *valid = (
-            pixels.reshape(record["picture_size"])
-            for pixels in self.read_columns(sequence, [(name, 0, None) for name in names])
-        )
-        return SceneRecord(
-            sequence,
-            self.picture_of[sequence],
-            self.splits[sequence],
-            dequantise_fraction(s0),
-            dequantise_fraction(dolp),
-            dequantise_angle(aolp),
-            torch.tensor(record["trajectory"], dtype=torch.float64),
-            record["duration_us"],
-            torch.from_numpy(valid[0] == 1) if valid else None,
-        )
+        record, requests = self.record(sequence), [(name, 0, None) for name in self.columns]
+        s0, dolp, aolp, *mask = (rows.reshape(record["picture_size"]) for rows in self.read_columns(sequence, requests))
+        scene = _dequantised([s0, dolp, aolp], torch.from_numpy(mask[0] == 1) if mask else None)
+        trajectory = torch.tensor(record["trajectory"], dtype=torch.float64)
+        name, duration_us = self.scene_of[sequence], record["duration_us"]
+        return SceneRecord(sequence, name, *scene[:3], trajectory, duration_us, scene.valid)
 
     def duration_us(self, sequence: str) -> int:
         """Length of a sequence in microseconds."""
         return self.record(sequence)["duration_us"]
 
-    def _pixels(self, picture: str, scene: Scene) -> dict[str, np.ndarray]:
-        """The columns of a picture; ValueError for a scene that the store cannot hold."""
-        planes = {name: as_tensor(name, getattr(scene, name)) for name in ("s0", "dolp", "aolp")}
-        for name, plane in planes.items():
-            check_shape(name, plane, "height width")
+    def _pixels(self, name: str, scene: Scene) -> dict[str, np.ndarray]:
+        """The columns of a scene; ValueError for a scene that the store cannot hold."""
+        planes = {plane: as_tensor(plane, getattr(scene, plane)) for plane in QUANTISERS}
+        for plane, values in planes.items():
+            check_shape(plane, values, "height width")
         check_same_shape(planes)
         size, valid = tuple(scene.s0.shape), scene.valid
         if valid is not None and (not self.masked or valid.shape != size):
             raise ValueError(
-                f"{picture}: expected a mask of {size} in a store created with masked=True, "
+                f"{name}: expected a mask of {size} in a store created with masked=True, "
                 f"got one of {tuple(valid.shape)}, masked={self.masked}"
             )
-        height, width = self.header["largest_picture"]
+        height, width = self.largest_picture
         if not (self.sensor_height <= size[0] <= height and self.sensor_width <= size[1] <= width):
             raise ValueError(
-                f"{picture}: expected a picture between the sensor's {self.sensor_height}x{self.sensor_width} px and "
+                f"{name}: expected a picture between the sensor's {self.sensor_height}x{self.sensor_width} px and "
                 f"{height}x{width} px, got {size[0]}x{size[1]}"
             )
-        rows = _quantised(scene)
+        columns = dict(zip(QUANTISERS, _quantised(scene), strict=True))
         if self.masked:
             known = torch.ones(size, dtype=torch.bool) if valid is None else mask_of("valid", valid, size)
-            rows["valid"] = known.cpu().numpy().astype(np.uint8)
-        return {name: values.ravel() for name, values in rows.items()}
+            columns["valid"] = known.cpu().numpy().astype(np.uint8)
+        return {column: values.ravel() for column, values in columns.items()}
 
 
 def as_stored(scene: Scene) -> Scene:
     """The scene as a store gives it back, quantised."""
-    steps = _quantised(scene)
-    s0, dolp, aolp = (
-        dequantise_fraction(steps["s0"]),
-        dequantise_fraction(steps["dolp"]),
-        dequantise_angle(steps["aolp"]),
-    )
-    return Scene(s0, dolp, aolp, scene.valid)
+    return _dequantised(_quantised(scene), scene.valid)
 
 
-def _quantised(scene: Scene) -> dict[str, np.ndarray]:
-    return {
-        "s0": quantise_fraction(scene.s0, "s0"),
-        "dolp": quantise_fraction(scene.dolp, "dolp"),
-        "aolp": quantise_angle(scene.aolp, "aolp"),
-    }
+def _quantised(scene: Scene) -> list[np.ndarray]:
+    return [quantise(getattr(scene, plane), plane) for plane, (quantise, _) in QUANTISERS.items()]
 
 
-def _check_no_leak(picture_of: Mapping[str, str], splits: Mapping[str, str]) -> None:
-    split_of_picture: dict[str, str] = {}
-    for sequence, picture in picture_of.items():
-        if split_of_picture.setdefault(picture, splits[sequence]) != splits[sequence]:
+def _dequantised(planes: Sequence[np.ndarray], valid: Tensor | None) -> Scene:
+    s0, dolp, aolp = (dequantise(steps) for steps, (_, dequantise) in zip(planes, QUANTISERS.values(), strict=True))
+    return Scene(s0, dolp, aolp, valid)
+
+
+def _check_no_leak(pictures: Mapping[str, str], splits: Mapping[str, str]) -> None:
+    split_of: dict[str, str] = {}
+    for sequence, picture in pictures.items():
+        if split_of.setdefault(picture, splits[sequence]) != splits[sequence]:
             raise ValueError(
-                f"picture {picture} would be in the splits {split_of_picture[picture]} and {splits[sequence]}; "
-                "put all sequences of a picture in one"
+                f"picture {picture} would be in the splits {split_of[picture]} and {splits[sequence]}; "
+                "put all sequences of a picture and its variants in one"
             )

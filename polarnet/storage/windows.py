@@ -20,25 +20,15 @@ class EventSource(Protocol):
     request.
     """
 
-    @property
-    def path(self) -> str:
-        """Path of the event store, or of the scenes that the events are made from."""
-
-    @property
-    def sequences(self) -> list[str]:
-        """Names of the sequences."""
-
-    @property
-    def height(self) -> int:
-        """Rows of the sensor."""
-
-    @property
-    def width(self) -> int:
-        """Columns of the sensor."""
-
-    @property
-    def attributes(self) -> dict[str, Any]:
-        """All settings that the events depend on, besides the data at `path`."""
+    path: str
+    """Path of the event store, or of the scenes that the events are made from."""
+    sequences: list[str]
+    height: int
+    """Rows of the sensor."""
+    width: int
+    """Columns of the sensor."""
+    attributes: dict[str, Any]
+    """All settings that the events depend on, besides the data at `path`."""
 
     def read(self, sequence: str, start_us: int | None = None, stop_us: int | None = None) -> list[Events]:
         """The four channels of a sequence, or their events with start <= t < stop."""

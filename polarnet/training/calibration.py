@@ -58,8 +58,8 @@ def fitted(scenes: Sequence[Scene]) -> ExpectedErrors:
         if not any(scene.squared.any() for scene in others):
             continue
         for ridge in RIDGES:
-            found = _fitted(others, ridge)
-            losses[ridge] += sum(found.loss(scene) for scene in scenes[fold::FOLDS])
+            fit = _fitted(others, ridge)
+            losses[ridge] += sum(fit.loss(scene) for scene in scenes[fold::FOLDS])
     return _fitted(scenes, min(reversed(RIDGES), key=losses.__getitem__))
 
 

@@ -36,6 +36,10 @@ def dolp_task(
             maps = torch.cat([maps, prediction.stokes, prediction.log_variance[:, :, None]], dim=2)
         return maps, state
 
+    def unroll_with_features(inputs: Tensor, state: State) -> tuple[Tensor, Tensor, State]:
+        prediction, features, state = network.unroll_with_features(inputs, state)
+        return prediction.dolp, features, state
+
     return Task(
         network=network,
         encode=encode,
@@ -51,7 +55,7 @@ def dolp_task(
         wants_intensity=False,
         optimizer=config.optimizer or build.optimizer,
         scored=lambda maps: maps[:, :, 0],
-        expects=network.expected if build.predicts_stokes else None,
+        unroll_with_features=unroll_with_features if build.predicts_stokes else None,
     )
 
 

@@ -1,34 +1,35 @@
 """Training task of the E2P baseline: events of the four channels in; intensity, AoLP and DoLP out."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field, NonNegativeFloat
 from torch import Tensor
 
 from polarnet.events.representations import voxel_grid
 from polarnet.events.stream import Events
 from polarnet.metrics.similarity import Lpips
 from polarnet.networks.e2p import BRANCHES, E2p, coded_aolp, interleaved
-from polarnet.runtime.ranges import allowed
+from polarnet.runtime.sections import section
 from polarnet.training.loop import LoopConfig
 from polarnet.training.losses import FrameLoss
 from polarnet.training.sequences import Batch
 from polarnet.training.task import Baseline, Task, initialised
 
 
-@dataclass(frozen=True)
+@section
 class E2pConfig(LoopConfig):
     """Section `baselines.e2p` of params.yaml; the loss weights are the published ones."""
 
-    bins: int = field(metadata=allowed(low=2))
+    bins: Annotated[int, Field(ge=2)]
     """Number of bins of the voxel grid."""
-    intensity_lpips: float = field(metadata=allowed(low=0))
+    intensity_lpips: NonNegativeFloat
     """Weight of LPIPS of the intensity, its only loss term. The next three weights apply to AoLP and to DoLP."""
-    lpips: float = field(metadata=allowed(low=0))
-    mse: float = field(metadata=allowed(low=0))
-    ssim: float = field(metadata=allowed(low=0))
+    lpips: NonNegativeFloat
+    mse: NonNegativeFloat
+    ssim: NonNegativeFloat
     """Weight of 1 - SSIM."""
 
 

@@ -1,30 +1,31 @@
 """Training task of the E2V baseline: events of one channel in, intensity behind its polarizer out."""
 
-from dataclasses import dataclass, field
+from typing import Annotated
 
+from pydantic import Field, NonNegativeFloat
 from torch import Tensor
 
 from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.stream import Events
 from polarnet.metrics.similarity import Lpips
 from polarnet.networks.e2v import ARCHITECTURES
-from polarnet.runtime.ranges import allowed
+from polarnet.runtime.sections import one_of, section
 from polarnet.training.loop import LoopConfig
 from polarnet.training.losses import FrameLoss
 from polarnet.training.sequences import Batch
 from polarnet.training.task import Baseline, Task, initialised
 
 
-@dataclass(frozen=True)
+@section
 class E2vConfig(LoopConfig):
     """Section `baselines.e2v` of params.yaml."""
 
-    arch: str = field(metadata=allowed(choices=tuple(ARCHITECTURES)))
-    bins: int = field(metadata=allowed(low=2))
+    arch: Annotated[str, one_of(ARCHITECTURES)]
+    bins: Annotated[int, Field(ge=2)]
     """Number of bins of the voxel grid."""
-    ssim: float = field(metadata=allowed(low=0))
+    ssim: NonNegativeFloat
     """Weight of 1 - SSIM; the weight of the mean absolute error is 1."""
-    lpips: float = field(metadata=allowed(low=0))
+    lpips: NonNegativeFloat
 
 
 def e2v_task(config: E2vConfig, lpips: Lpips | None, seed: int) -> Task:

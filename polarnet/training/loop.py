@@ -3,18 +3,18 @@
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from statistics import fmean
+from typing import Annotated
 
 import torch
+from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from polarnet.events.representations import REPRESENTATIONS
 from polarnet.metrics.similarity import correlation, mse, psnr
 from polarnet.runtime.machine import precision_on
-from polarnet.runtime.ranges import allowed
-from polarnet.storage.scenes import without_variants
+from polarnet.runtime.sections import one_of, section
 from polarnet.storage.windows import WindowDataset
 from polarnet.training.calibration import Scene, fitted
 from polarnet.training.losses import known_frames
@@ -25,42 +25,45 @@ from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, l
 from polarnet.training.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
-LOOKED_AT = 10_000  # 2x2-pixel blocks per sequence in the expected-error fit; errors of neighbouring blocks are alike
+MAX_BLOCKS = 10_000  # 2x2-pixel blocks per sequence in the expected-error fit; errors of neighbouring blocks are alike
+
+Run = tuple[Tensor, Tensor, Tensor | None]
+"""Consecutive windows of a batch, their truth, and the mask of known truth (None: all known)."""
 
 
-@dataclass(frozen=True)
+@section
 class LoopConfig(ViewConfig):
     """Training settings shared by the sections `train`, `baselines.e2v` and `baselines.e2p` of params.yaml."""
 
-    data: str = field(metadata=allowed(choices=("store", "fly")))
+    data: Annotated[str, one_of(("store", "fly"))]
     """store: read events from the store on disk; fly: emulate the same events in memory, from the scenes, on demand."""
-    epochs: int = field(metadata=allowed(low=1))
-    batch_size: int = field(metadata=allowed(low=1))
+    epochs: PositiveInt
+    batch_size: PositiveInt
     """Number of visits to sequences in one batch."""
-    accumulate: int = field(metadata=allowed(low=1))
+    accumulate: PositiveInt
     """Number of parts that a batch is split into to save memory. The steps stay the same up to rounding."""
-    bptt_windows: int = field(metadata=allowed(low=1))
+    bptt_windows: PositiveInt
     """Windows per optimizer step. The recurrent state passes from step to step, gradients do not."""
-    learning_rate: float = field(metadata=allowed(above=0))
+    learning_rate: PositiveFloat
     """Peak learning rate."""
-    schedule: str = field(metadata=allowed(choices=("constant", "cosine")))
+    schedule: Annotated[str, one_of(("constant", "cosine"))]
     """cosine: decay from the peak rate to 0 over the training."""
-    warmup: float = field(metadata=allowed(low=0, high=1))
+    warmup: Annotated[float, Field(ge=0, le=1)]
     """Fraction of the training over which the rate rises from 0."""
-    gradient_norm: float | None = field(metadata=allowed(above=0))
+    gradient_norm: PositiveFloat | None
     """Largest norm of all gradients together; longer gradients are scaled down to it. null: no limit."""
-    precision: str = field(metadata=allowed(choices=("auto", "fp32", "bf16")))
+    precision: Annotated[str, one_of(("auto", "fp32", "bf16"))]
     """Precision of autocast; weights and optimizer state are always float32. auto: bf16 if the device has units for
     it."""
 
 
-@dataclass(frozen=True)
+@section
 class TrainConfig(LoopConfig):
     """Section `train` of params.yaml."""
 
-    representation: str | None = field(metadata=allowed(choices=tuple(REPRESENTATIONS)))
+    representation: Annotated[str, one_of(REPRESENTATIONS)] | None
     """Representation of the events in a window; null: the network's own default."""
-    optimizer: str | None = field(metadata=allowed(choices=tuple(OPTIMIZERS)))
+    optimizer: Annotated[str, one_of(OPTIMIZERS)] | None
     """Name of the optimizer; null: the network's own default."""
 
 
@@ -91,9 +94,9 @@ def train(
             recorder.keep(progress, network, optimizer)
         recorder.end_epoch(progress, network, validate(task, split.val, config, device, workers))
         recorder.keep(progress, network, optimizer, at_once=True)
-    if task.expects is not None and recorder.writes:
+    if task.unroll_with_features is not None and recorder.writes:
         network.load_state_dict(progress.best)
-        names = without_variants(split.train.sequences)
+        names = [name for name in split.train.sequences if name not in split.train.frames.variant_of]
         scenes = WindowDataset(split.train.events, split.train.frames, names, split.train.encode)
         recorder.calibrated(progress, network, calibrate(task, scenes, config, device, workers))
     recorder.finish()
@@ -151,10 +154,8 @@ def gradients_of(network: nn.Module, processes: int) -> list[Tensor]:
     return [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
 
 
-def runs_of(
-    task: Task, batch: Batch, length: int, device: torch.device
-) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
-    """Input, truth and validity mask of the network, in runs of `length` windows."""
+def runs_of(task: Task, batch: Batch, length: int, device: torch.device) -> Iterator[Run]:
+    """Yield runs of `length` windows of a batch."""
     inputs, truth, valid = task.streams(batch)
     windows, frames = (tensor.to(device).split(length) for tensor in (inputs, truth))
     masks = [None] * len(frames) if valid is None else valid.to(device).split(length)
@@ -217,40 +218,39 @@ def calibrate(
     The fit also includes one frame of each sequence predicted without any events. Returns a record of the fit for the
     checkpoint. ValueError if the network has no error at all.
     """
-    if task.expects is None:
-        raise ValueError("expected a task whose network says how large its errors are")
     task.network.eval()
     scenes, mean_squared = [], []
-    seen: list[Tensor] = []
-
-    def looked_at(
-        windows: Tensor, frames: Tensor, valid: Tensor | None, state: State, every: int
-    ) -> tuple[Scene, State]:
-        with autocast(config.precision, device):
-            predicted, state = task.unroll(windows, state)
-        errors = (task.scored(predicted).clamp(0, 1) - task.scored(frames)).square()
-        known = torch.ones_like(errors) if valid is None else valid.to(errors)
-        of_four, all_known = (avg_pool2d(image.flatten(0, 1), 2)[:, ::every, ::every] for image in (errors, known))
-        height, width = (every * size for size in of_four.shape[-2:])
-        here = seen.pop()[..., :height:every, :width:every].permute(0, 2, 3, 1)[all_known == 1]
-        return Scene(here.double().cpu(), of_four[all_known == 1].double().cpu()), state
-
-    with task.expects.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0])):
-        for batch in batches_of(dataset, range(len(dataset)), 1, workers):
-            every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / LOOKED_AT)))  # along each axis
-            state: State = None
-            parts: list[Scene] = []
-            still: list[Scene] = []
-            for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
-                if not parts:
-                    mask = None if valid is None else valid[:1]
-                    still = [looked_at(torch.zeros_like(windows[:1]), frames[:1], mask, None, every)[0]]
-                part, state = looked_at(windows, frames, valid, state, every)
-                parts.append(part)
-            if any(len(part.squared) for part in parts):
-                mean_squared.append(torch.cat([part.squared for part in parts]).mean().item())
-                scenes.append(Scene(*(torch.cat(field) for field in zip(*parts, *still, strict=True))))
-    found = fitted(scenes)
-    task.network.expect(found.weight, found.bias)  # type: ignore[operator]
+    for batch in batches_of(dataset, range(len(dataset)), 1, workers):
+        every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / MAX_BLOCKS)))  # along each axis
+        runs = list(runs_of(task, batch, config.bptt_windows, device))
+        samples: list[Scene] = []
+        state: State = None
+        for run in runs:
+            sample, state = sampled_errors(task, run, state, every, config.precision)
+            samples.append(sample)
+        squared = torch.cat([sample.squared for sample in samples])
+        if len(squared):
+            windows, frames, valid = runs[0]
+            still = (torch.zeros_like(windows[:1]), frames[:1], None if valid is None else valid[:1])
+            samples.append(sampled_errors(task, still, None, every, config.precision)[0])
+            mean_squared.append(squared.mean().item())
+            scenes.append(Scene(*(torch.cat(field) for field in zip(*samples, strict=True))))
+    fit = fitted(scenes)
+    task.network.expect(fit.weight, fit.bias)  # type: ignore[operator]
     task.network.train()
-    return {"sequences": len(scenes), "mse": fmean(mean_squared), "ridge": found.ridge}
+    return {"sequences": len(scenes), "mse": fmean(mean_squared), "ridge": fit.ridge}
+
+
+def sampled_errors(task: Task, run: Run, state: State, every: int, precision: str) -> tuple[Scene, State]:
+    """Features and squared errors of one 2x2-pixel block in `every` along each axis, and the state after the run."""
+    if task.unroll_with_features is None:
+        raise ValueError("expected a task whose network predicts the size of its errors")
+    windows, frames, valid = run
+    with autocast(precision, windows.device):
+        predicted, features, state = task.unroll_with_features(windows, state)
+    errors = (predicted.clamp(0, 1) - task.scored(frames)).square()
+    known = torch.ones_like(errors) if valid is None else valid.to(errors)
+    squared, share_known = (avg_pool2d(image.flatten(0, 1), 2)[:, ::every, ::every] for image in (errors, known))
+    height, width = (every * size for size in squared.shape[-2:])
+    features = features[..., :height:every, :width:every].permute(0, 2, 3, 1)[share_known == 1]
+    return Scene(features.double().cpu(), squared[share_known == 1].double().cpu()), state

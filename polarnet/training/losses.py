@@ -1,14 +1,14 @@
 """Training losses (paper Eq. 6-9)."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float
+from pydantic import NonNegativeFloat
 from torch import Tensor
 
 from polarnet.metrics.similarity import Lpips, mean_where, mse, ssim, with_truth_outside
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 
 Frames = Float[Tensor, "t b h w"]
 Valid = Bool[Tensor, "t b h w"] | None
@@ -16,7 +16,7 @@ Valid = Bool[Tensor, "t b h w"] | None
 LOG_VARIANCES = (-10.0, 1.0)  # limits of DoLP's log-variance, wide enough for every possible error
 
 
-@dataclass(frozen=True)
+@section
 class LossConfig:
     """Section `loss` of params.yaml: weights of the loss terms (Eq. 9). A weight of 0 leaves a term out.
 
@@ -24,17 +24,16 @@ class LossConfig:
     than DoLP.
     """
 
-    mse: float = field(metadata=allowed(low=0))
-    ssim: float = field(metadata=allowed(low=0))
-    lpips: float = field(metadata=allowed(low=0))
-    stokes: float = field(metadata=allowed(low=0))
+    mse: NonNegativeFloat
+    ssim: NonNegativeFloat
+    lpips: NonNegativeFloat
+    stokes: NonNegativeFloat
     """Weight of the squared error of (S1, S2) / S0."""
-    uncertainty: float = field(metadata=allowed(low=0))
+    uncertainty: NonNegativeFloat
     """Weight of the negative log-likelihood of DoLP's error under its predicted variance. Only the variance learns
     from this term."""
 
     def __post_init__(self):
-        check_ranges(self)
         if self.mse == self.ssim == self.lpips == 0:
             raise ValueError("mse, ssim, lpips: expected at least one weight > 0, got 0 for all three")
 

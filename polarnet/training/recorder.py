@@ -1,10 +1,9 @@
-"""Outputs of a training: checkpoints, history and curves, and the running checkpoint for resuming a killed run.
+"""Outputs of a training: checkpoints, history, and the running checkpoint for resuming a killed run.
 
 The outputs contain no dates or durations, so equal trainings write equal bytes.
 """
 
 import json
-import logging
 import math
 import shutil
 import time
@@ -20,10 +19,9 @@ from tqdm import tqdm
 
 from polarnet.networks.checkpoint import save_checkpoint
 from polarnet.runtime.files import replaced, sha256
+from polarnet.training.history import Row, best_row, write_history
 from polarnet.training.parallel import place
 from polarnet.training.sequences import Batch
-
-logger = logging.getLogger(__name__)
 
 KEEP_EVERY_S = 60.0  # writing a running checkpoint of the paper's network takes 0.1 s
 
@@ -39,8 +37,7 @@ class Progress:
     steps: int = 0
     """Number of optimizer steps in the current epoch; `sums` adds up the loss and its terms over them."""
     sums: dict[str, float] = field(default_factory=dict)
-    history: list[dict[str, Any]] = field(default_factory=list)
-    """One row per epoch: its number, the mean loss terms of training, and the scores on the validation split."""
+    history: list[Row] = field(default_factory=list)
     best: dict[str, Tensor] = field(default_factory=dict)
     """Weights of the epoch with the smallest validation MSE."""
 
@@ -125,7 +122,7 @@ class Recorder:
                 bar.set_postfix(loss=f"{progress.sums['total'] / progress.steps:.4f}")
 
     def end_epoch(self, progress: Progress, network: nn.Module, scores: Mapping[str, float]) -> None:
-        """Close the epoch in `progress` and write checkpoints, history and curves."""
+        """Close the epoch in `progress` and write checkpoints and history."""
         progress.end_epoch(network.state_dict(), scores)
         if not self.writes:
             return
@@ -148,36 +145,8 @@ class Recorder:
         best = best_row(progress.history)
         save_checkpoint(self.out / "last.safetensors", network.state_dict(), {**self.metadata, **_result(last)})
         save_checkpoint(self.out / "best.safetensors", progress.best, {**self.metadata, **_result(best)})
-        (self.out / "history.json").write_text(json.dumps(progress.history, indent=2) + "\n")
-        write_curves(self.out / "live", progress.history)
+        write_history(self.out, progress.history)
 
 
-def best_row(history: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the epoch with the smallest validation MSE; the first one if several are equal."""
-    return min(history, key=lambda row: row["val"]["mse"])
-
-
-def _result(row: Mapping[str, Any]) -> dict[str, Any]:
+def _result(row: Row) -> dict[str, Any]:
     return {"epoch": row["epoch"], "val": row["val"]}
-
-
-def write_curves(folder: Path, history: Sequence[Mapping[str, Any]]) -> None:
-    """Write DVCLive's metrics and curves (`dvc plots show`) for every row of `history`.
-
-    The whole history is written again each time. DVCLive's own resumption would not work, because DVC empties the
-    outputs of a stage before it reruns the stage.
-    """
-    from dvclive import Live  # extra `pipeline`; half a second
-    from scmrepo.exceptions import SCMError
-
-    try:
-        live = Live(str(folder), dvcyaml=None, save_dvc_exp=False, monitor_system=False, cache_images=False)
-    except SCMError as error:  # in a git repository without a commit
-        logger.warning("no DVCLive curves in %s (%s); history.json has their values", folder, error)
-        return
-    for row in history:
-        for split in ("train", "val"):
-            for name, value in row[split].items():
-                live.log_metric(f"{split}/{name}", value)
-        live.next_step()
-    live.end()

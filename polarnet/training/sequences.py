@@ -2,23 +2,23 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import psutil
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field, PositiveInt
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from polarnet.runtime.machine import generator_for, memory_handed_back
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 from polarnet.storage.windows import WindowDataset, WindowSequence
 
 Sequences = WindowDataset | list[WindowSequence]
 
-KEPT = 0.7  # largest share of the memory free at the start of a training that its sequences may take
+MEMORY_SHARE = 0.7  # of the memory free at the start of a training, for its sequences
 EIGHTH_TURN = math.pi / 4  # angle between neighbouring polarizers
 
 
@@ -54,37 +54,38 @@ class View(NamedTuple):
     direction: int
 
 
-def seen(sequence: WindowSequence, view: View) -> WindowSequence:
-    """Apply a view to a sequence. The four channels and their truth stay exact."""
+def apply_view(sequence: WindowSequence, view: View) -> WindowSequence:
+    """Crop, mirror and renumber a sequence. The four channels and their truth stay exact."""
     stop, bottom, right = view.start + view.windows, view.top + view.height, view.left + view.width
     mirrored = [axis for axis, mirror in ((-1, view.mirror_x), (-2, view.mirror_y)) if mirror]
 
-    def look(frames: Tensor) -> Tensor:
+    def cropped(frames: Tensor) -> Tensor:
         return frames[view.start : stop, ..., view.top : bottom, view.left : right].flip(mirrored).contiguous()
 
     polarizers = [(view.turn + view.direction * j) % 4 for j in range(4)]
-    inputs = look(sequence.inputs).unflatten(1, (4, -1))[:, polarizers].flatten(1, 2).float()
-    aolp = view.direction * (look(sequence.aolp) - view.turn * EIGHTH_TURN)
-    intensity = look(sequence.intensity)[:, polarizers]
-    valid = None if sequence.valid is None else look(sequence.valid)
-    return WindowSequence(sequence.name, inputs, look(sequence.dolp), torch.remainder(aolp, math.pi), intensity, valid)
+    inputs = cropped(sequence.inputs).unflatten(1, (4, -1))[:, polarizers].flatten(1, 2).float()
+    aolp = view.direction * (cropped(sequence.aolp) - view.turn * EIGHTH_TURN)
+    intensity = cropped(sequence.intensity)[:, polarizers]
+    valid = None if sequence.valid is None else cropped(sequence.valid)
+    return WindowSequence(
+        sequence.name, inputs, cropped(sequence.dolp), torch.remainder(aolp, math.pi), intensity, valid
+    )
 
 
-@dataclass(frozen=True)
+@section
 class ViewConfig:
     """Augmentation settings; keys of `train`, `baselines.e2v` and `baselines.e2p` in params.yaml."""
 
-    visits: int = field(metadata=allowed(low=1))
+    visits: PositiveInt
     """Visits to each sequence per epoch, each with a new random view."""
-    windows: int | None = field(metadata=allowed(low=1))
+    windows: PositiveInt | None
     """Consecutive windows per visit, starting at a random window; null: all windows."""
-    crop: list[int] | None = field(metadata=allowed(low=16))
+    crop: list[Annotated[int, Field(ge=16)]] | None
     """Height and width in pixels of a visit's random crop; null: the whole image."""
     symmetries: bool
     """Mirror the image and renumber the polarizers at random. This does not change DoLP."""
 
     def __post_init__(self):
-        check_ranges(self)
         if self.crop is not None and len(self.crop) != 2:
             raise ValueError(f"crop: expected height and width, or null, got {self.crop}")
 
@@ -117,16 +118,16 @@ class Visits(Dataset[WindowSequence]):
         sequence = self.sequences[number]
         count, height, width = sequence.dolp.shape
         generator = generator_for(self.seed, sequence.name, f"visit {visit} in epoch {self.epoch}")
-        return seen(sequence, random_view(count, height, width, self.config, generator))
+        return apply_view(sequence, random_view(count, height, width, self.config, generator))
 
 
 def loaded_if_it_fits(dataset: WindowDataset, intensity: bool) -> list[WindowSequence] | None:
-    """A dataset's encoded sequences, if they fit into `KEPT` of the free memory; None if they do not.
+    """A dataset's encoded sequences, if they fit into `MEMORY_SHARE` of the free memory; None if they do not.
 
     `intensity` says whether to keep the intensity.
     """
     bytes_each = sum(tensor.nbytes for tensor in packed(dataset[0], intensity)[1:] if tensor is not None)
-    if bytes_each * len(dataset) > KEPT * psutil.virtual_memory().available:
+    if bytes_each * len(dataset) > MEMORY_SHARE * psutil.virtual_memory().available:
         return None
     with memory_handed_back():
         return [packed(dataset[number], intensity) for number in range(len(dataset))]
@@ -156,14 +157,12 @@ def stack(sequences: Sequence[WindowSequence]) -> Batch:
 
 def parts_of(batch: Batch, parts: int) -> list[Batch]:
     """Split a batch into `parts` parts of nearly equal size, or into single visits if it has fewer visits."""
-    numbers = [part.tolist() for part in torch.arange(len(batch.names)).tensor_split(parts) if len(part)]
-    return [_visits_of(batch, part[0], part[-1] + 1) for part in numbers]
-
-
-def _visits_of(batch: Batch, start: int, stop: int) -> Batch:
-    inputs, dolp, aolp, intensity = (tensor[:, start:stop] for tensor in batch[1:5])
-    valid = None if batch.valid is None else batch.valid[:, start:stop]
-    return Batch(batch.names[start:stop], inputs, dolp, aolp, intensity, valid)
+    numbers = torch.arange(len(batch.names)).tensor_split(min(parts, len(batch.names)))
+    ranges = [slice(int(part[0]), int(part[-1]) + 1) for part in numbers]
+    return [
+        Batch(batch.names[part], *(None if field is None else field[:, part] for field in batch[1:]))  # type: ignore
+        for part in ranges
+    ]
 
 
 def shuffled(count: int, seed: int, epoch: int) -> list[int]:

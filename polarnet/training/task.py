@@ -52,9 +52,11 @@ class Task:
     scored: Callable[[Tensor], Float[Tensor, "t b h w"]] = lambda frames: frames
     """Function that picks the map to score from the predicted or true maps; its validation MSE selects the best
     epoch."""
-    expects: nn.Module | None = None
-    """Module that predicts the expected error of the `scored` map at half resolution; None: the network has none. A
-    network with this module has a method `expect(weight, bias)`."""
+    unroll_with_features: (
+        Callable[[Tensor, State], tuple[Float[Tensor, "t b h w"], Float[Tensor, "n c i j"], State]] | None
+    ) = None
+    """Same as `unroll`, but with the `scored` map alone and, at half resolution, features of its expected error. None:
+    the network expects no error. A network with this function has a method `expect(weight, bias)`."""
 
 
 @dataclass(frozen=True)
@@ -104,14 +106,6 @@ def initialised(build: Callable[[], Network], seed: int) -> Network:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed_for(seed, "network", "initial weights"))
         return build()
-
-
-def lpips_of(folder: str, backbone: str, weight: float) -> Lpips | None:
-    """Load the LPIPS network of a loss from the outputs of stage `weights` in `folder`; None if its weight is 0.
-
-    ValueError if the folder has no weights for this backbone.
-    """
-    return Lpips.load(folder, "loss", backbone) if weight > 0 else None
 
 
 def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, device: torch.device) -> dict[str, Any]:

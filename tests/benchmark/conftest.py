@@ -18,10 +18,10 @@ def five_scenes(make_sequence, tmp_path):
     frames = FrameStore.create(tmp_path / "frames.zarr", list(SCENES), splits, 5, 18, 20, {"scenes": SCENES})
     events = EventStore.create(tmp_path / "events.zarr", list(SCENES), 18, 20, {})
     for seed, name in enumerate(SCENES):
-        made = make_sequence(name, seed=seed)
-        dolp, aolp, s0 = (torch.cat([x[:1], x]) for x in (made.dolp, made.aolp, made.s0))
-        frames.write(name, made.t_us, intensities_from_stokes(stokes_from_polarization(s0, dolp, aolp)), dolp, aolp)
-        events.write(name, made.events, 4000)
+        clip = make_sequence(name, seed=seed)
+        dolp, aolp, s0 = (torch.cat([x[:1], x]) for x in (clip.dolp, clip.aolp, clip.s0))
+        frames.write(name, clip.t_us, intensities_from_stokes(stokes_from_polarization(s0, dolp, aolp)), dolp, aolp)
+        events.write(name, clip.events, 4000)
     for store in (frames, events):
         store.finish()
     return BenchmarkSet(

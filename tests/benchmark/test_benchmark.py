@@ -32,10 +32,10 @@ def config(**changes):
 def test_a_test_sequence_has_the_truth_at_the_end_of_each_window(five_scenes, make_sequence):
     sequences = [five_scenes.sequence(name) for name in five_scenes.sequences]
     assert [(r.name, r.scene) for r in sequences] == [("a1", "lake"), ("a2", "lake"), ("b1", "wood"), ("c1", "town")]
-    made = make_sequence("a1", seed=1)
-    torch.testing.assert_close(sequences[0].dolp, made.dolp, atol=1e-5, rtol=0)
-    torch.testing.assert_close(sequences[0].s0, made.s0, atol=2e-5, rtol=0)
-    assert torch.equal(sequences[0].events[3].t, made.events[3].t)
+    expected = make_sequence("a1", seed=1)
+    torch.testing.assert_close(sequences[0].dolp, expected.dolp, atol=1e-5, rtol=0)
+    torch.testing.assert_close(sequences[0].s0, expected.s0, atol=2e-5, rtol=0)
+    assert torch.equal(sequences[0].events[3].t, expected.events[3].t)
 
 
 def test_the_training_mean_counts_training_frames_after_the_warm_up(five_scenes, make_sequence):
@@ -87,11 +87,11 @@ def test_expected_errors_are_held_against_measured_ones_in_the_scored_windows(
         return Prediction(sequence.dolp + off, None, log_variance)
 
     monkeypatch.setitem(REFERENCES, "train_mean", Reference("train_mean", sure))
-    found = run_benchmark(five_scenes, context, config(methods=["zeros", "train_mean"]), None)
-    assert set(found.reliability) == {"train_mean"}
-    assert found.reliability["train_mean"].pixels.sum() == 4 * 3 * 18 * 20
-    assert found.reliability["train_mean"].log_error() < 0.01
-    write_benchmark(tmp_path / "out", found, config(methods=["zeros", "train_mean"]), 1, {})
+    benchmark = run_benchmark(five_scenes, context, config(methods=["zeros", "train_mean"]), None)
+    assert set(benchmark.reliability) == {"train_mean"}
+    assert benchmark.reliability["train_mean"].pixels.sum() == 4 * 3 * 18 * 20
+    assert benchmark.reliability["train_mean"].log_error() < 0.01
+    write_benchmark(tmp_path / "out", benchmark, config(methods=["zeros", "train_mean"]), 1, {})
     written = json.loads((tmp_path / "out" / "details.json").read_text())["reliability"]["train_mean"]
     ((predicted, measured, pixels),) = written["curve"]
     assert (predicted, measured, pixels) == (pytest.approx(0.01, rel=0.01), pytest.approx(0.01, rel=0.01), 4320)
@@ -100,9 +100,9 @@ def test_expected_errors_are_held_against_measured_ones_in_the_scored_windows(
 def test_panels_show_one_window_of_different_scenes_and_every_method(five_scenes, context, tmp_path):
     wanted = config(methods=["zeros", "cf"])
     benchmark = run_benchmark(five_scenes, context, wanted, None)
-    assert [(p.sequence, p.scene, p.window, p.t_us) for p in benchmark.panels] == [
-        ("a1", "lake", 2, 3000),
-        ("c1", "town", 2, 3000),
+    assert [(panel.sequence, panel.window, panel.t_us) for panel in benchmark.panels] == [
+        ("a1", 2, 3000),
+        ("c1", 2, 3000),
     ]
     folder = tmp_path / "benchmark"
     (folder / "panels").mkdir(parents=True)
@@ -120,8 +120,8 @@ def test_panels_show_one_window_of_different_scenes_and_every_method(five_scenes
 def test_all_but_the_time_is_the_same_in_two_runs(five_scenes, context, tmp_path):
     some = config(methods=["cf", "e2v", "ours"])
     for name in ("one", "two"):
-        found = run_benchmark(five_scenes, context, some, None)
-        write_benchmark(tmp_path / name, found, some, 1, {})
+        benchmark = run_benchmark(five_scenes, context, some, None)
+        write_benchmark(tmp_path / name, benchmark, some, 1, {})
     for file in ("metrics.json", "frames.csv", "details.json", "panels/a1.npz"):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
 

@@ -15,8 +15,8 @@ def checkpoint(config, **synthesize):
     """Metadata of a training with the settings of `config` but for these."""
     motion = dataclasses.replace(config.synthesize, **synthesize)
     scenes = {"synthesize": dataclasses.asdict(motion)}
-    made = {"emulate": dataclasses.asdict(config.emulate), "scenes": scenes}
-    return {"data": {"height": motion.sensor_height, "width": motion.sensor_width, "events_from": made}}
+    attributes = {"emulate": dataclasses.asdict(config.emulate), "scenes": scenes}
+    return {"data": {"height": motion.sensor_height, "width": motion.sensor_width, "events_from": attributes}}
 
 
 def test_size_duration_rate_and_sensor_are_said(config):

@@ -16,10 +16,10 @@ from polarnet.storage.scenes import SceneStore
 
 def test_events_per_pixel_is_the_mean_over_channels_before_each_time(sequence):
     t_us = sequence.t_us
-    found = events_per_pixel(sequence.events, t_us)
-    assert found[-1].item() == pytest.approx(300 / (18 * 20))
+    per_pixel = events_per_pixel(sequence.events, t_us)
+    assert per_pixel[-1].item() == pytest.approx(300 / (18 * 20))
     half = sum(int((e.t < 2000).sum()) for e in sequence.events) / (4 * 18 * 20)
-    assert found[2].item() == pytest.approx(half)
+    assert per_pixel[2].item() == pytest.approx(half)
 
 
 def test_frames_of_overlapping_windows_stand_alone_unless_the_state_is_carried(sequence, context):

@@ -12,15 +12,15 @@ def row(method, scene, value):
 
 
 def test_winning_all_of_six_scenes_has_effect_1_and_the_smallest_p_there_is():
-    found = compared(np.arange(1.0, 7.0))
-    assert found == {"scenes": 6, "better": 6, "effect": 1.0, "p": pytest.approx(2 / 2**6)}
+    comparison = compared(np.arange(1.0, 7.0))
+    assert comparison == {"scenes": 6, "better": 6, "effect": 1.0, "p": pytest.approx(2 / 2**6)}
 
 
 def test_ranks_by_hand():
     # |gains| rank 1, 2, 3, 4; the second smallest is a loss: (1 - 2 + 3 + 4) / 10
-    found = compared(np.array([0.1, -0.2, 0.3, 0.4]))
-    assert found["effect"] == pytest.approx(0.6)
-    assert found["p"] == pytest.approx(wilcoxon([0.1, -0.2, 0.3, 0.4]).pvalue)
+    comparison = compared(np.array([0.1, -0.2, 0.3, 0.4]))
+    assert comparison["effect"] == pytest.approx(0.6)
+    assert comparison["p"] == pytest.approx(wilcoxon([0.1, -0.2, 0.3, 0.4]).pvalue)
 
 
 def test_equal_scenes_count_for_neither_side():
@@ -29,22 +29,22 @@ def test_equal_scenes_count_for_neither_side():
 
 def test_lower_is_better_for_errors_and_higher_for_psnr():
     rows = [row("ours", f"s{i}", 1.0 + i) for i in range(4)] + [row("cf", f"s{i}", 2.0 + 1.5 * i) for i in range(4)]
-    found = paired_comparisons(rows, "ours")["cf"]
-    assert found["mse"]["better"] == 4
-    assert found["psnr"]["better"] == 0
-    assert found["mse"]["median_difference"] == pytest.approx(-1.75)
-    assert found["psnr"]["effect"] == -1
-    assert "lpips" not in found
+    comparison = paired_comparisons(rows, "ours")["cf"]
+    assert comparison["mse"]["better"] == 4
+    assert comparison["psnr"]["better"] == 0
+    assert comparison["mse"]["median_difference"] == pytest.approx(-1.75)
+    assert comparison["psnr"]["effect"] == -1
+    assert "lpips" not in comparison
 
 
 def test_holm_corrects_for_the_number_of_rivals_and_never_falls():
     gains = {"a": [1, 2, 3, 4, 5, 6], "b": [1, 2, 3, 4, 5, -6], "c": [-1, 2, -3, 4, -5, 6]}
     rows = [row("ours", f"s{i}", 10.0) for i in range(6)]
     rows += [row(name, f"s{i}", 10.0 + gain) for name, values in gains.items() for i, gain in enumerate(values)]
-    found = {rival: scores["mse"] for rival, scores in paired_comparisons(rows, "ours").items()}
-    assert found["a"]["p_holm"] == pytest.approx(3 * found["a"]["p"])
-    assert found["b"]["p_holm"] == pytest.approx(2 * found["b"]["p"])
-    assert found["a"]["p_holm"] <= found["b"]["p_holm"] <= found["c"]["p_holm"] <= 1
+    by_rival = {rival: scores["mse"] for rival, scores in paired_comparisons(rows, "ours").items()}
+    assert by_rival["a"]["p_holm"] == pytest.approx(3 * by_rival["a"]["p"])
+    assert by_rival["b"]["p_holm"] == pytest.approx(2 * by_rival["b"]["p"])
+    assert by_rival["a"]["p_holm"] <= by_rival["b"]["p_holm"] <= by_rival["c"]["p_holm"] <= 1
 
 
 def test_without_the_method_there_is_nothing_to_compare():

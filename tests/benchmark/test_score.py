@@ -92,18 +92,18 @@ def test_frames_of_another_size_are_refused(sequence):
 
 def test_lpips_sees_the_truth_once_for_all_methods_and_a_constant_once(make_sequence, monkeypatch):
     torch.manual_seed(0)
-    lpips, seen = Lpips("squeeze"), []
+    lpips, batches = Lpips("squeeze"), []
     features = Lpips.features
 
     def counted(self, images):
-        seen.append(len(images))
+        batches.append(len(images))
         return features(self, images)
 
     monkeypatch.setattr(Lpips, "features", counted)
     sequence, other = make_sequence(windows=8), make_sequence(windows=8, seed=1)
     constant, zeros = Prediction(torch.full_like(other.dolp, 0.3)), Prediction(0 * other.dolp)
     rows = score_sequence(sequence, {"m": Prediction(other.dolp), "c": constant, "z": zeros}, 0, lpips, CPU)
-    assert seen == [8, 8, 1, 1]  # the truth, m, c, z
+    assert batches == [8, 8, 1, 1]  # the truth, m, c, z
     of_constant = [r.lpips for r in rows if r.method == "c"]
     assert of_constant == pytest.approx(lpips(constant.dolp, sequence.dolp).tolist(), rel=1e-4)
 
@@ -208,11 +208,11 @@ def test_frames_are_written_one_a_line_with_empty_cells_for_what_is_not_known(tm
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"methods": ["zeros", "magic"]}, "methods: expected some of zeros, train_mean, .*, got magic"),
+        ({"methods": ["zeros", "magic"]}, r"methods\[1\]: expected one of zeros, train_mean, .*, got 'magic'"),
         ({"methods": ["zeros", "zeros"]}, "methods: expected at least one and none twice"),
         ({"methods": []}, "methods: expected at least one and none twice"),
         ({"sets": ["measured"]}, "sets: expected simulated and others, none twice"),
-        ({"sets": ["simulated", "real"]}, "sets: expected one of simulated, complex_motion, measured, got"),
+        ({"sets": ["simulated", "real"]}, r"sets\[1\]: expected one of simulated, complex_motion, measured, got"),
         ({"warmup_windows": -1}, "warmup_windows: expected >= 0, got -1"),
         ({"precision": "fp16"}, "precision: expected one of fp32, bf16, got 'fp16'"),
     ],

@@ -36,7 +36,17 @@ def stores(tmp_path_factory, config):
     images.mkdir()
     write_png(images / "leaf.png", dead_leaves(generator_for(1, "leaf", "picture"), 200, 300), bits=8)
     entry = ManifestEntry(
-        "leaf", "leaf.png", "test", "dead_leaves", "", None, None, "0" * 64, 8, 200, 300, 200, 300, None
+        name="leaf",
+        file="leaf.png",
+        split="test",
+        source="dead_leaves",
+        origin="",
+        sha256="0" * 64,
+        bits=8,
+        height=200,
+        width=300,
+        source_height=200,
+        source_width=300,
     )
     write_manifest(Manifest((entry,), (), 0, 0), images)
     synthesize(images, root / "scenes.zarr", root / "frames.zarr", config.synthesize, config.seed, map, 2)
@@ -48,17 +58,17 @@ def stores(tmp_path_factory, config):
 def test_the_same_sensor_and_speed_give_the_stored_sequence_again(stores, config):
     scenes, frames, events = stores
     again = resimulated(scenes, "leaf-00", config.synthesize, [config.emulate] * 4, config.seed)
-    for made, stored in zip(again.events, events.read("leaf-00"), strict=True):
-        assert torch.equal(made.t, stored.t)
-        assert torch.equal(made.x, stored.x)
+    for events_again, stored in zip(again.events, events.read("leaf-00"), strict=True):
+        assert torch.equal(events_again.t, stored.t)
+        assert torch.equal(events_again.x, stored.x)
     torch.testing.assert_close(again.dolp, frames.dolp("leaf-00")[1:], atol=1e-5, rtol=0)
 
 
 def test_truth_at_any_time_lies_between_that_of_the_frames(stores):
     scenes, frames, events = stores
     t_us = frames.t_us("leaf-00")
-    found = sequence_at(scenes, "leaf-00", events.read("leaf-00"), t_us)
-    torch.testing.assert_close(found.dolp, frames.dolp("leaf-00")[1:], atol=1e-5, rtol=0)
+    result = sequence_at(scenes, "leaf-00", events.read("leaf-00"), t_us)
+    torch.testing.assert_close(result.dolp, frames.dolp("leaf-00")[1:], atol=1e-5, rtol=0)
     finer = sequence_at(scenes, "leaf-00", events.read("leaf-00"), torch.arange(0, int(t_us[-1]) + 1, 5000))
     assert len(finer.dolp) == int(t_us[-1]) // 5000
 
@@ -67,32 +77,32 @@ def test_an_error_of_one_channel_changes_the_events_behind_that_polarizer_alone(
     scenes, _, events = stores
     stored = events.read("leaf-00")
     higher = dataclasses.replace(config.emulate, contrast_threshold_on=0.4, contrast_threshold_off=0.4)
-    made = resimulated(
+    channels = resimulated(
         scenes, "leaf-00", config.synthesize, [higher, *[config.emulate] * 3], config.seed
     ).events  # fmt: skip
-    assert len(made[0]) < 0.8 * len(stored[0])
+    assert len(channels[0]) < 0.8 * len(stored[0])
     for k in (1, 2, 3):
-        assert torch.equal(made[k].t, stored[k].t)
+        assert torch.equal(channels[k].t, stored[k].t)
 
 
 def test_twice_the_speed_is_twice_the_speed(stores, config, monkeypatch):
     scenes = stores[0]
-    seen = []
+    speeds = []
 
     def noting(*arguments):
         trajectory = arguments[1]
-        seen.append(trajectory.speed_px_s)
+        speeds.append(trajectory.speed_px_s)
         return list(stores[2].read("leaf-00"))
 
     monkeypatch.setattr("polarnet.benchmark.resimulate.emulate_motion", noting)
     resimulated(scenes, "leaf-00", config.synthesize, [config.emulate] * 4, config.seed, speed=2.0)
     stored = Trajectory.from_vector(scenes.read("leaf-00").trajectory.numpy())
-    assert seen == [pytest.approx(2 * stored.speed_px_s, rel=1e-6)]
+    assert speeds == [pytest.approx(2 * stored.speed_px_s, rel=1e-6)]
 
 
 def test_channel_errors_are_opposite_in_each_pair_of_polarizers(config):
-    found = sensors("channel_error", 0.1, config.emulate)
-    assert [s.contrast_threshold_on for s in found] == pytest.approx([0.22, 0.18, 0.18, 0.22])
+    result = sensors("channel_error", 0.1, config.emulate)
+    assert [s.contrast_threshold_on for s in result] == pytest.approx([0.22, 0.18, 0.18, 0.22])
     assert CHANNEL_SIGNS[0] == -CHANNEL_SIGNS[2]
     assert CHANNEL_SIGNS[1] == -CHANNEL_SIGNS[3]
     assert {s.shot_noise_rate_hz for s in sensors("noise_rate_hz", 5.0, config.emulate)} == {5.0}

@@ -20,18 +20,18 @@ def log_light(t_s, pixel):
 def events():
     """Events of ideal pixels with larger OFF than ON thresholds."""
     t_us = np.arange(0, 1_000_000, 20)
-    found = []
+    rows = []
     for pixel in range(HEIGHT * WIDTH):
         light = log_light(t_us * 1e-6, pixel)
         reference = light[0]
         for t, level in zip(t_us.tolist(), light.tolist(), strict=True):
             if level >= reference + THRESHOLD_ON:
                 reference += THRESHOLD_ON
-                found.append((t, pixel % WIDTH, pixel // WIDTH, 1))
+                rows.append((t, pixel % WIDTH, pixel // WIDTH, 1))
             elif level <= reference - THRESHOLD_OFF:
                 reference -= THRESHOLD_OFF
-                found.append((t, pixel % WIDTH, pixel // WIDTH, -1))
-    t, x, y, p = np.array(sorted(found)).T
+                rows.append((t, pixel % WIDTH, pixel // WIDTH, -1))
+    t, x, y, p = np.array(sorted(rows)).T
     return Events(torch.from_numpy(t), *map(torch.from_numpy, (x.astype(np.int16), y.astype(np.int16))),
                   torch.from_numpy(p.astype(np.int8)), HEIGHT, WIDTH)  # fmt: skip
 
@@ -51,9 +51,9 @@ def of(events):
 def test_each_step_lies_between_two_events_of_one_pixel():
     x = torch.tensor([0, 1, 0, 1, 0], dtype=torch.int16)
     p = torch.tensor([1, -1, 1, 1, -1], dtype=torch.int8)
-    found = steps(Events(torch.tensor([1, 2, 5, 9, 9]), x, torch.zeros_like(x), p, 1, 2), (0, 0), (1, 2), 0, 9)
-    assert found.before_us.tolist() == [1]  # those that end at 9 us are not before the stop
-    assert (found.after_us.tolist(), found.pixel.tolist(), found.polarity.tolist()) == ([5], [0], [1])
+    pairs = steps(Events(torch.tensor([1, 2, 5, 9, 9]), x, torch.zeros_like(x), p, 1, 2), (0, 0), (1, 2), 0, 9)
+    assert pairs.before_us.tolist() == [1]  # those that end at 9 us are not before the stop
+    assert (pairs.after_us.tolist(), pairs.pixel.tolist(), pairs.polarity.tolist()) == ([5], [0], [1])
 
 
 @pytest.mark.parametrize("shift_us", [-31_400, -700, 0, 12_345])
@@ -74,9 +74,9 @@ def test_noise_of_the_pictures_does_not_move_the_lag(events, pictures):
 
 def test_thresholds_are_the_changes_between_events(events, pictures):
     t_us, values = pictures
-    found = best_lag(of(events), t_us, logarithms(values), 20_000).thresholds
-    assert found.on == pytest.approx(THRESHOLD_ON, rel=0.05)
-    assert found.off == pytest.approx(THRESHOLD_OFF, rel=0.05)
+    contrast = best_lag(of(events), t_us, logarithms(values), 20_000).thresholds
+    assert contrast.on == pytest.approx(THRESHOLD_ON, rel=0.05)
+    assert contrast.off == pytest.approx(THRESHOLD_OFF, rel=0.05)
 
 
 def test_without_any_change_there_is_no_agreement(events, pictures):

@@ -17,16 +17,16 @@ from polarnet.captures.dot import (
     read_intensity_capture,
 )
 from polarnet.captures.imported import import_targets
-from polarnet.captures.targets import calibrate_targets, spread_us
+from polarnet.captures.targets import calibrate_targets
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.recordings.recording import read_recording
 from polarnet.recovery.recover import Arrangement, open_files
-from polarnet.reports.calibration import draw_calibration
+from polarnet.reports.recordings import draw_calibration
 from polarnet.simulation.scene import scene_from_rgb
 from polarnet.storage.frames import FrameStore
-from studies.simulated_rig import RigConfig, true_dolp, write_rig
+from studies.simulated_rig import RigConfig, spread_us, true_dolp, write_rig
 
 PICTURE_RATE_HZ = 60.0
 SMALL = {

@@ -81,7 +81,7 @@ def test_a_folder_of_photographs_is_scored_with_given_weights(
     assert 'src="http' not in page
     assert (out / "comparison.png").exists()
     files = [path for path in (out / "work").rglob("*") if path.is_file()]
-    made = {path: path.stat().st_mtime_ns for path in files}
+    written_ns = {path: path.stat().st_mtime_ns for path in files}
     given = metrics["ours"]
     assert run(project_root, monkeypatch, photographs, out) == 0  # by the shipped weights, on the same events
     warning = (
@@ -93,7 +93,7 @@ def test_a_folder_of_photographs_is_scored_with_given_weights(
     metrics = json.loads((out / "metrics.json").read_text())
     assert set(metrics) == {"zeros", "oracle_mean", "cf", "ours"}
     assert metrics["ours"]["mse"] != given["mse"]
-    assert {path: path.stat().st_mtime_ns for path in made} == made
+    assert {path: path.stat().st_mtime_ns for path in written_ns} == written_ns
 
 
 def test_nothing_usable_says_what_was_expected(project_root, tmp_path, monkeypatch, capsys):

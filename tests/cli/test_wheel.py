@@ -35,8 +35,8 @@ def built(source, kind, folder):
     before = set(folder.iterdir())
     command = [sys.executable, "-c", BUILD.format(kind=kind, folder=str(folder))]
     subprocess.run(command, cwd=source, check=True, capture_output=True, env=os.environ | {"PYTHONPATH": ""})
-    (made,) = set(folder.iterdir()) - before
-    return made
+    (distribution,) = set(folder.iterdir()) - before
+    return distribution
 
 
 def test_the_wheel_holds_the_package_alone_with_the_settings(distributions, project_root):
@@ -69,3 +69,5 @@ def test_a_wheel_reads_its_own_settings_outside_a_clone_and_those_of_the_clone_i
     assert printed(f"print(settings_root()); {load}", tmp_path / "empty").split() == [
         str(tmp_path / "installed" / "polarnet" / "config" / "settings"), "7",
     ]  # fmt: skip
+    sensor = "from polarnet.simulation import SENSORS; print(SENSORS['noisy'].cutoff_hz)"
+    assert printed(sensor, tmp_path / "empty").strip() == "30.0"

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra.errors import ConfigCompositionException
 
 from polarnet.cli import main
 from polarnet.config.experiments import BASE, preset_names, preset_values, write_preset
-from polarnet.config.tree import Config, check_keys, input_folder, load, with_lpips
+from polarnet.config.tree import Config, check_overrides, input_folder, load, with_lpips
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 
 
@@ -47,7 +46,7 @@ def test_the_committed_values_pass(project_root):
         ("train.epochs=0", r"train\.epochs: expected"),
         ("methods.cf.cutoff_hz=-1.0", r"methods\.cf\.cutoff_hz: expected"),
         ("methods.e2p.weights=' '", r"methods\.e2p\.weights: expected the path of a file or null"),
-        ("benchmark.methods=[magic]", r"benchmark\.methods: expected some of zeros, .*, ours, got magic"),
+        ("benchmark.methods=[magic]", r"benchmark\.methods\[0\]: expected one of zeros, .*, ours, got 'magic'"),
         ("ingest.source=camera", r"ingest\.source: expected one of"),
         ("network=resnet", r"network: expected one of paper"),
         ("lpips.backbone=resnet", r"lpips\.backbone: expected one of"),
@@ -61,17 +60,15 @@ def test_a_value_out_of_range_is_refused_with_its_key_and_what_is_allowed(projec
 
 
 def test_a_wrong_type_is_refused_with_its_key(project_root):
-    with pytest.raises(ConfigCompositionException) as refusal:
+    with pytest.raises(ValueError, match=r"^train\.epochs: expected a valid integer, got 'many'$"):
         load(project_root, ["train.epochs=many"])
-    assert "could not be converted to Integer" in str(refusal.value.__cause__)
-    assert "train.epochs" in str(refusal.value.__cause__)
 
 
 def test_a_typo_on_the_command_line_is_refused_with_the_keys_there_are(project_root):
     with pytest.raises(ValueError, match=r"loss\.msee is not a setting; loss has lpips, mse, ssim"):
-        check_keys(project_root, ["loss.msee=1.0"])
+        check_overrides(project_root, ["loss.msee=1.0"])
     with pytest.raises(ValueError, match=r"seed\.x is not a setting; seed is a value, not a section"):
-        check_keys(project_root, ["seed.x=1"])
+        check_overrides(project_root, ["seed.x=1"])
 
 
 @pytest.mark.parametrize(
@@ -116,8 +113,8 @@ def test_the_base_of_each_group_may_change_nothing(project_root):
 
 def test_a_typo_in_params_yaml_is_refused_with_the_keys_there_are(project):
     edit(project, "  mse: 10.0\n  ssim: 1.0", "  mse: 10.0\n  sim: 1.0")
-    with pytest.raises(ValueError, match=r"params.yaml: loss\.sim is not a setting; loss has lpips, mse, ssim"):
-        check_keys(project, [])
+    with pytest.raises(ValueError, match=r"loss\.sim is not a setting; loss has lpips, mse, ssim"):
+        load(project)
 
 
 def test_a_stage_stops_before_it_runs_anything(project_root, tmp_path):

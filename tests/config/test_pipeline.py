@@ -58,7 +58,7 @@ def test_a_baseline_that_no_row_uses_is_not_trained(project_root):
         ("rows.highpass.settings=methods.cf", "rows.highpass.settings: expected methods.highpass"),
         ("rows.ours.needs=data/train/e2v", "rows.ours.needs: expected data/train/ours"),
         ("rows.zeros.module=polarnet/stokes.py", "rows.zeros.module: expected polarnet/benchmark/references.py"),
-        ("~rows.cf.needs", "rows.cf: expected the keys module, needs, settings, got module, settings"),
+        ("~rows.cf.needs", "rows.cf.needs: expected a value, got none; add the key"),
     ],
 )
 def test_a_row_that_declares_less_than_it_uses_is_refused(project_root, change, expected):

@@ -87,5 +87,5 @@ def test_a_refused_point_is_a_row_with_its_reason_and_stops_no_other(project_roo
     assert "Traceback" not in done.stderr
     rows = json.loads((tmp_path / "comparison.json").read_text())["rows"]
     assert [row["notes"] for row in rows] == [
-        [f"seed 1 failed: train: configuration error: train.epochs: expected >= 1, got {epochs}"] for epochs in (0, -1)
+        [f"seed 1 failed: train: configuration error: train.epochs: expected > 0, got {epochs}"] for epochs in (0, -1)
     ]

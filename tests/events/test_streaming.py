@@ -47,22 +47,22 @@ def test_windows_do_not_depend_on_the_pieces_in_which_a_stream_comes(rule, piece
 
 
 def test_consecutive_windows_of_a_time_hold_every_event_once():
-    found = windows(WindowRule(4000, None, None))
-    assert [(w.start_us, w.stop_us) for w in found] == [(0, 4000), (4000, 8000), (8000, 12000), (12000, 16000),
+    cut = windows(WindowRule(4000, None, None))
+    assert [(w.start_us, w.stop_us) for w in cut] == [(0, 4000), (4000, 8000), (8000, 12000), (12000, 16000),
                                                         (16000, 20000)]  # fmt: skip
-    assert sum(len(events) for w in found for events in w.channels) == 4 * 300
+    assert sum(len(events) for w in cut for events in w.channels) == 4 * 300
 
 
 def test_overlapping_windows_are_whole_ones_that_end_at_every_step():
-    found = windows(WindowRule(5000, None, 100))
-    assert [w.stop_us for w in found] == list(range(5000, 20001, 100))
-    assert {w.stop_us - w.start_us for w in found} == {5000}
+    cut = windows(WindowRule(5000, None, 100))
+    assert [w.stop_us for w in cut] == list(range(5000, 20001, 100))
+    assert {w.stop_us - w.start_us for w in cut} == {5000}
 
 
 def test_windows_of_a_number_follow_each_other_and_hold_it():
-    found = windows(WindowRule(None, 90, None))
-    assert all(90 <= sum(map(len, w.channels)) < 95 for w in found)  # events of one time stay together
-    assert all(after.start_us == before.stop_us for before, after in itertools.pairwise(found))
+    cut = windows(WindowRule(None, 90, None))
+    assert all(90 <= sum(map(len, w.channels)) < 95 for w in cut)  # events of one time stay together
+    assert all(after.start_us == before.stop_us for before, after in itertools.pairwise(cut))
     last = windows(WindowRule(None, 90, 1000))
     assert [w.stop_us for w in last] == list(range(last[0].stop_us, 20001, 1000))
     assert all(90 <= sum(map(len, w.channels)) < 95 for w in last)

@@ -6,15 +6,12 @@ import torch
 
 from polarnet.events.stream import Events, slice_count, slice_time
 from polarnet.methods.complementary_filter import (
-    ComplementaryFilterConfig,
-    Decay,
-    HighPassConfig,
+    FilterConfig,
     at_rest,
-    filter_at_rest,
+    cf_intensity,
+    highpass_intensity,
+    image_of,
     integrate,
-    log_intensity_at,
-    step_cf,
-    step_highpass,
 )
 
 LN2 = math.log(2)
@@ -22,11 +19,11 @@ HALVING_PER_MS_HZ = LN2 / (2 * math.pi * 1e-3)  # the cut-off at which log inten
 
 
 def cf_config(cutoff_hz=HALVING_PER_MS_HZ, contrast_on=0.1, contrast_off=-0.1, intensity_range=(-0.1, 1.2)):
-    return ComplementaryFilterConfig(cutoff_hz, contrast_on, contrast_off, list(intensity_range))
+    return FilterConfig(cutoff_hz, 0.0, contrast_on, contrast_off, list(intensity_range))
 
 
 def highpass_config(cutoff_hz=HALVING_PER_MS_HZ, decay_per_event=LN2, intensity_range=(-0.5, 1.5)):
-    return HighPassConfig(cutoff_hz, decay_per_event, 0.1, -0.1, list(intensity_range))
+    return FilterConfig(cutoff_hz, decay_per_event, 0.1, -0.1, list(intensity_range))
 
 
 def events_of(*rows, height=2, width=3):
@@ -46,47 +43,46 @@ def times(*t_us):
     return torch.tensor(t_us)
 
 
-def reconstructed(step, channels, t_us, config):
+def reconstructed(intensity, channels, t_us, config):
     """Images at rising times, each from the events before it: windows are half-open."""
-    state = filter_at_rest(len(channels), channels[0].height, channels[0].width)
-    images, before = [], 0
+    state = at_rest(len(channels), channels[0].height, channels[0].width)
+    images = []
     for t in t_us.tolist():
-        image, state = step(state, [slice_time(events, before, t) for events in channels], t, config)
-        images.append(image)
-        before = t
+        state = integrate(state, [slice_time(events, state.t_us, t) for events in channels], t, config)
+        images.append(image_of(state, config, intensity))
     return torch.stack(images)
 
 
 def reconstruct_cf(channels, t_us, config):
-    return reconstructed(step_cf, channels, t_us, config)
+    return reconstructed(cf_intensity, channels, t_us, config)
 
 
 def reconstruct_highpass(channels, t_us, config):
-    return reconstructed(step_highpass, channels, t_us, config)
+    return reconstructed(highpass_intensity, channels, t_us, config)
 
 
 def test_cf_of_a_hand_worked_event_list(hand_list):
-    found = reconstruct_cf([hand_list], times(500, 2000, 3000, 5000), cf_config())
+    images = reconstruct_cf([hand_list], times(500, 2000, 3000, 5000), cf_config())
     # An event shows after its time: log intensity of (1, 2): 0 | 0.1 / 2 | (0.1 / 2 + 0.1) / 2 | (0.15 / 4 - 0.1) / 2;
     # of (0, 0): 0 | 0 | 0 | -0.1 / 4
     expected = np.zeros((4, 2, 3))
     expected[:, 1, 2] = [0, 0.05, 0.075, -0.03125]
     expected[:, 0, 0] = [0, 0, 0, -0.025]
-    np.testing.assert_allclose(found[:, 0], (np.exp(expected) - 1 + 0.1) / 1.3, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(images[:, 0], (np.exp(expected) - 1 + 0.1) / 1.3, rtol=0, atol=1e-12)
 
 
 def test_highpass_of_a_hand_worked_event_list(hand_list):
-    found = reconstruct_highpass([hand_list], times(500, 2000, 3000, 5000), highpass_config())
+    images = reconstruct_highpass([hand_list], times(500, 2000, 3000, 5000), highpass_config())
     # each event halves once more: (1, 2): 0 | 0.1 / 2 | (0.1 / 4 + 0.1) / 2 | (0.125 / 8 - 0.1) / 2
     expected = np.zeros((4, 2, 3))
     expected[:, 1, 2] = [0, 0.05, 0.0625, -0.0421875]
     expected[:, 0, 0] = [0, 0, 0, -0.025]
-    np.testing.assert_allclose(found[:, 0], (1.5 * np.exp(expected) - 1 + 0.5) / 2, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(images[:, 0], (1.5 * np.exp(expected) - 1 + 0.5) / 2, rtol=0, atol=1e-12)
 
 
 def test_without_a_cutoff_log_intensity_is_the_sum_of_the_steps(hand_list):
-    found = reconstruct_cf([hand_list], times(9_000_000), cf_config(cutoff_hz=0.0, contrast_on=0.3, contrast_off=-0.2))
-    assert found[0, 0, 1, 2].item() == pytest.approx((math.exp(0.4) - 0.9) / 1.3, abs=1e-12)
+    images = reconstruct_cf([hand_list], times(9_000_000), cf_config(cutoff_hz=0.0, contrast_on=0.3, contrast_off=-0.2))
+    assert images[0, 0, 1, 2].item() == pytest.approx((math.exp(0.4) - 0.9) / 1.3, abs=1e-12)
 
 
 def test_before_any_event_a_filter_shows_log_intensity_zero():
@@ -109,8 +105,8 @@ def test_intensities_outside_the_range_are_clipped():
 
 def test_twice_the_contrast_behind_one_polarizer_shows_as_twice_the_contrast():
     three, six = (events_of(*((t, 0, 0, 1) for t in range(count))) for count in (3, 6))
-    shown = reconstruct_cf([three, six], times(9), cf_config(cutoff_hz=0.0))[0, :, 0, 0]
-    intensity = 1.3 * shown - 0.1
+    images = reconstruct_cf([three, six], times(9), cf_config(cutoff_hz=0.0))[0, :, 0, 0]
+    intensity = 1.3 * images - 0.1
     assert intensity.tolist() == pytest.approx([math.expm1(0.3), math.expm1(0.6)])
 
 
@@ -121,18 +117,19 @@ def test_asking_for_more_output_times_changes_no_frame(hand_list):
 
 
 def test_events_in_two_pieces_leave_the_state_of_one_and_the_old_state_alone(hand_list):
-    decay = Decay(1e-4, 0.06, 0.1, -0.2)
-    whole = integrate(at_rest(2, 3), hand_list, decay)
-    half = integrate(at_rest(2, 3), slice_count(hand_list, 0, 2), decay)
-    kept = half.log_intensity.copy()
-    again = integrate(half, slice_count(hand_list, 2, 4), decay)
-    assert np.array_equal(log_intensity_at(again, 6000, decay), log_intensity_at(whole, 6000, decay))
-    assert np.array_equal(half.log_intensity, kept)
+    config = highpass_config()
+    whole = integrate(at_rest(1, 2, 3), [hand_list], 6000, config)
+    half = integrate(at_rest(1, 2, 3), [slice_count(hand_list, 0, 2)], 2500, config)
+    before = half.log_intensity.copy()
+    again = integrate(half, [slice_count(hand_list, 2, 4)], 6000, config)
+    assert np.array_equal(again.log_intensity, whole.log_intensity)
+    assert np.array_equal(again.updated_us, whole.updated_us)
+    assert np.array_equal(half.log_intensity, before)
 
 
 def test_an_event_from_the_past_is_refused():
-    with pytest.raises(ValueError, match="older than one its pixel has seen"):
-        integrate(at_rest(2, 3), events_of((5, 0, 0, 1), (4, 0, 0, 1)), Decay(0.0, 0.0, 0.1, -0.1))
+    with pytest.raises(ValueError, match="older than the last event of its pixel"):
+        integrate(at_rest(1, 2, 3), [events_of((5, 0, 0, 1), (4, 0, 0, 1))], 9, cf_config())
 
 
 @pytest.mark.parametrize("bad", [[0.5, 0.5], [1.0, 0.0], [0.0], [0.0, 0.5, 1.0]])

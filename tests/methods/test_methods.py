@@ -167,19 +167,19 @@ def test_published_networks_are_post_processed_and_firenet_plus_sees_voxels_as_t
     sequence, make_setup, open_method
 ):
     setup = make_setup("firenetplus_published")
-    network = load_baseline(FireNet, "firenet", setup.weights)
+    network = load_baseline({"firenet": FireNet}, setup.weights)
     grids = encode_windows(sequence.events, sequence.t_us, lambda events, _: voxel_grid(events, 5)).unflatten(1, (4, 5))
     with torch.no_grad():
         raw, _ = network.unroll(grids)
-    shown = recovered(open_method("firenetplus_published"), sequence.windows).intensities
-    torch.testing.assert_close(shown, postprocessed(raw, setup.postprocessing))
-    normalised = intensity_network(lambda path: network, setup, published=True)
-    assert not torch.allclose(shown, recovered(normalised, sequence.windows).intensities)
+    intensities = recovered(open_method("firenetplus_published"), sequence.windows).intensities
+    torch.testing.assert_close(intensities, postprocessed(raw, setup.postprocessing))
+    normalised = intensity_network(network, setup, sharpened=True)
+    assert not torch.allclose(intensities, recovered(normalised, sequence.windows).intensities)
 
 
 def test_e2p_sees_the_channels_as_a_mosaic_and_carries_its_state_on(sequence, open_method, checkpoints):
     grids = encode_windows(sequence.events, sequence.t_us, lambda events, _: voxel_grid(events, 5))
-    network = load_baseline(E2p, "e2p", checkpoints["e2p"])
+    network = load_baseline({"e2p": E2p}, checkpoints["e2p"])
     with torch.no_grad():
         maps, _ = network.unroll(interleaved(grids.unflatten(1, (4, 5)))[:, None])
     prediction = recovered(open_method("e2p"), sequence.windows)

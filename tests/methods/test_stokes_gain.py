@@ -62,11 +62,11 @@ def test_a_twentieth_of_wild_pixels_is_outvoted_by_weights_alone():
     truth, _, unknown = spoilt(1, 0.0)
     generator = torch.Generator().manual_seed(9)
     wild = torch.rand(unknown.shape, generator=generator) < 0.05
-    seen = torch.where(wild, torch.rand(unknown.shape, generator=generator), unknown)
+    intensities = torch.where(wild, torch.rand(unknown.shape, generator=generator), unknown)
 
     def score(rounds):
-        found = gains(seen, dataclasses.replace(CONFIG, rounds=rounds))
-        return psnr(unknown[0] * found[0, :, None, None], truth)
+        solution = gains(intensities, dataclasses.replace(CONFIG, rounds=rounds))
+        return psnr(unknown[0] * solution[0, :, None, None], truth)
 
     assert score(5) > 40
     assert score(5) > score(0) + 5
@@ -76,11 +76,11 @@ def test_gains_of_a_hand_worked_pair_of_pixels():
     # 2 I0 + I90 = I45 + I135 holds at both, and another direction leaves a residual
     residuals = torch.tensor([[0.5, -1.0, 1.0, -1.0], [1.0, -1.0, 0.0, -1.0], [0.25, -0.75, 1.0, -0.75],
                               [0.5, -0.75, 0.5, -0.75], [0.5, -0.5, 0.75, -1.25]], dtype=torch.float64)  # fmt: skip
-    found = solved(residuals, CONFIG)
+    solution = solved(residuals, CONFIG)
     torch.testing.assert_close(
-        found / found[1], torch.tensor([2.0, 1.0, 1.0, 1.0], dtype=torch.float64), atol=1e-5, rtol=0
+        solution / solution[1], torch.tensor([2.0, 1.0, 1.0, 1.0], dtype=torch.float64), atol=1e-5, rtol=0
     )
-    assert found.log().mean().abs() < 1e-9
+    assert solution.log().mean().abs() < 1e-9
 
 
 def test_a_frame_looks_at_no_later_one_and_at_no_more_than_its_window():
@@ -94,15 +94,15 @@ def test_a_frame_looks_at_no_later_one_and_at_no_more_than_its_window():
 def test_gains_stay_positive_whatever_comes():
     torch.manual_seed(0)
     for _ in range(20):
-        found = gains(torch.rand(2, 4, 6, 7) ** 4, CONFIG)
-        assert (found > 0).all()
-        torch.testing.assert_close(found.log().mean(1), torch.zeros(2, dtype=torch.float64))
+        solution = gains(torch.rand(2, 4, 6, 7) ** 4, CONFIG)
+        assert (solution > 0).all()
+        torch.testing.assert_close(solution.log().mean(1), torch.zeros(2, dtype=torch.float64))
 
 
 def test_a_strong_pull_makes_the_channels_equally_bright():
     _, _, unknown = spoilt(2, 0.1)
-    found = consistent(unknown, dataclasses.replace(CONFIG, pull=1e6))[0]
-    brightness = found.square().mean((1, 2)).sqrt()
+    images = consistent(unknown, dataclasses.replace(CONFIG, pull=1e6))[0]
+    brightness = images.square().mean((1, 2)).sqrt()
     torch.testing.assert_close(brightness / brightness.mean(), torch.ones(4), atol=1e-4, rtol=0)
 
 

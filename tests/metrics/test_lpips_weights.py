@@ -81,8 +81,8 @@ def test_the_heads_of_the_reference_material_are_those_of_torchmetrics_too(share
     with np.load(shared / "weights" / "lpips_squeeze_v0.1.npz") as arrays:
         backbone = {name: torch.from_numpy(arrays[name]) for name in arrays.files if name.startswith("features")}
         heads = {name: torch.from_numpy(arrays[name]) for name in arrays.files if name.startswith("lin")}
-    found = lpips_weights._checked("squeeze", backbone, Path("x")).tensors
-    assert all(torch.equal(found[name], head) for name, head in heads.items())
+    tensors = lpips_weights._checked("squeeze", backbone, Path("x")).tensors
+    assert all(torch.equal(tensors[name], head) for name, head in heads.items())
 
 
 def test_a_given_file_comes_before_the_package_and_the_package_before_the_hub(tmp_path, monkeypatch):

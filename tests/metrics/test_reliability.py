@@ -11,20 +11,20 @@ def test_errors_of_the_predicted_size_lie_on_the_diagonal():
     log_variance = torch.empty(4, 100, 100).uniform_(-8, -4)
     truth = torch.full_like(log_variance, 0.5)
     dolp = truth + torch.randn_like(truth) * (log_variance / 2).exp()
-    found = reliability(log_variance, dolp, truth)
-    for predicted, measured, pixels in found.curve():
+    result = reliability(log_variance, dolp, truth)
+    for predicted, measured, pixels in result.curve():
         assert measured == pytest.approx(predicted, rel=0.1)
         assert pixels > 1000
-    assert found.log_error() < 0.1
-    assert sum(pixels for *_, pixels in found.curve()) == truth.numel()
+    assert result.log_error() < 0.1
+    assert sum(pixels for *_, pixels in result.curve()) == truth.numel()
 
 
 def test_errors_four_times_as_large_as_expected_are_off_by_ln_4_per_pixel():
     log_variance = torch.full((1, 2, 2), math.log(0.01))
     truth = torch.zeros(1, 2, 2)
-    found = reliability(log_variance, truth + 0.2, truth)
-    assert found.curve() == [pytest.approx((0.01, 0.04, 4))]
-    assert found.log_error() == pytest.approx(math.log(4), rel=1e-5)
+    result = reliability(log_variance, truth + 0.2, truth)
+    assert result.curve() == [pytest.approx((0.01, 0.04, 4))]
+    assert result.log_error() == pytest.approx(math.log(4), rel=1e-5)
 
 
 def test_sequences_add_up_and_masked_pixels_do_not_count():

@@ -32,7 +32,7 @@ def test_a_conv_gru_of_one_pixel_is_the_textbook_gru():
     update = sigmoid(-1.0 * x + 0.25 * state)
     candidate = math.tanh(2.0 * x - 0.5 * reset * state)
     expected = (1 - update) * state + update * candidate
-    states, last = gru(torch.full((1, 1, 1, 1), x), torch.full((1, 1, 1, 1), state))
+    states, last = gru(torch.full((1, 1, 1, 1), x), 1, torch.full((1, 1, 1, 1), state))
     assert math.isclose(states.item(), expected, rel_tol=1e-6)
     assert torch.equal(states, last)
 
@@ -40,9 +40,9 @@ def test_a_conv_gru_of_one_pixel_is_the_textbook_gru():
 def test_a_conv_gru_over_windows_at_once_is_the_same_as_window_by_window():
     torch.manual_seed(0)
     gru, x, state = ConvGRU(3), torch.randn(8, 3, 4, 5), torch.randn(2, 3, 4, 5)
-    states, last = gru(x, state)
+    states, last = gru(x, 2, state)
     for window, together in zip(x.split(2), states.split(2), strict=True):
-        alone, state = gru(window, state)
+        alone, state = gru(window, 2, state)
         torch.testing.assert_close(together, alone)
     torch.testing.assert_close(last, state)
 
@@ -67,13 +67,12 @@ def test_an_up_block_doubles_the_size_and_takes_the_channels_of_its_skip():
 def test_levels_over_windows_at_once_are_the_same_as_window_by_window(height, width):
     torch.manual_seed(0)
     level, x = Level(3, [4, 5, 6]), torch.randn(6, 3, height, width)
-    start = level.initial_states(x[:2])
-    together, last = level(x, start)
+    together, last = level(x, 2, [])
     assert together.shape == x.shape
-    states = start
+    states = []
     for window, expected in zip(x.split(2), together.split(2), strict=True):
-        found, states = level(window, states)
-        torch.testing.assert_close(found, expected)
+        alone, states = level(window, 2, states)
+        torch.testing.assert_close(alone, expected)
     torch.testing.assert_close(states, last)
 
 
@@ -82,10 +81,9 @@ def test_levels_over_windows_at_once_are_the_same_as_window_by_window(height, wi
 def test_each_level_sees_further(levels, reached):
     torch.manual_seed(0)
     level, x = Level(4, [4] * levels), torch.randn(1, 4, 1, 64)
-    start = level.initial_states(x)
     changed = x.clone()
     changed[..., 63] += 10
-    far = (level(x, start)[0] - level(changed, start)[0])[..., :40]
+    far = (level(x, 1, [])[0] - level(changed, 1, [])[0])[..., :40]
     assert bool(far.any()) == reached
 
 

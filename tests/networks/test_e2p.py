@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.e2p import E2p, MosaicHead, coded_aolp, decoded_aolp, interleaved, own_names
+from polarnet.networks.e2p import E2p, MosaicHead, coded_aolp, decoded_aolp, interleaved
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +43,9 @@ def test_each_convolution_of_the_first_layer_is_centred_on_one_polarizer():
     torch.nn.init.zeros_(head.conv.weight)
     torch.nn.init.zeros_(head.conv.bias)  # every channel weighs sigmoid(0) = 1/2
     channels = torch.rand(1, 4, 1, 3, 4)
-    found = 2 * head(interleaved(channels))
+    features = 2 * head(interleaved(channels))
     for group, angle in enumerate((90, 45, 135, 0)):
-        torch.testing.assert_close(found[:, 8 * group], channels[:, angle // 45, 0])
+        torch.testing.assert_close(features[:, 8 * group], channels[:, angle // 45, 0])
 
 
 @torch.no_grad()
@@ -99,7 +99,7 @@ def test_the_authors_names_are_understood(network, tmp_path):
         theirs[".".join(parts)] = tensor
     assert {"head_i.pattern1.0.weight", "G1_d.reset_gate.bias", "fusion_weight2.conv4.weight"} < theirs.keys()
     assert {"fusion_weight1.conv1.0.weight", "head_a.conv.bias", "pred_a.weight"} < theirs.keys()
-    assert own_names(theirs).keys() == network.state_dict().keys()
+    assert E2p.own_names(theirs).keys() == network.state_dict().keys()
     torch.save({"state_dict": theirs}, tmp_path / "e2p.pth")
     loaded = E2p.load(tmp_path / "e2p.pth").state_dict()
     assert all(torch.equal(loaded[name], tensor) for name, tensor in network.state_dict().items())

@@ -113,9 +113,9 @@ def test_an_lstm_whose_forget_gate_is_open_and_input_gate_shut_keeps_its_memory(
     torch.nn.init.zeros_(lstm.Gates.weight)
     lstm.Gates.bias.copy_(torch.tensor([-100.0, -100, 100, 100, 100, 100, 0, 0]))  # i, f, o, g
     memory = torch.rand(1, 2, 3, 3)
-    shown, kept = lstm(torch.rand(1, 2, 3, 3), (torch.zeros(1, 2, 3, 3), memory))
-    torch.testing.assert_close(kept, memory)
-    torch.testing.assert_close(shown, memory.tanh())
+    output, memory_after = lstm(torch.rand(1, 2, 3, 3), (torch.zeros(1, 2, 3, 3), memory))
+    torch.testing.assert_close(memory_after, memory)
+    torch.testing.assert_close(output, memory.tanh())
 
 
 def test_another_number_of_bins_is_refused(network):

@@ -3,22 +3,22 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.expected_error import MIN_DISAGREEMENT, MIN_ROOM, TELLING, ExpectedError, telling
+from polarnet.networks.expected_error import FEATURES, MIN_DISAGREEMENT, MIN_ROOM, ExpectedError, error_features
 
 EVEN = torch.full((1, 2, 4, 6), 0.5)
 
 
-def told(candidates=EVEN, weights=EVEN, evidence=EVEN, dolp=0.5):
-    return telling(candidates, weights, evidence, torch.full((1, 1, 16, 24), dolp))
+def features(candidates=EVEN, weights=EVEN, evidence=EVEN, dolp=0.5):
+    return error_features(candidates, weights, evidence, torch.full((1, 1, 16, 24), dolp))
 
 
 def test_candidates_that_agree_say_the_least_and_the_others_how_far_they_are_apart():
-    assert told().shape == (1, TELLING, 8, 12)
-    apart, _, of_frame, _, _ = told()[0]
+    assert features().shape == (1, FEATURES, 8, 12)
+    apart, _, of_frame, _, _ = features()[0]
     assert apart.unique().item() == of_frame.unique().item() == pytest.approx(math.log(MIN_DISAGREEMENT))
     candidates = EVEN.clone()
     candidates[:, 0, :, 3:] = 0.9
-    apart, _, of_frame, _, _ = told(candidates)[0]
+    apart, _, of_frame, _, _ = features(candidates)[0]
     disagree = math.log(0.2**2 + MIN_DISAGREEMENT)
     assert apart[:, -1].unique().item() == pytest.approx(disagree)
     assert of_frame.unique().item() == pytest.approx((disagree + math.log(MIN_DISAGREEMENT)) / 2)
@@ -27,29 +27,29 @@ def test_candidates_that_agree_say_the_least_and_the_others_how_far_they_are_apa
 def test_a_candidate_that_the_network_does_not_trust_does_not_count():
     candidates, weights = EVEN.clone(), EVEN.clone()
     candidates[:, 0], weights[:, 0] = 0.9, 0.0
-    torch.testing.assert_close(told(candidates, weights), told())
-    assert told(candidates, 0 * weights).isfinite().all()
+    torch.testing.assert_close(features(candidates, weights), features())
+    assert features(candidates, 0 * weights).isfinite().all()
 
 
 def test_much_evidence_hardly_any_and_none_in_a_frame_are_told_apart():
-    assert told(evidence=3 * EVEN)[0, 1].unique().item() == pytest.approx(math.log(2.5))
-    silence = [told(evidence=share * EVEN)[0, 3].unique().item() for share in (100, 0.2, 0)]
+    assert features(evidence=3 * EVEN)[0, 1].unique().item() == pytest.approx(math.log(2.5))
+    silence = [features(evidence=share * EVEN)[0, 3].unique().item() for share in (100, 0.2, 0)]
     assert silence == pytest.approx([0, 0.5, 1], abs=0.01)
     evidence = 0 * EVEN
     evidence[..., 0] = 60.0
-    assert told(evidence=evidence)[0, 3].unique().item() < 0.01
+    assert features(evidence=evidence)[0, 3].unique().item() < 0.01
 
 
 def test_errors_of_middle_values_have_most_room():
-    assert told(dolp=0.2)[0, 4].unique().item() == pytest.approx(math.log(0.16 + MIN_ROOM))
-    assert told(dolp=-0.1)[0, 4].unique().item() == told(dolp=1.1)[0, 4].unique().item()
+    assert features(dolp=0.2)[0, 4].unique().item() == pytest.approx(math.log(0.16 + MIN_ROOM))
+    assert features(dolp=-0.1)[0, 4].unique().item() == features(dolp=1.1)[0, 4].unique().item()
 
 
 def test_it_says_nothing_until_it_is_told_and_has_nothing_to_learn():
     expected = ExpectedError()
     assert not [*expected.parameters()]
-    assert not expected(torch.randn(2, TELLING, 3, 5)).any()
+    assert not expected(torch.randn(2, FEATURES, 3, 5)).any()
     expected.weight.copy_(torch.tensor([1.0, 0.0, 0.0, 0.0, 2.0]))
     expected.bias.fill_(-3.0)
-    seen = torch.randn(2, TELLING, 3, 5)
-    torch.testing.assert_close(expected(seen), seen[:, :1] + 2 * seen[:, 4:] - 3)
+    inputs = torch.randn(2, FEATURES, 3, 5)
+    torch.testing.assert_close(expected(inputs), inputs[:, :1] + 2 * inputs[:, 4:] - 3)

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.panorama import Memory, Motion, certainty, displacements, follow, nothing_seen
+from polarnet.networks.panorama import Memory, Motion, certainty, displacements, empty_panorama, follow
 
 MEMORY = Memory(prior=1.0, noise=0.01, drift=0.01, renewal=0.15, fade=0.95)
 HEIGHT, WIDTH, MARGIN = 44, 60, 16
@@ -34,32 +34,32 @@ def motion_between(places: list[tuple[float, float]], k: int) -> Motion:
 
 
 def followed(places: list[tuple[float, float]], noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The picture after the last window, sums of events, and what the sensor then sees; each [4, h, w], means 0.
+    """The panorama after the last window, sums of events, and what the sensor then sees; each [4, h, w], means 0.
 
     The events have errors of this standard deviation, which the filter is told.
     """
     memory = MEMORY._replace(drift=max(MEMORY.drift, noise**2))
     changes = views(places).diff(dim=0)
     changes = changes + noise * torch.randn(changes.shape, generator=torch.Generator().manual_seed(1))
-    picture = nothing_seen(changes[:1], MARGIN)
+    panorama = empty_panorama(changes[:1], MARGIN)
     for k, change in enumerate(changes):
-        picture = follow(change[None], motion_between(places, k), picture, memory)
-    level, truth = picture.level[0, :, :HEIGHT, :WIDTH], views(places[-1:])[0]
+        panorama = follow(change[None], motion_between(places, k), panorama, memory)
+    level, truth = panorama.level[0, :, :HEIGHT, :WIDTH], views(places[-1:])[0]
     return tuple(image - image.mean((-1, -2), keepdim=True) for image in (level, changes.sum(0), truth))  # type: ignore[return-value]
 
 
 @pytest.mark.parametrize("speed", [(3.0, 0.0), (0.0, 2.0), (5.0, 4.0), (-2.4, 1.3), (0.5, -6.7)])
 def test_the_motion_is_found_in_the_events_of_two_windows(speed):
-    seen = views([(k * speed[0], k * speed[1]) for k in range(4)])
-    motion = displacements(seen.diff(dim=0).sum(1, keepdim=True).round(), reach=8)
-    assert motion.found.all()
+    images = views([(k * speed[0], k * speed[1]) for k in range(4)])
+    motion = displacements(images.diff(dim=0).sum(1, keepdim=True).round(), reach=8)
+    assert motion.reliable.all()
     torch.testing.assert_close(motion.displacement, torch.tensor(speed).expand(2, 1, 2), atol=0.25, rtol=0)
 
 
 def test_windows_that_show_different_things_or_nothing_have_no_motion():
     one, other = torch.randn(2, 1, 120, 180, generator=torch.Generator().manual_seed(0))
     nothing = torch.zeros_like(one)
-    assert not displacements(torch.stack([nothing, one, other, nothing, nothing]), reach=6).found.any()
+    assert not displacements(torch.stack([nothing, one, other, nothing, nothing]), reach=6).reliable.any()
 
 
 def test_motion_is_looked_for_in_images_smaller_than_the_reach():
@@ -99,26 +99,26 @@ def test_noise_of_the_events_averages_out_where_sums_gather_it():
 def test_what_is_known_grows_with_the_motion_and_fades_without():
     places = path(9)
     changes = views(places).diff(dim=0)
-    picture, known = nothing_seen(changes[:1], MARGIN), []
+    panorama, known = empty_panorama(changes[:1], MARGIN), []
     for k, change in enumerate(changes):
-        picture = follow(change[None], motion_between(places, k), picture, MEMORY)
-        known.append(certainty(picture, MEMORY).item())
+        panorama = follow(change[None], motion_between(places, k), panorama, MEMORY)
+        known.append(certainty(panorama, MEMORY).item())
     assert known[:4] == sorted(known[:4])
     assert 0.5 < known[-1] < 1
     for _ in range(60):
-        picture = follow(changes[:1], Motion(torch.zeros(1, 2), torch.tensor([False])), picture, MEMORY)
-    assert certainty(picture, MEMORY) < 0.1
+        panorama = follow(changes[:1], Motion(torch.zeros(1, 2), torch.tensor([False])), panorama, MEMORY)
+    assert certainty(panorama, MEMORY) < 0.1
 
 
 def test_without_motion_the_picture_changes_as_the_pixels_do():
     places = path(6)
     changes = views(places).diff(dim=0)
-    picture = nothing_seen(changes[:1], MARGIN)
+    panorama = empty_panorama(changes[:1], MARGIN)
     for k, change in enumerate(changes[:-1]):
-        picture = follow(change[None], motion_between(places, k), picture, MEMORY)
+        panorama = follow(change[None], motion_between(places, k), panorama, MEMORY)
     lost = Motion(torch.tensor([[2.0, 1.0]]), torch.tensor([False]))
-    after = follow(changes[-1:], lost, picture, MEMORY)
-    torch.testing.assert_close(after.own, picture.own + changes[-1:])
+    after = follow(changes[-1:], lost, panorama, MEMORY)
+    torch.testing.assert_close(after.own, panorama.own + changes[-1:])
     torch.testing.assert_close(after.level[..., :HEIGHT, :WIDTH], after.own, atol=1e-4, rtol=0)
 
 
@@ -127,39 +127,39 @@ def test_one_window_by_hand():
     change[:, :, 4, 5], change[:, :, 4, 6] = -1.0, 1.0  # what was bright at column 6 came to column 5 ...
     motion = Motion(torch.tensor([[1.0, 0.0]]), torch.tensor([True]))
     memory = Memory(prior=2.0, noise=0.3, drift=0.2, renewal=0.0, fade=0.5)
-    picture = follow(change, motion, nothing_seen(change, 16), memory)
+    panorama = follow(change, motion, empty_panorama(change, 16), memory)
     down, across = (torch.fft.fftfreq(32) * 2 * math.pi)[:, None], torch.fft.rfftfreq(32) * 2 * math.pi
     before = 2 / (down.square() + across.square()).clamp(min=(2 * math.pi / 32) ** 2)  # variance of either error
     step = 2 - 2 * torch.cos(across)  # |exp(i f) - 1|^2
     spread = before * step + 0.2 + 0.3
-    # both errors were minus the picture; that of the level has moved: (1 - exp(i f)) of it shows in the difference
-    seen = torch.exp(-4j * down) * (torch.exp(-6j * across) - torch.exp(-5j * across))
-    level = torch.fft.irfft2(before * (1 - torch.exp(1j * across)) / spread * seen, s=(32, 32))
-    own = torch.fft.irfft2((before * (1 - torch.exp(-1j * across)) + 0.2) / spread * seen, s=(32, 32))
+    # both errors were minus the scene; that of the level has moved: (1 - exp(i f)) of it shows in the difference
+    difference = torch.exp(-4j * down) * (torch.exp(-6j * across) - torch.exp(-5j * across))
+    level = torch.fft.irfft2(before * (1 - torch.exp(1j * across)) / spread * difference, s=(32, 32))
+    own = torch.fft.irfft2((before * (1 - torch.exp(-1j * across)) + 0.2) / spread * difference, s=(32, 32))
     for channel in range(2):
-        torch.testing.assert_close(picture.level[0, channel], level, atol=1e-5, rtol=0)
-        torch.testing.assert_close(picture.own[0, channel], change[0, channel] - own[:16, :16], atol=1e-5, rtol=0)
-    torch.testing.assert_close(picture.explained[0, 0], before.square() * step / spread, atol=1e-4, rtol=1e-5)
+        torch.testing.assert_close(panorama.level[0, channel], level, atol=1e-5, rtol=0)
+        torch.testing.assert_close(panorama.own[0, channel], change[0, channel] - own[:16, :16], atol=1e-5, rtol=0)
+    torch.testing.assert_close(panorama.explained[0, 0], before.square() * step / spread, atol=1e-4, rtol=1e-5)
     own_alone = (before * (1 - torch.exp(-1j * across)) + 0.2).abs().square()
-    torch.testing.assert_close(picture.explained[0, 1], own_alone / spread - 0.2, atol=1e-4, rtol=1e-5)
+    torch.testing.assert_close(panorama.explained[0, 1], own_alone / spread - 0.2, atol=1e-4, rtol=1e-5)
     unchecked = memory._replace(noise=1e12)  # so noisy that nothing is corrected: what was known moves on, and fades
-    later = follow(torch.zeros_like(change), motion, picture, unchecked).level[0, 0]
-    moved = picture.level[0, 0].roll(-1, dims=-1)
+    later = follow(torch.zeros_like(change), motion, panorama, unchecked).level[0, 0]
+    moved = panorama.level[0, 0].roll(-1, dims=-1)
     torch.testing.assert_close(later[:16, :16], moved[:16, :16], atol=1e-5, rtol=0)
     torch.testing.assert_close(later[:, 16:], 0.5 * moved[:, 16:], atol=1e-5, rtol=0)  # out of sight
 
 
 def test_a_long_recording_leaves_the_filter_sound():
     generator = torch.Generator().manual_seed(0)
-    picture = nothing_seen(torch.zeros(1, 2, HEIGHT, WIDTH), MARGIN)
+    panorama = empty_panorama(torch.zeros(1, 2, HEIGHT, WIDTH), MARGIN)
     for k in range(600):
         change = torch.randn(1, 2, HEIGHT, WIDTH, generator=generator) * (50 if k % 200 == 0 else 0.5)
         speed = 0.0 if 200 < k < 300 else 3.0  # and for a while a motion of nothing
         motion = Motion(speed * torch.randn(1, 2, generator=generator), torch.rand(1, generator=generator) > 0.1)
-        picture = follow(change, motion, picture, MEMORY)
-    assert picture.explained.isfinite().all()
-    assert 0.5 < certainty(picture, MEMORY) < 1
-    assert picture.level.square().mean().sqrt() < 5  # although single windows brought changes of 50
+        panorama = follow(change, motion, panorama, MEMORY)
+    assert panorama.explained.isfinite().all()
+    assert 0.5 < certainty(panorama, MEMORY) < 1
+    assert panorama.level.square().mean().sqrt() < 5  # although single windows brought changes of 50
 
 
 def test_every_stream_is_followed_by_itself():
@@ -167,13 +167,13 @@ def test_every_stream_is_followed_by_itself():
     changes = views(places).diff(dim=0)
     here, there = motion_between(places, 0), Motion(torch.tensor([[0.0, -3.0]]), torch.tensor([False]))
     both = Motion(*(torch.cat(pair) for pair in zip(here, there, strict=True)))
-    together = follow(changes[:2], both, nothing_seen(changes[:2], MARGIN), MEMORY)
+    together = follow(changes[:2], both, empty_panorama(changes[:2], MARGIN), MEMORY)
     for stream, motion in enumerate((here, there)):
-        alone = follow(changes[stream : stream + 1], motion, nothing_seen(changes[:1], MARGIN), MEMORY)
+        alone = follow(changes[stream : stream + 1], motion, empty_panorama(changes[:1], MARGIN), MEMORY)
         for image, expected in zip(together, alone, strict=True):
             torch.testing.assert_close(image[stream : stream + 1], expected, atol=1e-5, rtol=1e-5)
 
 
 def test_the_margin_is_at_least_what_was_asked_for():
-    picture = nothing_seen(torch.zeros(2, 3, 60, 92), 16)
-    assert [tuple(image.shape) for image in picture] == [(2, 3, 80, 112), (2, 3, 60, 92), (2, 4, 80, 57)]
+    panorama = empty_panorama(torch.zeros(2, 3, 60, 92), 16)
+    assert [tuple(image.shape) for image in panorama] == [(2, 3, 80, 112), (2, 3, 60, 92), (2, 4, 80, 57)]

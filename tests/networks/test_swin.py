@@ -32,24 +32,24 @@ def test_windows_put_back_together_give_the_image_for_any_size_and_shift():
 
 
 def test_plain_windows_see_their_own_window_and_nothing_else():
-    seen = influence(WindowAttention(8, 2, window=4, shift=0), row=5, column=2, height=8, width=8)
+    pixels = influence(WindowAttention(8, 2, window=4, shift=0), row=5, column=2, height=8, width=8)
     expected = torch.zeros(8, 8, dtype=torch.bool)
     expected[4:8, 0:4] = True
-    assert torch.equal(seen, expected)
+    assert torch.equal(pixels, expected)
 
 
 def test_shifted_windows_straddle_the_plain_ones():
-    seen = influence(WindowAttention(8, 2, window=4, shift=2), row=3, column=3, height=8, width=8)
+    pixels = influence(WindowAttention(8, 2, window=4, shift=2), row=3, column=3, height=8, width=8)
     expected = torch.zeros(8, 8, dtype=torch.bool)
     expected[2:6, 2:6] = True
-    assert torch.equal(seen, expected)
+    assert torch.equal(pixels, expected)
 
 
 def test_shifted_windows_do_not_leak_from_one_border_to_the_opposite_one():
-    seen = influence(WindowAttention(8, 2, window=4, shift=2), row=0, column=0, height=8, width=8)
+    pixels = influence(WindowAttention(8, 2, window=4, shift=2), row=0, column=0, height=8, width=8)
     expected = torch.zeros(8, 8, dtype=torch.bool)
     expected[:2, :2] = True
-    assert torch.equal(seen, expected)
+    assert torch.equal(pixels, expected)
 
 
 def test_a_window_that_reaches_beyond_the_image_gives_what_the_part_inside_would_give_alone():

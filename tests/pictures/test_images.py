@@ -76,9 +76,9 @@ def test_every_exif_orientation_shows_the_same_upright_picture(tmp_path):
         exif[0x0112] = orientation
         path = tmp_path / f"{orientation}.jpg"
         Image.fromarray(np.ascontiguousarray(pixels)).save(path, exif=exif, quality=100, subsampling=0)
-        shown = read_picture(path).pixels
-        assert shown.shape == blocks.shape, orientation
-        assert np.abs(shown.astype(int) - blocks).max() < 8, orientation
+        turned = read_picture(path).pixels
+        assert turned.shape == blocks.shape, orientation
+        assert np.abs(turned.astype(int) - blocks).max() < 8, orientation
         assert np.array_equal(upright(pixels, orientation), blocks), orientation
 
 

@@ -242,7 +242,7 @@ def test_no_fraction_means_no_picture():
     [
         ({"source": "web"}, "source: expected one of builtin, folder, polarization"),
         ({"mosaic": "90 45 / 135 135"}, 'mosaic: expected the angles 0, 45, 90 and 135 like "90 45 / 135 0"'),
-        ({"limit": 0}, "limit: expected >= 1"),
+        ({"limit": 0}, "limit: expected > 0"),
         ({"max_upscale": 0.5}, "max_upscale: expected >= 1"),
         ({"val_fraction": 0.9}, "val_fraction: expected <= 1 - test_fraction = 0.8, got 0.9"),
     ],

@@ -143,11 +143,11 @@ def test_every_angle_of_a_mosaic_is_seen_at_the_centre_of_its_cell(order):
     for row in (0, 1):
         for column in (0, 1):
             raw[row::2, column::2] = plane[mosaic[row][column]][row::2, column::2]
-    seen = demosaic(raw, mosaic)
-    assert seen.shape == (4, 8, 13)
+    at_angles = demosaic(raw, mosaic)
+    assert at_angles.shape == (4, 8, 13)
     centre_rows, centre_columns = np.mgrid[1:9, 1:14] * 2 + 0.5
     expected = [centre_rows, centre_columns, 10 + centre_rows - 2 * centre_columns, 3 * centre_rows + centre_columns]
-    np.testing.assert_allclose(seen, expected, atol=1e-12)
+    np.testing.assert_allclose(at_angles, expected, atol=1e-12)
 
 
 def test_an_unpolarized_edge_looks_less_polarized_than_with_one_pixel_per_angle():

@@ -16,7 +16,7 @@ FORKSERVER.set_forkserver_preload([*(f"stages.{stage}" for stage in STAGES), "di
 
 
 def run_stage(root: Path, stage: str, arguments: list[str]) -> subprocess.CompletedProcess[str]:
-    """What `python -m stages.STAGE ARGUMENTS`, started in `root`, returns and prints; both outputs are in `stdout`."""
+    """The exit status and output of `python -m stages.STAGE ARGUMENTS` in `root`; `stdout` holds both streams."""
     with tempfile.NamedTemporaryFile(mode="r") as output:
         process = FORKSERVER.Process(target=_main, args=(root, stage, arguments, output.name))
         process.start()

@@ -15,7 +15,7 @@ from polarnet.config.experiments import stage_names
 from polarnet.methods import METHODS, module_of
 from polarnet.training.baselines import BASELINES
 
-# What starts a stage and checks its values decides no output; listing it would re-run everything at each new setting.
+# Code that starts a stage and checks its values decides no output; listed, it would re-run all at each new setting.
 PLUMBING = {"polarnet", "polarnet.config.tree", "polarnet.runtime.cluster"}
 ASSEMBLED = {"polarnet.methods", "polarnet.training.baselines", "polarnet.benchmark.references"}
 """Modules that collect entries by name; a row or a training depends on its own entry alone."""
@@ -47,15 +47,15 @@ def stages(project_root: Path) -> dict[str, dict[str, Any]]:
 
 def reached(starts: list[str], imports: grimp.ImportGraph, ends: set[str] = frozenset()) -> set[str]:
     """Modules that `starts` import, directly or not, with those in `ends` but not what these import."""
-    found: set[str] = set()
+    modules: set[str] = set()
     waiting = list(starts)
     while waiting:
         module = waiting.pop()
-        if module not in found | PLUMBING:
-            found.add(module)
+        if module not in modules | PLUMBING:
+            modules.add(module)
             if module not in ends:
                 waiting += imports.find_modules_directly_imported_by(module)
-    return found
+    return modules
 
 
 def modules_behind(stage: str, cmd: str, imports: grimp.ImportGraph) -> set[str]:

@@ -55,7 +55,7 @@ def bytes_of(folder: Path) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def data(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the whole pipeline leaves behind, one worker."""
+    """The data folder after the whole pipeline ran with one worker."""
     folder = tmp_path_factory.mktemp("pipeline") / "data"
     for _, stage, overrides in hydra_runs(project_root, ["e2v", "e2p"]):
         run_stage(project_root, stage, folder, *overrides)

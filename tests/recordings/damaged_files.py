@@ -11,12 +11,11 @@ from hypothesis import strategies as st
 
 from polarnet.events.stream import Events, slice_count, validate
 from polarnet.recordings.formats.celex5_bin import celex5_pictures
-from polarnet.recordings.formats.celex5_csv import write_celex5_csv
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import REPAIRS, RecordingError
 from polarnet.storage.events import EventStore
 from polarnet.storage.exchange import write_hdf5, write_text
-from studies.celex5_bin_writer import write_celex5_bin
+from studies.celex5_writer import write_celex5_bin, write_celex5_csv
 
 EVENTS = 60
 PLACES = st.one_of(st.integers(0, 200), st.integers(0, 2**20))
@@ -72,9 +71,9 @@ class Sample:
         """Damage file `number`, counted round, read the recording, and put the file right again."""
         number %= len(self._files)
         self._files[number].write_bytes(damaged(self._sound[number], damage))
-        found = ending(self.path, self.form if says_format else None, chunk_events)
+        outcome = ending(self.path, self.form if says_format else None, chunk_events)
         self._files[number].write_bytes(self._sound[number])
-        return found
+        return outcome
 
 
 def write_sample(form: str, path: Path, events: Events) -> None:
@@ -126,7 +125,7 @@ def write_sample(form: str, path: Path, events: Events) -> None:
 def ending(path: Path, form: str | None, chunk_events: int) -> str:
     """One of ENDINGS. Whatever else a reader does (another error, events out of order, an unnamed file) is raised."""
     try:
-        reader = open_recording(path, form, part="lake/135", assume_polarity=1, chunk_events=chunk_events)
+        reader = open_recording(path, form, part="lake/135", chunk_events=chunk_events)
         before = None
         for events in reader:
             validate(events)

@@ -6,10 +6,10 @@ import torch
 
 from polarnet.events.stream import Events
 from polarnet.recordings.arrangements import read_four, read_mosaic, split_mosaic, write_store
-from polarnet.recordings.formats.celex5_csv import write_celex5_csv
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import parse_mosaic
 from polarnet.storage.events import EventStore
+from studies.celex5_writer import write_celex5_csv
 
 ANGLES = (0, 45, 90, 135)
 

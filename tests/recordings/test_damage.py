@@ -5,10 +5,9 @@ import struct
 import pytest
 import torch
 
-from polarnet.recordings.formats.celex5_csv import write_celex5_csv
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
-from studies.celex5_bin_writer import write_celex5_bin
+from studies.celex5_writer import write_celex5_bin, write_celex5_csv
 
 EVENTS = 2000
 

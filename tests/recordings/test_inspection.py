@@ -4,11 +4,10 @@ import pytest
 
 from polarnet.cli import main
 from polarnet.events.stream import merge
-from polarnet.recordings.formats.celex5_csv import write_celex5_csv
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
-from studies.celex5_bin_writer import write_celex5_pictures
+from studies.celex5_writer import write_celex5_csv, write_celex5_pictures
 
 FACTOR = 4
 
@@ -89,10 +88,6 @@ def test_inspect_of_a_mode_without_polarity_says_what_to_do(tmp_path, capsys):
     (tmp_path / "e.csv").write_text("10,20,5\n11,21,7\n")
     assert main(["inspect", str(tmp_path / "e.csv")]) == 1
     assert "have no polarity" in capsys.readouterr().err
-    assert (
-        main(["inspect", str(tmp_path / "e.csv"), "--assume-polarity", "1", "--picture", str(tmp_path / "p.png")]) == 0
-    )
-    assert "events      2: 2 ON, 0 OFF" in capsys.readouterr().out
 
 
 def test_a_sensor_larger_than_any_is_refused(tmp_path):

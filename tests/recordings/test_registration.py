@@ -11,7 +11,7 @@ from polarnet.cli import main
 from polarnet.events.stream import Events
 from polarnet.recordings.registration import event_image, register, warp_events, warped
 from polarnet.recordings.source import RecordingError
-from polarnet.reports.calibration import draw_hot_pixels, draw_registration
+from polarnet.reports.recordings import draw_hot_pixels, draw_registration
 
 HEIGHT, WIDTH = 120, 160
 TRUE = np.array([[1.01, 0.015, 3.2], [-0.012, 0.99, -2.4], [2e-5, -3e-5, 1.0]])
@@ -37,11 +37,11 @@ def corners_apart(homography):
 
 def test_the_homography_between_two_cameras_is_found_to_a_fraction_of_a_pixel(images, tmp_path):
     reference, moving = images
-    found = register(reference, 0.6 * moving)  # another polarizer: not as bright
+    registration = register(reference, 0.6 * moving)  # another polarizer: not as bright
     assert corners_apart(np.eye(3)) > 2
-    assert corners_apart(found.homography) < 0.2
-    assert found.correlation > 0.95
-    after = warped(moving, found.homography)
+    assert corners_apart(registration.homography) < 0.2
+    assert registration.correlation > 0.95
+    after = warped(moving, registration.homography)
     draw_registration(reference, moving, after, tmp_path / "registration.png")
     draw_hot_pixels(np.ones((5, 5)), np.eye(5, dtype=bool), tmp_path / "hot.png")
     assert all((tmp_path / name).stat().st_size > 5000 for name in ("registration.png", "hot.png"))
@@ -52,15 +52,15 @@ def test_register_prints_the_homography_of_two_recordings_and_draws_both(images,
         write_recording(tmp_path / name, image)
     command = ["register", str(tmp_path / "a.txt"), str(tmp_path / "b.txt"), "--picture", str(tmp_path / "both.png")]
     assert main(command) == 0
-    found = capsys.readouterr().out
-    assert corners_apart(np.array(json.loads(found)["homography"])) < 0.5
+    printed = capsys.readouterr().out
+    assert corners_apart(np.array(json.loads(printed)["homography"])) < 0.5
     assert (tmp_path / "both.png").stat().st_size > 5000
     for name in ("a.txt", "b.txt"):
         (tmp_path / name).write_text((tmp_path / name).read_text().split("\n", 1)[1])
     assert main(command) == 1
     assert "height" in capsys.readouterr().err
     assert main([*command, "--height", str(HEIGHT), "--width", str(WIDTH)]) == 0
-    assert capsys.readouterr().out == found
+    assert capsys.readouterr().out == printed
 
 
 def write_recording(path, image):

@@ -12,8 +12,8 @@ def read(blocks, height=10, width=10):
     counts = Counter()
     tables = [np.array(rows, np.int64).reshape(-1, 4) for rows in blocks]
     source = Source(height, width, lambda counts: (Block(*table.T) for table in tables))
-    found = [np.stack([column.astype(np.int64) for column in block]) for block in repaired("a.bin", source, counts)]
-    rows = np.concatenate(found, axis=1).T.tolist() if found else []
+    mended = [np.stack([column.astype(np.int64) for column in block]) for block in repaired("a.bin", source, counts)]
+    rows = np.concatenate(mended, axis=1).T.tolist() if mended else []
     return rows, {kind: count for kind, count in counts.items() if count}
 
 

@@ -108,9 +108,9 @@ def test_a_store_four_files_and_lines_that_come_give_the_same(store, channels, w
     expected = recovered(tmp_path / "a")
     assert expected["t_us"].tolist() == [20_000, 40_000, 60_000, 80_000, 100_000]
     for other in "bc":
-        found = recovered(tmp_path / other)
-        assert found["t_us"].tolist() == expected["t_us"].tolist()
-        np.testing.assert_allclose(found["dolp"].astype(float), expected["dolp"], atol=3)
+        frames = recovered(tmp_path / other)
+        assert frames["t_us"].tolist() == expected["t_us"].tolist()
+        np.testing.assert_allclose(frames["dolp"].astype(float), expected["dolp"], atol=3)
 
 
 def test_a_mosaic_is_one_file_with_channels_of_half_its_size(tmp_path, at_root):
@@ -284,10 +284,12 @@ def test_what_a_very_short_recording_is_told_works(channels, tmp_path, at_root, 
     files = [write_lines(tmp_path / f"{angle}.txt", e) for angle, e in zip(ANGLES, early, strict=True)]
     arguments = (*files, "--angles", *ANGLES, "--method", "highpass")
     assert run(*arguments, out=tmp_path / "out") == 1
-    told = re.search(r"record for longer\. Networks need .*--method highpass --window (\d+us)", capsys.readouterr().err)
-    assert told is not None
+    advice = re.search(
+        r"record for longer\. Networks need .*--method highpass --window (\d+us)", capsys.readouterr().err
+    )
+    assert advice is not None
     assert not (tmp_path / "out").exists()
-    assert run(*arguments, "--window", told[1], out=tmp_path / "out") == 0
+    assert run(*arguments, "--window", advice[1], out=tmp_path / "out") == 0
 
 
 def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):

@@ -121,12 +121,12 @@ def differing(ours: list, theirs: list) -> list[int]:
 def ties(frames: torch.Tensor, config: EmulatorConfig) -> set[int]:
     """Pixels that at some frame are within rounding (2e-6) of a whole number of thresholds from their reference."""
     log = np.log(frames[:, 0].numpy() / 255.0 + config.esim_log_eps).reshape(len(frames), -1)
-    reference, found = log[0], np.zeros(log.shape[1], bool)
+    reference, on_level = log[0], np.zeros(log.shape[1], bool)
     for values in log[1:]:
         crossed = (values - reference) / config.contrast_threshold_on
-        found |= (abs(crossed - np.rint(crossed)) < 1e-5) & (np.rint(crossed) != 0)
+        on_level |= (abs(crossed - np.rint(crossed)) < 1e-5) & (np.rint(crossed) != 0)
         reference = reference + config.contrast_threshold_on * np.trunc(crossed)
-    return set(np.flatnonzero(found))
+    return set(np.flatnonzero(on_level))
 
 
 @pytest.mark.parametrize("refractory_us", [0, 2000])

@@ -11,7 +11,7 @@ import math
 import pytest
 import torch
 
-from polarnet.methods.complementary_filter import ComplementaryFilterConfig, filter_at_rest, step_cf
+from polarnet.methods.complementary_filter import FilterConfig, at_rest, cf_intensity, image_of, integrate
 from polarnet.simulation.emulator import emulate
 from polarnet.simulation.presets import SENSORS
 from polarnet.stokes import aolp, dolp, intensities_from_stokes, stokes_from_intensities, stokes_from_polarization
@@ -21,7 +21,9 @@ REST = 0.25  # of full scale, behind each polarizer
 S0 = 0.8
 HEIGHT, WIDTH = 12, 16
 APPEARS_US = 100_000
-FILTER = ComplementaryFilterConfig(cutoff_hz=0.0, contrast_on=C, contrast_off=-C, intensity_range=[-1.0, 1 / REST - 1])
+FILTER = FilterConfig(
+    cutoff_hz=0.0, decay_per_event=0.0, contrast_on=C, contrast_off=-C, intensity_range=[-1.0, 1 / REST - 1]
+)
 """Shows exp(L) REST, which is the intensity itself: L is 0 at REST."""
 
 
@@ -47,9 +49,10 @@ def recovered(request, stokes) -> torch.Tensor:
     share = torch.linspace(0, 1, 31)[:, None, None, None]
     frames = 255 * (REST + share * (intensities - REST))
     events, _ = emulate(frames, torch.linspace(0, APPEARS_US, 31, dtype=torch.float64), config, key=1)
-    found, _ = step_cf(filter_at_rest(4, HEIGHT, WIDTH), events, APPEARS_US, FILTER)
-    assert ((found / intensities).log().abs() < 1.01 * C).all()
-    return stokes_from_intensities(found)
+    state = integrate(at_rest(4, HEIGHT, WIDTH), events, APPEARS_US, FILTER)
+    reconstruction = image_of(state, FILTER, cf_intensity)
+    assert ((reconstruction / intensities).log().abs() < 1.01 * C).all()
+    return stokes_from_intensities(reconstruction)
 
 
 def test_dolp_is_the_scenes_own_within_three_thresholds(stokes, recovered):

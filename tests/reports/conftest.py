@@ -19,6 +19,7 @@ from polarnet.simulation.truth import synthesize
 from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
+from polarnet.training.history import write_history
 
 SPLITS = {"park": "train", "lake": "val", "tree": "test", "leaf": "test"}
 HISTORY = [
@@ -91,13 +92,10 @@ def run_methods(events, frames, folder):
         answers["e2v"] = Prediction(dolp["e2v"], sequence.aolp)
         rows += score_sequence(sequence, answers, 1, None, torch.device("cpu"))
         k = 3
-        panels.append(
-            Panel(
-                sequence.name, sequence.scene, k, int(sequence.t_us[k + 1]), torch.randn(4, 24, 36), truth[k],
-                sequence.aolp[k], sequence.s0[k], {m: frames[k] for m, frames in dolp.items()},
-                {"e2v": sequence.aolp[k]},
-            )
-        )  # fmt: skip
+        maps = {"events": torch.randn(4, 24, 36), "truth_dolp": truth[k], "truth_aolp": sequence.aolp[k]}
+        maps |= {"truth_s0": sequence.s0[k], "aolp_e2v": sequence.aolp[k]}
+        maps |= {f"dolp_{method}": frames[k] for method, frames in dolp.items()}
+        panels.append(Panel(sequence.name, k, int(sequence.t_us[k + 1]), maps))
     about = {
         "lpips": {"backbone": None, "sha256": None, "source": None},
         "weights": {
@@ -128,6 +126,6 @@ def paths(tmp_path_factory):
     run_methods(EventStore.open(paths.events), frames, paths.benchmark)
     for folder, network in ((paths.train / "ours", "paper"), (paths.train / "e2v", "firenet")):
         folder.mkdir(parents=True)
-        (folder / "history.json").write_text(json.dumps(HISTORY))
+        write_history(folder, HISTORY)
         (folder / "best.json").write_text(json.dumps({"network": network}))
     return paths

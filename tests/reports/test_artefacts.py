@@ -5,7 +5,7 @@ import pytest
 import torch
 from matplotlib.colors import rgb_to_hsv
 
-from polarnet.reports.artefacts import event_rates, read_artefacts, read_history
+from polarnet.reports.artefacts import event_rates, read_artefacts, training_history
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 
@@ -17,12 +17,12 @@ def artefacts(paths):
 
 def test_everything_missing_is_named_with_the_stage_that_makes_it(paths, tmp_path):
     elsewhere = dataclasses.replace(paths, events=tmp_path / "events.zarr", train=tmp_path / "train")
-    with pytest.raises(FileNotFoundError, match=r"events\.zarr \(stage emulate\).*history\.json \(stage train\)"):
+    with pytest.raises(FileNotFoundError, match=r"events\.zarr \(stage emulate\).*history\.csv \(stage train\)"):
         read_artefacts(elsewhere, [])
 
 
 def test_a_panel_holds_the_truth_of_the_window_it_names(artefacts, paths):
-    panel = artefacts.panels[0]
+    panel = artefacts.results.panels[0]
     frames = FrameStore.open(paths.frames).frames(panel.sequence)
     assert int(frames.t_us[panel.window + 1]) == panel.t_us
     assert torch.equal(frames.dolp[panel.window + 1], panel.truth_dolp)
@@ -31,12 +31,12 @@ def test_a_panel_holds_the_truth_of_the_window_it_names(artefacts, paths):
 
 
 def test_photographs_come_before_dead_leaves(artefacts):
-    assert [panel.sequence for panel in artefacts.panels] == ["tree-00", "leaf-00"]
+    assert [panel.sequence for panel in artefacts.results.panels] == ["tree-00", "leaf-00"]
     assert artefacts.overview.name == "tree-00"
 
 
 def test_the_overview_shows_the_events_of_the_panels_window(artefacts, paths):
-    overview, panel = artefacts.overview, artefacts.panels[0]
+    overview, panel = artefacts.overview, artefacts.results.panels[0]
     assert overview.start_us + overview.duration_us == panel.t_us
     assert overview.duration_us == pytest.approx(1e6 / 30, abs=1)
     for stream in overview.streams:
@@ -59,10 +59,10 @@ def test_the_outlined_part_of_the_picture_is_what_the_window_shows(artefacts):
 
 
 def test_a_thumbnail_of_a_scene_looks_like_its_picture(artefacts, source_picture):
-    small = artefacts.thumbnails["train"][0]
-    assert small.name == "park"
+    ((name, small),) = artefacts.thumbnails["train"].items()
+    assert name == "park"
     expected = np.rint(255 * source_picture(0.0)).mean(axis=(0, 1))
-    assert small.picture.mean(axis=(0, 1)) == pytest.approx(expected, abs=2)
+    assert small.mean(axis=(0, 1)) == pytest.approx(expected, abs=2)
 
 
 def test_event_rates_count_every_event_of_a_split_once(paths):
@@ -76,13 +76,7 @@ def test_event_rates_count_every_event_of_a_split_once(paths):
 
 
 def test_the_best_epoch_is_the_one_with_the_lowest_validation_mse(paths):
-    history = read_history(paths.train / "ours" / "history.json")
+    history = training_history(paths.train / "ours")
     assert history.best_epoch == 1
-    assert [curve.label for curve in history.loss] == ["total", "mse"]
-    assert history.validation["psnr"].values == [10.0, 11.0, 12.0]
-
-
-def test_a_history_without_epochs_is_an_error(tmp_path):
-    (tmp_path / "history.json").write_text("[]")
-    with pytest.raises(ValueError, match="a row for each epoch"):
-        read_history(tmp_path / "history.json")
+    assert list(history.loss) == ["total", "mse"]
+    assert history.validation["psnr"] == [10.0, 11.0, 12.0]

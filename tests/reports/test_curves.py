@@ -5,7 +5,7 @@ import pytest
 
 from polarnet.reports.curves import event_budget_figure, sensitivity_figure
 from polarnet.reports.figures import DARK, LIGHT
-from polarnet.reports.png import png
+from polarnet.reports.maps import png
 from studies.figures import expected_errors_figure, loss_sweep_figure
 
 

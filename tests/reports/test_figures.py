@@ -3,11 +3,10 @@ import numpy as np
 import pytest
 import torch
 
+from polarnet.reports.artefacts import Panel
 from polarnet.reports.figures import (
     DARK,
     LIGHT,
-    Curve,
-    PanelScene,
     comparison_panel,
     dolp_bar,
     reliability_figure,
@@ -15,21 +14,22 @@ from polarnet.reports.figures import (
     score_line,
     training_curves,
 )
-from polarnet.reports.png import png
+from polarnet.reports.maps import png
 
 TRUTH = torch.linspace(0, 1, 24 * 36).view(24, 36)
-CURVE = Curve("mse", [0, 1, 2], [0.3, 0.2, 0.1])
+CURVE = [0.3, 0.2, 0.1]
 SCORES = {"psnr": {"cf": [7.0, 8.0, 9.0], "ours": [15.0, 16.0, 18.0]}, "mse": {"cf": [0.2, 0.1], "ours": [0.02, 0.03]}}
 
 
 def scene(*methods):
-    return PanelScene("tree", torch.zeros(4, 24, 36), TRUTH, dict.fromkeys(methods, TRUTH / 2))
+    dolp = dict.fromkeys(methods, TRUTH / 2)
+    return Panel("tree", 0, 33_333, torch.zeros(4, 24, 36), TRUTH, TRUTH, TRUTH, dolp, aolp={})
 
 
 @pytest.mark.parametrize(
     "draw",
     [
-        lambda: training_curves([CURVE], [CURVE], "validation", LIGHT),
+        lambda: training_curves({"mse": CURVE}, CURVE, "validation", LIGHT),
         lambda: score_distribution(SCORES, DARK),
         lambda: dolp_bar(LIGHT),
         lambda: reliability_figure({"ours": [(0.01, 0.02, 100), (0.1, 0.1, 300)]}, DARK),
@@ -64,7 +64,7 @@ def test_constants_have_no_place_in_a_comparison_panel(tmp_path):
 
 
 def test_a_panel_of_no_scene_is_an_error(tmp_path):
-    with pytest.raises(ValueError, match="at least one scene"):
+    with pytest.raises(ValueError, match="at least one panel"):
         comparison_panel([], tmp_path / "panel.png")
 
 
@@ -83,12 +83,12 @@ def test_figures_for_a_dark_page_have_light_text_and_no_background():
 
 def test_every_term_of_the_losses_has_a_readable_name_in_the_legend():
     terms = ["total", "mse", "mae", "ssim_loss", "lpips", "stokes", "uncertainty", "intensity_lpips", "aolp_ssim_loss"]
-    legend = training_curves([Curve(name, [0], [0.1]) for name in terms], [CURVE], "", LIGHT).axes[0].get_legend()
+    legend = training_curves({term: [0.1] for term in terms}, CURVE, "", LIGHT).axes[0].get_legend()
     labels = [text.get_text() for text in legend.get_texts()]
     assert labels[-2:] == ["intensity: LPIPS", "AoLP: 1 - SSIM"]
     assert not [label for label in labels if "_" in label]
 
 
 def test_epochs_count_from_one_on_the_axis():
-    line = training_curves([CURVE], [CURVE], "validation", LIGHT).axes[0].lines[0]
+    line = training_curves({"mse": CURVE}, CURVE, "validation", LIGHT).axes[0].lines[0]
     assert list(line.get_xdata()) == [1, 2, 3]

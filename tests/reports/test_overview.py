@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from polarnet.reports.artefacts import read_artefacts
+from polarnet.reports.maps import png
 from polarnet.reports.overview import MAX_EVENTS, _oblique, overview_figure
-from polarnet.reports.png import png
 
 
 @pytest.fixture(scope="module")

@@ -34,8 +34,8 @@ for name in modules:
         importlib.import_module(name)
 own = [str(paths[0]) for paths in REMOVED if ".pyc" not in str(paths[0])]
 changed = sorted({*before.items()} ^ {*os.environ.items()})
-found = {"modules": len(modules), "environment": changed, "removed": own, "before": was, "after": str(modes())}
-print(json.dumps(found))
+state = {"modules": len(modules), "environment": changed, "removed": own, "before": was, "after": str(modes())}
+print(json.dumps(state))
 """
 
 
@@ -43,9 +43,9 @@ def test_importing_every_module_changes_no_variable_no_file_and_no_mode():
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("OMP", "GOMP"))}
     command = [sys.executable, "-c", IMPORT_EVERYTHING]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    found = json.loads(done.stdout)
-    assert found["modules"] > 100
-    assert (found["environment"], found["removed"], found["after"]) == ([], [], found["before"])
+    state = json.loads(done.stdout)
+    assert state["modules"] > 100
+    assert (state["environment"], state["removed"], state["after"]) == ([], [], state["before"])
 
 
 def test_importing_polarnet_loads_no_package(project_root):

@@ -41,7 +41,7 @@ def test_a_missing_gpu_is_refused_with_the_way_out():
 
 
 def test_zero_workers_are_refused():
-    with pytest.raises(ValueError, match="workers: expected >= 1, got 0"):
+    with pytest.raises(ValueError, match="workers: expected > 0, got 0"):
         dataclasses.replace(RUNTIME, workers=0)
 
 

@@ -27,7 +27,7 @@ def source(simulated, emulated, monkeypatch) -> EmulatedEvents:
 
     emulate_sequence = fly.emulate_sequence
     monkeypatch.setattr(fly, "emulate_sequence", counted)
-    return EmulatedEvents(SceneStore.open(simulated.scenes), simulated.emulate, simulated.seed, kept=2)
+    return EmulatedEvents(SceneStore.open(simulated.scenes), simulated.emulate, simulated.seed, capacity=2)
 
 
 def same(some: list[Events], others: list[Events]) -> bool:
@@ -79,10 +79,10 @@ def test_another_seed_gives_other_events(simulated, source):
 
 
 def test_an_unknown_sequence_and_an_empty_memory_are_refused(simulated, source):
-    with pytest.raises(ValueError, match="expected the name of one of its sequences, got 'lake'"):
+    with pytest.raises(ValueError, match="there is no 'lake' among its 4 sequences"):
         source.read("lake")
     with pytest.raises(ValueError, match="at least one sequence to keep"):
-        EmulatedEvents(SceneStore.open(simulated.scenes), simulated.emulate, simulated.seed, kept=0)
+        EmulatedEvents(SceneStore.open(simulated.scenes), simulated.emulate, simulated.seed, capacity=0)
 
 
 def test_threads_change_nothing(simulated, source):

@@ -55,17 +55,17 @@ def test_a_drifting_sensor_sees_what_render_sees(scene):
     expected = 255 * intensities_from_stokes(render(scene, trajectory(), t_us * 1e-6, H, W))
     pose = trajectory().pose(t_us * 1e-6)
     for polarizer, light in enumerate(lights_of_drift(scene, pose, H, W)):
-        seen = np.empty((len(t_us), H * W), np.float32)
+        rendered = np.empty((len(t_us), H * W), np.float32)
         for k in range(len(t_us)):
-            intensity_rows(light, k, 0, W, seen[k])
-        assert seen.reshape(-1, H, W) / 255 == pytest.approx(expected[:, polarizer].numpy() / 255, abs=1e-5)
+            intensity_rows(light, k, 0, W, rendered[k])
+        assert rendered.reshape(-1, H, W) / 255 == pytest.approx(expected[:, polarizer].numpy() / 255, abs=1e-5)
 
 
 def test_a_turning_sensor_sees_what_render_sees_with_polarizers_that_turn_along(scene):
     t_us, turning = times_us(31), trajectory(roll=0.3, zoom=0.2)
     expected = 255 * intensities_from_stokes(render(scene, turning, t_us * 1e-6, H, W)).transpose(0, 1).numpy()
-    seen = render_intensities(scene, turning.pose(t_us * 1e-6), H, W, eight_bit=False)
-    assert seen == pytest.approx(np.maximum(expected, 0), abs=255e-5)
+    light = render_intensities(scene, turning.pose(t_us * 1e-6), H, W, eight_bit=False)
+    assert light == pytest.approx(np.maximum(expected, 0), abs=255e-5)
     rounded = render_intensities(scene, turning.pose(t_us * 1e-6), H, W, eight_bit=True)
     assert rounded.dtype == np.uint8
     assert abs(rounded - expected).max() <= 0.501

@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from polarnet.config.tree import load
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.simulation.motion import (
@@ -98,6 +99,21 @@ def test_every_picture_gets_its_sequences_and_all_of_them_its_split(stores):
         assert frames.of_split(split) == scenes.of_split(split)
 
 
+def test_each_training_sequence_over_a_variant_names_its_picture(images, stores, tmp_path, project_root):
+    variation = dataclasses.replace(load(project_root).variation, scenes_per_picture=1)
+    paths = tmp_path / "scenes.zarr", tmp_path / "frames.zarr"
+    synthesize(images, *paths, CONFIG, 1, map, SEQUENCES_PER_PART, variation)
+    scenes, frames = SceneStore.open(paths[0]), FrameStore.open(paths[1])
+    assert frames.variant_of == scenes.variant_of
+    assert sorted(scenes.variant_of.values()) == sorted(
+        stores[0].scene_of[name] for name in stores[0].of_split("train")
+    )
+    assert set(scenes.sequences) - set(scenes.variant_of) == set(stores[0].sequences)
+    variant, picture = next(iter(scenes.variant_of.items()))
+    assert scenes.scene_of[variant] == f"{picture}-variant01"
+    assert not torch.equal(scenes.read(variant).aolp, scenes.read(f"{picture}-00").aolp)
+
+
 def test_pictures_too_small_for_the_window_are_left_out(images, stores, tmp_path, caplog):
     smaller = tmp_path / "images"
     shutil.copytree(images, smaller)
@@ -106,7 +122,7 @@ def test_pictures_too_small_for_the_window_are_left_out(images, stores, tmp_path
     write_manifest(dataclasses.replace(manifest, pictures=(dataclasses.replace(first, height=24), *others)), smaller)
     scenes, frames = run(smaller, tmp_path)
     assert f"skipped {first.origin}: a scene of 24x120 (height x width) is too small" in caplog.text
-    assert set(scenes.picture_of.values()) == {entry.name for entry in others}
+    assert set(scenes.scene_of.values()) == {entry.name for entry in others}
     for sequence in scenes.sequences:
         assert frames.frames(sequence).dolp.equal(stores[1].frames(sequence).dolp)
     with pytest.raises(ValueError, match=r"none of 5 pictures can be used:\n  .*: a scene of 80x120 .* is too small"):
@@ -132,12 +148,12 @@ def test_the_stored_truth_is_what_the_stored_scene_and_trajectory_show(stores):
 
 def test_the_truth_follows_from_the_four_intensities_by_equations_1_to_3(stores):
     _, frames = stores
-    seen = frames.frames(frames.sequences[0])
-    stokes = stokes_from_intensities(seen.intensity)
+    truth = frames.frames(frames.sequences[0])
+    stokes = stokes_from_intensities(truth.intensity)
     bright = stokes[:, 0] > 0.2
-    torch.testing.assert_close(dolp(stokes)[bright], seen.dolp[bright], atol=3e-4, rtol=0)
-    polarized = bright & (seen.dolp > 0.3)
-    turn = (aolp(stokes) - seen.aolp + torch.pi / 2) % torch.pi - torch.pi / 2
+    torch.testing.assert_close(dolp(stokes)[bright], truth.dolp[bright], atol=3e-4, rtol=0)
+    polarized = bright & (truth.dolp > 0.3)
+    turn = (aolp(stokes) - truth.aolp + torch.pi / 2) % torch.pi - torch.pi / 2
     assert turn[polarized].abs().max() < 1e-3
 
 
@@ -198,12 +214,12 @@ def test_the_mask_of_a_turning_window_is_that_of_its_weights():
     light = torch.rand(3, 60, 80, generator=generator)
     valid = torch.rand(60, 80, generator=generator) < 0.98
     trajectory = random_trajectory(CONFIG, 60, 80, np.random.default_rng(4))
-    seen = valid_frames(valid, trajectory, [0, 50_000, 100_000], 24, 36)
+    rendered = valid_frames(valid, trajectory, [0, 50_000, 100_000], 24, 36)
     t_s = np.array([0, 0.05, 0.1])
     changed = torch.where(valid, light, light + 1)
     before, after = (render(PolarizationScene(planes), trajectory, t_s, 24, 36)[:, 0] for planes in (light, changed))
-    assert torch.equal(seen, before == after)
-    assert 0.8 < seen.float().mean() < 0.98
+    assert torch.equal(rendered, before == after)
+    assert 0.8 < rendered.float().mean() < 0.98
 
 
 def test_photographs_have_no_mask(stores):
@@ -221,9 +237,9 @@ def test_the_number_of_threads_changes_no_bit_of_a_frame(threads_as_they_were):
 
     def frames(threads):
         torch.set_num_threads(threads)
-        seen = frames_of(scene, trajectory, frame_times_us(config), 121, 179)
+        on_sensor = frames_of(scene, trajectory, frame_times_us(config), 121, 179)
         assert torch.get_num_threads() == threads
-        return seen
+        return on_sensor
 
     for one, several in zip(frames(1), frames(3), strict=True):
         assert torch.equal(one, several)

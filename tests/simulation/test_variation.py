@@ -54,14 +54,14 @@ def test_with_no_share_only_angles_turn_and_all_alike():
 
 def test_an_even_variant_has_one_polarization_everywhere():
     config = replace(CONFIG, uniform_share=1.0, uniform_weight=[1.0, 1.0])
-    seen = []
+    polarizations = []
     for seed in range(20):
         s0, dolp, aolp = varied(scene(), config, np.random.default_rng(seed))
         assert s0.std() > 0.05
         assert dolp.std() < 1e-5
         assert torch.exp(2j * (aolp - aolp[0, 0])).real.min() > 0.9999
-        seen.append((dolp.mean().item(), aolp[0, 0].item()))
-    degrees, angles = zip(*seen, strict=True)
+        polarizations.append((dolp.mean().item(), aolp[0, 0].item()))
+    degrees, angles = zip(*polarizations, strict=True)
     assert min(degrees) < 0.3
     assert max(degrees) > 0.7
     assert max(angles) - min(angles) > 1

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import polarnet.storage.events as store_module
 import polarnet.storage.parts as parts_module
 from polarnet.events.stream import Events, slice_time
-from polarnet.storage.events import LONGEST_US, EventStore
+from polarnet.storage.events import MAX_DURATION_US, EventStore
 
 HEIGHT, WIDTH = 12, 18
 DURATIONS_US = {"coffee": 1_000_000, "leaves": 250_500, "still": 40_000}
@@ -204,7 +204,7 @@ def test_events_that_break_the_format_are_refused_before_anything_is_written(mak
         write(make_events([(0, 0, 0, 1), (1001, 0, 0, 1)], HEIGHT, WIDTH))
     with pytest.raises(ValueError, match="polarizer 45: expected a sensor of 12x18 px, got 12x19"):
         write(Events.empty(HEIGHT, 19))
-    with pytest.raises(ValueError, match=f"expected a duration of 1 to {LONGEST_US} us, got 0"):
+    with pytest.raises(ValueError, match=f"expected a duration of 1 to {MAX_DURATION_US} us, got 0"):
         write(good, 0)
     with pytest.raises(ValueError, match="each of 4 polarizers, got 1"):
         store.write("a", [good], 1000)

@@ -34,8 +34,8 @@ class Numbers(Store):
     FORMAT = "test.numbers"
     VERSION = 3
 
-    @classmethod
-    def columns_of(cls, header):
+    @functools.cached_property
+    def columns(self):
         return {"group/value": Column("long", "uint16", 1024), "pair": Column("short", "int64", 4, (2,))}
 
 
@@ -381,7 +381,7 @@ def test_attributes_that_json_cannot_hold_are_refused(tmp_path):
 def test_a_part_holds_at_least_one_sequence(tmp_path):
     with pytest.raises(ValueError, match="at least one sequence per part, got 0"):
         Numbers.create_parts(tmp_path / "store.zarr", NAMES, {}, 0)
-    with pytest.raises(ValueError, match="sequences_per_part: expected >= 1, got 0"):
+    with pytest.raises(ValueError, match="sequences_per_part: expected > 0, got 0"):
         StorageConfig(sequences_per_part=0)
 
 

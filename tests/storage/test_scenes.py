@@ -13,7 +13,7 @@ NAMES = ["centre_x", "centre_y", "speed"]
 
 def create(path, **changes) -> SceneStore:
     arguments = {
-        "picture_of": {"coffee-0": "coffee", "coffee-1": "coffee", "leaves-0": "leaves"},
+        "scene_of": {"coffee-0": "coffee", "coffee-1": "coffee", "leaves-0": "leaves"},
         "splits": {"coffee-0": "train", "coffee-1": "train", "leaves-0": "test"},
         "largest_picture": (20, 30),
         "sensor": (8, 12),
@@ -39,14 +39,14 @@ def finished(tmp_path_factory):
     store = create(path)
     for i, name in enumerate(store.sequences):
         trajectory = torch.tensor([math.pi, i, -1e-300], dtype=torch.float64)
-        store.write(name, SCENES[store.picture_of[name]], trajectory, 1_000_000 + i)
+        store.write(name, SCENES[store.scene_of[name]], trajectory, 1_000_000 + i)
     store.finish()
     return path
 
 
 def test_a_sequence_comes_back_with_its_picture_and_its_exact_trajectory(finished):
     read, (s0, dolp, aolp, _) = SceneStore.open(finished).read("leaves-0"), SCENES["leaves"]
-    assert (read.name, read.picture, read.split, read.duration_us) == ("leaves-0", "leaves", "test", 1_000_002)
+    assert (read.name, read.scene, read.duration_us) == ("leaves-0", "leaves", 1_000_002)
     assert read.trajectory.tolist() == [math.pi, 2.0, -1e-300]
     torch.testing.assert_close(read.s0, s0, atol=0.51 / 65535, rtol=0)
     torch.testing.assert_close(read.dolp, dolp, atol=0.51 / 65535, rtol=0)
@@ -67,7 +67,7 @@ def test_sequences_of_one_picture_share_its_pixels_within_a_part(finished, tmp_p
     assert store.record("coffee-0")["pixels"] == store.record("coffee-1")["pixels"] == [0, 600]
     alone = create(tmp_path / "scenes.zarr", sequences_per_part=1)
     for name in alone.sequences:
-        alone.write(name, SCENES[alone.picture_of[name]], STILL, 1)
+        alone.write(name, SCENES[alone.scene_of[name]], STILL, 1)
     alone.finish()
     assert torch.equal(SceneStore.open(tmp_path / "scenes.zarr").read("coffee-1").s0, second.s0)
 
@@ -87,7 +87,6 @@ def test_a_part_begun_again_holds_its_pictures(finished, tmp_path):
 def test_the_store_says_what_it_holds(finished):
     store = SceneStore.open(finished)
     assert store.sequences == ["coffee-0", "coffee-1", "leaves-0"]
-    assert store.pictures == ["coffee", "leaves"]
     assert (store.sensor_height, store.sensor_width) == (8, 12)
     assert store.trajectory_names == NAMES
     assert store.of_split("train") == ["coffee-0", "coffee-1"]
@@ -104,10 +103,18 @@ def test_a_store_lacks_the_sequences_of_a_part_until_all_are_written(tmp_path):
         again.finish()
 
 
-def test_a_picture_never_is_in_two_splits(tmp_path):
+def test_a_picture_and_its_variants_are_never_in_two_splits(tmp_path):
     splits = {"coffee-0": "train", "coffee-1": "test", "leaves-0": "test"}
     with pytest.raises(ValueError, match="picture coffee would be in the splits train and test"):
         create(tmp_path / "scenes.zarr", splits=splits)
+    with pytest.raises(ValueError, match="picture coffee would be in the splits train and test"):
+        create(tmp_path / "scenes.zarr", variant_of={"leaves-0": "coffee"})
+
+
+def test_the_store_says_which_sequences_show_a_variant_of_which_picture(finished, tmp_path):
+    variants = {"coffee-1": "coffee"}
+    store = create(tmp_path / "scenes.zarr", variant_of=variants)
+    assert (store.variant_of, SceneStore.open(finished).variant_of) == (variants, {})
 
 
 def test_what_cannot_be_a_scene_is_refused(tmp_path):
@@ -138,8 +145,8 @@ def test_a_mask_comes_back_with_its_picture_and_one_that_has_none_is_valid_every
     store = create(tmp_path / "scenes.zarr", masked=True)
     valid = torch.rand(10, 14, generator=torch.Generator().manual_seed(1)) < 0.5
     masks = {"coffee": None, "leaves": valid}
-    for name, picture in store.picture_of.items():
-        store.write(name, SCENES[picture]._replace(valid=masks[picture]), STILL, 1)
+    for name, shown in store.scene_of.items():
+        store.write(name, SCENES[shown]._replace(valid=masks[shown]), STILL, 1)
     store.finish()
     read = SceneStore.open(tmp_path / "scenes.zarr")
     assert torch.equal(read.read("leaves-0").valid, valid)

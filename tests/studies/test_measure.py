@@ -56,9 +56,9 @@ def test_a_section_of_the_results_is_replaced_and_the_others_stay(tmp_path):
 def test_headlines_stand_above_the_sections_and_join_what_is_there(tmp_path):
     write_section(tmp_path, "network", "speed", {"a": 1}, {}, {"speedup": 2.0, "ours": {"per_s": 10}})
     path = write_section(tmp_path, "network", "study", {"b": 1}, {}, {"ours": {"mse": 0.1}})
-    found = json.loads(path.read_text())
-    assert found["speedup"] == 2.0
-    assert found["ours"] == {"mse": 0.1, "per_s": 10}
+    results = json.loads(path.read_text())
+    assert results["speedup"] == 2.0
+    assert results["ours"] == {"mse": 0.1, "per_s": 10}
 
 
 def test_a_tree_with_changes_is_not_measured(tmp_path):
@@ -100,11 +100,11 @@ def swept(root, write_trial, **mse):
 
 def test_an_ablation_has_the_scores_of_each_job_and_a_description_in_conf(tmp_path, write_trial):
     sweep = swept(tmp_path, write_trial, nothing=0.03, sums=0.05)
-    found = json.loads(measure_ablation(tmp_path, sweep).read_text())
-    assert found["ablation"]["overrides"] == ["train.epochs=1"]
+    results = json.loads(measure_ablation(tmp_path, sweep).read_text())
+    assert results["ablation"]["overrides"] == ["train.epochs=1"]
     assert ablation_about(tmp_path, "sums") == "Without sums."
-    assert {name: row["mse"] for name, row in found["ablation"]["rows"].items()} == {"nothing": 0.03, "sums": 0.05}
-    assert found["records"]["ablation"]["commit"] == git(tmp_path, "rev-parse", "HEAD")
+    assert {name: row["mse"] for name, row in results["ablation"]["rows"].items()} == {"nothing": 0.03, "sums": 0.05}
+    assert results["records"]["ablation"]["commit"] == git(tmp_path, "rev-parse", "HEAD")
 
 
 def test_an_ablation_needs_the_whole_to_compare_with(tmp_path, write_trial):
@@ -129,18 +129,18 @@ def loss_sweep(root, write_trial):
 
 def test_a_loss_sweep_becomes_means_over_seeds_a_table_and_a_heat_map(tmp_path, write_trial):
     path, picture = measure_sweep(tmp_path, loss_sweep(tmp_path, write_trial))
-    found = json.loads(path.read_text())
-    assert [point["weights"] for point in found["points"]] == [
+    results = json.loads(path.read_text())
+    assert [point["weights"] for point in results["points"]] == [
         {"mse": 10.0, "ssim": 0.0, "lpips": 0.0},  # the smaller validation MSE, though the larger test MSE
         {"mse": 10.0, "ssim": 1.0, "lpips": 0.0},
     ]
-    assert found["points"][0]["seeds"] == [1, 2]
-    assert found["points"][0]["test"]["mse"] == {"mean": pytest.approx(0.04), "std": pytest.approx(0.01 * 2**0.5)}
-    assert found["points"][1]["test"]["mse"] == {"mean": 0.02, "std": None}
-    assert found["loss_weights"] == {"overrides": ["network=paper"], "lpips_backbone": "alex"}
-    assert found["records"]["loss_weights"]["commit"] == git(tmp_path, "rev-parse", "HEAD")
+    assert results["points"][0]["seeds"] == [1, 2]
+    assert results["points"][0]["test"]["mse"] == {"mean": pytest.approx(0.04), "std": pytest.approx(0.01 * 2**0.5)}
+    assert results["points"][1]["test"]["mse"] == {"mean": 0.02, "std": None}
+    assert results["loss_weights"] == {"overrides": ["network=paper"], "lpips_backbone": "alex"}
+    assert results["records"]["loss_weights"]["commit"] == git(tmp_path, "rev-parse", "HEAD")
     assert picture.read_bytes().startswith(b"\x89PNG")
-    lines = BLOCKS["sweep"].text(found).splitlines()
+    lines = BLOCKS["sweep"].text(results).splitlines()
     assert lines[2].startswith("| 10 | 0 | 0 | 2 | 0.0800 ± 0.0283 | 14.00 ± 0.00 | 0.0400 ± 0.0141 |")
     assert lines[3].startswith("| 10 | 1 | 0 | 1 | 0.0900 | 12.00 | 0.0200 | 17.00 | 0.6000 | 0.3000 | - |")
 

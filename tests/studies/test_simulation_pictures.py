@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from polarnet.reports.png import png
+from polarnet.reports.maps import png
 from studies.simulation_pictures import FIGURES, QUIET, few_colours, light_of_one_pixel, pixel_events
 from studies.simulation_pictures import parameters_figure as draw
 

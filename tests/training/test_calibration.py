@@ -10,7 +10,7 @@ from polarnet.config.tree import load
 from polarnet.events.representations import event_tensor
 from polarnet.networks.checkpoint import load_network
 from polarnet.storage.events import EventStore
-from polarnet.storage.scenes import without_variants
+from polarnet.storage.frames import FrameStore
 from polarnet.training.calibration import RIDGES, Scene, fitted
 from polarnet.training.dolp import dolp_task
 from polarnet.training.loop import TrainConfig, calibrate
@@ -29,8 +29,10 @@ def task_of(project_root):
 
 
 def scenes_of(in_all: float, in_each: float) -> list[Scene]:
-    """Of scenes, features and squared errors. These depend on one feature by `in_all`, on another by `in_each`, but
-    in two fifths of the scenes the other way round; a third says nothing and a fourth is always the same."""
+    """Scenes whose errors depend on one feature by `in_all` and on another by `in_each`.
+
+    In two fifths of the scenes, the second dependence is reversed. A third feature is noise, a fourth constant.
+    """
     generator, scenes = torch.Generator().manual_seed(0), []
     for k in range(20):
         features = torch.randn(5000, 4, generator=generator, dtype=torch.float64) * torch.tensor([0.01, 5, 1, 0])
@@ -41,26 +43,26 @@ def scenes_of(in_all: float, in_each: float) -> list[Scene]:
 
 
 def test_what_tells_how_large_errors_are_is_found_however_small_it_is():
-    found = fitted(scenes_of(in_all=1.0, in_each=0.0))
-    assert found.ridge == min(RIDGES)
-    assert found.weight[0].item() == pytest.approx(100, rel=0.05)
-    assert found.weight[1:].abs().max() < 2e-2
-    assert found.bias == pytest.approx(-4, abs=0.05)
+    fit = fitted(scenes_of(in_all=1.0, in_each=0.0))
+    assert fit.ridge == min(RIDGES)
+    assert fit.weight[0].item() == pytest.approx(100, rel=0.05)
+    assert fit.weight[1:].abs().max() < 2e-2
+    assert fit.bias == pytest.approx(-4, abs=0.05)
 
 
 def test_what_tells_it_of_each_scene_alone_is_not_believed():
     scenes = scenes_of(in_all=0.0, in_each=0.5)
-    found = fitted(scenes)
-    assert found.ridge == max(RIDGES)
+    fit = fitted(scenes)
+    assert fit.ridge == max(RIDGES)
     for scene in scenes:
-        expected = (scene.features @ found.weight + found.bias).exp()
+        expected = (scene.features @ fit.weight + fit.bias).exp()
         assert expected.std() < 0.01 * expected.mean()
 
 
 def test_one_scene_says_how_large_errors_are_and_not_where():
     scene = scenes_of(in_all=1.0, in_each=0.0)[0]
-    found = fitted([scene])
-    expected = (scene.features @ found.weight + found.bias).exp()
+    fit = fitted([scene])
+    expected = (scene.features @ fit.weight + fit.bias).exp()
     assert expected.mean().item() == pytest.approx(scene.squared.mean().item(), rel=0.01)
     assert expected.std() < 0.02 * expected.mean()
 
@@ -103,17 +105,31 @@ def test_of_what_it_has_seen_nothing_of_it_expects_the_errors_of_a_guess(stores,
     still, errors = [], []
     for sequence in split.train:
         with torch.no_grad():
-            found, _ = task.network(torch.zeros_like(sequence.inputs[:1]))
-        still.append(found.log_variance.exp().mean().item())
-        errors.append((found.dolp.clamp(0, 1) - sequence.dolp[:1]).square().mean().item())
+            prediction, _ = task.network(torch.zeros_like(sequence.inputs[:1]))
+        still.append(prediction.log_variance.exp().mean().item())
+        errors.append((prediction.dolp.clamp(0, 1) - sequence.dolp[:1]).square().mean().item())
     assert len({round(expected, 6) for expected in still}) == 1
     assert still[0] == pytest.approx(sum(errors) / len(errors), rel=0.25)
 
 
-def test_it_rests_on_pictures_as_they_are_without_their_variants():
-    pictures = ["a-variant1-0123abcd-00", "b-0123abcd-00", "b-0123abcd-01"]
-    variants = ["a-variant1-0123abcd-variant01-00", "b-0123abcd-variant12-01"]
-    assert without_variants([*pictures, *variants]) == pictures
+def test_it_rests_on_pictures_as_they_are_without_their_variants(stores, tmp_path, task_of):
+    source = FrameStore.open(stores[1])
+    frames = FrameStore.create(
+        tmp_path / "frames.zarr",
+        source.sequences,
+        source.splits,
+        len(source.t_us("a")),
+        source.height,
+        source.width,
+        {},
+        variant_of={"b": "a"},
+    )
+    for name in source.sequences:
+        frames.write(name, *source.frames(name))
+    frames.finish()
+    content = bytes_of(run(task_of(), (stores[0], tmp_path / "frames.zarr"), tmp_path / "run", TRAIN))
+    assert source.of_split("train") == ["a", "b", "c"]
+    assert json.loads(content["best.json"])["expected_errors"]["sequences"] == 2
 
 
 def test_a_training_ends_with_it_even_if_killed_in_its_midst(stores, tmp_path, task_of):

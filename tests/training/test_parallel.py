@@ -1,7 +1,6 @@
 """Two processes on this processor, at the size of test_loop."""
 
 import dataclasses
-import json
 import os
 import socket
 from pathlib import Path
@@ -12,6 +11,7 @@ import torch.multiprocessing
 from test_loop import CPU, TRAIN, run, small_task
 
 from polarnet.networks.checkpoint import load_checkpoint
+from polarnet.training.history import read_history
 from polarnet.training.parallel import add_up, join, launched, place
 from polarnet.training.sequences import Batch, parts_of
 
@@ -33,7 +33,7 @@ def test_two_processes_train_like_one_with_the_same_batches(stores, tmp_path):
     torch.multiprocessing.spawn(train_as, (port, stores, tmp_path / "two"), nprocs=2)
     alone = run(small_task(), stores, tmp_path / "one", CONFIG)
     assert not list((tmp_path / "two" / "resume").iterdir())
-    curves = [json.loads((out / "history.json").read_text()) for out in (alone, tmp_path / "two" / "out")]
+    curves = [read_history(out) for out in (alone, tmp_path / "two" / "out")]
     for one, two in zip(*curves, strict=True):
         for split in ("train", "val"):
             assert two[split] == pytest.approx(one[split], rel=1e-4)

@@ -14,11 +14,11 @@ from polarnet.training.sequences import (
     View,
     ViewConfig,
     Visits,
+    apply_view,
     batches_of,
     loaded_if_it_fits,
     packed,
     random_view,
-    seen,
     shuffled,
     stack,
 )
@@ -49,7 +49,7 @@ WHOLE = View(start=0, windows=3, top=0, left=0, height=6, width=8, mirror_x=Fals
 
 def test_the_plain_view_changes_nothing():
     before = sequence()
-    after = seen(before, WHOLE)
+    after = apply_view(before, WHOLE)
     for a, b in zip(before[1:], after[1:], strict=True):
         torch.testing.assert_close(a, b)
 
@@ -58,7 +58,7 @@ def test_the_plain_view_changes_nothing():
 @pytest.mark.parametrize("direction", [1, -1])
 def test_renumbered_polarizers_still_obey_the_stokes_equations(turn, direction):
     before = sequence()
-    after = seen(before, WHOLE._replace(turn=turn, direction=direction))
+    after = apply_view(before, WHOLE._replace(turn=turn, direction=direction))
     vector = stokes.stokes_from_intensities(after.intensity)
     torch.testing.assert_close(stokes.dolp(vector), before.dolp, atol=1e-4, rtol=1e-4)
     difference = torch.remainder(stokes.aolp(vector) - after.aolp + math.pi / 2, math.pi) - math.pi / 2
@@ -68,7 +68,7 @@ def test_renumbered_polarizers_still_obey_the_stokes_equations(turn, direction):
 
 def test_a_mirrored_view_is_mirrored_everywhere():
     before = sequence()
-    after = seen(before, WHOLE._replace(mirror_x=True))
+    after = apply_view(before, WHOLE._replace(mirror_x=True))
     assert torch.equal(after.inputs, before.inputs.flip(-1))
     assert torch.equal(after.dolp, before.dolp.flip(-1))
     assert torch.equal(after.intensity, before.intensity.flip(-1))
@@ -76,7 +76,7 @@ def test_a_mirrored_view_is_mirrored_everywhere():
 
 def test_a_crop_is_the_same_part_of_inputs_and_truth():
     before = sequence()
-    after = seen(before, WHOLE._replace(top=2, left=3, height=4, width=5))
+    after = apply_view(before, WHOLE._replace(top=2, left=3, height=4, width=5))
     assert torch.equal(after.inputs, before.inputs[..., 2:6, 3:8])
     assert torch.equal(after.dolp, before.dolp[..., 2:6, 3:8])
 
@@ -99,7 +99,7 @@ def test_without_windows_crop_and_symmetries_the_view_is_the_plain_one():
 
 def test_some_windows_are_the_same_ones_of_inputs_and_truth():
     before = sequence()
-    after = seen(before, WHOLE._replace(start=1, windows=2))
+    after = apply_view(before, WHOLE._replace(start=1, windows=2))
     assert torch.equal(after.inputs, before.inputs[1:])
     assert torch.equal(after.aolp, before.aolp[1:])
 
@@ -107,26 +107,26 @@ def test_some_windows_are_the_same_ones_of_inputs_and_truth():
 def test_an_epoch_visits_each_sequence_as_often_as_it_should_under_other_views():
     config = ViewConfig(visits=3, windows=1, crop=None, symmetries=True)
     visits = Visits([sequence("a"), sequence("bb")], config, seed=1, epoch=0)
-    seen_so_far = [visits[index] for index in range(len(visits))]
-    assert sorted(one.name for one in seen_so_far) == ["a", "a", "a", "bb", "bb", "bb"]
-    firsts = [one.inputs for one in seen_so_far if one.name == "a"]
+    views = [visits[index] for index in range(len(visits))]
+    assert sorted(one.name for one in views) == ["a", "a", "a", "bb", "bb", "bb"]
+    firsts = [one.inputs for one in views if one.name == "a"]
     assert not torch.equal(firsts[0], firsts[1])
     assert torch.equal(visits[0].inputs, visits[0].inputs)
 
 
 def test_a_dataset_in_memory_is_read_once(stores):
     dataset = WindowDataset(EventStore.open(stores[0]), FrameStore.open(stores[1]), ["a", "b"], event_tensor)
-    kept = loaded_if_it_fits(dataset, intensity=True)
-    assert kept[1] is kept[1]
-    assert torch.equal(kept[1].inputs, dataset[1].inputs)
+    loaded = loaded_if_it_fits(dataset, intensity=True)
+    assert loaded[1] is loaded[1]
+    assert torch.equal(loaded[1].inputs, dataset[1].inputs)
 
 
 def test_counts_of_events_are_kept_as_bytes_and_seen_as_they_were():
     counts = sequence()._replace(inputs=torch.randint(-128, 128, (3, 8, 6, 8)).float())
-    kept = packed(counts, intensity=True)
-    assert kept.inputs.dtype == torch.int8
-    assert torch.equal(seen(kept, WHOLE).inputs, counts.inputs)
-    assert seen(kept, WHOLE).inputs.dtype == torch.float32
+    compact = packed(counts, intensity=True)
+    assert compact.inputs.dtype == torch.int8
+    assert torch.equal(apply_view(compact, WHOLE).inputs, counts.inputs)
+    assert apply_view(compact, WHOLE).inputs.dtype == torch.float32
 
 
 @pytest.mark.parametrize("value", [0.5, 128.0, -129.0, 1e9])
@@ -136,8 +136,8 @@ def test_what_bytes_do_not_hold_is_kept_as_it_is(value):
 
 
 def test_a_sequence_without_its_intensity_is_seen_as_before_otherwise():
-    whole, kept = sequence(), packed(sequence(), intensity=False)
-    batch = stack([seen(kept, WHOLE)] * 2)
+    whole, compact = sequence(), packed(sequence(), intensity=False)
+    batch = stack([apply_view(compact, WHOLE)] * 2)
     assert batch.intensity.numel() == 0
     assert torch.equal(batch.dolp[:, 1], whole.dolp)
     assert torch.equal(batch.inputs[:, 1], whole.inputs)
@@ -176,7 +176,7 @@ def test_batches_follow_the_order_and_the_last_may_be_small():
 
 def test_a_mask_is_cropped_mirrored_and_stacked_with_its_truth():
     masked = [s._replace(valid=s.dolp > 0.3) for s in (sequence("a"), sequence("bb"))]
-    after = seen(masked[0], WHOLE._replace(mirror_x=True, mirror_y=True, turn=3, direction=-1, top=1, height=4))
+    after = apply_view(masked[0], WHOLE._replace(mirror_x=True, mirror_y=True, turn=3, direction=-1, top=1, height=4))
     assert torch.equal(after.valid, after.dolp > 0.3)
     batch = stack(masked)
     assert torch.equal(batch.valid, batch.dolp > 0.3)

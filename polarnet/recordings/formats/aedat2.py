@@ -12,12 +12,21 @@ from pathlib import Path
 
 import numpy as np
 
-from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, running_on, sensor_size
+from polarnet.recordings.source import (
+    BLOCK_EVENTS,
+    Block,
+    Choices,
+    RecordingError,
+    Source,
+    running_on,
+    sensor_size,
+    word_blocks,
+)
 
 MAGIC = b"#!AER-DAT2"
 LAST_LINE = b"#End Of ASCII Header"  # only in newer files; an event can begin with # too
 MAX_HEADER_BYTES = 2**20  # jAER writes its settings into the header
-EVENT_BYTES = 8
+ENTRY = np.dtype([("address", ">u4"), ("t", ">u4")])
 NO_EVENT = 1 << 31 | 1 << 10
 SENSORS = {b"346": (260, 346), b"240": (180, 240), b"128": None}
 """Height and width by the number in the camera's class name in the header; the DVS128 uses another address layout."""
@@ -46,15 +55,11 @@ def open_aedat2(path: Path, choices: Choices) -> Source:
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
         turns, before = 0, 0
-        with path.open("rb") as file:
-            file.seek(start)
-            while data := file.read(BLOCK_EVENTS * EVENT_BYTES):
-                counts["cut_tail"] += len(data) % EVENT_BYTES != 0
-                words = np.frombuffer(data[: len(data) // EVENT_BYTES * EVENT_BYTES], ">u4").reshape(-1, 2)
-                words = words[words[:, 0] & NO_EVENT == 0]
-                if len(words):
-                    t, turns, before = running_on(words[:, 1], turns, before)
-                    address = words[:, 0].astype(np.int64)
-                    yield Block(t, address >> 12 & 0x3FF, height - 1 - (address >> 22 & 0x1FF), address >> 11 & 1)
+        for entries in word_blocks(path, start, ENTRY, BLOCK_EVENTS, counts):
+            events = entries[entries["address"] & NO_EVENT == 0]
+            if len(events):
+                t, turns, before = running_on(events["t"], turns, before)
+                address = events["address"].astype(np.int64)
+                yield Block(t, address >> 12 & 0x3FF, height - 1 - (address >> 22 & 0x1FF), address >> 11 & 1)
 
     return Source(height, width, blocks)

@@ -4,8 +4,8 @@ A header gives the data type (bit 0 loop mode, bit 1 IMU), the modes of the sens
 and the number of packages. Each package is a length and that many bytes. With an IMU, the computer's time in
 milliseconds and the IMU's samples follow. The last byte of a package is 0 for a full picture.
 
-The sensor sends 14-bit words, four in 7 bytes: the high 8 bits of each, then the low 6 of all. An item is one word in
-event format 2, and two words in format 1. Its two lowest bits give its kind. Time stamps wrap around.
+The sensor sends 14-bit words, four in 7 bytes: the high 8 bits of each, then the low 6 of all. An item is two words,
+and its two lowest bits give its kind. Time stamps of 16 bits wrap around.
 """
 
 import struct
@@ -16,10 +16,15 @@ from typing import BinaryIO, NamedTuple, no_type_check
 
 import numba
 import numpy as np
-from jaxtyping import UInt8, UInt16
+from jaxtyping import Int64, UInt8, UInt16
 
-from polarnet.recordings.formats.celex5 import CLOCK_MHZ, HEIGHT, WHITE, WIDTH, microseconds, polarity_to_assume
 from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size
+
+HEIGHT, WIDTH = 800, 1280
+WHITE = 4095  # maximum of the 12-bit converter
+
+CLOCK_MHZ = 100.0  # the vendor's default
+TICK_CYCLES = 1024  # clock cycles per step of the time stamp
 
 HEADER = struct.Struct("<8B I")
 LENGTH = struct.Struct("<I")
@@ -30,13 +35,11 @@ LOOP, IMU = 1, 2  # bits of the data type
 OFF_PIXEL, IN_PIXEL, INTENSITY, FULL_PICTURE = range(4)
 MODES = ("Event Off-Pixel Timestamp", "Event In-Pixel Timestamp", "Event Intensity", "Full Picture",
          "Optical Flow", "Optical Flow FPN", "Multi-Read Optical Flow")  # fmt: skip
-STAMP_BITS = {1: 16, 2: 12}
-"""Bits of a time stamp, by event format."""
 
 PICTURE_BYTES = HEIGHT * WIDTH * 3 // 2 + 1
 MAX_PACKAGE = 2_048_000  # bytes; the limit of the vendor's library
 
-ROW, COLUMN, TIME = 2, 1, 3  # kinds of items
+ROW, COLUMN = 2, 1  # kinds of items
 
 
 class Header(NamedTuple):
@@ -73,39 +76,52 @@ def matches(path: Path, head: bytes) -> bool:
 
 
 def open_celex5_bin(path: Path, choices: Choices) -> Source:
-    """Open the events of a BIN file of event format 1 or 2; format 2 and some modes have no polarity and are refused.
+    """Open the events of a BIN file of event format 1; format 2 and some modes have no polarity and are refused.
 
     A pixel's polarity is the sign of its intensity change. Its first event is compared with 0 and therefore brighter.
     Time 0 is the first time stamp. Full pictures between the events are left out; `celex5_pictures` reads them.
     """
     header = _header(path)
-    if header.event_format not in STAMP_BITS:
+    if header.event_format == 0:
         raise RecordingError(
-            f"{path.name}: the events are of format {header.event_format}, whose intensities are wrong "
-            f"by the vendor's own word; record in event format 1"
+            f"{path.name}: the events are of format 0, whose intensities are wrong according to the vendor; record in "
+            f"event format 1"
         )
     if header.data_type & LOOP:
         raise RecordingError(
             f"{path.name}: recorded in loop mode, where the time stamps of events do not run on during pictures; "
             f"record events and pictures each in a mode of their own"
         )
-    mode = MODES[header.loop_a] if header.loop_a < len(MODES) else MODES[INTENSITY]
-    polarity = 0
     if header.event_format == 2 or header.loop_a in (OFF_PIXEL, IN_PIXEL):
-        polarity = polarity_to_assume(path, mode if header.event_format == 1 else f"{mode}, event format 2", choices)
+        mode = MODES[header.loop_a] if header.loop_a < len(MODES) else MODES[INTENSITY]
+        raise no_polarity(path, mode if header.event_format == 1 else f"{mode}, event format 2")
     height, width = sensor_size(path, choices, HEIGHT, WIDTH)
     clock_mhz = choices.clock_mhz or CLOCK_MHZ
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        decoder = _Decoder(header.event_format, polarity)
+        state = np.array([-1, -1, 0])  # row, last time stamp, ticks since the first
+        last_adc = np.zeros((HEIGHT, WIDTH), np.uint16)
         for _, package in _packages(path, counts):
             if package[-1] == 0:
-                decoder.forget_row()
+                state[0] = -1  # the events after a picture begin with their row
             else:
-                t, x, y, p = decoder.events(package[:-1], counts)
+                t, x, y, p = _decoded(package[:-1], state, last_adc, counts)
                 yield Block(microseconds(t, clock_mhz), x, y, p)
 
     return Source(height, width, blocks)
+
+
+def microseconds(ticks: np.ndarray, clock_mhz: float | int) -> np.ndarray:
+    """Convert the sensor's time stamps to microseconds, rounded down as in the vendor's library."""
+    return np.asarray(ticks, np.int64) * (1000 * TICK_CYCLES) // round(1000 * clock_mhz)
+
+
+def no_polarity(path: Path, mode: str) -> RecordingError:
+    """The error for a file of a mode without polarity."""
+    return RecordingError(
+        f"{path.name}: events of a CeleX-5 in its mode {mode} have no polarity, so nothing can be recovered from them; "
+        f"record in Event Intensity mode"
+    )
 
 
 def celex5_pictures(path: Path) -> Iterator[Picture]:
@@ -191,39 +207,24 @@ def _skip_imu(path: Path, file: BinaryIO) -> int | None:
     return t_ms
 
 
-class _Decoder:
-    """Decoder state kept between packages: row, time, and the intensity of each pixel."""
-
-    def __init__(self, event_format: int, polarity: int):
-        self._format = event_format
-        self._polarity = polarity
-        self._state = np.array([-1, -1, 0])  # row, last time stamp, ticks since the first
-        self._last_adc = np.zeros((HEIGHT, WIDTH), np.uint16)
-
-    def forget_row(self) -> None:
-        """Call this after a package without events."""
-        self._state[0] = -1
-
-    def events(self, data: np.ndarray, counts: Counter[str]) -> tuple[np.ndarray, ...]:
-        """Ticks, columns, rows and polarities of the events in a package."""
-        groups = len(data) // 7
-        counts["unreadable_packages"] += len(data) % 7 != 0
-        most = groups * (4 if self._format == 2 else 2)
-        t, x, y, p = (np.empty(most, dtype) for dtype in (np.int64, np.int16, np.int16, np.int8))
-        if self._format == 1:
-            found, orphans, unchanged = _decode_1(data, groups, self._state, self._last_adc, self._polarity, t, x, y, p)
-        else:
-            found, orphans, unchanged = _decode_2(data, groups, self._state, self._polarity, t, x, y, p)
-        counts.update({"orphans": orphans, "no_change": unchanged})
-        return t[:found], x[:found], y[:found], p[:found]
+def _decoded(
+    data: UInt8[np.ndarray, " bytes"], state: Int64[np.ndarray, " 3"], last_adc: np.ndarray, counts: Counter[str]
+) -> list[np.ndarray]:
+    """Ticks, columns, rows and polarities of the events in a package; `state` and `last_adc` are updated."""
+    groups = len(data) // 7
+    counts["unreadable_packages"] += len(data) % 7 != 0
+    columns = [np.empty(2 * groups, dtype) for dtype in (np.int64, np.int16, np.int16, np.int8)]
+    events, orphans, unchanged = _decode(data, groups, state, last_adc, *columns)
+    counts.update({"orphans": orphans, "no_change": unchanged})
+    return [column[:events] for column in columns]
 
 
 @numba.njit(nogil=True, cache=True)
 @no_type_check
-def _decode_1(data, groups, state, last_adc, polarity, t, x, y, p):
+def _decode(data, groups, state, last_adc, t, x, y, p):
     """Decode items of 28 bits: row and time stamp, or intensity and column."""
     row, stamp, now = state
-    found, orphans, unchanged = 0, 0, 0
+    n, orphans, unchanged = 0, 0, 0
     height, width = last_adc.shape
     for i in range(groups):
         a, b, c, d = data[7 * i], data[7 * i + 1], data[7 * i + 2], data[7 * i + 3]
@@ -244,45 +245,15 @@ def _decode_1(data, groups, state, last_adc, polarity, t, x, y, p):
                     continue
                 adc = 4095 - (item >> 16)
                 column = item >> 5 & 0x7FF
-                sign = polarity
-                if sign == 0:
-                    sign = 1
-                    if row < height and column < width:
-                        before = np.int64(last_adc[row, column])
-                        last_adc[row, column] = adc
-                        sign = 1 if adc > before else -1 if adc < before else 0
+                sign = 1
+                if row < height and column < width:
+                    before = np.int64(last_adc[row, column])
+                    last_adc[row, column] = adc
+                    sign = 1 if adc > before else -1 if adc < before else 0
                 if sign == 0:
                     unchanged += 1
                 else:
-                    t[found], x[found], y[found], p[found] = now, column, row, sign
-                    found += 1
+                    t[n], x[n], y[n], p[n] = now, column, row, sign
+                    n += 1
     state[:] = row, stamp, now
-    return found, orphans, unchanged
-
-
-@numba.njit(nogil=True, cache=True)
-@no_type_check
-def _decode_2(data, groups, state, polarity, t, x, y, p):
-    """Decode items of 14 bits: row, column or time stamp."""
-    row, stamp, now = state
-    found, orphans = 0, 0
-    for i in range(groups):
-        low = np.int64(data[7 * i + 4]) | np.int64(data[7 * i + 5]) << 8 | np.int64(data[7 * i + 6]) << 16
-        for k in range(4):
-            item = np.int64(data[7 * i + k]) << 6 | low >> 6 * k & 63
-            kind = item & 3
-            if kind == ROW:
-                row = item >> 4
-            elif kind == TIME:
-                tick = item >> 2
-                if stamp >= 0:
-                    now += (tick - stamp) & 0xFFF
-                stamp = tick
-            elif kind == COLUMN:
-                if row < 0 or stamp < 0:
-                    orphans += 1
-                    continue
-                t[found], x[found], y[found], p[found] = now, item >> 3, row, polarity
-                found += 1
-    state[:] = row, stamp, now
-    return found, orphans, 0
+    return n, orphans, unchanged

@@ -1,6 +1,6 @@
 """Formats read by the package faery: AEDAT4 of iniVation, and Event Stream.
 
-Its EVT3 decoder holds times back where the sensor's clock steps back, so `evt` reads EVT2 and EVT3.
+Its EVT3 decoder holds times back where the sensor's clock steps back, so `prophesee` reads EVT2 and EVT3.
 """
 
 import contextlib

@@ -28,20 +28,18 @@ def block(path: str, file_type: str, reader: int, number: int) -> list[np.ndarra
         packets = iter(faery.events_stream_from_file(path, file_type=file_type))
         for _ in range(number):
             gathered(packets)
-    found = gathered(packets)
+    batch = gathered(packets)
     streams[reader] = number + 1, packets
-    if not found:
-        return None
-    return [np.concatenate([packet[name] for packet in found]) for name in ("t", "x", "y", "on")]
+    return [np.concatenate([packet[name] for packet in batch]) for name in ("t", "x", "y", "on")] if batch else None
 
 
 def gathered(packets: Iterator[np.ndarray]) -> list[np.ndarray]:
     """Packets with about as many events as an answer holds; empty at the end."""
-    found, count = [], 0
+    batch, count = [], 0
     while count < GATHERED_EVENTS and (packet := next(packets, None)) is not None:
-        found.append(packet)
+        batch.append(packet)
         count += len(packet)
-    return found
+    return batch
 
 
 def close(path: str, reader: int) -> None:

@@ -13,7 +13,7 @@ from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingEr
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 DSEC_COLUMNS = ("events/t", "events/x", "events/y", "events/p")
-LARGEST = 2**53  # largest whole number that a float holds exactly
+MAX_WHOLE = 2**53  # largest whole number that a float holds exactly
 E2P_COLUMNS = 4  # columns of /events: t in microseconds, x, y, p of 0 or 1
 
 Description = dict[str, Any]
@@ -121,12 +121,12 @@ def _whole(path: Path, description: Description, name: str) -> int | None:
 
 
 def _number(path: Path, name: str, value: Any) -> int:
-    if not isinstance(value, (int, float)) or not abs(value) <= LARGEST or int(value) != value:
+    if not isinstance(value, (int, float)) or not abs(value) <= MAX_WHOLE or int(value) != value:
         raise RecordingError(f"{path.name}: expected a whole number as {name}, got {value}")
     return int(value)
 
 
 def _microseconds(path: Path, t: np.ndarray) -> np.ndarray:
-    if t.dtype.kind == "f" and not (np.equal(t, np.floor(t)).all() and (np.abs(t) < LARGEST).all()):
+    if t.dtype.kind == "f" and not (np.equal(t, np.floor(t)).all() and (np.abs(t) < MAX_WHOLE).all()):
         raise RecordingError(f"{path.name}: expected whole microseconds as times")
     return t.astype(np.int64)

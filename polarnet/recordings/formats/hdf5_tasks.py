@@ -17,8 +17,17 @@ files: dict[str, h5py.File] = {}
 
 def describe(name: str, tables: list[str], attributes: list[str]) -> dict[str, Any]:
     """Shape and number kind of each existing table, and values of existing scalars and attributes."""
+    shapes, values = {}, {}
     with h5py.File(name, "r") as file:
-        return described(file, tables, attributes)
+        for key in tables:
+            if isinstance(table := file.get(key), h5py.Dataset) and table.shape is not None:
+                shapes[key] = (tuple(map(int, table.shape)), table.dtype.kind)
+        for key in attributes:
+            if key in file.attrs:
+                values[key] = plain(np.asarray(file.attrs[key]))
+            elif isinstance(scalar := file.get(key), h5py.Dataset) and scalar.shape == ():
+                values[key] = plain(np.asarray(scalar[()]))
+    return {"tables": shapes, "values": values}
 
 
 def read(name: str, tables: list[str], start: int, stop: int) -> list[np.ndarray]:
@@ -35,22 +44,6 @@ def close(name: str) -> None:
 
 
 TASKS: dict[str, Callable[..., Any]] = {"describe": describe, "read": read, "close": close}
-
-
-def described(file: h5py.File, tables: list[str], attributes: list[str]) -> dict[str, Any]:
-    """The answer of `describe` for an open file."""
-    shapes, values = {}, {}
-    for name in tables:
-        if name in file:
-            table = file[name]
-            if isinstance(table, h5py.Dataset) and table.shape is not None:
-                shapes[name] = (tuple(map(int, table.shape)), table.dtype.kind)
-    for name in attributes:
-        if name in file.attrs:
-            values[name] = np.asarray(file.attrs[name])
-        elif name in file and isinstance(file[name], h5py.Dataset) and file[name].shape == ():
-            values[name] = np.asarray(file[name][()])
-    return {"tables": shapes, "values": {name: plain(value) for name, value in values.items()}}
 
 
 def plain(value: np.ndarray) -> Any:

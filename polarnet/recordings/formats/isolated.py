@@ -14,7 +14,7 @@ from typing import Any
 from polarnet.recordings.source import RecordingError
 
 PATIENCE_S = 60  # limit for an answer; a damaged file can put a library into an endless loop
-LARGEST_MIB = 8192  # address space of the process; a damaged file can state any size
+MAX_MIB = 8192  # address space of the process; a damaged file can state any size
 WORKER = Path(__file__).with_name("isolated_worker.py")
 
 
@@ -71,7 +71,7 @@ class IsolatedLibrary:
         if self._owner != os.getpid() or self._process is None or self._process.poll() is not None:
             self._owner = os.getpid()  # a forked process must not share its parent's worker
             self._process = subprocess.Popen(
-                [sys.executable, "-P", str(WORKER), str(self._tasks), str(LARGEST_MIB)],
+                [sys.executable, "-P", str(WORKER), str(self._tasks), str(MAX_MIB)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,

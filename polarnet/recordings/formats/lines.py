@@ -14,12 +14,12 @@ from polarnet.recordings.source import BLOCK_EVENTS, RecordingError
 
 HEAD_BYTES = 4096  # bytes at the start of a file; enough for every format to recognise its own
 BLOCK_BYTES = 2**22
-LONGEST_LINE = 2**12  # bytes
+MAX_LINE = 2**12  # bytes
 
 _SEPARATORS = re.compile(rb"[,;]")
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _DIGITS = 18  # decimal digits that always fit into int64; further ones are less than a microsecond
-_LARGEST = 2**60
+_MAX_VALUE = 2**60
 _END, _COMMENT = 10, 35  # line feed, #
 
 
@@ -40,7 +40,7 @@ def number_blocks(
             data = rest + data
             end = data.rfind(b"\n") + 1
             rest = data[end:]
-            if len(rest) > LONGEST_LINE:
+            if len(rest) > MAX_LINE:
                 raise RecordingError(
                     f"{path.name}: expected lines of numbers, got {len(rest)} bytes without the end of a line"
                 )
@@ -58,18 +58,18 @@ class Line(NamedTuple):
 
 def numbers_of(head: bytes) -> list[Line]:
     """The lines of numbers among the first bytes of a file; empty if most lines are something else."""
-    found: list[Line] = []
+    numbers: list[Line] = []
     others, place = 0, 0
     for line in head.splitlines(keepends=True):
         place += len(line)
-        if len(line) == len(head) > LONGEST_LINE // 2 or (place == len(head) and found and not line.endswith(b"\n")):
+        if len(line) == len(head) > MAX_LINE // 2 or (place == len(head) and numbers and not line.endswith(b"\n")):
             break  # cut off at the end of the head
         words = _SEPARATORS.sub(b" ", line.split(b"#")[0]).split()
         if words and all(map(_NUMBER.fullmatch, words)):
-            found.append(Line([word.decode() for word in words], place))
+            numbers.append(Line([word.decode() for word in words], place))
         elif words:
             others += 1
-    return found if len(found) >= others else []
+    return numbers if len(numbers) >= others else []
 
 
 def rows_of(
@@ -88,32 +88,8 @@ def rows_of(
 
 def lines_of(table: Int64[np.ndarray, "n columns"], separator: str) -> bytes:
     """Format whole numbers as lines of text."""
-    out = np.empty(table.size * (_DIGITS + 3), np.uint8)
-    return out[: _write(np.ascontiguousarray(table), ord(separator), out)].tobytes()
-
-
-@numba.njit(nogil=True, cache=True)
-@no_type_check
-def _write(table, separator, out):
-    place = 0
-    for row in table:
-        for column in range(len(row)):
-            value = row[column]
-            if value < 0:
-                out[place] = 45
-                place += 1
-                value = -value
-            first = place
-            while True:
-                out[place] = 48 + value % 10
-                place += 1
-                value //= 10
-                if value == 0:
-                    break
-            out[first:place] = out[first:place][::-1].copy()
-            out[place] = separator if column < len(row) - 1 else _END
-            place += 1
-    return place
+    row = separator.join(["%d"] * table.shape[1]) + "\n"
+    return "".join([row % tuple(values) for values in table.tolist()]).encode()
 
 
 @numba.njit(nogil=True, cache=True)
@@ -159,11 +135,11 @@ def _number(buffer, place, shift):
     if shift == 0 and place > first and (place == size or _ends(buffer[place])):
         return -value if negative else value, place, True
     place = start + (negative or buffer[start] == 43)
-    value, digits, seen, exponent, point = 0, 0, 0, shift, False
+    value, digits, count, exponent, point = 0, 0, 0, shift, False
     while place < size:
         code = buffer[place]
         if 48 <= code <= 57:
-            seen += 1
+            count += 1
             if digits < _DIGITS:
                 value = 10 * value + (code - 48)
                 digits += value > 0
@@ -175,7 +151,7 @@ def _number(buffer, place, shift):
         else:
             break
         place += 1
-    good = seen > 0
+    good = count > 0
     if place < size and (buffer[place] == 101 or buffer[place] == 69):
         place += 1
         sign = -1 if place < size and buffer[place] == 45 else 1
@@ -187,7 +163,7 @@ def _number(buffer, place, shift):
         good = good and place > first
         exponent += sign * power
     while exponent > 0 and value != 0 and good:
-        good = value < _LARGEST // 10
+        good = value < _MAX_VALUE // 10
         value, exponent = 10 * value, exponent - 1
     tenths = 0
     while exponent < 0 and value != 0:
@@ -195,7 +171,7 @@ def _number(buffer, place, shift):
         tenths = value % 10
         value, exponent = value // 10, exponent + 1
     value += tenths >= 5
-    good = good and value < _LARGEST
+    good = good and value < _MAX_VALUE
     while place < size and not _ends(buffer[place]):
         good = False
         place += 1

@@ -6,16 +6,16 @@ log intensity and reference in float32. The model has no noise, mismatch or low-
 """
 
 import math
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from pydantic import PositiveFloat
 
-from polarnet.runtime.ranges import allowed
+from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import compiled
-from polarnet.simulation.pixels.columns import SIGNAL
+from polarnet.simulation.pixels.columns import SIGNAL, event_of, place_of
 from polarnet.simulation.pixels.light import FULL_SCALE, intensity_rows, ln
-from polarnet.simulation.pixels.pending import event_of, pending_events, place_of, roomier, write_in_order
+from polarnet.simulation.pixels.pending import pending_events, roomier, write_in_order
 from polarnet.simulation.pixels.physics import PixelConfig
 from polarnet.simulation.pixels.strips import rows_of_strip
 
@@ -24,11 +24,11 @@ NO_CHANGE = 1e-6  # log intensity; the CPU variant ignores smaller changes
 NEARLY = np.float32(0.99999)  # narrows a first look at thresholds by more than rounding
 
 
-@dataclass(frozen=True)
+@section
 class EsimConfig(PixelConfig):
     """Parameters of ESIM's pixel; ESIM uses only thresholds and refractory period of the inherited ones."""
 
-    esim_log_eps: float = field(metadata=allowed(above=0))
+    esim_log_eps: PositiveFloat
     """Constant added to the intensity in [0, 1] before the logarithm."""
 
 

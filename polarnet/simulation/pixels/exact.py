@@ -14,9 +14,9 @@ import numpy as np
 from polarnet.simulation.compilation import compiled, inlined
 from polarnet.simulation.pixels import physics, randomness
 from polarnet.simulation.pixels.active import empty_active, gather, keep_continuing, scatter
-from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL
+from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL, event_of, place_of
 from polarnet.simulation.pixels.light import intensity_rows, linlog
-from polarnet.simulation.pixels.pending import event_of, pending_events, place_of, roomier, write_in_order
+from polarnet.simulation.pixels.pending import pending_events, roomier, write_in_order
 from polarnet.simulation.pixels.physics import (
     DARK_OFFSET,
     DARK_SHOT_NOISE,

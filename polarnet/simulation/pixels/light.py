@@ -34,11 +34,6 @@ def light_of_frames(frames: np.ndarray) -> Light:
     return Light(frames, np.empty(0), np.empty(0))
 
 
-def light_of_scene(scene: np.ndarray, top: np.ndarray, left: np.ndarray) -> Light:
-    """Light on a sensor that drifts over `scene` (float32 DN, padded as in `Light`)."""
-    return Light(scene[np.newaxis], top, left)
-
-
 @compiled
 def intensity_rows(light, frame, row, width, dn):
     """Fill `dn` (float32, whole rows of `width` pixels) with the light of one frame from `row` on."""

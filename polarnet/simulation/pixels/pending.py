@@ -1,7 +1,6 @@
 """Events of one step of one channel: collected pixel by pixel, then written in the order (t, y, x, p).
 
-An event is one 64-bit integer that sorts by (t, y, x, p): whole microseconds since the step's start (31 bits), row
-(15), column (15), 1 for ON (1), label (2).
+An event is the integer of `columns.event_of`, with its time in whole microseconds since the step's start.
 """
 
 import math
@@ -9,10 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.simulation.compilation import compiled, inlined
-from polarnet.simulation.pixels.columns import sort_ties, with_room
+from polarnet.simulation.compilation import compiled
+from polarnet.simulation.pixels.columns import (
+    COLUMN_SHIFT,
+    POLARITY_SHIFT,
+    ROW_SHIFT,
+    TIME_SHIFT,
+    sort_ties,
+    with_room,
+)
 
-TIME_SHIFT, ROW_SHIFT, COLUMN_SHIFT, POLARITY_SHIFT = np.int64(33), np.int64(18), np.int64(3), np.int64(2)
 PLACE_MASK, LABEL_MASK = np.int64(0x7FFF), np.int64(3)
 MAX_BUCKETS = 4096  # of the counting sort: one per microsecond in steps up to this long
 
@@ -21,7 +26,7 @@ class Pending(NamedTuple):
     """Events of one step in any order."""
 
     events: np.ndarray
-    """int64, see the module"""
+    """int64, see `columns.event_of`"""
     unrounded_us: np.ndarray
     """float64, times before rounding; empty if not requested"""
     in_order: np.ndarray
@@ -44,18 +49,6 @@ def roomier(pending):
     larger.events[:n] = pending.events
     larger.unrounded_us[: pending.unrounded_us.size] = pending.unrounded_us
     return larger
-
-
-@inlined
-def place_of(y, x):
-    """Row and column as part of an event's integer."""
-    return np.int64(y) << ROW_SHIFT | np.int64(x) << COLUMN_SHIFT
-
-
-@inlined
-def event_of(offset_us, place, on, label):
-    """The integer of an event."""
-    return np.int64(offset_us) << TIME_SHIFT | place | np.int64(on) << POLARITY_SHIFT | np.int64(label)
 
 
 @compiled

@@ -3,12 +3,12 @@
 Formulas and constants are those of v2e (Hu, Liu, Delbruck, CVPRW 2021).
 """
 
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import Field, NonNegativeFloat
 
-from polarnet.runtime.ranges import allowed
+from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import inlined
 from polarnet.simulation.pixels import randomness
 
@@ -19,25 +19,25 @@ SHOT_NOISE_SLOPE = 0.75  # shot noise falls by this fraction from dark to bright
 DARK_SHOT_NOISE = 1 - SHOT_NOISE_SLOPE * DARK_OFFSET / SATURATION  # fraction of the nominal rate at 0 DN
 
 
-@dataclass(frozen=True)
+@section
 class PixelConfig:
     """Parameters of v2e's pixel. Contrast thresholds are steps of natural-log intensity."""
 
-    contrast_threshold_on: float = field(metadata=allowed(low=0.01, high=10))
-    contrast_threshold_off: float = field(metadata=allowed(low=0.01, high=10))
-    contrast_threshold_sigma: float = field(metadata=allowed(low=0))
+    contrast_threshold_on: Annotated[float, Field(ge=0.01, le=10)]
+    contrast_threshold_off: Annotated[float, Field(ge=0.01, le=10)]
+    contrast_threshold_sigma: NonNegativeFloat
     """Standard deviation between pixels, drawn for each channel."""
-    cutoff_hz: float = field(metadata=allowed(low=0))
+    cutoff_hz: NonNegativeFloat
     """Bandwidth of the photoreceptor at full brightness, less in the dark; 0: infinite."""
-    leak_rate_hz: float = field(metadata=allowed(low=0))
+    leak_rate_hz: NonNegativeFloat
     """ON events per second of a pixel that sees no change."""
-    leak_jitter: float = field(metadata=allowed(low=0, high=1))
+    leak_jitter: Annotated[float, Field(ge=0, le=1)]
     """Relative standard deviation of the leak: in each frame for `v2e`, in each interval of events for `exact`."""
-    noise_rate_cov_decades: float = field(metadata=allowed(low=0))
+    noise_rate_cov_decades: NonNegativeFloat
     """Spread of the leak rate between pixels, as a power of ten."""
-    shot_noise_rate_hz: float = field(metadata=allowed(low=0))
+    shot_noise_rate_hz: NonNegativeFloat
     """Noise events per second of a pixel in the dark, ON and OFF together; a quarter of it at full brightness."""
-    refractory_period_us: float = field(metadata=allowed(low=0))
+    refractory_period_us: NonNegativeFloat
 
 
 class Physics(NamedTuple):

@@ -192,10 +192,10 @@ def _count(pixels, physics, first, stop, y, w, firing, n, most):
     filtered, memory = pixels.filtered[first:stop], pixels.memory[first:stop]
     threshold_on, threshold_off = pixels.threshold_on[first:stop], pixels.threshold_off[first:stop]
     entries, candidates = firing.entries, firing.candidates
-    found = flagged(firing.words, stop - first, candidates[0], candidates[1])
+    count = flagged(firing.words, stop - first, candidates[0], candidates[1])
     row_end = w
     exact_nominal = memory.itemsize == 8 and physics.threshold_sigma == 0  # v2e divides float64 by a Python float
-    for c in range(found):
+    for c in range(count):
         j = np.uint64(candidates[0, c])  # unsigned: numba checks other indices for being negative
         while candidates[0, c] >= row_end:
             y, row_end = y + 1, row_end + w

@@ -5,17 +5,16 @@ and noise are one process, so every event has the label SIGNAL.
 """
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from polarnet.runtime.ranges import allowed
+from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels import randomness
-from polarnet.simulation.pixels.columns import SIGNAL
+from polarnet.simulation.pixels.columns import SIGNAL, event_of, place_of
 from polarnet.simulation.pixels.light import intensity_rows
-from polarnet.simulation.pixels.pending import event_of, pending_events, place_of, roomier, write_in_order
+from polarnet.simulation.pixels.pending import pending_events, roomier, write_in_order
 from polarnet.simulation.pixels.randomness import key_for, mixed, normal, uniform
 
 EIGHT_BIT_VIDEO = False
@@ -45,11 +44,11 @@ CAMERAS = {
 }
 
 
-@dataclass(frozen=True)
+@section
 class VoltmeterConfig:
     """Parameters of DVS-Voltmeter's pixel."""
 
-    voltmeter_camera: str = field(metadata=allowed(choices=tuple(CAMERAS)))
+    voltmeter_camera: Annotated[str, one_of(CAMERAS)]
     """Camera whose fitted constants are used."""
 
 

@@ -6,7 +6,7 @@ import pytest
 from polarnet.recordings.formats.celex5_bin import celex5_pictures
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
-from studies.celex5_bin_writer import write_celex5_bin, write_celex5_pictures
+from studies.celex5_writer import write_celex5_bin, write_celex5_pictures
 
 
 def header(data_type=0, loop_a=2, event_format=1, packages=1):
@@ -17,15 +17,14 @@ def package(content, last=1):
     return struct.pack("<I", len(content) + 1) + content + bytes([last])
 
 
-@pytest.mark.parametrize("event_format", [1, 2])
-def test_what_is_written_reads_back_equal(tmp_path, make_random_events, same_events, event_format):
+def test_what_is_written_reads_back_equal(tmp_path, make_random_events, same_events):
     events = make_random_events(2, 5000, 9_000_000)
-    written = write_celex5_bin(tmp_path / "e.bin", events, event_format)
-    recording = read_recording(tmp_path / "e.bin", assume_polarity=1)
+    written = write_celex5_bin(tmp_path / "e.bin", events)
+    recording = read_recording(tmp_path / "e.bin")
     assert recording.format == "celex5_bin"
     assert same_events(recording.events, written)
     assert (recording.events.t[-5000:] - events.t).abs().max() <= 10  # a step of the clock
-    for name in "xy" + ("p" if event_format == 1 else ""):
+    for name in "xyp":
         assert (getattr(written, name)[-5000:] == getattr(events, name)).all()
 
 
@@ -38,7 +37,7 @@ def test_events_on_the_clocks_own_steps_read_back_equal_to_what_was_given(tmp_pa
     assert recording.repairs == {"pauses": 1}
 
 
-def test_format_1_in_bytes_worked_out_by_hand(tmp_path):
+def test_an_event_in_bytes_worked_out_by_hand(tmp_path):
     """Row 5 at time stamp 3, then column 9 with intensity 1000 (stored as 3095).
 
     Item 1: 5 << 18 | 3 << 2 | 2, as 14 bit words 0b1110 and 0b1010000. Item 2: 3095 << 16 | 9 << 5 | 1, as 0b100100001
@@ -50,21 +49,6 @@ def test_format_1_in_bytes_worked_out_by_hand(tmp_path):
     (tmp_path / "e.bin").write_bytes(header() + package(high + low))
     events = read_recording(tmp_path / "e.bin").events
     assert [events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist()] == [[0], [9], [5], [1]]
-
-
-def test_format_2_in_bytes_worked_out_by_hand(tmp_path):
-    """Time stamp 4095, row 513, column 1030, then time stamp 4: five steps of 10.24 us later."""
-    words = [4095 << 2 | 3, 513 << 4 | 2, 1030 << 3 | 1, 4 << 2 | 3, 1031 << 3 | 1, 0, 0, 0]
-    content = b""
-    for group in (words[:4], words[4:]):
-        low = sum((word & 63) << 6 * k for k, word in enumerate(group)).to_bytes(3, "little")
-        content += bytes(word >> 6 for word in group) + low
-    (tmp_path / "e.bin").write_bytes(header(loop_a=0, event_format=2) + package(content))
-    with pytest.raises(RecordingError, match="Event Off-Pixel Timestamp, event format 2 have no polarity"):
-        read_recording(tmp_path / "e.bin")
-    events = read_recording(tmp_path / "e.bin", assume_polarity=-1).events
-    assert [events.t.tolist(), events.x.tolist(), events.y.tolist()] == [[0, 51], [1030, 1031], [513, 513]]
-    assert events.p.tolist() == [-1, -1]
 
 
 def test_polarity_is_the_sign_of_the_change_and_the_first_compares_with_zero(tmp_path, make_events):
@@ -83,9 +67,9 @@ def test_pictures_read_back_equal_but_for_the_pixel_that_holds_the_mode(tmp_path
     generator = np.random.default_rng(0)
     pictures = [generator.integers(0, 4096, (800, 1280)).astype(np.uint16) for _ in range(2)]
     write_celex5_pictures(tmp_path / "p.bin", pictures, [1_000_000, 1_033_000])
-    found = list(celex5_pictures(tmp_path / "p.bin"))
-    assert [picture.t_us for picture in found] == [1_000_000, 1_033_000]
-    for before, after in zip(pictures, found, strict=True):
+    read = list(celex5_pictures(tmp_path / "p.bin"))
+    assert [picture.t_us for picture in read] == [1_000_000, 1_033_000]
+    for before, after in zip(pictures, read, strict=True):
         assert np.flatnonzero(before != after.intensity).tolist() in ([], [0])
     assert len(read_recording(tmp_path / "p.bin").events) == 0
 
@@ -115,6 +99,7 @@ def test_imu_samples_after_a_package_are_passed_over(tmp_path, make_events):
         (header(event_format=0) + package(bytes(7)), "events are of format 0, whose intensities are wrong"),
         (header(data_type=1) + package(bytes(7)), "recorded in loop mode"),
         (header(loop_a=1) + package(bytes(7)), "Event In-Pixel Timestamp have no polarity"),
+        (header(loop_a=0, event_format=2) + package(bytes(7)), "Event Off-Pixel Timestamp, event format 2 have no"),
         (
             header() + struct.pack("<I", 2**31) + bytes(70),
             "package 0 before byte 16 states a length of 2147483648",
@@ -145,7 +130,5 @@ def test_what_the_sensor_cannot_send_is_not_written(tmp_path, make_events):
     ):
         with pytest.raises(ValueError, match=message):
             write_celex5_bin(path, make_events(rows, *size))
-    with pytest.raises(ValueError, match="event format 1 or 2, got 3"):
-        write_celex5_bin(path, make_events([], 800, 1280), 3)
     with pytest.raises(ValueError, match="pictures of 800x1280 up to 4095"):
         write_celex5_pictures(path, [np.full((800, 1280), 4096, np.uint16)])

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from polarnet.recordings.formats.celex5_csv import write_celex5_csv
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
+from studies.celex5_writer import write_celex5_csv
 
 INTENSITY_MODE = [(10, 20, 2000, 1, 5), (10, 21, 1999, -1, 7), (799, 1279, 4095, 1, 9)]
 
@@ -42,13 +42,10 @@ def test_events_whose_pixel_did_not_change_are_dropped_and_counted(tmp_path):
         ([(10, 20, 5, 900), (11, 21, 7, 1007)], "Event In-Pixel Timestamp"),
     ],
 )
-def test_modes_without_polarity_are_refused_with_the_reason_and_can_be_looked_at(tmp_path, rows, mode):
+def test_modes_without_polarity_are_refused_with_the_reason(tmp_path, rows, mode):
     path = write(tmp_path / "e.csv", rows)
     with pytest.raises(RecordingError, match=rf"e\.csv: .* mode {mode} have no polarity"):
         read_recording(path)
-    events = read_recording(path, assume_polarity=1).events
-    assert events.t.tolist() == [row[-1] for row in rows]
-    assert (events.y.tolist(), events.x.tolist(), events.p.tolist()) == ([10, 11], [20, 21], [1, 1])
 
 
 def test_other_columns_are_refused_with_those_of_every_mode(tmp_path):

@@ -58,8 +58,8 @@ def test_damage_that_crashes_the_library_ends_in_events_or_in_the_reason(tmp_pat
 def test_two_readers_of_one_file_do_not_disturb_each_other(tmp_path):
     path = write(tmp_path / "e.es")
     one, two = iter(open_recording(path, chunk_events=1)), iter(open_recording(path, chunk_events=1))
-    found = [int(next(reader).x[0]) for reader in (one, two, two, one, one, two)]
-    assert found == [1, 1, 345, 345, 3, 3]
+    columns = [int(next(reader).x[0]) for reader in (one, two, two, one, one, two)]
+    assert columns == [1, 1, 345, 345, 3, 3]
 
 
 def test_without_the_library_the_error_names_the_extra(tmp_path, monkeypatch):

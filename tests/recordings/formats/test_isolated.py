@@ -89,7 +89,7 @@ def test_a_library_that_is_not_there_is_asked_for():
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the memory of a process")
 def test_a_claim_beyond_the_limit_of_memory_is_refused(library, monkeypatch):
-    monkeypatch.setattr(isolated, "LARGEST_MIB", 2048)
+    monkeypatch.setattr(isolated, "MAX_MIB", 2048)
     assert library.ask(FILE, "claim", 2**20) == (2**20,)
     with pytest.raises(RecordingError, match="MemoryError"):
         library.ask(FILE, "claim", 2**32)

@@ -3,7 +3,7 @@ import shutil
 
 import pytest
 
-from polarnet.reports.set_page import write_set_page
+from polarnet.reports.page import write_set_page
 
 
 @pytest.fixture(scope="module")

@@ -1,63 +1,58 @@
-"""Write BIN files of a CeleX-5, for simulated cameras and for tests of the reader in `celex5_bin`."""
+"""Write BIN and CSV files of a CeleX-5, for simulated cameras and for tests of the readers."""
 
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Int64, UInt8, UInt16
+from jaxtyping import Int, Int64, UInt8, UInt16
 
 from polarnet.events.stream import Events, validate
-from polarnet.recordings.formats.celex5 import CLOCK_MHZ, HEIGHT, WHITE, WIDTH, microseconds, ticks
 from polarnet.recordings.formats.celex5_bin import (
+    CLOCK_MHZ,
     COLUMN,
     FULL_PICTURE,
     HEADER,
+    HEIGHT,
     IMU,
     INTENSITY,
     LENGTH,
-    OFF_PIXEL,
     PICTURE_BYTES,
     ROW,
     STAMP,
-    STAMP_BITS,
-    TIME,
+    TICK_CYCLES,
+    WHITE,
+    WIDTH,
+    microseconds,
 )
+from polarnet.recordings.formats.lines import lines_of
 
 PACKAGE_GROUPS = 51_000  # 7 bytes each; the sensor sends only packages of this length
 NO_MODE = 255
+CSV_LINES = 2**18  # written at a time
 
 
-def write_celex5_bin(path: Path, events: Events, event_format: int = 1, clock_mhz: float | int = CLOCK_MHZ) -> Events:
+def write_celex5_bin(path: Path, events: Events, clock_mhz: float | int = CLOCK_MHZ) -> Events:
     """Write events as the sensor sends them, and return the events that a reader gets from the file.
 
-    Each time becomes the sensor's first time stamp at or after it (every 10.24 us at 100 MHz), from 0 on. In format 1
-    polarity is a change of intensity, which starts from 0, so a pixel that first becomes darker gets a brighter event
-    at the start. Format 2 has no polarity; the returned polarity is +1 everywhere, as with `assume_polarity=1`.
+    Each time becomes the sensor's first time stamp at or after it (every 10.24 us at 100 MHz), from 0 on. Polarity is a
+    change of intensity, which starts from 0, so a pixel that first becomes darker gets a brighter event at the start.
     ValueError for events that are out of order, before 0, off a sensor of 800 x 1280, or more than 4095 of one polarity
     in a row in a pixel.
     """
-    if event_format not in STAMP_BITS:
-        raise ValueError(f"expected event format 1 or 2, got {event_format}")
-    if events.height > HEIGHT or events.width > WIDTH:
-        raise ValueError(f"expected events of a sensor of {HEIGHT}x{WIDTH}, got {events.height}x{events.width}")
+    _check_size(events)
     validate(events)
     if len(events) and events.t[0] < 0:
         raise ValueError(f"expected times from 0 on, got {int(events.t[0])} us")
-    stamp = ticks(events.t.numpy(), clock_mhz)
+    stamp = -(-events.t.numpy() * round(1000 * clock_mhz) // (1000 * TICK_CYCLES))
     row, column = events.y.numpy().astype(np.int64), events.x.numpy().astype(np.int64)
     p = events.p.numpy()
-    if event_format == 1:
-        first_is_darker = _first_is_darker(row * WIDTH + column, p)
-        stamp = np.concatenate([np.zeros(first_is_darker.sum(), np.int64), stamp])
-        row, column = (np.concatenate([values[first_is_darker], values]) for values in (row, column))
-        p = np.concatenate([np.ones(first_is_darker.sum(), np.int8), p])
-        items = _items_1(stamp, row, column, _intensities(row * WIDTH + column, p))
-        words = np.stack([items & 0x3FFF, items >> 14], axis=1).reshape(-1)
-    else:
-        p = np.ones_like(p)
-        words = _items_2(stamp, row, column)
-    _write_packages(path, _packed(words, event_format), event_format)
+    first_is_darker = _first_is_darker(row * WIDTH + column, p)
+    stamp = np.concatenate([np.zeros(first_is_darker.sum(), np.int64), stamp])
+    row, column = (np.concatenate([values[first_is_darker], values]) for values in (row, column))
+    p = np.concatenate([np.ones(first_is_darker.sum(), np.int8), p])
+    items = _items(stamp, row, column, _intensities(row * WIDTH + column, p))
+    _write_packages(path, _packed(np.stack([items & 0x3FFF, items >> 14], axis=1).reshape(-1)))
     return Events(
         torch.from_numpy(microseconds(stamp, clock_mhz)),
         torch.from_numpy(column.astype(np.int16)),
@@ -78,7 +73,7 @@ def write_celex5_pictures(
     stamps = None if t_us is None else iter(t_us)
     packages = 0
     with path.open("wb") as file:
-        file.write(_header(FULL_PICTURE, 1, IMU if stamps else 0, 0))
+        file.write(_header(FULL_PICTURE, IMU if stamps else 0, 0))
         for picture in pictures:
             if picture.shape != (HEIGHT, WIDTH) or picture.max() > WHITE:
                 raise ValueError(
@@ -90,11 +85,33 @@ def write_celex5_pictures(
                 file.write(STAMP.pack(next(stamps) // 1000, 0))
             packages += 1
         file.seek(0)
-        file.write(_header(FULL_PICTURE, 1, IMU if stamps else 0, packages))
+        file.write(_header(FULL_PICTURE, IMU if stamps else 0, packages))
 
 
-def _header(mode: int, event_format: int, data_type: int, packages: int) -> bytes:
-    return HEADER.pack(data_type, mode, NO_MODE, NO_MODE, event_format, 0, 0, 0, packages)
+def write_celex5_csv(path: Path, events: Events, intensity: Int[np.ndarray, " n"] | None = None) -> None:
+    """Write events in the converter's Event Intensity format: lines row,col,adc,polarity,t in microseconds.
+
+    `intensity` is the pixel's measurement, 0 to 4095; None writes half of the maximum. ValueError where events are not
+    on the sensor of 800 x 1280.
+    """
+    _check_size(events)
+    adc = np.full(len(events), WHITE // 2) if intensity is None else np.asarray(intensity)
+    if len(adc) != len(events) or (len(adc) and not (adc.min() >= 0 and adc.max() <= WHITE)):
+        raise ValueError(f"expected an intensity of 0 to {WHITE} for each of {len(events)} events, got {len(adc)}")
+    columns = [events.y.numpy(), events.x.numpy(), adc, events.p.numpy(), events.t.numpy()]
+    with path.open("wb") as file:
+        for start in range(0, len(events), CSV_LINES):
+            part = [column[start : start + CSV_LINES] for column in columns]
+            file.write(lines_of(np.stack(part, axis=1).astype(np.int64), ","))
+
+
+def _check_size(events: Events) -> None:
+    if events.height > HEIGHT or events.width > WIDTH:
+        raise ValueError(f"expected events of a sensor of {HEIGHT}x{WIDTH}, got {events.height}x{events.width}")
+
+
+def _header(mode: int, data_type: int, packages: int) -> bytes:
+    return HEADER.pack(data_type, mode, NO_MODE, NO_MODE, 1, 0, 0, 0, packages)
 
 
 def _packed_picture(picture: np.ndarray) -> np.ndarray:
@@ -125,13 +142,13 @@ def _intensities(pixel: Int64[np.ndarray, " n"], p: np.ndarray) -> Int64[np.ndar
     return intensity
 
 
-def _stamps(stamp: np.ndarray, announced: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:
+def _stamps(stamp: np.ndarray, announced: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Time stamps to send, and the index of the event that each precedes.
 
     The stamps are close enough to stay unambiguous when they wrap. The first is 0; one comes before each of the
     `announced` events.
     """
-    step = 2 ** (bits - 1)
+    step = 2**15
     sent = stamp[announced]
     before = np.concatenate([[0], sent[:-1]])[: len(sent)]
     between = np.maximum(sent - before - 1, 0) // step
@@ -142,40 +159,30 @@ def _stamps(stamp: np.ndarray, announced: np.ndarray, bits: int) -> tuple[np.nda
     return times[order], places[order]
 
 
-def _items_1(
+def _items(
     stamp: np.ndarray, row: np.ndarray, column: np.ndarray, intensity: np.ndarray
 ) -> Int64[np.ndarray, " items"]:
     announced = np.flatnonzero((np.diff(stamp, prepend=-1) != 0) | (np.diff(row, prepend=-1) != 0))
-    times, places = _stamps(stamp, announced, STAMP_BITS[1])
+    times, places = _stamps(stamp, announced)
     rows = np.append(row, 0)[places]
     items = (WHITE - intensity) << 16 | column << 5 | COLUMN
     return np.insert(items, places, rows << 18 | (times & 0xFFFF) << 2 | ROW)
 
 
-def _items_2(stamp: np.ndarray, row: np.ndarray, column: np.ndarray) -> Int64[np.ndarray, " items"]:
-    times, places = _stamps(stamp, np.flatnonzero(np.diff(stamp, prepend=-1)), STAMP_BITS[2])
-    new_row = np.flatnonzero(np.diff(row, prepend=-1))
-    announcements = np.concatenate([(times & 0xFFF) << 2 | TIME, row[new_row] << 4 | ROW])
-    places = np.concatenate([places, new_row])
-    order = np.argsort(places, kind="stable")
-    return np.insert(column << 3 | COLUMN, places[order], announcements[order])
-
-
-def _packed(words: Int64[np.ndarray, " words"], event_format: int) -> UInt8[np.ndarray, "groups 7"]:
+def _packed(words: Int64[np.ndarray, " words"]) -> UInt8[np.ndarray, "groups 7"]:
     """Pack 14-bit words as the sensor sends them, in full packages; padding in the last one states the mode."""
-    padding = [INTENSITY << 14 & 0x3FFF, INTENSITY << 14 >> 14] if event_format == 1 else [0]
-    missing = -len(words) % (4 * PACKAGE_GROUPS)
-    words = np.concatenate([words, np.resize(np.array(padding, np.int64), missing)]).reshape(-1, 4)
+    padding = np.array([INTENSITY << 14 & 0x3FFF, INTENSITY << 14 >> 14])
+    words = np.concatenate([words, np.resize(padding, -len(words) % (4 * PACKAGE_GROUPS))]).reshape(-1, 4)
     low = words & 63
     low_bytes = low[:, 0] | low[:, 1] << 6 | low[:, 2] << 12 | low[:, 3] << 18
     high = [words[:, k] >> 6 for k in range(4)]
     return np.stack([*high, low_bytes, low_bytes >> 8, low_bytes >> 16], axis=1).astype(np.uint8)
 
 
-def _write_packages(path: Path, groups: np.ndarray, event_format: int) -> None:
+def _write_packages(path: Path, groups: np.ndarray) -> None:
     packages = len(groups) // PACKAGE_GROUPS
     with path.open("wb") as file:
-        file.write(_header(INTENSITY if event_format == 1 else OFF_PIXEL, event_format, 0, packages))
+        file.write(_header(INTENSITY, 0, packages))
         for package in groups.reshape(packages, -1):
             file.write(LENGTH.pack(package.size + 1))
             file.write(package.tobytes() + b"\1")

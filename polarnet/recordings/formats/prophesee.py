@@ -1,0 +1,181 @@
+"""Files of Prophesee's cameras, little endian: EVT2, EVT3 (raw) and DAT. Each begins with lines that start with %.
+
+EVT sends the high bits of the time occasionally, and the low bits in between. A sensor's clock sometimes steps back by
+some microseconds within the same high bits. Times are those of the words, regardless of earlier ones. DAT has 8 bytes
+per event.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import no_type_check
+
+import numba
+import numpy as np
+
+from polarnet.recordings.source import (
+    BLOCK_EVENTS,
+    Block,
+    Choices,
+    RecordingError,
+    Source,
+    running_on,
+    sensor_size,
+    word_blocks,
+)
+
+MAX_HEADER_BYTES = 2**16
+EVT_BLOCK_WORDS = 2**17
+MAX_PER_WORD = 12  # events per EVT3 word
+SENSORS = {b"gen31": (480, 640), b"gen3": (480, 640), b"gen4": (720, 1280), b"imx636": (720, 1280),
+           b"genx320": (320, 320)}  # fmt: skip
+"""Height and width by the sensor's name in the header of EVT; files of 2020 state nothing else."""
+DAT_EVENT = np.dtype([("t", "<u4"), ("address", "<u4")])
+CHANGE_DETECTION = (0, 12)  # DAT's types of events: 2D of the first sensors, CD of the later ones
+
+
+def matches_evt(path: Path, head: bytes) -> bool:
+    """Whether the header names an EVT format."""
+    return head.startswith(b"% ") and (b"% evt " in head or b"% format EVT" in head)
+
+
+def matches_dat(path: Path, head: bytes) -> bool:
+    """Whether there is a header of % lines without a mention of EVT."""
+    return head.startswith(b"% ") and not matches_evt(path, head)
+
+
+def open_evt(path: Path, choices: Choices) -> Source:
+    """Open the events of EVT2 or EVT3; the sensor's size comes from the header, or from the sensor's name there."""
+    header, _ = _header(path)
+    stated = re.search(rb"% (?:evt |format EVT)(\d(?:\.\d)?)", header)
+    version = stated[1].decode().removesuffix(".0") if stated else "none"
+    if version not in ("2", "3"):
+        raise RecordingError(f"{path.name}: expected a header of % lines that states EVT 2 or 3, got {version}")
+    height, width = sensor_size(path, choices, *_evt_size(header))
+    word, decode = {"2": ("<u4", _decode_evt2), "3": ("<u2", _decode_evt3)}[version]
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        state = np.array([-1, 0, 0, -1, 0, 0])  # high bits of the time, their wraps, low bits, y, base x, its polarity
+        for words in word_blocks(path, len(header), word, EVT_BLOCK_WORDS, counts):
+            columns = [np.empty(MAX_PER_WORD * len(words), t) for t in (np.int64, np.int16, np.int16, np.int8)]
+            events, orphans = decode(words, state, *columns)
+            counts["orphans"] += int(orphans)
+            yield Block(*(column[:events] for column in columns))
+
+    return Source(height, width, blocks)
+
+
+def open_dat(path: Path, choices: Choices) -> Source:
+    """Open change detection events of version 1 or 2; in version 2, times that wrap after 71 minutes are unwrapped."""
+    header, after = _header(path)
+    if len(after) < 2 or after.startswith(b"% "):
+        raise RecordingError(f"{path.name}: the file ends within its header of % lines")
+    kind, size = after
+    if kind not in CHANGE_DETECTION or size != DAT_EVENT.itemsize:
+        raise RecordingError(
+            f"{path.name}: expected events of type 0 or 12 and 8 bytes, as DAT has for changes, got type {kind} and "
+            f"{size} bytes"
+        )
+    stated = {name: int(value) for name, value in re.findall(rb"% (Version|Height|Width) (\d{1,9})\s", header)}
+    version = stated.get(b"Version", 1)
+    if version not in (1, 2):
+        raise RecordingError(f"{path.name}: expected DAT of version 1 or 2, got {version}")
+    height, width = sensor_size(path, choices, stated.get(b"Height"), stated.get(b"Width"))
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        turns, before = 0, 0
+        for events in word_blocks(path, len(header) + 2, DAT_EVENT, BLOCK_EVENTS, counts):
+            t, turns, before = running_on(events["t"], turns, before)
+            address = events["address"]
+            if version == 1:
+                yield Block(t, address & 0x1FF, address >> 9 & 0xFF, address >> 17 & 1)
+            else:
+                yield Block(t, address & 0x3FFF, address >> 14 & 0x3FFF, address >> 28)
+
+    return Source(height, width, blocks)
+
+
+def _header(path: Path) -> tuple[bytes, bytes]:
+    """The header's % lines, up to `% end` if there is one, and the two bytes after them."""
+    with path.open("rb") as file:
+        data = file.read(MAX_HEADER_BYTES)
+    start = 0
+    while data[start : start + 2] == b"% " and (end := data.find(b"\n", start)) >= 0:
+        line, start = data[start:end].strip(), end + 1
+        if line == b"% end":
+            break
+    return data[:start], data[start : start + 2]
+
+
+def _evt_size(header: bytes) -> tuple[int | None, int | None]:
+    if geometry := re.search(rb"% geometry (\d{1,5})x(\d{1,5})", header):
+        return int(geometry[2]), int(geometry[1])
+    height, width = (re.search(name + rb"=(\d{1,5})", header) for name in (b"height", b"width"))
+    if height and width:
+        return int(height[1]), int(width[1])
+    for name, size in SENSORS.items():
+        if re.search(rb"(?i)% (plugin_name|sensor_name|generation)[^\n]*" + name, header):
+            return size
+    return None, None
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _decode_evt2(words, state, t, x, y, p):
+    """Decode words by their upper 4 bits: 0 OFF, 1 ON, 8 the upper 28 bits of the time."""
+    high, turns = state[0], state[1]
+    n, orphans = 0, 0
+    for i in range(len(words)):
+        word = np.int64(words[i])
+        kind = word >> 28
+        if kind == 8:
+            before, high = high, word & 0xFFFFFFF
+            turns += before - high > 2**27
+        elif kind <= 1:
+            if high < 0:
+                orphans += 1
+                continue
+            t[n] = ((turns << 28 | high) << 6) | (word >> 22 & 0x3F)
+            x[n], y[n], p[n] = word >> 11 & 0x7FF, word & 0x7FF, kind
+            n += 1
+    state[0], state[1] = high, turns
+    return n, orphans
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _decode_evt3(words, state, t, x, y, p):
+    """Decode words by their upper 4 bits: 0 y, 2 x, 3 base x, 4 and 5 pixels after it, 6 and 8 the time."""
+    high, turns, low, row, base, polarity = state
+    n, orphans = 0, 0
+    for i in range(len(words)):
+        word = np.int64(words[i])
+        kind, value = word >> 12, word & 0xFFF
+        if kind == 6:
+            low = value
+        elif kind == 8:
+            before, high = high, value
+            turns += before - high > 2**11
+            low = 0 if before != high else low
+        elif kind == 0:
+            row = value & 0x7FF
+        elif kind == 3:
+            base, polarity = value & 0x7FF, value >> 11
+        elif kind == 2 or kind == 4 or kind == 5:
+            if high < 0 or row < 0:
+                orphans += 1
+                continue
+            now = (turns << 12 | high) << 12 | low
+            if kind == 2:
+                t[n], x[n], y[n], p[n] = now, value & 0x7FF, row, value >> 11
+                n += 1
+                continue
+            pixels = 12 if kind == 4 else 8
+            for k in range(pixels):
+                if value >> k & 1:
+                    t[n], x[n], y[n], p[n] = now, base + k, row, polarity
+                    n += 1
+            base = min(base + pixels, 2048)  # outside every sensor; larger values would not fit into int16
+    state[:] = high, turns, low, row, base, polarity
+    return n, orphans

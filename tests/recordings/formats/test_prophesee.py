@@ -1,0 +1,126 @@
+import numpy as np
+import pytest
+
+from polarnet.recordings.recording import read_recording
+from polarnet.recordings.source import RecordingError
+
+DAT_HEADER = b"% Data file containing CD events.\n% Version 2\n% Height 720\n% Width 1280\n"
+EVT_HEADER = {2: b"% evt 2.0\n% geometry 640x480\n", 3: b"% format EVT3;height=720;width=1280\n% end\n"}
+
+
+def columns(tmp_path, version, words):
+    path = tmp_path / "e.raw"
+    path.write_bytes(EVT_HEADER[version] + np.array(words, {2: "<u4", 3: "<u2"}[version]).tobytes())
+    recording = read_recording(path)
+    assert recording.format == "evt"
+    return [getattr(recording.events, name).tolist() for name in "txyp"], recording.repairs
+
+
+def test_evt2_words_worked_out_by_hand(tmp_path):
+    """The time is 28 high bits and 6 low ones; 0 is OFF, 1 is ON."""
+    words = [
+        8 << 28 | 100,
+        1 << 28 | 5 << 22 | 639 << 11 | 7,
+        0 << 28 | 63 << 22 | 1 << 11 | 479,
+        8 << 28 | 101,
+        1 << 28,
+    ]
+    rows, repairs = columns(tmp_path, 2, words)
+    assert rows == [[6405, 6463, 6464], [639, 1, 0], [7, 479, 0], [1, -1, 1]]
+    assert repairs == {}
+
+
+def test_evt3_words_worked_out_by_hand(tmp_path):
+    """The time is 12 high bits and 12 low ones; vectors of 12 and 8 pixels follow a base."""
+    words = [
+        0x8001,
+        0x6002,
+        0x0007,
+        0x2000 | 5,
+        0x2800 | 6,
+        0x3800 | 100,
+        0x4000 | 0b1001,
+        0x5000 | 0b10,
+        0x6003,
+        0x0008,
+        0x2001,
+    ]
+    rows, repairs = columns(tmp_path, 3, words)
+    assert rows[0] == [4098] * 5 + [4099]
+    assert rows[1:] == [[5, 6, 100, 103, 113, 1], [7, 7, 7, 7, 7, 8], [-1, 1, 1, 1, 1, -1]]
+    assert repairs == {}
+
+
+def test_evt_times_run_on_when_the_high_bits_are_full(tmp_path):
+    rows, _ = columns(tmp_path, 3, [0x8FFF, 0x6FFF, 0x0007, 0x2000, 0x8000, 0x2000])
+    assert rows[0] == [2**24 - 1, 2**24]
+    rows, _ = columns(tmp_path, 2, [8 << 28 | 2**28 - 1, 63 << 22, 8 << 28, 0])
+    assert rows[0] == [2**34 - 1, 2**34]
+
+
+def test_events_before_the_first_time_and_row_are_left_out_and_counted(tmp_path):
+    assert columns(tmp_path, 3, [0x2000, 0x8001, 0x2000, 0x0007, 0x2000])[1] == {"orphans": 2}
+    assert columns(tmp_path, 2, [1 << 28, 8 << 28, 1 << 28])[1] == {"orphans": 1}
+
+
+def test_the_sensors_name_stands_for_its_size(tmp_path):
+    words = np.array([0x8001, 0x0007, 0x2000], "<u2").tobytes()
+    (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n% plugin_name hal_plugin_gen41_evk3\n" + words)
+    events = read_recording(tmp_path / "e.raw").events
+    assert (events.height, events.width) == (720, 1280)
+    (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n" + words)
+    with pytest.raises(RecordingError, match="give height and width"):
+        read_recording(tmp_path / "e.raw")
+
+
+def test_other_versions_of_evt_are_refused(tmp_path):
+    (tmp_path / "e.raw").write_bytes(b"% evt 4.0\n1234")
+    with pytest.raises(RecordingError, match="states EVT 2 or 3, got 4"):
+        read_recording(tmp_path / "e.raw")
+
+
+def dat_events(rows):
+    return np.array([(t % 2**32, x | y << 14 | p << 28) for t, x, y, p in rows], "<u4").tobytes()
+
+
+def test_dat_version_2_has_14_bits_for_each_coordinate(tmp_path):
+    content = DAT_HEADER + b"\x0c\x08" + dat_events([(5, 1279, 0, 1), (7, 0, 719, 0)])
+    (tmp_path / "e.dat").write_bytes(content)
+    recording = read_recording(tmp_path / "e.dat")
+    events = recording.events
+    assert (recording.format, events.height, events.width, recording.repairs) == ("dat", 720, 1280, {})
+    assert [events.t.tolist(), events.x.tolist(), events.y.tolist()] == [[5, 7], [1279, 0], [0, 719]]
+    assert events.p.tolist() == [1, -1]
+
+
+def test_dat_version_1_has_9_and_8_bits(tmp_path):
+    words = np.array([(5, 303 | 239 << 9 | 1 << 17)], "<u4").tobytes()
+    (tmp_path / "e.dat").write_bytes(b"% Version 1\n\x00\x08" + words)
+    events = read_recording(tmp_path / "e.dat", height=240, width=304).events
+    assert [events.x.tolist(), events.y.tolist(), events.p.tolist()] == [[303], [239], [1]]
+
+
+def test_dat_times_run_on_when_32_bits_are_full(tmp_path):
+    rows = [(2**32 - 5, 1, 1, 1), (2**32 - 1, 1, 1, 0), (2**32 + 3, 1, 1, 1)]
+    (tmp_path / "e.dat").write_bytes(DAT_HEADER + b"\x0c\x08" + dat_events(rows))
+    assert read_recording(tmp_path / "e.dat").events.t.tolist() == [2**32 - 5, 2**32 - 1, 2**32 + 3]
+
+
+def test_half_an_event_at_the_end_is_left_out_and_counted(tmp_path):
+    (tmp_path / "e.dat").write_bytes(DAT_HEADER + b"\x0c\x08" + dat_events([(5, 1, 0, 1), (7, 0, 1, 0)])[:-3])
+    recording = read_recording(tmp_path / "e.dat")
+    assert (len(recording.events), recording.repairs) == (1, {"cut_tail": 1})
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (DAT_HEADER, "the file ends within its header"),
+        (DAT_HEADER + b"\x0e\x08", "expected events of type 0 or 12 and 8 bytes, .* got type 14"),
+        (b"% Version 7\n\x0c\x08", "expected DAT of version 1 or 2, got 7"),
+    ],
+)
+def test_other_dat_files_are_refused_with_the_reason(tmp_path, content, message):
+    (tmp_path / "e.dat").write_bytes(content)
+    with pytest.raises(RecordingError, match=rf"e\.dat: .*{message}"):
+        read_recording(tmp_path / "e.dat", height=720, width=1280)
