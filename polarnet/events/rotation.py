@@ -37,6 +37,10 @@ class Rotation:
         """Duration of half a turn, over which the light behind the polarizer goes through one period."""
         return 0.5e6 / abs(self.rate_hz)
 
+    def since(self, start_us: int) -> "Rotation":
+        """The same rotation for times that count from `start_us`."""
+        return Rotation(self.times_us - start_us, self.angles)
+
     def at(self, t_us: Shaped[np.ndarray, "*m"]) -> Float64[np.ndarray, "*m"]:
         """Angle in radians at times in microseconds."""
         t, known = np.asarray(t_us, np.float64), self.times_us
@@ -57,7 +61,7 @@ def steady_rotation(rate_hz: float, start_angle: float = 0.0) -> Rotation:
 def triggered_rotation(
     trigger_us: Int64[np.ndarray, " n"], start_angle: float = 0.0, turns_per_trigger: float = 1.0
 ) -> Rotation:
-    """The polarizer is at `start_angle` (radians) at the first trigger, `turns_per_trigger` further at each next one."""
+    """The polarizer is at `start_angle` (radians) at the first trigger, and turns on to each next trigger."""
     if len(trigger_us) < MIN_TRIGGERS:
         raise ValueError(f"rotation: expected at least two trigger times, got {len(trigger_us)}; give the rate instead")
     turns = turns_per_trigger * np.arange(len(trigger_us))

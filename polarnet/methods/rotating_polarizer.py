@@ -13,19 +13,19 @@ Their ratio to DoLP follows from the number of events, their size from the shape
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float64
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from polarnet.events.rotation import Rotation
 from polarnet.events.stream import Events, merge, slice_time
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Recoverer
 from polarnet.methods.modulation import UNKNOWNS, Pixels, fit_pixels, response_model
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
 INITIAL_RATIO_MAX = 0.7  # DoLP 0.94
@@ -33,38 +33,35 @@ SILENT_DOLPS = 400  # nodes of the integral over DoLP of silent pixels
 SPREADS = np.linspace(-3, 3, 25)  # nodes of the integral over thresholds, in standard deviations
 
 
-@dataclass(frozen=True)
+@section
 class ModulationConfig:
     """Section `modulation` of params.yaml: the sensor and the noise that the fit expects."""
 
-    threshold_on: float = field(metadata=allowed(above=0))
+    threshold_on: PositiveFloat
     """Mean contrast thresholds, in natural-log intensity."""
-    threshold_off: float = field(metadata=allowed(above=0))
-    threshold_spread: float = field(metadata=allowed(above=0))
+    threshold_off: PositiveFloat
+    threshold_spread: PositiveFloat
     """Relative standard deviation of the thresholds between pixels."""
-    cutoff_hz: float = field(metadata=allowed(low=0))
+    cutoff_hz: NonNegativeFloat
     """Bandwidth of the photoreceptor at full brightness, as in section `emulate`; 0: infinite."""
-    knee_dn: float = field(metadata=allowed(low=0))
+    knee_dn: NonNegativeFloat
     """Light below which the response is linear instead of logarithmic; 0: logarithmic throughout."""
-    level_dn: float = field(metadata=allowed(above=0))
+    level_dn: PositiveFloat
     """Typical mean light behind the polarizer, 0 to 255 DN; matters only with a cutoff or a knee."""
-    level_spread: float = field(metadata=allowed(above=0))
+    level_spread: PositiveFloat
     """Standard deviation of the natural logarithm of the mean light between pixels."""
-    noise: float = field(metadata=allowed(above=0))
+    noise: PositiveFloat
     """Standard deviation of the change between two events, relative to the threshold."""
-    silence_noise: float = field(metadata=allowed(above=0))
+    silence_noise: PositiveFloat
     """The same for the largest change between two events, which must not exceed the threshold."""
-    extinction_ratio: float | None = field(metadata=allowed(above=1))
+    extinction_ratio: Annotated[float, Field(gt=1)] | None
     """Transmission of the polarizer along its axis over that across it; null: infinite."""
-    window_turns: float = field(metadata=allowed(above=0))
+    window_turns: PositiveFloat
     """Turns of the polarizer whose events make one frame; there is a frame for each half turn."""
-    variance_scale: float = field(metadata=allowed(above=0))
+    variance_scale: PositiveFloat
     """Squared error of DoLP over the variance of the fit, measured in simulation (python -m studies.rotating)."""
-    variance_floor: float = field(metadata=allowed(above=0))
+    variance_floor: PositiveFloat
     """Smallest expected squared error of DoLP."""
-
-    def __post_init__(self):
-        check_ranges(self)
 
     @property
     def polarizer_contrast(self) -> float:
@@ -104,24 +101,24 @@ def fit_modulation(
     height, width = events.height, events.width
     state = initial_state(height, width, config) if state is None else state
     pixels, last_us = _pixels_of(slice_time(events, start_us, stop_us), rotation, stop_us, state.last_us.ravel())
-    thresholds = config.threshold_on, config.threshold_off
     phase_rate = 4 * math.pi * rotation.rate_hz
-    model = response_model(*thresholds, phase_rate, config.cutoff_hz, config.knee_dn, config.silence_noise)
-    count = height * width
-    mean, precision = np.zeros((count, UNKNOWNS)), np.ones((count, UNKNOWNS))
-    mean[:, 2:4], precision[:, 2:4] = state.log_thresholds.reshape(2, -1).T, 1 / state.variances.reshape(2, -1).T
-    mean[:, 4], precision[:, 4] = math.log(config.level_dn), config.level_spread**-2
+    model = response_model(
+        config.threshold_on, config.threshold_off, phase_rate, config.cutoff_hz, config.knee_dn, config.silence_noise
+    )
+    mean, precision = _prior(state, config)
     start = _initial_g(pixels, config, rotation, stop_us - start_us)
     fitted, covariance, cost = fit_pixels(pixels, start, mean, precision, model, config.noise)
     intervals = np.maximum(np.diff(pixels.first) - 1, 0)
     # residuals above the expected noise make the errors larger in proportion
     covariance *= np.maximum(1, 2 * cost / np.maximum(intervals, 1))[:, None, None]
     active = intervals > 0
-    prediction = _prediction(fitted, covariance, active, config, (height, width))
-    thresholds = np.where(active[:, None], fitted[:, 2:4], mean[:, 2:4])
-    variances = np.where(active[:, None], np.diagonal(covariance, axis1=1, axis2=2)[:, 2:4], 1 / precision[:, 2:4])
-    maps = (values.T.reshape(2, height, width) for values in (thresholds, np.minimum(variances, 1 / precision[:, 2:4])))
-    return prediction, ModulationState(*maps, last_us.reshape(height, width))
+    variances = np.where(active[:, None], np.diagonal(covariance, axis1=1, axis2=2)[:, 2:4], np.inf)
+    memory = (
+        fitted[:, 2:4],
+        np.minimum(variances, 1 / precision[:, 2:4]),
+    )  # a window never makes thresholds less certain
+    after = ModulationState(*(x.T.reshape(2, height, width) for x in memory), last_us.reshape(height, width))
+    return _prediction(fitted, covariance, active, config, (height, width)), after
 
 
 def rotating_recoverer(config: ModulationConfig, rotation: Rotation) -> Recoverer:
@@ -157,6 +154,17 @@ def silent_dolp(config: ModulationConfig) -> tuple[float, float]:
     silent = (np.maximum(0, 1 - swing[:, None] / rooms) * weights).sum(axis=1)
     mean = float((silent * dolp).sum() / silent.sum())
     return mean, float((silent * (dolp - mean) ** 2).sum() / silent.sum())
+
+
+def _prior(
+    state: ModulationState, config: ModulationConfig
+) -> tuple[Float64[np.ndarray, "n 5"], Float64[np.ndarray, "n 5"]]:
+    """Mean and precision of the unknowns before a window."""
+    count = state.last_us.size
+    mean, precision = np.zeros((count, UNKNOWNS)), np.ones((count, UNKNOWNS))
+    mean[:, 2:4], precision[:, 2:4] = state.log_thresholds.reshape(2, -1).T, 1 / state.variances.reshape(2, -1).T
+    mean[:, 4], precision[:, 4] = math.log(config.level_dn), config.level_spread**-2
+    return mean, precision
 
 
 def _prediction(

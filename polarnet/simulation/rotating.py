@@ -6,17 +6,17 @@ The light behind a polarizer at angle theta is, with e = 1 / extinction ratio (M
 """
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64
+from pydantic import Field
 from torch import Tensor
 
 from polarnet.events.rotation import Rotation, steady_rotation
 from polarnet.events.stream import Events, concatenate
-from polarnet.runtime.ranges import allowed, check_ranges
+from polarnet.runtime.sections import section
 from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate
 from polarnet.simulation.motion import Trajectory, render
 from polarnet.simulation.pixels.light import FULL_SCALE
@@ -26,21 +26,20 @@ from polarnet.simulation.scene import PolarizationScene
 CHUNK = 64  # frames rendered at once
 
 
-@dataclass(frozen=True)
+@section
 class RotatingConfig:
     """Section `rotating` of params.yaml: a polarizer that rotates in front of one sensor."""
 
     rate_hz: float
     """Turns per second; negative: from 0 towards 135 degrees."""
-    start_angle_deg: float = field(metadata=allowed(low=-360, high=360))
-    extinction_ratio: float | None = field(metadata=allowed(low=1))
+    start_angle_deg: Annotated[float, Field(ge=-360, le=360)]
+    extinction_ratio: Annotated[float, Field(ge=1)] | None
     """Transmission along the axis over that across it; null: infinite."""
-    frames_per_turn: int = field(metadata=allowed(low=32))
+    frames_per_turn: Annotated[int, Field(ge=32)]
     """Light is rendered at least as often as this, and as section `emulate` says."""
 
     def __post_init__(self):
-        check_ranges(self)
-        if not (math.isfinite(self.rate_hz) and self.rate_hz):
+        if self.rate_hz == 0:
             raise ValueError(f"rate_hz: expected turns per second other than 0, got {self.rate_hz}")
 
     @property
