@@ -128,7 +128,8 @@ def _add_recovery(commands: Commands) -> None:
     )  # fmt: skip
     recover.add_argument(
         "--step",
-        help="time between the ends of overlapping windows, at least 0.1ms (default: no overlap; with --rotating: half a turn)",
+        help="time between the ends of overlapping windows, at least 0.1ms (default: no overlap; with "
+        "--rotating: half a turn)",
     )
     recover.add_argument(
         "--weights", type=Path, metavar="FILE", help="checkpoint of the network (default: the shipped one)"

@@ -81,17 +81,21 @@ def response_model(
 def fit_pixels(
     pixels: Pixels,
     start: Float64[np.ndarray, "n 2"],
+    guess: Float64[np.ndarray, "n 3"],
     mean: Float64[np.ndarray, "n 5"],
     precision: Float64[np.ndarray, "n 5"],
     model: ResponseModel,
     noise: float,
 ) -> tuple[Float64[np.ndarray, "n 5"], Float64[np.ndarray, "n 5 5"], Float64[np.ndarray, " n"]]:
-    """Unknowns, covariance and cost of each pixel, from initial g and a normal prior; the mean without events."""
+    """Unknowns, covariance and cost of each pixel; the mean for fewer than two events.
+
+    `start` is an initial g, `guess` a better one with the level (NaN: none); `mean` and `precision` are the prior.
+    """
     fitted, cost = mean.copy(), np.zeros(len(mean))
     covariance = np.zeros((len(mean), UNKNOWNS, UNKNOWNS))
     levels = RESTART_LEVELS if model.lagged or model.knee > 0 else ()
-    restarts = [(g, math.nan) for g in RESTART_G] + [(math.nan, math.log(level)) for level in levels]
-    _fit_pixels(pixels, start, mean, precision, model, noise, np.array(restarts), fitted, covariance, cost)
+    restarts = [(g, math.nan) for g in (math.nan, *RESTART_G)] + [(math.nan, math.log(level)) for level in levels]
+    _fit_pixels(pixels, start, guess, mean, precision, model, noise, np.array(restarts), fitted, covariance, cost)
     return fitted, covariance, cost
 
 
@@ -312,32 +316,38 @@ def _descend(x, pixels, lo, hi, model, noise, mean, precision, scratch):
 
 
 @_kernel
-def _fit_pixels(pixels, start, mean, precision, model, noise, restarts, fitted, covariance, cost):
+def _fit_pixels(pixels, start, guess, mean, precision, model, noise, restarts, fitted, covariance, cost):
     most = 1
     for i in range(len(start)):
         most = max(most, pixels.first[i + 1] - pixels.first[i])
     scratch = Scratch(np.empty(most), np.empty((most, 3)), np.empty(UNKNOWNS))
     normal, factor = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros((UNKNOWNS, UNKNOWNS))
-    unit, column = np.zeros(UNKNOWNS), np.zeros(UNKNOWNS)
+    unit, column, tried = np.zeros(UNKNOWNS), np.zeros(UNKNOWNS), np.zeros(UNKNOWNS)
+    coarse = max(noise, COARSE_NOISE)
     for i in range(len(start)):
         lo, hi = pixels.first[i], pixels.first[i + 1]
         if hi - lo < 2:
             continue
-        best, size = np.inf, math.hypot(start[i, 0], start[i, 1]) + G_MIN
-        for number in range(1 + len(restarts)):
-            if best < RESTART_COST * (hi - lo):
-                break
-            x, scale = mean[i].copy(), 1.0
-            if number > 0:
-                g, level = restarts[number - 1]
-                scale = scale if math.isnan(g) else g / size
+        first = mean[i].copy()
+        if math.isnan(guess[i, 0]):
+            first[0], first[1] = start[i]
+        else:
+            first[0], first[1], first[4] = guess[i]
+        _descend(first, pixels, lo, hi, model, coarse, mean[i], precision[i], scratch)
+        cost[i] = _descend(first, pixels, lo, hi, model, noise, mean[i], precision[i], scratch)
+        fitted[i] = first
+        if cost[i] > RESTART_COST * (hi - lo):
+            best, size = np.inf, math.hypot(start[i, 0], start[i, 1]) + G_MIN
+            for g, level in restarts:
+                x, scale = mean[i].copy(), 1.0 if math.isnan(g) else g / size
+                x[0], x[1] = start[i, 0] * scale, start[i, 1] * scale
                 x[4] = x[4] if math.isnan(level) else level
-            x[0], x[1] = start[i, 0] * scale, start[i, 1] * scale
-            _descend(x, pixels, lo, hi, model, max(noise, COARSE_NOISE), mean[i], precision[i], scratch)
-            now = _descend(x, pixels, lo, hi, model, noise, mean[i], precision[i], scratch)
-            if now < best:
-                best = now
-                fitted[i] = x
+                now = _descend(x, pixels, lo, hi, model, coarse, mean[i], precision[i], scratch)
+                if now < best:
+                    best = now
+                    tried[:] = x
+            if _descend(tried, pixels, lo, hi, model, noise, mean[i], precision[i], scratch) < cost[i]:
+                fitted[i] = tried
         cost[i] = _evaluate(fitted[i], pixels, lo, hi, model, noise, mean[i], precision[i], normal, column, scratch)
         _factorise(normal, 0.0, factor)
         for j in range(UNKNOWNS):

@@ -77,12 +77,15 @@ class ModulationState(NamedTuple):
     variances: Float64[np.ndarray, "2 h w"]
     last_us: Float64[np.ndarray, "h w"]
     """NaN before the first event."""
+    guess: Float64[np.ndarray, "3 h w"]
+    """The last fit, from which the next one starts: artanh(DoLP) as a vector, logarithm of the level; NaN: none."""
 
 
 def initial_state(height: int, width: int, config: ModulationConfig) -> ModulationState:
     """State before the first event: mean thresholds, with the sensor's mismatch."""
     variances = np.full((2, height, width), config.threshold_spread**2)
-    return ModulationState(np.zeros((2, height, width)), variances, np.full((height, width), np.nan))
+    last_us, guess = np.full((height, width), np.nan), np.full((3, height, width), np.nan)
+    return ModulationState(np.zeros((2, height, width)), variances, last_us, guess)
 
 
 def fit_modulation(
@@ -106,18 +109,18 @@ def fit_modulation(
         config.threshold_on, config.threshold_off, phase_rate, config.cutoff_hz, config.knee_dn, config.silence_noise
     )
     mean, precision = _prior(state, config)
+    guess = state.guess.reshape(3, -1).T
     start = _initial_g(pixels, config, rotation, stop_us - start_us)
-    fitted, covariance, cost = fit_pixels(pixels, start, mean, precision, model, config.noise)
+    fitted, covariance, cost = fit_pixels(pixels, start, guess, mean, precision, model, config.noise)
     intervals = np.maximum(np.diff(pixels.first) - 1, 0)
     # residuals above the expected noise make the errors larger in proportion
     covariance *= np.maximum(1, 2 * cost / np.maximum(intervals, 1))[:, None, None]
     active = intervals > 0
     variances = np.where(active[:, None], np.diagonal(covariance, axis1=1, axis2=2)[:, 2:4], np.inf)
-    memory = (
-        fitted[:, 2:4],
-        np.minimum(variances, 1 / precision[:, 2:4]),
-    )  # a window never makes thresholds less certain
-    after = ModulationState(*(x.T.reshape(2, height, width) for x in memory), last_us.reshape(height, width))
+    variances = np.minimum(variances, 1 / precision[:, 2:4])  # a window never makes thresholds less certain
+    columns = fitted[:, 2:4], variances, last_us, np.where(active[:, None], fitted[:, [0, 1, 4]], np.nan)
+    thresholds, variances, latest, guess = (np.moveaxis(c.reshape(height, width, -1), -1, 0) for c in columns)
+    after = ModulationState(thresholds, variances, latest[0], guess)
     return _prediction(fitted, covariance, active, config, (height, width)), after
 
 
