@@ -1,13 +1,14 @@
 """Error of the fit to a rotating polarizer's events: python -m studies.rotating [--write]
 
-Still scenes are smooth random maps of S0 from 0.2 to 1, DoLP from 0 to 0.95 and AoLP over half a circle, 60 x 80 pixels,
-seen by the sensor of params.yaml. `headline` has three such scenes at the rate and window of params.yaml. The curves
-change one setting each, on one scene. The fit expects the sensor's mean thresholds and bandwidth, except in
-`assumed_threshold`. Moving scenes are compared with the truth at the middle of the window. `--write` puts the figures
-into docs/results/camera.json and draws docs/pictures/rotating_polarizer.png.
+Still scenes are smooth random maps of S0 from 0.2 to 1, DoLP from 0 to 0.95 and AoLP over half a circle, 60 x 80
+pixels, seen by the sensor of params.yaml. Section `rotating` has three such scenes at the rate and window of
+params.yaml. The curves change one setting each, on one scene. The fit expects the sensor's mean thresholds and
+bandwidth, except in `assumed_threshold`. Moving scenes are compared with the truth at the middle of the window.
+`--write` puts the figures into docs/results/camera.json and draws docs/pictures/rotating_polarizer.png.
 """
 
 import argparse
+import itertools
 import json
 import math
 from collections.abc import Mapping
@@ -36,6 +37,7 @@ from studies.measure import machine_record, uncommitted, write_section
 ROOT = Path(__file__).resolve().parents[1]
 PICTURE = ROOT / "docs" / "pictures" / "rotating_polarizer.png"
 HEIGHT, WIDTH = 60, 80
+PHOTOGRAPH = "coffee.png"
 MARGIN = 40  # columns beyond the sensor, for motion
 GRID = (6, 8)  # independent values of a smooth map
 S0_MIN, DOLP_MAX = 0.2, 0.95
@@ -90,7 +92,11 @@ def smooth_scene(seed: int) -> PolarizationScene:
 
 def photograph() -> PolarizationScene:
     """Centre of a built-in photograph, whose saturation is DoLP."""
-    rgb = torch.nn.functional.interpolate(read_rgb(BUILTIN_PHOTOS["coffee"])[None], scale_factor=0.25, mode="area")[0]
+    rgb = torch.nn.functional.interpolate(
+        read_rgb(next(photo.path for photo in BUILTIN_PHOTOS if photo.file == PHOTOGRAPH))[None],
+        scale_factor=0.25,
+        mode="area",
+    )[0]
     top, left = (rgb.shape[1] - HEIGHT) // 2, (rgb.shape[2] - WIDTH - MARGIN) // 2
     return scene_from_rgb(rgb[:, top : top + HEIGHT, left : left + WIDTH + MARGIN].clamp(0, 1))
 
@@ -115,7 +121,8 @@ def moving_right(speed_px_s: float) -> Trajectory:
 
 def errors_against(stokes: torch.Tensor, prediction: Prediction) -> Errors:
     """Errors of a prediction of DoLP, AoLP and log variance."""
-    assert prediction.aolp is not None and prediction.log_variance is not None
+    assert prediction.aolp is not None
+    assert prediction.log_variance is not None
     truth, angle = dolp(stokes).double(), aolp(stokes).double()
     turned = torch.remainder(prediction.aolp - angle + math.pi / 2, math.pi) - math.pi / 2
     maps = stokes[0], truth, prediction.dolp - truth, torch.rad2deg(turned), torch.exp(prediction.log_variance / 2)
@@ -138,7 +145,7 @@ def scores(errors: Errors) -> dict[str, float]:
 def binned(errors: Errors, values: np.ndarray, edges: tuple[float, ...]) -> list[dict[str, float]]:
     """Scores by the truth's DoLP or S0."""
     rows = []
-    for low, high in zip(edges, edges[1:], strict=False):
+    for low, high in itertools.pairwise(edges):
         chosen = (values >= low) & ((values < high) | (high == edges[-1]))
         part = Errors(*(one[chosen] for one in errors))
         rows.append({"low": low, "high": high, "pixels": int(chosen.sum()), **scores(part)})
@@ -158,7 +165,8 @@ def case_of(config: Config, curve: str, value: float) -> Case:
         return case._replace(modulation=replace(case.modulation, window_turns=value))
     if curve == "threshold":
         spread = config.modulation.threshold_spread * value
-        sensor = {"contrast_threshold_on": value, "contrast_threshold_off": value, "contrast_threshold_sigma": spread}
+        sensor: Any = {"contrast_threshold_on": value, "contrast_threshold_off": value}
+        sensor["contrast_threshold_sigma"] = spread
         modulation = replace(case.modulation, threshold_on=value, threshold_off=value)
         return case._replace(sensor=replace(case.sensor, **sensor), modulation=modulation)
     if curve == "assumed_threshold":
@@ -192,7 +200,12 @@ def measure(config: Config) -> tuple[dict[str, Any], dict[str, Any]]:
     """Section `rotating`, and the curves and cases."""
     scenes = [Case(smooth_scene(seed), config.rotating, config.emulate, config.modulation) for seed in HEADLINE_SCENES]
     errors = Errors(*map(np.concatenate, zip(*map(errors_of, scenes), strict=True)))
-    figures = {**scores(errors), "rate_hz": config.rotating.rate_hz, "window_turns": config.modulation.window_turns}
+    figures: dict[str, Any] = {
+        **scores(errors),
+        "rate_hz": config.rotating.rate_hz,
+        "window_turns": config.modulation.window_turns,
+    }
+    figures |= {"scenes": len(scenes)}
     figures |= {"by_dolp": binned(errors, errors.dolp, DOLP_BINS), "by_s0": binned(errors, errors.s0, S0_BINS)}
     print(json.dumps(figures, indent=1), flush=True)
     curves: dict[str, Any] = {}

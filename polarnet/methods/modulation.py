@@ -3,12 +3,12 @@
 import functools
 import itertools
 import math
-from typing import Any, NamedTuple, no_type_check
+from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION
 
 TWO_PI = 2 * math.pi
@@ -139,11 +139,7 @@ def _responses(light: np.ndarray, knee: float) -> np.ndarray:
     return np.where(light > knee, logarithm, light * (math.log(knee) / knee)) if knee > 0 else logarithm
 
 
-def _kernel(function: Any) -> Any:
-    return numba.njit(nogil=True, cache=True, error_model="numpy")(no_type_check(function))
-
-
-@_kernel
+@compiled
 def _response(light, knee):
     """Response and its derivative."""
     if light > knee:
@@ -152,7 +148,7 @@ def _response(light, knee):
     return light * slope, slope
 
 
-@_kernel
+@compiled
 def _cell(g, level):
     """Cell of the tables and the place in it."""
     a = min(g / G_STEP, G_SIZE - 1.001)
@@ -160,7 +156,7 @@ def _cell(g, level):
     return int(a), int(b), a - int(a), b - int(b)
 
 
-@_kernel
+@compiled
 def _lag(table, g, level, phase):
     """Lag and its derivatives by g, level and phase."""
     i, j, a, b = _cell(g, level)
@@ -178,7 +174,7 @@ def _lag(table, g, level, phase):
     return v0 + a * (v1 - v0), (v1 - v0) / G_STEP, by_level, by_phase
 
 
-@_kernel
+@compiled
 def _turning_point(table, g, level):
     i, j, a, b = _cell(g, level)
     near, far = (
@@ -188,7 +184,7 @@ def _turning_point(table, g, level):
     return near + a * (far - near)
 
 
-@_kernel
+@compiled
 def _add(residual, jacobian, normal, gradient):
     """Add a residual to the normal equations; returns its pseudo-Huber cost, quadratic up to about 2."""
     root = math.sqrt(1 + residual * residual / 4)
@@ -199,7 +195,7 @@ def _add(residual, jacobian, normal, gradient):
     return 4 * (root - 1)
 
 
-@_kernel
+@compiled
 def _evaluate(x, pixels, lo, hi, model, noise, mean, precision, normal, gradient, scratch):
     """Cost of the unknowns `x` for a pixel's events `lo` to `hi`; fills its normal equations."""
     response, slope, jacobian = scratch
@@ -265,7 +261,7 @@ def _evaluate(x, pixels, lo, hi, model, noise, mean, precision, normal, gradient
     return cost
 
 
-@_kernel
+@compiled
 def _factorise(normal, damping, factor):
     """Cholesky factor of the normal equations, whose diagonal is enlarged by `damping`."""
     for i in range(UNKNOWNS):
@@ -276,7 +272,7 @@ def _factorise(normal, damping, factor):
             factor[i, j] = math.sqrt(max(value, PIVOT_MIN)) if i == j else value / factor[j, j]
 
 
-@_kernel
+@compiled
 def _solve(factor, right, x):
     for i in range(UNKNOWNS):
         value = right[i]
@@ -290,7 +286,7 @@ def _solve(factor, right, x):
         x[i] = value / factor[i, i]
 
 
-@_kernel
+@compiled
 def _descend(x, pixels, lo, hi, model, noise, mean, precision, scratch):
     """Levenberg-Marquardt from `x`, in place; returns the cost."""
     square = (UNKNOWNS, UNKNOWNS)
@@ -315,7 +311,7 @@ def _descend(x, pixels, lo, hi, model, noise, mean, precision, scratch):
     return cost
 
 
-@_kernel
+@compiled
 def _fit_pixels(pixels, start, guess, mean, precision, model, noise, restarts, fitted, covariance, cost):
     most = 1
     for i in range(len(start)):

@@ -29,7 +29,7 @@ from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
 INITIAL_RATIO_MAX = 0.7  # DoLP 0.94
-SILENT_DOLPS = 400  # nodes of the integral over DoLP of silent pixels
+SILENT_DOLPS = 4000  # nodes of the integral over DoLP of silent pixels
 SPREADS = np.linspace(-3, 3, 25)  # nodes of the integral over thresholds, in standard deviations
 
 
@@ -118,9 +118,11 @@ def fit_modulation(
     active = intervals > 0
     variances = np.where(active[:, None], np.diagonal(covariance, axis1=1, axis2=2)[:, 2:4], np.inf)
     variances = np.minimum(variances, 1 / precision[:, 2:4])  # a window never makes thresholds less certain
-    columns = fitted[:, 2:4], variances, last_us, np.where(active[:, None], fitted[:, [0, 1, 4]], np.nan)
-    thresholds, variances, latest, guess = (np.moveaxis(c.reshape(height, width, -1), -1, 0) for c in columns)
-    after = ModulationState(thresholds, variances, latest[0], guess)
+    guess = np.where(active[:, None], fitted[:, [0, 1, 4]], np.nan)
+    thresholds, variance_maps, guesses = (
+        np.moveaxis(c.reshape(height, width, -1), -1, 0) for c in (fitted[:, 2:4], variances, guess)
+    )
+    after = ModulationState(thresholds, variance_maps, last_us.reshape(height, width), guesses)
     return _prediction(fitted, covariance, active, config, (height, width)), after
 
 
@@ -148,7 +150,7 @@ def silent_dolp(config: ModulationConfig) -> tuple[float, float]:
     The light swings by ln((1 + DoLP) / (1 - DoLP)). The pixel stays silent if this swing fits between its thresholds,
     and its reference level may lie anywhere between them.
     """
-    dolp = np.linspace(0, 1, SILENT_DOLPS, endpoint=False)
+    dolp = (np.arange(SILENT_DOLPS) + 0.5) / SILENT_DOLPS
     swing = 2 * np.arctanh(dolp * config.polarizer_contrast)
     room = config.threshold_on + config.threshold_off
     spread = config.threshold_spread * math.hypot(config.threshold_on, config.threshold_off)
