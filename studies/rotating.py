@@ -44,6 +44,7 @@ S0_MIN, DOLP_MAX = 0.2, 0.95
 HEADLINE_SCENES = (0, 1, 2)
 DOLP_BINS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, DOLP_MAX)
 S0_BINS = (S0_MIN, 0.4, 0.6, 0.8, 1.0)
+HEADROOM = 1.05  # of the axes above the largest value
 LONG_PATH_PX = 1e4  # amplitude of a sine whose beginning is an even motion
 CURVES = {
     "rate_hz": ("rotation rate, turns/s", (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)),
@@ -225,15 +226,15 @@ def curves_figure(curves: Mapping[str, list[Mapping[str, float]]]) -> Figure:
             x = [point["value"] for point in curves[curve]]
             axes.plot(x, [point["dolp_rms"] for point in curves[curve]], "o-", color="#1f6feb")
             axes.plot(x, [point["expected_rms"] for point in curves[curve]], ":", color="#1f6feb")
-            axes.set_ylim(0, None)
             axes.set_xlabel(label)
             axes.set_ylabel("DoLP error, RMS (dotted: expected)", color="#1f6feb")
             if curve in ("rate_hz", "shot_noise_rate_hz"):
                 axes.set_xscale("log")
             right = axes.twinx()
             right.plot(x, [point["aolp_deg"] for point in curves[curve]], "s--", color="#c2410c")
-            right.set_ylim(0, None)
             right.set_ylabel("AoLP error, degrees", color="#c2410c")
+            for side in (axes, right):
+                side.set_ylim(0, HEADROOM * side.get_ylim()[1])
     return figure
 
 
