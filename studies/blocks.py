@@ -450,7 +450,7 @@ BLOCKS = {
     "rotating": Block(
         "camera", "rotating", "studies.rotating --write", lambda results: [results["rotating"]],
         {"turns/s": "{rate_hz:g}", "window, turns": "{window_turns:g}", **ROTATING_COLUMNS},
-        "{rotating[scenes]} scenes of 60 x 80 pixels. {origin}",
+        "{rotating[scenes]} scenes. {origin}",
     ),
     "rotating-dolp": Block(
         "camera", "rotating", "studies.rotating --write", lambda results: results["rotating"]["by_dolp"],
