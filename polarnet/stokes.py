@@ -58,12 +58,24 @@ def stokes_from_polarization(
 Plane = TypeVar("Plane", Tensor, np.ndarray)
 
 
+def analyzer(angle: float, extinction_ratio: float = math.inf, transmission: float = 1.0) -> tuple[float, float, float]:
+    """First row of the Mueller matrix of a linear polarizer, without circular polarization: weights of S0, S1 and S2.
+
+    The intensity behind the polarizer is the weighted sum. `angle` of the transmission axis in radians;
+    `transmission` for light polarized along the axis, and `extinction_ratio` times less across it (infinite: ideal).
+    """
+    along, across = transmission, transmission / extinction_ratio
+    polarized = (along - across) / 2
+    return (along + across) / 2, polarized * math.cos(2 * angle), polarized * math.sin(2 * angle)
+
+
 def behind_polarizer(s0: Plane, s1: Plane, s2: Plane, angle: float) -> Plane:
     """Intensity behind an ideal linear polarizer at `angle` radians (paper Eq. 4, written in Stokes parameters).
 
     S0 (1 - DoLP) / 2 + S0 DoLP cos^2(angle - AoLP) = (S0 + S1 cos(2 angle) + S2 sin(2 angle)) / 2.
     """
-    return (s0 + s1 * math.cos(2 * angle) + s2 * math.sin(2 * angle)) / 2
+    a, b, c = analyzer(angle)
+    return a * s0 + b * s1 + c * s2
 
 
 def intensity_behind_polarizer(stokes: Float[Array, "*b 3 h w"], angle: float) -> Float[Tensor, "*b h w"]:

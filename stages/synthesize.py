@@ -11,7 +11,8 @@ def main(config: Config) -> None:
     """Make a scene from every picture and move the sensor over it."""
     images, scenes, frames = (Path(path) for path in (config.paths.images, config.paths.scenes, config.paths.frames))
     mapper, size = config.mapper("synthesize"), config.storage.sequences_per_part
-    count = synthesize(images, scenes, frames, config.synthesize, config.seed, mapper, size, config.variation)
+    layout = config.polarizers.layout
+    count = synthesize(images, scenes, frames, config.synthesize, config.seed, mapper, size, config.variation, layout)
     print(f"{count} sequences")
 
 

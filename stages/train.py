@@ -26,7 +26,7 @@ def main(config: Config) -> None:
     join(device)
     settings, task = or_exit(lambda: _task(config))
     paths, threads = config.paths, threads_of(config.runtime)
-    events = open_events(settings.data, paths.events, paths.scenes, config.emulate, config.seed, threads)
+    events = open_events(settings.data, paths.events, paths.scenes, config.camera, config.seed, threads)
     split = open_split(events, paths.frames, task.encode)
     metadata = describe(task, split, settings, Path(paths.weights), config.seed, device)
     recorder = Recorder(Path(paths.train) / (config.baseline or DOLP_TRAINING), Path(paths.resume), metadata)

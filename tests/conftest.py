@@ -102,7 +102,7 @@ class Simulated(NamedTuple):
     scenes: Path
     frames: Path
     events: Path
-    emulate: Any
+    camera: Any
     seed: int
 
 
@@ -113,6 +113,7 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     import torch
 
     from polarnet.config.tree import load
+    from polarnet.simulation.camera import Camera
     from polarnet.simulation.dataset import emulate_scenes
     from polarnet.simulation.motion import Trajectory, frame_times_us, random_trajectory
     from polarnet.simulation.scene import scene_from_polarization
@@ -125,7 +126,8 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     motion = dataclasses.replace(
         config.synthesize, duration_s=0.2, sensor_height=18, sensor_width=24, acceleration_max_px_s2=4000.0
     )
-    emulate = dataclasses.replace(config.emulate, randomise=True, random_shot_noise_rate_hz=[20.0, 40.0])
+    sensor = dataclasses.replace(config.emulate, randomise=True, random_shot_noise_rate_hz=[20.0, 40.0])
+    camera = Camera(sensor)
     splits = {"a-0": "train", "b-0": "train", "c-0": "train", "d-0": "val"}
     window, t_us = (motion.sensor_height, motion.sensor_width), frame_times_us(motion)
     scenes = SceneStore.create(
@@ -135,7 +137,7 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
         largest_picture=(60, 80),
         sensor=window,
         trajectory_names=Trajectory.vector_names(),
-        attributes={},
+        attributes={"layout": "four_sensors"},
         sequences_per_part=2,
     )
     frames = FrameStore.create(folder / "frames.zarr", list(splits), splits, len(t_us), *window, {})
@@ -150,8 +152,8 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
         frames.write(name, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *window))
     scenes.finish()
     frames.finish()
-    emulate_scenes(folder / "scenes.zarr", folder / "events.zarr", emulate, 3, map, 1)
-    return Simulated(folder / "scenes.zarr", folder / "frames.zarr", folder / "events.zarr", emulate, 3)
+    emulate_scenes(folder / "scenes.zarr", folder / "events.zarr", camera, 3, map, 1)
+    return Simulated(folder / "scenes.zarr", folder / "frames.zarr", folder / "events.zarr", camera, 3)
 
 
 @pytest.fixture(scope="session")

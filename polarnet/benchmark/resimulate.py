@@ -10,9 +10,11 @@ from torch import Tensor
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import Events
 from polarnet.runtime.machine import generator_for, seed_for
-from polarnet.simulation.emulator import EmulatorConfig, randomised
+from polarnet.simulation.camera import Camera
+from polarnet.simulation.emulator import randomised
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
+from polarnet.simulation.polarizers import grid
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.truth import frames_of, valid_frames
 from polarnet.storage.scenes import SceneRecord, SceneStore
@@ -30,12 +32,12 @@ def resimulated(
     scenes: SceneStore,
     sequence: str,
     motion: SynthesizeConfig,
-    emulate: Sequence[EmulatorConfig],
+    cameras: Sequence[Camera],
     seed: int,
     speed: float = 1.0,
     threads: int = 1,
 ) -> TestSequence:
-    """Emulate a stored sequence again, with one sensor configuration for each of the four polarizers.
+    """Emulate a stored sequence again, with one camera for each of the four channels.
 
     The noise equals that of the stored sequence. A `speed` other than 1 multiplies the configured speed and moves
     the sensor over the same picture along another path.
@@ -52,11 +54,17 @@ def resimulated(
         )
         trajectory = random_trajectory(quicker, scene.height, scene.width, generator_for(seed, sequence, "motion"))
     t_us = torch.tensor(frame_times_us(motion))
-    sensors = [randomised(config, generator_for(seed, sequence, "sensor")) for config in emulate]
-    distinct = [sensor for i, sensor in enumerate(sensors) if sensor not in sensors[:i]]
+    drawn = [
+        dataclasses.replace(camera, sensor=randomised(camera.sensor, generator_for(seed, sequence, "sensor")))
+        for camera in cameras
+    ]
+    distinct = [camera for i, camera in enumerate(drawn) if camera not in drawn[:i]]
     size, key = (scenes.sensor_height, scenes.sensor_width), seed_for(seed, sequence, "emulate")
-    channels = [emulate_motion(scene, trajectory, int(t_us[-1]), *size, one, key, threads) for one in distinct]
-    events = [channels[distinct.index(sensor)][polarizer] for polarizer, sensor in enumerate(sensors)]
+    channels = [
+        emulate_motion(scene, trajectory, int(t_us[-1]), *size, one.sensor, key, threads, one.polarizers, one.readout)
+        for one in distinct
+    ]
+    events = [channels[distinct.index(camera)][channel] for channel, camera in enumerate(drawn)]
     return _test_sequence(scenes, record, scene, trajectory, events, t_us)
 
 
@@ -68,7 +76,7 @@ def _test_sequence(
     events: Sequence[Events],
     t_us: Int64[Tensor, " n"],
 ) -> TestSequence:
-    size = scenes.sensor_height, scenes.sensor_width
+    size = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
     intensity, dolp, aolp = (frames[1:] for frames in frames_of(scene, trajectory, t_us.tolist(), *size))
     valid = None if record.valid is None else valid_frames(record.valid, trajectory, t_us.tolist()[1:], *size)
     s0 = intensity[:, 0] + intensity[:, 2]

@@ -10,6 +10,7 @@ from tqdm import tqdm
 from polarnet.benchmark.resimulate import resimulated
 from polarnet.benchmark.rows import Context, predictions_of
 from polarnet.benchmark.score import FrameScore, mean_scores, score_sequence
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.storage.scenes import SceneStore
@@ -34,8 +35,12 @@ SETTINGS: Mapping[str, Sequence[float]] = {
 SHOWN = ("mse", "psnr", "corr", "skill")
 
 
-def sensors(setting: str, value: float, emulate: EmulatorConfig) -> list[EmulatorConfig]:
-    """Sensors behind the four polarizers with one setting changed; `speed` leaves them unchanged."""
+def cameras(setting: str, value: float, camera: Camera) -> list[Camera]:
+    """Cameras whose four channels have one setting of the sensor changed; `speed` leaves them unchanged."""
+    return [dataclasses.replace(camera, sensor=sensor) for sensor in _sensors(setting, value, camera.sensor)]
+
+
+def _sensors(setting: str, value: float, emulate: EmulatorConfig) -> list[EmulatorConfig]:
     if setting == "threshold_mismatch":
         return [dataclasses.replace(emulate, contrast_threshold_sigma=value)] * 4
     if setting == "noise_rate_hz":
@@ -58,7 +63,7 @@ def sensitivity(
     scenes: SceneStore,
     sequences: Sequence[str],
     motion: SynthesizeConfig,
-    emulate: EmulatorConfig,
+    camera: Camera,
     seed: int,
     warmup_windows: int,
     methods: Sequence[str],
@@ -80,7 +85,7 @@ def sensitivity(
         for sequence in sequences:
             speed = value if setting == "speed" else 1.0
             try:
-                test = resimulated(scenes, sequence, motion, sensors(setting, value, emulate), seed, speed, threads)
+                test = resimulated(scenes, sequence, motion, cameras(setting, value, camera), seed, speed, threads)
             except ValueError as error:
                 if setting != "speed":
                     raise

@@ -73,11 +73,12 @@ def _preset(options: argparse.Namespace) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from polarnet.config.experiments import BASE
     from polarnet.config.tree import load
 
     root = project_root()
     chosen = dict(item.split("=", 1) for item in options.overrides if "=" in item)
-    name = "-".join([chosen.get("experiment", "demo"), *([chosen["sensor"]] if "sensor" in chosen else [])])
+    name = "-".join(chosen[group] for group in BASE if group in chosen) or BASE["experiment"]
     folder = chosen.get("paths.data", f"outputs/run/{name}")
     overrides = [*options.overrides, *([] if "paths.data" in chosen else [f"paths.data={folder}"])]
     for name, stage, own in hydra_runs(root, load(root, options.overrides).used_baselines):

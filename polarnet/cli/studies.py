@@ -61,7 +61,7 @@ def run_sensitivity(
     motion = dataclasses.replace(config.synthesize, **size)  # emulated again at the scenes' sensor size
     conditions = announced(configured(motion, config.emulate), metadata_used(methods, context), SET_THEM)
     table = sensitivity(
-        scenes, sequences, config.synthesize, config.emulate, config.seed, config.benchmark.warmup_windows, methods,
+        scenes, sequences, config.synthesize, config.camera, config.seed, config.benchmark.warmup_windows, methods,
         context, threads=threads_of(config.runtime),
     )  # fmt: skip
     results = {"methods": list(methods), "sequences": list(sequences), "conditions": conditions, "settings": table}

@@ -10,7 +10,7 @@ from ruamel.yaml.comments import CommentedSeq
 
 from polarnet.runtime.files import replaced
 
-BASE = {"experiment": "demo", "sensor": "default"}
+BASE = {"experiment": "demo", "sensor": "default", "polarizers": "ideal"}
 """Base preset of each group (a folder of conf/).
 
 It sets every value that another preset of the group changes, so no value of an earlier preset remains.
@@ -35,7 +35,7 @@ def stage_names(root: Path) -> list[str]:
 
 
 def preset_names(root: Path, group: str) -> list[str]:
-    """Names of the presets of a group (`experiment`, `sensor`) in the project at `root`."""
+    """Names of the presets of a group (`experiment`, `sensor`, `polarizers`) in the project at `root`."""
     return sorted(path.stem for path in (root / "conf" / group).glob("*.yaml"))
 
 
@@ -50,7 +50,7 @@ def group_of(root: Path, name: str) -> str:
     for group, of_group in names.items():
         if name in of_group:
             return group
-    listed = "; ".join(f"{group}s {', '.join(of_group)}" for group, of_group in names.items())
+    listed = "; ".join(f"{group}: {', '.join(of_group)}" for group, of_group in names.items())
     raise ValueError(f"no preset {name!r}; there are {listed}")
 
 

@@ -31,8 +31,11 @@ from polarnet.pictures.ingest import IngestConfig
 from polarnet.runtime.cluster import pmap
 from polarnet.runtime.machine import RuntimeConfig, configure, threads_of
 from polarnet.runtime.sections import one_of, section, unknown_key
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
+from polarnet.simulation.polarizers import PolarizersConfig, channel_size
+from polarnet.simulation.readout import ReadoutConfig
 from polarnet.simulation.rotating import RotatingConfig
 from polarnet.simulation.sets import Recipe, SetsConfig
 from polarnet.simulation.variation import VariationConfig
@@ -122,6 +125,8 @@ class Config:
     synthesize: SynthesizeConfig
     variation: VariationConfig
     emulate: EmulatorConfig
+    polarizers: PolarizersConfig
+    readout: ReadoutConfig
     storage: StorageConfig
     network: Annotated[str, one_of(NETWORKS)]
     networks: NetworksConfig
@@ -151,25 +156,26 @@ class Config:
         self._check_sizes()
 
     def _check_sizes(self) -> None:
-        """ValueError for a crop larger than the sensor, and for images too small for LPIPS."""
-        sensor = [self.synthesize.sensor_height, self.synthesize.sensor_width]
+        """ValueError for a DoFP sensor of odd size, a crop larger than a channel, and images too small for LPIPS."""
+        size = self.synthesize.sensor_height, self.synthesize.sensor_width
+        channel = list(channel_size(self.polarizers.layout, *size))
         crops = {f"baselines.{name}": getattr(self.baselines, name).crop for name in BASELINES}
         for training, crop in {"train": self.train.crop, **crops}.items():
-            if crop is not None and (crop[0] > sensor[0] or crop[1] > sensor[1]):
+            if crop is not None and (crop[0] > channel[0] or crop[1] > channel[1]):
                 raise ValueError(
-                    f"{training}.crop: expected at most the sensor of section synthesize, {sensor}, got {crop}"
+                    f"{training}.crop: expected at most a channel of section synthesize's sensor, {channel}, got {crop}"
                 )
         compared = {
-            key: (self.lpips.backbone, crops.get(key.rpartition(".")[0], self.train.crop) or sensor)
+            key: (self.lpips.backbone, crops.get(key.rpartition(".")[0], self.train.crop) or channel)
             for key, weight in self.lpips_losses.items()
             if weight > 0
         }
         if self.benchmark.lpips:
-            compared["benchmark.lpips"] = (self.benchmark.lpips_backbone, sensor)
-        for key, (backbone, size) in compared.items():
+            compared["benchmark.lpips"] = (self.benchmark.lpips_backbone, channel)
+        for key, (backbone, image) in compared.items():
             side = BACKBONES[backbone].min_side
-            if min(size) < side:
-                raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {size}")
+            if min(image) < side:
+                raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {image}")
 
     def _check_rows(self) -> None:
         """ValueError for a row whose entry in `rows` differs from the record of its method."""
@@ -227,10 +233,15 @@ class Config:
         return getattr(self.networks, self.network)
 
     @property
+    def camera(self) -> Camera:
+        """The simulated camera."""
+        return Camera(self.emulate, self.polarizers, self.readout)
+
+    @property
     def recipe(self) -> Recipe:
         """Settings that make sequences from pictures."""
         threads, size = threads_of(self.runtime), self.storage.sequences_per_part
-        return Recipe(self.ingest, self.synthesize, self.emulate, self.seed, threads, size)
+        return Recipe(self.ingest, self.synthesize, self.camera, self.seed, threads, size)
 
     def mapper(self, label: str) -> functools.partial[list[Any]]:
         """Parallel map with the workers and the cluster of this configuration; `label` names its progress bar."""
@@ -260,8 +271,8 @@ def load(root: Path, overrides: list[str] | None = None) -> Config:
 def check_overrides(root: Path, overrides: list[str]) -> None:
     """Raise ValueError for an override of a key that is not a setting, or of a group that has no such choice.
 
-    The groups are `experiment`, `sensor` and `ablation`. Hydra refuses both as well, but this message lists the
-    available keys and choices.
+    The groups are `experiment`, `sensor`, `polarizers` and `ablation`. Hydra refuses both as well, but this message
+    lists the available keys and choices.
     """
     groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
     for override in overrides:

@@ -9,9 +9,11 @@ from typing import Any
 
 MODULE_OF = {
     "BUILTIN_PHOTOS": "polarnet.pictures.builtin",
+    "Camera": "polarnet.simulation.camera",
     "EmulatorConfig": "polarnet.simulation.emulator",
     "MOTIONS": "polarnet.simulation.presets",
     "SynthesizeConfig": "polarnet.simulation.motion",
+    "POLARIZERS": "polarnet.simulation.presets",
     "PolarizationScene": "polarnet.simulation.scene",
     "SENSORS": "polarnet.simulation.presets",
     "SensorState": "polarnet.simulation.emulator",

@@ -4,8 +4,9 @@ import functools
 from typing import Any
 
 from polarnet.events.stream import Events, slice_time
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.dataset import emulate_sequence, origin_of
-from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.polarizers import channel_size
 from polarnet.storage.scenes import SceneStore
 
 CAPACITY = 8  # sequences in memory, about 25 MB each at 120x180 px and 2 million events
@@ -18,19 +19,16 @@ class EmulatedEvents:
     further reads. A copy in another process starts with none.
     """
 
-    def __init__(
-        self, scenes: SceneStore, config: EmulatorConfig, seed: int, threads: int = 1, capacity: int = CAPACITY
-    ):
+    def __init__(self, scenes: SceneStore, camera: Camera, seed: int, threads: int = 1, capacity: int = CAPACITY):
         if capacity < 1:
             raise ValueError(f"expected at least one sequence to keep in memory, got capacity={capacity}")
         self.path = scenes.path
         self.sequences = scenes.sequences
-        self.height = scenes.sensor_height
-        self.width = scenes.sensor_width
-        self.attributes = origin_of(scenes, config, seed)
-        self._settings = scenes, config, seed, threads, capacity
+        self.height, self.width = channel_size(camera.polarizers.layout, scenes.sensor_height, scenes.sensor_width)
+        self.attributes = origin_of(scenes, camera, seed)
+        self._settings = scenes, camera, seed, threads, capacity
         self._emulated = functools.lru_cache(capacity)(
-            lambda sequence: emulate_sequence(scenes, sequence, config, seed, threads)
+            lambda sequence: emulate_sequence(scenes, sequence, camera, seed, threads)
         )
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -263,14 +263,21 @@ def frame_times_us(config: SynthesizeConfig) -> list[int]:
 
 
 def render(
-    scene: PolarizationScene, trajectory: Trajectory, t_s: Float64[np.ndarray, " n"], height: int, width: int
+    scene: PolarizationScene,
+    trajectory: Trajectory,
+    t_s: Float64[np.ndarray, " n"],
+    height: int,
+    width: int,
+    pitch: int = 1,
 ) -> Float32[Tensor, "n 3 h w"]:
     """Stokes images on the moving sensor, by bilinear interpolation of the scene's.
 
     `sensor_to_scene` maps sensor pixel (row, column) to a point of the scene; pixel centres are at integers in both.
-    A camera rolled by a measures angles from its own axes, so that its AoLP is the scene's minus a.
+    A camera rolled by a measures angles from its own axes, so that its AoLP is the scene's minus a. Pixels lie `pitch`
+    pixels of the scene apart: 2 for the cells of a DoFP sensor.
     """
-    return torch.from_numpy(render_poses(scene, trajectory.pose(np.asarray(t_s, dtype=np.float64)), height, width))
+    pose = trajectory.pose(np.asarray(t_s, dtype=np.float64))
+    return torch.from_numpy(render_poses(scene, pose._replace(zoom=pose.zoom / pitch), height, width))
 
 
 def render_poses(scene: PolarizationScene, pose: Pose, height: int, width: int) -> Float32[np.ndarray, "n 3 h w"]:

@@ -10,7 +10,24 @@ from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, em
 from polarnet.simulation.motion import Pose, Trajectory
 from polarnet.simulation.pixels.columns import Columns
 from polarnet.simulation.pixels.light import light_of_frames
-from polarnet.simulation.rendering import check_inside, drifts, lights_of_drift, render_intensities, render_times_us
+from polarnet.simulation.polarizers import (
+    IDEAL,
+    PolarizersConfig,
+    analyzer_maps,
+    analyzers,
+    channel_size,
+    mixed_with_neighbours,
+    places_of,
+    split_cells,
+)
+from polarnet.simulation.readout import PERFECT, ReadoutConfig, as_channels, as_one_sensor, read_out
+from polarnet.simulation.rendering import (
+    check_inside,
+    drifts,
+    lights_of_drift,
+    render_intensities,
+    render_times_us,
+)
 from polarnet.simulation.scene import PolarizationScene
 
 CHANNELS = (0, 1, 2, 3)  # behind the polarizers at 0, 45, 90 and 135 degrees
@@ -26,14 +43,29 @@ def emulate_motion(
     config: EmulatorConfig,
     key: int,
     threads: int = 1,
+    polarizers: PolarizersConfig = IDEAL,
+    readout: ReadoutConfig = PERFECT,
 ) -> list[Events]:
     """Events of the four channels of a sensor of height x width pixels that moves over a scene for `duration_us`.
 
-    Times count from the start of the motion. `key` (64 bits) seeds the mismatch of the pixels and all noise.
+    Times count from the start of the motion. `key` (64 bits) seeds the mismatch of the pixels and all noise. The
+    channels of a DoFP sensor (`polarizers.layout`) have half its rows and columns.
     """
     t_us = emulation_times_us(trajectory, duration_us, height, width, config)
-    events, _ = emulate_motion_steps(scene, trajectory, t_us, height, width, config, key, None, threads)
-    return events
+    events, _ = emulate_motion_steps(scene, trajectory, t_us, height, width, config, key, None, threads, polarizers)
+    return _read_out(events, polarizers, readout, key, duration_us)
+
+
+def _read_out(
+    channels: list[Events], polarizers: PolarizersConfig, readout: ReadoutConfig, key: int, duration_us: int
+) -> list[Events]:
+    """The channels as they leave their sensors: each its own, or all four one DoFP sensor."""
+    if readout.perfect:
+        return channels
+    if polarizers.layout == "dofp":
+        places = places_of(polarizers.mosaic)
+        return as_channels(read_out(as_one_sensor(channels, places), readout, key, duration_us)[0], places)
+    return [read_out(channel, readout, key + number, duration_us)[0] for number, channel in enumerate(channels)]
 
 
 def emulation_times_us(
@@ -54,31 +86,39 @@ def emulate_motion_steps(
     key: int,
     state: SensorState | None,
     threads: int = 1,
+    polarizers: PolarizersConfig = IDEAL,
 ) -> tuple[list[Events], SensorState]:
     """As `emulate_motion`, for light rendered at times `t_us`; pass the returned state to continue.
 
-    If the sensor only drifts, light is rendered row by row as the pixels need it. If it turns or zooms, light is
-    rendered CHUNK frames at a time. Both interpolate the scene's Stokes parameters like `motion.render`. Raises
+    If the sensor only drifts behind uniform polarizers, light is rendered row by row as the pixels need it. Otherwise
+    it is rendered CHUNK frames at a time. Both interpolate the scene's Stokes parameters like `motion.render`. Raises
     ValueError if the sensor leaves the scene.
     """
     if len(t_us) == 0 or (np.diff(t_us) <= 0).any():
         raise ValueError(f"expected at least one time, and strictly increasing times, got {t_us[:5].tolist()}...")
     pose = trajectory.pose(t_us * 1e-6)
     check_inside(scene, pose, t_us, height, width)
+    rows, columns = channel_size(polarizers.layout, height, width)
+    eight_bit = MODELS[config.model].EIGHT_BIT_VIDEO
+    weights = analyzers(polarizers) if polarizers.uniform else analyzer_maps(polarizers, height, width, key)
     advance = functools.partial(
-        emulate_lights, height=height, width=width, config=config, key=key, channels=CHANNELS, threads=threads
+        emulate_lights, height=rows, width=columns, config=config, key=key, channels=CHANNELS, threads=threads
     )
-    if drifts(pose):
-        columns, state = advance(lights_of_drift(scene, pose, height, width), t_us.astype(np.float64), state=state)
-        return [events_of(c, height, width) for c in columns], state
+    if drifts(pose) and polarizers.uniform:
+        lights = lights_of_drift(scene, pose, height, width, weights)
+        channels, state = advance(lights, t_us.astype(np.float64), state=state)
+        return [events_of(channel, rows, columns) for channel in channels], state
     pieces = []
     for first in range(0, len(t_us), CHUNK):
         chunk = slice(first, first + CHUNK)
-        chunk_pose = Pose(*(values[chunk] for values in pose))
-        frames = render_intensities(scene, chunk_pose, height, width, MODELS[config.model].EIGHT_BIT_VIDEO)
-        lights = [light_of_frames(frames[channel]) for channel in CHANNELS]
-        columns, state = advance(lights, t_us[chunk].astype(np.float64), state=state)
-        pieces.append(columns)
+        frames = render_intensities(scene, Pose(*(values[chunk] for values in pose)), height, width, weights)
+        if polarizers.layout == "dofp":
+            frames = split_cells(mixed_with_neighbours(frames[0], polarizers.crosstalk), polarizers.mosaic)
+        if eight_bit:
+            frames = (frames + np.float32(0.5)).astype(np.uint8)
+        lights = [light_of_frames(channel) for channel in frames]
+        channels, state = advance(lights, t_us[chunk].astype(np.float64), state=state)
+        pieces.append(channels)
     joined = [Columns(*map(np.concatenate, zip(*channel, strict=True))) for channel in zip(*pieces, strict=True)]
     assert state is not None  # there was at least one time
-    return [events_of(c, height, width) for c in joined], state
+    return [events_of(channel, rows, columns) for channel in joined], state

@@ -11,6 +11,7 @@ from ruamel.yaml import YAML
 from polarnet.runtime.files import shipped_settings
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
+from polarnet.simulation.polarizers import IDEAL
 
 
 def _preset(group: str, name: str) -> dict[str, Any]:
@@ -22,6 +23,12 @@ _SENSOR = EmulatorConfig(**_DEMO["emulate"])
 
 SENSORS = {name: replace(_SENSOR, **_preset("sensor", name)["emulate"]) for name in ("default", "clean", "noisy")}
 """v2e's command-line defaults and its options `clean` and `noisy`; derive others with `dataclasses.replace`."""
+
+POLARIZERS = {
+    name: replace(IDEAL, **_preset("polarizers", name)["polarizers"])
+    for name in ("ideal", "film", "wire_grid", "micropolarizers")
+}
+"""Polarizers of a `Camera`, as in conf/polarizers."""
 
 MOTIONS = {"default": SynthesizeConfig(**_DEMO["synthesize"])}
 """One second of a 120 x 180 px sensor that drifts at up to 160 px/s."""

@@ -4,12 +4,11 @@ import itertools
 import math
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Float32, Float64, Int64
 
 from polarnet.simulation.motion import Pose, Trajectory, render_poses
 from polarnet.simulation.pixels.light import FULL_SCALE, Light
 from polarnet.simulation.scene import PolarizationScene
-from polarnet.stokes import POLARIZER_ANGLES_DEG, behind_polarizer
 
 MIN_RATE_HZ = 30.0  # minimum of the adaptive rate, for a sensor at rest
 SAMPLES_PER_STEP = 8  # samples of the motion for each pixel of movement
@@ -79,26 +78,29 @@ def drifts(pose: Pose) -> bool:
 
 
 def render_intensities(
-    scene: PolarizationScene, pose: Pose, height: int, width: int, eight_bit: bool
-) -> UInt8[np.ndarray, "4 n h w"] | Float32[np.ndarray, "4 n h w"]:
-    """Digital numbers behind the four polarizers for any motion; uint8, rounded, if `eight_bit`."""
-    frames = behind_polarizers(render_poses(scene, pose, height, width).transpose(1, 0, 2, 3))
-    return (frames + np.float32(0.5)).astype(np.uint8) if eight_bit else frames
+    scene: PolarizationScene, pose: Pose, height: int, width: int, weights: Float32[np.ndarray, "sensors 3 *pixels"]
+) -> Float32[np.ndarray, "sensors n h w"]:
+    """Digital numbers behind polarizers of these `weights` for any motion; the polarizers turn with the camera."""
+    return behind_polarizers(render_poses(scene, pose, height, width).transpose(1, 0, 2, 3), weights)
 
 
-def behind_polarizers(stokes: Float32[np.ndarray, "3 *shape"]) -> Float32[np.ndarray, "4 *shape"]:
-    """Digital numbers behind ideal polarizers at 0, 45, 90 and 135 degrees that see the same Stokes parameters."""
+def behind_polarizers(
+    stokes: Float32[np.ndarray, "3 *shape"], weights: Float32[np.ndarray, "sensors 3 *pixels"]
+) -> Float32[np.ndarray, "sensors *shape"]:
+    """Digital numbers behind polarizers that weight S0, S1 and S2: alike at all pixels, or with a weight for each."""
     s0, s1, s2 = stokes
-    intensities = [behind_polarizer(s0, s1, s2, math.radians(angle)) for angle in POLARIZER_ANGLES_DEG]
-    return np.maximum(np.stack(intensities), 0) * FULL_SCALE
+    return np.maximum(np.stack([a * s0 + b * s1 + c * s2 for a, b, c in weights]), 0) * FULL_SCALE
 
 
-def lights_of_drift(scene: PolarizationScene, pose: Pose, height: int, width: int) -> list[Light]:
-    """Light behind the four polarizers of a drifting sensor, from the part of the scene that the sensor covers."""
+def lights_of_drift(
+    scene: PolarizationScene, pose: Pose, height: int, width: int, weights: Float32[np.ndarray, "sensors 3"]
+) -> list[Light]:
+    """Light behind the polarizers of a drifting sensor, from the part of the scene that the sensor covers."""
     left, top = pose.x - (width - 1) / 2, pose.y - (height - 1) / 2
     rows, columns = _visible(top, height, scene.height), _visible(left, width, scene.width)
     # numpy, because idle torch threads would occupy the cores that the channels' threads need next
-    intensities = np.pad(behind_polarizers(scene.stokes[:, rows, columns].numpy()), ((0, 0), (0, 1), (0, 1)), "edge")
+    intensities = behind_polarizers(scene.stokes[:, rows, columns].numpy(), weights)
+    intensities = np.pad(intensities, ((0, 0), (0, 1), (0, 1)), "edge")
     return [Light(intensity[np.newaxis], top - rows.start, left - columns.start) for intensity in intensities]
 
 

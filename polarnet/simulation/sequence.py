@@ -9,9 +9,11 @@ from torch import Tensor, tensor
 from polarnet.events.stream import Events
 from polarnet.runtime.arrays import Array
 from polarnet.runtime.machine import generator_for, seed_for
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig, randomised
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
+from polarnet.simulation.polarizers import grid
 from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb
 from polarnet.simulation.truth import frames_of
 
@@ -32,23 +34,28 @@ class Simulation(NamedTuple):
 
 
 def simulate(
-    picture: Float[Array, "3 h w"] | PolarizationScene, motion: SynthesizeConfig, sensor: EmulatorConfig, seed: int
+    picture: Float[Array, "3 h w"] | PolarizationScene,
+    motion: SynthesizeConfig,
+    sensor: EmulatorConfig | Camera,
+    seed: int,
 ) -> Simulation:
     """Simulate an event camera whose sensor moves over a picture or a scene.
 
     A picture is RGB, numpy or torch, of shape (3, height, width), in floating-point numbers of any precision in [0, 1].
     Hue becomes AoLP, saturation DoLP and value S0, as in the pipeline. The same arguments give the same numbers.
+    A sensor alone is behind ideal polarizers; a `Camera` has its own polarizers and readout.
 
     Raises TypeError for arguments of another kind. Raises ValueError for integers (divide 8 bits by 255, 16 bits by
     65535), values outside [0, 1], another order of axes, NaN and infinity, unphysical scenes, and pictures
     too small for the sensor and its motion; the message gives the remedy.
     """
-    for name, value, kind, example in (
-        ("motion", motion, SynthesizeConfig, 'MOTIONS["default"]'),
-        ("sensor", sensor, EmulatorConfig, 'SENSORS["default"]'),
+    for name, value, kinds, example in (
+        ("motion", motion, (SynthesizeConfig,), 'MOTIONS["default"]'),
+        ("sensor", sensor, (EmulatorConfig, Camera), 'SENSORS["default"]'),
     ):
-        if not isinstance(value, kind):
-            raise TypeError(f"{name}: expected {kind.__name__} such as {example}, got {value!r}")
+        if not isinstance(value, kinds):
+            expected = " or ".join(kind.__name__ for kind in kinds)
+            raise TypeError(f"{name}: expected {expected} such as {example}, got {value!r}")
     if not isinstance(seed, (int, np.integer)):
         raise TypeError(f"seed: expected a whole number, got {seed!r}")
     if isinstance(picture, PolarizationScene):
@@ -57,8 +64,12 @@ def simulate(
     else:
         scene = scene_from_rgb(picture)
     trajectory = random_trajectory(motion, scene.height, scene.width, generator_for(seed, "picture", "motion"))
+    camera = sensor if isinstance(sensor, Camera) else Camera(sensor)
     t_us, size = frame_times_us(motion), (motion.sensor_height, motion.sensor_width)
-    sensor = randomised(sensor, generator_for(seed, "picture", "sensor"))
+    drawn = randomised(camera.sensor, generator_for(seed, "picture", "sensor"))
     key = seed_for(seed, "picture", "emulate")
-    events = emulate_motion(scene, trajectory, t_us[-1], *size, sensor, key)
-    return Simulation(events, tensor(t_us), *frames_of(scene, trajectory, t_us, *size), trajectory)
+    events = emulate_motion(
+        scene, trajectory, t_us[-1], *size, drawn, key, polarizers=camera.polarizers, readout=camera.readout
+    )
+    pixels = grid(camera.polarizers.layout, *size)
+    return Simulation(events, tensor(t_us), *frames_of(scene, trajectory, t_us, *pixels), trajectory)

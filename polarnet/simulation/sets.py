@@ -20,8 +20,8 @@ from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.pictures.polarimetry import group_by_measurement
 from polarnet.runtime.files import sha256
 from polarnet.runtime.sections import section
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.dataset import emulate_scenes
-from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.truth import synthesize
 
@@ -55,7 +55,7 @@ class Recipe:
 
     ingest: IngestConfig
     motion: SynthesizeConfig
-    emulate: EmulatorConfig
+    camera: Camera
     seed: int
     threads: int
     """Threads of each task; changes no result."""
@@ -105,7 +105,7 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
     `fill` writes the pictures into a folder, and `source` is the hash of those that it reads. A folder made with others
     is emptied first. The code is not compared: DVC does that for the pipeline's sets.
     """
-    sections = {name: asdict(getattr(recipe, name)) for name in ("ingest", "motion", "emulate")}
+    sections = {"ingest": asdict(recipe.ingest), "motion": asdict(recipe.motion), **recipe.camera.sections}
     key = sha256(json.dumps(sections | {"seed": recipe.seed, "source": source}, sort_keys=True).encode())
     note = folder / MADE
     if note.exists():
@@ -120,9 +120,10 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
     if not (images / "manifest.json").exists():
         fill(images)
     if not (scenes.exists() and frames.exists()):
-        synthesize(images, scenes, frames, recipe.motion, recipe.seed, mapper("synthesize"), recipe.sequences_per_part)
+        layout, size = recipe.camera.polarizers.layout, recipe.sequences_per_part
+        synthesize(images, scenes, frames, recipe.motion, recipe.seed, mapper("synthesize"), size, layout=layout)
     if not events.exists():
-        emulate_scenes(scenes, events, recipe.emulate, recipe.seed, mapper("emulate"), recipe.threads)
+        emulate_scenes(scenes, events, recipe.camera, recipe.seed, mapper("emulate"), recipe.threads)
     note.write_text(json.dumps({"key": key, "complete": True}))
     return True
 

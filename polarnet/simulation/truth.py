@@ -20,6 +20,7 @@ from polarnet.pictures.polarimetry import read_intensities
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import generator_for, one_thread
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
+from polarnet.simulation.polarizers import IDEAL, channel_size, grid
 from polarnet.simulation.scene import (
     PolarizationScene,
     polarization_from_rgb,
@@ -46,13 +47,14 @@ class Motion(NamedTuple):
 
 @one_thread()
 def frames_of(
-    scene: PolarizationScene, trajectory: Trajectory, t_us: Sequence[int], height: int, width: int
+    scene: PolarizationScene, trajectory: Trajectory, t_us: Sequence[int], height: int, width: int, pitch: int = 1
 ) -> tuple[Float[Tensor, "n 4 h w"], Float[Tensor, "n h w"], Float[Tensor, "n h w"]]:
     """(intensity behind the four polarizers, DoLP, AoLP) on a sensor that moves over a scene, at times in microseconds.
 
     Interpolation applies to Stokes parameters, because angles cannot be averaged; all three results follow from them.
+    Pixels lie `pitch` pixels of the scene apart (`polarizers.grid`).
     """
-    stokes_frames = render(scene, trajectory, np.asarray(t_us) * 1e-6, height, width)
+    stokes_frames = render(scene, trajectory, np.asarray(t_us) * 1e-6, height, width, pitch)
     return (
         stokes.intensities_from_stokes(stokes_frames).clamp(0, 1),
         stokes.dolp(stokes_frames).clamp(0, 1),
@@ -61,14 +63,15 @@ def frames_of(
 
 
 def valid_frames(
-    valid: Bool[Tensor, "h1 w1"], trajectory: Trajectory, t_us: Sequence[int], height: int, width: int
+    valid: Bool[Tensor, "h1 w1"], trajectory: Trajectory, t_us: Sequence[int], height: int, width: int, pitch: int = 1
 ) -> Bool[Tensor, "n h w"]:
     """Sensor pixels with known light: those interpolated from valid pixels of the scene only.
 
     Interpolation weights are not negative, so the rendered mask of invalid pixels is 0 exactly there.
     """
     masked = (~valid).float()
-    rendered = render(PolarizationScene(masked.expand(3, -1, -1)), trajectory, np.asarray(t_us) * 1e-6, height, width)
+    scene, t_s = PolarizationScene(masked.expand(3, -1, -1)), np.asarray(t_us) * 1e-6
+    rendered = render(scene, trajectory, t_s, height, width, pitch)
     return rendered[:, 0] == 0
 
 
@@ -81,10 +84,12 @@ def synthesize(
     mapper: Callable[..., Iterable[Any]],
     sequences_per_part: int,
     variation: VariationConfig | None = None,
+    layout: str = IDEAL.layout,
 ) -> int:
     """Fill both stores with `sequences_per_picture` sequences of every scene, and return the number of sequences.
 
     A scene is a picture of `images`, or a variant of a training picture; without `variation` there are no variants.
+    The frames are those of the channels of a camera of this `layout` (section `polarizers`).
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks makes
     one part of the stores, `sequences_per_part` sequences. Every trajectory depends only on the seed and the sequence's
@@ -103,13 +108,14 @@ def synthesize(
     attributes = {
         "synthesize": asdict(config),
         "variation": asdict(variation) if variation else None,
+        "layout": layout,
         "seed": seed,
         "images_sha256": _digest(entries, images),
     }
     scene_store, frame_store = _create(scenes, frames, entries, motions, config, attributes, sequences_per_part)
     motion_of = {motion.sequence: motion for motion in motions}
     missing = sorted({*scene_store.missing_parts(), *frame_store.missing_parts()})
-    task = functools.partial(_synthesize_part, scene_store, frame_store, images, config, variation, seed)
+    task = functools.partial(_synthesize_part, scene_store, frame_store, images, config, variation, layout, seed)
     for _ in mapper(task, [[motion_of[sequence] for sequence in scene_store.parts[part]] for part in missing]):
         pass
     scene_store.finish()
@@ -172,8 +178,9 @@ def _create(
         sequences_per_part=sequences_per_part,
     )
     n_frames, attributes = len(frame_times_us(config)), {**attributes, "scenes": scene_of}
+    size = channel_size(attributes["layout"], *sensor)
     frame_store = FrameStore.create(
-        frames, list(scene_of), splits, n_frames, *sensor, attributes, masked, sequences_per_part, variant_of
+        frames, list(scene_of), splits, n_frames, *size, attributes, masked, sequences_per_part, variant_of
     )
     return scene_store, frame_store
 
@@ -185,11 +192,12 @@ def _synthesize_part(
     images: Path,
     config: SynthesizeConfig,
     variation: VariationConfig | None,
+    layout: str,
     seed: int,
     motions: Sequence[Motion],
 ) -> None:
     """Write the part of both stores that holds the sequences of these motions."""
-    t_us, size = frame_times_us(config), (config.sensor_height, config.sensor_width)
+    t_us, pixels = frame_times_us(config), grid(layout, config.sensor_height, config.sensor_width)
     for (name, picture), over_scene in itertools.groupby(motions, lambda motion: (motion.scene, motion.picture)):
         planes = _planes_of(name, picture, images, variation, seed)
         if not scenes.masked:
@@ -197,8 +205,8 @@ def _synthesize_part(
         scene = scene_from_polarization(planes.s0, planes.dolp, planes.aolp)
         for sequence, *_, trajectory in over_scene:
             scenes.write(sequence, planes, torch.from_numpy(trajectory.to_vector()), t_us[-1])
-            valid = None if planes.valid is None else valid_frames(planes.valid, trajectory, t_us, *size)
-            frames.write(sequence, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *size), valid)
+            valid = None if planes.valid is None else valid_frames(planes.valid, trajectory, t_us, *pixels)
+            frames.write(sequence, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *pixels), valid)
 
 
 def _planes_of(scene: str, picture: str, images: Path, variation: VariationConfig | None, seed: int) -> Scene:

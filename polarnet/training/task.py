@@ -15,7 +15,7 @@ from polarnet.metrics.lpips import NO_RECORD, stored_record
 from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import precision_on, seed_for
-from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.fly import EmulatedEvents
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
@@ -81,12 +81,12 @@ class Split(NamedTuple):
 
 
 def open_events(
-    data: str, events: str, scenes: str, emulate: EmulatorConfig, seed: int, threads: int
+    data: str, events: str, scenes: str, camera: Camera, seed: int, threads: int
 ) -> EventStore | EmulatedEvents:
     """Open the events: `store` reads them from disk, `fly` emulates them in memory. Both give identical events."""
     if data == "store":
         return EventStore.open(events)
-    return EmulatedEvents(SceneStore.open(scenes), emulate, seed, threads)
+    return EmulatedEvents(SceneStore.open(scenes), camera, seed, threads)
 
 
 def open_split(events: EventSource, frames: str, encode: Encode) -> Split:

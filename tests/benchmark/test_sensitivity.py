@@ -4,12 +4,13 @@ import pytest
 import torch
 
 from polarnet.benchmark.resimulate import resimulated, sequence_at
-from polarnet.benchmark.sensitivity import CHANNEL_SIGNS, SETTINGS, sensitivity, sensors
+from polarnet.benchmark.sensitivity import CHANNEL_SIGNS, SETTINGS, cameras, sensitivity
 from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import write_png
 from polarnet.pictures.manifest import Manifest, ManifestEntry, write_manifest
 from polarnet.runtime.machine import generator_for
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.dataset import emulate_scenes
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.truth import synthesize
@@ -50,14 +51,14 @@ def stores(tmp_path_factory, config):
     )
     write_manifest(Manifest((entry,), (), 0, 0), images)
     synthesize(images, root / "scenes.zarr", root / "frames.zarr", config.synthesize, config.seed, map, 2)
-    emulate_scenes(root / "scenes.zarr", root / "events.zarr", config.emulate, config.seed, map, 1)
+    emulate_scenes(root / "scenes.zarr", root / "events.zarr", config.camera, config.seed, map, 1)
     opened = SceneStore.open(root / "scenes.zarr"), FrameStore.open(root / "frames.zarr")
     return *opened, EventStore.open(root / "events.zarr")
 
 
 def test_the_same_sensor_and_speed_give_the_stored_sequence_again(stores, config):
     scenes, frames, events = stores
-    again = resimulated(scenes, "leaf-00", config.synthesize, [config.emulate] * 4, config.seed)
+    again = resimulated(scenes, "leaf-00", config.synthesize, [config.camera] * 4, config.seed)
     for events_again, stored in zip(again.events, events.read("leaf-00"), strict=True):
         assert torch.equal(events_again.t, stored.t)
         assert torch.equal(events_again.x, stored.x)
@@ -78,7 +79,7 @@ def test_an_error_of_one_channel_changes_the_events_behind_that_polarizer_alone(
     stored = events.read("leaf-00")
     higher = dataclasses.replace(config.emulate, contrast_threshold_on=0.4, contrast_threshold_off=0.4)
     channels = resimulated(
-        scenes, "leaf-00", config.synthesize, [higher, *[config.emulate] * 3], config.seed
+        scenes, "leaf-00", config.synthesize, [Camera(higher), *[config.camera] * 3], config.seed
     ).events  # fmt: skip
     assert len(channels[0]) < 0.8 * len(stored[0])
     for k in (1, 2, 3):
@@ -95,25 +96,25 @@ def test_twice_the_speed_is_twice_the_speed(stores, config, monkeypatch):
         return list(stores[2].read("leaf-00"))
 
     monkeypatch.setattr("polarnet.benchmark.resimulate.emulate_motion", noting)
-    resimulated(scenes, "leaf-00", config.synthesize, [config.emulate] * 4, config.seed, speed=2.0)
+    resimulated(scenes, "leaf-00", config.synthesize, [config.camera] * 4, config.seed, speed=2.0)
     stored = Trajectory.from_vector(scenes.read("leaf-00").trajectory.numpy())
     assert speeds == [pytest.approx(2 * stored.speed_px_s, rel=1e-6)]
 
 
 def test_channel_errors_are_opposite_in_each_pair_of_polarizers(config):
-    result = sensors("channel_error", 0.1, config.emulate)
-    assert [s.contrast_threshold_on for s in result] == pytest.approx([0.22, 0.18, 0.18, 0.22])
+    result = cameras("channel_error", 0.1, config.camera)
+    assert [s.sensor.contrast_threshold_on for s in result] == pytest.approx([0.22, 0.18, 0.18, 0.22])
     assert CHANNEL_SIGNS[0] == -CHANNEL_SIGNS[2]
     assert CHANNEL_SIGNS[1] == -CHANNEL_SIGNS[3]
-    assert {s.shot_noise_rate_hz for s in sensors("noise_rate_hz", 5.0, config.emulate)} == {5.0}
+    assert {s.sensor.shot_noise_rate_hz for s in cameras("noise_rate_hz", 5.0, config.camera)} == {5.0}
     with pytest.raises(ValueError, match="expected one of threshold_mismatch"):
-        sensors("colour", 1.0, config.emulate)
+        cameras("colour", 1.0, config.camera)
 
 
 def test_each_setting_and_value_is_scored_for_each_method(stores, config, context):
     settings = {"noise_rate_hz": (0.0, 20.0), "speed": (1.0,)}
     table = sensitivity(
-        stores[0], ["leaf-00"], config.synthesize, config.emulate, 1, 1, ["zeros", "cf"], context, settings
+        stores[0], ["leaf-00"], config.synthesize, config.camera, 1, 1, ["zeros", "cf"], context, settings
     )
     quiet, noisy = table["noise_rate_hz"]
     assert noisy["events_per_pixel_second"] > quiet["events_per_pixel_second"] + 5

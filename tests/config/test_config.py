@@ -51,7 +51,10 @@ def test_the_committed_values_pass(project_root):
         ("network=resnet", r"network: expected one of paper"),
         ("lpips.backbone=resnet", r"lpips\.backbone: expected one of"),
         ("train.crop=[24,90]", r"loss\.lpips: LPIPS \(alex\) needs images of 31 pixels a side, got \[24, 90\]"),
-        ("train.crop=[240,90]", r"train\.crop: expected at most the sensor of section synthesize, \[120, 180\]"),
+        (
+            "train.crop=[240,90]",
+            r"train\.crop: expected at most a channel of section synthesize's sensor, \[120, 180\]",
+        ),
     ],
 )
 def test_a_value_out_of_range_is_refused_with_its_key_and_what_is_allowed(project_root, override, message):
@@ -262,7 +265,7 @@ def test_the_base_preset_is_what_params_yaml_holds_and_covers_what_others_change
 
 
 def test_the_base_experiment_undoes_a_sensor_too_and_no_sensor_is_called_like_an_experiment(project_root):
-    demo, default = (preset_values(project_root, group, name) for group, name in BASE.items())
+    demo, default = (preset_values(project_root, group, BASE[group]) for group in ("experiment", "sensor"))
     assert set(default) <= set(demo)
     assert not set(preset_names(project_root, "experiment")) & set(preset_names(project_root, "sensor"))
 
@@ -290,7 +293,7 @@ def test_a_preset_keeps_comments_and_unrelated_values_and_the_base_undoes_it(pro
 
 
 def test_an_unknown_preset_lists_the_ones_there_are(project):
-    with pytest.raises(ValueError, match="no preset 'papper'; there are experiments demo, paper, photographs, smoke;"):
+    with pytest.raises(ValueError, match="no preset 'papper'; there are experiment: demo, paper, photographs, smoke;"):
         write_preset(project, "papper")
 
 

@@ -217,7 +217,7 @@ def over_dask(folder: Path, events: Path, cluster) -> None:
 
     config = load(Path(__file__).resolve().parents[2])
     mapper = functools.partial(pmap, workers=1, label="emulate", address=cluster.scheduler_address)
-    assert emulate_scenes(folder / "scenes.zarr", events, config.emulate, config.seed, mapper, 1) == SEQUENCES
+    assert emulate_scenes(folder / "scenes.zarr", events, config.camera, config.seed, mapper, 1) == SEQUENCES
 
 
 def test_one_and_three_dask_workers_and_one_killed_half_way_give_the_bytes_of_one_process(

@@ -1,6 +1,5 @@
 """Events made in memory are those that the emulate stage stores."""
 
-import dataclasses
 import pickle
 
 import pytest
@@ -27,7 +26,7 @@ def source(simulated, emulated, monkeypatch) -> EmulatedEvents:
 
     emulate_sequence = fly.emulate_sequence
     monkeypatch.setattr(fly, "emulate_sequence", counted)
-    return EmulatedEvents(SceneStore.open(simulated.scenes), simulated.emulate, simulated.seed, capacity=2)
+    return EmulatedEvents(SceneStore.open(simulated.scenes), simulated.camera, simulated.seed, capacity=2)
 
 
 def same(some: list[Events], others: list[Events]) -> bool:
@@ -74,7 +73,7 @@ def test_a_copy_in_another_process_takes_no_events_along(source):
 
 
 def test_another_seed_gives_other_events(simulated, source):
-    other = EmulatedEvents(SceneStore.open(simulated.scenes), simulated.emulate, simulated.seed + 1)
+    other = EmulatedEvents(SceneStore.open(simulated.scenes), simulated.camera, simulated.seed + 1)
     assert not all(len(a) == len(b) for a, b in zip(source.read("a-0"), other.read("a-0"), strict=True))
 
 
@@ -82,10 +81,10 @@ def test_an_unknown_sequence_and_an_empty_memory_are_refused(simulated, source):
     with pytest.raises(ValueError, match="there is no 'lake' among its 4 sequences"):
         source.read("lake")
     with pytest.raises(ValueError, match="at least one sequence to keep"):
-        EmulatedEvents(SceneStore.open(simulated.scenes), simulated.emulate, simulated.seed, capacity=0)
+        EmulatedEvents(SceneStore.open(simulated.scenes), simulated.camera, simulated.seed, capacity=0)
 
 
 def test_threads_change_nothing(simulated, source):
-    threaded = EmulatedEvents(SceneStore.open(simulated.scenes), simulated.emulate, simulated.seed, threads=3)
-    assert dataclasses.asdict(simulated.emulate)["randomise"]
+    threaded = EmulatedEvents(SceneStore.open(simulated.scenes), simulated.camera, simulated.seed, threads=3)
+    assert simulated.camera.sensor.randomise
     assert same(source.read("d-0"), threaded.read("d-0"))

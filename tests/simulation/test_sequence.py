@@ -102,7 +102,7 @@ def test_a_picture_too_small_to_move_over_is_told_which_size_would_do():
     [
         ({"picture": "coffee.png"}, "picture: expected a numpy array or torch tensor of real numbers, got str"),
         ({"motion": "default"}, r'motion: expected SynthesizeConfig such as MOTIONS\["default"\], got'),
-        ({"sensor": "noisy"}, r'sensor: expected EmulatorConfig such as SENSORS\["default"\], got'),
+        ({"sensor": "noisy"}, r'sensor: expected EmulatorConfig or Camera such as SENSORS\["default"\], got'),
         ({"seed": None}, "seed: expected a whole number, got None"),
     ],
 )

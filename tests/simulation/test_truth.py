@@ -23,6 +23,7 @@ from polarnet.simulation.motion import (
     random_trajectory,
     render,
 )
+from polarnet.simulation.polarizers import grid
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.truth import frames_of, synthesize, valid_frames
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
@@ -243,3 +244,16 @@ def test_the_number_of_threads_changes_no_bit_of_a_frame(threads_as_they_were):
 
     for one, several in zip(frames(1), frames(3), strict=True):
         assert torch.equal(one, several)
+
+
+def test_the_truth_of_a_mosaic_is_that_of_the_centres_of_its_cells():
+    """Each cell's truth is the mean of the four pixels' Stokes parameters where the sensor stands on whole pixels."""
+    generator = torch.Generator().manual_seed(3)
+    scene = scene_from_polarization(*torch.rand(3, 40, 60, generator=generator))
+    still = Sine(0.0, 0.0, 0.0)
+    trajectory = Trajectory(29.5, 19.5, (still,), (still,), still, still, 0.0)
+    rows, columns, pitch = grid("dofp", 20, 30)
+    intensities, degree, _ = frames_of(scene, trajectory, [0], rows, columns, pitch)
+    cells = torch.nn.functional.avg_pool2d(scene.stokes[None, :, 10:30, 15:45], 2)[0]
+    assert intensities.shape == (1, 4, 10, 15)
+    torch.testing.assert_close(degree[0], dolp(cells), atol=1e-5, rtol=0)

@@ -51,7 +51,7 @@ def e2v() -> Task:
 
 def split_of(simulated, data: str, task: Task) -> Split:
     events = open_events(
-        data, str(simulated.events), str(simulated.scenes), simulated.emulate, simulated.seed, threads=1
+        data, str(simulated.events), str(simulated.scenes), simulated.camera, simulated.seed, threads=1
     )
     return open_split(events, str(simulated.frames), task.encode)
 
@@ -99,7 +99,7 @@ def test_a_checkpoint_tells_what_its_events_were_made_from(simulated, tmp_path):
         config = dataclasses.replace(TRAIN, data=data)
         described[data] = describe(task, split_of(simulated, data, task), config, tmp_path, SEED, torch.device("cpu"))
         assert described[data]["training"]["data"] == data
-        assert described[data]["data"]["events_from"]["emulate"] == dataclasses.asdict(simulated.emulate)
+        assert described[data]["data"]["events_from"]["emulate"] == dataclasses.asdict(simulated.camera.sensor)
     assert described["store"]["data"]["events_sha256"] != described["fly"]["data"]["events_sha256"]
 
 

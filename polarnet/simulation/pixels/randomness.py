@@ -13,6 +13,7 @@ DIGITS_MEAN, DIGITS_SCALE = np.float32(60.0), np.float32(1 / math.sqrt(170.0))  
 
 # Purposes: each random quantity of a channel has a key of its own.
 THRESHOLD_ON, THRESHOLD_OFF, NOISE_RATE, LEAK_PHASE, LEAK_JITTER, SHOT_NOISE, FIRST_PASSAGE = range(1, 8)
+POLARIZER_ANGLE, EXTINCTION, TRANSMISSION, TIMESTAMP, HOT, DEAD = range(8, 14)
 
 
 @inlined

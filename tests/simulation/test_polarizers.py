@@ -1,0 +1,223 @@
+"""Polarizers of the simulated camera, against values worked out by hand."""
+
+import dataclasses
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet import stokes
+from polarnet.pictures.polarimetry import demosaic
+from polarnet.simulation.motion import Pose, Sine, Trajectory
+from polarnet.simulation.moving_sensor import emulate_motion
+from polarnet.simulation.pixels.light import intensity_rows
+from polarnet.simulation.polarizers import (
+    IDEAL,
+    PolarizersConfig,
+    analyzer_maps,
+    analyzers,
+    channel_size,
+    mixed_with_neighbours,
+    split_cells,
+)
+from polarnet.simulation.presets import SENSORS
+from polarnet.simulation.rendering import lights_of_drift, render_intensities
+from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
+from polarnet.stokes import parse_mosaic
+
+FILM = dataclasses.replace(IDEAL, extinction_ratio=[100.0] * 4)
+DOFP = dataclasses.replace(IDEAL, layout="dofp")
+STILL = Sine(0.0, 0.0, 0.0)
+
+
+def uniform_scene(dolp: float, aolp_deg: float, s0: float = 1.0) -> PolarizationScene:
+    plane = torch.ones(60, 80)
+    return scene_from_polarization(s0 * plane, dolp * plane, math.radians(aolp_deg) * plane)
+
+
+def random_scene(seed: int = 0, height: int = 60, width: int = 80) -> PolarizationScene:
+    generator = torch.Generator().manual_seed(seed)
+    coarse = torch.rand(1, 3, 8, 10, generator=generator)
+    s0, dolp, fraction = torch.nn.functional.interpolate(coarse, (height, width), mode="bilinear")[0]
+    return scene_from_polarization(s0, dolp, 3.14 * fraction)
+
+
+def still(x: float = 39.5, y: float = 29.5, roll_deg: float = 0.0) -> Pose:
+    return Pose(np.array([x]), np.array([y]), np.array([math.radians(roll_deg)]), np.ones(1))
+
+
+def channels_of(
+    scene: PolarizationScene, polarizers: PolarizersConfig, pose: Pose | None = None, size: tuple[int, int] = (20, 30)
+) -> torch.Tensor:
+    """Light of the four channels in [0, 1]; without a pose, at the scene's middle."""
+    frames = render_intensities(scene, pose or still(), *size, analyzer_maps(polarizers, *size, key=3))
+    if polarizers.layout == "dofp":
+        frames = split_cells(mixed_with_neighbours(frames[0], polarizers.crosstalk), polarizers.mosaic)
+    return torch.from_numpy(frames[:, 0].astype(np.float64) / 255)
+
+
+def measured(scene: PolarizationScene, polarizers: PolarizersConfig) -> tuple[float, float]:
+    """(DoLP, AoLP in degrees) that Eq. 1 to 3 give, at the middle of a channel."""
+    vector = stokes.stokes_from_intensities(channels_of(scene, polarizers))
+    row, column = vector.shape[1] // 2, vector.shape[2] // 2
+    return float(stokes.dolp(vector)[row, column]), math.degrees(float(stokes.aolp(vector)[row, column]))
+
+
+@pytest.mark.parametrize("polarizers", [IDEAL, dataclasses.replace(IDEAL, angle_spread_deg=1e-6), DOFP])
+def test_the_light_obeys_malus_law(polarizers):
+    for aolp in (0.0, 30.0, 45.0, 110.0):
+        channels = channels_of(uniform_scene(1.0, aolp), polarizers)
+        for angle, channel in zip(stokes.POLARIZER_ANGLES_DEG, channels, strict=True):
+            torch.testing.assert_close(
+                channel, torch.full_like(channel, math.cos(math.radians(angle - aolp)) ** 2), atol=1e-6, rtol=0
+            )
+
+
+@pytest.mark.parametrize("layout", ["four_sensors", "dofp"])
+def test_a_film_of_100_to_1_measures_full_polarization_as_99_in_101(layout):
+    for aolp in (0.0, 22.5, 100.0):
+        dolp, _ = measured(uniform_scene(1.0, aolp), dataclasses.replace(FILM, layout=layout))
+        assert dolp == pytest.approx((1 - 1 / 100) / (1 + 1 / 100), abs=1e-5)
+
+
+def test_transmission_scales_a_channel_and_extinction_leaks_a_hundredth_of_it():
+    polarizers = dataclasses.replace(FILM, transmission=[0.8, 0.6, 0.8, 0.8])
+    i0, i45, i90, _ = channels_of(uniform_scene(1.0, 0.0), polarizers)[:, 5, 5].tolist()
+    assert i0 == pytest.approx(0.8, abs=1e-6)  # along the axis
+    assert i90 == pytest.approx(0.008, abs=1e-6)  # across it
+    assert i45 == pytest.approx(0.6 * (1 + 0.01) / 2, abs=1e-6)  # half of either
+
+
+@pytest.mark.parametrize("error_deg", [-2.0, 2.0])
+def test_polarizers_that_are_all_turned_measure_an_aolp_turned_back(error_deg):
+    for aolp in (10.0, 60.0, 150.0):
+        polarizers = dataclasses.replace(IDEAL, angle_error_deg=[error_deg] * 4)
+        dolp, angle = measured(uniform_scene(0.5, aolp), polarizers)
+        assert angle == pytest.approx(aolp - error_deg, abs=1e-3)
+        assert dolp == pytest.approx(0.5, abs=1e-5)
+
+
+def test_one_turned_polarizer_bends_s1_as_theory_says():
+    """Only the polarizer at 0 degrees is turned by 2: S1 = (cos(2 AoLP - 4) + cos(2 AoLP)) / 2, S0 and S2 likewise."""
+    polarizers = dataclasses.replace(IDEAL, angle_error_deg=[2.0, 0.0, 0.0, 0.0])
+    for aolp in (0.0, 45.0, 80.0):
+        double, turned = math.radians(2 * aolp), math.radians(2 * aolp - 4)
+        s0 = 1 + (math.cos(turned) - math.cos(double)) / 2
+        s1, s2 = (math.cos(turned) + math.cos(double)) / 2, math.sin(double)
+        dolp, angle = measured(uniform_scene(1.0, aolp), polarizers)
+        assert dolp == pytest.approx(math.hypot(s1, s2) / s0, abs=1e-5)
+        assert angle == pytest.approx(math.degrees(math.atan2(s2, s1)) / 2 % 180, abs=1e-3)
+
+
+def test_each_channel_of_a_mosaic_sees_its_own_pixels():
+    """Behind ideal polarizers, unpolarized light of brightness 0.001 (100 row + column) gives half of that."""
+    rows, columns = torch.meshgrid(torch.arange(8.0), torch.arange(10.0), indexing="ij")
+    scene = scene_from_polarization(0.001 * (100 * rows + columns), torch.zeros(8, 10), torch.zeros(8, 10))
+    channels = channels_of(scene, dataclasses.replace(DOFP, mosaic="90 45 / 135 0"), still(4.5, 3.5), (8, 10))
+    assert channels.shape == (4, 4, 5)
+    for channel, (row, column) in zip(channels, [(1, 1), (0, 1), (0, 0), (1, 0)], strict=True):
+        expected = 0.0005 * (100 * rows + columns)[row::2, column::2]
+        torch.testing.assert_close(channel, expected.double(), atol=1e-6, rtol=0)
+
+
+def test_a_mosaic_demosaicked_gives_the_dolp_of_a_scene_that_changes_evenly():
+    """S0 rises along the columns, DoLP along the rows; bilinear interpolation to the centres of cells is then exact.
+
+    Without it, an unpolarized scene would look polarized: S0 changes by 2 % from one pixel of a cell to the next.
+    """
+    rows, columns = torch.meshgrid(torch.arange(40.0), torch.arange(60.0), indexing="ij")
+    for slope, degree in ((0.01, 0.0), (0.01, 0.02), (-0.01, 0.02)):
+        s0 = 0.5 + slope * (columns - 30)
+        scene = scene_from_polarization(s0, degree * rows, math.radians(40) * torch.ones(40, 60))
+        cells = channels_of(scene, DOFP, still(29.5, 19.5), (40, 60))
+        raw = np.empty((40, 60))
+        for cell, (row, column) in zip(cells.numpy(), [(1, 1), (0, 1), (0, 0), (1, 0)], strict=True):
+            raw[row::2, column::2] = cell
+        centres = degree * (rows[2:-2:2, 2:-2:2].double() + 0.5)
+        interpolated = torch.from_numpy(demosaic(raw, parse_mosaic(DOFP.mosaic)))
+        dolp = stokes.dolp(stokes.stokes_from_intensities(interpolated))
+        torch.testing.assert_close(dolp, centres, atol=1e-5, rtol=0)
+        without = stokes.dolp(stokes.stokes_from_intensities(cells))[1:-1, 1:-1]
+        assert float((without - centres).abs().max()) > 0.01
+
+
+def test_crosstalk_brings_a_fifth_of_the_light_from_four_neighbours():
+    frame = np.zeros((1, 5, 5), np.float32)
+    frame[0, 2, 2] = 1
+    mixed = mixed_with_neighbours(frame, 0.2)[0]
+    assert mixed[2, 2] == pytest.approx(0.8)
+    assert mixed[1, 2] == mixed[2, 1] == mixed[2, 3] == mixed[3, 2] == pytest.approx(0.05)
+    assert mixed.sum() == pytest.approx(1)
+
+
+def test_crosstalk_of_a_mosaic_mixes_polarizers_at_45_degrees():
+    """In uniform light a pixel's neighbours in the mosaic 90 45 / 135 0 are, for 0: twice 45 and twice 135."""
+    polarizers = dataclasses.replace(DOFP, crosstalk=0.2)
+    dolp, angle = measured(uniform_scene(1.0, 0.0), polarizers)
+    assert dolp == pytest.approx(0.8, abs=1e-5)  # I0 = 0.8 + 0.2 / 2, I90 = 0.2 / 2
+    assert angle % 180 == pytest.approx(0, abs=1e-3)
+
+
+def test_micropolarizers_differ_between_pixels_as_much_as_stated():
+    polarizers = dataclasses.replace(
+        DOFP, extinction_ratio=[50.0] * 4, extinction_spread=0.3, angle_spread_deg=1.5, transmission=[0.5] * 4,
+        transmission_spread=0.04,
+    )  # fmt: skip
+    (weights,) = analyzer_maps(polarizers, 200, 300, key=7).astype(np.float64)
+    angles = np.degrees(np.arctan2(weights[2], weights[1]) / 2) % 180
+    zero = split_cells(angles[None].astype(np.float32), "90 45 / 135 0")[0, 0]
+    assert ((zero + 90) % 180 - 90).std() == pytest.approx(1.5, rel=0.03)
+    polarized = np.hypot(weights[1], weights[2])
+    along, across = weights[0] + polarized, weights[0] - polarized
+    assert along.std() / along.mean() == pytest.approx(0.04, rel=0.03)
+    assert np.log(along / across).std() == pytest.approx(0.3, rel=0.03)
+    assert not np.array_equal(analyzer_maps(polarizers, 200, 300, key=8)[0], weights.astype(np.float32))
+
+
+def test_ideal_polarizers_give_the_same_light_alike_or_pixel_by_pixel():
+    scene, pose = random_scene(), still(38.2, 30.7, roll_deg=20)
+    alike = render_intensities(scene, pose, 20, 30, analyzers(IDEAL))[:, 0]
+    torch.testing.assert_close(channels_of(scene, IDEAL, pose).float() * 255, torch.from_numpy(alike))
+
+
+def test_a_drifting_sensor_sees_imperfect_polarizers_as_a_turning_one_does():
+    scene, pose = random_scene(), still(38.2, 30.7)
+    polarizers = dataclasses.replace(FILM, angle_error_deg=[1.0, -2.0, 0.5, 0.0], transmission=[0.8, 0.9, 0.7, 0.8])
+    for channel, light in enumerate(lights_of_drift(scene, pose, 20, 30, analyzers(polarizers))):
+        row = np.empty(20 * 30, np.float32)
+        intensity_rows(light, 0, 0, 30, row)
+        expected = channels_of(scene, polarizers, pose)[channel]
+        torch.testing.assert_close(torch.from_numpy(row.reshape(20, 30)).double() / 255, expected, atol=1e-5, rtol=0)
+
+
+def test_events_of_ideal_polarizers_do_not_depend_on_naming_them():
+    scene = random_scene()
+    path = Trajectory(39.5, 29.5, (Sine(8.0, 6.0, 0.0),), (Sine(5.0, 4.0, 1.0),), STILL, STILL, 60.0)
+    one = emulate_motion(scene, path, 200_000, 20, 30, SENSORS["default"], 5)
+    two = emulate_motion(scene, path, 200_000, 20, 30, SENSORS["default"], 5, polarizers=IDEAL)
+    assert all(torch.equal(a.t, b.t) and torch.equal(a.x, b.x) for a, b in zip(one, two, strict=True))
+    cells = emulate_motion(scene, path, 200_000, 20, 30, SENSORS["default"], 5, polarizers=DOFP)
+    assert [(events.height, events.width) for events in cells] == [(10, 15)] * 4
+    assert all(len(events.t) > 0 for events in cells)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"layout": "prism"}, "layout: expected one of four_sensors, dofp, got 'prism'"),
+        ({"extinction_ratio": [100.0]}, "extinction_ratio: expected at least 4 values, got"),
+        ({"crosstalk": 0.1}, "crosstalk: expected 0 with layout four_sensors"),
+        ({"mosaic": "0 45 90"}, 'expected the angles 0, 45, 90 and 135 like "90 45 / 135 0"'),
+        ({"transmission": [0.0, 1.0, 1.0, 1.0]}, "transmission[0]: expected > 0, got 0.0"),
+    ],
+)
+def test_polarizers_that_cannot_be_are_refused(change, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        dataclasses.replace(IDEAL, **change)
+
+
+def test_a_mosaic_needs_whole_cells():
+    with pytest.raises(ValueError, match="expected a sensor with even sides, for whole cells of 2x2 pixels, got 21x30"):
+        channel_size("dofp", 21, 30)
