@@ -80,7 +80,7 @@ def channel_size(layout: str, height: int, width: int) -> tuple[int, int]:
         return height, width
     if height % 2 or width % 2:
         raise ValueError(
-            f"polarizers.layout dofp: expected a sensor with even sides, for whole cells of 2x2 pixels, got {height}x{width}"
+            f"polarizers.layout dofp: expected a sensor with even sides, for whole 2x2 cells, got {height}x{width}"
         )
     return height // 2, width // 2
 

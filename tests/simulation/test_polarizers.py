@@ -219,5 +219,5 @@ def test_polarizers_that_cannot_be_are_refused(change, message):
 
 
 def test_a_mosaic_needs_whole_cells():
-    with pytest.raises(ValueError, match="expected a sensor with even sides, for whole cells of 2x2 pixels, got 21x30"):
+    with pytest.raises(ValueError, match="expected a sensor with even sides, for whole 2x2 cells, got 21x30"):
         channel_size("dofp", 21, 30)
