@@ -19,6 +19,7 @@ from polarnet.reports.tables import (
 )
 from studies.designs import DESIGNS
 from studies.measure import ABLATION_KEYS, ablation_about
+from studies.rotating import CURVES
 from studies.scenes import CHOICES
 from studies.tables import Block, Columns, Results, Row, as_markdown, listed, origin
 
@@ -201,6 +202,21 @@ def _lpips_rows(results: Results) -> Iterator[Row]:
             "share": share,
         }
         yield {"label": f"`{backbone}`", "error": results[f"{backbone}_error_max"], **costs}
+
+
+ROTATING_COLUMNS = {
+    "DoLP RMS": "{dolp_rms:.4f}", "bias": "{dolp_bias:+.4f}", "AoLP error, degrees": "{aolp_deg:.2f}",
+    "expected RMS": "{expected_rms:.4f}", "errors within the expected": "{within_expected:.0%}",
+    "within twice": "{within_twice_expected:.0%}",
+}  # fmt: skip
+
+
+def _rotating_curve_rows(results: Results) -> Iterator[Row]:
+    for curve, points in results["rotating"]["curves"].items():
+        label, _ = CURVES[curve]
+        for score, about, form in (("dolp_rms", "DoLP RMS", "{:.3f}"), ("aolp_deg", "AoLP, degrees", "{:.1f}")):
+            errors = ", ".join(f"{point['value']:g}: {form.format(point[score])}" for point in points)
+            yield {"label": label, "about": about, "errors": errors}
 
 
 def _formats(readers: Results) -> list[str]:
@@ -456,6 +472,28 @@ BLOCKS = {
         "Rows are in the order of validation MSE; ± is the standard deviation over seeds. LPIPS has the backbone "
         "`{loss_weights[lpips_backbone]}`. {origin}",
         _overrides("loss_weights"),
+    ),
+    "rotating": Block(
+        "camera", "rotating", "studies.rotating --write", lambda results: [results["rotating"]],
+        {"turns/s": "{rate_hz:g}", "window, turns": "{window_turns:g}", **ROTATING_COLUMNS},
+        "{rotating[scenes]} scenes. {origin}",
+    ),
+    "rotating-dolp": Block(
+        "camera", "rotating", "studies.rotating --write", lambda results: results["rotating"]["by_dolp"],
+        {"DoLP": "{low:g} to {high:g}", "pixels": "{pixels:,}", **ROTATING_COLUMNS}, caption="",
+    ),
+    "rotating-s0": Block(
+        "camera", "rotating", "studies.rotating --write", lambda results: results["rotating"]["by_s0"],
+        {"S0": "{low:g} to {high:g}", "pixels": "{pixels:,}", **ROTATING_COLUMNS}, caption="",
+    ),
+    "rotating-cases": Block(
+        "camera", "rotating", "studies.rotating --write",
+        lambda results: [{"name": name, **one} for name, one in results["rotating"]["cases"].items()],
+        {"case": "{name}", **ROTATING_COLUMNS}, caption="",
+    ),
+    "rotating-curves": Block(
+        "camera", "rotating", "studies.rotating --write", _rotating_curve_rows,
+        {"setting": "{label}", "error": "{about}", "value: error": "{errors}"}, caption="",
     ),
     "house": Block(
         "house", "house", "studies.house --write",

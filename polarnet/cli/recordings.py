@@ -14,10 +14,13 @@ from polarnet.cli.project import settings_root
 READING_OPTIONS = ("format", "height", "width", "clock_mhz")
 """Options that describe a camera's file where the file itself does not."""
 
+NETWORK_WINDOW = "33.333ms"
+
 OPTIONS_BY_INPUT = {
     "--live": {"mosaic"},
     "four files": {"angles", "size", *READING_OPTIONS},
     "one file with --mosaic": {"mosaic", "size", *READING_OPTIONS},
+    "one file with --rotating or --triggers": {"rotating", "triggers", "start_angle", "size", *READING_OPTIONS},
     "an event store or a folder": {"sequence", "size"},
 }
 """Options of `polarnet recover` that apply to each kind of input."""
@@ -83,7 +86,8 @@ def _add_recovery(commands: Commands) -> None:
         "recover",
         help="recover DoLP and AoLP from recordings or from a running camera",
         description="Writes frames, pictures, a video and a page. INPUT is one of: four files, one for each polarizer, "
-        "with --angles; one file of a camera with polarizers on its pixels, with --mosaic; an event store; a folder of "
+        "with --angles; one file of a camera with polarizers on its pixels, with --mosaic; one file of a "
+        "camera behind a rotating polarizer, with --rotating or --triggers; an event store; a folder of "
         "division-of-time captures; with --live, a growing file or standard input (-) with lines `t x y p angle`.",
     )
     recover.add_argument("input", nargs="+", metavar="INPUT", help="recordings, an event store, a folder, or -")
@@ -92,6 +96,18 @@ def _add_recovery(commands: Commands) -> None:
     )
     recover.add_argument(
         "--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels in degrees: even row / odd row"
+    )
+    recover.add_argument(
+        "--rotating", type=float, metavar="HZ", help="turns per second of a polarizer before the one camera"
+    )
+    recover.add_argument(
+        "--triggers",
+        type=Path,
+        metavar="FILE",
+        help="times of that polarizer's triggers in us, one a turn: text or HDF5",
+    )
+    recover.add_argument(
+        "--start-angle", type=float, metavar="DEG", help="its angle at time 0, or at the first trigger (default: 0)"
     )
     recover.add_argument("--sequence", metavar="NAME", help="sequence of an event store with several")
     recover.add_argument("--live", action="store_true", help="recover while events arrive, and print the latency")
@@ -106,12 +122,14 @@ def _add_recovery(commands: Commands) -> None:
         "--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce the sensor to this many rows and columns"
     )
     recover.add_argument(
-        "--window", default="33.333ms",
+        "--window",
         help="length of a window: a time (33.3ms) or a number of events of all channels (20000ev); networks are "
-        "trained on windows of 1/30 s (default: 33.333ms)",
+        "trained on windows of 1/30 s (default: 33.333ms; with --rotating: modulation.window_turns)",
     )  # fmt: skip
     recover.add_argument(
-        "--step", help="time between the ends of overlapping windows, at least 0.1ms (default: no overlap)"
+        "--step",
+        help="time between the ends of overlapping windows, at least 0.1ms (default: no overlap; with "
+        "--rotating: half a turn)",
     )
     recover.add_argument(
         "--weights", type=Path, metavar="FILE", help="checkpoint of the network (default: the shipped one)"
@@ -201,8 +219,10 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
     refuse_unused_options(options)
+    if options.rotating is not None or options.triggers is not None:
+        return _recover_rotating(options)
     config = functools.cache(lambda: load(settings_root()))
-    length_us, events = parse_window(options.window)
+    length_us, events = parse_window(options.window or NETWORK_WINDOW)
     step_us, step_events = parse_window(options.step) if options.step else (None, None)
     if step_events is not None:
         raise ValueError(f"--step: expected a time such as 0.1ms, got {options.step}")
@@ -242,6 +262,48 @@ def _recover(options: argparse.Namespace) -> int:
     return 0
 
 
+def _recover_rotating(options: argparse.Namespace) -> int:
+    from polarnet.config.tree import load
+    from polarnet.methods.rotating_polarizer import rotating_recoverer
+    from polarnet.recordings.recording import read_recording
+    from polarnet.recovery.recover import facts_of, recover
+    from polarnet.recovery.rotating import half_turn_rule, open_rotating, rotation_of
+    from polarnet.recovery.writer import RecoveryWriter
+
+    if options.method or options.weights:
+        raise ValueError(
+            "--rotating: expected no --method or --weights, a fit without network recovers DoLP; leave it out"
+        )
+    config = load(settings_root()).modulation
+    file, size = Path(options.input[0]), (options.size[0], options.size[1]) if options.size else None
+    rotation = rotation_of(options.rotating, options.triggers, options.start_angle or 0.0)
+    length_us, step_us = (_duration_us(options, name) for name in ("window", "step"))
+    rule = half_turn_rule(rotation, config.window_turns, length_us, step_us)
+    out = options.out or Path("outputs") / "recover" / file.stem
+    with run_folder(out, "recover") as folder:
+        source, rotation = open_rotating(file, rotation, functools.partial(read_recording, **_reading(options)), size)
+        writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
+        summary = recover(source, rule, rotating_recoverer(config, rotation), writer)
+        words = f"fit to the modulation by a polarizer at {rotation.rate_hz:g} turns/s"
+        facts = facts_of(source, rule, words, summary)
+        page = writer.write_page(source.name, facts, [])
+    for key, value in facts.items():
+        print(f"{key:11s} {value}")
+    print(f"page        {out / page.name}")
+    return 0
+
+
+def _duration_us(options: argparse.Namespace, name: str) -> int | None:
+    """Option --window or --step as a time; None if it is not given."""
+    from polarnet.events.streaming import parse_window
+
+    text = getattr(options, name)
+    duration_us, _ = parse_window(text) if text else (None, None)
+    if text and duration_us is None:
+        raise ValueError(f"--{name}: expected a time such as 500ms with a rotating polarizer, got {text}")
+    return duration_us
+
+
 def refuse_unused_options(options: argparse.Namespace) -> None:
     """ValueError for an option that does not apply to the given kind of input."""
     if options.live and len(options.input) != 1:
@@ -250,6 +312,8 @@ def refuse_unused_options(options: argparse.Namespace) -> None:
         kind = "--live"
     elif len(options.input) > 1:
         kind = "four files"
+    elif options.rotating is not None or options.triggers is not None:
+        kind = "one file with --rotating or --triggers"
     elif options.mosaic is not None:
         kind = "one file with --mosaic"
     elif Path(options.input[0]).is_dir() or Path(options.input[0]).suffix == ".zip":

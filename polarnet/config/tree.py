@@ -22,6 +22,7 @@ from polarnet.captures.dot import RecordingsConfig
 from polarnet.config.experiments import preset_names, preset_values
 from polarnet.methods import METHODS, module_of, trained_rows
 from polarnet.methods.postprocessing import PostprocessingConfig
+from polarnet.methods.rotating_polarizer import ModulationConfig
 from polarnet.methods.stokes_gain import GainConfig
 from polarnet.metrics.lpips import BACKBONES, PURPOSES, Purpose, is_stored
 from polarnet.metrics.lpips_weights import LpipsConfig, local_source
@@ -35,6 +36,7 @@ from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.polarizers import PolarizersConfig, channel_size
 from polarnet.simulation.readout import ReadoutConfig
+from polarnet.simulation.rotating import RotatingConfig
 from polarnet.simulation.sets import Recipe, SetsConfig
 from polarnet.simulation.variation import VariationConfig
 from polarnet.storage.parts import StorageConfig
@@ -138,6 +140,8 @@ class Config:
     """Rows of the tables."""
     sets: SetsConfig
     recordings: RecordingsConfig
+    rotating: RotatingConfig
+    modulation: ModulationConfig
     row: RowName | None
     """Row that stage row runs."""
     baseline: BaselineName | None

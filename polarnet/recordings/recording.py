@@ -31,6 +31,7 @@ class Format(NamedTuple):
 FORMATS = {
     "store": Format("our own event store", store.matches, store.open_store),
     "e2p": Format("HDF5 of E2P, for the PDAVIS", hdf5.matches_e2p, hdf5.open_e2p),
+    "esfp": Format("HDF5 of ESfP, one sensor behind a rotating polarizer", hdf5.matches_esfp, hdf5.open_esfp),
     "dsec": Format("HDF5 of DSEC", hdf5.matches_dsec, hdf5.open_dsec),
     "aedat4": Format("AEDAT4 of iniVation", faery.matches_aedat4, faery.open_aedat4),
     "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", aedat2.matches, aedat2.open_aedat2),

@@ -1,4 +1,4 @@
-"""HDF5 files of two kinds: events in DSEC's layout, and recordings of E2P's polarization camera (PDAVIS)."""
+"""HDF5 files of three kinds: columns of events in DSEC's layout or ESfP's, and E2P's polarization camera (PDAVIS)."""
 
 import contextlib
 from collections import Counter
@@ -13,6 +13,8 @@ from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingEr
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 DSEC_COLUMNS = ("events/t", "events/x", "events/y", "events/p")
+ESFP_COLUMNS = ("t", "x", "y", "p")
+TRIGGERS = "triggers"  # times of a trigger signal in microseconds
 MAX_WHOLE = 2**53  # largest whole number that a float holds exactly
 E2P_COLUMNS = 4  # columns of /events: t in microseconds, x, y, p of 0 or 1
 
@@ -29,12 +31,12 @@ _library = IsolatedLibrary(
 
 def matches_e2p(path: Path, head: bytes) -> bool:
     """Whether the file has one table of events."""
-    if not head.startswith(MAGIC):
-        return False
-    try:
-        return "events" in _described(path)["tables"]
-    except (RecordingError, RuntimeError):
-        return False  # `open_dsec` reports the reason
+    return _has_tables(path, head, ("events",))
+
+
+def matches_esfp(path: Path, head: bytes) -> bool:
+    """Whether the file has the four columns of events at its top."""
+    return _has_tables(path, head, ESFP_COLUMNS)
 
 
 def matches_dsec(path: Path, head: bytes) -> bool:
@@ -47,18 +49,37 @@ def open_dsec(path: Path, choices: Choices) -> Source:
 
     DSEC does not state the size of its sensors, 480 x 640; files that polarnet writes do.
     """
+    return _open_columns(path, choices, DSEC_COLUMNS, "DSEC's")
+
+
+def open_esfp(path: Path, choices: Choices) -> Source:
+    """Open the columns t, x, y, p of ESfP (Muglikar et al. 2023), in microseconds and p of 1 or 0."""
+    return _open_columns(path, choices, ESFP_COLUMNS, "ESfP's")
+
+
+def trigger_times_us(path: Path) -> np.ndarray:
+    """Times in the table /triggers; RecordingError if there is none."""
     description = _described(path)
-    absent = [name for name in DSEC_COLUMNS if name not in description["tables"]]
+    if TRIGGERS not in description["tables"]:
+        raise RecordingError(f"{path.name}: expected a table /{TRIGGERS} of times in microseconds, there is none")
+    length = _length(path, description, TRIGGERS, 1)
+    blocks = [_microseconds(path, t) for (t,) in _read(path, (TRIGGERS,), length)]
+    return np.concatenate(blocks) if blocks else np.empty(0, np.int64)
+
+
+def _open_columns(path: Path, choices: Choices, columns: tuple[str, ...], layout: str) -> Source:
+    description = _described(path)
+    absent = [name for name in columns if name not in description["tables"]]
     if absent:
-        raise RecordingError(f"{path.name}: expected DSEC's HDF5, there is no {', '.join(absent)}")
-    lengths = [_length(path, description, name, 1) for name in DSEC_COLUMNS]
+        raise RecordingError(f"{path.name}: expected {layout} HDF5, there is no {', '.join(absent)}")
+    lengths = [_length(path, description, name, 1) for name in columns]
     if len(set(lengths)) > 1:
         raise RecordingError(f"{path.name}: its columns t, x, y, p have different lengths, {lengths}")
     offset_us = _whole(path, description, "t_offset") or 0
     height, width = (_whole(path, description, name) for name in ("height", "width"))
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        for t, x, y, p in _read(path, DSEC_COLUMNS, lengths[0]):
+        for t, x, y, p in _read(path, columns, lengths[0]):
             yield Block(_microseconds(path, t) + offset_us, x, y, p)
 
     return Source(*sensor_size(path, choices, height, width), blocks)
@@ -92,8 +113,17 @@ def open_e2p(path: Path, choices: Choices) -> Source:
     return Source(*sensor_size(path, choices, height, width), blocks)
 
 
+def _has_tables(path: Path, head: bytes, names: tuple[str, ...]) -> bool:
+    if not head.startswith(MAGIC):
+        return False
+    try:
+        return set(names) <= set(_described(path)["tables"])
+    except (RecordingError, RuntimeError):
+        return False  # `open_dsec` reports the reason
+
+
 def _described(path: Path) -> Description:
-    tables = [*DSEC_COLUMNS, "events"]
+    tables = [*DSEC_COLUMNS, *ESFP_COLUMNS, "events", TRIGGERS]
     return _library.ask(path, "describe", tables, ["t_offset", "height", "width", "sensor_resolution"])
 
 

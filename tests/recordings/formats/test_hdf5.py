@@ -3,6 +3,7 @@ import sys
 import numpy as np
 import pytest
 
+from polarnet.recordings.formats.hdf5 import trigger_times_us
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.storage.exchange import write_hdf5
@@ -101,3 +102,28 @@ def test_without_h5py_the_error_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(RuntimeError, match=r"pip install 'polarnet\[hdf5\]'"):
         read_recording(path, height=480, width=640)
+
+
+def write_esfp(path, triggers=None, **columns):
+    names = {"t": [3.0, 9.0], "x": [5, 0], "y": [1, 0], "p": [True, False]} | columns
+    with h5py.File(path, "w") as file:
+        for name, values in names.items():
+            file[name] = np.asarray(values)
+        if triggers is not None:
+            file["triggers"] = np.asarray(triggers)
+    return path
+
+
+def test_esfp_has_its_columns_at_the_top_of_the_file(tmp_path):
+    recording = read_recording(write_esfp(tmp_path / "e.h5"), height=2, width=6)
+    events = recording.events
+    assert recording.format == "esfp"
+    assert (events.t.tolist(), events.x.tolist(), events.p.tolist()) == ([3, 9], [5, 0], [1, -1])
+    with pytest.raises(RecordingError, match="columns t, x, y, p have different lengths"):
+        read_recording(write_esfp(tmp_path / "e.h5", x=[1]), height=2, width=6)
+
+
+def test_triggers_are_read_where_present(tmp_path):
+    assert trigger_times_us(write_esfp(tmp_path / "e.h5", [10, 20, 30])).tolist() == [10, 20, 30]
+    with pytest.raises(RecordingError, match="expected a table /triggers"):
+        trigger_times_us(write_esfp(tmp_path / "f.h5"))

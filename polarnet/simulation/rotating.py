@@ -1,0 +1,113 @@
+"""Events of one sensor behind a polarizer that rotates in front of it, on a still or moving scene.
+
+The light behind a polarizer at angle theta is, with e = 1 / extinction ratio (Malus' law of an imperfect polarizer):
+
+    I = ((1 + e) S0 + (1 - e) (S1 cos 2 theta + S2 sin 2 theta)) / 2
+"""
+
+import math
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int64
+from pydantic import Field
+from torch import Tensor
+
+from polarnet.events.rotation import Rotation, steady_rotation
+from polarnet.events.stream import Events, concatenate
+from polarnet.runtime.sections import section
+from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate
+from polarnet.simulation.motion import Trajectory, render
+from polarnet.simulation.pixels.light import FULL_SCALE
+from polarnet.simulation.rendering import check_inside
+from polarnet.simulation.scene import PolarizationScene
+
+CHUNK = 64  # frames rendered at once
+
+
+@section
+class RotatingConfig:
+    """Section `rotating` of params.yaml: a polarizer that rotates in front of one sensor."""
+
+    rate_hz: float
+    """Turns per second; negative: from 0 towards 135 degrees."""
+    start_angle_deg: Annotated[float, Field(ge=-360, le=360)]
+    extinction_ratio: Annotated[float, Field(ge=1)] | None
+    """Transmission along the axis over that across it; null: infinite."""
+    frames_per_turn: Annotated[int, Field(ge=32)]
+    """Light is rendered at least as often as this, and as section `emulate` says."""
+
+    def __post_init__(self):
+        if self.rate_hz == 0:
+            raise ValueError(f"rate_hz: expected turns per second other than 0, got {self.rate_hz}")
+
+    @property
+    def rotation(self) -> Rotation:
+        """The polarizer's angle over time."""
+        return steady_rotation(self.rate_hz, math.radians(self.start_angle_deg))
+
+
+class RotatingSimulation(NamedTuple):
+    """Events of the one sensor, and the polarizer's angle at their times."""
+
+    events: Events
+    rotation: Rotation
+    state: SensorState
+    """The sensor after the last frame; hand it back to continue."""
+
+
+def behind_rotating_polarizer(
+    stokes: Float32[Tensor, "n 3 h w"], angles: Float64[np.ndarray, " n"], extinction_ratio: float | None
+) -> Float32[Tensor, "n h w"]:
+    """Intensity behind a polarizer at the angle of each time; None: nothing passes across its axis."""
+    leakage = 0.0 if extinction_ratio is None else 1 / extinction_ratio
+    cos, sin = (torch.from_numpy(f(2 * angles)).float()[:, None, None] for f in (np.cos, np.sin))
+    s0, s1, s2 = stokes.unbind(1)
+    return (((1 + leakage) * s0 + (1 - leakage) * (s1 * cos + s2 * sin)) / 2).clamp(min=0)
+
+
+def rotating_times_us(
+    config: RotatingConfig, emulator: EmulatorConfig, start_us: int, stop_us: int
+) -> Int64[np.ndarray, " n"]:
+    """Times of rendered light from `start_us` to `stop_us`, both included."""
+    rate_hz = max(abs(config.rate_hz) * config.frames_per_turn, emulator.render_rate_hz or 0)
+    steps = max(1, math.ceil((stop_us - start_us) * 1e-6 * rate_hz))
+    return np.unique(np.rint(np.linspace(start_us, stop_us, steps + 1)).astype(np.int64))
+
+
+def emulate_rotating(
+    scene: PolarizationScene,
+    trajectory: Trajectory | None,
+    t_us: Int64[np.ndarray, " n"],
+    height: int,
+    width: int,
+    rotating: RotatingConfig,
+    emulator: EmulatorConfig,
+    key: int,
+    state: SensorState | None = None,
+) -> RotatingSimulation:
+    """Events of a sensor of height x width pixels under light rendered at times `t_us` (`rotating_times_us`).
+
+    Without a trajectory the sensor rests on the scene's upper left corner. `key` (64 bits) seeds mismatch and noise.
+    A span cut into pieces, each given the state that the previous piece returned and times after it, gives the events
+    of the whole span. ValueError if the sensor leaves the scene.
+    """
+    if trajectory is not None:
+        check_inside(scene, trajectory.pose(t_us * 1e-6), t_us, height, width)
+    elif height > scene.height or width > scene.width:
+        raise ValueError(f"a sensor of {height}x{width} px exceeds the scene of {scene.height}x{scene.width}")
+    rotation, pieces = rotating.rotation, []
+    for first in range(0, len(t_us), CHUNK):
+        times = t_us[first : first + CHUNK]
+        if trajectory is None:
+            stokes = scene.stokes[None, :, :height, :width].expand(len(times), -1, -1, -1)
+        else:
+            stokes = render(scene, trajectory, times * 1e-6, height, width)
+        light = behind_rotating_polarizer(stokes, rotation.at(times), rotating.extinction_ratio)
+        frames = (FULL_SCALE * light).clamp(max=FULL_SCALE)[:, None]
+        (events,), state = emulate(frames, times, emulator, key, state)
+        pieces.append(events)
+    if state is None:
+        raise ValueError("expected at least one time")
+    return RotatingSimulation(concatenate(pieces), rotation, state)

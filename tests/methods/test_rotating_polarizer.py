@@ -1,0 +1,186 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet.events.rotation import steady_rotation
+from polarnet.events.stream import Events, slice_count, slice_time
+from polarnet.events.streaming import EventWindow
+from polarnet.methods.rotating_polarizer import (
+    ModulationConfig,
+    fit_modulation,
+    initial_state,
+    rotating_recoverer,
+    silent_dolp,
+)
+from polarnet.simulation.presets import SENSORS
+from polarnet.simulation.rotating import RotatingConfig, emulate_rotating, rotating_times_us
+from polarnet.simulation.scene import scene_from_polarization
+
+IDEAL = ModulationConfig(
+    threshold_on=0.2,
+    threshold_off=0.2,
+    threshold_spread=0.02,
+    cutoff_hz=0.0,
+    knee_dn=0.0,
+    level_dn=60.0,
+    level_spread=0.8,
+    noise=0.01,
+    silence_noise=0.1,
+    extinction_ratio=None,
+    window_turns=2.0,
+    variance_scale=1.0,
+    variance_floor=1e-6,
+)
+"""For events exactly at the thresholds of the logarithm."""
+DOLP = np.array([[0.25, 0.4, 0.6], [0.8, 0.9, 0.5]])
+AOLP = np.array([[0.0, 0.3, 1.0], [1.6, 2.4, 3.1]])
+
+
+def exact_events(dolp, aolp, rotation, stop_us, threshold=0.2, delay_us=0.0):
+    """Events at the crossings of ln(1 + DoLP cos 2 (angle - AoLP)), found on a grid of 5 us and between its points."""
+    t_us = np.arange(0, stop_us + 5, 5.0)
+    rows = []
+    for (y, x), m in np.ndenumerate(dolp):
+        logs = np.log1p(m * np.cos(2 * (rotation.at(t_us - delay_us) - aolp[y, x])))
+        # a level of the staircase is crossed again by the opposite polarity only one threshold further on
+        reference = logs[0]
+        for k in range(1, len(t_us)):
+            while abs(logs[k] - reference) >= threshold:
+                p = 1 if logs[k] > reference else -1
+                reference += p * threshold
+                share = (reference - logs[k - 1]) / (logs[k] - logs[k - 1])
+                rows.append((round(t_us[k - 1] + 5 * share), x, y, p))
+    columns = np.array(sorted(rows), np.int64).reshape(-1, 4).T
+    return Events.from_columns(*columns, *dolp.shape)
+
+
+def angle_error_deg(found, truth):
+    return np.degrees((found.numpy() - truth + math.pi / 2) % math.pi - math.pi / 2)
+
+
+@pytest.mark.parametrize("rate_hz", [4.0, -4.0])
+def test_exact_crossings_give_dolp_back_to_a_thousandth(rate_hz):
+    rotation = steady_rotation(rate_hz, 0.5)
+    events = exact_events(DOLP, AOLP, rotation, 250_000)
+    prediction, _ = fit_modulation(events, rotation, 0, 250_000, IDEAL)
+    assert prediction.dolp.numpy() == pytest.approx(DOLP, abs=1e-3)
+    assert np.abs(angle_error_deg(prediction.aolp, AOLP)).max() < 0.05
+    assert (prediction.aolp >= 0).all()
+    assert (prediction.aolp < math.pi).all()
+
+
+def test_thresholds_that_are_unknown_by_a_tenth_follow_from_the_shape_of_the_logarithm():
+    rotation = steady_rotation(4.0)
+    events = exact_events(DOLP, AOLP, rotation, 500_000, threshold=0.22)
+    prediction, state = fit_modulation(events, rotation, 0, 500_000, replace(IDEAL, threshold_spread=0.15, noise=0.003))
+    assert prediction.dolp.numpy() == pytest.approx(DOLP, abs=5e-3)
+    assert np.exp(state.log_thresholds) == pytest.approx(np.full((2, 2, 3), 1.1), rel=0.02)
+
+
+def test_an_imperfect_polarizer_is_accounted_for():
+    rotation = steady_rotation(4.0)
+    events = exact_events(DOLP * 9 / 11, AOLP, rotation, 250_000)
+    prediction, _ = fit_modulation(events, rotation, 0, 250_000, replace(IDEAL, extinction_ratio=10.0))
+    assert prediction.dolp.numpy() == pytest.approx(DOLP, abs=2e-3)
+
+
+def test_events_late_by_2_ms_turn_aolp_by_the_polarizers_angle_in_2_ms():
+    rotation = steady_rotation(4.0)
+    events = exact_events(DOLP, AOLP, rotation, 250_000, delay_us=2000.0)
+    prediction, _ = fit_modulation(events, rotation, 0, 250_000, IDEAL)
+    assert angle_error_deg(prediction.aolp, AOLP) == pytest.approx(np.full((2, 3), 360 * 4 * 0.002), abs=0.05)
+
+
+def simulated(dolp, sensor, turns=2, rate_hz=4.0, s0=1.0, aolp=0.7, size=(6, 8)):
+    maps = (torch.full(size, float(value)) for value in (s0, dolp, aolp))
+    rotating = RotatingConfig(rate_hz=rate_hz, start_angle_deg=0.0, extinction_ratio=None, frames_per_turn=720)
+    stop_us = round(turns / rate_hz * 1e6)
+    t_us = rotating_times_us(rotating, sensor, 0, stop_us)
+    return emulate_rotating(scene_from_polarization(*maps), None, t_us, *size, rotating, sensor, 1), stop_us
+
+
+def test_the_photoreceptor_delays_aolp_by_its_time_constant_and_the_fit_knows_it():
+    """At 127.5 DN a cutoff of 60 Hz is 60 (127.5 + 20) / 275 = 32.2 Hz: 4.95 ms, 7.1 degrees at 4 turns/s."""
+    sensor = replace(SENSORS["clean"], cutoff_hz=60.0, contrast_threshold_sigma=0.0, contrast_threshold_on=0.05)
+    simulation, stop_us = simulated(0.2, replace(sensor, contrast_threshold_off=0.05))
+    config = replace(IDEAL, threshold_on=0.05, threshold_off=0.05, level_dn=127.5, level_spread=0.05, knee_dn=20.0)
+    unaware, aware = (
+        fit_modulation(simulation.events, simulation.rotation, 0, stop_us, replace(config, cutoff_hz=cutoff))[0]
+        for cutoff in (0.0, 60.0)
+    )
+    phase = math.degrees(math.atan(8 * math.pi * 2 * 0.00495)) / 2
+    assert angle_error_deg(unaware.aolp, 0.7).mean() == pytest.approx(phase, rel=0.05)
+    assert angle_error_deg(aware.aolp, 0.7).mean() == pytest.approx(0, abs=0.1)
+    assert aware.dolp.mean() == pytest.approx(0.2, abs=2e-3)
+
+
+def test_a_silent_pixel_gets_the_mean_and_variance_of_a_triangle():
+    """Thresholds of 0.02 without spread: the probability of silence falls linearly to 0 at DoLP 0.02."""
+    config = replace(IDEAL, threshold_on=0.02, threshold_off=0.02, threshold_spread=1e-6)
+    mean, variance = silent_dolp(config)
+    assert mean == pytest.approx(0.02 / 3, rel=0.03)
+    assert variance == pytest.approx(0.02**2 / 18, rel=0.06)
+    prediction, _ = fit_modulation(Events.empty(2, 3), steady_rotation(1.0), 0, 10**6, config)
+    assert prediction.dolp.numpy() == pytest.approx(np.full((2, 3), mean))
+    assert prediction.log_variance.exp().numpy() == pytest.approx(np.full((2, 3), variance))
+    assert prediction.aolp.eq(0).all()
+
+
+def test_half_turns_in_sequence_use_the_last_event_before_and_learn_the_thresholds():
+    rotation = steady_rotation(4.0)
+    events = exact_events(DOLP, AOLP, rotation, 500_000, threshold=0.22)
+    config, state, errors = replace(IDEAL, threshold_spread=0.15, noise=0.003), None, []
+    for start_us in range(0, 500_000, 125_000):
+        before = initial_state(2, 3, config) if state is None else state
+        prediction, state = fit_modulation(events, rotation, start_us, start_us + 125_000, config, state)
+        assert (state.variances <= before.variances).all()
+        errors.append(np.abs(prediction.dolp.numpy() - DOLP).max())
+    assert errors[-1] < 0.01
+    assert errors[-1] < errors[0]
+
+
+def test_one_event_in_a_window_is_enough_after_one_in_the_window_before():
+    rotation = steady_rotation(4.0)
+    events = exact_events(np.array([[0.4]]), np.array([[0.3]]), rotation, 250_000)
+    start_us = int(events.t[3]) + 1
+    alone = slice_count(events, 4, 5)
+    stop_us = int(events.t[4]) + 1
+    _, state = fit_modulation(events, rotation, 0, start_us, IDEAL)
+    with_memory, _ = fit_modulation(alone, rotation, start_us, stop_us, IDEAL, state)
+    without, _ = fit_modulation(alone, rotation, start_us, stop_us, IDEAL)
+    assert without.dolp.item() == pytest.approx(silent_dolp(IDEAL)[0])
+    assert with_memory.dolp.item() != pytest.approx(silent_dolp(IDEAL)[0])
+
+
+def test_expected_errors_are_of_the_size_of_the_errors():
+    generator = np.random.default_rng(0)
+    size = (24, 32)
+    s0, dolp = generator.uniform(0.3, 1, size), generator.uniform(0.2, 0.9, size)
+    scene = scene_from_polarization(*map(torch.from_numpy, (s0, dolp, generator.uniform(0, math.pi, size))))
+    rotating = RotatingConfig(rate_hz=1.0, start_angle_deg=0.0, extinction_ratio=None, frames_per_turn=720)
+    sensor = SENSORS["default"]
+    t_us = rotating_times_us(rotating, sensor, 0, 2_000_000)
+    simulation = emulate_rotating(scene, None, t_us, *size, rotating, sensor, 1)
+    config = replace(IDEAL, threshold_spread=0.15, cutoff_hz=300.0, knee_dn=20.0, noise=0.03, variance_scale=0.3)
+    config = replace(config, variance_floor=1e-4)
+    prediction, _ = fit_modulation(simulation.events, simulation.rotation, 0, 2_000_000, config)
+    squared = (prediction.dolp.numpy() - dolp) ** 2
+    expected = prediction.log_variance.exp().numpy()
+    assert np.sqrt(squared.mean()) < 0.03
+    assert 0.4 < squared.mean() / expected.mean() < 2.5
+    uncertain = expected > np.median(expected)
+    assert squared[uncertain].mean() > squared[~uncertain].mean()
+
+
+def test_as_a_method_it_gives_a_map_for_each_window():
+    rotation = steady_rotation(4.0)
+    events = exact_events(DOLP, AOLP, rotation, 250_000)
+    recoverer, empty = rotating_recoverer(IDEAL, rotation), Events.empty(2, 3)
+    halves = [(0, 125_000), (125_000, 250_000)]
+    windows = [EventWindow([slice_time(events, *half), empty, empty, empty], *half) for half in halves]
+    _, prediction = recoverer.step(recoverer.start(2, 3), windows)
+    assert prediction.dolp.shape == prediction.aolp.shape == prediction.log_variance.shape == (2, 2, 3)
+    assert prediction.dolp[1].numpy() == pytest.approx(DOLP, abs=5e-3)
