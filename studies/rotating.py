@@ -184,11 +184,11 @@ def single_cases(config: Config) -> dict[str, Case]:
     still = Case(smooth_scene(0), config.rotating, config.emulate, config.modulation)
     noisy = SENSORS["noisy"]
     spread = noisy.contrast_threshold_sigma / noisy.contrast_threshold_on
-    told = replace(config.modulation, cutoff_hz=noisy.cutoff_hz, threshold_spread=spread)
+    prior_config = replace(config.modulation, cutoff_hz=noisy.cutoff_hz, threshold_spread=spread)
     return {
         "photograph": still._replace(scene=photograph()),
         "sensor clean": still._replace(sensor=SENSORS["clean"], modulation=replace(config.modulation, cutoff_hz=0.0)),
-        "sensor noisy": still._replace(sensor=noisy, modulation=told),
+        "sensor noisy": still._replace(sensor=noisy, modulation=prior_config),
         "bandwidth unknown (fit without lag)": still._replace(modulation=replace(config.modulation, cutoff_hz=0.0)),
         "extinction 100:1, known": still._replace(
             rotating=replace(config.rotating, extinction_ratio=100.0),

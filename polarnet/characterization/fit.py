@@ -274,10 +274,10 @@ def _thresholds(data: _Increments, leak_hz: float, pixels: int) -> _Pair:
             typical = np.nanmedian(pair.on.threshold)
             threshold_on = np.where(np.isfinite(pair.on.threshold), pair.on.threshold, typical)
             leaked = leak * threshold_on[data.pixel] * data.duration_s * np.where(data.on, 1.0, -1.0)
-        kept = leak * data.duration_s < LEAKED
+        few_leaks = leak * data.duration_s < LEAKED
         halves = []
         for of in (data.on, ~data.on):
-            chosen = of & kept
+            chosen = of & few_leaks
             halves.append(
                 pixel_thresholds((data.increment + leaked)[chosen], data.pixel[chosen], data.block[chosen], pixels)
             )
@@ -406,8 +406,8 @@ def _cutoff(sources: Sequence[_Source], leak_hz: float) -> Estimate | None:
 
 def _of_pixels(source: _Source, mask: Bool[np.ndarray, " pixels"]) -> _Source:
     """The part of a source at some pixels."""
-    kept = mask[source.events.pixel]
-    number = np.cumsum(kept) - 1
+    selected = mask[source.events.pixel]
+    number = np.cumsum(selected) - 1
     chosen = mask[source.intervals.pixel]
     start, stop = number[source.intervals.start[chosen]], number[source.intervals.stop[chosen]]
     rest = (column[chosen] for column in source.intervals[2:])

@@ -43,8 +43,8 @@ def by_pixel(events: Events) -> PixelEvents:
 
 def chosen_pixels(events: PixelEvents, chosen: Bool[np.ndarray, " pixels"]) -> PixelEvents:
     """The events of some pixels."""
-    kept = chosen[events.pixel]
-    return PixelEvents(events.pixel[kept], events.t_us[kept], events.on[kept], events.pixels)
+    selected = chosen[events.pixel]
+    return PixelEvents(events.pixel[selected], events.t_us[selected], events.on[selected], events.pixels)
 
 
 def intervals_of(events: PixelEvents) -> Intervals:
@@ -64,5 +64,5 @@ def undisturbed(intervals: Intervals, refractory_us: float, margin: float = 1.3)
     after_waiting = np.zeros(len(free), bool)
     follows = intervals.start[1:] == intervals.stop[:-1]
     after_waiting[1:] = follows & ~free[:-1]
-    kept = free & ~after_waiting
-    return Intervals(*(column[kept] for column in intervals))
+    usable = free & ~after_waiting
+    return Intervals(*(column[usable] for column in intervals))

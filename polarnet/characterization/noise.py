@@ -41,7 +41,7 @@ class Noise(NamedTuple):
     """Mean over the pixels."""
     shot_off_hz: float
     shot_error_hz: float
-    """Of the sum of both."""
+    """Standard error of the sum of both means."""
     hot: Bool[np.ndarray, " pixels"]
     duration_s: float
 
@@ -69,11 +69,11 @@ def estimate_noise(events: PixelEvents) -> Noise:
     hot = hot_under_constant_light(counts)
     good = int((~hot).sum())
     duration_s = float(np.ptp(events.t_us)) * 1e-6
-    kept = chosen_pixels(events, ~hot)
-    off = np.bincount(kept.pixel[~kept.on], minlength=events.pixels)[~hot] / duration_s
+    ordinary = chosen_pixels(events, ~hot)
+    off = np.bincount(ordinary.pixel[~ordinary.on], minlength=events.pixels)[~hot] / duration_s
     shot_off = float(off.mean())
-    fit, error = _fit_leak(_ages(_few_enough(kept)), max(shot_off, 1 / (good * duration_s)))
-    shot_on = _rate_of_young(_ages(kept), YOUNG * math.exp(-fit[1]))
+    fit, error = _fit_leak(_ages(_few_enough(ordinary)), max(shot_off, 1 / (good * duration_s)))
+    shot_on = _rate_of_young(_ages(ordinary), YOUNG * math.exp(-fit[1]))
     poisson = math.sqrt((shot_on + shot_off) / (good * duration_s))
     between = float(off.std()) / math.sqrt(good)
     return Noise(
@@ -163,12 +163,12 @@ def _fit_leak(ages: _Ages, shot_guess_hz: float) -> tuple[Float64[np.ndarray, " 
     x = _minimised(loss, first)
     # the shot noise of a pixel depends on its threshold: its share of young ON events, shrunk to the mean
     young_s = YOUNG * math.exp(-x[1])
-    seen = np.add.reduceat(ages.on & (ages.age_s < young_s), ages.starts[:-1])
+    young_events = np.add.reduceat(ages.on & (ages.age_s < young_s), ages.starts[:-1])
     at_risk_s = np.add.reduceat(np.minimum(ages.age_s, young_s), ages.starts[:-1])
     expected = math.exp(x[0]) * at_risk_s
-    excess_variance = ((seen - expected) ** 2 - expected).sum() / max((expected**2).sum(), 1e-12)
+    excess_variance = ((young_events - expected) ** 2 - expected).sum() / max((expected**2).sum(), 1e-12)
     if excess_variance > 1e-3:
-        factor = (1 / excess_variance + seen) / (1 / excess_variance + expected)
+        factor = (1 / excess_variance + young_events) / (1 / excess_variance + expected)
         x = _minimised(loss, x)
     return x, _errors(loss, x)
 

@@ -216,8 +216,8 @@ def _twin(
     h, w, key = part.height, part.width, seed_for(seed, "twin", "sensor")
     if isinstance(light, MovingLight):
         top, left = _corner(recording)
-        kept = (light.t_us >= start_us) & (light.t_us <= stop_us)
-        frames, t_us = light.frames[kept, top : top + h, left : left + w], light.t_us[kept]
+        within = (light.t_us >= start_us) & (light.t_us <= stop_us)
+        frames, t_us = light.frames[within, top : top + h, left : left + w], light.t_us[within]
         step = max(2, CHUNK_PIXELS // (h * w))
         return emulated((frames[k : k + step] for k in range(0, len(frames), step)), t_us, sensor, key)
     if isinstance(light, Flicker):

@@ -192,7 +192,7 @@ def _check_packages() -> None:
     """RuntimeError if a package of the extra `export` is missing."""
     for name in ("onnx", "onnxruntime", "onnxscript"):
         if importlib.util.find_spec(name) is None:
-            raise RuntimeError(f"ONNX files need {name}: pip install 'polarnet[export]'")
+            raise RuntimeError(f"ONNX files need {name}: run pip install -e '.[export]' in the clone")
 
 
 @contextlib.contextmanager

@@ -36,7 +36,7 @@ class PolarizersConfig:
     """Transmission along the axis over that across it; null: infinite."""
     angle_error_deg: FourValues[Annotated[float, Field(ge=-90, le=90)]]
     transmission: FourValues[Annotated[float, Field(gt=0, le=1)]]
-    """Of light polarized along the axis."""
+    """Transmission of light polarized along the axis."""
     extinction_spread: NonNegativeFloat
     """Standard deviation between pixels of the natural logarithm of the extinction ratio."""
     angle_spread_deg: NonNegativeFloat

@@ -229,7 +229,7 @@ def test_without_the_packages_the_extra_is_named(small, tmp_path, monkeypatch, c
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == absent else real(name))
     said = refusal(capsys, tmp_path / "n.onnx", "--weights", small)
-    assert f"ONNX files need {absent}: pip install 'polarnet[export]'" in said
+    assert f"ONNX files need {absent}: run pip install -e '.[export]' in the clone" in said
 
 
 def test_the_lines_on_the_page_run_as_they_stand(of_each, monkeypatch, project_root):
