@@ -62,6 +62,7 @@ class Sample:
 
     def __init__(self, form: str, folder: Path, events: Events):
         self.form = form
+        self._size = {"height": events.height, "width": events.width} if form == "esfp" else {}  # the file has no size
         self.path = folder / f"sample.{form}"
         write_sample(form, self.path, events)
         self._files = sorted(path for path in [self.path, *self.path.rglob("*")] if path.is_file())
@@ -71,7 +72,7 @@ class Sample:
         """Damage file `number`, counted round, read the recording, and put the file right again."""
         number %= len(self._files)
         self._files[number].write_bytes(damaged(self._sound[number], damage))
-        outcome = ending(self.path, self.form if says_format else None, chunk_events)
+        outcome = ending(self.path, self.form if says_format else None, chunk_events, **self._size)
         self._files[number].write_bytes(self._sound[number])
         return outcome
 
@@ -89,6 +90,12 @@ def write_sample(form: str, path: Path, events: Events) -> None:
         with h5py.File(path, "w") as file:
             file["events"] = np.stack([events.t, events.x, events.y, events.p > 0], axis=1).astype(np.uint32)
             file.attrs["sensor_resolution"] = (events.width, events.height)
+    elif form == "esfp":
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w") as file:
+            columns = {"t": events.t, "x": events.x, "y": events.y, "p": events.p > 0}
+            for name, column in columns.items():
+                file[name] = column.numpy()
     elif form in ("aedat4", "event_stream"):
         faery = pytest.importorskip("faery")
         rows = np.array(list(zip(events.t, events.x, events.y, events.p > 0, strict=True)), faery.EVENTS_DTYPE)
@@ -122,10 +129,10 @@ def write_sample(form: str, path: Path, events: Events) -> None:
         raise ValueError(f"no sample of format {form!r}: write one here")
 
 
-def ending(path: Path, form: str | None, chunk_events: int) -> str:
+def ending(path: Path, form: str | None, chunk_events: int, **size: int) -> str:
     """One of ENDINGS. Whatever else a reader does (another error, events out of order, an unnamed file) is raised."""
     try:
-        reader = open_recording(path, form, part="lake/135", chunk_events=chunk_events)
+        reader = open_recording(path, form, part="lake/135", chunk_events=chunk_events, **size)
         before = None
         for events in reader:
             validate(events)
