@@ -48,7 +48,8 @@ class TestSequence:
             return self.windows
         if self.rotating is None:
             raise ValueError(
-                f"{self.name}: there are no events of a camera behind a rotating polarizer; {NOT_ROTATING}"
+                f"{self.name}: expected events of a camera behind a rotating polarizer, there are none; leave the row "
+                f"rotating_polarizer out of the methods"
             )
         empty = Events.empty(self.rotating.height, self.rotating.width)
         return self._windows([self.rotating, *[empty] * (len(self.events) - 1)])

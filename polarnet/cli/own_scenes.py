@@ -1,7 +1,6 @@
 """The benchmark on a user's own folder of photographs or measured polarization, without training."""
 
 import dataclasses
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -74,9 +73,8 @@ def benchmark_folder(
 
 
 def _rotating_events(config: Config, work: Path) -> Path:
-    """Emulate the scenes behind a rotating polarizer, anew in each run because its settings may have changed."""
+    """Emulate the scenes behind a rotating polarizer; returns the path of the events."""
     events = work / "rotating.zarr"
-    shutil.rmtree(events, ignore_errors=True)
     mapper = config.mapper("emulate_rotating")
     emulate_rotating_scenes(work / "scenes.zarr", events, config.rotating, config.camera, config.seed, mapper)
     return events

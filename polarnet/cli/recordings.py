@@ -264,27 +264,35 @@ def _recover(options: argparse.Namespace) -> int:
 
 def _recover_rotating(options: argparse.Namespace) -> int:
     from polarnet.config.tree import load
+    from polarnet.methods.half_turns import half_turns_recoverer
     from polarnet.methods.rotating_polarizer import rotating_recoverer
     from polarnet.recordings.recording import read_recording
     from polarnet.recovery.recover import facts_of, recover
     from polarnet.recovery.rotating import half_turn_rule, open_rotating, rotation_of
     from polarnet.recovery.writer import RecoveryWriter
 
-    if options.method or options.weights:
+    if options.method not in (None, "rotating_polarizer") or options.weights:
         raise ValueError(
-            "--rotating: expected no --method or --weights, a fit without network recovers DoLP; leave it out"
+            "--rotating: expected no --method but rotating_polarizer (for moving scenes) and no --weights, because a "
+            "fit without network recovers DoLP; leave it out"
         )
-    config = load(settings_root()).modulation
+    settings = load(settings_root())
+    config, moving = settings.modulation, options.method is not None
     file, size = Path(options.input[0]), (options.size[0], options.size[1]) if options.size else None
     rotation = rotation_of(options.rotating, options.triggers, options.start_angle or 0.0)
     length_us, step_us = (_duration_us(options, name) for name in ("window", "step"))
-    rule = half_turn_rule(rotation, config.window_turns, length_us, step_us)
+    rule = half_turn_rule(rotation, 0.5 if moving else config.window_turns, length_us, step_us)
     out = options.out or Path("outputs") / "recover" / file.stem
     with run_folder(out, "recover") as folder:
         source, rotation = open_rotating(file, rotation, functools.partial(read_recording, **_reading(options)), size)
         writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
-        summary = recover(source, rule, rotating_recoverer(config, rotation), writer)
-        words = f"fit to the modulation by a polarizer at {rotation.rate_hz:g} turns/s"
+        if moving:
+            recoverer = half_turns_recoverer(settings.methods.rotating_polarizer, rotation)
+        else:
+            recoverer = rotating_recoverer(config, rotation)
+        summary = recover(source, rule, recoverer, writer)
+        words = f"fit to {'each half turn of' if moving else 'the modulation by'} a polarizer at "
+        words += f"{rotation.rate_hz:g} turns/s"
         facts = facts_of(source, rule, words, summary)
         page = writer.write_page(source.name, facts, [])
     for key, value in facts.items():

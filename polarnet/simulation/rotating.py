@@ -6,7 +6,9 @@ The light behind a polarizer at angle theta is, with e = 1 / extinction ratio (M
 """
 
 import functools
+import json
 import math
+import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -137,12 +139,17 @@ def emulate_rotating_scenes(
     """Emulate the test sequences of a scene store behind the rotating polarizer, and return their number.
 
     The sensor, its readout and its motion are those of the four channels, its noise is not. The event store holds the
-    events in its first channel. `mapper` is as in `dataset.emulate_scenes`.
+    events in its first channel; one of the same scenes and settings is kept, any other is replaced. `mapper` is as in
+    `dataset.emulate_scenes`.
     """
     source = SceneStore.open(scenes)
     attributes = {**origin_of(source, camera, seed), "rotating": asdict(rotating)}
     height, width, _ = grid(source.attributes["layout"], source.sensor_height, source.sensor_width)
     names = source.of_split("test")
+    if events.exists():
+        if EventStore.open(events).attributes == json.loads(json.dumps(attributes)):
+            return len(names)
+        shutil.rmtree(events)
     store = EventStore.create(events, names, height, width, attributes, source.sequences_per_part)
     task = functools.partial(_emulate_part, scenes=source, events=store, rotating=rotating, camera=camera, seed=seed)
     for _ in mapper(task, store.missing_parts()):

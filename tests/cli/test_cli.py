@@ -41,9 +41,9 @@ def test_the_stages_come_in_the_order_they_run_in(capsys, project_root, monkeypa
     assert main(["stages"]) == 0
     assert capsys.readouterr().out.split() == [
         "ingest", "synthesize", "emulate", "weights", "train", "train_baseline@e2v", "import_recordings", "calibrate",
-        "sets", "benchmark@zeros", "benchmark@train_mean", "benchmark@oracle_mean", "benchmark@cf",
-        "benchmark@highpass", "benchmark@cf+gain", "benchmark@highpass+gain", "benchmark@e2v", "benchmark@ours",
-        "report",
+        "sets", "emulate_rotating", "benchmark@zeros", "benchmark@train_mean", "benchmark@oracle_mean", "benchmark@cf",
+        "benchmark@highpass", "benchmark@cf+gain", "benchmark@highpass+gain", "benchmark@e2v",
+        "benchmark@rotating_polarizer", "benchmark@ours", "report",
     ]  # fmt: skip
 
 
@@ -161,7 +161,7 @@ def test_a_run_with_another_sensor_has_a_folder_of_its_own(project_root, monkeyp
     assert [call[2] for call in calls] == [
         f"stages.{name}"
         for name in ("ingest", "synthesize", "emulate", "weights", "train", "train", "import_recordings", "calibrate",
-                     "sets", "benchmark", "report")
+                     "sets", "emulate_rotating", "benchmark", "report")
     ]  # fmt: skip
     assert [call[-1] for call in calls if call[2] == "stages.train"] == [calls[0][-1], "baseline=e2v"]
     assert "outputs/run/smoke-noisy/report/index.html" in capsys.readouterr().out
