@@ -111,12 +111,13 @@ def half_turns_recoverer(config: HalfTurnsConfig, rotation: Rotation) -> Recover
 
 def local_variance(frame: Float[Tensor, "h w"], side: int) -> Float[Tensor, "h w"]:
     """Variance over the square of `side` pixels around each pixel, cut off at the border."""
-
-    def mean(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-        return F.avg_pool2d(values[None, None], side, 1, side // 2, count_include_pad=False)[0, 0]
-
     values = frame.double()
-    return (mean(values.square()) - mean(values).square()).clamp(min=0).float()
+    return (local_mean(values.square(), side) - local_mean(values, side).square()).clamp(min=0).float()
+
+
+def local_mean(frame: Float[Tensor, "h w"], side: int) -> Float[Tensor, "h w"]:
+    """Mean over the square of `side` pixels around each pixel, cut off at the border."""
+    return F.avg_pool2d(frame[None, None], side, 1, side // 2, count_include_pad=False)[0, 0]
 
 
 def open_half_turns(setup: Setup) -> Recoverer:
