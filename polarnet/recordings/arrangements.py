@@ -9,13 +9,10 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
-from jaxtyping import Float64
 
 from polarnet.events.stream import Events, slice_count
 from polarnet.recordings.recording import Recording, read_recording
-from polarnet.recordings.registration import warp_events
 from polarnet.recordings.source import RecordingError
 from polarnet.runtime.files import sha256
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
@@ -25,29 +22,21 @@ from polarnet.storage.events import EventStore
 def read_four(
     files: Mapping[int, str | os.PathLike[str]],
     start_us: Mapping[int, int] | None = None,
-    homographies: Mapping[int, Float64[np.ndarray, "3 3"]] | None = None,
     read: Callable[[Path], Recording] = read_recording,
 ) -> list[Events]:
     """The four channels, in the order 0, 45, 90, 135 degrees, from files keyed by polarizer angle.
 
     Angles are in degrees, of any half turn. `start_us` gives the start of the common clock in each file's own clock;
-    earlier events are left out. Without it the files share one clock, which starts with the first event of all.
-    `homographies` map cameras to the reference (`polarnet.recordings.registration`). `read` replaces `read_recording`
-    where a file needs options. RecordingError where an angle is missing or duplicated, or where the sensor sizes
-    differ.
+    earlier events are left out. Without it the files share one clock, which starts with the first event of all. `read`
+    replaces `read_recording` where a file needs options. RecordingError where an angle is missing or duplicated, or
+    where the sensor sizes differ.
     """
     by_angle = {angle % 180: angle for angle in files}
     if sorted(by_angle) != list(POLARIZER_ANGLES_DEG) or len(by_angle) != len(files):
         raise RecordingError(f"expected one file for each of 0, 45, 90 and 135 degrees, got {sorted(files)}")
     if start_us is not None and set(start_us) != set(files):
         raise RecordingError(f"expected a start for each of the angles {sorted(files)}, got {sorted(start_us)}")
-    channels = []
-    for angle in POLARIZER_ANGLES_DEG:
-        key = by_angle[angle]
-        events = read(Path(files[key])).events
-        if homographies is not None and key in homographies:
-            events = warp_events(events, homographies[key])
-        channels.append(events)
+    channels = [read(Path(files[by_angle[angle]])).events for angle in POLARIZER_ANGLES_DEG]
     sizes = {(channel.height, channel.width) for channel in channels}
     if len(sizes) > 1:
         raise RecordingError(f"expected four files of one size of sensor, got {sorted(sizes)} (height, width)")
