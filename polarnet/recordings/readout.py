@@ -323,7 +323,7 @@ def readout_findings(readout: Readout, height: int) -> Iterator[str]:
         yield f"late        {axis} are read one after another, {way}: each {delay_us:.2f} us later"
     if readout.lost_rows:
         rows, cases = readout.lost_rows
-        yield f"lost rows   {_ranges(rows)}: {cases} times empty in busy moments, while rows on both sides had many events"
+        yield f"lost rows   {_ranges(rows)}: {cases} times empty in busy moments, with many events on both sides"
     if len(readout.empty_rows):
         yield f"empty rows  {len(readout.empty_rows)} of {height} without any event: {_ranges(readout.empty_rows)}"
     if readout.gap:
