@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 
+from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import Events, slice_count
 from polarnet.recordings.recording import Recording, read_recording
 from polarnet.recordings.source import RecordingError
@@ -43,28 +44,6 @@ def read_four(
     if start_us is None:
         return _from_first_event(channels)
     return [_since(c, start_us[by_angle[a]]) for c, a in zip(channels, POLARIZER_ANGLES_DEG, strict=True)]
-
-
-def split_mosaic(events: Events, mosaic: Mosaic) -> list[Events]:
-    """The four channels, in the order 0, 45, 90, 135 degrees, of a sensor with polarizers on its pixels.
-
-    Each channel has half of the sensor's rows and columns. Its pixel for a 2x2 cell fires when that angle's pixel in
-    the cell does. Events keep their times, and none is added; only those of an odd last row or column are left out. The
-    four pixels of a cell look at places half a cell apart, so an edge crosses them one after the other.
-    """
-    height, width = events.height // 2, events.width // 2
-    if not (height and width):
-        raise RecordingError(f"expected a mosaic of at least 2x2 pixels, got {events.height}x{events.width}")
-    row, column = events.y & 1, events.x & 1
-    complete = (events.y < 2 * height) & (events.x < 2 * width)
-    places = {mosaic[r][c]: (r, c) for r in (0, 1) for c in (0, 1)}
-    channels = []
-    for angle in POLARIZER_ANGLES_DEG:
-        r, c = places[angle]
-        own = complete & (row == r) & (column == c)
-        x, y = events.x[own] // 2, events.y[own] // 2
-        channels.append(Events(events.t[own], x, y, events.p[own], height, width))
-    return channels
 
 
 def read_mosaic(
