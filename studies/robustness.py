@@ -2,6 +2,7 @@
 
 python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] --measured FOLDER ... --work FOLDER
     [--weights [NAME=]FILE ...] [--firenet FILE] [--split test|val] [--conditions NAME ...] [--limit N] [--write]
+python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] --work FOLDER --training FOLDER
 
 - `photographs`: a split of the pipeline's (`experiment=photographs`) of the folder --photographs.
 - `photographs_large`: the same splits of --photographs and of --photographs-large together.
@@ -15,6 +16,9 @@ Nothing is trained, except the constants: `train_mean` is the mean DoLP of the t
 the mean DoLP of the measured scenes of all sources but the one that is scored. --split val is for choices and --split
 test for figures. --limit takes the first N pictures of each set; --sensor-limit of the sensors alone. Events are
 simulated in memory, and pictures are kept in --work. --write puts the scores into docs/results/robustness.json.
+
+The second command scores nothing. It fills --training with links to the training photographs of both folders. A
+network trained on them (`ingest.root`) has seen no photograph of --split val and --split test.
 """
 
 import argparse
@@ -116,7 +120,7 @@ def settings(arguments: argparse.Namespace, *overrides: str) -> Config:
     return load(ROOT, [*common, *firenet, *overrides])
 
 
-def ingested(root: Path, folder: Path, arguments: argparse.Namespace, *overrides: str) -> Path:
+def ingested(root: Path, folder: Path, *overrides: str) -> Path:
     """Folder of the pictures of `root`, made by stage ingest if missing."""
     if not (folder / "images" / MANIFEST).exists():
         common = ("experiment=photographs", f"ingest.root={root}", f"paths.data={folder}", *overrides)
@@ -138,6 +142,17 @@ def sources_of(folder: Path, work: Path) -> dict[str, Path]:
             if not (link := sources[name] / row["file"]).exists():
                 link.symlink_to(folder / row["file"])
     return sources
+
+
+def link_training(roots: Mapping[str, Path], images: Mapping[str, Path], folder: Path) -> int:
+    """Fill a folder with links to the training photographs of all roots, and return their number."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, root in roots.items():
+        for entry in read_manifest(images[name]).pictures:
+            link = folder / f"{name}_{entry.origin.replace('/', '_')}"
+            if entry.split == "train" and not link.is_symlink():
+                link.symlink_to(root / entry.origin)
+    return len(list(folder.iterdir()))
 
 
 def part_of(images: Path, folder: Path, split: str, limit: int | None) -> Path:
@@ -310,6 +325,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument(
         "--weights", nargs="+", default=[], metavar="[NAME=]FILE", help="checkpoints; default: the shipped one"
     )
+    parser.add_argument("--training", type=Path, help="folder for links to the training photographs")
     parser.add_argument("--firenet", type=Path, help="published weights of FireNet")
     parser.add_argument("--split", choices=("test", "val"), default="test", help="of the photographs")
     parser.add_argument("--conditions", nargs="+", help="only these, such as photographs measured sensors.noisy")
@@ -321,7 +337,7 @@ def parsed() -> argparse.Namespace:
     arguments = parser.parse_args()
     if arguments.write and uncommitted(ROOT):
         parser.error("the tree has uncommitted changes; commit them first, the figures name a commit")
-    for name in ("photographs", "photographs_large", "work", "firenet"):
+    for name in ("photographs", "photographs_large", "work", "firenet", "training"):
         if path := getattr(arguments, name):
             setattr(arguments, name, path.resolve())
     arguments.measured = [folder.resolve() for folder in arguments.measured]
@@ -330,11 +346,11 @@ def parsed() -> argparse.Namespace:
     return arguments
 
 
-def conditions_of(arguments: argparse.Namespace) -> dict[str, list[tuple[Path, tuple[str, ...]]]]:
-    """Folders of pictures and overrides by condition."""
+def conditions_of(
+    images: Mapping[str, Path], arguments: argparse.Namespace
+) -> dict[str, list[tuple[Path, tuple[str, ...]]]]:
+    """Folders of pictures and overrides by condition; `images` are the ingested photographs."""
     work, limit = arguments.work, arguments.limit
-    folders = {"rgb": arguments.photographs, "more": arguments.photographs_large}
-    images = {name: ingested(root, work / name, arguments) for name, root in folders.items() if root}
     parts = {name: part_of(folder, work / name, arguments.split, limit) for name, folder in images.items()}
     conditions: dict[str, list[tuple[Path, tuple[str, ...]]]] = {"photographs": [(parts["rgb"], ())]}
     if "more" in parts:
@@ -342,7 +358,7 @@ def conditions_of(arguments: argparse.Namespace) -> dict[str, list[tuple[Path, t
     for folder in arguments.measured:
         for name, root in sources_of(folder, work).items():
             chosen = ("ingest.source=polarization", "ingest.val_fraction=0", "ingest.test_fraction=1")
-            measured = ingested(root, work / name, arguments, *chosen)
+            measured = ingested(root, work / name, *chosen)
             conditions[f"measured.{name}"] = [(part_of(measured, work / name, "test", limit), ())]
     small = part_of(images["rgb"], work / "rgb", arguments.split, arguments.sensor_limit or limit)
     others = {"sensors": SENSORS, "time": TIMES}
@@ -356,10 +372,16 @@ def main() -> None:
     arguments = parsed()
     record = machine_record(ROOT)
     arguments.work.mkdir(parents=True, exist_ok=True)
-    conditions = conditions_of(arguments)
+    given = {"rgb": arguments.photographs, "more": arguments.photographs_large}
+    roots = {name: root for name, root in given.items() if root}
+    images = {name: ingested(root, arguments.work / name) for name, root in roots.items()}
+    if arguments.training:
+        print(f"{link_training(roots, images, arguments.training)} photographs in {arguments.training}")
+        return
+    conditions = conditions_of(images, arguments)
     wanted = arguments.conditions or ["photographs", "photographs_large", "measured", "sensors", "time", "speed"]
     configure(settings(arguments).runtime, settings(arguments).seed)
-    train_mean = statistics.fmean(mean_dolp(arguments.work / "rgb" / "images", "train"))
+    train_mean = statistics.fmean(mean_dolp(images["rgb"], "train"))
     means = {
         name: mean_dolp(part, "test")
         for name, parts in conditions.items()
@@ -373,10 +395,10 @@ def main() -> None:
             continue
         others = [mean for source, of_source in means.items() if source != name for mean in of_source]
         constant = statistics.fmean(others) if others else train_mean
-        for images, overrides in parts:
+        for part, overrides in parts:
             config = settings(arguments, *overrides)
             contexts = {row: context_of(config, train_mean, file) for row, file in arguments.weights.items()}
-            one = scored(images, config, contexts, constant)
+            one = scored(part, config, contexts, constant)
             results[name] = results[name] + one if name in results else one
         tables[name] = table_of(results[name])
         print(
