@@ -36,7 +36,7 @@ def _add_inspection(commands: Commands) -> None:
         "inspect",
         help="summarise a camera's file and draw its busiest moment",
         description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
-        "camera's file, and draws its busiest moment as a PNG.",
+        "camera's file, with signs of a readout at its limit, and draws its busiest moment as a PNG.",
     )
     inspect.add_argument("file", type=Path, help="file of a camera, or an event store with --part")
     add_reading(inspect)
@@ -145,7 +145,7 @@ def _add_recovery(commands: Commands) -> None:
         description="Prints the events of a stored sequence at the pace of the recording. Pipe them into "
         "`polarnet recover - --live` to try live recovery without a camera.",
     )
-    replay.add_argument("store", help="event store: folder, zip or fsspec URL")
+    replay.add_argument("store", help="event store: folder or fsspec URL")
     replay.add_argument("sequence", help="name of the sequence")
     replay.add_argument("--speed", type=float, default=1.0, help="speed relative to the recording (default: 1)")
     replay.set_defaults(run=_replay)
@@ -280,7 +280,7 @@ def refuse_unused_options(options: argparse.Namespace) -> None:
         kind = "one file with --rotating or --triggers"
     elif options.mosaic is not None:
         kind = "one file with --mosaic"
-    elif Path(options.input[0]).is_dir() or Path(options.input[0]).suffix == ".zip":
+    elif Path(options.input[0]).is_dir():
         kind = "an event store or a folder"
     else:
         return  # reading the input will name the missing option

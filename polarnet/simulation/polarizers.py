@@ -15,6 +15,7 @@ from pydantic import Field, NonNegativeFloat
 from polarnet.events.mosaic import places_of
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.pixels import randomness
+from polarnet.simulation.ranges import RandomisedConfig
 from polarnet.stokes import POLARIZER_ANGLES_DEG, analyzer, parse_mosaic
 
 CHANNELS = len(POLARIZER_ANGLES_DEG)
@@ -26,7 +27,7 @@ FourValues = Annotated[list[Value], Field(min_length=CHANNELS, max_length=CHANNE
 
 
 @section
-class PolarizersConfig:
+class PolarizersConfig(RandomisedConfig):
     """Section `polarizers` of params.yaml. Lists hold one value for each of 0, 45, 90 and 135 degrees."""
 
     layout: Annotated[str, one_of(("four_sensors", "dofp"))]
@@ -48,6 +49,7 @@ class PolarizersConfig:
     """Share of a DoFP pixel's light that falls in through its four neighbours' polarizers."""
 
     def __post_init__(self):
+        super().__post_init__()
         parse_mosaic(self.mosaic)
         if self.crosstalk and self.layout != "dofp":
             raise ValueError(
@@ -72,6 +74,7 @@ IDEAL = PolarizersConfig(
     angle_spread_deg=0.0,
     transmission_spread=0.0,
     crosstalk=0.0,
+    randomise=None,
 )
 
 

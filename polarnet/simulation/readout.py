@@ -14,10 +14,11 @@ from polarnet.events.stream import Events
 from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import compiled, forget_stale_code
 from polarnet.simulation.pixels import randomness
+from polarnet.simulation.ranges import RandomisedConfig
 
 
 @section
-class ReadoutConfig:
+class ReadoutConfig(RandomisedConfig):
     """Section `readout` of params.yaml: how events leave the sensor."""
 
     row_latency_us: NonNegativeFloat
@@ -35,7 +36,7 @@ class ReadoutConfig:
         return not (self.row_latency_us or self.jitter_us or self.max_events_per_s)
 
 
-PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=0.0)
+PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=0.0, randomise=None)
 
 
 def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) -> tuple[Events, int]:
