@@ -13,7 +13,7 @@ from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL
 from polarnet.simulation.pixels.randomness import mixed, normal, normal_map, rough_normals, uniform
 from polarnet.simulation.presets import SENSORS
 
-QUIET = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma=0.0)
+QUIET = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
 SIDE = 64  # pixels
 
 
@@ -66,7 +66,9 @@ def test_rejected_shot_noise_does_not_delay_a_threshold_crossing():
 
 
 def test_thresholds_tilt_shot_noise_towards_the_lower_one():
-    config = dataclasses.replace(QUIET, shot_noise_rate_hz=5.0, contrast_threshold_sigma=0.05)
+    config = dataclasses.replace(
+        QUIET, shot_noise_rate_hz=5.0, contrast_threshold_sigma_on=0.05, contrast_threshold_sigma_off=0.05
+    )
     for model in ("v2e", "exact"):
         t_us = 1e4 * torch.arange(201, dtype=torch.float64)
         frames = torch.zeros(1, 1, SIDE, SIDE).expand(201, -1, -1, -1)
