@@ -51,7 +51,9 @@ class Pixels(NamedTuple):
     linlog: np.ndarray
     """Response to that light: linear up to 20 DN, logarithmic above."""
     lag: np.ndarray
-    """Filtered response minus response."""
+    """Output of the photoreceptor minus response."""
+    buffer_lag: np.ndarray
+    """Output of the source follower minus that of the photoreceptor; empty without a source follower."""
     threshold_on: np.ndarray
     threshold_off: np.ndarray
     leak_nominal: np.ndarray
@@ -93,6 +95,7 @@ def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: 
         dn=zeros.copy(),
         linlog=zeros.copy(),
         lag=zeros.copy(),
+        buffer_lag=zeros[: n if physics.source_follower_hz > 0 else 0].copy(),
         threshold_on=threshold_on,
         threshold_off=threshold_off,
         leak_nominal=np.float32(physics.leak_rate_hz * 1e-6) * leak_factor * threshold_on,
@@ -160,6 +163,10 @@ def advance(light, pixels, steps, columns):
                 )
             else:
                 _difference(dn, response, pixels.dn[first:stop], pixels.linlog[first:stop], rise)
+            if physics.source_follower_hz > 0:
+                _buffer(
+                    rise, pixels.buffer_lag[first:stop], 2e-6 * math.pi * physics.source_follower_hz * step.duration_us
+                )
             change, leak = pixels.change[first:stop], pixels.leak[first:stop]
             threshold_on, threshold_off = pixels.threshold_on[first:stop], pixels.threshold_off[first:stop]
             fires = flags_of(words, stop - first)
@@ -209,6 +216,20 @@ def _filter(dn, response, dn_before, response_before, lag, rate, rise):
         lag_after = lag_after if abs(lag_after) > MIN_LAG else np.float32(0)
         rise[j] = step + (lag_after - lag[j])
         lag[j], dn_before[j], response_before[j] = lag_after, dn[j], response[j]
+
+
+@borrowing
+def _buffer(rise, lag, a):
+    """The source follower: a first-order low-pass, where a = bandwidth * dt, of an input that rises linearly by `rise`.
+
+    The solution is that of `_filter` with one bandwidth for all pixels. `rise` becomes the rise of the output.
+    """
+    kept, mean_kept = np.float32(math.exp(-a)), np.float32(-math.expm1(-a) / a)
+    for j in range(rise.size):
+        lag_after = lag[j] * kept - rise[j] * mean_kept
+        lag_after = lag_after if abs(lag_after) > MIN_LAG else np.float32(0)
+        rise[j] += lag_after - lag[j]
+        lag[j] = lag_after
 
 
 @borrowing

@@ -37,7 +37,9 @@ class Pixels(NamedTuple):
     memory: np.ndarray
     """Log intensity at the last event, less what leaked; float64 with a low-pass."""
     filtered: np.ndarray
-    """Log intensity behind the photoreceptor's low-pass; float64 with a low-pass."""
+    """Log intensity behind the low-passes of photoreceptor and source follower; float64 with a low-pass."""
+    photoreceptor: np.ndarray
+    """float64, log intensity between the two; empty without a source follower."""
     threshold_on: np.ndarray
     threshold_off: np.ndarray
     leak_factor: np.ndarray
@@ -77,11 +79,12 @@ class Firing(NamedTuple):
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
     """Pixels before their first frame, with the mismatch of their channel."""
     n = height * width
-    real = np.float64 if physics.cutoff_hz > 0 else np.float32
+    real = np.float64 if physics.cutoff_hz > 0 or physics.source_follower_hz > 0 else np.float32
     threshold_on, threshold_off = threshold_maps(physics, n, key, channel)
     return Pixels(
         memory=np.zeros(n, real),
         filtered=np.zeros(n, real),
+        photoreceptor=np.zeros(n if physics.source_follower_hz > 0 else 0, np.float64),
         threshold_on=threshold_on,
         threshold_off=threshold_off,
         leak_factor=leak_factor_map(physics, n, key, channel),
@@ -105,6 +108,8 @@ def start(light, pixels, steps):
     dn, linlog = np.empty(pixels.memory.size, np.float32), np.empty(pixels.memory.size, np.float32)
     _respond(light, 0, 0, steps.width, dn, linlog)
     pixels.filtered[:] = linlog
+    if pixels.photoreceptor.size:
+        pixels.photoreceptor[:] = linlog
     pixels.memory[:] = linlog
     pixels.last_event_us[:] = steps.times_us[0]
 
@@ -136,7 +141,14 @@ def advance(light, pixels, steps, columns):
             filtered, memory = pixels.filtered[first:stop], pixels.memory[first:stop]
             threshold_on, threshold_off = pixels.threshold_on[first:stop], pixels.threshold_off[first:stop]
             _respond(light, steps.first_frame + k, y, w, dn, linlog)
-            if physics.cutoff_hz > 0:
+            if physics.source_follower_hz > 0:
+                photoreceptor = pixels.photoreceptor[first:stop]
+                if physics.cutoff_hz > 0:
+                    _filter(linlog, dn, photoreceptor, 2 * math.pi * physics.cutoff_hz * dt)
+                else:
+                    photoreceptor[:] = linlog
+                _buffer(photoreceptor, filtered, min(1.0, 2 * math.pi * physics.source_follower_hz * dt))
+            elif physics.cutoff_hz > 0:
                 _filter(linlog, dn, filtered, 2 * math.pi * physics.cutoff_hz * dt)
             else:
                 filtered[:] = linlog
@@ -161,6 +173,13 @@ def _filter(linlog, dn, filtered, rate):
     for j in range(dn.size):
         share = min(1.0, (np.float64(dn[j]) + DARK_OFFSET) * per_dn)
         filtered[j] += share * (linlog[j] - filtered[j])
+
+
+@borrowing
+def _buffer(photoreceptor, filtered, share):
+    """The source follower: a first-order low-pass that closes `share` of the difference in a step."""
+    for j in range(filtered.size):
+        filtered[j] += share * (photoreceptor[j] - filtered[j])
 
 
 @borrowing
