@@ -20,7 +20,8 @@ def borrowing(kernel: Callable) -> Any:
 
     The counts of array slices are atomic, and cost up to 9 % of an emulation.
     """
-    return numba.njit(nogil=True, cache=True, error_model="numpy", _nrt=False)(_bare(kernel))
+    without_counts: Any = {"_nrt": False}  # numba's name, absent from its type stubs
+    return numba.njit(nogil=True, cache=True, error_model="numpy", **without_counts)(_bare(kernel))
 
 
 def inlined(kernel: Callable) -> Any:
