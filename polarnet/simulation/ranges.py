@@ -23,15 +23,13 @@ class RandomisedConfig:
     def __post_init__(self):
         for name, bounds in (self.randomise or {}).items():
             if name not in vars(self) or name == "randomise":
-                raise ValueError(
-                    f"randomise.{name}: expected a number of this section, got {name}; there are {', '.join(_numbers(self))}"
-                )
+                raise ValueError(f"randomise.{name}: expected one of {', '.join(_numbers(self))}, got {name!r}")
             lowest, highest = bounds
             if lowest > highest:
                 raise ValueError(f"randomise.{name}: expected [lowest, highest], got {bounds}")
             if name.endswith(LOGARITHMIC) and lowest <= 0:
                 raise ValueError(
-                    f"randomise.{name}: expected a lowest value > 0, got {bounds}; it is drawn uniformly in its logarithm"
+                    f"randomise.{name}: expected a lowest value > 0, got {bounds}; its logarithm is drawn uniformly"
                 )
             for bound in bounds:
                 try:

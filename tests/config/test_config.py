@@ -297,7 +297,7 @@ def test_an_unknown_preset_lists_the_ones_there_are(project):
         write_preset(project, "papper")
 
 
-# thresholds, their deviations, cutoff, leak, shot noise (Hz), refractory period (us), jitter, spread: v2e's defaults, --dvs_params
+# thresholds, deviations, cutoff, leak, shot noise (Hz), refractory period (us), jitter, spread: v2e's --dvs_params
 SENSORS = {
     "default": (0.2, 0.2, 0.03, 0.03, 300.0, 0.01, 0.001, 500.0, 0.1, 0.1),
     "clean": (0.2, 0.2, 0.02, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
