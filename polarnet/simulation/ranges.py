@@ -35,7 +35,8 @@ class RandomisedConfig:
                 try:
                     dataclasses.replace(self, randomise=None, **{name: _repeated(getattr(self, name), bound)})
                 except ValueError as error:
-                    raise ValueError(f"randomise.{error}") from None
+                    first_line, _, _ = str(error).partition("\n")  # every value of a list is wrong alike
+                    raise ValueError(f"randomise.{first_line}") from None
 
 
 def _numbers(config: RandomisedConfig) -> list[str]:
