@@ -211,6 +211,36 @@ def test_every_channel_has_thresholds_of_its_own_around_the_nominal_ones(model):
 
 
 @pytest.mark.parametrize("model", ["v2e", "exact"])
+@pytest.mark.parametrize("correlation", [-0.5, 0.0, 0.8, 1.0])
+def test_on_and_off_thresholds_have_deviations_of_their_own_and_the_configured_correlation(model, correlation):
+    config = of(
+        model, NOISY, contrast_threshold_on=0.25, contrast_threshold_off=0.38, contrast_threshold_sigma_on=0.05,
+        contrast_threshold_sigma_off=0.04, contrast_threshold_correlation=correlation,
+    )  # fmt: skip
+    _, state = emulate(torch.full((1, 2, 100, 100), 100.0), torch.tensor([0]), config, key=3)
+    for pixels in state.pixels:
+        on, off = pixels.threshold_on, pixels.threshold_off
+        assert (on.mean(), off.mean()) == pytest.approx((0.25, 0.38), abs=3 * 0.05 / 100)
+        assert (on.std(), off.std()) == pytest.approx((0.05, 0.04), abs=3 * 0.05 / math.sqrt(2) / 100)
+        error = (1 - correlation**2) / 100  # standard error of a correlation of 10,000 pairs
+        assert np.corrcoef(on, off)[0, 1] == pytest.approx(correlation, abs=3 * error + 1e-6)
+    across = np.corrcoef(state.pixels[0].threshold_on, state.pixels[1].threshold_off)[0, 1]
+    assert abs(across) < 3 / 100  # another channel is another sensor
+
+
+def test_the_correlation_changes_off_thresholds_alone():
+    light, t_us = torch.full((1, 1, 8, 8), 100.0), torch.tensor([0])
+    (apart, together) = (
+        emulate(light, t_us, of("exact", NOISY, contrast_threshold_correlation=rho), key=3)[1].pixels[0]
+        for rho in (0.0, 1.0)
+    )
+    assert np.array_equal(apart.threshold_on, together.threshold_on)
+    # with equal nominal thresholds and deviations, full correlation makes both thresholds of a pixel equal
+    assert np.array_equal(together.threshold_on, together.threshold_off)
+    assert not np.array_equal(apart.threshold_off, together.threshold_off)
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact"])
 def test_another_key_is_another_sensor_and_the_same_key_the_same(model):
     frames, t_us = moving_clip(torch.float32), 3333 * torch.arange(12)
     (first, *_), _ = emulate(frames, t_us, of(model, NOISY), key=2**64 - 1)
