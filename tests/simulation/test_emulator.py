@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from polarnet.events.stream import validate
-from polarnet.simulation.emulator import MODELS, EmulatorConfig, emulate, emulate_columns, randomised
+from polarnet.simulation.emulator import MODELS, EmulatorConfig, emulate, emulate_columns
 from polarnet.simulation.presets import SENSORS
 
-IDEAL = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma=0.0)
+IDEAL = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
 NOISY = dataclasses.replace(
     IDEAL,
-    contrast_threshold_sigma=0.03,
+    contrast_threshold_sigma_on=0.03,
+    contrast_threshold_sigma_off=0.03,
     cutoff_hz=100.0,
     leak_rate_hz=2.0,
     leak_jitter=0.1,
@@ -61,6 +62,24 @@ def test_events_of_a_log_ramp_are_stamped_where_it_crosses_the_thresholds(model)
     # 0.7 in 70 ms: 0.2 every 20 ms
     assert columns.unrounded_us == pytest.approx([20_000, 40_000, 60_000], abs=0.5)
     assert columns.t.tolist() == np.floor(columns.unrounded_us).astype(int).tolist()
+
+
+@pytest.mark.parametrize(("model", "tolerance_us"), [("exact", 5), ("v2e", 60)])
+@pytest.mark.parametrize("cutoff_hz", [50.0, 0.0])
+def test_photoreceptor_and_source_follower_answer_a_step_of_light_like_a_second_order_low_pass(
+    model, tolerance_us, cutoff_hz
+):
+    every_us, rate = 20, 2 * math.pi * 50
+    t_us = np.append(0, 1 + every_us * np.arange(1500))
+    frames = np.full((len(t_us), 1, 1, 1), 255.0, np.float32)
+    frames[0] = 25
+    config = of(model, cutoff_hz=cutoff_hz, source_follower_hz=100.0 if cutoff_hz else 50.0)
+    (columns,), _ = emulate_columns(frames, t_us, config, key=1, unrounded_times=True)
+    risen = 0.2 * np.arange(1, 11) / math.log(255 / 25)  # fraction of the step at each ON event
+    # poles at `rate` and 2 `rate` give the response (1 - exp(-rate t))^2, one pole alone 1 - exp(-rate t)
+    expected_us = -1e6 / rate * np.log(1 - (np.sqrt(risen) if cutoff_hz else risen))
+    assert columns.p.tolist()[:10] == [1] * 10
+    assert columns.unrounded_us[:10] == pytest.approx(expected_us, abs=tolerance_us)
 
 
 def test_v2e_spreads_events_over_a_step_as_its_busiest_pixel_asks():
@@ -192,6 +211,36 @@ def test_every_channel_has_thresholds_of_its_own_around_the_nominal_ones(model):
 
 
 @pytest.mark.parametrize("model", ["v2e", "exact"])
+@pytest.mark.parametrize("correlation", [-0.5, 0.0, 0.8, 1.0])
+def test_on_and_off_thresholds_have_deviations_of_their_own_and_the_configured_correlation(model, correlation):
+    config = of(
+        model, NOISY, contrast_threshold_on=0.25, contrast_threshold_off=0.38, contrast_threshold_sigma_on=0.05,
+        contrast_threshold_sigma_off=0.04, contrast_threshold_correlation=correlation,
+    )  # fmt: skip
+    _, state = emulate(torch.full((1, 2, 100, 100), 100.0), torch.tensor([0]), config, key=3)
+    for pixels in state.pixels:
+        on, off = pixels.threshold_on, pixels.threshold_off
+        assert (on.mean(), off.mean()) == pytest.approx((0.25, 0.38), abs=3 * 0.05 / 100)
+        assert (on.std(), off.std()) == pytest.approx((0.05, 0.04), abs=3 * 0.05 / math.sqrt(2) / 100)
+        error = (1 - correlation**2) / 100  # standard error of a correlation of 10,000 pairs
+        assert np.corrcoef(on, off)[0, 1] == pytest.approx(correlation, abs=3 * error + 1e-6)
+    across = np.corrcoef(state.pixels[0].threshold_on, state.pixels[1].threshold_off)[0, 1]
+    assert abs(across) < 3 / 100  # another channel is another sensor
+
+
+def test_the_correlation_changes_off_thresholds_alone():
+    light, t_us = torch.full((1, 1, 8, 8), 100.0), torch.tensor([0])
+    (apart, together) = (
+        emulate(light, t_us, of("exact", NOISY, contrast_threshold_correlation=rho), key=3)[1].pixels[0]
+        for rho in (0.0, 1.0)
+    )
+    assert np.array_equal(apart.threshold_on, together.threshold_on)
+    # with equal nominal thresholds and deviations, full correlation makes both thresholds of a pixel equal
+    assert np.array_equal(together.threshold_on, together.threshold_off)
+    assert not np.array_equal(apart.threshold_off, together.threshold_off)
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact"])
 def test_another_key_is_another_sensor_and_the_same_key_the_same(model):
     frames, t_us = moving_clip(torch.float32), 3333 * torch.arange(12)
     (first, *_), _ = emulate(frames, t_us, of(model, NOISY), key=2**64 - 1)
@@ -201,30 +250,14 @@ def test_another_key_is_another_sensor_and_the_same_key_the_same(model):
     assert not same(first, other)
 
 
-def test_a_sensor_is_drawn_for_each_sequence_within_the_ranges():
-    wanted = dataclasses.replace(IDEAL, randomise=True)
-    drawn = [randomised(wanted, np.random.default_rng(seed)) for seed in range(200)]
-    for name, bounds in (
-        ("contrast_threshold_on", IDEAL.random_threshold_on),
-        ("contrast_threshold_off", IDEAL.random_threshold_off),
-        ("contrast_threshold_sigma", IDEAL.random_threshold_sigma),
-        ("cutoff_hz", IDEAL.random_cutoff_hz),
-        ("leak_rate_hz", IDEAL.random_leak_rate_hz),
-        ("shot_noise_rate_hz", IDEAL.random_shot_noise_rate_hz),
-    ):
-        values = [getattr(config, name) for config in drawn]
-        assert bounds[0] <= min(values) < max(values) <= bounds[1]
-    assert np.median([config.shot_noise_rate_hz for config in drawn]) == pytest.approx(math.sqrt(0.005), rel=0.6)
-    assert randomised(IDEAL, np.random.default_rng(0)) is IDEAL
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"model": "iebcs"}, "model: expected one of v2e, exact, esim, esim_gpu, dvs_voltmeter"),
         ({"contrast_threshold_on": 0.0}, "contrast_threshold_on: expected >= 0.01"),
         ({"leak_jitter": 1.5}, "leak_jitter: expected <= 1"),
-        ({"random_cutoff_hz": [300.0, 30.0]}, "random_cutoff_hz: expected .lowest, highest., got .300.0, 30.0."),
+        ({"contrast_threshold_correlation": 1.01}, "contrast_threshold_correlation: expected <= 1"),
+        ({"hot_pixel_share": -0.1}, "hot_pixel_share: expected >= 0"),
     ],
 )
 def test_a_configuration_out_of_range_is_refused_by_name(changes, message):

@@ -3,6 +3,8 @@
 Formulas and constants are those of v2e (Hu, Liu, Delbruck, CVPRW 2021).
 """
 
+import math
+from collections.abc import Callable
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -25,10 +27,19 @@ class PixelConfig:
 
     contrast_threshold_on: Annotated[float, Field(ge=0.01, le=10)]
     contrast_threshold_off: Annotated[float, Field(ge=0.01, le=10)]
-    contrast_threshold_sigma: NonNegativeFloat
-    """Standard deviation between pixels, drawn for each channel."""
+    contrast_threshold_sigma_on: NonNegativeFloat
+    """Standard deviation of the ON threshold between pixels, drawn for each channel."""
+    contrast_threshold_sigma_off: NonNegativeFloat
+    contrast_threshold_correlation: Annotated[float, Field(ge=-1, le=1)]
+    """Correlation of a pixel's ON and OFF thresholds."""
     cutoff_hz: NonNegativeFloat
     """Bandwidth of the photoreceptor at full brightness, less in the dark; 0: infinite."""
+    source_follower_hz: NonNegativeFloat
+    """Bandwidth of the source follower behind the photoreceptor, in any light; 0: infinite, as in v2e.
+
+    The two form a second-order low-pass (Lichtsteiner, Posch, Delbruck, JSSC 2008). v2e keeps only the photoreceptor's
+    pole, because it usually dominates (Hu, Liu, Delbruck, CVPRW 2021).
+    """
     leak_rate_hz: NonNegativeFloat
     """ON events per second of a pixel that sees no change."""
     leak_jitter: Annotated[float, Field(ge=0, le=1)]
@@ -45,8 +56,11 @@ class Physics(NamedTuple):
 
     threshold_on: float
     threshold_off: float
-    threshold_sigma: float
+    threshold_sigma_on: float
+    threshold_sigma_off: float
+    threshold_correlation: float
     cutoff_hz: float
+    source_follower_hz: float
     leak_rate_hz: float
     leak_jitter: float
     noise_rate_cov_decades: float
@@ -59,8 +73,11 @@ def physics_of(config: PixelConfig) -> Physics:
     return Physics(
         config.contrast_threshold_on,
         config.contrast_threshold_off,
-        config.contrast_threshold_sigma,
+        config.contrast_threshold_sigma_on,
+        config.contrast_threshold_sigma_off,
+        config.contrast_threshold_correlation,
         config.cutoff_hz,
+        config.source_follower_hz,
         config.leak_rate_hz,
         config.leak_jitter,
         config.noise_rate_cov_decades,
@@ -71,16 +88,27 @@ def physics_of(config: PixelConfig) -> Physics:
 
 def threshold_maps(physics: Physics, pixels: int, key: np.uint64, channel: int) -> tuple[np.ndarray, np.ndarray]:
     """ON and OFF thresholds of the pixels of a channel, float32: normally distributed, at least `THRESHOLD_FLOOR`."""
-    on = _threshold_map(physics.threshold_on, physics.threshold_sigma, pixels, key, randomness.THRESHOLD_ON, channel)
-    off = _threshold_map(physics.threshold_off, physics.threshold_sigma, pixels, key, randomness.THRESHOLD_OFF, channel)
-    return on, off
+
+    def deviations_on() -> np.ndarray:
+        return randomness.normal_map(key, randomness.THRESHOLD_ON, channel, pixels)
+
+    def deviations_off() -> np.ndarray:
+        share, own = (
+            physics.threshold_correlation,
+            randomness.normal_map(key, randomness.THRESHOLD_OFF, channel, pixels),
+        )
+        return np.float32(share) * deviations_on() + np.float32(math.sqrt(1 - share * share)) * own if share else own
+
+    return (
+        _threshold_map(physics.threshold_on, physics.threshold_sigma_on, deviations_on, pixels),
+        _threshold_map(physics.threshold_off, physics.threshold_sigma_off, deviations_off, pixels),
+    )
 
 
-def _threshold_map(nominal: float, sigma: float, pixels: int, key: np.uint64, purpose: int, channel: int) -> np.ndarray:
+def _threshold_map(nominal: float, sigma: float, deviations: Callable[[], np.ndarray], pixels: int) -> np.ndarray:
     if sigma == 0:
         return np.full(pixels, nominal, np.float32)
-    deviations = randomness.normal_map(key, purpose, channel, pixels)
-    return np.maximum(np.float32(nominal) + np.float32(sigma) * deviations, np.float32(THRESHOLD_FLOOR))
+    return np.maximum(np.float32(nominal) + np.float32(sigma) * deviations(), np.float32(THRESHOLD_FLOOR))
 
 
 def leak_factor_map(physics: Physics, pixels: int, key: np.uint64, channel: int) -> np.ndarray:
