@@ -505,6 +505,18 @@ BLOCKS = {
         lambda results: [{"name": name, **one} for name, one in results["house"]["folders"].items()],
         {"folder": "`{name}`", "files": "{files:,}", "lines": "{lines:,}"}, caption="",
     ),
+    "polarizer-presets": Block(
+        "camera", "polarizer_presets", "studies.polarizer_presets",
+        lambda results: [
+            {"name": name, **figures} for name, figures in results["polarizer_presets"]["presets"].items()
+        ],
+        {
+            "`polarizers=`": "`{name}`", "DoLP of fully polarized light": "{dolp_of_full_polarization:.4f}",
+            "its AoLP, RMS error": "{aolp_error_deg:.2f}°", "DoLP of the photograph, RMS error": "{scene_dolp_rms:.4f}",
+        },
+        "{polarizer_presets[number]} presets; fully polarized light at 36 angles, and `{polarizer_presets[scene]}`. "
+        "{origin}",
+    ),
     "sensor-fit": _sensor_fit(
         "sensor_fit",
         "{sensor_fit[static_s]} s of constant light and {sensor_fit[moving_s]:g} s of drifting leaves with "
