@@ -96,6 +96,7 @@ def measured(presets: Mapping[str, PolarizersConfig]) -> dict[str, Any]:
     """Section `polarizer_presets` of docs/results/camera.json."""
     return {
         "number": len(presets),
+        "angles": len(ANGLES_DEG),
         "scene": PHOTO,
         "presets": {name: figures_of(preset) for name, preset in presets.items()},
     }
