@@ -514,8 +514,8 @@ BLOCKS = {
             "`polarizers=`": "`{name}`", "DoLP of fully polarized light": "{dolp_of_full_polarization:.4f}",
             "its AoLP, RMS error": "{aolp_error_deg:.2f}°", "DoLP of the photograph, RMS error": "{scene_dolp_rms:.4f}",
         },
-        "{polarizer_presets[number]} presets; fully polarized light at {polarizer_presets[angles]} angles, and `{polarizer_presets[scene]}`. "
-        "{origin}",
+        "{polarizer_presets[number]} presets; fully polarized light at {polarizer_presets[angles]} angles, and "
+        "`{polarizer_presets[scene]}`. {origin}",
     ),
     "sensor-fit": _sensor_fit(
         "sensor_fit",
