@@ -18,6 +18,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events
 from polarnet.reports.figures import LIGHT, chart_style, show_picture
 from polarnet.reports.maps import dolp_image, intensity_image, png
@@ -28,9 +29,9 @@ from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.pixels.light import KNEE, linlog
 from polarnet.simulation.polarizers import PolarizersConfig, analyzers
 from polarnet.simulation.presets import MOTIONS, POLARIZERS, SENSORS
-from polarnet.simulation.readout import ReadoutConfig, read_out
+from polarnet.simulation.readout import PERFECT, read_out
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
-from polarnet.stokes import POLARIZER_ANGLES_DEG, dolp
+from polarnet.stokes import POLARIZER_ANGLES_DEG, dolp, parse_mosaic
 from studies.polarizer_presets import channels_of, inside, measured_stokes, photograph, true_stokes
 from studies.simulation_pictures import FOLDER, LINE, QUIET, few_colours
 
@@ -195,9 +196,7 @@ def _draw_mosaic(figure: Any, polarizers: PolarizersConfig) -> None:
     """A part of a photograph as the pixels of a DoFP sensor see it, and its four channels."""
     channels = channels_of(photograph(), polarizers)[:, 20:52, 30:62]
     raw = np.empty((64, 64))
-    places = {0: (1, 1), 45: (0, 1), 90: (0, 0), 135: (1, 0)}  # mosaic 90 45 / 135 0
-    for channel, angle in zip(channels, POLARIZER_ANGLES_DEG, strict=True):
-        row, column = places[angle]
+    for channel, (row, column) in zip(channels, places_of(parse_mosaic(polarizers.mosaic)), strict=True):
         raw[row::2, column::2] = channel
     grid = figure.add_gridspec(2, 4)
     whole = figure.add_subplot(grid[:, :2])
@@ -237,17 +236,16 @@ def presets_figure() -> Figure:
 
 def readout_figure() -> Figure:
     """Draw the times of a flash by row, and a bus whose limit the events exceed."""
-    perfect = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=0.0)
     with matplotlib.rc_context(chart_style(LIGHT)):
         figure = Figure(figsize=(9.0, 2.8), layout="constrained", facecolor=LIGHT.face)
         rows, rate, waits = figure.subplots(1, 3)
         flash = _flash()
-        for changes, colour, label in (
-            ({}, LIGHT.quiet, "perfect"),
-            ({"row_latency_us": 20.0}, COLOURS[1], "20 us a row"),
-            ({"max_events_per_s": 1e6, "max_wait_us": 1500.0}, ON, "1 Mev/s, wait 1.5 ms"),
+        for readout, colour, label in (
+            (PERFECT, LIGHT.quiet, "perfect"),
+            (replace(PERFECT, row_latency_us=20.0), COLOURS[1], "20 µs a row"),
+            (replace(PERFECT, max_events_per_s=1e6, max_wait_us=1500.0), ON, "1 Mev/s, wait 1.5 ms"),
         ):
-            events, _ = read_out(flash, replace(perfect, **changes), key=1, duration_us=30_000)
+            events, _ = read_out(flash, readout, key=1, duration_us=30_000)
             rows.plot(events.t.numpy() / 1000, events.y.numpy(), ".", color=colour, markersize=1.2, label=label)
         rows.set(xlabel="ms", ylabel="row", xlim=(4.8, 8.0), ylim=(60, 0))
         rows.legend(fontsize=7, frameon=False, markerscale=6, loc="lower right")
@@ -255,7 +253,7 @@ def readout_figure() -> Figure:
         swing = _swing()
         limit_hz = 1e5
         limited, lost = read_out(
-            swing, replace(perfect, max_events_per_s=limit_hz, max_wait_us=5_000.0), key=1, duration_us=1_000_000
+            swing, replace(PERFECT, max_events_per_s=limit_hz, max_wait_us=5_000.0), key=1, duration_us=1_000_000
         )
         for events, colour, label in ((swing, LIGHT.quiet, "of the pixels"), (limited, ON, "read out")):
             counts = np.bincount(events.t.numpy() // 5_000, minlength=200)[:200]
@@ -268,7 +266,7 @@ def readout_figure() -> Figure:
         offered = np.linspace(0.1, 2.5, 25)
         for wait_us, colour in zip((200.0, 5_000.0), (COLOURS[1], COLOURS[3]), strict=True):
             shares = [
-                read_out(swing, replace(perfect, max_events_per_s=len(swing) / load, max_wait_us=wait_us), key=1,
+                read_out(swing, replace(PERFECT, max_events_per_s=len(swing) / load, max_wait_us=wait_us), key=1,
                          duration_us=1_000_000)[1] / len(swing) for load in offered
             ]  # fmt: skip
             waits.plot(offered, shares, color=colour, linewidth=1.4, label=f"wait up to {wait_us / 1000:g} ms")

@@ -16,12 +16,13 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from polarnet.events.mosaic import places_of
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import read_rgb
 from polarnet.pictures.polarimetry import demosaic
 from polarnet.simulation.motion import Pose
 from polarnet.simulation.moving_sensor import channel_frames
-from polarnet.simulation.polarizers import PolarizersConfig, analyzer_maps, places_of
+from polarnet.simulation.polarizers import PolarizersConfig, analyzer_maps
 from polarnet.simulation.presets import POLARIZERS
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, scene_from_rgb
 from polarnet.stokes import aolp, dolp, parse_mosaic, stokes_from_intensities
@@ -42,7 +43,7 @@ def measured_stokes(scene: PolarizationScene, polarizers: PolarizersConfig) -> F
     channels = channels_of(scene, polarizers)
     if polarizers.layout == "dofp":
         raw = np.empty(SIZE)
-        for channel, (row, column) in zip(channels, places_of(polarizers.mosaic), strict=True):
+        for channel, (row, column) in zip(channels, places_of(parse_mosaic(polarizers.mosaic)), strict=True):
             raw[row::2, column::2] = channel
         inner = demosaic(raw, parse_mosaic(polarizers.mosaic))
         missing = [(SIZE[axis] // 2 - inner.shape[axis + 1]) // 2 for axis in (0, 1)]

@@ -10,7 +10,7 @@ from polarnet.simulation.emulator import emulate
 from polarnet.simulation.presets import SENSORS
 
 CLEAN = SENSORS["clean"]
-ALIKE = dataclasses.replace(CLEAN, contrast_threshold_sigma=0.0)
+ALIKE = dataclasses.replace(CLEAN, contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
 MODELS = ["exact", "v2e"]
 SEEDS = (1, 2, 3_000_000_000)
 

@@ -14,7 +14,11 @@ from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.scene import scene_from_rgb
 
 IDEAL = dataclasses.replace(
-    SENSORS["clean"], contrast_threshold_sigma=0.0, contrast_threshold_on=0.05, contrast_threshold_off=0.05
+    SENSORS["clean"],
+    contrast_threshold_sigma_on=0.0,
+    contrast_threshold_sigma_off=0.0,
+    contrast_threshold_on=0.05,
+    contrast_threshold_off=0.05,
 )
 RAMP_DN = 10 * np.exp(np.linspace(0, math.log(4), 401))
 TIMES_US = 5_000 * torch.arange(401)
