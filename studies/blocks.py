@@ -521,6 +521,18 @@ BLOCKS = {
         lambda results: [{"name": name, **one} for name, one in results["house"]["folders"].items()],
         {"folder": "`{name}`", "files": "{files:,}", "lines": "{lines:,}"}, caption="",
     ),
+    "polarizer-presets": Block(
+        "camera", "polarizer_presets", "studies.polarizer_presets",
+        lambda results: [
+            {"name": name, **figures} for name, figures in results["polarizer_presets"]["presets"].items()
+        ],
+        {
+            "`polarizers=`": "`{name}`", "DoLP of fully polarized light": "{dolp_of_full_polarization:.4f}",
+            "its AoLP, RMS error": "{aolp_error_deg:.2f}°", "DoLP of the photograph, RMS error": "{scene_dolp_rms:.4f}",
+        },
+        "{polarizer_presets[number]} presets; fully polarized light at {polarizer_presets[angles]} angles, and "
+        "`{polarizer_presets[scene]}`. {origin}",
+    ),
     "robustness": _robustness("mse_over_oracle_mean", ".2f"),
     "robustness-median": _robustness("median_over_oracle_mean", ".2f"),
     "sensor-fit": _sensor_fit(

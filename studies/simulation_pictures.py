@@ -1,4 +1,4 @@
-"""The pictures of docs/simulation.md: python -m studies.simulation_pictures [FOLDER]
+"""Pictures of docs/simulation.md and docs/physics.md: python -m studies.simulation_pictures [FOLDER]
 
 Every line and every event in them comes from the simulation itself.
 """
@@ -252,11 +252,11 @@ def _photo() -> Path:
     return next(photo.path for photo in BUILTIN_PHOTOS if photo.file == PHOTO)
 
 
-def few_colours(content: bytes) -> bytes:
+def few_colours(content: bytes, colours: int = COLOURS) -> bytes:
     """Reduce the picture to a palette: a third of the bytes, without a visible difference."""
     buffer = io.BytesIO()
     picture = Image.open(io.BytesIO(content)).convert("RGB")
-    picture.quantize(COLOURS, dither=Image.Dither.NONE).save(buffer, format="png", optimize=True)
+    picture.quantize(colours, dither=Image.Dither.NONE).save(buffer, format="png", optimize=True)
     return buffer.getvalue()
 
 
@@ -270,7 +270,7 @@ FIGURES = {
 
 def main() -> None:
     """Write all pictures."""
-    parser = argparse.ArgumentParser(description="Draw the pictures of docs/simulation.md.")
+    parser = argparse.ArgumentParser(description="Draw pictures of docs/simulation.md and docs/physics.md.")
     parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help=f"default: {FOLDER}")
     folder = parser.parse_args().folder
     folder.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,7 @@
 import functools
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float32, Int64
 
 from polarnet.events.mosaic import join_mosaic, split_mosaic
 from polarnet.events.stream import Events
@@ -69,6 +69,21 @@ def _read_out(
     return [read_out(channel, readout, key + number, duration_us)[0] for number, channel in enumerate(channels)]
 
 
+def channel_frames(
+    scene: PolarizationScene,
+    pose: Pose,
+    height: int,
+    width: int,
+    weights: Float32[np.ndarray, "sensors 3 *pixels"],
+    polarizers: PolarizersConfig,
+) -> Float32[np.ndarray, "4 n h2 w2"]:
+    """Digital numbers of the four channels; `weights` are the `analyzers` or `analyzer_maps` of the polarizers."""
+    frames = render_intensities(scene, pose, height, width, weights)
+    if polarizers.layout == "dofp":
+        frames = split_cells(mixed_with_neighbours(frames[0], polarizers.crosstalk), polarizers.mosaic)
+    return frames
+
+
 def emulation_times_us(
     trajectory: Trajectory, duration_us: int, height: int, width: int, config: EmulatorConfig
 ) -> Int64[np.ndarray, " n"]:
@@ -112,9 +127,7 @@ def emulate_motion_steps(
     pieces = []
     for first in range(0, len(t_us), CHUNK):
         chunk = slice(first, first + CHUNK)
-        frames = render_intensities(scene, Pose(*(values[chunk] for values in pose)), height, width, weights)
-        if polarizers.layout == "dofp":
-            frames = split_cells(mixed_with_neighbours(frames[0], polarizers.crosstalk), polarizers.mosaic)
+        frames = channel_frames(scene, Pose(*(values[chunk] for values in pose)), height, width, weights, polarizers)
         if eight_bit:
             frames = (frames + np.float32(0.5)).astype(np.uint8)
         lights = [light_of_frames(channel) for channel in frames]

@@ -11,7 +11,7 @@ import torch
 from polarnet import stokes
 from polarnet.pictures.polarimetry import demosaic
 from polarnet.simulation.motion import Pose, Sine, Trajectory
-from polarnet.simulation.moving_sensor import emulate_motion
+from polarnet.simulation.moving_sensor import channel_frames, emulate_motion
 from polarnet.simulation.pixels.light import intensity_rows
 from polarnet.simulation.polarizers import (
     IDEAL,
@@ -52,9 +52,7 @@ def channels_of(
     scene: PolarizationScene, polarizers: PolarizersConfig, pose: Pose | None = None, size: tuple[int, int] = (20, 30)
 ) -> torch.Tensor:
     """Light of the four channels in [0, 1]; without a pose, at the scene's middle."""
-    frames = render_intensities(scene, pose or still(), *size, analyzer_maps(polarizers, *size, key=3))
-    if polarizers.layout == "dofp":
-        frames = split_cells(mixed_with_neighbours(frames[0], polarizers.crosstalk), polarizers.mosaic)
+    frames = channel_frames(scene, pose or still(), *size, analyzer_maps(polarizers, *size, key=3), polarizers)
     return torch.from_numpy(frames[:, 0].astype(np.float64) / 255)
 
 

@@ -1,4 +1,4 @@
-"""The pictures of docs/simulation.md."""
+"""The pictures of docs/simulation.md and docs/physics.md."""
 
 from dataclasses import replace
 
@@ -22,9 +22,9 @@ def test_half_the_threshold_gives_about_twice_the_events():
     assert 1.7 * len(pixel_events(QUIET)) <= len(pixel_events(half)) <= 2.5 * len(pixel_events(QUIET))
 
 
-def test_the_same_picture_is_drawn_each_time_and_lies_beside_the_page(project_root):
+def test_the_same_picture_is_drawn_each_time_and_lies_beside_the_pages(project_root):
     assert few_colours(png(draw())) == few_colours(png(draw()))
-    page = (project_root / "docs" / "simulation.md").read_text()
+    pages = "".join((project_root / "docs" / f"{page}.md").read_text() for page in ("simulation", "physics"))
     for name in FIGURES:
-        assert f"pictures/{name}.png" in page
+        assert f"pictures/{name}.png" in pages
         assert (project_root / "docs" / "pictures" / f"{name}.png").stat().st_size < 300_000

@@ -1,0 +1,365 @@
+"""The pictures of docs/physics.md: python -m studies.physics_pictures [FOLDER]
+
+Every point, line and event in them comes from the simulation itself; where a formula is drawn, its label says so.
+"""
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from polarnet.events.mosaic import places_of
+from polarnet.events.stream import Events
+from polarnet.reports.figures import LIGHT, chart_style, show_picture
+from polarnet.reports.maps import dolp_image, intensity_image, png
+from polarnet.reports.overview import OFF, ON
+from polarnet.simulation.emulator import EmulatorConfig, emulate
+from polarnet.simulation.motion import Sine, Trajectory, frame_times_us
+from polarnet.simulation.moving_sensor import emulate_motion
+from polarnet.simulation.pixels.light import KNEE, linlog
+from polarnet.simulation.polarizers import PolarizersConfig, analyzers
+from polarnet.simulation.presets import MOTIONS, POLARIZERS, SENSORS
+from polarnet.simulation.readout import PERFECT, read_out
+from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
+from polarnet.stokes import POLARIZER_ANGLES_DEG, dolp, parse_mosaic
+from studies.polarizer_presets import channels_of, inside, measured_stokes, photograph, true_stokes
+from studies.simulation_pictures import FOLDER, LINE, QUIET, few_colours
+
+COLOURS = ("#1c2330", "#2f7fc1", "#3f9c6d", "#e08a1e")
+STILL = Sine(0.0, 0.0, 0.0)
+PALETTE = 256  # colours of a picture on disk
+ERROR_SCALE = 0.1  # DoLP error of the strongest red and blue
+CONSTANT_SPEED_PX_S = 97.3
+FLAT_HEIGHT, FLAT_WIDTH = 40, 200
+SETTLING_FRAMES = 6  # until each pixel has fired, and its memory is that of an endless motion
+LIGHTS_DN = (0, 15, 30, 60, 90, 120, 150, 180, 210, 240, 255)
+
+
+def events_under(light_dn: Float64[np.ndarray, " n"], t_us: Float64[np.ndarray, " n"], config: EmulatorConfig,
+                 pixels: int = 1, eight_bit: bool = False) -> Events:  # fmt: skip
+    """Events of neighbouring pixels under one light."""
+    frames = torch.from_numpy(light_dn.astype(np.float32))[:, None, None, None].expand(-1, 1, 1, pixels)
+    frames = frames.round().to(torch.uint8) if eight_bit else frames
+    (events,), _ = emulate(frames.contiguous(), torch.from_numpy(t_us), config, key=5)
+    return events
+
+
+def pixel_figure() -> Figure:
+    """Draw a pixel's physics, from its light to its events."""
+    with matplotlib.rc_context(chart_style(LIGHT)):
+        figure = Figure(figsize=(9.0, 5.4), layout="constrained", facecolor=LIGHT.face)
+        for axes, draw in zip(
+            figure.subplots(2, 3).ravel(),
+            (_draw_response, _draw_photoreceptor, _draw_mismatch, _draw_noise, _draw_refractory, _draw_bit_depth),
+            strict=True,
+        ):
+            draw(axes)
+    return figure
+
+
+def _draw_response(axes: Axes) -> None:
+    light, response = np.arange(256, dtype=np.float32), np.empty(256, np.float32)
+    linlog(light, response)
+    axes.plot(light, response, **LINE)
+    axes.axvline(KNEE, color=LIGHT.grid, linewidth=1, zorder=0)
+    axes.annotate("logarithm", (90, float(response[90])), (95, 3.6), color=LIGHT.quiet, fontsize=8)
+    axes.annotate("linear below 20 DN", (KNEE, 0.4), (28, 0.4), color=LIGHT.quiet, fontsize=8)
+    axes.set(xlabel="light, DN", ylabel="response, ln units", xlim=(0, 255), ylim=(0, None))
+    axes.set_title("light to response", loc="left", fontsize=9)
+
+
+def _draw_photoreceptor(axes: Axes) -> None:
+    """The sum of the events of a pixel with small thresholds follows the filtered response."""
+    config = replace(QUIET, cutoff_hz=60.0, contrast_threshold_on=0.01, contrast_threshold_off=0.01)
+    t_us = np.arange(0, 60_001, 100.0)
+    for light_dn, colour in zip((200.0, 60.0, 15.0), COLOURS, strict=False):
+        light = np.where(t_us < 5_000, light_dn / 1.25, light_dn)
+        low, high = np.array([light_dn / 1.25], np.float32), np.array([light_dn], np.float32)
+        ends = np.empty((2, 1), np.float32)
+        linlog(low, ends[0])
+        linlog(high, ends[1])
+        events = events_under(light, t_us, config)
+        t_ms, rise = events.t.numpy() / 1000, events.p.numpy().cumsum() * 0.01 / float(ends[1, 0] - ends[0, 0])
+        axes.step(np.r_[0, t_ms, 60], np.r_[0, rise, rise[-1:]], where="post", color=colour, linewidth=1.2)
+        axes.text(58, 1.12 - 0.12 * (200.0, 60.0, 15.0).index(light_dn) - 0.45, f"{light_dn:g} DN", color=colour,
+                  ha="right", fontsize=8)  # fmt: skip
+    axes.set(xlabel="ms", ylabel="share of a step", xlim=(0, 60), ylim=(0, 1.05))
+    axes.set_title("photoreceptor, 60 Hz: slow in the dark", loc="left", fontsize=9)
+
+
+def _draw_mismatch(axes: Axes) -> None:
+    """The first event on a ramp of log light comes when the ramp has reached the pixel's threshold."""
+    config = SENSORS["default"]
+    quiet = replace(config, cutoff_hz=0.0, leak_rate_hz=0.0, shot_noise_rate_hz=0.0, refractory_period_us=0.0)
+    t_us = np.arange(0, 1_000_001, 5_000.0)
+    for sign, colour, label in ((1, ON, "ON"), (-1, OFF, "OFF")):
+        events = events_under(80 * np.exp(sign * 0.35 * t_us / 1e6), t_us, quiet, pixels=20_000)
+        first = np.full(20_000, np.nan)
+        x, t = events.x.numpy()[::-1], events.t.numpy()[::-1]
+        first[x] = t
+        counts, edges = np.histogram(0.35 * first / 1e6, np.arange(0.08, 0.34, 0.008))
+        axes.stairs(counts, edges, color=colour, linewidth=1.3, label=label)
+    axes.legend(fontsize=8, frameon=False)
+    axes.set(xlabel="threshold of a pixel, ln units", ylabel="pixels of 20,000")
+    axes.set_title("mismatch of the default sensor", loc="left", fontsize=9)
+
+
+def _draw_noise(axes: Axes) -> None:
+    """Events in constant light, against its brightness."""
+    shot = replace(QUIET, shot_noise_rate_hz=5.0)
+    leak = replace(QUIET, leak_rate_hz=1.0)
+    seconds, pixels = 20, 500
+    t_us = np.array([0.0, seconds * 1e6])
+    points: dict[str, list[float]] = {"shot noise, ON": [], "shot noise, OFF": [], "leak, ON": []}
+    for light_dn in LIGHTS_DN:
+        light = np.full(2, float(light_dn))
+        noise, leaked = events_under(light, t_us, shot, pixels), events_under(light, t_us, leak, pixels)
+        points["shot noise, ON"].append(float((noise.p > 0).sum()) / pixels / seconds)
+        points["shot noise, OFF"].append(float((noise.p < 0).sum()) / pixels / seconds)
+        points["leak, ON"].append(float((leaked.p > 0).sum()) / pixels / seconds)
+        assert not (leaked.p < 0).any()
+    for (label, rates), colour, marker in zip(points.items(), (ON, OFF, COLOURS[3]), "^vo", strict=True):
+        axes.plot(LIGHTS_DN, rates, marker, color=colour, markersize=4, label=label)
+    light = np.linspace(0, 255, 50)
+    axes.plot(light, 2.5 * (1 - 0.75 * (light + 20) / 275), color=LIGHT.quiet, linewidth=1, label="v2e's formula")
+    axes.legend(fontsize=7, frameon=False)
+    axes.set(xlabel="light, DN", ylabel="events per second", ylim=(0, 3.3))
+    axes.set_title("shot noise 5 Hz, leak 1 Hz", loc="left", fontsize=9)
+
+
+def _draw_refractory(axes: Axes) -> None:
+    """After a step of light by a factor of e, a pixel fires five events of 0.2, each after its blind time."""
+    t_us = np.arange(0, 40_001, 100.0)
+    light = np.where(t_us < 2_000, 40.0, 40 * np.e * 1.01)
+    for period_ms, colour in zip((0.0, 2.0, 7.0), COLOURS, strict=False):
+        events = events_under(light, t_us, replace(QUIET, refractory_period_us=1000 * period_ms))
+        t_ms = events.t.numpy() / 1000
+        axes.step(np.r_[0, t_ms, 40], np.r_[0, np.arange(1, len(t_ms) + 1), len(t_ms)], where="post", color=colour,
+                  linewidth=1.4, label=f"{period_ms:g} ms")  # fmt: skip
+    axes.legend(fontsize=8, frameon=False, loc="lower right")
+    axes.set(xlabel="ms", ylabel="events", xlim=(0, 40), ylim=(0, 5.6))
+    axes.set_title("refractory period, after a step of light", loc="left", fontsize=9)
+
+
+def _draw_bit_depth(axes: Axes) -> None:
+    """A slow ramp from 10 to 40 DN, as floating-point light and rounded to 8 bits."""
+    t_us = np.arange(0, 2_000_001, 2_000.0)
+    light = 10 * np.exp(np.log(4) * t_us / 2e6)
+    config = replace(QUIET, contrast_threshold_on=0.05, contrast_threshold_off=0.05)
+    for row, (eight_bit, label) in enumerate(((False, "floating-point light"), (True, "rounded to 8 bits"))):
+        events = events_under(light, t_us, config, eight_bit=eight_bit)
+        axes.vlines(events.t.numpy() / 1e6, 1.5 * row + 0.1, 1.5 * row + 0.9, color=ON, linewidth=0.8)
+        moments = len(np.unique(events.t.numpy() // 2_000))
+        axes.text(0, 1.5 * row + 0.95, f"{label}: {len(events)} events at {moments} times", fontsize=8,
+                  color=LIGHT.quiet, va="bottom")  # fmt: skip
+    axes.set_yticks([])
+    axes.set(xlabel="s", ylim=(-0.1, 2.9), xlim=(-0.02, 2.02))
+    axes.grid(visible=False)
+    axes.set_title("ramp from 10 to 40 DN, threshold 0.05", loc="left", fontsize=9)
+
+
+def polarizers_figure() -> Figure:
+    """Draw Malus' law for each preset, and a picture through the mosaic of a DoFP sensor."""
+    with matplotlib.rc_context(chart_style(LIGHT)):
+        figure = Figure(figsize=(9.0, 2.7), layout="constrained", facecolor=LIGHT.face)
+        curves, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.0, 1.05))[0]
+        for part in (curves, right):
+            part.set_facecolor(LIGHT.face)
+        axes = curves.subplots()
+        angles = np.radians(np.linspace(-90, 90, 361))
+        for (name, polarizers), colour in zip(POLARIZERS.items(), COLOURS, strict=True):
+            weights = analyzers(replace(polarizers, angle_error_deg=[0.0] * 4))[0].astype(np.float64)
+            through = weights @ np.stack([np.ones_like(angles), np.cos(2 * angles), np.sin(2 * angles)])
+            axes.semilogy(np.degrees(angles), through.clip(1e-6), color=colour, linewidth=1.4,
+                          label=name.replace("_", " "))  # fmt: skip
+        axes.set(
+            xlabel="angle between light and axis, degrees", ylabel="transmission", ylim=(1e-4, 1.5), xlim=(-90, 90)
+        )
+        axes.set_xticks(range(-90, 91, 45))
+        axes.legend(fontsize=8, frameon=False, loc="lower center")
+        axes.set_title("fully polarized light, without crosstalk", loc="left", fontsize=9)
+        _draw_mosaic(right, POLARIZERS["micropolarizers"])
+    return figure
+
+
+def _draw_mosaic(figure: Any, polarizers: PolarizersConfig) -> None:
+    """A part of a photograph as the pixels of a DoFP sensor see it, and its four channels."""
+    channels = channels_of(photograph(), polarizers)[:, 20:52, 30:62]
+    raw = np.empty((64, 64))
+    for channel, (row, column) in zip(channels, places_of(parse_mosaic(polarizers.mosaic)), strict=True):
+        raw[row::2, column::2] = channel
+    grid = figure.add_gridspec(2, 4)
+    whole = figure.add_subplot(grid[:, :2])
+    show_picture(whole, intensity_image(torch.from_numpy(raw / raw.max()).float()), LIGHT)
+    whole.set_title("DoFP sensor", loc="left", fontsize=9)
+    for number, (channel, angle) in enumerate(zip(channels, POLARIZER_ANGLES_DEG, strict=True)):
+        axes = figure.add_subplot(grid[number // 2, 2 + number % 2])
+        show_picture(axes, intensity_image(torch.from_numpy(channel / raw.max()).float()), LIGHT)
+        axes.set_title(f"{angle}°", loc="left", fontsize=9)
+
+
+def presets_figure() -> Figure:
+    """Draw the DoLP that each preset measures on a photograph, and its error."""
+    scene = photograph()
+    truth = dolp(inside(true_stokes(scene))).float()
+    with matplotlib.rc_context(chart_style(LIGHT)):
+        figure = Figure(figsize=(9.0, 2.9), layout="constrained", facecolor=LIGHT.face)
+        tiles = figure.subplots(2, 1 + len(POLARIZERS))
+        show_picture(tiles[0, 0], dolp_image(truth), LIGHT)
+        tiles[0, 0].set_title("true DoLP", loc="left", fontsize=9)
+        tiles[1, 0].set_axis_off()
+        for (above, below), (name, polarizers) in zip(tiles.T[1:], POLARIZERS.items(), strict=True):
+            found = dolp(inside(measured_stokes(scene, polarizers))).clamp(0, 1).float()
+            show_picture(above, dolp_image(found), LIGHT)
+            above.set_title(name.replace("_", " "), loc="left", fontsize=9)
+            below.imshow((found - truth).numpy(), cmap="RdBu_r", vmin=-ERROR_SCALE, vmax=ERROR_SCALE)
+            below.set_xticks([])
+            below.set_yticks([])
+            below.grid(visible=False)
+            below.set_xlabel(f"RMS {float((found - truth).square().mean().sqrt()):.4f}", color=LIGHT.quiet, fontsize=8)
+        scale = ScalarMappable(Normalize(-ERROR_SCALE, ERROR_SCALE), "RdBu_r")
+        bar = figure.colorbar(scale, cax=tiles[1, 0].inset_axes((0.05, 0.55, 0.9, 0.12)), orientation="horizontal")
+        bar.set_label("measured - true DoLP", fontsize=8)
+        bar.ax.tick_params(labelsize=7)
+    return figure
+
+
+def readout_figure() -> Figure:
+    """Draw the times of a flash by row, and a bus whose limit the events exceed."""
+    with matplotlib.rc_context(chart_style(LIGHT)):
+        figure = Figure(figsize=(9.0, 2.8), layout="constrained", facecolor=LIGHT.face)
+        rows, rate, waits = figure.subplots(1, 3)
+        flash = _flash()
+        for readout, colour, label in (
+            (PERFECT, LIGHT.quiet, "perfect"),
+            (replace(PERFECT, row_latency_us=20.0), COLOURS[1], "20 µs a row"),
+            (replace(PERFECT, max_events_per_s=1e6, max_wait_us=1500.0), ON, "1 Mev/s, wait 1.5 ms"),
+        ):
+            events, _ = read_out(flash, readout, key=1, duration_us=30_000)
+            rows.plot(events.t.numpy() / 1000, events.y.numpy(), ".", color=colour, markersize=1.2, label=label)
+        rows.set(xlabel="ms", ylabel="row", xlim=(4.8, 8.0), ylim=(60, 0))
+        rows.legend(fontsize=7, frameon=False, markerscale=6, loc="lower right")
+        rows.set_title("a flash on 60 rows", loc="left", fontsize=9)
+        swing = _swing()
+        limit_hz = 1e5
+        limited, lost = read_out(
+            swing, replace(PERFECT, max_events_per_s=limit_hz, max_wait_us=5_000.0), key=1, duration_us=1_000_000
+        )
+        for events, colour, label in ((swing, LIGHT.quiet, "of the pixels"), (limited, ON, "read out")):
+            counts = np.bincount(events.t.numpy() // 5_000, minlength=200)[:200]
+            rate.step(
+                np.arange(200) * 5e-3, counts * 200 / 1000, where="post", color=colour, linewidth=1.2, label=label
+            )
+        rate.set(xlabel="s", ylabel="kev/s", xlim=(0, 1), ylim=(0, None))
+        rate.legend(fontsize=7, frameon=False)
+        rate.set_title(f"limit {limit_hz / 1000:g} kev/s: {lost / len(swing):.0%} lost", loc="left", fontsize=9)
+        offered = np.linspace(0.1, 2.5, 25)
+        for wait_us, colour in zip((200.0, 5_000.0), (COLOURS[1], COLOURS[3]), strict=True):
+            shares = [
+                read_out(swing, replace(PERFECT, max_events_per_s=len(swing) / load, max_wait_us=wait_us), key=1,
+                         duration_us=1_000_000)[1] / len(swing) for load in offered
+            ]  # fmt: skip
+            waits.plot(offered, shares, color=colour, linewidth=1.4, label=f"wait up to {wait_us / 1000:g} ms")
+        waits.plot(
+            offered, np.maximum(0, 1 - 1 / offered), color=LIGHT.quiet, linewidth=1, label="steady rate: 1 - 1/load"
+        )
+        waits.set(xlabel="mean rate / limit", ylabel="events lost", ylim=(0, None))
+        waits.legend(fontsize=7, frameon=False)
+        waits.set_title("loss against load", loc="left", fontsize=9)
+    return figure
+
+
+def _flash() -> Events:
+    """A grey card that becomes brighter at 5 ms, seen by 60 x 80 pixels."""
+    t_us = np.array([0.0, 5_000.0, 5_001.0, 30_000.0])
+    light = torch.tensor([50.0, 50.0, 75.0, 75.0])[:, None, None, None].expand(-1, 1, 60, 80).contiguous()
+    (events,), _ = emulate(light, torch.from_numpy(t_us), QUIET, key=1)
+    return events
+
+
+def _swing() -> Events:
+    path = Trajectory(300.0, 200.0, (Sine(60.0, 8.0, 0.0),), (Sine(30.0, 5.0, 1.0),), STILL, STILL, 630.0)
+    return emulate_motion(photograph(), path, 1_000_000, 60, 80, SENSORS["default"], key=1)[0]
+
+
+def periodic_scene(columns: int) -> PolarizationScene:
+    """Unpolarized light whose pattern repeats after `FLAT_WIDTH` columns: the sensor always sees all of it."""
+    generator = np.random.default_rng(0)
+    pattern = generator.standard_normal((FLAT_HEIGHT + 2, FLAT_WIDTH))
+    smooth = np.exp(-((np.arange(FLAT_WIDTH // 2 + 1) / 25) ** 2))
+    pattern = np.fft.irfft(np.fft.rfft(pattern, axis=1) * smooth, FLAT_WIDTH, axis=1)
+    s0 = (0.4 * np.exp(0.5 * pattern / pattern.std())).clip(0, 1)
+    plane = torch.from_numpy(np.tile(s0, (1, columns // FLAT_WIDTH + 1))).float()
+    return scene_from_polarization(plane, torch.zeros_like(plane), torch.zeros_like(plane))
+
+
+def events_per_frame(config: EmulatorConfig, speed_px_s: float, duration_s: float = 2.0) -> Int64[np.ndarray, " n"]:
+    """Events of successive frames of a sensor that drifts at constant speed, after the first `SETTLING_FRAMES`.
+
+    It moves by less than the pattern's period, after which all pixels would cross their first level at once.
+    """
+    assert speed_px_s * duration_s < FLAT_WIDTH
+    far = 1e6  # amplitude of a sine whose start is a straight line
+    line = Sine(far, speed_px_s / far, 0.0)
+    path = Trajectory(FLAT_WIDTH / 2 + 1, (FLAT_HEIGHT + 1) / 2, (line,), (STILL,), STILL, STILL, speed_px_s)
+    edges_us = frame_times_us(replace(MOTIONS["default"], duration_s=duration_s))
+    scene = periodic_scene(int(speed_px_s * duration_s) + FLAT_WIDTH + 8)
+    events = emulate_motion(scene, path, int(edges_us[-1]), FLAT_HEIGHT, FLAT_WIDTH, config, key=1)[0]
+    return np.diff(np.searchsorted(events.t.numpy(), edges_us))[SETTLING_FRAMES:]
+
+
+def rate_figure() -> Figure:
+    """Draw events per frame at constant speed over a pattern that repeats."""
+    settings: Mapping[str, tuple[str, float | None]] = {
+        "exact, a frame of light for each pixel of motion": ("exact", None),
+        "exact, 300 frames of light a second": ("exact", 300.0),
+        "v2e, 300 frames of light a second": ("v2e", 300.0),
+        "v2e, a frame of light for each pixel of motion": ("v2e", None),
+    }
+    with matplotlib.rc_context(chart_style(LIGHT)):
+        figure = Figure(figsize=(9.0, 2.6), layout="constrained", facecolor=LIGHT.face)
+        axes = figure.subplots()
+        for (label, (model, rate_hz)), colour in zip(settings.items(), COLOURS, strict=True):
+            counts = events_per_frame(replace(QUIET, model=model, render_rate_hz=rate_hz), CONSTANT_SPEED_PX_S)
+            spread = counts.std() / counts.mean()
+            axes.plot(counts / counts.mean(), ".-", color=colour, linewidth=1, markersize=4,
+                      label=f"{label}: {spread:.1%} RMS")  # fmt: skip
+        axes.legend(fontsize=7, frameon=False, ncols=2, loc="upper center")
+        axes.set(xlabel="frame (30 a second)", ylabel="events / mean", ylim=(0.75, 1.4))
+        axes.set_title(f"{CONSTANT_SPEED_PX_S:g} px/s over a pattern", loc="left", fontsize=9)
+    return figure
+
+
+FIGURES = {
+    "physics_pixel": pixel_figure,
+    "physics_polarizers": polarizers_figure,
+    "physics_presets": presets_figure,
+    "physics_readout": readout_figure,
+    "physics_rate": rate_figure,
+}
+
+
+def main() -> None:
+    """Write all pictures."""
+    parser = argparse.ArgumentParser(description="Draw the pictures of docs/physics.md.")
+    parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help=f"default: {FOLDER}")
+    folder = parser.parse_args().folder
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in FIGURES.items():
+        path = folder / f"{name}.png"
+        path.write_bytes(few_colours(png(figure()), PALETTE))
+        print(f"{path}: {path.stat().st_size / 1024:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()

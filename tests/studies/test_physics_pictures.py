@@ -1,0 +1,54 @@
+"""The pictures of docs/physics.md, and the flow of events at constant speed that one of them shows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from studies.physics_pictures import FIGURES, FLAT_WIDTH, events_per_frame, periodic_scene
+from studies.simulation_pictures import QUIET
+
+
+def spread_and_drift(counts: np.ndarray) -> tuple[float, float]:
+    """Relative RMS deviation from the mean, and the slope over all frames as a share of the mean."""
+    slope = np.polyfit(np.arange(len(counts)), counts, 1)[0]
+    return counts.std() / counts.mean(), abs(slope) * len(counts) / counts.mean()
+
+
+@pytest.mark.parametrize("speed_px_s", [60.0, 97.3])
+@pytest.mark.parametrize("render_rate_hz", [None, 200.0, 300.0, 1000.0])
+def test_exact_fires_equally_in_each_frame_of_constant_motion_at_any_render_rate(speed_px_s, render_rate_hz):
+    counts = events_per_frame(replace(QUIET, render_rate_hz=render_rate_hz), speed_px_s)
+    spread, drift = spread_and_drift(counts)
+    assert counts.mean() > 5_000
+    assert spread < 0.01
+    assert drift < 0.01
+
+
+@pytest.mark.parametrize("speed_px_s", [60.0, 97.3])
+@pytest.mark.parametrize("render_rate_hz", [300.0, 600.0])
+def test_v2e_fires_equally_where_each_frame_holds_as_many_frames_of_light(speed_px_s, render_rate_hz):
+    """But for rounding, by which stamps at the end of a frame fall on either side of it."""
+    spread, drift = spread_and_drift(
+        events_per_frame(replace(QUIET, model="v2e", render_rate_hz=render_rate_hz), speed_px_s)
+    )
+    assert spread < 0.03
+    assert drift < 0.01
+
+
+def test_v2e_beats_with_the_frames_of_light_otherwise():
+    """97.3 frames of light a second are 3 or 4 in each of the 30 frames."""
+    spread, _ = spread_and_drift(events_per_frame(replace(QUIET, model="v2e", render_rate_hz=None), 97.3))
+    assert 0.05 < spread < 0.15
+
+
+def test_the_pattern_repeats_after_its_period():
+    s0 = periodic_scene(3 * FLAT_WIDTH).stokes[0]
+    assert (s0[:, :FLAT_WIDTH] == s0[:, FLAT_WIDTH : 2 * FLAT_WIDTH]).all()
+
+
+def test_the_pictures_lie_beside_the_page(project_root):
+    page = (project_root / "docs" / "physics.md").read_text()
+    for name in FIGURES:
+        assert f"pictures/{name}.png" in page
+        assert (project_root / "docs" / "pictures" / f"{name}.png").stat().st_size < 300_000
