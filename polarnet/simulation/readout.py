@@ -6,13 +6,14 @@ lost, as in sensors whose event rate exceeds what their readout carries.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, merge, select
 from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import compiled, forget_stale_code
 from polarnet.simulation.pixels import randomness
@@ -62,8 +63,7 @@ def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) 
     stamps = np.rint(times_us).astype(np.int64)
     here = torch.from_numpy(order[carried & (stamps <= duration_us)])
     left = torch.from_numpy(stamps[carried & (stamps <= duration_us)])
-    leaving = Events(left, events.x[here], events.y[here], events.p[here], events.height, events.width)
-    return leaving, int((~carried).sum())
+    return replace(select(events, here), t=left), int((~carried).sum())
 
 
 @compiled
@@ -90,22 +90,19 @@ def _bus(
 
 def as_one_sensor(channels: Sequence[Events], places: Sequence[tuple[int, int]]) -> Events:
     """Events of a DoFP sensor from its channels; `places` are (row, column) of each channel in a 2x2 cell."""
-    t, y, x, p = (
-        torch.cat(columns)
-        for columns in zip(
-            *((e.t, 2 * e.y + row, 2 * e.x + column, e.p) for e, (row, column) in zip(channels, places, strict=True)),
-            strict=True,
-        )
-    )
-    order = torch.from_numpy(np.lexsort((p.numpy(), x.numpy(), y.numpy(), t.numpy())))
-    return Events(t[order], x[order], y[order], p[order], 2 * channels[0].height, 2 * channels[0].width)
+    placed = [
+        replace(e, y=2 * e.y + row, x=2 * e.x + column, height=2 * e.height, width=2 * e.width)
+        for e, (row, column) in zip(channels, places, strict=True)
+    ]
+    sensor = merge(placed)
+    order = np.lexsort([column.numpy() for column in (sensor.p, sensor.x, sensor.y, sensor.t)])
+    return select(sensor, torch.from_numpy(order))
 
 
 def as_channels(sensor: Events, places: Sequence[tuple[int, int]]) -> list[Events]:
     """The inverse of `as_one_sensor`."""
     channels = []
     for row, column in places:
-        own = (sensor.y % 2 == row) & (sensor.x % 2 == column)
-        x, y = sensor.x[own] // 2, sensor.y[own] // 2
-        channels.append(Events(sensor.t[own], x, y, sensor.p[own], sensor.height // 2, sensor.width // 2))
+        own = select(sensor, (sensor.y % 2 == row) & (sensor.x % 2 == column))
+        channels.append(replace(own, x=own.x // 2, y=own.y // 2, height=sensor.height // 2, width=sensor.width // 2))
     return channels
