@@ -6,6 +6,8 @@ from pathlib import Path
 from polarnet.cli.outputs import run_folder
 from polarnet.cli.parsers import Commands
 
+PICTURE_US = 33_333
+
 
 def add_to(commands: Commands) -> None:
     """Add the commands verify, export and labels."""
@@ -38,7 +40,11 @@ def add_to(commands: Commands) -> None:
         default=4.0,
         help="a pixel is hot above this multiple of the third busiest of the 5 x 5 pixels around it (default: 4)",
     )
-    labels.add_argument("--picture", type=Path, help="PNG of the events coloured by cause (default: not drawn)")
+    labels.add_argument(
+        "--picture",
+        type=Path,
+        help="PNG of 33 ms in the middle of the sequence, coloured by cause (default: not drawn)",
+    )
     labels.set_defaults(run=_labels)
 
 
@@ -94,6 +100,7 @@ def _labels(options: argparse.Namespace) -> int:
         f"recall {scores.recall:.4f}, signal kept {scores.signal_kept:.4f}"
     )
     if options.picture:
-        draw_labels(channels, options.picture)
+        middle_us = store.duration_us(options.sequence) // 2
+        draw_labels(store.read(options.sequence, middle_us, middle_us + PICTURE_US), options.picture)
         print(f"picture {options.picture}")
     return 0

@@ -64,7 +64,7 @@ def draw_labels(channels: Sequence[Events], path: Path) -> None:
     for axes, angle, events in zip(figure.subplots(2, 2).flat, POLARIZER_ANGLES_DEG, channels, strict=True):
         assert events.label is not None
         signal, *noise = (select(events, events.label == number) for number in range(len(LABELS)))
-        axes.imshow(np.log1p(event_counts(signal)), cmap="gray")
+        axes.imshow(event_counts(signal), cmap="gray")
         for name, colour, of_cause in zip(LABELS[1:], LABEL_COLOURS, noise, strict=True):
             axes.scatter(of_cause.x, of_cause.y, s=6, color=colour, label=f"{name}: {len(of_cause):,}")
         axes.set_title(f"{angle} degrees, {len(signal):,} signal events")
