@@ -54,7 +54,8 @@ STILL = Sine(0.0, 0.0, 0.0)
 DEFAULT = replace(SENSORS["default"], model="v2e")  # v2e's command-line defaults
 NOISELESS = replace(
     DEFAULT,
-    contrast_threshold_sigma=0.0,
+    contrast_threshold_sigma_on=0.0,
+    contrast_threshold_sigma_off=0.0,
     cutoff_hz=0.0,
     leak_rate_hz=0.0,
     shot_noise_rate_hz=0.0,

@@ -5,7 +5,6 @@ carries a limited number of events a second. An event gets its time when it leav
 lost, as in sensors whose event rate exceeds what their readout carries.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,14 +12,15 @@ import torch
 from jaxtyping import Float64, Int64
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from polarnet.events.stream import Events, merge, select
+from polarnet.events.stream import Events, select
 from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import compiled, forget_stale_code
 from polarnet.simulation.pixels import randomness
+from polarnet.simulation.ranges import RandomisedConfig
 
 
 @section
-class ReadoutConfig:
+class ReadoutConfig(RandomisedConfig):
     """Section `readout` of params.yaml: how events leave the sensor."""
 
     row_latency_us: NonNegativeFloat
@@ -38,7 +38,7 @@ class ReadoutConfig:
         return not (self.row_latency_us or self.jitter_us or self.max_events_per_s)
 
 
-PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=0.0)
+PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=0.0, randomise=None)
 
 
 def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) -> tuple[Events, int]:
@@ -86,23 +86,3 @@ def _bus(
             leaves_us[i] = free_us if row_carried else times_us[i]
         first = stop
     return leaves_us, carried
-
-
-def as_one_sensor(channels: Sequence[Events], places: Sequence[tuple[int, int]]) -> Events:
-    """Events of a DoFP sensor from its channels; `places` are (row, column) of each channel in a 2x2 cell."""
-    placed = [
-        replace(e, y=2 * e.y + row, x=2 * e.x + column, height=2 * e.height, width=2 * e.width)
-        for e, (row, column) in zip(channels, places, strict=True)
-    ]
-    sensor = merge(placed)
-    order = np.lexsort([column.numpy() for column in (sensor.p, sensor.x, sensor.y, sensor.t)])
-    return select(sensor, torch.from_numpy(order))
-
-
-def as_channels(sensor: Events, places: Sequence[tuple[int, int]]) -> list[Events]:
-    """The inverse of `as_one_sensor`."""
-    channels = []
-    for row, column in places:
-        own = select(sensor, (sensor.y % 2 == row) & (sensor.x % 2 == column))
-        channels.append(replace(own, x=own.x // 2, y=own.y // 2, height=sensor.height // 2, width=sensor.width // 2))
-    return channels
