@@ -113,11 +113,9 @@ class Scores(NamedTuple):
         return Scores(self.rows + other.rows, self.dolp | other.dolp, sums)
 
 
-def settings(arguments: argparse.Namespace, *overrides: str) -> Config:
+def settings(*overrides: str) -> Config:
     """The configuration of a condition."""
-    common = ["experiment=photographs", f"runtime.threads={arguments.threads}", f"runtime.workers={arguments.workers}"]
-    firenet = [f"methods.firenet_published.weights={arguments.firenet}"] if arguments.firenet else []
-    return load(ROOT, [*common, *firenet, *overrides])
+    return load(ROOT, ["experiment=photographs", *overrides])
 
 
 def ingested(root: Path, folder: Path, *overrides: str) -> Path:
@@ -380,7 +378,11 @@ def main() -> None:
         return
     conditions = conditions_of(images, arguments)
     wanted = arguments.conditions or ["photographs", "photographs_large", "measured", "sensors", "time", "speed"]
-    configure(settings(arguments).runtime, settings(arguments).seed)
+    common = [f"runtime.threads={arguments.threads}", f"runtime.workers={arguments.workers}"]
+    if arguments.firenet:
+        common.append(f"methods.firenet_published.weights={arguments.firenet}")
+    config = settings(*common)
+    configure(config.runtime, config.seed)
     train_mean = statistics.fmean(mean_dolp(images["rgb"], "train"))
     means = {
         name: mean_dolp(part, "test")
@@ -396,7 +398,7 @@ def main() -> None:
         others = [mean for source, of_source in means.items() if source != name for mean in of_source]
         constant = statistics.fmean(others) if others else train_mean
         for part, overrides in parts:
-            config = settings(arguments, *overrides)
+            config = settings(*common, *overrides)
             contexts = {row: context_of(config, train_mean, file) for row, file in arguments.weights.items()}
             one = scored(part, config, contexts, constant)
             results[name] = results[name] + one if name in results else one

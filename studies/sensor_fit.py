@@ -9,7 +9,6 @@ leaves, 8-bit frames at --frame-rate. It knows nothing of the sensor. Two fits a
 
 import argparse
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from polarnet.characterization.light import Flicker, MovingLight
 from polarnet.characterization.twin import constant_frames, drifting_leaves, emulated, flicker_light
 from polarnet.events.stream import Events
 from polarnet.runtime.machine import generator_for
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.presets import SENSORS
 from studies.measure import machine_record, uncommitted, write_section
@@ -31,15 +31,18 @@ HEIGHT, WIDTH = 60, 80
 RANGES = {
     "contrast_threshold_on": (0.08, 0.42),
     "contrast_threshold_off": (0.08, 0.42),
-    "contrast_threshold_sigma": (0.02, 0.06),
+    "contrast_threshold_sigma_on": (0.02, 0.06),
+    "contrast_threshold_sigma_off": (0.02, 0.06),
+    "contrast_threshold_correlation": (-0.3, 0.3),
     "cutoff_hz": (30.0, 300.0),
     "leak_rate_hz": (0.01, 0.3),
     "shot_noise_rate_hz": (0.05, 5.0),
     "refractory_period_us": (100.0, 1000.0),
+    "hot_pixel_share": (0.001, 0.01),
+    "hot_pixel_rate_hz": (30.0, 300.0),
 }
-"""Sensors are drawn uniformly, rates and the refractory period in their logarithm."""
-LINEAR = ("contrast_threshold_on", "contrast_threshold_off", "contrast_threshold_sigma")
-MAX_RELATIVE_SIGMA = 0.3  # of the smaller threshold
+"""Sensors are drawn uniformly, rates in their logarithm."""
+MAX_RELATIVE_SIGMA = 0.3  # of the threshold
 STATIC_S, STATIC_LIGHT = 300, 200.0
 MOVING_S, RENDER_HZ, SPEED_PX_S = 10.0, 1000, 60.0
 FLICKERS = {2.0: 4.0, 20.0: 1.0, 60.0: 0.5}
@@ -51,29 +54,36 @@ ERRORS = {
     "deviation_error_max": ("threshold_deviation_on", "threshold_deviation_off"),
     "noise_error_max": ("leak_rate_hz", "shot_noise_rate_hz"),
     "bandwidth_error_max": ("cutoff_hz",),
+    "hot_rate_error_max": ("hot_pixel_rate_hz",),
 }
-REPORTED = (*(name for names in ERRORS.values() for name in names), "refractory_period_us")
+"""Relative errors."""
+REPORTED = (
+    *(name for names in ERRORS.values() for name in names),
+    "refractory_period_us",
+    "threshold_correlation",
+    "hot_pixel_share",
+)
+PARAMETERS = {
+    "threshold_deviation_on": "contrast_threshold_sigma_on",
+    "threshold_deviation_off": "contrast_threshold_sigma_off",
+    "threshold_correlation": "contrast_threshold_correlation",
+}
+"""Parameters of the emulator whose names differ from those in the results."""
 
 
 def drawn_sensor(number: int) -> EmulatorConfig:
     """Sensor `number` of the study."""
-    generator = generator_for(1, f"sensor {number}", "fit")
-    values: dict[str, Any] = {}
-    for name, (low, high) in RANGES.items():
-        if name in LINEAR:
-            values[name] = float(generator.uniform(low, high))
-        else:
-            values[name] = math.exp(generator.uniform(math.log(low), math.log(high)))
-    smaller = min(values["contrast_threshold_on"], values["contrast_threshold_off"])
-    values["contrast_threshold_sigma"] = min(values["contrast_threshold_sigma"], MAX_RELATIVE_SIGMA * smaller)
-    return replace(SENSORS["default"], model="exact", **values)
-
-
-def truth_of(sensor: EmulatorConfig) -> dict[str, float]:
-    """The sensor's parameters by the names of the estimates."""
-    sigma = sensor.contrast_threshold_sigma
-    truth = {name: getattr(sensor, name) for name in REPORTED if hasattr(sensor, name)}
-    return {**truth, "threshold_deviation_on": sigma, "threshold_deviation_off": sigma}
+    ranges = {name: list(bounds) for name, bounds in RANGES.items()}
+    camera = Camera(replace(SENSORS["default"], model="exact", randomise=ranges))
+    sensor = camera.drawn(1, f"sensor {number}").sensor
+    sigmas = {
+        f"contrast_threshold_sigma_{polarity}": min(
+            getattr(sensor, f"contrast_threshold_sigma_{polarity}"),
+            MAX_RELATIVE_SIGMA * getattr(sensor, f"contrast_threshold_{polarity}"),
+        )
+        for polarity in ("on", "off")
+    }
+    return replace(sensor, **sigmas)
 
 
 def static_recording(sensor: EmulatorConfig, key: int) -> Events:
@@ -121,8 +131,10 @@ def errors_of(fits: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def row_of(sensor: EmulatorConfig, fit: SensorFit) -> dict[str, Any]:
     """Truth and estimates of a sensor."""
-    estimate = {name: round(fit.estimates[name].value, 5) if name in fit.estimates else None for name in REPORTED}
-    return {"truth": {name: round(value, 5) for name, value in truth_of(sensor).items()}, "estimate": estimate}
+    parameters = {name: PARAMETERS.get(name, name) for name in REPORTED}
+    truth = {name: round(getattr(sensor, of), 5) for name, of in parameters.items()}
+    estimate = {name: fit.estimates[of].value if of in fit.estimates else None for name, of in parameters.items()}
+    return {"truth": truth, "estimate": {name: value and round(value, 5) for name, value in estimate.items()}}
 
 
 def fitted(number: int, kind: str, frame_rate_hz: int) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from polarnet.characterization.increments import (
     undisturbed,
 )
 from polarnet.characterization.light import Flicker, MovingLight, flicker_cycle, flicker_responses, moving_responses
-from polarnet.characterization.noise import Noise, estimate_noise, nominal_shot_noise_hz
+from polarnet.characterization.noise import HOT_FACTOR, Noise, estimate_noise, nominal_shot_noise_hz
 from polarnet.characterization.thresholds import (
     PixelThresholds,
     correlation,
@@ -68,8 +68,6 @@ class SensorFit:
 
     estimates: Mapping[str, Estimate]
     missing: Mapping[str, str]
-    hot: Bool[np.ndarray, "h w"] | None
-    """Hot pixels under constant light."""
     notes: Sequence[str]
 
 
@@ -117,9 +115,11 @@ def fit_sensor(
     estimates: dict[str, Estimate] = {}
     missing: dict[str, str] = {}
     notes: list[str] = []
+    noise = estimate_noise(ordered[0]) if static is not None else None
+    if noise is not None:
+        ordered = [chosen_pixels(events, ~noise.hot) for events in ordered]  # hot pixels do not follow the light
     dead_time = refractory_period_us([intervals_of(one).duration_us for one in ordered])
     _enter(estimates, missing, "refractory_period_us", dead_time, "no intervals of a pixel pile up at a shortest one")
-    noise = estimate_noise(ordered[0]) if static is not None else None
     shortest_us = dead_time.value if dead_time else 0.0
     first = 0 if static is None else 1
     sources = [
@@ -137,17 +137,23 @@ def fit_sensor(
         for name in KNOWN_LIGHT_PARAMETERS:
             missing[name] = "needs a moving recording with frames, or a flicker recording"
     _enter_noise(estimates, missing, notes, noise, leak, static_light, deviations)
-    hot = None if noise is None else noise.hot.reshape(next(iter(sizes)))
-    return SensorFit(estimates, missing, hot, notes)
+    return SensorFit(estimates, missing, notes)
 
 
 KNOWN_LIGHT_PARAMETERS = (
     "contrast_threshold_on",
     "contrast_threshold_off",
-    "threshold_deviation_on",
-    "threshold_deviation_off",
-    "threshold_correlation",
+    "contrast_threshold_sigma_on",
+    "contrast_threshold_sigma_off",
+    "contrast_threshold_correlation",
     "cutoff_hz",
+)
+CONSTANT_LIGHT_PARAMETERS = (
+    "shot_noise_rate_hz",
+    "noise_rate_cov_decades",
+    "leak_jitter",
+    "hot_pixel_share",
+    "hot_pixel_rate_hz",
 )
 
 
@@ -339,7 +345,7 @@ def _fit_known(
         spread = float(values.std())
         mean = Estimate(float(np.median(values)), 1.2533 * spread / math.sqrt(len(values)), source)
         estimates[f"contrast_threshold_{polarity}"] = mean
-        estimates[f"threshold_deviation_{polarity}"] = Estimate(
+        estimates[f"contrast_threshold_sigma_{polarity}"] = Estimate(
             deviation(thresholds), _grouped_error(lambda some: deviation(some[0]), [thresholds]), "two halves of these"
         )
         if len(values) < 0.9 * pixels:
@@ -347,9 +353,11 @@ def _fit_known(
                 f"{1 - len(values) / pixels:.0%} of the pixels have too few {polarity.upper()} events for a threshold; "
                 f"if those are the pixels of high threshold, mean and deviation are too small: record for longer"
             )
-    estimates["threshold_correlation"] = Estimate(
+    common = Estimate(
         correlation(*pair), _grouped_error(lambda some: correlation(*some), list(pair)), "ON and OFF of each pixel"
     )
+    found = common if math.isfinite(common.value) else None
+    _enter(estimates, missing, "contrast_threshold_correlation", found, "the thresholds do not differ between pixels")
     return pair, drift
 
 
@@ -438,13 +446,14 @@ def _enter_noise(
             "needs a static recording" if noise is None else "shot noise comes long before the leak; record brighter"
         )
     if noise is None:
-        for name in ("shot_noise_rate_hz", "noise_rate_cov_decades", "leak_jitter"):
+        for name in CONSTANT_LIGHT_PARAMETERS:
             missing[name] = "needs a static recording"
         return
     rate = noise.shot_on_hz + noise.shot_off_hz
     value = nominal_shot_noise_hz(rate, light, *deviations)
     source = f"{noise.duration_s:.0f} s under constant light of {light:g} DN"
     estimates["shot_noise_rate_hz"] = Estimate(value, value * noise.shot_error_hz / rate, source)
+    _enter_hot(estimates, missing, noise)
     spreads = {
         "noise_rate_cov_decades": (noise.leak_spread_decades, noise.leak_spread_error),
         "leak_jitter": (noise.leak_jitter, noise.leak_jitter_error),
@@ -454,3 +463,17 @@ def _enter_noise(
             estimates[name] = Estimate(spread, error, "ages of ON events under constant light")
         else:
             missing[name] = "too few leak events"
+
+
+def _enter_hot(estimates, missing, noise: Noise) -> None:
+    """Share of hot pixels, with the error of a count, and their mean rate, with the error of a mean."""
+    share, source = float(noise.hot.mean()), f"more than {HOT_FACTOR:g} times the median events under constant light"
+    error = math.sqrt(max(noise.hot.sum(), 1)) / len(noise.hot)
+    estimates["hot_pixel_share"] = Estimate(share, error, source)
+    rates_hz = noise.hot_rates_hz
+    if len(rates_hz):
+        spread = float(rates_hz.std(ddof=1)) if len(rates_hz) > 1 else float(rates_hz[0])
+        mean_error = spread / math.sqrt(len(rates_hz))
+        estimates["hot_pixel_rate_hz"] = Estimate(float(rates_hz.mean()), mean_error, f"{len(rates_hz):,} hot pixels")
+    else:
+        missing["hot_pixel_rate_hz"] = "there are no hot pixels"

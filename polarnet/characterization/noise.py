@@ -43,6 +43,8 @@ class Noise(NamedTuple):
     shot_error_hz: float
     """Standard error of the sum of both means."""
     hot: Bool[np.ndarray, " pixels"]
+    hot_rates_hz: Float64[np.ndarray, " hot"]
+    """Events per second of each hot pixel."""
     duration_s: float
 
 
@@ -87,6 +89,7 @@ def estimate_noise(events: PixelEvents) -> Noise:
         shot_off_hz=shot_off,
         shot_error_hz=max(poisson, between),
         hot=hot,
+        hot_rates_hz=counts[hot] / duration_s,
         duration_s=duration_s,
     )
 

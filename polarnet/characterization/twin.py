@@ -78,34 +78,14 @@ class Comparison(NamedTuple):
 
 
 def fitted_parameters(fit: SensorFit) -> dict[str, float]:
-    """Values for section `emulate` of params.yaml, rounded to four digits: only the estimated ones.
-
-    The emulator has one threshold deviation for ON and OFF: the root mean square of both.
-    """
-    values = {name: one.value for name, one in fit.estimates.items() if name in EMULATED}
-    deviations = [fit.estimates[name].value for name in DEVIATIONS if name in fit.estimates]
-    if deviations:
-        values["contrast_threshold_sigma"] = float(np.sqrt(np.mean(np.square(deviations))))
-    return {name: float(f"{value:.4g}") for name, value in values.items()}
-
-
-DEVIATIONS = ("threshold_deviation_on", "threshold_deviation_off")
-EMULATED = (
-    "contrast_threshold_on",
-    "contrast_threshold_off",
-    "cutoff_hz",
-    "leak_rate_hz",
-    "leak_jitter",
-    "noise_rate_cov_decades",
-    "shot_noise_rate_hz",
-    "refractory_period_us",
-)
+    """Values for section `emulate` of params.yaml, rounded to four digits: only the estimated ones."""
+    return {name: float(f"{one.value:.4g}") for name, one in fit.estimates.items()}
 
 
 def fitted_sensor(fit: SensorFit, default: EmulatorConfig) -> EmulatorConfig:
-    """`default` with the estimated parameters, in continuous time."""
+    """`default` with the estimated parameters, in continuous time and the same for every sequence."""
     changed: dict[str, Any] = dict(fitted_parameters(fit))
-    return replace(default, **changed, model="exact", randomise=False)
+    return replace(default, **changed, model="exact", randomise=None)
 
 
 def compare(
@@ -114,7 +94,8 @@ def compare(
     """Simulate the twin of `recording` under `light` and compare the two.
 
     A number is constant light in DN. None: the light is not known, and the twin sees drifting dead leaves whose speed
-    gives the recording's event rate. At most the first 20 seconds and the middle 240 x 240 pixels are compared.
+    gives the recording's event rate. At most the first 20 seconds and the middle 240 x 240 pixels are compared, without
+    the recording's hot pixels; the twin has none.
     ValueError for a recording without events.
     """
     if len(recording) < 2:
@@ -128,7 +109,7 @@ def compare(
     part = _middle(slice_time(recording, start_us, stop_us))
     counts = event_counts(part)
     hot = hot_pixels(counts, (stop_us - start_us) * 1e-6, HOT_PIXEL_FACTOR)
-    twin = _twin(part, recording, light, start_us, stop_us, sensor, seed)
+    twin = _twin(part, recording, light, start_us, stop_us, replace(sensor, hot_pixel_share=0.0), seed)
     pair = {"recording": without_pixels(part, hot), "twin": without_pixels(twin, hot)}
     intervals_us = {key: intervals_of(by_pixel(events)).duration_us for key, events in pair.items()}
     rates = {key: event_counts(events)[~hot] * (1e6 / (stop_us - start_us)) for key, events in pair.items()}

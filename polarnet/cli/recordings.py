@@ -29,6 +29,7 @@ def add_to(commands: Commands) -> None:
     """Add the commands inspect, recover and replay."""
     _add_inspection(commands)
     _add_recovery(commands)
+    _add_replay(commands)
 
 
 def _add_inspection(commands: Commands) -> None:
@@ -75,6 +76,15 @@ def _add_recovery(commands: Commands) -> None:
         "camera behind a rotating polarizer, with --rotating or --triggers; an event store; a folder of "
         "division-of-time captures; with --live, a growing file or standard input (-) with lines `t x y p angle`.",
     )
+    _add_input(recover)
+    _add_method(recover)
+    _add_output(recover)
+    add_reading(recover)
+    recover.set_defaults(run=_recover)
+
+
+def _add_input(recover: argparse.ArgumentParser) -> None:
+    """Add the recordings, and the options that say how light reached them."""
     recover.add_argument("input", nargs="+", metavar="INPUT", help="recordings, an event store, a folder, or -")
     recover.add_argument(
         "--angles", nargs=4, type=int, metavar="DEG", help="polarizer angles of the four files, in order"
@@ -106,6 +116,10 @@ def _add_recovery(commands: Commands) -> None:
     recover.add_argument(
         "--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce the sensor to this many rows and columns"
     )
+
+
+def _add_method(recover: argparse.ArgumentParser) -> None:
+    """Add the window and the method that recovers DoLP from it."""
     recover.add_argument(
         "--window",
         help="length of a window: a time (33.3ms) or a number of events of all channels (20000ev); networks are "
@@ -129,6 +143,9 @@ def _add_recovery(commands: Commands) -> None:
         default="auto",
         help="number format of the network; auto takes bf16 if the device has units for it (default: auto)",
     )
+
+
+def _add_output(recover: argparse.ArgumentParser) -> None:
     recover.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
     recover.add_argument(
         "--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), help="file types to write (default: zarr png mp4)"
@@ -136,9 +153,9 @@ def _add_recovery(commands: Commands) -> None:
     recover.add_argument(
         "--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)"
     )
-    add_reading(recover)
-    recover.set_defaults(run=_recover)
 
+
+def _add_replay(commands: Commands) -> None:
     replay = commands.add_parser(
         "replay",
         help="print a stored sequence as lines `t x y p angle`, at its own pace",

@@ -19,15 +19,17 @@ WRITTEN_BY = "# Written by `polarnet fit-sensor`"
 UNITS = {
     "contrast_threshold_on": "log intensity",
     "contrast_threshold_off": "log intensity",
-    "threshold_deviation_on": "log intensity",
-    "threshold_deviation_off": "log intensity",
-    "threshold_correlation": "",
+    "contrast_threshold_sigma_on": "log intensity",
+    "contrast_threshold_sigma_off": "log intensity",
+    "contrast_threshold_correlation": "",
     "cutoff_hz": "Hz",
     "refractory_period_us": "us",
     "leak_rate_hz": "Hz",
     "noise_rate_cov_decades": "decades",
     "leak_jitter": "",
     "shot_noise_rate_hz": "Hz",
+    "hot_pixel_share": "",
+    "hot_pixel_rate_hz": "Hz",
 }
 """Unit of each parameter, in the order of the table."""
 
@@ -114,7 +116,7 @@ def _fit_sensor(options: argparse.Namespace) -> int:
     base = preset_values(settings_root(), "sensor", "default")
     values = {k: v for k, v in fitted_parameters(fit).items() if v != base.get(f"emulate.{k}")}
     preset.parent.mkdir(parents=True, exist_ok=True)
-    preset.write_text(preset_text(options.name, values, fit), encoding="utf-8")
+    preset.write_text(preset_text(options.name, values), encoding="utf-8")
     sensor = fitted_sensor(fit, SENSORS["default"])
     comparisons = [compare(name, events, light, sensor, seed=1) for name, events, light in lights if len(events) > 1]
     for comparison in comparisons:
@@ -156,21 +158,12 @@ def table_rows(fit: "SensorFit") -> list[tuple[str, str, str, str]]:
             rows.append((name, f"{one.value:.4g} {unit}".rstrip(), f"{one.error:.2g}", one.source))
         else:
             rows.append((name, "not estimated", "", f"{fit.missing[name]}; the default stays"))
-    if fit.hot is not None:
-        count = int(fit.hot.sum())
-        rows.append(("hot pixels", f"{count:,}", "", "more than 10 times the median events under constant light"))
     return rows
 
 
-def preset_text(name: str, values: dict[str, float], fit: "SensorFit") -> str:
+def preset_text(name: str, values: dict[str, float]) -> str:
     """conf/sensor/NAME.yaml: the estimates that differ from the default sensor."""
     lines = ["# @package _global_", f"{WRITTEN_BY} --name {name}; parameters not named here keep their defaults."]
-    deviations = [fit.estimates.get(f"threshold_deviation_{polarity}") for polarity in ("on", "off")]
-    if deviations[0] and deviations[1]:
-        lines.append(
-            f"# Threshold deviation: ON {deviations[0].value:.4g}, OFF {deviations[1].value:.4g}, "
-            f"correlation {fit.estimates['threshold_correlation'].value:.2f}."
-        )
     body = [f"  {key}: {value:g}" if value % 1 else f"  {key}: {value:.1f}" for key, value in values.items()]
     return "\n".join([*lines, *(["emulate:", *body] if body else ["emulate: {}"])]) + "\n"
 

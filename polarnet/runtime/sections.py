@@ -1,6 +1,7 @@
 """Sections of params.yaml as classes: pydantic checks the names, types and ranges of their values."""
 
 import dataclasses
+import difflib
 import functools
 import types
 import typing
@@ -21,6 +22,7 @@ EXPECTED = {
     "choice": "one of {choices}",
 }
 """Expected values by pydantic's type of error; other types have a message of pydantic's own."""
+CLOSE = 0.85  # similarity of names, 1 for equal ones, from which a mistyped key is likely
 
 Section = TypeVar("Section")
 
@@ -70,7 +72,8 @@ def unknown_key(config_class: Any, path: Sequence[str]) -> str | None:
         if name not in names:
             inside = ".".join(path[:depth]) or "the configuration"
             keys = f"{inside} has {', '.join(names)}" if names else f"{inside} is a value, not a section"
-            return f"{'.'.join(path)} is not a setting; {keys}"
+            close = " or ".join(difflib.get_close_matches(name, names, cutoff=CLOSE))
+            return f"{'.'.join(path)} is not a setting; {keys}{f'; did you mean {close}?' if close else ''}"
         config_class = _without_none(typing.get_type_hints(config_class)[name])
     return None
 

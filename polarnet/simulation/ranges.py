@@ -23,21 +23,20 @@ class RandomisedConfig:
     def __post_init__(self):
         for name, bounds in (self.randomise or {}).items():
             if name not in vars(self) or name == "randomise":
-                raise ValueError(
-                    f"randomise.{name}: expected a number of this section, got {name}; there are {', '.join(_numbers(self))}"
-                )
+                raise ValueError(f"randomise.{name}: expected one of {', '.join(_numbers(self))}, got {name!r}")
             lowest, highest = bounds
             if lowest > highest:
                 raise ValueError(f"randomise.{name}: expected [lowest, highest], got {bounds}")
             if name.endswith(LOGARITHMIC) and lowest <= 0:
                 raise ValueError(
-                    f"randomise.{name}: expected a lowest value > 0, got {bounds}; it is drawn uniformly in its logarithm"
+                    f"randomise.{name}: expected a lowest value > 0, got {bounds}; its logarithm is drawn uniformly"
                 )
             for bound in bounds:
                 try:
                     dataclasses.replace(self, randomise=None, **{name: _repeated(getattr(self, name), bound)})
                 except ValueError as error:
-                    raise ValueError(f"randomise.{error}") from None
+                    first_line, _, _ = str(error).partition("\n")  # every value of a list is wrong alike
+                    raise ValueError(f"randomise.{first_line}") from None
 
 
 def _numbers(config: RandomisedConfig) -> list[str]:

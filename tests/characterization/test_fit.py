@@ -16,16 +16,21 @@ from polarnet.characterization.twin import (
     fitted_sensor,
     flicker_light,
 )
+from polarnet.recordings.pixels import event_counts
 from polarnet.simulation.presets import SENSORS
 
 TRUTH = dataclasses.replace(
     SENSORS["default"],
     contrast_threshold_on=0.18,
     contrast_threshold_off=0.27,
-    contrast_threshold_sigma=0.03,
+    contrast_threshold_sigma_on=0.02,
+    contrast_threshold_sigma_off=0.045,
+    contrast_threshold_correlation=0.5,
     cutoff_hz=80.0,
     leak_rate_hz=0.1,
     shot_noise_rate_hz=1.0,
+    hot_pixel_share=0.02,
+    hot_pixel_rate_hz=60.0,
 )
 HEIGHT, WIDTH = 24, 32
 
@@ -52,9 +57,9 @@ def test_a_static_and_a_moving_recording_give_the_sensor(fit):
     value = {name: one.value for name, one in fit.estimates.items()}
     assert value["contrast_threshold_on"] == pytest.approx(0.18, rel=0.03)
     assert value["contrast_threshold_off"] == pytest.approx(0.27, rel=0.03)
-    assert value["threshold_deviation_on"] == pytest.approx(0.03, rel=0.12)
-    assert value["threshold_deviation_off"] == pytest.approx(0.03, rel=0.12)
-    assert abs(value["threshold_correlation"]) < 0.15
+    assert value["contrast_threshold_sigma_on"] == pytest.approx(0.02, rel=0.12)
+    assert value["contrast_threshold_sigma_off"] == pytest.approx(0.045, rel=0.12)
+    assert value["contrast_threshold_correlation"] == pytest.approx(0.5, abs=0.12)
     assert value["cutoff_hz"] == pytest.approx(80, rel=0.1)
     assert value["leak_rate_hz"] == pytest.approx(0.1, rel=0.15)
     assert value["shot_noise_rate_hz"] == pytest.approx(1.0, rel=0.1)
@@ -79,10 +84,18 @@ def test_without_known_light_thresholds_are_missing_and_keep_the_default(static)
     assert sensor.leak_rate_hz == pytest.approx(0.1, rel=0.1)
 
 
-def test_the_one_deviation_of_the_emulator_is_the_root_mean_square_of_both(fit):
-    on, off = (fit.estimates[f"threshold_deviation_{p}"].value for p in ("on", "off"))
-    expected = ((on**2 + off**2) / 2) ** 0.5
-    assert fitted_parameters(fit)["contrast_threshold_sigma"] == pytest.approx(expected, rel=1e-3)
+def test_hot_pixels_are_counted_and_their_rate_is_their_mean(fit, static):
+    hot = int((event_counts(static) > 0.5 * 60 * 120).sum())  # 7200 events each; the others have about 130
+    assert hot == pytest.approx(0.02 * HEIGHT * WIDTH, abs=12)
+    assert fit.estimates["hot_pixel_share"].value == pytest.approx(hot / (HEIGHT * WIDTH))
+    assert fit.estimates["hot_pixel_rate_hz"].value == pytest.approx(60.0, rel=0.02)
+
+
+def test_every_estimate_is_a_parameter_of_the_emulator(fit):
+    parameters = fitted_parameters(fit)
+    assert parameters.keys() == fit.estimates.keys()
+    sensor = fitted_sensor(fit, SENSORS["default"])
+    assert {name: getattr(sensor, name) for name in parameters} == parameters
 
 
 def test_the_twin_of_a_simulated_recording_is_like_it(fit, static, moving):

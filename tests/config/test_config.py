@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import preloaded
 import pytest
 import torch
 
@@ -90,10 +91,9 @@ def test_a_mistyped_group_choice_is_refused_with_the_choices_there_are(project_r
 
 @pytest.mark.parametrize("stage", ["train", "trial"])
 def test_a_stage_refuses_a_mistyped_experiment_before_it_runs_anything(project_root, tmp_path, stage):
-    command = [sys.executable, "-m", f"stages.{stage}", "experiment=smok", f"paths.data={tmp_path}"]
-    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    done = preloaded.run_stage(project_root, stage, ["experiment=smok", f"paths.data={tmp_path}"])
     assert done.returncode == 1
-    assert done.stderr.startswith("configuration error: experiment: there is no 'smok'; ")
+    assert done.stdout.startswith("configuration error: experiment: there is no 'smok'; ")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -121,11 +121,10 @@ def test_a_typo_in_params_yaml_is_refused_with_the_keys_there_are(project):
 
 
 def test_a_stage_stops_before_it_runs_anything(project_root, tmp_path):
-    command = [sys.executable, "-m", "stages.synthesize", "synthesize.duration_s=-1.0", f"paths.data={tmp_path}"]
-    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    done = preloaded.run_stage(project_root, "synthesize", ["synthesize.duration_s=-1.0", f"paths.data={tmp_path}"])
     assert done.returncode == 1
-    assert "configuration error: synthesize.duration_s: expected > 0" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert "configuration error: synthesize.duration_s: expected > 0" in done.stdout
+    assert "Traceback" not in done.stdout
     assert list(tmp_path.iterdir()) == []
 
 
@@ -158,11 +157,10 @@ def test_a_folder_without_files_of_the_users_is_refused_in_one_line_that_tells_a
 def test_a_stage_without_its_input_files_ends_without_a_traceback(project_root, tmp_path, stage, overrides):
     (tmp_path / "empty").mkdir()
     values = [override.format(tmp_path / "empty") for override in overrides]
-    command = [sys.executable, "-m", f"stages.{stage}", *values, f"paths.data={tmp_path / 'data'}"]
-    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    done = preloaded.run_stage(project_root, stage, [*values, f"paths.data={tmp_path / 'data'}"])
     assert done.returncode == 1
-    assert done.stderr.startswith(f"{values[-1]}: no files there; put your files there")
-    assert "Traceback" not in done.stderr
+    assert done.stdout.startswith(f"{values[-1]}: no files there; put your files there")
+    assert "Traceback" not in done.stdout
 
 
 @pytest.mark.parametrize("group", BASE)
@@ -297,7 +295,7 @@ def test_an_unknown_preset_lists_the_ones_there_are(project):
         write_preset(project, "papper")
 
 
-# thresholds, their deviations, cutoff, leak, shot noise (Hz), refractory period (us), jitter, spread: v2e's defaults, --dvs_params
+# thresholds, deviations, cutoff, leak, shot noise (Hz), refractory period (us), jitter, spread: v2e's --dvs_params
 SENSORS = {
     "default": (0.2, 0.2, 0.03, 0.03, 300.0, 0.01, 0.001, 500.0, 0.1, 0.1),
     "clean": (0.2, 0.2, 0.02, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
@@ -352,3 +350,31 @@ def test_a_clean_sensor_sees_nothing_in_still_light_and_a_noisy_one_what_its_rat
     assert counts["clean"] == 0
     assert counts["default"] < 1000
     assert counts["noisy"] == pytest.approx(5.1 * 100 * 100, rel=0.05)  # shot noise and leak, events a second
+
+
+def test_ranges_are_written_whole_and_taken_back_whole(project):
+    original = (project / "params.yaml").read_text()
+    (change,) = write_preset(project, "random")
+    assert change.startswith("emulate.randomise: None -> {'contrast_threshold_on': [0.08, 0.31], ")
+    assert load(project).emulate == load(project, ["sensor=random"]).emulate
+    assert load(project, ["sensor=clean"]).emulate.randomise is None
+    assert load(project, ["emulate.randomise.cutoff_hz=[3,30]"]).emulate.randomise["cutoff_hz"] == [3.0, 30.0]
+    write_preset(project, "default")
+    assert (project / "params.yaml").read_text() == original
+
+
+def test_a_range_is_refused_by_its_full_key(project):
+    with pytest.raises(
+        ValueError, match=r"^emulate.randomise.cutof_hz: expected one of .*, cutoff_hz, .* got 'cutof_hz'$"
+    ):
+        load(project, ["emulate.randomise={cutof_hz:[30,300]}"])
+    with pytest.raises(ValueError, match=r"^polarizers.randomise.transmission\[0\]: expected <= 1, got 1.5$"):
+        load(project, ["polarizers.randomise={transmission:[0.5,1.5]}"])
+
+
+def test_the_one_deviation_of_earlier_versions_is_refused_with_the_two_of_today(project):
+    with pytest.raises(
+        ValueError,
+        match=r"contrast_threshold_sigma is not a setting; .*did you mean contrast_threshold_sigma_on or contrast_",
+    ):
+        load(project, ["emulate.contrast_threshold_sigma=0.05"])

@@ -35,5 +35,5 @@ def test_labels_that_do_not_exist_and_other_lengths_are_refused():
 
 
 def test_the_names_of_the_labels_are_those_of_the_pixel_models():
-    for name in ("signal", "leak", "shot"):
+    for name in ("signal", "leak", "shot", "hot"):
         assert LABELS[getattr(columns, name.upper())] == name

@@ -64,6 +64,24 @@ def test_events_of_a_log_ramp_are_stamped_where_it_crosses_the_thresholds(model)
     assert columns.t.tolist() == np.floor(columns.unrounded_us).astype(int).tolist()
 
 
+@pytest.mark.parametrize(("model", "tolerance_us"), [("exact", 5), ("v2e", 60)])
+@pytest.mark.parametrize("cutoff_hz", [50.0, 0.0])
+def test_photoreceptor_and_source_follower_answer_a_step_of_light_like_a_second_order_low_pass(
+    model, tolerance_us, cutoff_hz
+):
+    every_us, rate = 20, 2 * math.pi * 50
+    t_us = np.append(0, 1 + every_us * np.arange(1500))
+    frames = np.full((len(t_us), 1, 1, 1), 255.0, np.float32)
+    frames[0] = 25
+    config = of(model, cutoff_hz=cutoff_hz, source_follower_hz=100.0 if cutoff_hz else 50.0)
+    (columns,), _ = emulate_columns(frames, t_us, config, key=1, unrounded_times=True)
+    risen = 0.2 * np.arange(1, 11) / math.log(255 / 25)  # fraction of the step at each ON event
+    # poles at `rate` and 2 `rate` give the response (1 - exp(-rate t))^2, one pole alone 1 - exp(-rate t)
+    expected_us = -1e6 / rate * np.log(1 - (np.sqrt(risen) if cutoff_hz else risen))
+    assert columns.p.tolist()[:10] == [1] * 10
+    assert columns.unrounded_us[:10] == pytest.approx(expected_us, abs=tolerance_us)
+
+
 def test_v2e_spreads_events_over_a_step_as_its_busiest_pixel_asks():
     frames = torch.tensor([[math.exp(4.0), math.exp(4.0)], [math.exp(4.61), math.exp(4.21)]]).float().view(2, 1, 1, 2)
     (events,), _ = emulate(frames, torch.tensor([0, 3000]), of("v2e"), key=1)
@@ -190,6 +208,36 @@ def test_every_channel_has_thresholds_of_its_own_around_the_nominal_ones(model):
         assert values.min() >= 0.01
     correlations = np.corrcoef(maps)[np.triu_indices(8, 1)]
     assert abs(correlations).max() < 4 / 100  # of 28 pairs, standard deviation 1 / 100 each
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact"])
+@pytest.mark.parametrize("correlation", [-0.5, 0.0, 0.8, 1.0])
+def test_on_and_off_thresholds_have_deviations_of_their_own_and_the_configured_correlation(model, correlation):
+    config = of(
+        model, NOISY, contrast_threshold_on=0.25, contrast_threshold_off=0.38, contrast_threshold_sigma_on=0.05,
+        contrast_threshold_sigma_off=0.04, contrast_threshold_correlation=correlation,
+    )  # fmt: skip
+    _, state = emulate(torch.full((1, 2, 100, 100), 100.0), torch.tensor([0]), config, key=3)
+    for pixels in state.pixels:
+        on, off = pixels.threshold_on, pixels.threshold_off
+        assert (on.mean(), off.mean()) == pytest.approx((0.25, 0.38), abs=3 * 0.05 / 100)
+        assert (on.std(), off.std()) == pytest.approx((0.05, 0.04), abs=3 * 0.05 / math.sqrt(2) / 100)
+        error = (1 - correlation**2) / 100  # standard error of a correlation of 10,000 pairs
+        assert np.corrcoef(on, off)[0, 1] == pytest.approx(correlation, abs=3 * error + 1e-6)
+    across = np.corrcoef(state.pixels[0].threshold_on, state.pixels[1].threshold_off)[0, 1]
+    assert abs(across) < 3 / 100  # another channel is another sensor
+
+
+def test_the_correlation_changes_off_thresholds_alone():
+    light, t_us = torch.full((1, 1, 8, 8), 100.0), torch.tensor([0])
+    (apart, together) = (
+        emulate(light, t_us, of("exact", NOISY, contrast_threshold_correlation=rho), key=3)[1].pixels[0]
+        for rho in (0.0, 1.0)
+    )
+    assert np.array_equal(apart.threshold_on, together.threshold_on)
+    # with equal nominal thresholds and deviations, full correlation makes both thresholds of a pixel equal
+    assert np.array_equal(together.threshold_on, together.threshold_off)
+    assert not np.array_equal(apart.threshold_off, together.threshold_off)
 
 
 @pytest.mark.parametrize("model", ["v2e", "exact"])

@@ -51,6 +51,11 @@ def test_every_event_of_a_still_scene_is_noise():
     assert all((one.label != SIGNAL).all() for one in events)
 
 
+def test_every_event_of_a_hot_pixel_is_named_hot():
+    hot = dataclasses.replace(NOISY, hot_pixel_share=1.0, hot_pixel_rate_hz=50.0)
+    assert all(len(events) > 0 and (events.label == LABELS.index("hot")).all() for events in clip(True, hot))
+
+
 def test_labels_follow_their_events_through_the_readout_of_a_dofp_sensor():
     dofp = dataclasses.replace(IDEAL, layout="dofp")
     late = dataclasses.replace(PERFECT, row_latency_us=3.0, jitter_us=50.0)

@@ -69,9 +69,12 @@ def test_without_ranges_the_camera_stays_itself():
     ("ranges", "message"),
     [
         ({"cutoff_hz": [300.0, 30.0]}, r"^randomise.cutoff_hz: expected \[lowest, highest\], got \[300.0, 30.0\]$"),
-        ({"cutof_hz": [30.0, 300.0]}, r"^randomise.cutof_hz: expected a number of this section, .* cutoff_hz, "),
-        ({"randomise": [0.0, 1.0]}, r"^randomise.randomise: expected a number of this section"),
-        ({"cutoff_hz": [0.0, 300.0]}, r"^randomise.cutoff_hz: expected a lowest value > 0, .* in its logarithm$"),
+        ({"cutof_hz": [30.0, 300.0]}, r"^randomise.cutof_hz: expected one of .*, cutoff_hz, .*, got 'cutof_hz'$"),
+        ({"randomise": [0.0, 1.0]}, r"^randomise.randomise: expected one of hot_pixel_share, "),
+        (
+            {"cutoff_hz": [0.0, 300.0]},
+            r"^randomise.cutoff_hz: expected a lowest value > 0, .* logarithm is drawn uniformly$",
+        ),
         ({"cutoff_hz": ["slow", 300.0]}, r"^randomise.cutoff_hz\[0\]: expected a valid number, got 'slow'$"),
         ({"cutoff_hz": [300.0]}, r"^randomise.cutoff_hz: expected at least 2 values, got \[300.0\]$"),
         ({"leak_jitter": [0.0, 1.5]}, r"^randomise.leak_jitter: expected <= 1, got 1.5$"),
