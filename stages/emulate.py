@@ -12,7 +12,7 @@ def main(config: Config) -> None:
     """Emulate every sequence that is missing from the event store."""
     scenes, events = Path(config.paths.scenes), Path(config.paths.events)
     mapper, threads = config.mapper("emulate"), threads_of(config.runtime)
-    count = emulate_scenes(scenes, events, config.camera, config.seed, mapper, threads)
+    count = emulate_scenes(scenes, events, config.camera, config.seed, mapper, threads, config.storage.labels)
     print(f"{count} sequences")
 
 

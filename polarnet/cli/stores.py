@@ -1,4 +1,4 @@
-"""Commands for stores: verify, export."""
+"""Commands for stores: verify, export, labels."""
 
 import argparse
 from pathlib import Path
@@ -6,9 +6,11 @@ from pathlib import Path
 from polarnet.cli.outputs import run_folder
 from polarnet.cli.parsers import Commands
 
+PICTURE_US = 33_333
+
 
 def add_to(commands: Commands) -> None:
-    """Add the commands verify and export."""
+    """Add the commands verify, export and labels."""
     verify = commands.add_parser("verify", help="check every byte of a store of events, frames or scenes")
     verify.add_argument("store", help="store: folder or fsspec URL")
     verify.set_defaults(run=_verify)
@@ -23,6 +25,27 @@ def add_to(commands: Commands) -> None:
         help="HDF5 in DSEC's layout, or text lines t x y p (default: hdf5)",
     )
     export.set_defaults(run=_export)
+
+    labels = commands.add_parser(
+        "labels",
+        help="count and draw a stored sequence's events by cause, and score the removal of hot pixels",
+        description="Needs an event store that was written with storage.labels=true. Score a denoiser of your own with "
+        "polarnet.metrics.denoising.denoising_scores.",
+    )
+    labels.add_argument("store", help="event store: folder or fsspec URL")
+    labels.add_argument("sequence", help="name of the sequence")
+    labels.add_argument(
+        "--hot-pixel-factor",
+        type=float,
+        default=4.0,
+        help="a pixel is hot above this multiple of the third busiest of the 5 x 5 pixels around it (default: 4)",
+    )
+    labels.add_argument(
+        "--picture",
+        type=Path,
+        help="PNG of 33 ms in the middle of the sequence, coloured by cause (default: not drawn)",
+    )
+    labels.set_defaults(run=_labels)
 
 
 def _verify(options: argparse.Namespace) -> int:
@@ -51,4 +74,33 @@ def _export(options: argparse.Namespace) -> int:
     with run_folder(options.folder, "export") as folder:
         export_store(store, folder, options.format)
     print(f"{options.store} -> {options.folder}")
+    return 0
+
+
+def _labels(options: argparse.Namespace) -> int:
+    import torch
+
+    from polarnet.metrics.denoising import denoising_scores
+    from polarnet.recordings.pixels import event_counts, hot_pixels
+    from polarnet.reports.recordings import draw_labels
+    from polarnet.storage.events import EventStore
+
+    store = EventStore.open(options.store)
+    if not store.labelled:
+        raise ValueError(f"{options.store}: expected a store with labels; write it again with storage.labels=true")
+    channels, seconds = store.read(options.sequence), store.duration_us(options.sequence) * 1e-6
+    hot = [torch.from_numpy(hot_pixels(event_counts(e), seconds, options.hot_pixel_factor)) for e in channels]
+    kept = torch.cat([~bad[e.y.long(), e.x.long()] for bad, e in zip(hot, channels, strict=True)])
+    scores = denoising_scores(torch.cat([e.label for e in channels if e.label is not None]), kept)
+    print(f"{'cause':8s}{'events':>12s}{'in hot pixels':>15s}")
+    for label, (removed, events) in scores.removed.items():
+        print(f"{label:8s}{events:12,d}{removed:15,d}")
+    print(
+        f"removal of {sum(int(bad.sum()) for bad in hot)} hot pixels: precision {scores.precision:.4f}, "
+        f"recall {scores.recall:.4f}, signal kept {scores.signal_kept:.4f}"
+    )
+    if options.picture:
+        middle_us = store.duration_us(options.sequence) // 2
+        draw_labels(store.read(options.sequence, middle_us, middle_us + PICTURE_US), options.picture)
+        print(f"picture {options.picture}")
     return 0

@@ -1,11 +1,12 @@
 """Events of a sensor with a 2x2 mosaic of polarizers (DoFP): into its four channels, and back."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, merge, select
 from polarnet.stokes import Mosaic
 
 
@@ -28,23 +29,17 @@ def split_mosaic(events: Events, mosaic: Mosaic) -> list[Events]:
     complete = (events.y < 2 * height) & (events.x < 2 * width)
     channels = []
     for row, column in places_of(mosaic):
-        own = complete & (events.y & 1 == row) & (events.x & 1 == column)
-        x, y = events.x[own] // 2, events.y[own] // 2
-        channels.append(Events(events.t[own], x, y, events.p[own], height, width))
+        own = select(events, complete & (events.y & 1 == row) & (events.x & 1 == column))
+        channels.append(replace(own, x=own.x // 2, y=own.y // 2, height=height, width=width))
     return channels
 
 
 def join_mosaic(channels: Sequence[Events], mosaic: Mosaic) -> Events:
     """The inverse of `split_mosaic`; events of one time come row by row."""
-    t, y, x, p = (
-        torch.cat(columns)
-        for columns in zip(
-            *(
-                (e.t, 2 * e.y + row, 2 * e.x + column, e.p)
-                for e, (row, column) in zip(channels, places_of(mosaic), strict=True)
-            ),
-            strict=True,
-        )
-    )
-    order = torch.from_numpy(np.lexsort((p.numpy(), x.numpy(), y.numpy(), t.numpy())))
-    return Events(t[order], x[order], y[order], p[order], 2 * channels[0].height, 2 * channels[0].width)
+    placed = [
+        replace(e, y=2 * e.y + row, x=2 * e.x + column, height=2 * e.height, width=2 * e.width)
+        for e, (row, column) in zip(channels, places_of(mosaic), strict=True)
+    ]
+    sensor = merge(placed)
+    order = np.lexsort([column.numpy() for column in (sensor.p, sensor.x, sensor.y, sensor.t)])
+    return select(sensor, torch.from_numpy(order))

@@ -2,13 +2,13 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import no_type_check
 
 import numba
 import numpy as np
 import torch
-from jaxtyping import Int8, Int16, Int64, Integer
+from jaxtyping import Bool, Int8, Int16, Int64, Integer, UInt8
 from torch import Tensor
 
 from polarnet.runtime.arrays import Array, whole_numbers
@@ -31,9 +31,12 @@ class Events:
     p: Int8[Tensor, " n"]  # +1 brighter, -1 darker; never 0, so sums need no conversion
     height: int
     width: int
+    label: UInt8[Tensor, " n"] | None = None
+    """Number of each event's cause in `polarnet.events.labels.LABELS`; None where causes are not known."""
 
     def __post_init__(self):
-        for name, dtype in _COLUMNS.items():
+        labels = {} if self.label is None else {"label": torch.uint8}
+        for name, dtype in {**_COLUMNS, **labels}.items():
             column = getattr(self, name)
             if column.dtype != dtype or column.shape != self.t.shape or column.ndim != 1:
                 raise ValueError(
@@ -120,14 +123,14 @@ def slice_time(events: Events, start_us: int, stop_us: int) -> Events:
 
 def slice_count(events: Events, start: int, stop: int) -> Events:
     """Events `start` to `stop` (exclusive) by index; views, not copies."""
-    return Events(
-        events.t[start:stop],
-        events.x[start:stop],
-        events.y[start:stop],
-        events.p[start:stop],
-        events.height,
-        events.width,
-    )
+    return select(events, slice(start, stop))
+
+
+def select(events: Events, which: slice | Bool[Tensor, " n"] | Int64[Tensor, " m"]) -> Events:
+    """Events of a slice, of a mask, or in the order of their indices, with their labels."""
+    label = None if events.label is None else events.label[which]
+    t, x, y, p = (getattr(events, name)[which] for name in _COLUMNS)
+    return Events(t, x, y, p, events.height, events.width, label)
 
 
 def crop(events: Events, top: int, left: int, height: int, width: int) -> Events:
@@ -138,14 +141,8 @@ def crop(events: Events, top: int, left: int, height: int, width: int) -> Events
             f"{events.height}x{events.width} px"
         )
     inside = (events.y >= top) & (events.y < top + height) & (events.x >= left) & (events.x < left + width)
-    return Events(
-        events.t[inside],
-        events.x[inside] - left,
-        events.y[inside] - top,
-        events.p[inside],
-        height,
-        width,
-    )
+    cut = select(events, inside)
+    return replace(cut, x=cut.x - left, y=cut.y - top, height=height, width=width)
 
 
 def downscale(events: Events, height: int, width: int, *, keep_rate: bool) -> Events:
@@ -161,17 +158,16 @@ def downscale(events: Events, height: int, width: int, *, keep_rate: bool) -> Ev
         raise ValueError(f"downscale: expected a size within {events.height}x{events.width} px, got {height}x{width}")
     y = (events.y.long() * height // events.height).short()
     x = (events.x.long() * width // events.width).short()
-    coarse = Events(events.t, x, y, events.p, height, width)
+    coarse = replace(events, x=x, y=y, height=height, width=width)
     if not keep_rate:
         return coarse
     fine_pixels = events.height * events.width / (height * width)
     fired = torch.from_numpy(_fires(y.numpy(), x.numpy(), events.p.numpy(), height, width, fine_pixels))
-    return Events(events.t[fired], x[fired], y[fired], events.p[fired], height, width)
+    return select(coarse, fired)
 
 
 def concatenate(parts: Sequence[Events]) -> Events:
     """Join consecutive pieces of one stream; ValueError if a piece starts before the previous one ended."""
-    height, width = _common_size(parts)
     filled = [part for part in parts if len(part)]
     for i, (before, after) in enumerate(itertools.pairwise(filled), start=1):
         if after.t[0] < before.t[-1]:
@@ -179,8 +175,7 @@ def concatenate(parts: Sequence[Events]) -> Events:
                 f"concatenate: piece {i} starts at {int(after.t[0])} us, before the end of the piece ahead of it at "
                 f"{int(before.t[-1])} us; merge() sorts streams that overlap"
             )
-    t, x, y, p = (torch.cat([getattr(part, name) for part in parts]) for name in _COLUMNS)
-    return Events(t, x, y, p, height, width)
+    return _joined(parts)
 
 
 def merge(streams: Sequence[Events]) -> Events:
@@ -188,17 +183,18 @@ def merge(streams: Sequence[Events]) -> Events:
 
     At equal times, the earlier stream's events come first.
     """
-    height, width = _common_size(streams)
-    t, x, y, p = (torch.cat([getattr(stream, name) for stream in streams]) for name in _COLUMNS)
-    t, order = torch.sort(t, stable=True)
-    return Events(t, x[order], y[order], p[order], height, width)
+    joined = _joined(streams)
+    return select(joined, torch.sort(joined.t, stable=True).indices)
 
 
-def _common_size(streams: Sequence[Events]) -> tuple[int, int]:
+def _joined(streams: Sequence[Events]) -> Events:
+    """The events of one stream after the other, with labels if all have them."""
     sizes = {(stream.height, stream.width) for stream in streams}
     if len(sizes) != 1:
         raise ValueError(f"expected streams of one sensor, got sizes {sorted(sizes)} (height, width)")
-    return sizes.pop()
+    t, x, y, p = (torch.cat([getattr(stream, name) for stream in streams]) for name in _COLUMNS)
+    labels = [stream.label for stream in streams if stream.label is not None]
+    return Events(t, x, y, p, *sizes.pop(), torch.cat(labels) if len(labels) == len(streams) else None)
 
 
 @numba.njit(nogil=True, cache=True)

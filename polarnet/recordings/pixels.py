@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Int
 
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, select
 
 NEIGHBOURHOOD = 5  # side of a square, in pixels
 MIN_HOT_HZ = 20.0  # slower pixels are harmless
@@ -36,5 +36,4 @@ def without_pixels(events: Events, bad: Bool[np.ndarray, "h w"]) -> Events:
     """The events of all pixels outside `bad`."""
     if not bad.any():
         return events
-    keep = ~torch.from_numpy(bad)[events.y.long(), events.x.long()]
-    return Events(events.t[keep], events.x[keep], events.y[keep], events.p[keep], events.height, events.width)
+    return select(events, ~torch.from_numpy(bad)[events.y.long(), events.x.long()])

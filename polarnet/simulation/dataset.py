@@ -18,18 +18,24 @@ from polarnet.storage.scenes import SceneStore
 
 
 def emulate_scenes(
-    scenes: Path, events: Path, camera: Camera, seed: int, mapper: Callable[..., Iterable[Any]], threads: int
+    scenes: Path,
+    events: Path,
+    camera: Camera,
+    seed: int,
+    mapper: Callable[..., Iterable[Any]],
+    threads: int,
+    labels: bool = False,
 ) -> int:
     """Emulate all sequences of a scene store into an event store, and return their number.
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks
-    emulates one part on `threads` threads. The event store has the parts of the scene store. An interrupted run of the
-    same scenes, camera and seed makes the missing parts.
+    emulates one part on `threads` threads. The event store has the parts of the scene store. With `labels`, it stores
+    the cause of each event. An interrupted run of the same scenes, camera and seed makes the missing parts.
     """
     source = SceneStore.open(scenes)
     attributes = origin_of(source, camera, seed)
     size = channel_size(camera.polarizers.layout, source.sensor_height, source.sensor_width)
-    store = EventStore.create(events, source.sequences, *size, attributes, source.sequences_per_part)
+    store = EventStore.create(events, source.sequences, *size, attributes, source.sequences_per_part, labels)
     task = functools.partial(_emulate_part, scenes=source, events=store, camera=camera, seed=seed, threads=threads)
     for _ in mapper(task, store.missing_parts()):
         pass
@@ -47,7 +53,9 @@ def origin_of(scenes: SceneStore, camera: Camera, seed: int) -> dict[str, Any]:
     }
 
 
-def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: int, threads: int) -> list[Events]:
+def emulate_sequence(
+    scenes: SceneStore, sequence: str, camera: Camera, seed: int, threads: int, labels: bool = False
+) -> list[Events]:
     """Events of the four channels of one stored sequence.
 
     Its noise, and with `randomise` its camera, depend only on the seed and the sequence's name.
@@ -65,10 +73,11 @@ def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: in
         threads,
         camera.polarizers,
         camera.readout,
+        labels,
     )
 
 
 def _emulate_part(part: str, scenes: SceneStore, events: EventStore, camera: Camera, seed: int, threads: int) -> None:
     for sequence in events.parts[part]:
-        channels = emulate_sequence(scenes, sequence, camera, seed, threads)
+        channels = emulate_sequence(scenes, sequence, camera, seed, threads, events.labelled)
         events.write(sequence, channels, scenes.duration_us(sequence), camera.draws(seed, sequence))

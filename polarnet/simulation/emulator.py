@@ -177,10 +177,10 @@ def emulate_lights(
     return list(columns), SensorState(config.model, height, width, channels, pixels, float(times[-1]), steps_taken)
 
 
-def events_of(columns: Columns, height: int, width: int) -> Events:
-    """The columns as events that share their memory."""
-    t, x, y, p = (torch.from_numpy(column) for column in columns[:4])
-    return Events(t, x, y, p, height, width)
+def events_of(columns: Columns, height: int, width: int, labels: bool = False) -> Events:
+    """The columns as events that share their memory, with the labels of the columns if they have them."""
+    t, x, y, p, label = (torch.from_numpy(column) for column in columns[:5])
+    return Events(t, x, y, p, height, width, label if labels else None)
 
 
 def _check_frames(

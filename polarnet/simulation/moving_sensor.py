@@ -46,14 +46,18 @@ def emulate_motion(
     threads: int = 1,
     polarizers: PolarizersConfig = IDEAL,
     readout: ReadoutConfig = PERFECT,
+    labels: bool = False,
 ) -> list[Events]:
     """Events of the four channels of a sensor of height x width pixels that moves over a scene for `duration_us`.
 
     Times count from the start of the motion. `key` (64 bits) seeds the mismatch of the pixels and all noise. The
-    channels of a DoFP sensor (`polarizers.layout`) have half its rows and columns.
+    channels of a DoFP sensor (`polarizers.layout`) have half its rows and columns. With `labels`, every event names its
+    cause.
     """
     t_us = emulation_times_us(trajectory, duration_us, height, width, config)
-    events, _ = emulate_motion_steps(scene, trajectory, t_us, height, width, config, key, None, threads, polarizers)
+    events, _ = emulate_motion_steps(
+        scene, trajectory, t_us, height, width, config, key, None, threads, polarizers, labels
+    )
     return _read_out(events, polarizers, readout, key, duration_us)
 
 
@@ -103,6 +107,7 @@ def emulate_motion_steps(
     state: SensorState | None,
     threads: int = 1,
     polarizers: PolarizersConfig = IDEAL,
+    labels: bool = False,
 ) -> tuple[list[Events], SensorState]:
     """As `emulate_motion`, for light rendered at times `t_us`; pass the returned state to continue.
 
@@ -118,12 +123,19 @@ def emulate_motion_steps(
     eight_bit = MODELS[config.model].EIGHT_BIT_VIDEO
     weights = analyzers(polarizers) if polarizers.uniform else analyzer_maps(polarizers, height, width, key)
     advance = functools.partial(
-        emulate_lights, height=rows, width=columns, config=config, key=key, channels=CHANNELS, threads=threads
+        emulate_lights,
+        height=rows,
+        width=columns,
+        config=config,
+        key=key,
+        channels=CHANNELS,
+        threads=threads,
+        labels=labels,
     )
     if drifts(pose) and polarizers.uniform:
         lights = lights_of_drift(scene, pose, height, width, weights)
         channels, state = advance(lights, t_us.astype(np.float64), state=state)
-        return [events_of(channel, rows, columns) for channel in channels], state
+        return [events_of(channel, rows, columns, labels) for channel in channels], state
     pieces = []
     for first in range(0, len(t_us), CHUNK):
         chunk = slice(first, first + CHUNK)
@@ -135,4 +147,4 @@ def emulate_motion_steps(
         pieces.append(channels)
     joined = [Columns(*map(np.concatenate, zip(*channel, strict=True))) for channel in zip(*pieces, strict=True)]
     assert state is not None  # there was at least one time
-    return [events_of(channel, rows, columns) for channel in joined], state
+    return [events_of(channel, rows, columns, labels) for channel in joined], state

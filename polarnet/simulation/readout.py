@@ -5,12 +5,14 @@ carries a limited number of events a second. An event gets its time when it leav
 lost, as in sensors whose event rate exceeds what their readout carries.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, select
 from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import compiled, forget_stale_code
 from polarnet.simulation.pixels import randomness
@@ -61,8 +63,7 @@ def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) 
     stamps = np.rint(times_us).astype(np.int64)
     here = torch.from_numpy(order[carried & (stamps <= duration_us)])
     left = torch.from_numpy(stamps[carried & (stamps <= duration_us)])
-    leaving = Events(left, events.x[here], events.y[here], events.p[here], events.height, events.width)
-    return leaving, int((~carried).sum())
+    return replace(select(events, here), t=left), int((~carried).sum())
 
 
 @compiled

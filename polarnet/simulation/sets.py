@@ -61,6 +61,8 @@ class Recipe:
     """Threads of each task; changes no result."""
     sequences_per_part: int
     """Sequences in a part of a store; changes no result."""
+    labels: bool
+    """Whether the event store holds the cause of each event."""
 
 
 def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Recipe, mapper: MakeMapper) -> bool:
@@ -106,7 +108,8 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
     is emptied first. The code is not compared: DVC does that for the pipeline's sets.
     """
     sections = {"ingest": asdict(recipe.ingest), "motion": asdict(recipe.motion), **recipe.camera.sections}
-    key = sha256(json.dumps(sections | {"seed": recipe.seed, "source": source}, sort_keys=True).encode())
+    settings = sections | {"seed": recipe.seed, "source": source, "labels": recipe.labels}
+    key = sha256(json.dumps(settings, sort_keys=True).encode())
     note = folder / MADE
     if note.exists():
         known = json.loads(note.read_text())
@@ -123,7 +126,7 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
         layout, size = recipe.camera.polarizers.layout, recipe.sequences_per_part
         synthesize(images, scenes, frames, recipe.motion, recipe.seed, mapper("synthesize"), size, layout=layout)
     if not events.exists():
-        emulate_scenes(scenes, events, recipe.camera, recipe.seed, mapper("emulate"), recipe.threads)
+        emulate_scenes(scenes, events, recipe.camera, recipe.seed, mapper("emulate"), recipe.threads, recipe.labels)
     note.write_text(json.dumps({"key": key, "complete": True}))
     return True
 

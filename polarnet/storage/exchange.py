@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from polarnet.events.labels import LABELS
 from polarnet.events.stream import Events
 from polarnet.runtime.extras import installation
 from polarnet.stokes import POLARIZER_ANGLES_DEG
@@ -22,7 +23,8 @@ HDF5_CHUNK = 2**16  # events
 def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:
     """Write one channel in DSEC's layout of a camera (Gehrig et al. 2021): events/{x,y,t,p}, ms_to_idx and t_offset.
 
-    Polarity is 1 or 0 there. The attributes height and width add the sensor's size. Needs h5py.
+    Polarity is 1 or 0 there. The attributes height and width add the sensor's size, and events/label the labels of
+    events that have them. Needs h5py.
     """
     columns = {
         "x": events.x.numpy().astype(np.uint16),
@@ -30,6 +32,8 @@ def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -
         "t": events.t.numpy().astype(np.uint32),
         "p": (events.p > 0).numpy().astype(np.uint8),
     }
+    if events.label is not None:
+        columns["label"] = events.label.numpy()
     compressed = {"chunks": (min(HDF5_CHUNK, len(events)),), "compression": "gzip", "shuffle": True}
     with _h5py().File(path, "w") as file:
         for name, values in columns.items():
@@ -42,12 +46,16 @@ def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -
 def write_text(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:
     """Write one channel as a line `width height`, then a line `t x y p` per event, the format of E2VID's tools.
 
-    t is in seconds with six decimals; p is 1 or 0. Such a file cannot hold the duration.
+    t is in seconds with six decimals; p is 1 or 0. Such a file cannot hold the duration. Labels go to a file of their
+    own, NAME_label.txt with a line per event, because E2VID's tools expect four columns.
     """
     with Path(path).open("w", encoding="ascii") as file:
         file.write(f"{events.width} {events.height}\n")
         rows = zip(*(column.tolist() for column in (events.t, events.x, events.y, events.p)), strict=True)
         file.writelines(f"{t // 1_000_000}.{t % 1_000_000:06d} {x} {y} {int(p > 0)}\n" for t, x, y, p in rows)
+    if events.label is not None:
+        lines = "".join(f"{label}\n" for label in events.label.tolist())
+        Path(path).with_name(f"{Path(path).stem}_label.txt").write_text(lines, encoding="ascii")
 
 
 FORMS: dict[str, tuple[str, Callable[[Path, Events, int], None]]] = {
@@ -60,7 +68,8 @@ FORMS: dict[str, tuple[str, Callable[[Path, Events, int], None]]] = {
 def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -> None:
     """Write FOLDER/SEQUENCE/polarizer_{000,045,090,135}.{h5,txt} for every sequence, then FOLDER/store.json.
 
-    `form` is hdf5 or text. store.json holds the data that these files cannot: durations, sizes and attributes.
+    `form` is hdf5 or text. store.json holds the data that these files cannot: durations, sizes, attributes, and the
+    names of the labels in a labelled store.
     """
     folder = Path(folder)
     if form not in FORMS:
@@ -81,6 +90,7 @@ def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -
         "sequences_per_part": store.sequences_per_part,
         "duration_us": {sequence: store.duration_us(sequence) for sequence in store.sequences},
         "attributes": store.attributes,
+        **({"labels": LABELS} if store.labelled else {}),
     }
     (folder / "store.json").write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
 

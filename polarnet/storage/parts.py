@@ -52,6 +52,8 @@ class StorageConfig:
     """Section `storage` of params.yaml."""
 
     sequences_per_part: PositiveInt
+    labels: bool
+    """Store the cause of each simulated event."""
 
 
 @dataclass(frozen=True)
