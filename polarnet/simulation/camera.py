@@ -32,8 +32,11 @@ class Camera:
         values = self.draws(seed, sequence)
         if not values:
             return self
-        sections = (replace(s, **values.get(name, {}), randomise=None) for name, s in self._sections.items())
-        return Camera(*sections)
+        return Camera(
+            replace(self.sensor, **values.get("emulate", {}), randomise=None),
+            replace(self.polarizers, **values.get("polarizers", {}), randomise=None),
+            replace(self.readout, **values.get("readout", {}), randomise=None),
+        )
 
     @property
     def _sections(self) -> dict[str, RandomisedConfig]:

@@ -85,12 +85,12 @@ def with_defects(
     in_order = np.lexsort((hot.p, hot.x, hot.y, hot.t))
     hot = Columns(*(column[in_order] for column in hot))
     order = _merged_order(columns, hot, defects.silent, width)
-    merged = (np.concatenate(pair)[order] for pair in zip(columns[:4], hot[:4], strict=True))
+    t, x, y, p = (np.concatenate(pair)[order] for pair in zip(columns[:4], hot[:4], strict=True))
     return Columns(
-        *merged,
+        t, x, y, p,
         np.concatenate([columns.label, hot.label])[order] if labels else columns.label,
         np.concatenate([columns.unrounded_us, hot.unrounded_us])[order] if unrounded_times else columns.unrounded_us,
-    )
+    )  # fmt: skip
 
 
 @compiled
