@@ -23,6 +23,8 @@ $(READY): pyproject.toml constraints.txt .ci/lpips.txt .ci/setup
 repro: setup
 	dvc repro
 
+# Tests start many processes. Without bytecode on disk, each of them would compile polarnet anew.
+test: export PYTHONDONTWRITEBYTECODE =
 test: setup
 	python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 

@@ -1,10 +1,11 @@
-"""Speed and accuracy of the emulator: python -m studies.emulation [--write] [--rounds N] [--paper-set N]
+"""Speed and accuracy of the emulator: python -m studies.emulation [--write] [--before COMMIT] [--paper-set N]
 
 The clip is that of the shared reference figures: scikit-image's coffee photograph mapped to polarization, a sensor of
 120 x 180 pixels that drifts over it at 110 px/s, 300 steps a second, four channels, one second. Times run from
 rendering to columns in memory and are medians of wall-clock time with compiled kernels. Every model and number of
 threads runs in its own process, and the processes take turns over several rounds, so that other load on the machine
-affects all of them alike. Each process also reports its peak memory.
+affects all of them alike. Each process also reports its peak memory. `--before COMMIT` times an earlier commit in the
+same rounds, in a git worktree of its own. Its figures, and its seconds over today's, are entered under `before`.
 
 Timing errors are those of noiseless pixels with equal thresholds, relative to `exact` at 4800 steps a second. They
 cover the pixels whose polarities agree from the first event to the last. `exact` places its steps where pixels meet;
@@ -13,13 +14,14 @@ its figure for regular frames is printed too.
 The paper's set is made with `python -m stages.ingest`, `stages.synthesize` and `stages.emulate`, with experiment=paper
 on two workers, from the built-in photographs and dead leaves. Minutes are wall-clock time. Peak memory is the largest
 sum over a stage's processes, sampled twice a second; shared pages count once (Linux: proportional set size).
-`--paper-set N` makes about N sequences instead of 1000, and minutes are never scaled. `--paper-set 0` skips the set,
-`--only-paper-set` skips everything else.
+The files of the scene, frame and event stores are counted. `--paper-set N` makes about N sequences instead of 1000, and
+minutes are never scaled. `--paper-set 0` skips the set, `--only-paper-set` skips everything else.
 
 The passed cases of tests/golden are counted. `--write` merges the figures into docs/results/emulation.json.
 """
 
 import argparse
+import contextlib
 import json
 import os
 import resource
@@ -27,6 +29,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -68,6 +71,7 @@ MODELS = {
     "dvs_voltmeter": replace(DEFAULT, model="dvs_voltmeter"),
 }
 PAPER_SEQUENCES, PAPER_SEQUENCES_A_PICTURE, PAPER_WORKERS = 1000, 5, 2
+STORES = ("scenes.zarr", "frames.zarr", "events.zarr")  # whose files are counted
 MEMORY_SAMPLES_A_SECOND = 2
 THREADS = (1, 2)
 
@@ -105,8 +109,8 @@ def measure_one(name: str, threads: int, repeats: int) -> dict[str, Any]:
     }
 
 
-def in_own_process(name: str, threads: int, repeats: int) -> dict[str, Any]:
-    """`measure_one` in a new process of this script."""
+def in_own_process(name: str, threads: int, repeats: int, tree: Path) -> dict[str, Any]:
+    """`measure_one` in a new process of this script, as it stands in the working tree `tree`."""
     command = [
         sys.executable,
         "-m",
@@ -118,8 +122,8 @@ def in_own_process(name: str, threads: int, repeats: int) -> dict[str, Any]:
         "--repeats",
         str(repeats),
     ]
-    environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
-    done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    environment = os.environ | {"OMP_NUM_THREADS": str(threads), "PYTHONPATH": str(tree)}
+    done = subprocess.run(command, cwd=tree, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout)
 
 
@@ -216,6 +220,7 @@ def measure_paper_set(sequences: int) -> dict[str, Any]:
         store = EventStore.open(Path(folder) / "events.zarr")
         events = sum(sum(store.count(sequence)) for sequence in store.sequences)
         stored_mib = sum(file.stat().st_size for file in Path(store.path).rglob("*") if file.is_file()) / 2**20
+        files = sum(file.is_file() for kind in STORES for file in Path(folder, kind).rglob("*"))
     return {
         "sequences": len(store.sequences),
         "sequences_per_picture": PAPER_SEQUENCES_A_PICTURE,
@@ -226,6 +231,7 @@ def measure_paper_set(sequences: int) -> dict[str, Any]:
         "peak_mib": round(peak_mib),
         "events": events,
         "event_store_mib": round(stored_mib),
+        "files": files,
         "load": round(os.getloadavg()[0], 2),
     }
 
@@ -254,16 +260,52 @@ def _held_bytes(pid: int) -> int:
     return total
 
 
-def measure(rounds: int, repeats: int) -> dict[str, Any]:
-    """All figures of the models, printed as they come."""
-    processes: dict[str, dict[int, list[dict[str, Any]]]] = {name: {t: [] for t in THREADS} for name in MODELS}
+def full_name(commit: str) -> str:
+    """The hash of a commit that is named in any way git understands."""
+    command = ["git", "rev-parse", "--verify", f"{commit}^{{commit}}"]
+    return subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+
+
+@contextlib.contextmanager
+def worktree_of(commit: str) -> Iterator[Path]:
+    """A working tree of `commit`, deleted at the end."""
+    with tempfile.TemporaryDirectory() as folder:
+        tree = Path(folder) / "before"
+        subprocess.run(["git", "worktree", "add", "--quiet", "--detach", str(tree), commit], cwd=ROOT, check=True)
+        try:
+            yield tree
+        finally:
+            subprocess.run(["git", "worktree", "remove", "--force", str(tree)], cwd=ROOT, check=True)
+
+
+def measure_trees(trees: list[Path], rounds: int, repeats: int) -> list[dict[str, dict[str, Any]]]:
+    """Figures of the models in each working tree; the trees take turns as well."""
+    processes: list[dict[str, dict[int, list[dict[str, Any]]]]] = [
+        {name: {t: [] for t in THREADS} for name in MODELS} for _ in trees
+    ]
     for _ in range(rounds):
         for threads in THREADS:
             for name in MODELS:
-                one = in_own_process(name, threads, repeats)
-                processes[name][threads].append(one)
-                print(f"{name:14s} {threads} thread(s): {np.median(one['seconds']):.4f} s")
-    figures: dict[str, Any] = {name: figures_of(name, processes[name]) for name in MODELS}
+                for tree, results in zip(trees, processes, strict=True):
+                    one = in_own_process(name, threads, repeats, tree)
+                    results[name][threads].append(one)
+                    print(f"{tree.name} {name:14s} {threads} thread(s): {np.median(one['seconds']):.4f} s", flush=True)
+    return [{name: figures_of(name, results[name]) for name in MODELS} for results in processes]
+
+
+def measure(rounds: int, repeats: int, before: str | None) -> dict[str, Any]:
+    """All figures of the models, printed as they come; `before` names a commit to time beside them."""
+    figures: dict[str, Any]
+    if before is None:
+        (figures,) = measure_trees([ROOT], rounds, repeats)
+    else:
+        with worktree_of(before) as tree:
+            figures, earlier = measure_trees([ROOT, tree], rounds, repeats)
+        for name, of_model in earlier.items():
+            for seconds in (key for key in tuple(of_model) if key.startswith("seconds")):
+                of_model[f"{seconds}_over_present"] = round(of_model[seconds] / figures[name][seconds], 3)
+            print("before", name, of_model)
+        figures["before"] = {"commit": full_name(before), **earlier}
     for name in MODELS:
         print(name, figures[name])
     for name, errors in measure_timing().items():
@@ -284,6 +326,7 @@ def main() -> None:
         "--paper-set", type=int, default=PAPER_SEQUENCES, metavar="N", help="sequences of the paper's set to make"
     )
     parser.add_argument("--only-paper-set", action="store_true", help="measure nothing else")
+    parser.add_argument("--before", metavar="COMMIT", help="earlier commit to time in the same rounds")
     parser.add_argument("--one", choices=list(MODELS), help=argparse.SUPPRESS)
     parser.add_argument("--threads", type=int, default=1, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -295,7 +338,7 @@ def main() -> None:
     figures: dict[str, Any] = machine_record(ROOT)
     print(f"{figures['machine']}, {figures['cores']} cores, load {figures['load']}")
     if not arguments.only_paper_set:
-        figures |= measure(arguments.rounds, arguments.repeats)
+        figures |= measure(arguments.rounds, arguments.repeats, arguments.before)
     if arguments.paper_set:
         figures["paper_set"] = measure_paper_set(arguments.paper_set)
         print("paper_set", figures["paper_set"])

@@ -1,8 +1,8 @@
 """Error of the fit to a rotating polarizer's events: python -m studies.rotating [--write]
 
 Still scenes are smooth random maps of S0 from 0.2 to 1, DoLP from 0 to 0.95 and AoLP over half a circle, 60 x 80
-pixels, seen by the sensor of params.yaml. Section `rotating` has three such scenes at the rate and window of
-params.yaml. The curves change one setting each, on one scene. The fit expects the sensor's mean thresholds and
+pixels, seen by the sensor of params.yaml. Section `rotating` has three such scenes at one turn a second and the window
+of params.yaml. The curves change one setting each, on one scene. The fit expects the sensor's mean thresholds and
 bandwidth, except in `assumed_threshold`. Moving scenes are compared with the truth at the middle of the window.
 `--write` puts the figures into docs/results/camera.json and draws docs/pictures/rotating_polarizer.png.
 """
@@ -56,6 +56,7 @@ CURVES = {
 }
 """Label and values of the setting that each curve changes."""
 MOVING_RATE_HZ, MOVING_TURNS = 5.0, 1.0
+STILL_RATE_HZ, FRAMES_PER_TURN = 1.0, 720
 
 
 class Case(NamedTuple):
@@ -157,9 +158,15 @@ def _rms(values: np.ndarray) -> float:
     return round(float(np.sqrt(np.mean(values**2))), 4)
 
 
+def still_case(config: Config, scene: PolarizationScene) -> Case:
+    """A scene at rest, with the sensor and the fit of params.yaml."""
+    rotating = replace(config.rotating, rate_hz=STILL_RATE_HZ, frames_per_turn=FRAMES_PER_TURN)
+    return Case(scene, rotating, config.emulate, config.modulation)
+
+
 def case_of(config: Config, curve: str, value: float) -> Case:
     """The case of a curve's point."""
-    case = Case(smooth_scene(0), config.rotating, config.emulate, config.modulation)
+    case = still_case(config, smooth_scene(0))
     if curve == "rate_hz":
         return case._replace(rotating=replace(case.rotating, rate_hz=value))
     if curve == "window_turns":
@@ -181,7 +188,7 @@ def case_of(config: Config, curve: str, value: float) -> Case:
 
 def single_cases(config: Config) -> dict[str, Case]:
     """Cases apart from the curves."""
-    still = Case(smooth_scene(0), config.rotating, config.emulate, config.modulation)
+    still = still_case(config, smooth_scene(0))
     noisy = SENSORS["noisy"]
     spread = noisy.contrast_threshold_sigma_on / noisy.contrast_threshold_on
     prior_config = replace(config.modulation, cutoff_hz=noisy.cutoff_hz, threshold_spread=spread)
@@ -191,7 +198,7 @@ def single_cases(config: Config) -> dict[str, Case]:
         "sensor noisy": still._replace(sensor=noisy, modulation=prior_config),
         "bandwidth unknown (fit without lag)": still._replace(modulation=replace(config.modulation, cutoff_hz=0.0)),
         "extinction 100:1, known": still._replace(
-            rotating=replace(config.rotating, extinction_ratio=100.0),
+            rotating=replace(still.rotating, extinction_ratio=100.0),
             modulation=replace(config.modulation, extinction_ratio=100.0),
         ),
     }
@@ -199,11 +206,11 @@ def single_cases(config: Config) -> dict[str, Case]:
 
 def measure(config: Config) -> tuple[dict[str, Any], dict[str, Any]]:
     """Section `rotating`, and the curves and cases."""
-    scenes = [Case(smooth_scene(seed), config.rotating, config.emulate, config.modulation) for seed in HEADLINE_SCENES]
+    scenes = [still_case(config, smooth_scene(seed)) for seed in HEADLINE_SCENES]
     errors = Errors(*map(np.concatenate, zip(*map(errors_of, scenes), strict=True)))
     figures: dict[str, Any] = {
         **scores(errors),
-        "rate_hz": config.rotating.rate_hz,
+        "rate_hz": STILL_RATE_HZ,
         "window_turns": config.modulation.window_turns,
     }
     figures |= {"scenes": len(scenes)}

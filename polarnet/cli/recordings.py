@@ -1,8 +1,7 @@
-"""Commands for recordings: inspect, register, recover DoLP, replay."""
+"""Commands for recordings: inspect, recover DoLP, replay."""
 
 import argparse
 import functools
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -27,9 +26,10 @@ OPTIONS_BY_INPUT = {
 
 
 def add_to(commands: Commands) -> None:
-    """Add the commands inspect, register, recover and replay."""
+    """Add the commands inspect, recover and replay."""
     _add_inspection(commands)
     _add_recovery(commands)
+    _add_replay(commands)
 
 
 def _add_inspection(commands: Commands) -> None:
@@ -37,7 +37,7 @@ def _add_inspection(commands: Commands) -> None:
         "inspect",
         help="summarise a camera's file and draw its busiest moment",
         description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
-        "camera's file, and draws its busiest moment as a PNG.",
+        "camera's file, with signs of a readout at its limit, and draws its busiest moment as a PNG.",
     )
     inspect.add_argument("file", type=Path, help="file of a camera, or an event store with --part")
     add_reading(inspect)
@@ -53,20 +53,6 @@ def _add_inspection(commands: Commands) -> None:
         "--hot-pixels", type=Path, metavar="PNG", help="PNG of the number of events of each pixel (default: not drawn)"
     )
     inspect.set_defaults(run=_inspect)
-
-    register = commands.add_parser(
-        "register",
-        help="estimate the homography between the recordings of two cameras",
-        description="Prints the homography that maps pixels of REFERENCE to pixels of FILE, as JSON, with the "
-        "correlation of the edges of both recordings.",
-    )
-    register.add_argument("reference", type=Path, help="recording of the first camera")
-    register.add_argument("file", type=Path, help="recording of the second camera, of the same scene")
-    add_reading(register)
-    register.add_argument(
-        "--picture", type=Path, help="PNG of both event images, before and after (default: not drawn)"
-    )
-    register.set_defaults(run=_register)
 
 
 def add_reading(command: argparse.ArgumentParser) -> None:
@@ -90,6 +76,15 @@ def _add_recovery(commands: Commands) -> None:
         "camera behind a rotating polarizer, with --rotating or --triggers; an event store; a folder of "
         "division-of-time captures; with --live, a growing file or standard input (-) with lines `t x y p angle`.",
     )
+    _add_input(recover)
+    _add_method(recover)
+    _add_output(recover)
+    add_reading(recover)
+    recover.set_defaults(run=_recover)
+
+
+def _add_input(recover: argparse.ArgumentParser) -> None:
+    """Add the recordings, and the options that say how light reached them."""
     recover.add_argument("input", nargs="+", metavar="INPUT", help="recordings, an event store, a folder, or -")
     recover.add_argument(
         "--angles", nargs=4, type=int, metavar="DEG", help="polarizer angles of the four files, in order"
@@ -121,6 +116,10 @@ def _add_recovery(commands: Commands) -> None:
     recover.add_argument(
         "--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce the sensor to this many rows and columns"
     )
+
+
+def _add_method(recover: argparse.ArgumentParser) -> None:
+    """Add the window and the method that recovers DoLP from it."""
     recover.add_argument(
         "--window",
         help="length of a window: a time (33.3ms) or a number of events of all channels (20000ev); networks are "
@@ -144,6 +143,9 @@ def _add_recovery(commands: Commands) -> None:
         default="auto",
         help="number format of the network; auto takes bf16 if the device has units for it (default: auto)",
     )
+
+
+def _add_output(recover: argparse.ArgumentParser) -> None:
     recover.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
     recover.add_argument(
         "--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), help="file types to write (default: zarr png mp4)"
@@ -151,16 +153,16 @@ def _add_recovery(commands: Commands) -> None:
     recover.add_argument(
         "--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)"
     )
-    add_reading(recover)
-    recover.set_defaults(run=_recover)
 
+
+def _add_replay(commands: Commands) -> None:
     replay = commands.add_parser(
         "replay",
         help="print a stored sequence as lines `t x y p angle`, at its own pace",
         description="Prints the events of a stored sequence at the pace of the recording. Pipe them into "
         "`polarnet recover - --live` to try live recovery without a camera.",
     )
-    replay.add_argument("store", help="event store: folder, zip or fsspec URL")
+    replay.add_argument("store", help="event store: folder or fsspec URL")
     replay.add_argument("sequence", help="name of the sequence")
     replay.add_argument("--speed", type=float, default=1.0, help="speed relative to the recording (default: 1)")
     replay.set_defaults(run=_replay)
@@ -184,27 +186,6 @@ def _inspect(options: argparse.Namespace) -> int:
 
         draw_hot_pixels(inspection.counts, inspection.hot, options.hot_pixels)
         print(f"hot pixels  {options.hot_pixels}")
-    return 0
-
-
-def _register(options: argparse.Namespace) -> int:
-    from polarnet.recordings.recording import read_recording
-    from polarnet.recordings.registration import UNRELATED, event_image, register, warped
-    from polarnet.reports.recordings import draw_registration
-
-    files = options.reference, options.file
-    reference, moving = (event_image(read_recording(path, **_reading(options)).events) for path in files)
-    registration = register(reference, moving)
-    print(json.dumps({**registration._asdict(), "homography": registration.homography.tolist()}, indent=2))
-    if registration.edge_correlation < UNRELATED:
-        print(
-            f"polarnet register: warning: do not use this homography: the edges of the two recordings do not match "
-            f"(correlation {registration.edge_correlation:.2f}, expected at least {UNRELATED:g}). The recordings show "
-            f"different scenes, have too few edges, or come from cameras too far apart",
-            file=sys.stderr,
-        )
-    if options.picture:
-        draw_registration(reference, moving, warped(moving, registration.homography), options.picture)
     return 0
 
 
@@ -264,27 +245,35 @@ def _recover(options: argparse.Namespace) -> int:
 
 def _recover_rotating(options: argparse.Namespace) -> int:
     from polarnet.config.tree import load
+    from polarnet.methods.half_turns import half_turns_recoverer
     from polarnet.methods.rotating_polarizer import rotating_recoverer
     from polarnet.recordings.recording import read_recording
     from polarnet.recovery.recover import facts_of, recover
     from polarnet.recovery.rotating import half_turn_rule, open_rotating, rotation_of
     from polarnet.recovery.writer import RecoveryWriter
 
-    if options.method or options.weights:
+    if options.method not in (None, "rotating_polarizer") or options.weights:
         raise ValueError(
-            "--rotating: expected no --method or --weights, a fit without network recovers DoLP; leave it out"
+            "--rotating: expected no --method but rotating_polarizer (for moving scenes) and no --weights, because a "
+            "fit without network recovers DoLP; leave it out"
         )
-    config = load(settings_root()).modulation
+    settings = load(settings_root())
+    config, moving = settings.modulation, options.method is not None
     file, size = Path(options.input[0]), (options.size[0], options.size[1]) if options.size else None
     rotation = rotation_of(options.rotating, options.triggers, options.start_angle or 0.0)
     length_us, step_us = (_duration_us(options, name) for name in ("window", "step"))
-    rule = half_turn_rule(rotation, config.window_turns, length_us, step_us)
+    rule = half_turn_rule(rotation, 0.5 if moving else config.window_turns, length_us, step_us)
     out = options.out or Path("outputs") / "recover" / file.stem
     with run_folder(out, "recover") as folder:
         source, rotation = open_rotating(file, rotation, functools.partial(read_recording, **_reading(options)), size)
         writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
-        summary = recover(source, rule, rotating_recoverer(config, rotation), writer)
-        words = f"fit to the modulation by a polarizer at {rotation.rate_hz:g} turns/s"
+        if moving:
+            recoverer = half_turns_recoverer(settings.methods.rotating_polarizer, rotation)
+        else:
+            recoverer = rotating_recoverer(config, rotation)
+        summary = recover(source, rule, recoverer, writer)
+        words = f"fit to {'each half turn of' if moving else 'the modulation by'} a polarizer at "
+        words += f"{rotation.rate_hz:g} turns/s"
         facts = facts_of(source, rule, words, summary)
         page = writer.write_page(source.name, facts, [])
     for key, value in facts.items():
@@ -316,7 +305,7 @@ def refuse_unused_options(options: argparse.Namespace) -> None:
         kind = "one file with --rotating or --triggers"
     elif options.mosaic is not None:
         kind = "one file with --mosaic"
-    elif Path(options.input[0]).is_dir() or Path(options.input[0]).suffix == ".zip":
+    elif Path(options.input[0]).is_dir():
         kind = "an event store or a folder"
     else:
         return  # reading the input will name the missing option

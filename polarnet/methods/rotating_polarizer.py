@@ -23,12 +23,16 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from polarnet.events.rotation import Rotation
 from polarnet.events.stream import Events, merge, slice_time
 from polarnet.events.streaming import EventWindow
+from polarnet.methods.half_turns import local_mean, local_variance
 from polarnet.methods.method import Recoverer
 from polarnet.methods.modulation import UNKNOWNS, Pixels, fit_pixels, response_model
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
 INITIAL_RATIO_MAX = 0.7  # DoLP 0.94
+MISFIT_MAX = 20.0  # limit of one pixel's misfit in the mean over its neighbours
+MISFIT_STILL = 0.25  # misfit that a still scene reaches too, because `noise` is larger than what most pixels have
+MISFIT_SIDE, SPREAD_SIDE = 5, 3  # pixels; sides of the squares of that mean, and of the variance of DoLP
 SILENT_DOLPS = 4000  # nodes of the integral over DoLP of silent pixels
 SPREADS = np.linspace(-3, 3, 25)  # nodes of the integral over thresholds, in standard deviations
 
@@ -62,6 +66,8 @@ class ModulationConfig:
     """Squared error of DoLP over the variance of the fit, measured in simulation (python -m studies.rotating)."""
     variance_floor: PositiveFloat
     """Smallest expected squared error of DoLP."""
+    spread_scale: PositiveFloat
+    """Squared error of DoLP over its variance among neighbours where the model does not fit, as in moving scenes."""
 
     @property
     def polarizer_contrast(self) -> float:
@@ -113,8 +119,8 @@ def fit_modulation(
     start = _initial_g(pixels, config, rotation, stop_us - start_us)
     fitted, covariance, cost = fit_pixels(pixels, start, guess, mean, precision, model, config.noise)
     intervals = np.maximum(np.diff(pixels.first) - 1, 0)
-    # residuals above the expected noise make the errors larger in proportion
-    covariance *= np.maximum(1, 2 * cost / np.maximum(intervals, 1))[:, None, None]
+    misfit = 2 * cost / np.maximum(intervals, 1)  # squared residuals over those of the expected noise
+    covariance *= np.maximum(1, misfit)[:, None, None]
     active = intervals > 0
     variances = np.where(active[:, None], np.diagonal(covariance, axis1=1, axis2=2)[:, 2:4], np.inf)
     variances = np.minimum(variances, 1 / precision[:, 2:4])  # a window never makes thresholds less certain
@@ -123,7 +129,20 @@ def fit_modulation(
         np.moveaxis(c.reshape(height, width, -1), -1, 0) for c in (fitted[:, 2:4], variances, guess)
     )
     after = ModulationState(thresholds, variance_maps, last_us.reshape(height, width), guesses)
-    return _prediction(fitted, covariance, active, config, (height, width)), after
+    prediction = _prediction(fitted, covariance, active, config, (height, width))
+    return _with_misfit(prediction, misfit.reshape(height, width), config), after
+
+
+def _with_misfit(prediction: Prediction, misfit: Float64[np.ndarray, "h w"], config: ModulationConfig) -> Prediction:
+    """Add the variance of DoLP among neighbours to the expected error, as far as the model does not fit there.
+
+    A scene that moves, or light below the knee, misfits at all its pixels. The error is then about as large as DoLP
+    differs around the pixel, while the residuals of one pixel tell little about it.
+    """
+    assert prediction.log_variance is not None
+    local = (local_mean(torch.from_numpy(np.minimum(misfit, MISFIT_MAX)), MISFIT_SIDE) - MISFIT_STILL).clamp(min=0)
+    spread = config.spread_scale * local_variance(prediction.dolp, SPREAD_SIDE) * local / (1 + local)
+    return prediction._replace(log_variance=(prediction.log_variance.exp() + spread).log().float())
 
 
 def rotating_recoverer(config: ModulationConfig, rotation: Rotation) -> Recoverer:

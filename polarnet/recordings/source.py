@@ -1,7 +1,7 @@
 """The interface of a file format's module: an opened file that yields its columns in blocks, unchanged."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -79,14 +79,26 @@ def word_blocks(
                 yield np.frombuffer(data[: len(data) // size * size], dtype)
 
 
-def running_on(t: np.ndarray, turns: int, before: int) -> tuple[np.ndarray, int, int]:
-    """Unwrap 32-bit microseconds; returns the times, the number of wraps so far, and the last raw time.
+def header_lines(path: Path, prefix: bytes, last: bytes, max_bytes: int) -> tuple[bytes, bytes, bool]:
+    """First lines of a file that begin with `prefix`, the two bytes after them, and whether `last` ends them."""
+    with path.open("rb") as file:
+        data = file.read(max_bytes)
+    start, ended = 0, False
+    while not ended and data.startswith(prefix, start) and (end := data.find(b"\n", start)) >= 0:
+        ended = data[start:end].strip() == last
+        start = end + 1
+    return data[:start], data[start : start + 2], ended
 
-    `turns` and `before` are the last two values returned for the previous block, 0 at the start.
-    """
-    t = t.astype(np.int64)
-    wrapped = np.cumsum(np.diff(t, prepend=before) < -WRAP_US // 2)
-    return t + (turns + wrapped) * WRAP_US, turns + int(wrapped[-1]), int(t[-1])
+
+def unwrapped(blocks: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Times without wraps, and entries, of each block that is not empty; column `t` has 32-bit microseconds."""
+    turns, before = 0, 0
+    for block in blocks:
+        if len(block):
+            t = block["t"].astype(np.int64)
+            wraps = turns + np.cumsum(np.diff(t, prepend=before) < -WRAP_US // 2)
+            turns, before = int(wraps[-1]), int(t[-1])
+            yield t + wraps * WRAP_US, block
 
 
 def sensor_size(path: Path, choices: Choices, height: int | None = None, width: int | None = None) -> tuple[int, int]:

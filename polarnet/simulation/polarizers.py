@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from pydantic import Field, NonNegativeFloat
 
+from polarnet.events.mosaic import places_of
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.ranges import RandomisedConfig
@@ -146,11 +147,6 @@ def mixed_with_neighbours(frames: Float32[np.ndarray, "n h w"], crosstalk: float
     return np.float32(1 - crosstalk) * frames + np.float32(crosstalk / 4) * neighbours
 
 
-def places_of(mosaic: str) -> list[tuple[int, int]]:
-    """(row, column) in a 2x2 cell of the pixels at 0, 45, 90 and 135 degrees."""
-    return [divmod(int(cell), 2) for cell in np.argsort(np.ravel(parse_mosaic(mosaic)))]
-
-
 def split_cells(frames: Float32[np.ndarray, "n h w"], mosaic: str) -> Float32[np.ndarray, "4 n h2 w2"]:
     """Channels at 0, 45, 90 and 135 degrees of a DoFP sensor's frames: each one pixel of every 2x2 cell."""
-    return np.stack([frames[:, row::2, column::2] for row, column in places_of(mosaic)])
+    return np.stack([frames[:, row::2, column::2] for row, column in places_of(parse_mosaic(mosaic))])

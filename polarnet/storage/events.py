@@ -40,7 +40,7 @@ class EventStore(Store):
     """Sequences of events in four channels; see `create` and `open`."""
 
     FORMAT = "polarnet.events"
-    VERSION = 2
+    VERSION = 3
     height: int
     width: int
 

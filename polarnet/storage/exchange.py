@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from polarnet.events.stream import Events
+from polarnet.runtime.extras import installation
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore, first_at_millisecond
 
@@ -88,5 +89,5 @@ def _h5py() -> Any:
     try:
         import h5py
     except ImportError:
-        raise RuntimeError("HDF5 needs h5py: pip install 'polarnet[hdf5]'") from None
+        raise RuntimeError(f"HDF5 needs h5py: {installation('hdf5')}") from None
     return h5py

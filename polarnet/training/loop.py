@@ -25,6 +25,7 @@ from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, l
 from polarnet.training.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
+MAX_SCENES = 200  # sequences in the expected-error fit, spread evenly; more cost time and change it little
 MAX_BLOCKS = 10_000  # 2x2-pixel blocks per sequence in the expected-error fit; errors of neighbouring blocks are alike
 
 Run = tuple[Tensor, Tensor, Tensor | None]
@@ -65,6 +66,8 @@ class TrainConfig(LoopConfig):
     """Representation of the events in a window; null: the network's own default."""
     optimizer: Annotated[str, one_of(OPTIMIZERS)] | None
     """Name of the optimizer; null: the network's own default."""
+    start: str | None
+    """Checkpoint (.safetensors) of the same network whose weights the training starts from; null: random weights."""
 
 
 def train(
@@ -97,6 +100,7 @@ def train(
     if task.unroll_with_features is not None and recorder.writes:
         network.load_state_dict(progress.best)
         names = [name for name in split.train.sequences if name not in split.train.frames.variant_of]
+        names = names[:: math.ceil(len(names) / MAX_SCENES)]
         scenes = WindowDataset(split.train.events, split.train.frames, names, split.train.encode)
         recorder.calibrated(progress, network, calibrate(task, scenes, config, device, workers))
     recorder.finish()

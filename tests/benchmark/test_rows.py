@@ -91,3 +91,12 @@ def test_the_weights_behind_a_table_are_named_once_a_section(context):
 def test_checkpoints_of_polarnet_say_what_they_are_and_files_of_other_authors_say_nothing(context):
     metadata = metadata_used(["zeros", "cf", "e2v", "e2v+gain", "firenet_published", "ours"], context)
     assert {row: one["network"] for row, one in metadata.items()} == {"e2v": "firenet", "ours": "paper"}
+
+
+def test_the_row_of_a_rotating_polarizer_sees_its_own_camera_alone(sequence, context):
+    silent = dataclasses.replace(sequence, events=[Events.empty(18, 20)] * 4)
+    row = "rotating_polarizer"
+    assert torch.equal(dolp_of(row, sequence, context), dolp_of(row, silent, context))
+    without = dataclasses.replace(sequence, rotating=None)
+    with pytest.raises(ValueError, match="a: expected events of a camera behind a rotating polarizer, there are none"):
+        dolp_of(row, without, context)

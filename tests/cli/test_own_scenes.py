@@ -16,7 +16,7 @@ from polarnet.runtime.machine import generator_for
 
 TINY = [
     "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.2", "synthesize.sensor_height=60",
-    "synthesize.sensor_width=90", "benchmark.methods=[zeros,train_mean,oracle_mean,cf,ours]",
+    "synthesize.sensor_width=90", "benchmark.methods=[zeros,train_mean,oracle_mean,cf,rotating_polarizer,ours]",
     "benchmark.warmup_windows=1", "benchmark.bootstrap_samples=10", "benchmark.panel_scenes=1", "runtime.threads=1",
 ]  # fmt: skip
 
@@ -63,7 +63,7 @@ def test_a_folder_of_photographs_is_scored_with_given_weights(
     out = tmp_path / "out"
     assert run(project_root, monkeypatch, photographs, out, "--weights", str(weights)) == 0
     metrics = json.loads((out / "metrics.json").read_text())
-    assert set(metrics) == {"zeros", "oracle_mean", "cf", "ours"}  # nobody made a training split
+    assert set(metrics) == {"zeros", "oracle_mean", "cf", "rotating_polarizer", "ours"}  # nobody made a training split
     details = json.loads((out / "details.json").read_text())
     assert len(details["scenes"]) == 2
     assert details["set"] == "holidays"
@@ -73,9 +73,11 @@ def test_a_folder_of_photographs_is_scored_with_given_weights(
     assert printed.startswith("Sequences of 60x90 pixels (height x width), 0.2 s at 30 frames a second; sensor: model")
     assert "WARNING: ours: the checkpoint does not say what it was trained on" in printed
     assert "oracle mean" in printed
+    assert "† Not ranked: another camera" in printed
     page = (out / "index.html").read_text()
     assert "train_mean was left out" in page
     assert "mine.safetensors (sha256" in page
+    assert "† Not ranked: another camera" in page
     assert "Sequences of 60x90 pixels (height x width), 0.2 s" in page
     assert "does not say what it was trained on" in page
     assert 'src="http' not in page
@@ -91,7 +93,7 @@ def test_a_folder_of_photographs_is_scored_with_given_weights(
     assert f"WARNING: {warning}" in capsys.readouterr().out
     assert warning in (out / "index.html").read_text()
     metrics = json.loads((out / "metrics.json").read_text())
-    assert set(metrics) == {"zeros", "oracle_mean", "cf", "ours"}
+    assert set(metrics) == {"zeros", "oracle_mean", "cf", "rotating_polarizer", "ours"}
     assert metrics["ours"]["mse"] != given["mse"]
     assert {path: path.stat().st_mtime_ns for path in written_ns} == written_ns
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import preloaded
 import pytest
 import torch
 
@@ -90,10 +91,9 @@ def test_a_mistyped_group_choice_is_refused_with_the_choices_there_are(project_r
 
 @pytest.mark.parametrize("stage", ["train", "trial"])
 def test_a_stage_refuses_a_mistyped_experiment_before_it_runs_anything(project_root, tmp_path, stage):
-    command = [sys.executable, "-m", f"stages.{stage}", "experiment=smok", f"paths.data={tmp_path}"]
-    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    done = preloaded.run_stage(project_root, stage, ["experiment=smok", f"paths.data={tmp_path}"])
     assert done.returncode == 1
-    assert done.stderr.startswith("configuration error: experiment: there is no 'smok'; ")
+    assert done.stdout.startswith("configuration error: experiment: there is no 'smok'; ")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -121,11 +121,10 @@ def test_a_typo_in_params_yaml_is_refused_with_the_keys_there_are(project):
 
 
 def test_a_stage_stops_before_it_runs_anything(project_root, tmp_path):
-    command = [sys.executable, "-m", "stages.synthesize", "synthesize.duration_s=-1.0", f"paths.data={tmp_path}"]
-    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    done = preloaded.run_stage(project_root, "synthesize", ["synthesize.duration_s=-1.0", f"paths.data={tmp_path}"])
     assert done.returncode == 1
-    assert "configuration error: synthesize.duration_s: expected > 0" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert "configuration error: synthesize.duration_s: expected > 0" in done.stdout
+    assert "Traceback" not in done.stdout
     assert list(tmp_path.iterdir()) == []
 
 
@@ -158,11 +157,10 @@ def test_a_folder_without_files_of_the_users_is_refused_in_one_line_that_tells_a
 def test_a_stage_without_its_input_files_ends_without_a_traceback(project_root, tmp_path, stage, overrides):
     (tmp_path / "empty").mkdir()
     values = [override.format(tmp_path / "empty") for override in overrides]
-    command = [sys.executable, "-m", f"stages.{stage}", *values, f"paths.data={tmp_path / 'data'}"]
-    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    done = preloaded.run_stage(project_root, stage, [*values, f"paths.data={tmp_path / 'data'}"])
     assert done.returncode == 1
-    assert done.stderr.startswith(f"{values[-1]}: no files there; put your files there")
-    assert "Traceback" not in done.stderr
+    assert done.stdout.startswith(f"{values[-1]}: no files there; put your files there")
+    assert "Traceback" not in done.stdout
 
 
 @pytest.mark.parametrize("group", BASE)

@@ -4,7 +4,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from rotation_fixtures import angle_error_deg, exact_events
 
+from polarnet.config.tree import load
 from polarnet.events.rotation import steady_rotation
 from polarnet.events.stream import Events, slice_count, slice_time
 from polarnet.events.streaming import EventWindow
@@ -15,9 +17,11 @@ from polarnet.methods.rotating_polarizer import (
     rotating_recoverer,
     silent_dolp,
 )
+from polarnet.simulation.motion import Sine, Trajectory, render
 from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.rotating import RotatingConfig, emulate_rotating, rotating_times_us
 from polarnet.simulation.scene import scene_from_polarization
+from polarnet.stokes import dolp as polarization_degree
 
 IDEAL = ModulationConfig(
     threshold_on=0.2,
@@ -33,32 +37,11 @@ IDEAL = ModulationConfig(
     window_turns=2.0,
     variance_scale=1.0,
     variance_floor=1e-6,
+    spread_scale=1.5,
 )
 """For events exactly at the thresholds of the logarithm."""
 DOLP = np.array([[0.25, 0.4, 0.6], [0.8, 0.9, 0.5]])
 AOLP = np.array([[0.0, 0.3, 1.0], [1.6, 2.4, 3.1]])
-
-
-def exact_events(dolp, aolp, rotation, stop_us, threshold=0.2, delay_us=0.0):
-    """Events at the crossings of ln(1 + DoLP cos 2 (angle - AoLP)), found on a grid of 5 us and between its points."""
-    t_us = np.arange(0, stop_us + 5, 5.0)
-    rows = []
-    for (y, x), m in np.ndenumerate(dolp):
-        logs = np.log1p(m * np.cos(2 * (rotation.at(t_us - delay_us) - aolp[y, x])))
-        # a level of the staircase is crossed again by the opposite polarity only one threshold further on
-        reference = logs[0]
-        for k in range(1, len(t_us)):
-            while abs(logs[k] - reference) >= threshold:
-                p = 1 if logs[k] > reference else -1
-                reference += p * threshold
-                share = (reference - logs[k - 1]) / (logs[k] - logs[k - 1])
-                rows.append((round(t_us[k - 1] + 5 * share), x, y, p))
-    columns = np.array(sorted(rows), np.int64).reshape(-1, 4).T
-    return Events.from_columns(*columns, *dolp.shape)
-
-
-def angle_error_deg(found, truth):
-    return np.degrees((found.numpy() - truth + math.pi / 2) % math.pi - math.pi / 2)
 
 
 @pytest.mark.parametrize("rate_hz", [4.0, -4.0])
@@ -179,6 +162,28 @@ def test_expected_errors_are_of_the_size_of_the_errors():
     assert 0.4 < squared.mean() / expected.mean() < 2.5
     uncertain = expected > np.median(expected)
     assert squared[uncertain].mean() > squared[~uncertain].mean()
+
+
+def test_expected_errors_grow_where_a_moving_scene_does_not_fit_the_model(project_root):
+    """Under motion the errors are several times those of the same scene at rest; half to twice of them are expected."""
+    config = load(project_root, ["rotating.rate_hz=5", "modulation.window_turns=1"])
+    generator = torch.Generator().manual_seed(5)
+    coarse = torch.rand(1, 3, 4, 6, generator=generator, dtype=torch.float64)
+    s0, dolp, aolp = torch.nn.functional.interpolate(coarse, (32, 60), mode="bilinear")[0]
+    scene = scene_from_polarization(0.3 + 0.7 * s0, dolp, 3 * aolp)
+    still = Sine(0.0, 0.0, 0.0)
+    ratios, errors = [], []
+    for speed in (0.0, 40.0):
+        path = Sine(1e4, speed / 1e4, 0.0)
+        trajectory = Trajectory(16.0, 16.0, (path,), (still,), still, still, speed)
+        t_us = rotating_times_us(config.rotating, config.emulate, 0, 200_000)
+        events = emulate_rotating(scene, trajectory, t_us, 24, 24, config.rotating, config.emulate, 1)
+        prediction, _ = fit_modulation(events.events, events.rotation, 0, 200_000, config.modulation)
+        (stokes,) = render(scene, trajectory, np.array([0.1]), 24, 24)
+        errors.append((prediction.dolp - polarization_degree(stokes)).square().mean().sqrt().item())
+        ratios.append(prediction.log_variance.exp().mean().sqrt().item() / errors[-1])
+    assert errors[1] > 2 * errors[0]
+    assert all(0.5 < ratio < 2 for ratio in ratios)
 
 
 def test_as_a_method_it_gives_a_map_for_each_window():

@@ -43,6 +43,19 @@ def test_a_recording_gives_dolp_and_aolp_every_half_turn(recording, tmp_path, mo
     assert (tmp_path / "out" / "index.html").exists()
 
 
+def test_the_fit_for_moving_scenes_gives_a_frame_each_half_turn_from_that_half_turn(
+    recording, tmp_path, monkeypatch, project_root, capsys
+):
+    monkeypatch.chdir(project_root)
+    options = [recording, "--rotating", RATE_HZ, "--start-angle", START_DEG, "--method", "rotating_polarizer"]
+    frames = recovered(options, tmp_path / "out")
+    assert frames["t_us"][:2].tolist() == [100_000, 200_000]
+    assert frames["dolp"][-1].mean() / 65535 == pytest.approx(0.5, abs=0.05)
+    assert frames["aolp"][-1].mean() * 180 / 65536 == pytest.approx(60, abs=3)
+    assert main(["recover", str(recording), "--method", "rotating_polarizer"]) == 1
+    assert "expected the rotation of the polarizer too: --rotating HZ" in capsys.readouterr().err
+
+
 def test_triggers_replace_the_rate(recording, tmp_path, monkeypatch, project_root):
     monkeypatch.chdir(project_root)
     (tmp_path / "triggers.txt").write_text("0\n200000\n400000\n600000\n")

@@ -46,6 +46,15 @@ def test_values_that_read_the_same_are_bold_together():
     assert [r.cells[0].best for r in table.rows] == [True, True]
 
 
+def test_a_row_of_another_camera_is_never_bold_and_a_note_says_why():
+    table = score_table({"rotating_polarizer": {"mse": 0.01}, "cf": {"mse": 0.3}, "ours": {"mse": 0.02}})
+    assert not row(table, "rotating_polarizer").cells[0].best
+    assert row(table, "ours").cells[0].best
+    assert row(table, "rotating_polarizer").label.endswith("†")
+    assert table.notes[0].startswith("† Not ranked: another camera")
+    assert score_table({"ours": {"mse": 0.02}}).notes == ()
+
+
 def test_the_fastest_method_is_not_bold_because_speed_is_no_score():
     table = score_table(SCORES)
     assert table.headings[-1] == "ms / window ↓"

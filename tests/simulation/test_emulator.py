@@ -64,6 +64,24 @@ def test_events_of_a_log_ramp_are_stamped_where_it_crosses_the_thresholds(model)
     assert columns.t.tolist() == np.floor(columns.unrounded_us).astype(int).tolist()
 
 
+@pytest.mark.parametrize(("model", "tolerance_us"), [("exact", 5), ("v2e", 60)])
+@pytest.mark.parametrize("cutoff_hz", [50.0, 0.0])
+def test_photoreceptor_and_source_follower_answer_a_step_of_light_like_a_second_order_low_pass(
+    model, tolerance_us, cutoff_hz
+):
+    every_us, rate = 20, 2 * math.pi * 50
+    t_us = np.append(0, 1 + every_us * np.arange(1500))
+    frames = np.full((len(t_us), 1, 1, 1), 255.0, np.float32)
+    frames[0] = 25
+    config = of(model, cutoff_hz=cutoff_hz, source_follower_hz=100.0 if cutoff_hz else 50.0)
+    (columns,), _ = emulate_columns(frames, t_us, config, key=1, unrounded_times=True)
+    risen = 0.2 * np.arange(1, 11) / math.log(255 / 25)  # fraction of the step at each ON event
+    # poles at `rate` and 2 `rate` give the response (1 - exp(-rate t))^2, one pole alone 1 - exp(-rate t)
+    expected_us = -1e6 / rate * np.log(1 - (np.sqrt(risen) if cutoff_hz else risen))
+    assert columns.p.tolist()[:10] == [1] * 10
+    assert columns.unrounded_us[:10] == pytest.approx(expected_us, abs=tolerance_us)
+
+
 def test_v2e_spreads_events_over_a_step_as_its_busiest_pixel_asks():
     frames = torch.tensor([[math.exp(4.0), math.exp(4.0)], [math.exp(4.61), math.exp(4.21)]]).float().view(2, 1, 1, 2)
     (events,), _ = emulate(frames, torch.tensor([0, 3000]), of("v2e"), key=1)

@@ -5,15 +5,19 @@ import numpy as np
 import pytest
 import torch
 
+from polarnet.config.tree import load
 from polarnet.simulation.motion import Sine, Trajectory
 from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.rotating import (
     RotatingConfig,
     behind_rotating_polarizer,
     emulate_rotating,
+    emulate_rotating_scenes,
     rotating_times_us,
 )
 from polarnet.simulation.scene import scene_from_polarization
+from polarnet.storage.events import EventStore
+from polarnet.storage.scenes import Scene, SceneStore
 
 ROTATING = RotatingConfig(rate_hz=2.0, start_angle_deg=0.0, extinction_ratio=None, frames_per_turn=720)
 
@@ -85,3 +89,33 @@ def test_a_resting_trajectory_equals_none_and_leaving_the_scene_is_refused():
 def test_a_rate_of_0_is_refused():
     with pytest.raises(ValueError, match="rate_hz: expected turns per second other than 0"):
         replace(ROTATING, rate_hz=0.0)
+
+
+def test_only_test_sequences_are_stored_and_a_second_run_keeps_the_store(project_root, tmp_path):
+    """The four channels' sensor, motion and size, with the events in the first channel."""
+    config = load(project_root, ["rotating.frames_per_turn=32"])
+    names = {"lake-00": "lake", "wood-00": "wood"}
+    store = SceneStore.create(
+        tmp_path / "scenes.zarr", names, {"lake-00": "train", "wood-00": "test"}, largest_picture=(20, 30),
+        sensor=(6, 8), trajectory_names=Trajectory.vector_names(), attributes={"layout": "four_sensors"},
+    )  # fmt: skip
+    still = Sine(0.0, 0.0, 0.0)
+    trajectory = Trajectory(12.0, 10.0, (Sine(2.0, 5.0, 0.0), still, still), (still, still, still), still, still, 10.0)
+    maps = torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(1))
+    for name in names:
+        store.write(name, Scene(maps[0], maps[1], 3 * maps[2]), trajectory.to_vector(), 100_000)
+    store.finish()
+    arguments = tmp_path / "scenes.zarr", tmp_path / "events.zarr", config.rotating, config.camera, config.seed, map
+    assert emulate_rotating_scenes(*arguments) == 1
+    events = EventStore.open(tmp_path / "events.zarr")
+    assert events.sequences == ["wood-00"]
+    first, *others = events.read("wood-00")
+    assert (first.height, first.width) == (6, 8)
+    assert len(first) > 0
+    assert [len(channel) for channel in others] == [0, 0, 0]
+    written_ns = (tmp_path / "events.zarr" / "zarr.json").stat().st_mtime_ns
+    assert emulate_rotating_scenes(*arguments) == 1
+    assert (tmp_path / "events.zarr" / "zarr.json").stat().st_mtime_ns == written_ns
+    faster = replace(config.rotating, rate_hz=30.0)
+    emulate_rotating_scenes(*arguments[:2], faster, *arguments[3:])
+    assert len(EventStore.open(tmp_path / "events.zarr").read("wood-00")[0]) > len(first)

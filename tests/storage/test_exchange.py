@@ -62,7 +62,7 @@ def test_text_is_what_e2vid_reads(make_events, tmp_path):
 
 def test_without_h5py_the_error_names_the_extra(make_events, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(RuntimeError, match=r"pip install 'polarnet\[hdf5\]'"):
+    with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[hdf5\]' in the clone"):
         write_hdf5(tmp_path / "e.h5", make_events([], 1, 1), 1000)
 
 

@@ -18,8 +18,9 @@ from polarnet.recordings.source import (
     Choices,
     RecordingError,
     Source,
-    running_on,
+    header_lines,
     sensor_size,
+    unwrapped,
     word_blocks,
 )
 
@@ -39,27 +40,19 @@ def matches(path: Path, head: bytes) -> bool:
 
 def open_aedat2(path: Path, choices: Choices) -> Source:
     """Open the events of a DAVIS; times that wrap after 71 minutes are unwrapped."""
-    with path.open("rb") as file:
-        data = file.read(MAX_HEADER_BYTES)
-    start, ended = 0, False
-    while not ended and data[start : start + 1] == b"#" and (end := data.find(b"\n", start)) >= 0:
-        ended = data[start:end].strip() == LAST_LINE
-        start = end + 1
-    if not data.startswith(MAGIC) or (not ended and data[start : start + 1] == b"#"):
+    header, after, ended = header_lines(path, b"#", LAST_LINE, MAX_HEADER_BYTES)
+    if not header.startswith(MAGIC) or (not ended and after.startswith(b"#")):
         raise RecordingError(f"{path.name}: expected AEDAT-2's header of # lines, and events after it")
-    chip = re.search(rb"# AEChip: [\w.]*?(346|240|128)", data[:start])
+    chip = re.search(rb"# AEChip: [\w.]*?(346|240|128)", header)
     size = SENSORS[chip[1]] if chip else (None, None)
     if size is None:
         raise RecordingError(f"{path.name}: expected the recording of a DAVIS, got one of a DVS128")
     height, width = sensor_size(path, choices, *size)
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        turns, before = 0, 0
-        for entries in word_blocks(path, start, ENTRY, BLOCK_EVENTS, counts):
-            events = entries[entries["address"] & NO_EVENT == 0]
-            if len(events):
-                t, turns, before = running_on(events["t"], turns, before)
-                address = events["address"].astype(np.int64)
-                yield Block(t, address >> 12 & 0x3FF, height - 1 - (address >> 22 & 0x1FF), address >> 11 & 1)
+        entries = word_blocks(path, len(header), ENTRY, BLOCK_EVENTS, counts)
+        for t, events in unwrapped(block[block["address"] & NO_EVENT == 0] for block in entries):
+            address = events["address"].astype(np.int64)
+            yield Block(t, address >> 12 & 0x3FF, height - 1 - (address >> 22 & 0x1FF), address >> 11 & 1)
 
     return Source(height, width, blocks)

@@ -20,11 +20,13 @@ from polarnet.recordings.source import (
     Choices,
     RecordingError,
     Source,
-    running_on,
+    header_lines,
     sensor_size,
+    unwrapped,
     word_blocks,
 )
 
+PREFIX, LAST_LINE = b"% ", b"% end"
 MAX_HEADER_BYTES = 2**16
 EVT_BLOCK_WORDS = 2**17
 MAX_PER_WORD = 12  # events per EVT3 word
@@ -47,7 +49,7 @@ def matches_dat(path: Path, head: bytes) -> bool:
 
 def open_evt(path: Path, choices: Choices) -> Source:
     """Open the events of EVT2 or EVT3; the sensor's size comes from the header, or from the sensor's name there."""
-    header, _ = _header(path)
+    header, _, _ = header_lines(path, PREFIX, LAST_LINE, MAX_HEADER_BYTES)
     stated = re.search(rb"% (?:evt |format EVT)(\d(?:\.\d)?)", header)
     version = stated[1].decode().removesuffix(".0") if stated else "none"
     if version not in ("2", "3"):
@@ -68,8 +70,8 @@ def open_evt(path: Path, choices: Choices) -> Source:
 
 def open_dat(path: Path, choices: Choices) -> Source:
     """Open change detection events of version 1 or 2; in version 2, times that wrap after 71 minutes are unwrapped."""
-    header, after = _header(path)
-    if len(after) < 2 or after.startswith(b"% "):
+    header, after, _ = header_lines(path, PREFIX, LAST_LINE, MAX_HEADER_BYTES)
+    if len(after) < 2 or after == PREFIX:
         raise RecordingError(f"{path.name}: the file ends within its header of % lines")
     kind, size = after
     if kind not in CHANGE_DETECTION or size != DAT_EVENT.itemsize:
@@ -84,9 +86,7 @@ def open_dat(path: Path, choices: Choices) -> Source:
     height, width = sensor_size(path, choices, stated.get(b"Height"), stated.get(b"Width"))
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        turns, before = 0, 0
-        for events in word_blocks(path, len(header) + 2, DAT_EVENT, BLOCK_EVENTS, counts):
-            t, turns, before = running_on(events["t"], turns, before)
+        for t, events in unwrapped(word_blocks(path, len(header) + 2, DAT_EVENT, BLOCK_EVENTS, counts)):
             address = events["address"]
             if version == 1:
                 yield Block(t, address & 0x1FF, address >> 9 & 0xFF, address >> 17 & 1)
@@ -94,18 +94,6 @@ def open_dat(path: Path, choices: Choices) -> Source:
                 yield Block(t, address & 0x3FFF, address >> 14 & 0x3FFF, address >> 28)
 
     return Source(height, width, blocks)
-
-
-def _header(path: Path) -> tuple[bytes, bytes]:
-    """The header's % lines, up to `% end` if there is one, and the two bytes after them."""
-    with path.open("rb") as file:
-        data = file.read(MAX_HEADER_BYTES)
-    start = 0
-    while data[start : start + 2] == b"% " and (end := data.find(b"\n", start)) >= 0:
-        line, start = data[start:end].strip(), end + 1
-        if line == b"% end":
-            break
-    return data[:start], data[start : start + 2]
 
 
 def _evt_size(header: bytes) -> tuple[int | None, int | None]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.simulation.compilation import compiled, inlined
+from polarnet.simulation.compilation import borrowing, compiled, inlined
 from polarnet.simulation.pixels import physics, randomness
 from polarnet.simulation.pixels.active import empty_active, gather, keep_continuing, scatter
 from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL, event_of, place_of
@@ -51,7 +51,9 @@ class Pixels(NamedTuple):
     linlog: np.ndarray
     """Response to that light: linear up to 20 DN, logarithmic above."""
     lag: np.ndarray
-    """Filtered response minus response."""
+    """Output of the photoreceptor minus response."""
+    buffer_lag: np.ndarray
+    """Output of the source follower minus that of the photoreceptor; empty without a source follower."""
     threshold_on: np.ndarray
     threshold_off: np.ndarray
     leak_nominal: np.ndarray
@@ -93,6 +95,7 @@ def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: 
         dn=zeros.copy(),
         linlog=zeros.copy(),
         lag=zeros.copy(),
+        buffer_lag=zeros[: n if physics.source_follower_hz > 0 else 0].copy(),
         threshold_on=threshold_on,
         threshold_off=threshold_off,
         leak_nominal=np.float32(physics.leak_rate_hz * 1e-6) * leak_factor * threshold_on,
@@ -160,6 +163,10 @@ def advance(light, pixels, steps, columns):
                 )
             else:
                 _difference(dn, response, pixels.dn[first:stop], pixels.linlog[first:stop], rise)
+            if physics.source_follower_hz > 0:
+                _buffer(
+                    rise, pixels.buffer_lag[first:stop], 2e-6 * math.pi * physics.source_follower_hz * step.duration_us
+                )
             change, leak = pixels.change[first:stop], pixels.leak[first:stop]
             threshold_on, threshold_off = pixels.threshold_on[first:stop], pixels.threshold_off[first:stop]
             fires = flags_of(words, stop - first)
@@ -178,14 +185,14 @@ def advance(light, pixels, steps, columns):
     return columns, used
 
 
-@inlined
+@borrowing
 def _difference(dn, response, dn_before, response_before, rise):
     for j in range(rise.size):
         rise[j] = response[j] - response_before[j]
         dn_before[j], response_before[j] = dn[j], response[j]
 
 
-@inlined
+@borrowing
 def _filter(dn, response, dn_before, response_before, lag, rate, rise):
     """First-order low-pass of a response that is linear in time, with the bandwidth at the mean light of the step.
 
@@ -211,7 +218,21 @@ def _filter(dn, response, dn_before, response_before, lag, rate, rise):
         lag[j], dn_before[j], response_before[j] = lag_after, dn[j], response[j]
 
 
-@inlined
+@borrowing
+def _buffer(rise, lag, a):
+    """The source follower: a first-order low-pass, where a = bandwidth * dt, of an input that rises linearly by `rise`.
+
+    The solution is that of `_filter` with one bandwidth for all pixels. `rise` becomes the rise of the output.
+    """
+    kept, mean_kept = np.float32(math.exp(-a)), np.float32(-math.expm1(-a) / a)
+    for j in range(rise.size):
+        lag_after = lag[j] * kept - rise[j] * mean_kept
+        lag_after = lag_after if abs(lag_after) > MIN_LAG else np.float32(0)
+        rise[j] += lag_after - lag[j]
+        lag[j] = lag_after
+
+
+@borrowing
 def _move(change, leak, rise, dt_us, before, threshold_on, threshold_off, fires):
     """Advance each change by its rise and leak as if nothing fired; flag pixels beyond a threshold at either end."""
     for j in range(rise.size):
@@ -221,13 +242,13 @@ def _move(change, leak, rise, dt_us, before, threshold_on, threshold_off, fires)
         before[j], change[j] = start, stop
 
 
-@inlined
+@borrowing
 def _flag_shots(next_shot_us, stop_us, fires):
     for j in range(fires.size):
         fires[j] |= next_shot_us[j] < stop_us
 
 
-@inlined
+@borrowing
 def _activate(words, first, before, rise, pixels, step, active, count):
     """Append the flagged pixels of a strip to the `count` active ones; returns their new number.
 
@@ -254,7 +275,7 @@ def _activate(words, first, before, rise, pixels, step, active, count):
     return stop
 
 
-@inlined
+@compiled
 def _fire(pixels, step, active, count, width, pending, n):
     """Follow the active pixels through a step, in rounds: in each round, a pixel fires at most once.
 
@@ -264,15 +285,21 @@ def _fire(pixels, step, active, count, width, pending, n):
     while count > 0:
         while n + count > pending.events.size:
             pending = roomier(pending)
-        _next_crossing(active, count, step.refractory_us, step.duration_us)
-        active.continues[:count] = 0
-        if step.has_shots:
-            _insert_shots(pixels, step, active, count)
-        _move_on(active, count, step.jitter, step.leak_key, step.duration_us)
-        n = _append_events(active, count, width, step.start_us, pending, n)
-        _store_state(pixels, active, count, step.start_us)
-        count = keep_continuing(active, count)
+        n, count = _fire_once(pixels, step, active, count, width, pending, n)
     return pending, n
+
+
+@borrowing
+def _fire_once(pixels, step, active, count, width, pending, n):
+    """One round; returns the numbers of pending events and of pixels that may fire in the next round."""
+    _next_crossing(active, count, step.refractory_us, step.duration_us)
+    active.continues[:count] = 0
+    if step.has_shots:
+        _insert_shots(pixels, step, active, count)
+    _move_on(active, count, step.jitter, step.leak_key, step.duration_us)
+    n = _append_events(active, count, width, step.start_us, pending, n)
+    _store_state(pixels, active, count, step.start_us)
+    return n, keep_continuing(active, count)
 
 
 @inlined
@@ -298,21 +325,26 @@ def _next_crossing(active, count, refractory_us, duration_us):
         active.next_change[a], active.next_now[a] = left if fires else change, event if fires else now
 
 
-@compiled
+@borrowing
 def _insert_shots(pixels, step, active, count):
-    """Let shot noise that precedes a pixel's next crossing take its place."""
+    """Let shot noise that precedes a pixel's next crossing take its place; the crossing stands if none is accepted."""
     for a in range(count):
         i = active.pixel[a]
-        shot = pixels.next_shot_us[i] - step.start_us
-        if shot < (active.next_now[a] if active.fires[a] else step.duration_us):
-            on, off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
+        on, off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
+        shot, limit = (
+            pixels.next_shot_us[i] - step.start_us,
+            active.next_now[a] if active.fires[a] else step.duration_us,
+        )
+        replaced = False
+        while shot < limit and not replaced:
             shot_us = step.start_us + shot
             accepted, is_on = _shot(step.physics, step.shot_key, i, shot_us, on, off, pixels.dn[i])
             pixels.next_shot_us[i] += _until_next_shot(step.physics, step.shot_key, i, shot_us, on, off)
-            fires = accepted & (shot >= active.last_event[a] + step.refractory_us)
-            active.event[a], active.fires[a] = event_of(0, 0, is_on, SHOT), fires
-            active.next_change[a] = 0.0 if fires else active.change[a]
-            active.next_now[a] = shot if fires else active.now[a]
+            if accepted and shot >= active.last_event[a] + step.refractory_us:
+                active.event[a], active.fires[a] = event_of(0, 0, is_on, SHOT), 1
+                active.next_change[a], active.next_now[a] = 0.0, shot
+                replaced = True
+            shot = pixels.next_shot_us[i] - step.start_us
         active.continues[a] = pixels.next_shot_us[i] < step.stop_us
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.simulation.compilation import compiled, inlined
+from polarnet.simulation.compilation import borrowing, inlined
 
 FULL_SCALE = 255.0  # DN
 KNEE = 20.0  # DN below which v2e's response is linear
@@ -34,7 +34,7 @@ def light_of_frames(frames: np.ndarray) -> Light:
     return Light(frames, np.empty(0), np.empty(0))
 
 
-@compiled
+@borrowing
 def intensity_rows(light, frame, row, width, dn):
     """Fill `dn` (float32, whole rows of `width` pixels) with the light of one frame from `row` on."""
     for r in range(dn.size // width):
@@ -42,10 +42,12 @@ def intensity_rows(light, frame, row, width, dn):
         if light.top.size:
             _bilinear_row(light.images, light.top[frame] + (row + r), light.left[frame], target)
         else:
-            target[:] = light.images[frame, row + r]
+            source = light.images[frame, row + r]
+            for x in range(width):
+                target[x] = source[x]
 
 
-@compiled
+@borrowing
 def _bilinear_row(images, row, column, dn):
     i, j, w = math.floor(row), math.floor(column), dn.size
     down, right = np.float32(row - i), np.float32(column - j)
@@ -59,7 +61,7 @@ def _bilinear_row(images, row, column, dn):
         dn[x] = (w00 * a[x] + w01 * b[x]) + (w10 * c[x] + w11 * d[x])
 
 
-@compiled
+@borrowing
 def linlog_8bit(dn, linlog):
     """v2e's response to 8-bit light: rounds `dn` to whole numbers in place, then looks the response up."""
     for j in range(dn.size):
@@ -68,7 +70,7 @@ def linlog_8bit(dn, linlog):
         linlog[j] = LINLOG_TABLE[whole]
 
 
-@compiled
+@borrowing
 def linlog_as_v2e(dn, linlog):
     """v2e's response to any DN >= 0, rounded as v2e rounds it: ln(DN) above 20, linear below, computed in float64."""
     for j in range(dn.size):
@@ -112,7 +114,7 @@ def ln(x):
     return (f + ((cubic + e * LN2_LOW) - np.float32(0.5) * square)) + e * LN2_HIGH
 
 
-@compiled
+@borrowing
 def linlog(dn, response):
     """v2e's response to any DN >= 0, in float32 throughout."""
     for j in range(dn.size):

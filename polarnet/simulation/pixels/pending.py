@@ -101,8 +101,9 @@ def _sort(events, longest_us, in_order):
         in_order[np.uint64(starts[bucket])] = events[i]
         starts[bucket] += 1
     for i in range(1, events.size):
-        event, j = in_order[i], i
-        while j > 0 and in_order[j - 1] > event:
-            in_order[j] = in_order[j - 1]
-            j -= 1
-        in_order[j] = event
+        event, j = in_order[np.uint64(i)], i
+        if in_order[np.uint64(i - 1)] > event:
+            while j > 0 and in_order[j - 1] > event:
+                in_order[j] = in_order[j - 1]
+                j -= 1
+            in_order[j] = event

@@ -34,6 +34,12 @@ class PixelConfig:
     """Correlation of a pixel's ON and OFF thresholds."""
     cutoff_hz: NonNegativeFloat
     """Bandwidth of the photoreceptor at full brightness, less in the dark; 0: infinite."""
+    source_follower_hz: NonNegativeFloat
+    """Bandwidth of the source follower behind the photoreceptor, in any light; 0: infinite, as in v2e.
+
+    The two form a second-order low-pass (Lichtsteiner, Posch, Delbruck, JSSC 2008). v2e keeps only the photoreceptor's
+    pole, because it usually dominates (Hu, Liu, Delbruck, CVPRW 2021).
+    """
     leak_rate_hz: NonNegativeFloat
     """ON events per second of a pixel that sees no change."""
     leak_jitter: Annotated[float, Field(ge=0, le=1)]
@@ -54,6 +60,7 @@ class Physics(NamedTuple):
     threshold_sigma_off: float
     threshold_correlation: float
     cutoff_hz: float
+    source_follower_hz: float
     leak_rate_hz: float
     leak_jitter: float
     noise_rate_cov_decades: float
@@ -70,6 +77,7 @@ def physics_of(config: PixelConfig) -> Physics:
         config.contrast_threshold_sigma_off,
         config.contrast_threshold_correlation,
         config.cutoff_hz,
+        config.source_follower_hz,
         config.leak_rate_hz,
         config.leak_jitter,
         config.noise_rate_cov_decades,

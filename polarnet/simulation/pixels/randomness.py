@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from polarnet.simulation.compilation import compiled, inlined
+from polarnet.simulation.compilation import borrowing, compiled, inlined
 
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: the increment of SplitMix64 (Steele et al., OOPSLA 2014)
 MIX_1, MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)  # its output function, variant 13
@@ -44,7 +44,7 @@ def rough_normal(bits):
     return (np.float32((sums >> np.uint64(24)) & np.uint64(255)) - DIGITS_MEAN) * DIGITS_SCALE
 
 
-@compiled
+@borrowing
 def rough_normals(key, first_pixel, values):
     """Fill `values` (float32) with mean 0, variance 1, nearly Gaussian: standardised sums of eight 4-bit random digits.
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from polarnet.simulation.compilation import compiled
+from polarnet.simulation.compilation import borrowing, compiled
 
 STRIP = 4000  # pixels, approximately
 SPARE = 8  # entries that `flagged` may write beyond the pixels of a strip
@@ -27,7 +27,7 @@ def flags_of(words, pixels):
     return words.view(np.uint8)[:pixels]
 
 
-@compiled
+@borrowing
 def flagged(words, pixels, positions, groups):
     """Write the indices of the flags set among the first `pixels` into `positions`; returns their number.
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.simulation.compilation import compiled
+from polarnet.simulation.compilation import borrowing, compiled
 from polarnet.simulation.pixels import physics, randomness
 from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL, sort_ties, with_room
 from polarnet.simulation.pixels.light import intensity_rows, linlog_8bit, linlog_as_v2e
@@ -37,7 +37,9 @@ class Pixels(NamedTuple):
     memory: np.ndarray
     """Log intensity at the last event, less what leaked; float64 with a low-pass."""
     filtered: np.ndarray
-    """Log intensity behind the photoreceptor's low-pass; float64 with a low-pass."""
+    """Log intensity behind the low-passes of photoreceptor and source follower; float64 with a low-pass."""
+    photoreceptor: np.ndarray
+    """float64, log intensity between the two; empty without a source follower."""
     threshold_on: np.ndarray
     threshold_off: np.ndarray
     leak_factor: np.ndarray
@@ -77,11 +79,12 @@ class Firing(NamedTuple):
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
     """Pixels before their first frame, with the mismatch of their channel."""
     n = height * width
-    real = np.float64 if physics.cutoff_hz > 0 else np.float32
+    real = np.float64 if physics.cutoff_hz > 0 or physics.source_follower_hz > 0 else np.float32
     threshold_on, threshold_off = threshold_maps(physics, n, key, channel)
     return Pixels(
         memory=np.zeros(n, real),
         filtered=np.zeros(n, real),
+        photoreceptor=np.zeros(n if physics.source_follower_hz > 0 else 0, np.float64),
         threshold_on=threshold_on,
         threshold_off=threshold_off,
         leak_factor=leak_factor_map(physics, n, key, channel),
@@ -90,7 +93,7 @@ def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: 
     )
 
 
-@compiled
+@borrowing
 def _respond(light, frame, y, w, dn, linlog):
     intensity_rows(light, frame, y, w, dn)
     if light.images.itemsize == 1 or light.top.size:  # bytes, or a scene that an 8-bit video shows
@@ -105,6 +108,8 @@ def start(light, pixels, steps):
     dn, linlog = np.empty(pixels.memory.size, np.float32), np.empty(pixels.memory.size, np.float32)
     _respond(light, 0, 0, steps.width, dn, linlog)
     pixels.filtered[:] = linlog
+    if pixels.photoreceptor.size:
+        pixels.photoreceptor[:] = linlog
     pixels.memory[:] = linlog
     pixels.last_event_us[:] = steps.times_us[0]
 
@@ -136,7 +141,14 @@ def advance(light, pixels, steps, columns):
             filtered, memory = pixels.filtered[first:stop], pixels.memory[first:stop]
             threshold_on, threshold_off = pixels.threshold_on[first:stop], pixels.threshold_off[first:stop]
             _respond(light, steps.first_frame + k, y, w, dn, linlog)
-            if physics.cutoff_hz > 0:
+            if physics.source_follower_hz > 0:
+                photoreceptor = pixels.photoreceptor[first:stop]
+                if physics.cutoff_hz > 0:
+                    _filter(linlog, dn, photoreceptor, 2 * math.pi * physics.cutoff_hz * dt)
+                else:
+                    photoreceptor[:] = linlog
+                _buffer(photoreceptor, filtered, min(1.0, 2 * math.pi * physics.source_follower_hz * dt))
+            elif physics.cutoff_hz > 0:
                 _filter(linlog, dn, filtered, 2 * math.pi * physics.cutoff_hz * dt)
             else:
                 filtered[:] = linlog
@@ -154,7 +166,7 @@ def advance(light, pixels, steps, columns):
     return columns, used
 
 
-@compiled
+@borrowing
 def _filter(linlog, dn, filtered, rate):
     """First-order low-pass whose bandwidth grows with light: rate = 2 pi cutoff dt at full brightness."""
     per_dn = rate / SATURATION
@@ -163,7 +175,14 @@ def _filter(linlog, dn, filtered, rate):
         filtered[j] += share * (linlog[j] - filtered[j])
 
 
-@compiled
+@borrowing
+def _buffer(photoreceptor, filtered, share):
+    """The source follower: a first-order low-pass that closes `share` of the difference in a step."""
+    for j in range(filtered.size):
+        filtered[j] += share * (photoreceptor[j] - filtered[j])
+
+
+@borrowing
 def _leak(memory, threshold_on, leak_factor, noise, dt, physics):
     """The reset switch leaks, so the reference sinks and a dark, motionless scene keeps firing ON events."""
     one, dt, rate, jitter = (
@@ -176,14 +195,14 @@ def _leak(memory, threshold_on, leak_factor, noise, dt, physics):
         memory[j] -= dt * (rate * leak_factor[j] * (one - jitter * noise[j])) * threshold_on[j]
 
 
-@compiled
+@borrowing
 def _flag(filtered, memory, threshold_on, threshold_off, fires):
     for j in range(filtered.size):
         change = (filtered[j] - memory[j]) * NEARLY
         fires[j] = (change >= threshold_on[j]) | (-change >= threshold_off[j])
 
 
-@compiled
+@borrowing
 def _count(pixels, physics, first, stop, y, w, firing, n, most):
     """List the flagged pixels of the strip `first` .. `stop`, with their threshold crossings (negative for OFF).
 
@@ -221,13 +240,12 @@ def _emit(pixels, step, firing, n, most, columns, used):
     Events within the refractory period of their pixel are not consumed: they try again in the next step.
     """
     physics, start_us, stop_us = step.physics, step.start_us, step.stop_us
-    entries, order = firing.entries, firing.order
+    order = firing.order
     refractory = physics.refractory_s > (stop_us - start_us) * 1e-6 / max(most, 1)
     least = np.float32(physics.refractory_s) if refractory else np.float32(-np.inf)
     first = np.float32((start_us + (stop_us - start_us) / max(most, 1)) * 1e-6)
     last = np.float32(stop_us * 1e-6)
     interval = np.float32((last - first) / np.float32(max(most - 1, 1)))
-    since = pixels.refractory_since
     for a in range(n):
         order[a] = a
     active = n
@@ -238,31 +256,43 @@ def _emit(pixels, step, firing, n, most, columns, used):
             first + interval * np.float32(slot - 1) if slot <= most // 2 else last - interval * np.float32(most - slot)
         )
         columns = with_room(columns, used, active + 1)
-        t, x, y, p = columns.t[used:], columns.x[used:], columns.y[used:], columns.p[used:]
-        t_us, written, remaining = np.int64(np.rint(unrounded_us)), 0, 0
-        for a in range(active):  # without branches: an event that is suppressed is overwritten by the next
-            e, at = np.uint64(order[a]), np.uint64(written)
-            i, place, crossed = np.uint64(entries[e, PIXEL]), entries[e, PLACE], entries[e, CROSSED]
-            accepted = np.float32(stamp - since[i]) > least
-            if refractory:
-                since[i] = stamp if accepted else since[i]
-            polarity = np.int32(1) if crossed > 0 else np.int32(-1)
-            t[at], x[at], y[at], p[at] = t_us, place & 0xFFFF, place >> 16, polarity
-            entries[e, ACCEPTED] += polarity if accepted else np.int32(0)
-            if columns.label.size and accepted:
-                columns.label[used + written] = _label(pixels, physics, i, unrounded_us, polarity)
-            if columns.unrounded_us.size:
-                columns.unrounded_us[used + written] = unrounded_us
-            written += int(accepted)
-            order[np.uint64(remaining)] = e
-            remaining += abs(crossed) > slot
+        written, active = _emit_slot(
+            pixels, physics, firing, active, slot, unrounded_us, stamp, least, refractory, columns, used
+        )
         used += written
-        active = remaining
-    _consume(pixels, entries, n)
+    _consume(pixels, firing.entries, n)
     return columns, used
 
 
-@compiled
+@borrowing
+def _emit_slot(pixels, physics, firing, active, slot, unrounded_us, stamp, least, refractory, columns, used):
+    """Append the events of one slot; returns their number, and how many pixels have events left.
+
+    The columns have room for one event more than there are active pixels.
+    """
+    entries, order, since = firing.entries, firing.order, pixels.refractory_since
+    t, x, y, p = columns.t[used:], columns.x[used:], columns.y[used:], columns.p[used:]
+    t_us, written, remaining = np.int64(np.rint(unrounded_us)), 0, 0
+    for a in range(active):  # without branches: an event that is suppressed is overwritten by the next
+        e, at = np.uint64(order[a]), np.uint64(written)
+        i, place, crossed = np.uint64(entries[e, PIXEL]), entries[e, PLACE], entries[e, CROSSED]
+        accepted = np.float32(stamp - since[i]) > least
+        if refractory:
+            since[i] = stamp if accepted else since[i]
+        polarity = np.int32(1) if crossed > 0 else np.int32(-1)
+        t[at], x[at], y[at], p[at] = t_us, place & 0xFFFF, place >> 16, polarity
+        entries[e, ACCEPTED] += polarity if accepted else np.int32(0)
+        if columns.label.size and accepted:
+            columns.label[used + written] = _label(pixels, physics, i, unrounded_us, polarity)
+        if columns.unrounded_us.size:
+            columns.unrounded_us[used + written] = unrounded_us
+        written += int(accepted)
+        order[np.uint64(remaining)] = e
+        remaining += abs(crossed) > slot
+    return written, remaining
+
+
+@borrowing
 def _consume(pixels, entries, n):
     """Move each memory by the thresholds whose events were accepted; the remainder of the change is kept."""
     for a in range(n):
@@ -271,7 +301,7 @@ def _consume(pixels, entries, n):
         pixels.memory[i] += (on if accepted > 0 else off) * np.float32(accepted)
 
 
-@compiled
+@borrowing
 def _label(pixels, physics, i, time_us, polarity):
     """LEAK for an ON event where the leak made up more than half a threshold."""
     leaked = physics.leak_rate_hz * pixels.leak_factor[i] * (time_us - pixels.last_event_us[i]) * 1e-6

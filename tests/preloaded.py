@@ -10,7 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-STAGES = sorted(path.stem for path in (Path(__file__).parents[2] / "stages").glob("[a-z]*.py"))
+STAGES = sorted(path.stem for path in (Path(__file__).parents[1] / "stages").glob("[a-z]*.py"))
 FORKSERVER = multiprocessing.get_context("forkserver")
 FORKSERVER.set_forkserver_preload([*(f"stages.{stage}" for stage in STAGES), "distributed"])
 

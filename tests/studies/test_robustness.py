@@ -1,0 +1,56 @@
+import pytest
+
+from polarnet.benchmark.score import FrameScore
+from studies.robustness import SENSORS, Scores, headlines, settings, sources_of, table_of
+
+ERRORS = {"pale": 0.001, "middle": 0.01, "strong": 0.1}
+DOLP = {"pale": 0.03, "middle": 0.1, "strong": 0.5}
+
+
+def scores(factor: float = 2.0) -> Scores:
+    """Three scenes; the error of `ours` is `factor` times the oracle mean's, that of zeros ten times."""
+    rows = [
+        FrameScore(method, scene, scene, 5, 200_000, times * error, 20.0, 0.5, None, 0.1, 0.1, 0.0, error, None, error)
+        for method, times in (("oracle_mean", 1.0), ("zeros", 10.0), ("ours", factor))
+        for scene, error in ERRORS.items()
+    ]
+    return Scores(rows, DOLP, {})
+
+
+def test_errors_are_given_as_means_as_medians_and_by_the_mean_dolp_of_a_scene():
+    row = table_of(scores())["rows"]["ours"]
+    assert row["mse"] == pytest.approx(2 * sum(ERRORS.values()) / 3)
+    assert row["median_mse"] == pytest.approx(0.02)
+    assert row["mse_over_oracle_mean"] == row["median_over_oracle_mean"] == pytest.approx(2)
+    assert row["mse_by_dolp"] == pytest.approx({"below_0.06": 0.002, "0.06_to_0.2": 0.02, "above_0.2": 0.2})
+
+
+def test_sensors_are_compared_with_the_default_one_and_the_worst_is_named():
+    tables = {"sensors.default": table_of(scores()), "sensors.noisy": table_of(scores(factor=3.0))}
+    sensors = headlines(tables, "ours")["sensors"]
+    assert sensors["noisy"]["mse_over_default"] == pytest.approx(1.5)
+    assert sensors["noisy"]["mse_over_oracle_mean"] == pytest.approx(3)
+    assert sensors["worst_over_default"] == pytest.approx(1.5)
+
+
+def test_measured_scenes_are_compared_with_the_best_row_that_needs_no_truth():
+    rows = table_of(scores())
+    rows["rows"]["ours"]["error_factor"] = 1.2
+    assert headlines({"measured": rows}, "ours")["measured"]["mse_over_best_baseline"] == pytest.approx(0.2)
+
+
+def test_a_folder_with_a_manifest_has_a_source_for_each_repo(tmp_path):
+    folder = tmp_path / "scenes"
+    folder.mkdir()
+    (folder / "manifest.csv").write_text("file,repo\na.npz,one/first\nb.npz,two/second\nc.npz,one/first\n")
+    sources = sources_of(folder, tmp_path)
+    assert {name: sorted(file.name for file in of.iterdir()) for name, of in sources.items()} == {
+        "first": ["a.npz", "c.npz"],
+        "second": ["b.npz"],
+    }
+    assert sources_of(tmp_path, tmp_path) == {tmp_path.name: tmp_path}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_every_sensor_is_a_valid_configuration(name):
+    settings(*SENSORS[name])
