@@ -87,13 +87,10 @@ def with_defects(
     order = _merged_order(columns, hot, defects.silent, width)
     t, x, y, p = (np.concatenate(pair)[order] for pair in zip(columns[:4], hot[:4], strict=True))
     return Columns(
-        t,
-        x,
-        y,
-        p,
+        t, x, y, p,
         np.concatenate([columns.label, hot.label])[order] if labels else columns.label,
         np.concatenate([columns.unrounded_us, hot.unrounded_us])[order] if unrounded_times else columns.unrounded_us,
-    )
+    )  # fmt: skip
 
 
 @compiled
