@@ -63,8 +63,8 @@ SENSORS: dict[str, tuple[str, ...]] = {
     "thresholds_0.1": ("emulate.contrast_threshold_on=0.1", "emulate.contrast_threshold_off=0.1"),
     "thresholds_0.4": ("emulate.contrast_threshold_on=0.4", "emulate.contrast_threshold_off=0.4"),
     "off_1.4_times_on": ("emulate.contrast_threshold_off=0.28",),
-    "mismatch_0.06": ("emulate.contrast_threshold_sigma=0.06",),
-    "mismatch_half": ("emulate.contrast_threshold_sigma=0.1",),  # of a threshold of 0.2
+    "mismatch_0.06": ("emulate.contrast_threshold_sigma_on=0.06", "emulate.contrast_threshold_sigma_off=0.06"),
+    "mismatch_half": ("emulate.contrast_threshold_sigma_on=0.1", "emulate.contrast_threshold_sigma_off=0.1"),
     "slow": ("synthesize.speed_min_px_s=10", "synthesize.speed_max_px_s=40"),
     "fast": (
         "synthesize.speed_min_px_s=160", "synthesize.speed_max_px_s=320", "synthesize.acceleration_max_px_s2=3200",
