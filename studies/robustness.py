@@ -64,9 +64,7 @@ SENSORS: dict[str, tuple[str, ...]] = {
     "thresholds_0.4": ("emulate.contrast_threshold_on=0.4", "emulate.contrast_threshold_off=0.4"),
     "off_1.4_times_on": ("emulate.contrast_threshold_off=0.28",),
     "mismatch_0.06": ("emulate.contrast_threshold_sigma_on=0.06", "emulate.contrast_threshold_sigma_off=0.06"),
-    "mismatch_half": (  # of a threshold of 0.2
-        "emulate.contrast_threshold_sigma_on=0.1", "emulate.contrast_threshold_sigma_off=0.1",
-    ),
+    "mismatch_half": ("emulate.contrast_threshold_sigma_on=0.1", "emulate.contrast_threshold_sigma_off=0.1"),
     "slow": ("synthesize.speed_min_px_s=10", "synthesize.speed_max_px_s=40"),
     "fast": (
         "synthesize.speed_min_px_s=160", "synthesize.speed_max_px_s=320", "synthesize.acceleration_max_px_s2=3200",
@@ -83,7 +81,7 @@ SENSORS: dict[str, tuple[str, ...]] = {
     ),
     "dofp": ("polarizers.layout=dofp", "synthesize.sensor_height=240", "synthesize.sensor_width=360"),
     "saturating_readout": ("readout.max_events_per_s=300000",),  # a sensor fires 500,000 a second on average
-    "randomised": ("sensor=random",),
+    "randomised": ("emulate.randomise=true",),
 }  # fmt: skip
 """Overrides of params.yaml by name; the scenes are the same, at the same places where the sensor has the same size."""
 TIMES: dict[str, tuple[str, ...]] = {"5ms": ("synthesize.frame_rate_hz=200",)}

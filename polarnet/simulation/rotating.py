@@ -164,11 +164,11 @@ def _emulate_part(
     height, width, pitch = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
     for sequence in events.parts[part]:
         record, key = scenes.read(sequence), seed_for(seed, sequence, "rotating")
-        sensor = camera.drawn(seed, sequence).sensor
+        drawn = camera.drawn(seed, sequence)
         scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
         trajectory = Trajectory.from_vector(record.trajectory.numpy())
-        t_us = rotating_times_us(rotating, sensor, 0, record.duration_us)
-        made = emulate_rotating(scene, trajectory, t_us, height, width, rotating, sensor, key, pitch=pitch).events
-        made, _ = read_out(made, camera.readout, key, record.duration_us)
+        t_us = rotating_times_us(rotating, drawn.sensor, 0, record.duration_us)
+        made = emulate_rotating(scene, trajectory, t_us, height, width, rotating, drawn.sensor, key, pitch=pitch).events
+        made, _ = read_out(made, drawn.readout, key, record.duration_us)
         empty = Events.empty(height, width)
-        events.write(sequence, [made, *[empty] * (CHANNELS - 1)], record.duration_us)
+        events.write(sequence, [made, *[empty] * (CHANNELS - 1)], record.duration_us, camera.draws(seed, sequence))
