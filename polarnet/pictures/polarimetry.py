@@ -66,15 +66,16 @@ def read_levels(paths: Sequence[Path]) -> Shaped[np.ndarray, "n h w"]:
 
 
 def levels_at_angles(
-    levels: Shaped[np.ndarray, "n h w"], white: float, mosaic: Mosaic
+    levels: Shaped[np.ndarray, "n h w"], white: float, mosaic: Mosaic | None
 ) -> tuple[Float64[np.ndarray, "4 h2 w2"], Bool[np.ndarray, "4 h2 w2"]]:
     """Intensities at 0, 45, 90 and 135 degrees, and which of them saturate; S0 is 1 at twice the level `white`.
 
-    `levels` are those of four angles, or of one raw mosaic, which is demosaicked.
+    `levels` are those of four angles, or of one raw frame of a `mosaic`, which is demosaicked.
     """
     values = levels.astype(np.float64)
     if len(values) == len(POLARIZER_ANGLES_DEG):
         return values / (2 * white), values >= white
+    assert mosaic is not None
     saturated = demosaic((values[0] >= white).astype(np.float64), mosaic) > 0
     return demosaic(values[0], mosaic) / (2 * white), saturated
 

@@ -13,12 +13,8 @@ from polarnet.simulation.pixels.light import light_of_frames
 from polarnet.simulation.polarizers import (
     IDEAL,
     PolarizersConfig,
-    analyzer_maps,
-    analyzers,
     channel_size,
-    mixed_with_neighbours,
     places_of,
-    split_cells,
 )
 from polarnet.simulation.readout import PERFECT, ReadoutConfig, as_channels, as_one_sensor, read_out
 from polarnet.simulation.rendering import (
@@ -27,6 +23,8 @@ from polarnet.simulation.rendering import (
     lights_of_drift,
     render_intensities,
     render_times_us,
+    split_channels,
+    weights_of,
 )
 from polarnet.simulation.scene import PolarizationScene
 
@@ -53,13 +51,16 @@ def emulate_motion(
     """
     t_us = emulation_times_us(trajectory, duration_us, height, width, config)
     events, _ = emulate_motion_steps(scene, trajectory, t_us, height, width, config, key, None, threads, polarizers)
-    return _read_out(events, polarizers, readout, key, duration_us)
+    return leave_sensors(events, polarizers, readout, key, duration_us)
 
 
-def _read_out(
+def leave_sensors(
     channels: list[Events], polarizers: PolarizersConfig, readout: ReadoutConfig, key: int, duration_us: int
 ) -> list[Events]:
-    """The channels as they leave their sensors: each its own, or all four one DoFP sensor."""
+    """The channels as they leave their sensors: each its own, or all four one DoFP sensor.
+
+    Takes whole sequences, with the `key` and duration of their emulation.
+    """
     if readout.perfect:
         return channels
     if polarizers.layout == "dofp":
@@ -100,7 +101,7 @@ def emulate_motion_steps(
     check_inside(scene, pose, t_us, height, width)
     rows, columns = channel_size(polarizers.layout, height, width)
     eight_bit = MODELS[config.model].EIGHT_BIT_VIDEO
-    weights = analyzers(polarizers) if polarizers.uniform else analyzer_maps(polarizers, height, width, key)
+    weights = weights_of(polarizers, height, width, key)
     advance = functools.partial(
         emulate_lights, height=rows, width=columns, config=config, key=key, channels=CHANNELS, threads=threads
     )
@@ -112,8 +113,7 @@ def emulate_motion_steps(
     for first in range(0, len(t_us), CHUNK):
         chunk = slice(first, first + CHUNK)
         frames = render_intensities(scene, Pose(*(values[chunk] for values in pose)), height, width, weights)
-        if polarizers.layout == "dofp":
-            frames = split_cells(mixed_with_neighbours(frames[0], polarizers.crosstalk), polarizers.mosaic)
+        frames = split_channels(frames, polarizers)
         if eight_bit:
             frames = (frames + np.float32(0.5)).astype(np.uint8)
         lights = [light_of_frames(channel) for channel in frames]
