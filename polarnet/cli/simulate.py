@@ -115,7 +115,8 @@ def _simulate(options: argparse.Namespace) -> int:
     if options.size and min(options.size) < 2:
         raise ValueError(f"--size: expected at least 2 rows and columns, got {options.size[0]} {options.size[1]}")
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
-    clip = open_clip(inputs, ClipOptions(mosaic, options.angles, options.white, options.grey, options.size))
+    size = (options.size[0], options.size[1]) if options.size else None
+    clip = open_clip(inputs, ClipOptions(mosaic, options.angles, options.white, options.grey, size))
     refuse_unused_options(options, clip, len(inputs))
     times = None if clip.still else _times_of(options, clip, inputs[0])
     folder, out = working_folder(), (options.out or working_folder() / "outputs" / "simulate" / clip.name).resolve()
@@ -197,6 +198,7 @@ def _run(
     threads, attributes = threads_of(config.runtime), {**config.camera.sections, "seed": config.seed}
     attributes |= {"input": clip.name, "kind": clip.words, "upsample": upsample, "polarnet": __version__}
     saturation: list[float] = []
+    total: int | None
     if times is None:
         pieces = moving_pieces(_scene(config, clip, saturation), config.synthesize, config.camera, config.seed, threads)
         attributes["synthesize"] = vars(config.synthesize)
@@ -218,12 +220,17 @@ def _run(
         "time": f"{written.run_s:.2f} s, {events / written.run_s:,.0f} events/s",
         "files": ", ".join(written.files),
     }
+    notes = []
+    if clip.count is not None and times is not None and written.frames < clip.count:
+        notes.append(f"the file states {clip.count:,} frames, {written.frames:,} could be read")
+    if not written.polarized:
+        notes.append("the frames are grey, so DoLP is 0 everywhere")
     if saturation and max(saturation) > 0:
-        facts["note"] = (
+        notes.append(
             f"up to {max(saturation):.2%} of a frame's pixels saturate; one saturated angle follows from the others, "
             f"the truth of pixels with more is wrong"
         )
-    return facts
+    return facts | ({"note": "; ".join(notes)} if notes else {})
 
 
 def _scene(config: "Config", clip: "Clip", saturation: list[float]) -> "PolarizationScene":

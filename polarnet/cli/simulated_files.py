@@ -66,6 +66,8 @@ class Written(NamedTuple):
     width: int
     events: tuple[int, ...]
     """Number in each channel."""
+    polarized: bool
+    """Whether any true frame has DoLP above 0."""
     run_s: float
     """Seconds of the simulation, without writing the files."""
     files: list[str]
@@ -88,7 +90,7 @@ def write_simulation(
     """
     started = time.perf_counter()
     truth = AppendedFrames(folder / TRUTH, TRUTH_CONVENTIONS)
-    duration_us, frames = 0, 0
+    duration_us, frames, polarized = 0, 0, False
     with EventSpool(folder / SPOOL) as spool:
         with tqdm(total=total, desc="simulate", unit="frame") as bar:
             for piece in pieces:
@@ -97,7 +99,9 @@ def write_simulation(
                     raise ValueError(f"expected at most {MAX_DURATION_US / 6e7:.0f} minutes, got more; cut the clip")
                 spool.append(piece.events)
                 for t_us, frame in zip(piece.t_us.tolist(), piece.stokes, strict=True):
-                    truth.add(_true_frame(t_us, frame))
+                    values = _true_frame(t_us, frame)
+                    polarized |= bool(values["dolp"].any())
+                    truth.add(values)
                 frames += len(piece.t_us)
                 bar.update(len(piece.t_us))
         truth.flush()
@@ -111,7 +115,7 @@ def write_simulation(
             files += _write_preview(folder, channels, outputs.video_rate_hz, outputs.gamma)
         size, counts = (channels[0].height, channels[0].width), tuple(map(len, channels))
     shutil.rmtree(folder / SPOOL)
-    return Written(duration_us, frames, *size, counts, run_s, [*files, TRUTH])
+    return Written(duration_us, frames, *size, counts, polarized, run_s, [*files, TRUTH])
 
 
 def _true_frame(t_us: int, frame: Float32[Tensor, "3 h w"]) -> dict[str, np.ndarray]:

@@ -133,7 +133,8 @@ def _open_files(groups: Sequence[tuple[Path, ...]], name: str, options: ClipOpti
     first = groups[0][0]
     measured = _extension(first) == "npz" or len(groups[0]) > 1
     if not measured and options.mosaic is None:
-        return _coloured(name, "grey frames" if options.grey else "RGB frames", _from_pictures(groups), options)
+        kind = "photograph" if len(groups) == 1 else "frames"
+        return _coloured(name, f"{'grey' if options.grey else 'RGB'} {kind}", _from_pictures(groups), options)
 
     def levels() -> Iterator[tuple[str, Levels, float | None]]:
         for group in groups:
