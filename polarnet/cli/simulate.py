@@ -49,9 +49,7 @@ def add_to(commands: Commands) -> None:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    simulate.add_argument(
-        "words", nargs="+", metavar="INPUT [KEY=VALUE]", help="input, then values that replace settings"
-    )
+    simulate.add_argument("words", nargs="+", metavar="INPUT", help="input, and after it words KEY=VALUE")
     simulate.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/simulate/NAME)")
     simulate.add_argument(
         "--format", nargs="+", choices=("store", "hdf5", "text", "evt3"), default=["store"],

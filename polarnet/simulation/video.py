@@ -140,7 +140,7 @@ def _truth(frames: Sequence[StokesFrame], rows: int, columns: int) -> Float32[Te
 
 
 def simulate_video(
-    frames: Iterable[Float[Array, "3 h w"] | PolarizationScene],
+    frames: Iterable[Float[Array, "3 _h _w"] | PolarizationScene],
     t_us: Sequence[int],
     sensor: EmulatorConfig | Camera,
     seed: int,
@@ -164,7 +164,7 @@ def simulate_video(
 
 
 def stokes_frames(
-    frames: Iterable[Float[Array, "3 h w"] | PolarizationScene], t_us: Iterable[int]
+    frames: Iterable[Float[Array, "3 _h _w"] | PolarizationScene], t_us: Iterable[int]
 ) -> Iterator[StokesFrame]:
     """Frames with their times; ValueError if there are more or fewer times than frames."""
     for number, (time_us, frame) in enumerate(itertools.zip_longest(t_us, frames)):
