@@ -8,6 +8,8 @@ from polarnet import __version__
 from polarnet.cli import benchmark, networks, project, recordings, sensors, simulate, stores
 from polarnet.runtime.environment import let_threads_sleep
 
+INTERRUPTED = 130  # exit status of shells after Ctrl-C
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; the exit status."""
@@ -18,6 +20,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, FileNotFoundError, RuntimeError) as error:
         print(f"polarnet {options.command}: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print(f"polarnet {options.command}: stopped", file=sys.stderr)
+        return INTERRUPTED
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:

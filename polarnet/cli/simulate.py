@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -126,16 +125,12 @@ def _simulate(options: argparse.Namespace) -> int:
         None if options.no_preview else options.video_rate,
         2.2 if clip.measured else 1.0,
     )
-    try:
-        with run_folder(out, "simulate") as partial:
-            try:
-                facts = _run(config, clip, times, options.upsample, partial, outputs)
-            except BaseException:
-                _remove_files(partial)  # half a simulation is of no use
-                raise
-    except KeyboardInterrupt:
-        print(f"polarnet simulate: stopped; {out} is unchanged", file=sys.stderr)
-        return 130
+    with run_folder(out, "simulate") as partial:
+        try:
+            facts = _run(config, clip, times, options.upsample, partial, outputs)
+        except BaseException:
+            _remove_files(partial)  # half a simulation is of no use
+            raise
     for key, value in facts.items():
         print(f"{key:11s} {value}")
     print(f"folder      {out}")
