@@ -288,6 +288,22 @@ HOUSE_FIGURES = {
 SEVERAL = "Several trainings: mean ± standard deviation."
 
 
+ROBUSTNESS_ROWS = ("zeros", "train_mean", "constant_real", "highpass+gain", "firenet_published+gain", "ours")
+
+
+def _robustness(key: str, form: str) -> Block:
+    """One score of every method, relative to the oracle mean's, on every set of scenes and under every sensor."""
+    return Block(
+        "robustness", "test", "studies.robustness --write",
+        lambda results: [
+            {"name": name, **table, "value": {row: one[key] for row, one in table["rows"].items()}}
+            for name, table in results["test"]["tables"].items()
+        ],
+        {"scenes": "`{name}`", "number": "{scenes}", "mean DoLP": "{mean_dolp:.3f}"}
+        | {f"`{row}`": f"{{value[{row}]:{form}}}" for row in ROBUSTNESS_ROWS},
+    )  # fmt: skip
+
+
 def _sensor_fit(section: str, stimulus: str) -> Block:
     """Truth and estimate of each simulated sensor."""
     pairs = {
@@ -505,6 +521,8 @@ BLOCKS = {
         lambda results: [{"name": name, **one} for name, one in results["house"]["folders"].items()],
         {"folder": "`{name}`", "files": "{files:,}", "lines": "{lines:,}"}, caption="",
     ),
+    "robustness": _robustness("mse_over_oracle_mean", ".2f"),
+    "robustness-median": _robustness("median_over_oracle_mean", ".2f"),
     "sensor-fit": _sensor_fit(
         "sensor_fit",
         "{sensor_fit[static_s]} s of constant light and {sensor_fit[moving_s]:g} s of drifting leaves with "

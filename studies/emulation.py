@@ -13,8 +13,8 @@ its figure for regular frames is printed too.
 The paper's set is made with `python -m stages.ingest`, `stages.synthesize` and `stages.emulate`, with experiment=paper
 on two workers, from the built-in photographs and dead leaves. Minutes are wall-clock time. Peak memory is the largest
 sum over a stage's processes, sampled twice a second; shared pages count once (Linux: proportional set size).
-`--paper-set N` makes about N sequences instead of 1000, and minutes are never scaled. `--paper-set 0` skips the set,
-`--only-paper-set` skips everything else.
+The files of the scene, frame and event stores are counted. `--paper-set N` makes about N sequences instead of 1000, and
+minutes are never scaled. `--paper-set 0` skips the set, `--only-paper-set` skips everything else.
 
 The passed cases of tests/golden are counted. `--write` merges the figures into docs/results/emulation.json.
 """
@@ -54,7 +54,8 @@ STILL = Sine(0.0, 0.0, 0.0)
 DEFAULT = replace(SENSORS["default"], model="v2e")  # v2e's command-line defaults
 NOISELESS = replace(
     DEFAULT,
-    contrast_threshold_sigma=0.0,
+    contrast_threshold_sigma_on=0.0,
+    contrast_threshold_sigma_off=0.0,
     cutoff_hz=0.0,
     leak_rate_hz=0.0,
     shot_noise_rate_hz=0.0,
@@ -67,6 +68,7 @@ MODELS = {
     "dvs_voltmeter": replace(DEFAULT, model="dvs_voltmeter"),
 }
 PAPER_SEQUENCES, PAPER_SEQUENCES_A_PICTURE, PAPER_WORKERS = 1000, 5, 2
+STORES = ("scenes.zarr", "frames.zarr", "events.zarr")  # whose files are counted
 MEMORY_SAMPLES_A_SECOND = 2
 THREADS = (1, 2)
 
@@ -215,6 +217,7 @@ def measure_paper_set(sequences: int) -> dict[str, Any]:
         store = EventStore.open(Path(folder) / "events.zarr")
         events = sum(sum(store.count(sequence)) for sequence in store.sequences)
         stored_mib = sum(file.stat().st_size for file in Path(store.path).rglob("*") if file.is_file()) / 2**20
+        files = sum(file.is_file() for kind in STORES for file in Path(folder, kind).rglob("*"))
     return {
         "sequences": len(store.sequences),
         "sequences_per_picture": PAPER_SEQUENCES_A_PICTURE,
@@ -225,6 +228,7 @@ def measure_paper_set(sequences: int) -> dict[str, Any]:
         "peak_mib": round(peak_mib),
         "events": events,
         "event_store_mib": round(stored_mib),
+        "files": files,
         "load": round(os.getloadavg()[0], 2),
     }
 

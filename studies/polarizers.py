@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 from torch.nn.functional import interpolate
 
-from polarnet.events.stream import Events, merge
+from polarnet.events.mosaic import split_mosaic
+from polarnet.events.stream import Events
 from polarnet.events.streaming import WindowCutter, WindowRule
-from polarnet.recordings.arrangements import split_mosaic
 from polarnet.recordings.polarizers import WINDOW_US, channel_findings, pair_misfits
 from polarnet.simulation import BUILTIN_PHOTOS, MOTIONS, SENSORS, read_rgb, scene_from_polarization, simulate
 from polarnet.simulation.scene import polarization_from_rgb
@@ -49,16 +49,6 @@ class Result(NamedTuple):
     exchanged_45_90: bool
     exchanged_90_135: bool
     """Warnings about the order with these angles exchanged."""
-
-
-def mosaic_of(channels: list[Events], order: tuple[tuple[int, int], tuple[int, int]]) -> Events:
-    """Events of a sensor whose pixels have polarizers in this order, from the light behind each polarizer."""
-    parts = []
-    for index, events in enumerate(channels):
-        row, column = next((r, c) for r in (0, 1) for c in (0, 1) if order[r][c] == 45 * index)
-        own = ((events.y & 1) == row) & ((events.x & 1) == column)
-        parts.append(Events(events.t[own], events.x[own], events.y[own], events.p[own], events.height, events.width))
-    return merge(parts)
 
 
 def result_of(name: str, dolp: float, channels: list[Events], mosaic: bool) -> Result:
@@ -95,7 +85,7 @@ def main() -> None:
                 simulation = simulate(scene_from_polarization(s0, factor * dolp, aolp), motion, config, seed=1)
                 case = f"{photo.path.stem}, {sensor}, x {factor:g}", float(simulation.dolp.mean())
                 results["four channels"].append(result_of(*case, simulation.events, mosaic=False))
-                cells = split_mosaic(mosaic_of(simulation.events, ORDER), ORDER)
+                cells = [split_mosaic(events, ORDER)[number] for number, events in enumerate(simulation.events)]
                 results["mosaic"].append(result_of(*case, cells, mosaic=True))
         print(f"{photo.path.stem} done", flush=True)
     print(

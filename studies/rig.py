@@ -39,8 +39,7 @@ from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.recording import open_recording
-from polarnet.recordings.registration import event_image, register, warped
-from polarnet.reports.recordings import draw_calibration, draw_hot_pixels, draw_registration, recording_picture
+from polarnet.reports.recordings import draw_calibration, draw_hot_pixels, recording_picture
 from polarnet.reports.tables import as_plain, score_table
 from polarnet.runtime.machine import generator_for
 from polarnet.simulation.emulator import EmulatorConfig
@@ -64,8 +63,6 @@ RIG = RigConfig(
     hot_pixels=5,
     file_type="bin",
 )
-SECOND_CAMERA = np.array([[1.01, 0.02, 5.0], [-0.015, 0.99, -4.0], [2e-5, -1e-5, 1.0]])
-"""Homography from the first camera's pixels to those of the one that the pages lay on it."""
 FULL_RIG = replace(RIG, speed_px_s=240.0, picture_rate_hz=100.0)
 
 
@@ -152,12 +149,10 @@ def draw_documentation(
     (found,) = calibrate_targets(scratch / "imported", scratch / "calibrated", recordings, {})
     draw_calibration(found, recordings, pictures / "recordings_calibration.png")
 
-    one, other = (
-        since_landmark(read_event_capture(scratch / "raw" / name / f"{capture}.bin", recordings), capture, found)
-        for capture in EVENT_CAPTURES[:2]
-    )
+    first = EVENT_CAPTURES[0]
+    events = read_event_capture(scratch / "raw" / name / f"{first}.bin", recordings)
     capture = scratch / "events_0.h5"
-    write_hdf5(capture, one, found.duration_us)
+    write_hdf5(capture, since_landmark(events, first, found), found.duration_us)
     assert recordings.hot_pixel_factor is not None
     inspection = inspect_recording(open_recording(capture), recordings.hot_pixel_factor)
     (pictures / "recordings_inspect.png").write_bytes(recording_picture(inspection))
@@ -166,9 +161,6 @@ def draw_documentation(
     lines = [f"$ polarnet inspect {capture.name}", *findings(inspection), f"picture     {capture.name}.png"]
     (ROOT / "docs" / "results" / "inspection.json").write_text(json.dumps({"lines": lines}, indent=2) + "\n")
 
-    reference, moving = event_image(one), warped(event_image(other), SECOND_CAMERA)
-    homography = register(reference, moving).homography
-    draw_registration(reference, moving, warped(moving, homography), pictures / "recordings_registration.png")
     drawn = sorted(pictures.glob("recordings_*.png"))
     for path in drawn:
         path.write_bytes(few_colours(path.read_bytes()))

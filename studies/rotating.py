@@ -167,7 +167,7 @@ def case_of(config: Config, curve: str, value: float) -> Case:
     if curve == "threshold":
         spread = config.modulation.threshold_spread * value
         sensor: Any = {"contrast_threshold_on": value, "contrast_threshold_off": value}
-        sensor["contrast_threshold_sigma"] = spread
+        sensor |= {"contrast_threshold_sigma_on": spread, "contrast_threshold_sigma_off": spread}
         modulation = replace(case.modulation, threshold_on=value, threshold_off=value)
         return case._replace(sensor=replace(case.sensor, **sensor), modulation=modulation)
     if curve == "assumed_threshold":
@@ -183,7 +183,7 @@ def single_cases(config: Config) -> dict[str, Case]:
     """Cases apart from the curves."""
     still = Case(smooth_scene(0), config.rotating, config.emulate, config.modulation)
     noisy = SENSORS["noisy"]
-    spread = noisy.contrast_threshold_sigma / noisy.contrast_threshold_on
+    spread = noisy.contrast_threshold_sigma_on / noisy.contrast_threshold_on
     prior_config = replace(config.modulation, cutoff_hz=noisy.cutoff_hz, threshold_spread=spread)
     return {
         "photograph": still._replace(scene=photograph()),

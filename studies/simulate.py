@@ -22,9 +22,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from polarnet.cli import main as polarnet
+from polarnet.events.mosaic import places_of
 from polarnet.simulation import BUILTIN_PHOTOS, read_rgb, scene_from_rgb
-from polarnet.simulation.polarizers import places_of
-from polarnet.stokes import POLARIZER_ANGLES_DEG, intensities_from_stokes
+from polarnet.stokes import POLARIZER_ANGLES_DEG, intensities_from_stokes, parse_mosaic
 from polarnet.storage.events import EventStore
 from studies.measure import machine_record, uncommitted, write_section
 
@@ -63,7 +63,9 @@ def samples(folder: Path) -> dict[str, list[str]]:
         (folder / name).mkdir()
     angles = clip_of(intensities_from_stokes(scene_from_rgb(rgb).stokes).permute(1, 2, 0).numpy())
     mosaic = np.empty((FRAMES, HEIGHT, WIDTH, 1), np.uint8)
-    for number, (angle, (row, column)) in enumerate(zip(POLARIZER_ANGLES_DEG, places_of(MOSAIC), strict=True)):
+    for number, (angle, (row, column)) in enumerate(
+        zip(POLARIZER_ANGLES_DEG, places_of(parse_mosaic(MOSAIC)), strict=True)
+    ):
         write_video(folder / f"polarized_{angle}.mp4", angles[..., number : number + 1])
         mosaic[:, row::2, column::2, 0] = angles[:, row::2, column::2, number]
         for k, frame in enumerate(angles):

@@ -36,7 +36,7 @@ PHOTO = "coffee.png"
 DURATION_MS = 500
 RATE_HZ = 2000.0  # sampling rate of the light on the pixel
 PIXELS = 12  # number of pixels side by side under the same light, to show their differences
-QUIET = replace(SENSORS["clean"], contrast_threshold_sigma=0.0)
+QUIET = replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
 WINDOW_US = (200_000, 233_333)
 COLOURS = 96  # palette size of a picture on disk
 LINE: dict[str, Any] = {"color": LIGHT.quiet, "linewidth": 1.3}
@@ -62,13 +62,14 @@ SETTINGS: Mapping[str, dict[str, Any]] = {
     "noiseless": {},
     "threshold 0.1": {"contrast_threshold_on": 0.1, "contrast_threshold_off": 0.1},
     "threshold 0.4": {"contrast_threshold_on": 0.4, "contrast_threshold_off": 0.4},
-    "mismatch 0.08": {"contrast_threshold_sigma": 0.08},
+    "mismatch 0.08": {"contrast_threshold_sigma_on": 0.08, "contrast_threshold_sigma_off": 0.08},
     "bandwidth 20 Hz": {"cutoff_hz": 20.0},
     "refractory 20 ms": {"refractory_period_us": 20_000.0},
     "leak 5 Hz": {"leak_rate_hz": 5.0},
     "shot noise 10 Hz": {"shot_noise_rate_hz": 10.0},
     "all of v2e's noise": {
-        "contrast_threshold_sigma": 0.03,
+        "contrast_threshold_sigma_on": 0.03,
+        "contrast_threshold_sigma_off": 0.03,
         "cutoff_hz": 300.0,
         "leak_rate_hz": 0.01,
         "leak_jitter": 0.1,
@@ -115,7 +116,9 @@ def parameters_figure() -> Figure:
             off = "∞ Hz" if variation.name == "cutoff_hz" else f"0{variation.unit}"
             _rows(axes, [f"{value:g}{variation.unit}" if value else off for value in variation.values])
         _light(panels[-1], t_ms, "mismatch 0.05: twelve pixels, one light")
-        events = pixel_events(replace(QUIET, contrast_threshold_sigma=0.05), pixels=PIXELS)
+        events = pixel_events(
+            replace(QUIET, contrast_threshold_sigma_on=0.05, contrast_threshold_sigma_off=0.05), pixels=PIXELS
+        )
         for pixel in range(PIXELS):
             _ticks(panels[-1], _of_pixel(events, pixel), 3 * pixel / PIXELS, 2.4 / PIXELS)
         panels[-1].set_yticks([])

@@ -126,7 +126,8 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     motion = dataclasses.replace(
         config.synthesize, duration_s=0.2, sensor_height=18, sensor_width=24, acceleration_max_px_s2=4000.0
     )
-    sensor = dataclasses.replace(config.emulate, randomise=True, random_shot_noise_rate_hz=[20.0, 40.0])
+    ranges = {"contrast_threshold_on": [0.08, 0.31], "cutoff_hz": [30.0, 300.0], "shot_noise_rate_hz": [20.0, 40.0]}
+    sensor = dataclasses.replace(config.emulate, randomise=ranges)
     camera = Camera(sensor)
     splits = {"a-0": "train", "b-0": "train", "c-0": "train", "d-0": "val"}
     window, t_us = (motion.sensor_height, motion.sensor_width), frame_times_us(motion)

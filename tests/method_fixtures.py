@@ -8,6 +8,7 @@ from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import Events
 from polarnet.methods import METHODS
 from polarnet.methods.complementary_filter import FilterConfig
+from polarnet.methods.half_turns import HalfTurnsConfig
 from polarnet.methods.method import Setup
 from polarnet.methods.postprocessing import PostprocessingConfig
 from polarnet.methods.stokes_gain import GainConfig
@@ -31,6 +32,7 @@ NETWORK = {
 SECTIONS = {
     "cf": FilterConfig(0.5, 0.0, 0.1, -0.1, [-0.1, 1.2]),
     "highpass": FilterConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5]),
+    "rotating_polarizer": HalfTurnsConfig(0.2, 0.2, 300.0, 60.0, 0.01, 0.1, 5, 1.3, 0.0026),
 }
 
 
@@ -56,6 +58,7 @@ def make_sequence():
             dolp,
             3.1 * torch.rand(windows, HEIGHT, WIDTH, generator=generator),
             s0,
+            rotating=random_events(torch.Generator().manual_seed(1 + seed), windows, 4000),
         )
 
     return make
@@ -100,6 +103,8 @@ def make_setup(checkpoints):
             "gain": GainConfig(10, 5, 20_000, 0.1, 0.0),
             "device": torch.device("cpu"),
             "precision": "fp32",
+            "rotation_hz": 500.0,
+            "start_angle": 0.0,
         }
         return Setup(**{**values, **changes})
 

@@ -12,6 +12,17 @@ MODEL_ALONE = {"esim_log_eps": ("esim", "esim_gpu"), "voltmeter_camera": ("dvs_v
 """Parameters that exist only in the pixel models listed."""
 
 
+RANGES_BEFORE = {
+    "random_threshold_on": ("contrast_threshold_on",),
+    "random_threshold_off": ("contrast_threshold_off",),
+    "random_threshold_sigma": ("contrast_threshold_sigma_on", "contrast_threshold_sigma_off"),
+    "random_cutoff_hz": ("cutoff_hz",),
+    "random_leak_rate_hz": ("leak_rate_hz",),
+    "random_shot_noise_rate_hz": ("shot_noise_rate_hz",),
+}
+"""Parameters whose range older checkpoints record under a key of its own."""
+
+
 class Conditions(NamedTuple):
     """The sections `synthesize` and `emulate` that sequences were made with; unknown keys are absent."""
 
@@ -24,8 +35,8 @@ class Conditions(NamedTuple):
         emulate = {
             key: value
             for key, value in self.emulate.items()
-            if (self.emulate["randomise"] or not key.startswith("random_"))
-            and (key not in MODEL_ALONE or self.emulate["model"] in MODEL_ALONE[key])
+            if (key not in MODEL_ALONE or self.emulate["model"] in MODEL_ALONE[key])
+            and key not in (self.emulate["randomise"] or {})
         }
         keyed = {f"synthesize.{key}": value for key, value in self.synthesize.items()}
         keyed |= {f"emulate.{key}": value for key, value in emulate.items()}
@@ -40,7 +51,25 @@ def configured(synthesize: SynthesizeConfig, emulate: EmulatorConfig) -> Conditi
 def stored(attributes: Mapping[str, Any], height: int, width: int) -> Conditions:
     """Conditions from the attributes of an event store; only the size if its events were not simulated."""
     size = {"sensor_height": height, "sensor_width": width}
-    return Conditions(attributes.get("scenes", {}).get("synthesize", {}) | size, attributes.get("emulate", {}))
+    return Conditions(
+        attributes.get("scenes", {}).get("synthesize", {}) | size, _as_today(attributes.get("emulate", {}))
+    )
+
+
+def _as_today(emulate: Mapping[str, Any]) -> dict[str, Any]:
+    """Section `emulate` by today's keys.
+
+    Checkpoints trained before ON and OFF deviations were separate have one for both, a range for each of six parameters
+    beside the switch `randomise`, and no defective pixels.
+    """
+    section = {key: value for key, value in emulate.items() if not key.startswith("random_")}
+    if "contrast_threshold_sigma" in section:
+        sigma = section.pop("contrast_threshold_sigma")
+        section |= {"contrast_threshold_sigma_on": sigma, "contrast_threshold_sigma_off": sigma}
+        section |= {"contrast_threshold_correlation": 0.0, "hot_pixel_share": 0.0, "dead_pixel_share": 0.0}
+        ranges = {new: emulate[old] for old, news in RANGES_BEFORE.items() for new in news}
+        section["randomise"] = ranges if emulate["randomise"] else None
+    return section
 
 
 def trained_on(metadata: Mapping[str, Any]) -> Conditions | None:
@@ -63,13 +92,14 @@ def sentence(conditions: Conditions) -> str:
     if sensor["model"] == "dvs_voltmeter":
         return f"{text} with the constants of {sensor['voltmeter_camera']}."
     if sensor["randomise"]:
-        return f"{text}, its parameters drawn for each sequence (emulate.randomise)."
+        return f"{text}, {', '.join(sensor['randomise'])} drawn for each sequence (emulate.randomise)."
     on, off = sensor["contrast_threshold_on"], sensor["contrast_threshold_off"]
     text += f", contrast thresholds {on:g} (ON) and {off:g} (OFF)"
     if sensor["model"] not in MODEL_ALONE["esim_log_eps"]:
         cutoff = f"{sensor['cutoff_hz']:g} Hz" if sensor["cutoff_hz"] else "none"
         text += (
-            f", mismatch {sensor['contrast_threshold_sigma']:g}, cutoff {cutoff}, leak {sensor['leak_rate_hz']:g} Hz, "
+            f", mismatch {sensor['contrast_threshold_sigma_on']:g} (ON) and "
+            f"{sensor['contrast_threshold_sigma_off']:g} (OFF), cutoff {cutoff}, leak {sensor['leak_rate_hz']:g} Hz, "
             f"shot noise {sensor['shot_noise_rate_hz']:g} Hz"
         )
     return f"{text}, refractory period {sensor['refractory_period_us']:g} us."
@@ -109,4 +139,6 @@ def _printed(value: Any) -> str:
     """A value in the syntax of Hydra's command line."""
     if isinstance(value, list):
         return f"[{','.join(map(_printed, value))}]"
+    if isinstance(value, dict):
+        return f"{{{','.join(f'{key}:{_printed(one)}' for key, one in value.items())}}}"
     return {True: "true", False: "false"}[value] if isinstance(value, bool) else "null" if value is None else str(value)

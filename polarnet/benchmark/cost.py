@@ -66,6 +66,7 @@ def first_windows(sequence: TestSequence, count: int) -> TestSequence:
         aolp=sequence.aolp[:count],
         s0=sequence.s0[:count],
         valid=None if sequence.valid is None else sequence.valid[:count],
+        rotating=None if sequence.rotating is None else slice_time(sequence.rotating, 0, end_us),
     )
 
 

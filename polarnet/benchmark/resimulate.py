@@ -11,7 +11,6 @@ from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import Events
 from polarnet.runtime.machine import generator_for, seed_for
 from polarnet.simulation.camera import Camera
-from polarnet.simulation.emulator import randomised
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.polarizers import grid
@@ -54,10 +53,7 @@ def resimulated(
         )
         trajectory = random_trajectory(quicker, scene.height, scene.width, generator_for(seed, sequence, "motion"))
     t_us = torch.tensor(frame_times_us(motion))
-    drawn = [
-        dataclasses.replace(camera, sensor=randomised(camera.sensor, generator_for(seed, sequence, "sensor")))
-        for camera in cameras
-    ]
+    drawn = [camera.drawn(seed, sequence) for camera in cameras]
     distinct = [camera for i, camera in enumerate(drawn) if camera not in drawn[:i]]
     size, key = (scenes.sensor_height, scenes.sensor_width), seed_for(seed, sequence, "emulate")
     channels = [

@@ -53,7 +53,6 @@ class Context:
 @torch.no_grad()
 def predictions_of(names: Sequence[str], sequence: TestSequence, context: Context) -> dict[str, Prediction]:
     """Prediction by row, one frame per window, on the CPU; NAME and NAME+gain share one run over the events."""
-    windows = sequence.windows
     predictions: dict[str, Prediction] = {}
     for name in sorted(names, key=lambda name: name in METHODS and METHODS[name].wraps is not None):
         if name in REFERENCES:
@@ -64,7 +63,7 @@ def predictions_of(names: Sequence[str], sequence: TestSequence, context: Contex
             _, prediction = method.convert(context.setup_of(method), None, predictions[method.wraps.name])
             predictions[name] = clamped(prediction)
         else:
-            predictions[name] = run(opened(method, context), windows)
+            predictions[name] = run(opened(method, context), sequence.windows_for(method.rotating))
     return {name: each_map(predictions[name]._replace(stokes=None, intensities=None), Tensor.cpu) for name in names}
 
 

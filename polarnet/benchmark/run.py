@@ -64,6 +64,8 @@ class BenchmarkSet:
     name: str
     events: EventStore
     frames: FrameStore
+    rotating: EventStore | None = None
+    """Events of one camera behind a rotating polarizer, in the first channel; None: no row needs them."""
 
     @property
     def sequences(self) -> list[str]:
@@ -86,7 +88,9 @@ class BenchmarkSet:
         events = self.events.read(name)
         scene = self.scene_of(name)
         valid = None if truth.valid is None else truth.valid[1:]
-        return TestSequence(name, scene, events, truth.t_us, truth.dolp[1:], truth.aolp[1:], i0 + i90, valid)
+        rotating = None if self.rotating is None else self.rotating.read(name)[0]
+        s0 = i0 + i90
+        return TestSequence(name, scene, events, truth.t_us, truth.dolp[1:], truth.aolp[1:], s0, valid, rotating)
 
 
 def train_mean_dolp(frames: FrameStore, warmup_windows: int) -> float:

@@ -42,7 +42,7 @@ def cameras(setting: str, value: float, camera: Camera) -> list[Camera]:
 
 def _sensors(setting: str, value: float, emulate: EmulatorConfig) -> list[EmulatorConfig]:
     if setting == "threshold_mismatch":
-        return [dataclasses.replace(emulate, contrast_threshold_sigma=value)] * 4
+        return [dataclasses.replace(emulate, contrast_threshold_sigma_on=value, contrast_threshold_sigma_off=value)] * 4
     if setting == "noise_rate_hz":
         return [dataclasses.replace(emulate, shot_noise_rate_hz=value)] * 4
     if setting == "channel_error":
@@ -85,7 +85,15 @@ def sensitivity(
         for sequence in sequences:
             speed = value if setting == "speed" else 1.0
             try:
-                test = resimulated(scenes, sequence, motion, cameras(setting, value, camera), seed, speed, threads)
+                test = resimulated(
+                    scenes,
+                    sequence,
+                    motion,
+                    cameras(setting, value, camera.drawn(seed, sequence)),
+                    seed,
+                    speed,
+                    threads,
+                )
             except ValueError as error:
                 if setting != "speed":
                     raise

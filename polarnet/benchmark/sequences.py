@@ -31,11 +31,30 @@ class TestSequence:
     s0: Float[Tensor, "n h w"]
     valid: Bool[Tensor, "n h w"] | None = None
     """Pixels with known truth, which are scored; None: all pixels."""
+    rotating: Events | None = None
+    """Events of one camera behind a rotating polarizer that moves like the four channels; None: not simulated."""
 
     @property
     def windows(self) -> list[EventWindow]:
         """Windows between consecutive frames, half-open: each includes its start and excludes its end."""
+        return self._windows(self.events)
+
+    def windows_for(self, rotating: bool) -> list[EventWindow]:
+        """The same windows of the four channels, or of the camera behind a rotating polarizer.
+
+        ValueError if the latter was not simulated.
+        """
+        if not rotating:
+            return self.windows
+        if self.rotating is None:
+            raise ValueError(
+                f"{self.name}: there are no events of a camera behind a rotating polarizer; {NOT_ROTATING}"
+            )
+        empty = Events.empty(self.rotating.height, self.rotating.width)
+        return self._windows([self.rotating, *[empty] * (len(self.events) - 1)])
+
+    def _windows(self, channels: Sequence[Events]) -> list[EventWindow]:
         return [
-            EventWindow([slice_time(events, start, stop) for events in self.events], start, stop)
+            EventWindow([slice_time(events, start, stop) for events in channels], start, stop)
             for start, stop in windows_of(self.t_us)
         ]

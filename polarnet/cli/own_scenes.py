@@ -1,6 +1,7 @@
 """The benchmark on a user's own folder of photographs or measured polarization, without training."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,14 @@ from polarnet.benchmark.rows import available, metadata_used, weights_used
 from polarnet.benchmark.run import run_benchmark, train_mean_dolp
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, with_lpips
-from polarnet.methods import METHODS
+from polarnet.methods import METHODS, is_rotating
 from polarnet.metrics.lpips import NO_RECORD
 from polarnet.metrics.lpips_weights import find_weights
 from polarnet.metrics.similarity import Lpips
 from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest
 from polarnet.reports.page import write_set_page
+from polarnet.simulation.rotating import emulate_rotating_scenes
 from polarnet.simulation.sets import make_folder_set
 from polarnet.simulation.truth import motions_of
 from polarnet.storage.frames import FrameStore
@@ -55,7 +57,8 @@ def benchmark_folder(
         raise ValueError(f"--scenes {root}: no scene to score. {error}") from error
     notes = [*_skipped(config, work), *(_left_out(row, reason) for row, reason in left_out.items())]
     settings = dataclasses.replace(config.benchmark, methods=methods)
-    test_set = made_set(root.resolve().name, work)
+    rotating = _rotating_events(config, work) if any(map(is_rotating, methods)) else None
+    test_set = made_set(root.resolve().name, work, rotating)
     benchmark = run_benchmark(test_set, context, settings, lpips, config.mapper("benchmark"))
     about = {
         "set": test_set.name,
@@ -68,6 +71,15 @@ def benchmark_folder(
     metrics = write_benchmark(out, benchmark, settings, config.seed, about)
     write_set_page(out, test_set.name, command, [*conditions["warnings"], *notes])
     return metrics, notes
+
+
+def _rotating_events(config: Config, work: Path) -> Path:
+    """Emulate the scenes behind a rotating polarizer, anew in each run because its settings may have changed."""
+    events = work / "rotating.zarr"
+    shutil.rmtree(events, ignore_errors=True)
+    mapper = config.mapper("emulate_rotating")
+    emulate_rotating_scenes(work / "scenes.zarr", events, config.rotating, config.camera, config.seed, mapper)
+    return events
 
 
 def _skipped(config: Config, work: Path) -> list[str]:

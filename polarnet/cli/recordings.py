@@ -1,8 +1,7 @@
-"""Commands for recordings: inspect, register, recover DoLP, replay."""
+"""Commands for recordings: inspect, recover DoLP, replay."""
 
 import argparse
 import functools
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ OPTIONS_BY_INPUT = {
 
 
 def add_to(commands: Commands) -> None:
-    """Add the commands inspect, register, recover and replay."""
+    """Add the commands inspect, recover and replay."""
     _add_inspection(commands)
     _add_recovery(commands)
 
@@ -37,7 +36,7 @@ def _add_inspection(commands: Commands) -> None:
         "inspect",
         help="summarise a camera's file and draw its busiest moment",
         description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
-        "camera's file, and draws its busiest moment as a PNG.",
+        "camera's file, with signs of a readout at its limit, and draws its busiest moment as a PNG.",
     )
     inspect.add_argument("file", type=Path, help="file of a camera, or an event store with --part")
     add_reading(inspect)
@@ -53,20 +52,6 @@ def _add_inspection(commands: Commands) -> None:
         "--hot-pixels", type=Path, metavar="PNG", help="PNG of the number of events of each pixel (default: not drawn)"
     )
     inspect.set_defaults(run=_inspect)
-
-    register = commands.add_parser(
-        "register",
-        help="estimate the homography between the recordings of two cameras",
-        description="Prints the homography that maps pixels of REFERENCE to pixels of FILE, as JSON, with the "
-        "correlation of the edges of both recordings.",
-    )
-    register.add_argument("reference", type=Path, help="recording of the first camera")
-    register.add_argument("file", type=Path, help="recording of the second camera, of the same scene")
-    add_reading(register)
-    register.add_argument(
-        "--picture", type=Path, help="PNG of both event images, before and after (default: not drawn)"
-    )
-    register.set_defaults(run=_register)
 
 
 def add_reading(command: argparse.ArgumentParser) -> None:
@@ -160,7 +145,7 @@ def _add_recovery(commands: Commands) -> None:
         description="Prints the events of a stored sequence at the pace of the recording. Pipe them into "
         "`polarnet recover - --live` to try live recovery without a camera.",
     )
-    replay.add_argument("store", help="event store: folder, zip or fsspec URL")
+    replay.add_argument("store", help="event store: folder or fsspec URL")
     replay.add_argument("sequence", help="name of the sequence")
     replay.add_argument("--speed", type=float, default=1.0, help="speed relative to the recording (default: 1)")
     replay.set_defaults(run=_replay)
@@ -184,27 +169,6 @@ def _inspect(options: argparse.Namespace) -> int:
 
         draw_hot_pixels(inspection.counts, inspection.hot, options.hot_pixels)
         print(f"hot pixels  {options.hot_pixels}")
-    return 0
-
-
-def _register(options: argparse.Namespace) -> int:
-    from polarnet.recordings.recording import read_recording
-    from polarnet.recordings.registration import UNRELATED, event_image, register, warped
-    from polarnet.reports.recordings import draw_registration
-
-    files = options.reference, options.file
-    reference, moving = (event_image(read_recording(path, **_reading(options)).events) for path in files)
-    registration = register(reference, moving)
-    print(json.dumps({**registration._asdict(), "homography": registration.homography.tolist()}, indent=2))
-    if registration.edge_correlation < UNRELATED:
-        print(
-            f"polarnet register: warning: do not use this homography: the edges of the two recordings do not match "
-            f"(correlation {registration.edge_correlation:.2f}, expected at least {UNRELATED:g}). The recordings show "
-            f"different scenes, have too few edges, or come from cameras too far apart",
-            file=sys.stderr,
-        )
-    if options.picture:
-        draw_registration(reference, moving, warped(moving, registration.homography), options.picture)
     return 0
 
 
@@ -316,7 +280,7 @@ def refuse_unused_options(options: argparse.Namespace) -> None:
         kind = "one file with --rotating or --triggers"
     elif options.mosaic is not None:
         kind = "one file with --mosaic"
-    elif Path(options.input[0]).is_dir() or Path(options.input[0]).suffix == ".zip":
+    elif Path(options.input[0]).is_dir():
         kind = "an event store or a folder"
     else:
         return  # reading the input will name the missing option

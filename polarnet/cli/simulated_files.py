@@ -14,13 +14,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from polarnet import stokes
+from polarnet.events.mosaic import join_mosaic
 from polarnet.events.stream import Events, slice_time
 from polarnet.reports.maps import encode_png
 from polarnet.reports.preview import Preview
 from polarnet.reports.videos import open_video
 from polarnet.simulation.moving_sensor import leave_sensors
-from polarnet.simulation.polarizers import places_of
-from polarnet.simulation.readout import as_one_sensor
 from polarnet.simulation.video import Drawn, Piece
 from polarnet.storage.appended import FRAMES_PER_CHUNK, AppendedFrames
 from polarnet.storage.events import MAX_DURATION_US, EventStore
@@ -149,7 +148,7 @@ def _write_events(
             files.append(EVENTS)
             bar.update()
         if polarizers.layout == "dofp" and others:
-            sensors = {"sensor": as_one_sensor(channels, places_of(polarizers.mosaic))}
+            sensors = {"sensor": join_mosaic(channels, stokes.parse_mosaic(polarizers.mosaic))}
         else:
             angles = stokes.POLARIZER_ANGLES_DEG
             sensors = {f"polarizer_{a:03d}": events for a, events in zip(angles, channels, strict=True)}

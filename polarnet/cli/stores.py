@@ -10,11 +10,11 @@ from polarnet.cli.parsers import Commands
 def add_to(commands: Commands) -> None:
     """Add the commands verify and export."""
     verify = commands.add_parser("verify", help="check every byte of a store of events, frames or scenes")
-    verify.add_argument("store", help="store: folder, zip or fsspec URL")
+    verify.add_argument("store", help="store: folder or fsspec URL")
     verify.set_defaults(run=_verify)
 
     export = commands.add_parser("export", help="export an event store to files for other tools")
-    export.add_argument("store", help="event store: folder, zip or fsspec URL")
+    export.add_argument("store", help="event store: folder or fsspec URL")
     export.add_argument("folder", type=Path, help="output folder; one file for each sequence and channel")
     export.add_argument(
         "--format",

@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedSeq
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from polarnet.runtime.files import replaced
+
+MAPPINGS = ("randomise",)
+"""Keys whose value is a whole mapping; a preset replaces it."""
 
 BASE = {"experiment": "demo", "sensor": "default", "polarizers": "ideal"}
 """Base preset of each group (a folder of conf/).
@@ -76,15 +79,19 @@ def write_preset(root: Path, name: str) -> list[str]:
             raise ValueError(f"{group} {name!r} sets {key}, which params.yaml does not have")
         if node[last] != value:
             changed.append(f"{key}: {node[last]} -> {value}")
-            node[last] = _in_a_line(value) if isinstance(value, list) else value
+            node[last] = _in_style(value)
     with replaced(path) as temporary:
         yaml.dump(params, temporary)
     return changed
 
 
-def _in_a_line(values: list[Any]) -> CommentedSeq:
-    """A list in flow style, such as [1, 2], like all lists in params.yaml."""
-    line = CommentedSeq(values)
+def _in_style(value: Any) -> Any:
+    """Lists in flow style, such as [1, 2], as everywhere in params.yaml; also those in a mapping."""
+    if isinstance(value, dict):
+        return CommentedMap({key: _in_style(one) for key, one in value.items()})
+    if not isinstance(value, list):
+        return value
+    line = CommentedSeq(value)
     line.fa.set_flow_style()
     return line
 
@@ -92,7 +99,7 @@ def _in_a_line(values: list[Any]) -> CommentedSeq:
 def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for key, value in values.items():
-        if isinstance(value, dict):
+        if isinstance(value, dict) and key not in MAPPINGS:
             flat |= _flat(value, f"{prefix}{key}.")
         else:
             flat[f"{prefix}{key}"] = value

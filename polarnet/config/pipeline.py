@@ -1,6 +1,7 @@
 """The benchmark of a configuration: the inputs of the methods, the test sets, and running rows on them."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from polarnet.benchmark.row_results import RowRecord, write_row
 from polarnet.benchmark.rows import Context, available, weights_used
 from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp
 from polarnet.config.tree import Config, or_exit
-from polarnet.methods import METHODS
+from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup
 from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.machine import device_of
@@ -45,21 +46,31 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
         gain=config.baselines.gain,
         device=device_of(config.runtime),
         precision=config.benchmark.precision,
+        rotation_hz=config.rotating.rate_hz,
+        start_angle=math.radians(config.rotating.start_angle_deg),
     )
 
 
-def pipeline_set(config: Config, name: str) -> BenchmarkSet:
-    """Open a test set that the pipeline made: one of `benchmark.sets`, or `RECORDINGS`."""
+def pipeline_set(config: Config, name: str, rows: Sequence[str] = ()) -> BenchmarkSet:
+    """Open a test set that the pipeline made, with what `rows` need: one of `benchmark.sets`, or `RECORDINGS`."""
     if name == RECORDINGS:
         return made_set(RECORDINGS, Path(config.paths.calibrated))
+    rotating = Path(config.paths.rotating) / f"{name}.zarr" if any(map(is_rotating, rows)) else None
     if name == "simulated":
-        return BenchmarkSet(name, EventStore.open(config.paths.events), FrameStore.open(config.paths.frames))
-    return made_set(name, Path(config.paths.sets) / name)
+        events, frames = EventStore.open(config.paths.events), FrameStore.open(config.paths.frames)
+        return BenchmarkSet(name, events, frames, None if rotating is None else EventStore.open(rotating))
+    return made_set(name, Path(config.paths.sets) / name, rotating)
 
 
-def made_set(name: str, folder: Path) -> BenchmarkSet:
-    """Open a test set that `polarnet.simulation.sets` made in `folder`."""
-    return BenchmarkSet(name, EventStore.open(folder / "events.zarr"), FrameStore.open(folder / "frames.zarr"))
+def made_set(name: str, folder: Path, rotating: Path | None = None) -> BenchmarkSet:
+    """Open a test set that `polarnet.simulation.sets` made in `folder`, and its events behind a rotating polarizer."""
+    events, frames = EventStore.open(folder / "events.zarr"), FrameStore.open(folder / "frames.zarr")
+    return BenchmarkSet(name, events, frames, None if rotating is None else EventStore.open(rotating))
+
+
+def rows_of_set(name: str, rows: Sequence[str]) -> list[str]:
+    """The rows that a test set can score: real targets were recorded by four channels."""
+    return [row for row in rows if name != RECORDINGS or not is_rotating(row)]
 
 
 def set_folder(config: Config, name: str) -> Path:
@@ -92,13 +103,14 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
     if not methods:
         return
     lpips = or_exit(lambda: lpips_of(config))
-    settings = dataclasses.replace(config.benchmark, methods=methods)
-    results = {
-        name: run_benchmark(pipeline_set(config, name), context, settings, lpips, config.mapper(name))
-        for name in set_names(config)
-    }
+    results = {}
+    for name in set_names(config):
+        if here := rows_of_set(name, methods):
+            test_set, settings = pipeline_set(config, name, here), dataclasses.replace(config.benchmark, methods=here)
+            results[name] = run_benchmark(test_set, context, settings, lpips, config.mapper(name))
     for row in methods:
-        write_row(row_folder(config, row), row, RowRecord(None, weights_used([row], context)), results)
+        own = {name: benchmark for name, benchmark in results.items() if row in benchmark.costs}
+        write_row(row_folder(config, row), row, RowRecord(None, weights_used([row], context)), own)
 
 
 def lpips_of(config: Config) -> Lpips | None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.row_results import read_record, read_rows
-from polarnet.config.pipeline import row_folder, set_folder, set_names, train_mean_of
+from polarnet.config.pipeline import row_folder, rows_of_set, set_folder, set_names, train_mean_of
 from polarnet.config.tree import Config
 from polarnet.metrics.lpips import NO_RECORD, stored_record
 
@@ -24,9 +24,8 @@ def collect_rows(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
     if not folders:
         reasons = "; ".join(f"{row}: {reason}" for row, reason in left_out.items())
         raise ValueError(f"benchmark.methods: expected at least one row that can run, got none ({reasons})")
-    settings = dataclasses.replace(config.benchmark, methods=list(folders))
     about = {
-        "lpips": stored_record(config.paths.weights, "benchmark") if settings.lpips else NO_RECORD,
+        "lpips": stored_record(config.paths.weights, "benchmark") if config.benchmark.lpips else NO_RECORD,
         "train_mean": train_mean_of(config),
         "left_out": left_out,
         "weights": {section: file for record in records.values() for section, file in record.weights.items()},
@@ -34,9 +33,9 @@ def collect_rows(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
     }
     shutil.rmtree(Path(config.paths.benchmark) / "sets", ignore_errors=True)  # an earlier run may have had other sets
     (Path(config.paths.benchmark) / "sets").mkdir(parents=True)
-    return {
-        name: write_benchmark(
-            set_folder(config, name), read_rows(folders, name), settings, config.seed, {"set": name, **about}
-        )
-        for name in set_names(config)
-    }
+    tables = {}
+    for name in set_names(config):
+        here = {row: folders[row] for row in rows_of_set(name, list(folders))}
+        settings, of_set = dataclasses.replace(config.benchmark, methods=list(here)), {"set": name, **about}
+        tables[name] = write_benchmark(set_folder(config, name), read_rows(here, name), settings, config.seed, of_set)
+    return tables

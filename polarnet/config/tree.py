@@ -109,6 +109,7 @@ class Paths:
     weights: str
     train: str
     sets: str
+    rotating: str
     benchmark: str
     report: str
     imported: str

@@ -28,6 +28,11 @@ METHODS = _assembled()
 """Method by name, in the order of all tables and figures."""
 
 
+def is_rotating(row: str) -> bool:
+    """Whether a row sees one camera behind a rotating polarizer instead of four channels."""
+    return row in METHODS and METHODS[row].rotating
+
+
 def module_of(method: str) -> str:
     """Full name of the module whose `METHODS` holds the record of a method."""
     return next(

@@ -45,6 +45,10 @@ class Setup:
     device: torch.device
     precision: str
     """Precision of networks: fp32, or bf16 autocast."""
+    rotation_hz: float
+    """Turns per second of the polarizer, for methods of one camera behind a rotating polarizer."""
+    start_angle: float
+    """Its angle at time 0, radians."""
 
     def __hash__(self) -> int:
         return hash((self.weights, self.device, self.precision))  # settings may be lists, which have no hash
@@ -108,6 +112,8 @@ class Method:
     """Class of the section `methods.NAME`; None: no section."""
     weights: Weights | None = None
     """Weights that the method needs; None: no weights."""
+    rotating: bool = False
+    """Whether the method needs the events of one camera behind a rotating polarizer instead of four channels."""
     reconstructs: bool = False
     """Whether DoLP is computed from reconstructed intensities, held by `Prediction.intensities`."""
     about: str = ""

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from polarnet.events.representations import REPRESENTATIONS, channels_of
+from polarnet.runtime.extras import installation
 from polarnet.runtime.files import replaced
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
 
@@ -192,7 +193,7 @@ def _check_packages() -> None:
     """RuntimeError if a package of the extra `export` is missing."""
     for name in ("onnx", "onnxruntime", "onnxscript"):
         if importlib.util.find_spec(name) is None:
-            raise RuntimeError(f"ONNX files need {name}: run pip install -e '.[export]' in the clone")
+            raise RuntimeError(f"ONNX files need {name}: {installation('export')}")
 
 
 @contextlib.contextmanager

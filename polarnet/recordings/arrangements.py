@@ -9,13 +9,11 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
-from jaxtyping import Float64
 
+from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import Events, slice_count
 from polarnet.recordings.recording import Recording, read_recording
-from polarnet.recordings.registration import warp_events
 from polarnet.recordings.source import RecordingError
 from polarnet.runtime.files import sha256
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
@@ -25,57 +23,27 @@ from polarnet.storage.events import EventStore
 def read_four(
     files: Mapping[int, str | os.PathLike[str]],
     start_us: Mapping[int, int] | None = None,
-    homographies: Mapping[int, Float64[np.ndarray, "3 3"]] | None = None,
     read: Callable[[Path], Recording] = read_recording,
 ) -> list[Events]:
     """The four channels, in the order 0, 45, 90, 135 degrees, from files keyed by polarizer angle.
 
     Angles are in degrees, of any half turn. `start_us` gives the start of the common clock in each file's own clock;
-    earlier events are left out. Without it the files share one clock, which starts with the first event of all.
-    `homographies` map cameras to the reference (`polarnet.recordings.registration`). `read` replaces `read_recording`
-    where a file needs options. RecordingError where an angle is missing or duplicated, or where the sensor sizes
-    differ.
+    earlier events are left out. Without it the files share one clock, which starts with the first event of all. `read`
+    replaces `read_recording` where a file needs options. RecordingError where an angle is missing or duplicated, or
+    where the sensor sizes differ.
     """
     by_angle = {angle % 180: angle for angle in files}
     if sorted(by_angle) != list(POLARIZER_ANGLES_DEG) or len(by_angle) != len(files):
         raise RecordingError(f"expected one file for each of 0, 45, 90 and 135 degrees, got {sorted(files)}")
     if start_us is not None and set(start_us) != set(files):
         raise RecordingError(f"expected a start for each of the angles {sorted(files)}, got {sorted(start_us)}")
-    channels = []
-    for angle in POLARIZER_ANGLES_DEG:
-        key = by_angle[angle]
-        events = read(Path(files[key])).events
-        if homographies is not None and key in homographies:
-            events = warp_events(events, homographies[key])
-        channels.append(events)
+    channels = [read(Path(files[by_angle[angle]])).events for angle in POLARIZER_ANGLES_DEG]
     sizes = {(channel.height, channel.width) for channel in channels}
     if len(sizes) > 1:
         raise RecordingError(f"expected four files of one size of sensor, got {sorted(sizes)} (height, width)")
     if start_us is None:
         return _from_first_event(channels)
     return [_since(c, start_us[by_angle[a]]) for c, a in zip(channels, POLARIZER_ANGLES_DEG, strict=True)]
-
-
-def split_mosaic(events: Events, mosaic: Mosaic) -> list[Events]:
-    """The four channels, in the order 0, 45, 90, 135 degrees, of a sensor with polarizers on its pixels.
-
-    Each channel has half of the sensor's rows and columns. Its pixel for a 2x2 cell fires when that angle's pixel in
-    the cell does. Events keep their times, and none is added; only those of an odd last row or column are left out. The
-    four pixels of a cell look at places half a cell apart, so an edge crosses them one after the other.
-    """
-    height, width = events.height // 2, events.width // 2
-    if not (height and width):
-        raise RecordingError(f"expected a mosaic of at least 2x2 pixels, got {events.height}x{events.width}")
-    row, column = events.y & 1, events.x & 1
-    complete = (events.y < 2 * height) & (events.x < 2 * width)
-    places = {mosaic[r][c]: (r, c) for r in (0, 1) for c in (0, 1)}
-    channels = []
-    for angle in POLARIZER_ANGLES_DEG:
-        r, c = places[angle]
-        own = complete & (row == r) & (column == c)
-        x, y = events.x[own] // 2, events.y[own] // 2
-        channels.append(Events(events.t[own], x, y, events.p[own], height, width))
-    return channels
 
 
 def read_mosaic(

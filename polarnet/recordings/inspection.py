@@ -1,20 +1,24 @@
-"""Summarise a recording: event counts and rates, duration, hot pixels, and an image of its busiest part."""
+"""Summarise a recording: events, rates, duration, hot pixels, signs of the readout, an image of the busiest part."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int64, UInt16
 
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, concatenate
 from polarnet.recordings.formats.celex5_bin import celex5_pictures
 from polarnet.recordings.pixels import hot_pixels
+from polarnet.recordings.readout import Readout, ReadoutSigns, readout_findings
 from polarnet.recordings.recording import FORMATS, RecordingReader
 from polarnet.recordings.source import REPAIRS, RecordingError
 
 MAX_PIXELS = 2**25
-MIN_SPAN_US = 1000  # shortest time over which a rate is taken
 EVENTS_PER_PIXEL = 0.15  # in the part shown: enough to see edges, few enough not to smear them
+PEAK_US = (1_000, 10_000, 100_000)  # intervals of the peak rate; the first that holds MIN_STEPS of the clock is taken
+MIN_STEPS = 10
+START_SHARE = 0.5  # of all pixels: if as many fire at the first time, a camera or a simulator started
 
 
 @dataclass(frozen=True)
@@ -34,8 +38,16 @@ class Inspection:
     hot: Bool[np.ndarray, "h w"]
     busiest: Int64[np.ndarray, "h w"]
     """Signed counts of the busiest part: the consecutive events, 0.15 per pixel, that took the least time."""
-    busiest_rate_hz: float
-    """Events per second in the busiest part."""
+    busiest_events: int
+    busiest_start_us: int
+    busiest_us: int
+    """Number of events, first time and duration of the busiest part."""
+    peak_rate_hz: float | None
+    """Events per second in the busiest interval of `peak_us`; None for a recording that is shorter."""
+    peak_us: int
+    start_events: int
+    """Events at the first time if most pixels fired then, else 0; no part of the peak and of the busiest part."""
+    readout: Readout
     repairs: Mapping[str, int]
     pictures: int
     """Number of full pictures between events, or in a file without events."""
@@ -43,7 +55,7 @@ class Inspection:
 
 
 def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) -> Inspection:
-    """Read a recording once, in constant memory.
+    """Read a recording once, in memory that does not grow with it unless millions of events have the same time.
 
     `hot_pixel_factor` is the `factor` of `polarnet.recordings.pixels.hot_pixels`. RecordingError if reading fails, or
     if no sensor is as large as the stated size.
@@ -55,24 +67,32 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
             f"given size is wrong, or the file is damaged"
         )
     counts = np.zeros(pixels, np.int64)
-    busiest = _Busiest(pixels)
-    on = off = 0
+    busiest, peak, signs = _Busiest(pixels), _Peak(), ReadoutSigns(reader.height, reader.width)
+    on = off = start_events = 0
     start_us = stop_us = None
-    for events in reader:
+    for events in _whole_times(reader):
         pixel = events.y.numpy().astype(np.int64) * reader.width + events.x.numpy()
         counts += np.bincount(pixel, minlength=pixels)
         on += int((events.p > 0).sum())
         off += int((events.p < 0).sum())
-        start_us = int(events.t[0]) if start_us is None else start_us
-        stop_us = int(events.t[-1])
-        busiest.add(events, pixel)
+        if start_us is None:
+            start_us = int(events.t[0])
+            at_first = int((events.t == start_us).sum())
+            start_events = at_first if at_first > START_SHARE * pixels else 0
+            events, pixel = _from(events, start_events), pixel[start_events:]
+        stop_us = int(events.t[-1]) if len(events) else start_us
+        if len(events):
+            busiest.add(events, pixel)
+            peak.add(events.t.numpy())
+            signs.add(events)
     pictures, first_picture = 0, None
     if reader.format == "celex5_bin":
         for picture in celex5_pictures(reader.path):
             first_picture = picture.intensity if pictures == 0 else first_picture
             pictures += 1
     shape = reader.height, reader.width
-    signed, rate_hz = busiest.result()
+    part, readout = busiest.result(), signs.result(counts.reshape(shape))
+    peak_us = next((us for us in PEAK_US if us >= MIN_STEPS * readout.clock_step_us), PEAK_US[-1])
     return Inspection(
         format=reader.format,
         height=reader.height,
@@ -83,8 +103,14 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
         stop_us=stop_us,
         counts=counts.reshape(shape),
         hot=hot_pixels(counts.reshape(shape), ((stop_us or 0) - (start_us or 0)) * 1e-6, hot_pixel_factor),
-        busiest=signed.reshape(shape),
-        busiest_rate_hz=rate_hz,
+        busiest=part.image.reshape(shape),
+        busiest_events=part.events,
+        busiest_start_us=part.start_us,
+        busiest_us=part.duration_us,
+        peak_rate_hz=peak.rate_hz(peak_us),
+        peak_us=peak_us,
+        start_events=start_events,
+        readout=readout,
         repairs={kind: count for kind, count in reader.repairs.items() if count},
         pictures=pictures,
         first_picture=first_picture,
@@ -103,9 +129,20 @@ def findings(inspection: Inspection) -> Iterator[str]:
         seconds = (inspection.stop_us - inspection.start_us) / 1e6
         yield f"time        {inspection.start_us:,} to {inspection.stop_us:,} us, {seconds:.6f} s"
         if seconds > 0:
-            yield f"rate        {_rate(inspection.on / seconds)} ON, {_rate(inspection.off / seconds)} OFF; " + (
-                f"up to {_rate(inspection.busiest_rate_hz)} together"
+            peak_hz = inspection.peak_rate_hz
+            yield f"rate        {_rate(inspection.on / seconds)} ON, {_rate(inspection.off / seconds)} OFF" + (
+                f"; at most {_rate(peak_hz)} together over {inspection.peak_us // 1000} ms" if peak_hz else ""
             )
+        if inspection.start_events:
+            yield (
+                f"start       {inspection.start_events:,} events at the first time, when the camera or its simulation "
+                f"started: not in the peak and the picture"
+            )
+        yield (
+            f"busiest     {inspection.busiest_events:,} events in {inspection.busiest_us / 1000:,.1f} ms from "
+            f"{inspection.busiest_start_us:,} us"
+        )
+        yield from readout_findings(inspection.readout, inspection.height)
     yield f"hot pixels  {_hot(inspection)}"
     pauses = inspection.repairs.get("pauses", 0)
     yield f"time jumps  {pauses} {REPAIRS['pauses']}" if pauses else "time jumps  none"
@@ -134,36 +171,96 @@ def _hot(inspection: Inspection) -> str:
     return f"{len(rows)} with {share:.1%} of the events ({worst}{', ...' if len(rows) > len(order) else ''})"
 
 
+def _whole_times(reader: RecordingReader) -> Iterator[Events]:
+    """The reader's chunks, cut so that all events of one time are in the same chunk."""
+    waiting: list[Events] = []
+    for events in reader:
+        complete = int((events.t < events.t[-1]).sum())
+        if complete:
+            yield concatenate([*waiting, _until(events, complete)])
+            waiting = []
+        waiting.append(_from(events, complete))
+    if waiting:
+        yield concatenate(waiting)
+
+
+def _from(events: Events, start: int) -> Events:
+    return Events(events.t[start:], events.x[start:], events.y[start:], events.p[start:], events.height, events.width)
+
+
+def _until(events: Events, stop: int) -> Events:
+    return Events(events.t[:stop], events.x[:stop], events.y[:stop], events.p[:stop], events.height, events.width)
+
+
+class _Peak:
+    """Finds the highest number of events in successive intervals of `PEAK_US`, from the first event on."""
+
+    def __init__(self) -> None:
+        self._start_us: int | None = None
+        self._number = dict.fromkeys(PEAK_US, 0)
+        self._count = dict.fromkeys(PEAK_US, 0)
+        self._highest: dict[int, int | None] = dict.fromkeys(PEAK_US)
+
+    def add(self, t: Int64[np.ndarray, " n"]) -> None:
+        self._start_us = int(t[0]) if self._start_us is None else self._start_us
+        for us in PEAK_US:
+            numbers, counts = np.unique((t - self._start_us) // us, return_counts=True)
+            if numbers[0] == self._number[us]:
+                counts[0] += self._count[us]
+            else:
+                self._complete(us, self._count[us])
+            if len(counts) > 1:
+                self._complete(us, int(counts[:-1].max()))
+            self._number[us], self._count[us] = int(numbers[-1]), int(counts[-1])
+
+    def _complete(self, us: int, count: int) -> None:
+        self._highest[us] = max(count, self._highest[us] or 0)
+
+    def rate_hz(self, us: int) -> float | None:
+        """Events per second in the busiest complete interval; None if there is none."""
+        highest = self._highest[us]
+        return None if highest is None else highest / us * 1e6
+
+
+class _Part(NamedTuple):
+    """Consecutive events of a recording."""
+
+    image: Int64[np.ndarray, " pixels"]
+    """Signed counts."""
+    events: int
+    start_us: int
+    duration_us: int
+
+
 class _Busiest:
-    """Finds the busiest of the consecutive parts of a recording, each with the same number of events."""
+    """Finds the busiest of the consecutive parts of a recording; a part ends with all events of a time."""
 
     def __init__(self, pixels: int):
         self._size = max(1, round(EVENTS_PER_PIXEL * pixels))
-        self._image = np.zeros(pixels, np.int64)
-        self._count, self._start_us, self._stop_us = 0, 0, 0
-        self._best: np.ndarray | None = None
-        self._best_us = 0
+        self._current = _Part(np.zeros(pixels, np.int64), 0, 0, 0)
+        self._best: _Part | None = None
 
     def add(self, events: Events, pixel: Int64[np.ndarray, " n"]) -> None:
+        t, signs = events.t.numpy(), events.p.numpy().astype(np.float64)
+        ends = np.r_[np.flatnonzero(t[1:] != t[:-1]) + 1, len(t)]
         start = 0
-        while start < len(events):
-            stop = min(len(events), start + self._size - self._count)
-            if self._count == 0:
-                self._start_us = int(events.t[start])
-            signs = events.p[start:stop].numpy().astype(np.float64)
-            self._image += np.bincount(pixel[start:stop], signs, len(self._image)).astype(np.int64)
-            self._count += stop - start
-            self._stop_us = int(events.t[stop - 1])
+        while start < len(t):
+            image, count, start_us, _ = self._current
+            full = np.searchsorted(ends, start + self._size - count)
+            stop = int(ends[min(full, len(ends) - 1)])
+            start_us = start_us if count else int(t[start])
+            image = image + np.bincount(pixel[start:stop], signs[start:stop], len(image)).astype(np.int64)
+            self._current = _Part(image, count + stop - start, start_us, int(t[stop - 1]) - start_us)
             start = stop
-            if self._count == self._size:
-                took_us = self._stop_us - self._start_us
-                if self._best is None or took_us < self._best_us:
-                    self._best, self._best_us = self._image.copy(), took_us
-                self._image[:] = 0
-                self._count = 0
+            if self._current.events >= self._size:
+                if self._best is None or _density(self._current) > _density(self._best):
+                    self._best = self._current
+                self._current = _Part(np.zeros_like(image), 0, 0, 0)
 
-    def result(self) -> tuple[np.ndarray, float]:
-        """The signed image and the events per second; both cover all events if there were too few for one part."""
-        if self._best is not None:
-            return self._best, self._size / max(MIN_SPAN_US, self._best_us) * 1e6
-        return self._image, self._count / max(MIN_SPAN_US, self._stop_us - self._start_us) * 1e6
+    def result(self) -> _Part:
+        """The busiest part, or all events if they are too few for one."""
+        return self._best or self._current
+
+
+def _density(part: _Part) -> float:
+    return part.events / max(1, part.duration_us)

@@ -18,8 +18,8 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from jaxtyping import Int64
 
+from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import MAX_SIDE, Events
-from polarnet.recordings.arrangements import split_mosaic
 from polarnet.recordings.formats.lines import lines_of, numbers_of, rows_of
 from polarnet.recordings.repair import TOLERATED_COUNT, TOLERATED_SHARE
 from polarnet.recordings.source import RecordingError

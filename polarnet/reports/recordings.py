@@ -1,10 +1,10 @@
-"""Pictures of recordings and of their calibration: start times, thresholds, hot pixels, registered cameras."""
+"""Pictures of recordings and of their calibration: start times, thresholds, hot pixels."""
 
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -49,22 +49,6 @@ def draw_hot_pixels(counts: np.ndarray, hot: Bool[np.ndarray, "h w"], path: Path
     axes.scatter(columns, rows, s=60, facecolors="none", edgecolors=COLOURS[0])
     axes.set_title(f"{len(rows)} hot pixels")
     figure.colorbar(image, ax=axes, label="log(1 + events)")
-    path.write_bytes(png(figure))
-
-
-def draw_registration(
-    reference: Float32[np.ndarray, "h w"],
-    before: Float32[np.ndarray, "h w"],
-    after: Float32[np.ndarray, "h w"],
-    path: Path,
-) -> None:
-    """Write two cameras' event images overlaid before and after registration: one red, one cyan, grey where equal."""
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    for axes, moving, title in zip(figure.subplots(1, 2), (before, after), ("before", "after"), strict=True):
-        scale = max(float(reference.max()), float(moving.max()), 1e-6)
-        axes.imshow(np.stack([reference, moving, moving], axis=-1) / scale)
-        axes.set_title(title)
-        axes.set_axis_off()
     path.write_bytes(png(figure))
 
 

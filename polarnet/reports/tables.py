@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
+from polarnet.methods import is_rotating
 from polarnet.reports.legend import LABELS, LPIPS_BACKBONES, in_order
 
 Scores = Mapping[str, Mapping[str, Any]]
@@ -81,6 +82,12 @@ PAPER_TABLE_2: Mapping[str, Scores] = {  # Yan et al., Photonics 2024, 11(5), 48
 }
 
 
+ANOTHER_CAMERA = (
+    "† Not ranked: another camera, one sensor behind a rotating polarizer, sees the same scenes and motions but other "
+    "events than the rows with four polarizers."
+)
+
+
 class Cell(NamedTuple):
     """One value of a table."""
 
@@ -88,7 +95,7 @@ class Cell(NamedTuple):
     interval: str
     """95 % interval; empty if there is none."""
     best: bool
-    """Whether no row has a better value in this column; all ties are best."""
+    """Whether no ranked row has a better value in this column; all ties are best."""
 
 
 class Row(NamedTuple):
@@ -114,8 +121,8 @@ def score_table(
 ) -> Table:
     """Scores of the methods in the fixed order; a metric without any value gets no column.
 
-    The LPIPS heading names the backbone from the rows' `lpips_backbone`. Methods missing in `labels` come last, under
-    their own key.
+    The LPIPS heading names the backbone from the rows' `lpips_backbone`. Rows of another camera are not ranked, and a
+    note says so. Methods missing in `labels` come last, under their own key.
     """
     if not scores:
         raise ValueError("a table needs the scores of at least one method, got none")
@@ -124,20 +131,28 @@ def score_table(
         columns = {**columns, "lpips": replace(columns["lpips"], label=f"LPIPS ({backbone})")}
     keys = [key for key in columns if any(scores[method].get(key) is not None for method in scores)]
     methods = in_order(scores)
-    best = {key: _best(columns[key], [scores[m].get(key) for m in methods]) for key in keys}
+    ranked = [method for method in methods if not is_rotating(method)]
+    best = {key: _best(columns[key], [scores[m].get(key) for m in ranked]) for key in keys}
     rows = tuple(
         Row(
             method,
             labels.get(method, method),
             tuple(
-                _cell(columns[key], scores[method].get(key), scores[method].get(f"{key}_ci"), best[key]) for key in keys
+                _cell(
+                    columns[key],
+                    scores[method].get(key),
+                    scores[method].get(f"{key}_ci"),
+                    best[key] if method in ranked else None,
+                )
+                for key in keys
             ),
         )
         for method in methods
     )
     about = f"LPIPS ({backbone}): version 0.1 on the features of {LPIPS_BACKBONES[backbone]}." if backbone else ""
-    notes = (about,) if about and "lpips" in keys else ()
-    return Table(tuple(columns[key].heading for key in keys), rows, notes)
+    notes = [about] if about and "lpips" in keys else []
+    notes += [ANOTHER_CAMERA] if len(ranked) < len(methods) else []
+    return Table(tuple(columns[key].heading for key in keys), rows, tuple(notes))
 
 
 def paper_table(experiment: Literal["simulated", "real"]) -> Table:

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
+from polarnet.runtime.extras import installation
 from polarnet.runtime.machine import limit_threads, tune, usable_cores
 
 ATTEMPTS = 4  # Dask's own limit for a task whose workers die (allowed-failures 3)
@@ -93,7 +94,7 @@ def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], addres
         from distributed import as_completed as dask_as_completed
     except ImportError:
         raise RuntimeError(
-            "cluster.address needs Dask on this machine and on the workers: pip install dask distributed"
+            f"cluster.address needs Dask on this machine and on the workers: {installation('cluster')}"
         ) from None
     with Client(address, timeout="30s") as client:
         futures = client.map(functools.partial(_on_one_thread, function), items, retries=ATTEMPTS - 1, pure=False)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import types
 import typing
 from collections.abc import Collection, Sequence
 from typing import Any, TypeVar
@@ -70,8 +71,14 @@ def unknown_key(config_class: Any, path: Sequence[str]) -> str | None:
             inside = ".".join(path[:depth]) or "the configuration"
             keys = f"{inside} has {', '.join(names)}" if names else f"{inside} is a value, not a section"
             return f"{'.'.join(path)} is not a setting; {keys}"
-        config_class = typing.get_type_hints(config_class)[name]
+        config_class = _without_none(typing.get_type_hints(config_class)[name])
     return None
+
+
+def _without_none(hint: Any) -> Any:
+    """The type that may also be None."""
+    kinds = [kind for kind in typing.get_args(hint) if kind is not type(None)]
+    return kinds[0] if isinstance(hint, types.UnionType) and len(kinds) == 1 else hint
 
 
 def _in_words(config_class: Any, error: ErrorDetails) -> str:

@@ -1,10 +1,11 @@
 """The simulated camera: its sensors, the polarizers before their pixels, and their readout."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.polarizers import IDEAL, PolarizersConfig
+from polarnet.simulation.ranges import RandomisedConfig, draws
 from polarnet.simulation.readout import PERFECT, ReadoutConfig
 
 
@@ -19,8 +20,21 @@ class Camera:
     @property
     def sections(self) -> dict[str, Any]:
         """The sections by name."""
-        return {
-            "emulate": asdict(self.sensor),
-            "polarizers": asdict(self.polarizers),
-            "readout": asdict(self.readout),
-        }
+        return {name: asdict(section) for name, section in self._sections.items()}
+
+    def draws(self, seed: int, sequence: str) -> dict[str, dict[str, Any]]:
+        """Values that a sequence draws from the ranges of `randomise`, by section and parameter."""
+        values = {name: draws(section, seed, sequence) for name, section in self._sections.items()}
+        return {name: drawn for name, drawn in values.items() if drawn}
+
+    def drawn(self, seed: int, sequence: str) -> "Camera":
+        """The camera of one sequence: with the values that it draws, and without ranges."""
+        values = self.draws(seed, sequence)
+        if not values:
+            return self
+        sections = (replace(s, **values.get(name, {}), randomise=None) for name, s in self._sections.items())
+        return Camera(*sections)
+
+    @property
+    def _sections(self) -> dict[str, RandomisedConfig]:
+        return {"emulate": self.sensor, "polarizers": self.polarizers, "readout": self.readout}

@@ -7,9 +7,8 @@ from typing import Any
 
 from polarnet import __version__
 from polarnet.events.stream import Events
-from polarnet.runtime.machine import generator_for, seed_for
+from polarnet.runtime.machine import seed_for
 from polarnet.simulation.camera import Camera
-from polarnet.simulation.emulator import randomised
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.polarizers import channel_size
@@ -51,8 +50,9 @@ def origin_of(scenes: SceneStore, camera: Camera, seed: int) -> dict[str, Any]:
 def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: int, threads: int) -> list[Events]:
     """Events of the four channels of one stored sequence.
 
-    Its noise, and with `randomise` its sensor, depend only on the seed and the sequence's name.
+    Its noise, and with `randomise` its camera, depend only on the seed and the sequence's name.
     """
+    camera = camera.drawn(seed, sequence)
     record = scenes.read(sequence)
     return emulate_motion(
         scene_from_polarization(record.s0, record.dolp, record.aolp),
@@ -60,7 +60,7 @@ def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: in
         record.duration_us,
         scenes.sensor_height,
         scenes.sensor_width,
-        randomised(camera.sensor, generator_for(seed, sequence, "sensor")),
+        camera.sensor,
         seed_for(seed, sequence, "emulate"),
         threads,
         camera.polarizers,
@@ -71,4 +71,4 @@ def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: in
 def _emulate_part(part: str, scenes: SceneStore, events: EventStore, camera: Camera, seed: int, threads: int) -> None:
     for sequence in events.parts[part]:
         channels = emulate_sequence(scenes, sequence, camera, seed, threads)
-        events.write(sequence, channels, scenes.duration_us(sequence))
+        events.write(sequence, channels, scenes.duration_us(sequence), camera.draws(seed, sequence))

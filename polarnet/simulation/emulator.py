@@ -1,15 +1,14 @@
 """Event-camera emulation: light on the channels of one sensor in, events and the sensor's state out."""
 
-import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Protocol
 
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64, Shaped
-from pydantic import Field, NonNegativeFloat, PositiveFloat
+from pydantic import PositiveFloat
 from torch import Tensor
 
 from polarnet.events.stream import Events
@@ -18,10 +17,12 @@ from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.compilation import forget_stale_code
 from polarnet.simulation.pixels import esim, esim_gpu, exact, v2e, voltmeter
 from polarnet.simulation.pixels.columns import Columns, empty_columns, trimmed
+from polarnet.simulation.pixels.defects import DefectsConfig, defects_of, with_defects
 from polarnet.simulation.pixels.esim import EsimConfig
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
 from polarnet.simulation.pixels.steps import Steps
 from polarnet.simulation.pixels.voltmeter import VoltmeterConfig
+from polarnet.simulation.ranges import RandomisedConfig
 
 EVENTS_PER_PIXEL_AND_STEP = 0.5  # initial room, far more than usual: untouched pages cost no memory
 MAX_INITIAL_ROOM = 1 << 22  # events; columns grow where a scene is busier
@@ -56,51 +57,16 @@ MODELS: dict[str, PixelModel] = {
 
 
 @section
-class EmulatorConfig(EsimConfig, VoltmeterConfig):
+class EmulatorConfig(EsimConfig, VoltmeterConfig, DefectsConfig, RandomisedConfig):
     """Section `emulate` of params.yaml: the parameters of all pixel models, and which model is in use.
 
-    A model ignores the parameters that it does not have.
+    A model ignores the parameters that it does not have. `emulate` takes the values as they are: ranges in `randomise`
+    are drawn before (`Camera.drawn`).
     """
 
     model: Annotated[str, one_of(MODELS)]
     render_rate_hz: PositiveFloat | None
     """Rate at which the light is rendered; null: one frame for each pixel of motion."""
-    randomise: bool
-    """Draw the parameters below for each sequence, uniformly (rates and cutoff: uniformly in their logarithm)."""
-    random_threshold_on: list[Annotated[float, Field(ge=0.01, le=10)]]
-    random_threshold_off: list[Annotated[float, Field(ge=0.01, le=10)]]
-    random_threshold_sigma: list[NonNegativeFloat]
-    random_cutoff_hz: list[PositiveFloat]
-    random_leak_rate_hz: list[PositiveFloat]
-    random_shot_noise_rate_hz: list[PositiveFloat]
-
-    def __post_init__(self):
-        for name in (name for name in vars(self) if name.startswith("random_")):
-            bounds = getattr(self, name)
-            if len(bounds) != 2 or bounds[0] > bounds[1]:
-                raise ValueError(f"{name}: expected [lowest, highest], got {list(bounds)}")
-
-
-def randomised(config: EmulatorConfig, generator: np.random.Generator) -> EmulatorConfig:
-    """The configuration of one sequence: `config`, with values drawn from its ranges if `randomise` is set."""
-    if not config.randomise:
-        return config
-
-    def between(bounds: list[float]) -> float:
-        return float(generator.uniform(bounds[0], bounds[1]))
-
-    def between_in_logarithm(bounds: list[float]) -> float:
-        return math.exp(between([math.log(bound) for bound in bounds]))
-
-    return replace(
-        config,
-        contrast_threshold_on=between(config.random_threshold_on),
-        contrast_threshold_off=between(config.random_threshold_off),
-        contrast_threshold_sigma=between(config.random_threshold_sigma),
-        cutoff_hz=between_in_logarithm(config.random_cutoff_hz),
-        leak_rate_hz=between_in_logarithm(config.random_leak_rate_hz),
-        shot_noise_rate_hz=between_in_logarithm(config.random_shot_noise_rate_hz),
-    )
 
 
 @dataclass(frozen=True)
@@ -195,8 +161,12 @@ def emulate_lights(
             model.start(lights[i], pixels, steps)
         else:
             pixels = type(state.pixels[i])(*(array.copy() for array in state.pixels[i]))
-        columns, count = model.advance(lights[i], pixels, steps, empty[i])
-        return trimmed(columns, count), pixels
+        columns = trimmed(*model.advance(lights[i], pixels, steps, empty[i]))
+        if defects := defects_of(config, height * width, seed, channels[i]):
+            # v2e stamps an event after the start of its step and up to its end, the others before the end
+            span, rounds_up = (float(times[0]), float(times[-1])), model is v2e
+            columns = with_defects(columns, defects, width, *span, rounds_up, labels, unrounded_times)
+        return columns, pixels
 
     if threads > 1:
         with ThreadPoolExecutor(threads) as pool:

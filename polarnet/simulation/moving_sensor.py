@@ -5,6 +5,7 @@ import functools
 import numpy as np
 from jaxtyping import Int64
 
+from polarnet.events.mosaic import join_mosaic, split_mosaic
 from polarnet.events.stream import Events
 from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, emulate_lights, events_of
 from polarnet.simulation.motion import Pose, Trajectory
@@ -14,9 +15,8 @@ from polarnet.simulation.polarizers import (
     IDEAL,
     PolarizersConfig,
     channel_size,
-    places_of,
 )
-from polarnet.simulation.readout import PERFECT, ReadoutConfig, as_channels, as_one_sensor, read_out
+from polarnet.simulation.readout import PERFECT, ReadoutConfig, read_out
 from polarnet.simulation.rendering import (
     check_inside,
     drifts,
@@ -27,6 +27,7 @@ from polarnet.simulation.rendering import (
     weights_of,
 )
 from polarnet.simulation.scene import PolarizationScene
+from polarnet.stokes import parse_mosaic
 
 CHANNELS = (0, 1, 2, 3)  # behind the polarizers at 0, 45, 90 and 135 degrees
 CHUNK = 16  # frames rendered at once if the sensor turns or zooms
@@ -64,8 +65,8 @@ def leave_sensors(
     if readout.perfect:
         return channels
     if polarizers.layout == "dofp":
-        places = places_of(polarizers.mosaic)
-        return as_channels(read_out(as_one_sensor(channels, places), readout, key, duration_us)[0], places)
+        mosaic = parse_mosaic(polarizers.mosaic)
+        return split_mosaic(read_out(join_mosaic(channels, mosaic), readout, key, duration_us)[0], mosaic)
     return [read_out(channel, readout, key + number, duration_us)[0] for number, channel in enumerate(channels)]
 
 

@@ -12,8 +12,10 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from pydantic import Field, NonNegativeFloat
 
+from polarnet.events.mosaic import places_of
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.pixels import randomness
+from polarnet.simulation.ranges import RandomisedConfig
 from polarnet.stokes import POLARIZER_ANGLES_DEG, analyzer, parse_mosaic
 
 CHANNELS = len(POLARIZER_ANGLES_DEG)
@@ -25,7 +27,7 @@ FourValues = Annotated[list[Value], Field(min_length=CHANNELS, max_length=CHANNE
 
 
 @section
-class PolarizersConfig:
+class PolarizersConfig(RandomisedConfig):
     """Section `polarizers` of params.yaml. Lists hold one value for each of 0, 45, 90 and 135 degrees."""
 
     layout: Annotated[str, one_of(("four_sensors", "dofp"))]
@@ -47,6 +49,7 @@ class PolarizersConfig:
     """Share of a DoFP pixel's light that falls in through its four neighbours' polarizers."""
 
     def __post_init__(self):
+        super().__post_init__()
         parse_mosaic(self.mosaic)
         if self.crosstalk and self.layout != "dofp":
             raise ValueError(
@@ -71,6 +74,7 @@ IDEAL = PolarizersConfig(
     angle_spread_deg=0.0,
     transmission_spread=0.0,
     crosstalk=0.0,
+    randomise=None,
 )
 
 
@@ -143,11 +147,6 @@ def mixed_with_neighbours(frames: Float32[np.ndarray, "n h w"], crosstalk: float
     return np.float32(1 - crosstalk) * frames + np.float32(crosstalk / 4) * neighbours
 
 
-def places_of(mosaic: str) -> list[tuple[int, int]]:
-    """(row, column) in a 2x2 cell of the pixels at 0, 45, 90 and 135 degrees."""
-    return [divmod(int(cell), 2) for cell in np.argsort(np.ravel(parse_mosaic(mosaic)))]
-
-
 def split_cells(frames: Float32[np.ndarray, "n h w"], mosaic: str) -> Float32[np.ndarray, "4 n h2 w2"]:
     """Channels at 0, 45, 90 and 135 degrees of a DoFP sensor's frames: each one pixel of every 2x2 cell."""
-    return np.stack([frames[:, row::2, column::2] for row, column in places_of(mosaic)])
+    return np.stack([frames[:, row::2, column::2] for row, column in places_of(parse_mosaic(mosaic))])

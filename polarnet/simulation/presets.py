@@ -21,8 +21,13 @@ def _preset(group: str, name: str) -> dict[str, Any]:
 _DEMO = _preset("experiment", "demo")
 _SENSOR = EmulatorConfig(**_DEMO["emulate"])
 
-SENSORS = {name: replace(_SENSOR, **_preset("sensor", name)["emulate"]) for name in ("default", "clean", "noisy")}
-"""v2e's command-line defaults and its options `clean` and `noisy`; derive others with `dataclasses.replace`."""
+SENSORS = {
+    name: replace(_SENSOR, **_preset("sensor", name)["emulate"]) for name in ("default", "clean", "noisy", "random")
+}
+"""v2e's command-line defaults, its options `clean` and `noisy`, and `random`, which differs from sequence to sequence.
+
+Derive others with `dataclasses.replace`.
+"""
 
 POLARIZERS = {
     name: replace(IDEAL, **_preset("polarizers", name)["polarizers"])

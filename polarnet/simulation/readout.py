@@ -5,8 +5,6 @@ carries a limited number of events a second. An event gets its time when it leav
 lost, as in sensors whose event rate exceeds what their readout carries.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
@@ -16,10 +14,11 @@ from polarnet.events.stream import Events
 from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import compiled, forget_stale_code
 from polarnet.simulation.pixels import randomness
+from polarnet.simulation.ranges import RandomisedConfig
 
 
 @section
-class ReadoutConfig:
+class ReadoutConfig(RandomisedConfig):
     """Section `readout` of params.yaml: how events leave the sensor."""
 
     row_latency_us: NonNegativeFloat
@@ -37,7 +36,7 @@ class ReadoutConfig:
         return not (self.row_latency_us or self.jitter_us or self.max_events_per_s)
 
 
-PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=0.0)
+PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=0.0, randomise=None)
 
 
 def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) -> tuple[Events, int]:
@@ -86,26 +85,3 @@ def _bus(
             leaves_us[i] = free_us if row_carried else times_us[i]
         first = stop
     return leaves_us, carried
-
-
-def as_one_sensor(channels: Sequence[Events], places: Sequence[tuple[int, int]]) -> Events:
-    """Events of a DoFP sensor from its channels; `places` are (row, column) of each channel in a 2x2 cell."""
-    t, y, x, p = (
-        torch.cat(columns)
-        for columns in zip(
-            *((e.t, 2 * e.y + row, 2 * e.x + column, e.p) for e, (row, column) in zip(channels, places, strict=True)),
-            strict=True,
-        )
-    )
-    order = torch.from_numpy(np.lexsort((p.numpy(), x.numpy(), y.numpy(), t.numpy())))
-    return Events(t[order], x[order], y[order], p[order], 2 * channels[0].height, 2 * channels[0].width)
-
-
-def as_channels(sensor: Events, places: Sequence[tuple[int, int]]) -> list[Events]:
-    """The inverse of `as_one_sensor`."""
-    channels = []
-    for row, column in places:
-        own = (sensor.y % 2 == row) & (sensor.x % 2 == column)
-        x, y = sensor.x[own] // 2, sensor.y[own] // 2
-        channels.append(Events(sensor.t[own], x, y, sensor.p[own], sensor.height // 2, sensor.width // 2))
-    return channels

@@ -5,8 +5,12 @@ The light behind a polarizer at angle theta is, with e = 1 / extinction ratio (M
     I = ((1 + e) S0 + (1 - e) (S1 cos 2 theta + S2 sin 2 theta)) / 2
 """
 
+import functools
 import math
-from typing import Annotated, NamedTuple
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,12 +20,19 @@ from torch import Tensor
 
 from polarnet.events.rotation import Rotation, steady_rotation
 from polarnet.events.stream import Events, concatenate
+from polarnet.runtime.machine import seed_for
 from polarnet.runtime.sections import section
+from polarnet.simulation.camera import Camera
+from polarnet.simulation.dataset import origin_of
 from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate
 from polarnet.simulation.motion import Trajectory, render
 from polarnet.simulation.pixels.light import FULL_SCALE
+from polarnet.simulation.polarizers import grid
+from polarnet.simulation.readout import read_out
 from polarnet.simulation.rendering import check_inside
-from polarnet.simulation.scene import PolarizationScene
+from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
+from polarnet.storage.events import CHANNELS, EventStore
+from polarnet.storage.scenes import SceneStore
 
 CHUNK = 64  # frames rendered at once
 
@@ -86,15 +97,17 @@ def emulate_rotating(
     emulator: EmulatorConfig,
     key: int,
     state: SensorState | None = None,
+    pitch: int = 1,
 ) -> RotatingSimulation:
     """Events of a sensor of height x width pixels under light rendered at times `t_us` (`rotating_times_us`).
 
     Without a trajectory the sensor rests on the scene's upper left corner. `key` (64 bits) seeds mismatch and noise.
+    The pixels of a moving sensor lie `pitch` pixels of the scene apart (`polarizers.grid`).
     A span cut into pieces, each given the state that the previous piece returned and times after it, gives the events
     of the whole span. ValueError if the sensor leaves the scene.
     """
     if trajectory is not None:
-        check_inside(scene, trajectory.pose(t_us * 1e-6), t_us, height, width)
+        check_inside(scene, trajectory.pose(t_us * 1e-6), t_us, pitch * height, pitch * width)
     elif height > scene.height or width > scene.width:
         raise ValueError(f"a sensor of {height}x{width} px exceeds the scene of {scene.height}x{scene.width}")
     rotation, pieces = rotating.rotation, []
@@ -103,7 +116,7 @@ def emulate_rotating(
         if trajectory is None:
             stokes = scene.stokes[None, :, :height, :width].expand(len(times), -1, -1, -1)
         else:
-            stokes = render(scene, trajectory, times * 1e-6, height, width)
+            stokes = render(scene, trajectory, times * 1e-6, height, width, pitch)
         light = behind_rotating_polarizer(stokes, rotation.at(times), rotating.extinction_ratio)
         frames = (FULL_SCALE * light).clamp(max=FULL_SCALE)[:, None]
         (events,), state = emulate(frames, times, emulator, key, state)
@@ -111,3 +124,44 @@ def emulate_rotating(
     if state is None:
         raise ValueError("expected at least one time")
     return RotatingSimulation(concatenate(pieces), rotation, state)
+
+
+def emulate_rotating_scenes(
+    scenes: Path,
+    events: Path,
+    rotating: RotatingConfig,
+    camera: Camera,
+    seed: int,
+    mapper: Callable[..., Iterable[Any]],
+) -> int:
+    """Emulate the test sequences of a scene store behind the rotating polarizer, and return their number.
+
+    The sensor, its readout and its motion are those of the four channels, its noise is not. The event store holds the
+    events in its first channel. `mapper` is as in `dataset.emulate_scenes`.
+    """
+    source = SceneStore.open(scenes)
+    attributes = {**origin_of(source, camera, seed), "rotating": asdict(rotating)}
+    height, width, _ = grid(source.attributes["layout"], source.sensor_height, source.sensor_width)
+    names = source.of_split("test")
+    store = EventStore.create(events, names, height, width, attributes, source.sequences_per_part)
+    task = functools.partial(_emulate_part, scenes=source, events=store, rotating=rotating, camera=camera, seed=seed)
+    for _ in mapper(task, store.missing_parts()):
+        pass
+    store.finish()
+    return len(names)
+
+
+def _emulate_part(
+    part: str, scenes: SceneStore, events: EventStore, rotating: RotatingConfig, camera: Camera, seed: int
+) -> None:
+    height, width, pitch = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
+    for sequence in events.parts[part]:
+        record, key = scenes.read(sequence), seed_for(seed, sequence, "rotating")
+        sensor = camera.drawn(seed, sequence).sensor
+        scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
+        trajectory = Trajectory.from_vector(record.trajectory.numpy())
+        t_us = rotating_times_us(rotating, sensor, 0, record.duration_us)
+        made = emulate_rotating(scene, trajectory, t_us, height, width, rotating, sensor, key, pitch=pitch).events
+        made, _ = read_out(made, camera.readout, key, record.duration_us)
+        empty = Events.empty(height, width)
+        events.write(sequence, [made, *[empty] * (CHANNELS - 1)], record.duration_us)

@@ -10,7 +10,7 @@ from polarnet.events.stream import Events
 from polarnet.runtime.arrays import Array
 from polarnet.runtime.machine import generator_for, seed_for
 from polarnet.simulation.camera import Camera
-from polarnet.simulation.emulator import EmulatorConfig, randomised
+from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.polarizers import grid
@@ -31,6 +31,8 @@ class Simulation(NamedTuple):
     aolp: Float[Tensor, "n h w"]
     """Radians in [0, pi)."""
     trajectory: Trajectory
+    camera: Camera
+    """The camera, with the values that it drew where its parameters have ranges (`randomise`)."""
 
 
 def simulate(
@@ -64,12 +66,11 @@ def simulate(
     else:
         scene = scene_from_rgb(picture)
     trajectory = random_trajectory(motion, scene.height, scene.width, generator_for(seed, "picture", "motion"))
-    camera = sensor if isinstance(sensor, Camera) else Camera(sensor)
+    camera = (sensor if isinstance(sensor, Camera) else Camera(sensor)).drawn(seed, "picture")
     t_us, size = frame_times_us(motion), (motion.sensor_height, motion.sensor_width)
-    drawn = randomised(camera.sensor, generator_for(seed, "picture", "sensor"))
     key = seed_for(seed, "picture", "emulate")
     events = emulate_motion(
-        scene, trajectory, t_us[-1], *size, drawn, key, polarizers=camera.polarizers, readout=camera.readout
+        scene, trajectory, t_us[-1], *size, camera.sensor, key, polarizers=camera.polarizers, readout=camera.readout
     )
     pixels = grid(camera.polarizers.layout, *size)
-    return Simulation(events, tensor(t_us), *frames_of(scene, trajectory, t_us, *pixels), trajectory)
+    return Simulation(events, tensor(t_us), *frames_of(scene, trajectory, t_us, *pixels), trajectory, camera)

@@ -16,9 +16,10 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt
 from torch import Tensor
 
 from polarnet import stokes
-from polarnet.runtime.sections import section
+from polarnet.runtime.sections import one_of, section
 
 MAX_DOLP = 0.99
+SPACINGS = ("linear", "logarithmic")
 
 
 @section
@@ -30,9 +31,12 @@ class VariationConfig:
     share: Annotated[float, Field(ge=0, le=1)]
     """Share of variants with changed DoLP, and share with changed S0; AoLP is rotated in all."""
     dolp_factor: list[NonNegativeFloat]
-    """DoLP is multiplied by a number drawn uniformly between these two ..."""
+    """DoLP is multiplied by a number drawn between these two ..."""
     dolp_exponent_spread: NonNegativeFloat
     """... after being raised to a power whose logarithm is normal with this standard deviation."""
+    dolp_spacing: Annotated[str, one_of(SPACINGS)]
+    """Distribution of the factor: linear draws it uniformly, logarithmic draws its logarithm uniformly, so that a
+    DoLP of a few percent, as in most measured scenes, is as frequent as a large one."""
     s0_factor: list[Annotated[float, Field(gt=0, le=1)]]
     s0_exponent_spread: NonNegativeFloat
     uniform_share: Annotated[float, Field(ge=0, le=1)]
@@ -45,6 +49,8 @@ class VariationConfig:
             values = getattr(self, name)
             if len(values) != 2 or values[0] > values[1]:
                 raise ValueError(f"{name}: expected [smaller, larger], got {values}")
+        if self.dolp_spacing == "logarithmic" and self.dolp_factor[0] == 0:
+            raise ValueError(f"dolp_factor: expected numbers above 0 for logarithmic spacing, got {self.dolp_factor}")
 
 
 def varied(
@@ -56,7 +62,8 @@ def varied(
     aolp = torch.remainder(direction * aolp + turn, math.pi)
     aolp = torch.where(aolp >= math.pi, 0.0, aolp)  # values just below 0 round up to pi
     if generator.random() < config.share:
-        dolp = _graded(dolp, config.dolp_factor, config.dolp_exponent_spread, generator).clamp(max=MAX_DOLP)
+        dolp = _graded(dolp, config.dolp_factor, config.dolp_exponent_spread, generator, config.dolp_spacing)
+        dolp = dolp.clamp(max=MAX_DOLP)
     if generator.random() < config.share:
         s0 = _graded(s0, config.s0_factor, config.s0_exponent_spread, generator)
     if generator.random() < config.uniform_share:
@@ -77,7 +84,13 @@ def _drawn_to_one(
     return stokes.dolp(mean).clamp(max=MAX_DOLP), stokes.aolp(mean)
 
 
-def _graded(values: Tensor, factor: list[float], spread: float, generator: np.random.Generator) -> Tensor:
+def _graded(
+    values: Tensor, factor: list[float], spread: float, generator: np.random.Generator, spacing: str = SPACINGS[0]
+) -> Tensor:
     exponent = math.exp(generator.normal(0, spread))
     low, high = factor
-    return generator.uniform(low, high) * values.clamp(0, 1) ** exponent
+    if spacing == "logarithmic":
+        multiplier = math.exp(generator.uniform(math.log(low), math.log(high)))
+    else:
+        multiplier = generator.uniform(low, high)
+    return multiplier * values.clamp(0, 1) ** exponent

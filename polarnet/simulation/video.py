@@ -13,7 +13,7 @@ from polarnet.events.stream import Events, concatenate
 from polarnet.runtime.arrays import Array
 from polarnet.runtime.machine import generator_for, one_thread, seed_for
 from polarnet.simulation.camera import Camera
-from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, emulate_lights, events_of, randomised
+from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, emulate_lights, events_of
 from polarnet.simulation.motion import SynthesizeConfig, frame_times_us, random_trajectory, render
 from polarnet.simulation.moving_sensor import CHANNELS, emulate_motion_steps, emulation_times_us, leave_sensors
 from polarnet.simulation.pixels.light import light_of_frames
@@ -46,9 +46,8 @@ class Drawn(NamedTuple):
 
 
 def drawn_camera(camera: Camera, seed: int, name: str) -> Drawn:
-    """The camera with the parameters drawn that section `emulate` randomises, and the key of mismatch and noise."""
-    sensor = randomised(camera.sensor, generator_for(seed, name, "sensor"))
-    return Drawn(seed_for(seed, name, "emulate"), Camera(sensor, camera.polarizers, camera.readout))
+    """The camera with the values that it draws from its ranges, and the key of mismatch and noise."""
+    return Drawn(seed_for(seed, name, "emulate"), camera.drawn(seed, name))
 
 
 def moving_pieces(

@@ -2,8 +2,8 @@
 
 The four channels of a sequence follow each other in the columns `events/x`, `events/y`, `events/t` (microseconds from
 the start of the sequence) and `events/p` (+1 or -1). A sequence's record holds `offsets`, the start of each channel and
-the end of the last, and `duration_us`, its length. `ms_to_idx` (DSEC's name) holds, for each millisecond and channel,
-the index of the first event at or after it.
+the end of the last, and `duration_us`, its length. If the sequence drew parameters of its camera, `drawn` holds their
+values. `ms_to_idx` (DSEC's name) holds, for each millisecond and channel, the index of the first event at or after it.
 """
 
 import functools
@@ -40,7 +40,7 @@ class EventStore(Store):
     """Sequences of events in four channels; see `create` and `open`."""
 
     FORMAT = "polarnet.events"
-    VERSION = 2
+    VERSION = 3
     height: int
     width: int
 
@@ -72,10 +72,13 @@ class EventStore(Store):
         metadata = {"polarizer_angles_deg": list(POLARIZER_ANGLES_DEG), "conventions": CONVENTIONS}
         return cls.create_parts(path, sequences, attributes, sequences_per_part, height=height, width=width, **metadata)
 
-    def write(self, sequence: str, channels: Sequence[Events], duration_us: int) -> None:
+    def write(
+        self, sequence: str, channels: Sequence[Events], duration_us: int, drawn: Mapping[str, Any] | None = None
+    ) -> None:
         """Write the four channels (0, 45, 90, 135 degrees) of the next sequence of a part; see `Store.append`.
 
-        A sequence that is already written stays unchanged, since the store's attributes determine its events.
+        `drawn` (plain JSON) are the parameters that this sequence alone has. A sequence that is already written stays
+        unchanged, since the store's attributes determine its events.
         ValueError, before anything is written, for events out of order, off the sensor or outside [0, duration_us].
         """
         self._check(channels, duration_us)
@@ -89,11 +92,16 @@ class EventStore(Store):
             columns[f"events/{name}"] = np.concatenate(pieces, dtype=dtype, casting="unsafe")
         counts = [first_at_millisecond(channel.t, duration_us) for channel in channels]
         columns["ms_to_idx"] = np.stack(counts, axis=1) + offsets[:-1]
-        self.append(sequence, columns, {"offsets": offsets.tolist(), "duration_us": int(duration_us)})
+        record = {"offsets": offsets.tolist(), "duration_us": int(duration_us)}
+        self.append(sequence, columns, record | ({"drawn": dict(drawn)} if drawn else {}))
 
     def duration_us(self, sequence: str) -> int:
         """Length of a sequence in microseconds."""
         return self.record(sequence)["duration_us"]
+
+    def drawn(self, sequence: str) -> dict[str, Any]:
+        """Values of the camera's parameters that the sequence drew, by section of params.yaml; empty if none."""
+        return self.record(sequence).get("drawn", {})
 
     def count(self, sequence: str) -> tuple[int, ...]:
         """Number of events in each channel of a sequence."""

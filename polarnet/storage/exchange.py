@@ -13,6 +13,7 @@ import numba
 import numpy as np
 
 from polarnet.events.stream import Events, slice_count
+from polarnet.runtime.extras import installation
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore, first_at_millisecond
 
@@ -147,5 +148,5 @@ def _h5py() -> Any:
     try:
         import h5py
     except ImportError:
-        raise RuntimeError("HDF5 needs h5py: pip install 'polarnet[hdf5]'") from None
+        raise RuntimeError(f"HDF5 needs h5py: {installation('hdf5')}") from None
     return h5py

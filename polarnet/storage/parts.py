@@ -1,11 +1,12 @@
 """The layout of every store, a folder of parts: how one is created, resumed, finished, read and verified.
 
-    NAME.zarr/zarr.json                     header: format, version, names of the sequences, attributes
-    NAME.zarr/part-00000/zarr.json          record of each sequence of the part: its rows in the columns, its numbers
-    NAME.zarr/part-00000/events/t/...       one column: the rows of these sequences, one sequence after the other
+    NAME.zarr/zarr.json            header: format, version, names of the sequences, attributes
+    NAME.zarr/part-00000.zip       a part: a zip of a Zarr group
+        zarr.json                  record of each sequence of the part: its rows in the columns, its numbers
+        events/t/...               one column: the rows of these sequences, one sequence after the other
 
-The store and each of its parts are Zarr v3 groups, each column is a sharded array. Every sequence starts a chunk of its
-own, so that reading one decodes nothing of its neighbours.
+The store and each of its parts are Zarr v3 groups, each column is an array. Every sequence starts a chunk of its own,
+so that reading one decodes nothing of its neighbours. Chunks are compressed, so the zip stores them as they are.
 
 A store is written as NAME.zarr.tmp. One process writes a part, under a temporary name, and renames it when it is
 complete; different processes write different parts. After a kill a part is whole or missing, and a rerun makes the
@@ -13,12 +14,13 @@ missing parts. `finish` marks the store complete and renames it. The same sequen
 the parts.
 """
 
-import contextlib
 import functools
+import hashlib
 import json
 import os
 import shutil
 import uuid
+import zipfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,15 +32,16 @@ import fsspec
 import numpy as np
 import zarr
 from pydantic import PositiveInt
+from zarr.abc.buffer import Buffer
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
-from zarr.storage import FsspecStore, LocalStore, WrapperStore, ZipStore
+from zarr.storage import FsspecStore, LocalStore, MemoryStore, WrapperStore, ZipStore
 
 from polarnet.runtime.files import sha256
 from polarnet.runtime.sections import section
 
 COMPRESSION_LEVEL = 1  # for zstd; higher levels cost 10-100 times the time for 6 % fewer bytes
-SHARD_BYTES = 2**25  # before compression; the writer of a part keeps about this much of each column in memory
-MAX_CHUNKS_PER_SHARD = 256  # a shard ends with an index of 16 bytes for each of its chunks, used or not
+DIGEST_LENGTH = 64  # characters of a SHA-256
+MAX_OPEN_PARTS = 64  # an open part has a file descriptor and about 2 MB of directory
 REPAIR = "write this store again, or copy it again from where it is whole"
 
 Header = dict[str, Any]
@@ -61,12 +64,6 @@ class Column:
     """Rows that are compressed together, the smallest unit of reading."""
     shape: tuple[int, ...] = ()
     """Shape of a row."""
-
-    @property
-    def shard(self) -> int:
-        """Rows in a file, a multiple of `chunk`."""
-        chunk_bytes = self.chunk * int(np.prod(self.shape)) * np.dtype(self.dtype).itemsize
-        return self.chunk * min(max(1, SHARD_BYTES // chunk_bytes), MAX_CHUNKS_PER_SHARD)
 
 
 Columns = Mapping[str, Column]
@@ -97,7 +94,7 @@ class Store:
         }
         """Names of the sequences in each part."""
         self._part_of = {sequence: part for part, names in self.parts.items() for sequence in names}
-        self._opened: dict[str, Any] = {}
+        self._opened = functools.lru_cache(MAX_OPEN_PARTS)(self._open)
         self._records: dict[str, Header] = {}
         self._unfinished: dict[str, _Part] = {}
 
@@ -150,10 +147,11 @@ class Store:
     def open(cls: type[S], path: str | os.PathLike[str]) -> S:
         """Open a finished store to read.
 
-        `path` is a local folder, a zip of one (its zarr.json at the top, as `cd STORE; zip -r0 ../STORE.zip .` makes
-        it), or an fsspec URL. FileNotFoundError where there is nothing; ValueError for other content, another version,
-        or an unfinished store.
+        `path` is a local folder or an fsspec URL. FileNotFoundError where there is nothing; ValueError for other
+        content, another version, or an unfinished store.
         """
+        if Path(path).is_file():
+            raise ValueError(f"{path}: expected the folder of a store, got a file; unpack a zip or tar of a store")
         header = dict(open_group(path).attrs)
         if header.get("format") != cls.FORMAT:
             raise ValueError(f"{path}: expected a store of format {cls.FORMAT!r}, got {header.get('format')!r}")
@@ -174,7 +172,7 @@ class Store:
 
     def missing_parts(self) -> list[str]:
         """Parts that are not written yet."""
-        return [part for part in self.parts if not Path(self.path, part).exists()]
+        return [part for part in self.parts if not self._is_whole(part)]
 
     def finish(self) -> None:
         """Mark the store complete and move it from PATH.tmp to PATH; ValueError where sequences are missing."""
@@ -196,7 +194,7 @@ class Store:
 
     def is_written(self, sequence: str) -> bool:
         """Whether the part of a sequence is complete."""
-        return Path(self.path, self._part(sequence)).exists()
+        return self._is_whole(self._part(sequence))
 
     def append(self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
         """Add the next sequence to its part, with its rows in some columns and its numbers; the last one completes it.
@@ -211,7 +209,7 @@ class Store:
                 f"{self.path}: {part} takes its sequences in order, expected {names[written]}, got {sequence}"
             )
         if not written:
-            self._unfinished[part] = _Part(Path(self.path, part), self.columns)
+            self._unfinished[part] = _Part(Path(self._file(part)), self.columns)
         self._unfinished[part].append(sequence, columns, record)
         if sequence == names[-1]:
             self._unfinished.pop(part).finish()
@@ -228,26 +226,31 @@ class Store:
         part = self._part(sequence)
         if part not in self._records:
             try:
-                header = dict(self._open(part).attrs)
-                if not _is_signed(header) or list(header["sequences"]) != self.parts[part]:
-                    raise ValueError("the attributes are not what was written")
+                group, _ = self._opened(os.getpid(), part)
+                records: Any = group.attrs["sequences"]
+                if list(records) != self.parts[part]:
+                    raise ValueError("it holds other sequences")
             except Exception as error:  # Zarr raises many kinds of exceptions
-                raise ValueError(
-                    f"{self.path}: {sequence}, {part}/zarr.json is unreadable: {error}; {REPAIR}"
-                ) from error
-            self._records[part] = header["sequences"]
+                raise ValueError(f"{self.path}: {sequence}, {part}.zip is unreadable: {error}; {REPAIR}") from error
+            self._records[part] = records
         return self._records[part][sequence]
 
     def read_column(self, name: str, sequence: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows `start` to `stop` (None: to the end) of a sequence; ValueError that names what cannot be read."""
         first, end = self.record(sequence)[self.columns[name].axis]
+        part = self._part(sequence)
         rows = slice(first + start, end if stop is None else min(first + stop, end))
         try:
-            values = np.asarray(self._open(f"{self._part(sequence)}/{name}")[rows])
+            group, arrays = self._opened(os.getpid(), part)
+            if name not in arrays:
+                arrays[name] = group[name]
+            values = np.asarray(arrays[name][rows])
             if len(values) != max(0, rows.stop - rows.start):
                 raise ValueError(f"expected rows {rows.start} to {rows.stop}, got {len(values)} of them")
         except Exception as error:  # each codec raises its own exceptions
-            raise ValueError(f"{self.path}: {sequence}, column {name} is unreadable: {error}; {REPAIR}") from error
+            raise ValueError(
+                f"{self.path}: {sequence}, column {name} is unreadable: {part}.zip: {error}; {REPAIR}"
+            ) from error
         return values
 
     def read_columns(self, sequence: str, requests: Sequence[tuple[str, int, int | None]]) -> list[np.ndarray]:
@@ -277,13 +280,14 @@ class Store:
         except (FileNotFoundError, ValueError) as error:
             return [str(error)]
         problems = [problem for sequence in store.sequences for problem in store.problems(sequence)]
-        files = fsspec.get_mapper(f"zip::{path}" if Path(path).is_file() else os.fspath(path))
-        for part, (first, *_) in store.parts.items():
-            with contextlib.suppress(ValueError):  # the problem of every sequence of the part
-                store.record(first)
-                for name, digest in store._open(part).attrs["metadata_sha256"].items():
-                    if sha256(files.get(f"{part}/{name}", b"")) != digest:
-                        problems.append(f"{path}: {part}/{name} is not as it was written; {REPAIR}")
+        for part in store.parts:
+            try:
+                with fsspec.open(store._file(part)) as file:
+                    digest, written = _digests(file)
+            except OSError:
+                digest, written = b"", None
+            if digest != written:
+                problems.append(f"{path}: {part}.zip is not as it was written; {REPAIR}")
         return problems
 
     def _part(self, sequence: str) -> str:
@@ -291,11 +295,17 @@ class Store:
             raise ValueError(f"{self.path}: there is no {sequence!r} among its {len(self.sequences)} sequences")
         return self._part_of[sequence]
 
-    def _open(self, name: str) -> Any:
-        """The part or the array of that name, kept open."""
-        if name not in self._opened:
-            self._opened[name] = self._open("")[name] if name else open_group(self.path)
-        return self._opened[name]
+    def _is_whole(self, part: str) -> bool:
+        return Path(self._file(part)).exists()
+
+    def _file(self, part: str) -> str:
+        """Path or fsspec URL of a part."""
+        return f"{self.path}/{part}.zip"
+
+    def _open(self, process: int, part: str) -> tuple[zarr.Group, dict[str, Any]]:
+        """The group of a part, and room for its arrays; a forked process must not share its parent's open file."""
+        file = self._file(part)
+        return open_group(f"zip::{file}" if "://" in file else file), {}
 
 
 class _Part:
@@ -305,40 +315,51 @@ class _Part:
         self.path = path
         self.records: dict[str, Header] = {}
         self._temporary = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
-        self._group = zarr.open_group(self._temporary, mode="w", zarr_format=3)
+        self._zip = zipfile.ZipFile(self._temporary, "w")
+        self._entries: dict[str, Buffer] = {}
+        self._group = zarr.create_group(MemoryStore(self._entries))
         self._columns = columns
         self._arrays = {name: _create_array(self._group, name, column) for name, column in columns.items()}
-        self._pending = {name: np.empty((0, *column.shape), column.dtype) for name, column in columns.items()}
 
     def append(self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
-        """Take the rows and the record of a sequence; whole shards go to disk."""
+        """Write the chunks of a sequence and take its record."""
         rows = {}
         for name, values in columns.items():
-            column, array, pending = self._columns[name], self._arrays[name], self._pending[name]
-            start = array.shape[0] + len(pending)
+            column, array = self._columns[name], self._arrays[name]
+            start = array.shape[0]
             rows[column.axis] = [start, start + len(values)]
             padding = np.zeros((-len(values) % column.chunk, *column.shape), column.dtype)
-            pending = np.concatenate([pending, values, padding])
-            whole = len(pending) - len(pending) % column.shard
-            if whole:
-                array.append(pending[:whole])
-            self._pending[name] = pending[whole:]
+            if len(values):
+                array.append(np.concatenate([values, padding]))
         self.records[sequence] = {**record, **rows}
+        self._pack([entry for entry in self._entries if not entry.endswith("zarr.json")])
 
     def finish(self) -> None:
-        """Write the attributes last, then give the part its name, unless another process did so first."""
-        for name, pending in self._pending.items():
-            if len(pending):
-                self._arrays[name].append(pending)
-        files = sorted(self._temporary.glob("*/**/zarr.json"))
-        digests = {file.relative_to(self._temporary).as_posix(): sha256(file) for file in files}
-        self._group.attrs.put(_signed({"sequences": self.records, "metadata_sha256": digests}))
-        try:
-            os.rename(self._temporary, self.path)
-        except OSError:
-            if not self.path.exists():
-                raise
-            shutil.rmtree(self._temporary)
+        """Write the metadata last, then give the part its name; another process may have given it the same bytes."""
+        self._group.attrs.put({"sequences": self.records})
+        self._pack(list(self._entries))
+        self._zip.comment = bytes(DIGEST_LENGTH)
+        self._zip.close()
+        with self._temporary.open("r+b") as file:
+            digest, _ = _digests(file)
+            file.seek(-DIGEST_LENGTH, os.SEEK_END)
+            file.write(digest)
+        os.replace(self._temporary, self.path)
+
+    def _pack(self, entries: list[str]) -> None:
+        """Move entries from memory into the zip, in an order and with a date that do not depend on the run."""
+        for entry in sorted(entries):
+            self._zip.writestr(zipfile.ZipInfo(entry), self._entries.pop(entry).to_bytes())
+
+
+def _digests(part: Any) -> tuple[bytes, bytes]:
+    """SHA-256 of an open part up to the comment of its zip, and that comment; they differ if a byte is damaged."""
+    digest, end = hashlib.sha256(), b""
+    while block := part.read(2**20):
+        block = end + block
+        digest.update(block[:-DIGEST_LENGTH])
+        end = block[-DIGEST_LENGTH:]
+    return digest.hexdigest().encode(), end
 
 
 class _WholeStore(WrapperStore[Any]):
@@ -382,7 +403,6 @@ def _create_array(group: zarr.Group, name: str, column: Column) -> zarr.Array:
         name,
         shape=(0, *column.shape),
         chunks=(column.chunk, *column.shape),
-        shards=(column.shard, *column.shape),
         dtype=dtype,
         fill_value=0,
         compressors=[blosc, Crc32cCodec()],

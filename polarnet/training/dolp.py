@@ -1,6 +1,7 @@
 """Training task of the DoLP networks: events of four channels in; DoLP out, and AoLP if the network predicts it."""
 
 from dataclasses import asdict
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -8,6 +9,7 @@ from torch import Tensor
 
 from polarnet.events.representations import REPRESENTATIONS, channels_of
 from polarnet.metrics.similarity import Lpips
+from polarnet.networks.checkpoint import load_checkpoint, load_tensors
 from polarnet.networks.registry import NETWORKS, NetworkConfig
 from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig, PolarizationLoss
@@ -18,16 +20,22 @@ from polarnet.training.task import State, Task, initialised
 def dolp_task(
     name: str, network_config: NetworkConfig, config: TrainConfig, loss: LossConfig, lpips: Lpips | None, seed: int
 ) -> Task:
-    """Build the task that trains a new network `name` (a key of NETWORKS), initialised from the seed.
+    """Build the task that trains a network `name` (a key of NETWORKS), from the seed or from `config.start`.
 
     The truth is a stack of DoLP, s1 and s2. The prediction is the same stack plus the log-variance, or DoLP alone if
-    the network predicts nothing else.
+    the network predicts nothing else. ValueError if the checkpoint holds another network, FileNotFoundError if there is
+    none.
     """
     build, _ = NETWORKS[name]
     representation = config.representation or build.representation
     encode = REPRESENTATIONS[representation]
     in_channels = 4 * channels_of(encode)
     network = initialised(lambda: build(network_config, in_channels), seed)
+    start: dict[str, str] = {}
+    if config.start is not None:
+        tensors, known = load_checkpoint(config.start)
+        load_tensors(network, tensors, Path(config.start))
+        start = {"start_sha256": known["sha256"]}
 
     def unroll(inputs: Tensor, state: State) -> tuple[Float[Tensor, "t b k h w"], State]:
         prediction, state = network.unroll(inputs, state)
@@ -51,6 +59,7 @@ def dolp_task(
             "config": asdict(network_config),
             "in_channels": in_channels,
             "representation": representation,
+            **start,
         },
         wants_intensity=False,
         optimizer=config.optimizer or build.optimizer,

@@ -65,6 +65,8 @@ class TrainConfig(LoopConfig):
     """Representation of the events in a window; null: the network's own default."""
     optimizer: Annotated[str, one_of(OPTIMIZERS)] | None
     """Name of the optimizer; null: the network's own default."""
+    start: str | None
+    """Checkpoint (.safetensors) of the same network whose weights the training starts from; null: random weights."""
 
 
 def train(

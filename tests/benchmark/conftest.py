@@ -3,6 +3,7 @@ import torch
 from method_fixtures import checkpoints, context, make_context, make_sequence, make_setup, sequence
 
 from polarnet.benchmark.run import BenchmarkSet
+from polarnet.events.stream import Events
 from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
@@ -17,13 +18,14 @@ def five_scenes(make_sequence, tmp_path):
     splits = {name: "train" if name.startswith("t") else "test" for name in SCENES}
     frames = FrameStore.create(tmp_path / "frames.zarr", list(SCENES), splits, 5, 18, 20, {"scenes": SCENES})
     events = EventStore.create(tmp_path / "events.zarr", list(SCENES), 18, 20, {})
+    rotating = EventStore.create(tmp_path / "rotating.zarr", list(SCENES), 18, 20, {})
     for seed, name in enumerate(SCENES):
         clip = make_sequence(name, seed=seed)
         dolp, aolp, s0 = (torch.cat([x[:1], x]) for x in (clip.dolp, clip.aolp, clip.s0))
         frames.write(name, clip.t_us, intensities_from_stokes(stokes_from_polarization(s0, dolp, aolp)), dolp, aolp)
         events.write(name, clip.events, 4000)
-    for store in (frames, events):
+        rotating.write(name, [clip.rotating, *[Events.empty(18, 20)] * 3], 4000)
+    for store in (frames, events, rotating):
         store.finish()
-    return BenchmarkSet(
-        "simulated", EventStore.open(tmp_path / "events.zarr"), FrameStore.open(tmp_path / "frames.zarr")
-    )
+    stores = EventStore.open(tmp_path / "events.zarr"), FrameStore.open(tmp_path / "frames.zarr")
+    return BenchmarkSet("simulated", *stores, EventStore.open(tmp_path / "rotating.zarr"))

@@ -24,7 +24,7 @@ def test_size_duration_rate_and_sensor_are_said(config):
     assert text.startswith(
         "Sequences of 120x180 pixels (height x width), 1 s at 30 frames a second; sensor: model exact"
     )
-    assert "contrast thresholds 0.2 (ON) and 0.2 (OFF), mismatch 0.03, cutoff 300 Hz" in text
+    assert "contrast thresholds 0.2 (ON) and 0.2 (OFF), mismatch 0.03 (ON) and 0.03 (OFF), cutoff 300 Hz" in text
 
 
 def test_a_model_is_described_by_the_parameters_that_it_has(config):
@@ -33,9 +33,9 @@ def test_a_model_is_described_by_the_parameters_that_it_has(config):
     assert "refractory period 500 us" in esim
     voltmeter = sentence(configured(config.synthesize, dataclasses.replace(config.emulate, model="dvs_voltmeter")))
     assert voltmeter.endswith("model dvs_voltmeter with the constants of dvs346.")
-    drawn = sentence(configured(config.synthesize, dataclasses.replace(config.emulate, randomise=True)))
-    assert "drawn for each sequence" in drawn
-    assert "thresholds" not in drawn
+    emulate = dataclasses.replace(config.emulate, randomise={"cutoff_hz": [30.0, 300.0], "leak_rate_hz": [0.01, 0.1]})
+    drawn = sentence(configured(config.synthesize, emulate))
+    assert drawn.endswith("model exact, cutoff_hz, leak_rate_hz drawn for each sequence (emulate.randomise).")
 
 
 def test_the_conditions_of_the_training_give_no_warning(config):
@@ -51,7 +51,7 @@ def test_a_difference_is_said_with_both_values_and_what_to_set(config):
 
 
 def test_another_sensor_is_a_difference_but_unused_parameters_and_more_sequences_are_none(config):
-    noisy = dataclasses.replace(config.emulate, shot_noise_rate_hz=5.0, esim_log_eps=0.1, random_cutoff_hz=[1.0, 2.0])
+    noisy = dataclasses.replace(config.emulate, shot_noise_rate_hz=5.0, esim_log_eps=0.1)
     motion = dataclasses.replace(config.synthesize, sequences_per_picture=3)
     (line,) = warnings(configured(motion, noisy), {"ours": checkpoint(config)}, "Set")
     assert line.endswith("emulate.shot_noise_rate_hz 5.0 (training: 0.001). Set emulate.shot_noise_rate_hz=0.001")
@@ -67,3 +67,43 @@ def test_of_events_that_were_not_simulated_the_size_alone_is_known(config):
     recorded = stored({}, 120, 180)
     assert sentence(recorded) == "Sequences of 120x180 pixels (height x width)."
     assert warnings(recorded, {"ours": checkpoint(config)}, "Set") == []
+
+
+BEFORE = {
+    "contrast_threshold_sigma": 0.03,
+    "random_threshold_on": [0.08, 0.31],
+    "random_threshold_off": [0.14, 0.42],
+    "random_threshold_sigma": [0.02, 0.06],
+    "random_cutoff_hz": [30.0, 300.0],
+    "random_leak_rate_hz": [0.01, 0.1],
+    "random_shot_noise_rate_hz": [0.001, 5.0],
+}
+"""Keys of section `emulate` when ON and OFF thresholds had one deviation."""
+
+
+def checkpoint_before(config, randomise: bool):
+    metadata = checkpoint(config)
+    emulate = metadata["data"]["events_from"]["emulate"]
+    for key in emulate.keys() & {"contrast_threshold_sigma_on", "contrast_threshold_sigma_off", "randomise"}:
+        del emulate[key]
+    for key in ("contrast_threshold_correlation", "hot_pixel_share", "hot_pixel_rate_hz", "dead_pixel_share"):
+        del emulate[key]
+    emulate |= BEFORE | {"randomise": randomise}
+    return metadata
+
+
+def test_a_checkpoint_with_one_deviation_for_both_thresholds_is_compared_by_todays_keys(config):
+    old = {"ours": checkpoint_before(config, randomise=False)}
+    assert warnings(configured(config.synthesize, config.emulate), old, "Set") == []
+    other = dataclasses.replace(config.emulate, contrast_threshold_sigma_off=0.05, dead_pixel_share=0.01)
+    (line,) = warnings(configured(config.synthesize, other), old, "Set")
+    assert line.endswith("Set emulate.contrast_threshold_sigma_off=0.03 emulate.dead_pixel_share=0.0")
+
+
+def test_the_ranges_of_an_old_checkpoint_are_said_as_todays(config):
+    (line,) = warnings(
+        configured(config.synthesize, config.emulate), {"ours": checkpoint_before(config, randomise=True)}, "Set"
+    )
+    assert "emulate.randomise null (training: {contrast_threshold_on:[0.08,0.31]," in line
+    assert "contrast_threshold_sigma_off:[0.02,0.06],cutoff_hz:[30.0,300.0]," in line
+    assert "emulate.cutoff_hz" not in line

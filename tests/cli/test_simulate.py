@@ -10,10 +10,10 @@ import torch
 import zarr
 
 from polarnet.cli import main, simulated_files
+from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import Events
 from polarnet.pictures.images import fit, read_rgb
 from polarnet.pictures.polarimetry import demosaic
-from polarnet.recordings.arrangements import split_mosaic
 from polarnet.recordings.recording import read_recording
 from polarnet.simulation import (
     MOTIONS,
@@ -133,7 +133,7 @@ def test_an_mp4_gives_the_events_of_its_frames_at_its_own_times(capsys):
 def test_a_grey_mp4_is_unpolarized_and_all_channels_see_the_same_light(capsys):
     write_video("walk.mp4", scenery(1))
     assert main(["simulate", "walk.mp4", "--out", "out", "sensor=clean", "--grey", "--no-preview",
-                 "emulate.contrast_threshold_sigma=0"]) == 0  # fmt: skip
+                 "emulate.contrast_threshold_sigma_on=0", "emulate.contrast_threshold_sigma_off=0"]) == 0  # fmt: skip
     first, *others = stored()
     assert_equal([first] * 3, others)
     assert "DoLP is 0 everywhere" in capsys.readouterr().out

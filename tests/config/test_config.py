@@ -78,7 +78,7 @@ def test_a_typo_on_the_command_line_is_refused_with_the_keys_there_are(project_r
     ("override", "message"),
     [
         ("experiment=smok", r"experiment: there is no 'smok'; conf/experiment has demo, paper, photographs, smoke$"),
-        ("sensor=noizy", r"sensor: there is no 'noizy'; conf/sensor has clean, default, noisy$"),
+        ("sensor=noizy", r"sensor: there is no 'noizy'; conf/sensor has clean, default, noisy, random$"),
         ("ablation=glob(moz*)", r"ablation: there is no 'moz\*'; conf/ablation has crop, "),
         ("ablation=nothing,panoramma", r"ablation: there is no 'panoramma'; conf/ablation has crop, memories, "),
     ],
@@ -297,11 +297,11 @@ def test_an_unknown_preset_lists_the_ones_there_are(project):
         write_preset(project, "papper")
 
 
-# thresholds, sigma, cutoff, leak, shot noise (Hz), refractory period (us), jitter, spread: v2e's defaults, --dvs_params
+# thresholds, their deviations, cutoff, leak, shot noise (Hz), refractory period (us), jitter, spread: v2e's defaults, --dvs_params
 SENSORS = {
-    "default": (0.2, 0.2, 0.03, 300.0, 0.01, 0.001, 500.0, 0.1, 0.1),
-    "clean": (0.2, 0.2, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-    "noisy": (0.2, 0.2, 0.05, 30.0, 0.1, 5.0, 0.0, 0.1, 0.1),
+    "default": (0.2, 0.2, 0.03, 0.03, 300.0, 0.01, 0.001, 500.0, 0.1, 0.1),
+    "clean": (0.2, 0.2, 0.02, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "noisy": (0.2, 0.2, 0.05, 0.05, 30.0, 0.1, 5.0, 0.0, 0.1, 0.1),
 }
 
 
@@ -309,7 +309,8 @@ def sensor_of(emulate: EmulatorConfig) -> tuple[float, ...]:
     return (
         emulate.contrast_threshold_on,
         emulate.contrast_threshold_off,
-        emulate.contrast_threshold_sigma,
+        emulate.contrast_threshold_sigma_on,
+        emulate.contrast_threshold_sigma_off,
         emulate.cutoff_hz,
         emulate.leak_rate_hz,
         emulate.shot_noise_rate_hz,
@@ -321,11 +322,11 @@ def sensor_of(emulate: EmulatorConfig) -> tuple[float, ...]:
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_sensor_is_v2es_for_hydra_and_for_dvc_alike_and_leaves_the_rest_as_it_was(project, monkeypatch, name):
-    edit(project, "  randomise: false", "  randomise: true")
+    edit(project, "  randomise: null  # {KEY", "  randomise: {cutoff_hz: [3.0, 30.0]}  # {KEY")
     edit(project, "  model: exact", "  model: esim")
     by_hydra = load(project, ["experiment=smoke", f"sensor={name}"])
     assert sensor_of(by_hydra.emulate) == SENSORS[name]
-    assert (by_hydra.emulate.model, by_hydra.emulate.randomise) == ("esim", False)
+    assert (by_hydra.emulate.model, by_hydra.emulate.randomise) == ("esim", None)
     monkeypatch.chdir(project)
     assert main(["preset", "smoke"]) == 0
     assert main(["preset", name]) == 0
@@ -336,7 +337,7 @@ def test_a_sensor_is_v2es_for_hydra_and_for_dvc_alike_and_leaves_the_rest_as_it_
 
 def test_the_next_experiment_puts_a_sensor_back(project):
     original = (project / "params.yaml").read_text()
-    assert len(write_preset(project, "noisy")) == 5
+    assert len(write_preset(project, "noisy")) == 6
     write_preset(project, "demo")
     assert (project / "params.yaml").read_text() == original
 

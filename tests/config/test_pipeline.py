@@ -2,21 +2,29 @@ import re
 
 import pytest
 
+from polarnet.benchmark.run import Benchmark
+from polarnet.benchmark.score import Cost
 from polarnet.config import pipeline, tables
 from polarnet.config.tree import load
+
+
+def scored_rows(rows):
+    return Benchmark([], dict.fromkeys(rows, Cost(0.0, None, 0, 0.0)), [])
 
 
 @pytest.mark.parametrize(("enabled", "scored"), [("false", ["simulated"]), ("true", ["simulated", "recordings"])])
 def test_real_targets_are_a_set_while_they_are_switched_on(project_root, tmp_path, monkeypatch, enabled, scored):
     opened, written = [], {}
-    monkeypatch.setattr(pipeline, "pipeline_set", lambda config, name: opened.append(name))
-    monkeypatch.setattr(pipeline, "run_benchmark", lambda *arguments: None)
+    monkeypatch.setattr(pipeline, "pipeline_set", lambda config, name, rows: opened.append(name))
+    monkeypatch.setattr(
+        pipeline, "run_benchmark", lambda test_set, context, settings, *_: scored_rows(settings.methods)
+    )
     monkeypatch.setattr(pipeline, "lpips_of", lambda config: None)
     monkeypatch.setattr(pipeline, "write_row", lambda folder, row, record, sets: written.update({row: list(sets)}))
     config = load(project_root, [f"paths.data={tmp_path}", f"recordings.enabled={enabled}"])
-    pipeline.run_rows(config, ["zeros", "cf"])
+    pipeline.run_rows(config, ["zeros", "cf", "rotating_polarizer"])
     assert opened == scored
-    assert written == {"zeros": scored, "cf": scored}
+    assert written == {"zeros": scored, "cf": scored, "rotating_polarizer": ["simulated"]}  # targets: four channels
     assert pipeline.set_folder(config, "simulated") == tmp_path / "benchmark"
     assert pipeline.set_folder(config, "recordings") == tmp_path / "benchmark" / "sets" / "recordings"
 

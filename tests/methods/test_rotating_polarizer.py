@@ -104,7 +104,13 @@ def simulated(dolp, sensor, turns=2, rate_hz=4.0, s0=1.0, aolp=0.7, size=(6, 8))
 
 def test_the_photoreceptor_delays_aolp_by_its_time_constant_and_the_fit_knows_it():
     """At 127.5 DN a cutoff of 60 Hz is 60 (127.5 + 20) / 275 = 32.2 Hz: 4.95 ms, 7.1 degrees at 4 turns/s."""
-    sensor = replace(SENSORS["clean"], cutoff_hz=60.0, contrast_threshold_sigma=0.0, contrast_threshold_on=0.05)
+    sensor = replace(
+        SENSORS["clean"],
+        cutoff_hz=60.0,
+        contrast_threshold_sigma_on=0.0,
+        contrast_threshold_sigma_off=0.0,
+        contrast_threshold_on=0.05,
+    )
     simulation, stop_us = simulated(0.2, replace(sensor, contrast_threshold_off=0.05))
     config = replace(IDEAL, threshold_on=0.05, threshold_off=0.05, level_dn=127.5, level_spread=0.05, knee_dn=20.0)
     unaware, aware = (

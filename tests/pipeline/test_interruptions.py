@@ -126,13 +126,13 @@ def digest(folder: Path) -> dict[str, str]:
 
 def finished(unfinished: Path) -> set[str]:
     """Names of the parts that are whole: a part gets its name last."""
-    return {path.name for path in unfinished.glob("part-[0-9][0-9][0-9][0-9][0-9]")}
+    return {path.name for path in unfinished.glob("part-[0-9][0-9][0-9][0-9][0-9].zip")}
 
 
 def identities(store: Path) -> dict[str, tuple[int, int]]:
-    """Inode and time of every file of the finished parts: another one if written again, even with equal bytes."""
-    files = [path for part in finished(store) for path in (store / part).rglob("*") if path.is_file()]
-    return {str(path.relative_to(store)): (path.stat().st_ino, path.stat().st_mtime_ns) for path in files}
+    """Inode and time of every finished part: another one if written again, even with equal bytes."""
+    parts = {part: (store / part).stat() for part in finished(store)}
+    return {part: (status.st_ino, status.st_mtime_ns) for part, status in parts.items()}
 
 
 def until(true: Callable[[], bool], still_worth_it: Callable[[], bool] = lambda: True) -> None:

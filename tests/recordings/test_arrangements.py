@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from polarnet.events.stream import Events
-from polarnet.recordings.arrangements import read_four, read_mosaic, split_mosaic, write_store
+from polarnet.recordings.arrangements import read_four, read_mosaic, write_store
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import parse_mosaic
 from polarnet.storage.events import EventStore
@@ -36,8 +36,6 @@ def test_four_files_in_any_order_become_the_channels_0_45_90_135(tmp_path):
     starts = {0: 5000, 45: 6000, 90: 7000, 135: 8000}
     for angle, channel in zip(ANGLES, read_four(files, starts), strict=True):
         assert torch.equal(channel.t, events[angle].t[events[angle].t >= starts[angle]] - starts[angle])
-    moved = read_four(files, homographies={45: np.array([[1.0, 0, 2], [0, 1, 0], [0, 0, 1]])})
-    assert torch.equal(moved[1].x[:20], events[45].x[events[45].x < 1278][:20] + 2)
     write_store(tmp_path / "events.zarr", {"a": channels})
     stored = EventStore.open(tmp_path / "events.zarr").read("a")
     assert all(torch.equal(ours.t, theirs.t) for ours, theirs in zip(stored, channels, strict=True))
@@ -52,29 +50,12 @@ def test_an_angle_that_is_missing_or_twice_there_is_refused(tmp_path):
         read_four(dict.fromkeys(ANGLES, tmp_path / "a"), {0: 1})
 
 
-@pytest.mark.parametrize("order", ["90 45 / 135 0", "0 45 / 90 135"])
-def test_a_mosaic_gives_each_channel_the_pixels_of_its_angle(order):
-    mosaic = parse_mosaic(order)
-    y, x = (axis.ravel() for axis in np.indices((5, 6)))  # every pixel once; the last row is of no cell
-    t = torch.arange(30)
-    events = Events(t, *(torch.from_numpy(c.astype(np.int16)) for c in (x, y)), torch.ones(30, dtype=torch.int8), 5, 6)
-    channels = split_mosaic(events, mosaic)
-    assert sum(map(len, channels)) == 24
-    for angle, channel in zip(ANGLES, channels, strict=True):
-        assert (channel.height, channel.width) == (2, 3)
-        for time, row, column in zip(channel.t.tolist(), channel.y.tolist(), channel.x.tolist(), strict=True):
-            assert (row, column) == (int(y[time]) // 2, int(x[time]) // 2)
-            assert mosaic[int(y[time]) % 2][int(x[time]) % 2] == angle
-
-
 def test_a_mosaic_file_starts_with_its_first_event(tmp_path):
     events = some_events(1)
     write_celex5_csv(tmp_path / "a.csv", events)
     channels = read_mosaic(tmp_path / "a.csv", parse_mosaic("90 45 / 135 0"))
     assert min(int(c.t[0]) for c in channels) == 0
     assert sum(map(len, channels)) == len(events)
-    with pytest.raises(RecordingError, match="at least 2x2"):
-        split_mosaic(Events.empty(1, 6), parse_mosaic("90 45 / 135 0"))
 
 
 def test_paths_may_be_text(tmp_path):

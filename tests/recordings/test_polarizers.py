@@ -6,9 +6,10 @@ import itertools
 import pytest
 import torch
 
+from polarnet.events.mosaic import join_mosaic, split_mosaic
 from polarnet.events.stream import Events, merge
 from polarnet.events.streaming import WindowCutter, WindowRule
-from polarnet.recordings.arrangements import read_mosaic, split_mosaic
+from polarnet.recordings.arrangements import read_mosaic
 from polarnet.recordings.live import Piece
 from polarnet.recordings.polarizers import WINDOW_US, ChannelCheck, pair_misfits
 from polarnet.simulation import BUILTIN_PHOTOS, MOTIONS, SENSORS, read_rgb, scene_from_polarization, simulate
@@ -38,14 +39,9 @@ def unpolarized():
     return events_of(0.0)
 
 
-def mosaic_of(channels, order):
-    """Events of a sensor whose 2x2 pixels have polarizers in this order."""
-    parts = []
-    for angle, events in zip(POLARIZER_ANGLES_DEG, channels, strict=True):
-        row, column = next((r, c) for r in (0, 1) for c in (0, 1) if order[r][c] == angle)
-        own = ((events.y & 1) == row) & ((events.x & 1) == column)
-        parts.append(Events(events.t[own], events.x[own], events.y[own], events.p[own], events.height, events.width))
-    return merge(parts)
+def camera_of(channels):
+    """Events of a sensor whose 2x2 pixels have polarizers in Sony's order."""
+    return join_mosaic([split_mosaic(events, SONY)[number] for number, events in enumerate(channels)], SONY)
 
 
 def windows_of(channels):
@@ -84,14 +80,13 @@ def test_four_files_in_their_order_are_not_named_and_in_another_order_are(polari
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_every_order_of_a_mosaic_that_changes_dolp_is_named(polarized, order):
-    camera = mosaic_of(polarized, SONY)
-    warning = findings(split_mosaic(camera, order), mosaic=True)
+    warning = findings(split_mosaic(camera_of(polarized), order), mosaic=True)
     assert ("another order" in warning) == (not right_angles(order))
 
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_a_mosaic_without_polarizers_is_named_whatever_its_order(unpolarized, order):
-    channels = split_mosaic(mosaic_of(unpolarized, SONY), order)
+    channels = split_mosaic(camera_of(unpolarized), order)
     assert "Either the recording was made without polarizers, or its scene is hardly" in findings(channels, mosaic=True)
 
 

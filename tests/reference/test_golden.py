@@ -36,7 +36,9 @@ MAPS = {
 }
 STAMP_TOLERANCE_US = 0.5
 SIZE = (32, 48)
-CONFIG = dataclasses.replace(SENSORS["clean"], model="v2e", contrast_threshold_sigma=0.0)
+CONFIG = dataclasses.replace(
+    SENSORS["clean"], model="v2e", contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0
+)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +68,8 @@ def v2e_config(params: dict) -> EmulatorConfig:
         CONFIG,
         contrast_threshold_on=params["pos_thres"],
         contrast_threshold_off=params["neg_thres"],
-        contrast_threshold_sigma=params["sigma_thres"],
+        contrast_threshold_sigma_on=params["sigma_thres"],
+        contrast_threshold_sigma_off=params["sigma_thres"],
         cutoff_hz=float(params["cutoff_hz"]),
         leak_rate_hz=float(params["leak_rate_hz"]),
         leak_jitter=float(params["leak_jitter_fraction"]),

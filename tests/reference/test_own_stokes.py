@@ -43,7 +43,8 @@ def recovered(request, stokes) -> torch.Tensor:
         model=request.param,
         contrast_threshold_on=C,
         contrast_threshold_off=C,
-        contrast_threshold_sigma=0.0,
+        contrast_threshold_sigma_on=0.0,
+        contrast_threshold_sigma_off=0.0,
     )
     intensities = intensities_from_stokes(stokes)
     share = torch.linspace(0, 1, 31)[:, None, None, None]

@@ -13,7 +13,7 @@ from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL
 from polarnet.simulation.pixels.randomness import mixed, normal, normal_map, rough_normals, uniform
 from polarnet.simulation.presets import SENSORS
 
-QUIET = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma=0.0)
+QUIET = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
 SIDE = 64  # pixels
 
 
@@ -54,8 +54,21 @@ def test_shot_noise_of_exact_is_a_poisson_process_at_any_frame_rate():
     assert stats.kstest(first, law.cdf).pvalue > 0.01
 
 
+def test_rejected_shot_noise_does_not_delay_a_threshold_crossing():
+    config = dataclasses.replace(QUIET, shot_noise_rate_hz=40.0)
+    t_s = np.arange(101) / 100
+    frames = np.float32(50 * 5**t_s).reshape(-1, 1, 1, 1).repeat(SIDE, 2).repeat(SIDE, 3)
+    (columns,), _ = emulate_columns(frames, t_s * 1e6, config, key=5, labels=True, unrounded_times=True)
+    assert (columns.label == SHOT).mean() > 0.5
+    between, first = intervals_s(columns)
+    until_crossing_s = config.contrast_threshold_on / math.log(5)  # in log light that rises steadily
+    assert max(between.max(), first.max()) == pytest.approx(until_crossing_s, abs=2e-6)
+
+
 def test_thresholds_tilt_shot_noise_towards_the_lower_one():
-    config = dataclasses.replace(QUIET, shot_noise_rate_hz=5.0, contrast_threshold_sigma=0.05)
+    config = dataclasses.replace(
+        QUIET, shot_noise_rate_hz=5.0, contrast_threshold_sigma_on=0.05, contrast_threshold_sigma_off=0.05
+    )
     for model in ("v2e", "exact"):
         t_us = 1e4 * torch.arange(201, dtype=torch.float64)
         frames = torch.zeros(1, 1, SIDE, SIDE).expand(201, -1, -1, -1)

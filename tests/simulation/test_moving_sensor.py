@@ -154,7 +154,7 @@ def test_a_sensor_that_leaves_the_scene_is_refused_with_its_place(scene):
 
 def test_exact_needs_few_frames_for_the_times_of_many(scene):
     config = dataclasses.replace(
-        CONFIG, contrast_threshold_sigma=0.0, cutoff_hz=0.0, leak_rate_hz=0.0, shot_noise_rate_hz=0.0,
+        CONFIG, contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0, cutoff_hz=0.0, leak_rate_hz=0.0, shot_noise_rate_hz=0.0,
         refractory_period_us=0.0,
     )  # fmt: skip
     many, few = (

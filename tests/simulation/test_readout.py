@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from polarnet.events.stream import Events, validate
-from polarnet.simulation.readout import ReadoutConfig, as_one_sensor, read_out
+from polarnet.simulation.readout import ReadoutConfig, read_out
 
-PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=1000.0)
+PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=1000.0, randomise=None)
 
 
 def events_at(*rows: tuple[int, int, int], height: int = 10, width: int = 10) -> Events:
@@ -87,11 +87,3 @@ def test_events_after_the_end_of_the_recording_are_missing():
     )
     assert triples(leaving) == [(10, 0, 0)]
     assert lost == 0
-
-
-def test_the_channels_of_a_mosaic_share_one_bus():
-    places = [(1, 1), (0, 1), (0, 0), (1, 0)]
-    channels = [events_at((10 + k, 0, 0), height=2, width=2) for k in range(4)]
-    sensor = as_one_sensor(channels, places)
-    assert (sensor.height, sensor.width) == (4, 4)
-    assert triples(sensor) == [(10, 1, 1), (11, 0, 1), (12, 0, 0), (13, 1, 0)]

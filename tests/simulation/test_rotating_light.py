@@ -45,7 +45,7 @@ def test_unpolarized_light_fires_nothing_behind_a_rotating_polarizer():
 
 def test_dolp_one_half_fires_three_events_down_from_its_mean_and_five_on_each_way_between_its_extremes():
     """ln(1 + 0.5 cos x) falls from 0 to -0.693 and rises to 0.405; thresholds of 0.2 lie at -0.6 and 0.4."""
-    sensor = replace(SENSORS["clean"], contrast_threshold_sigma=0.0)
+    sensor = replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
     rotating = replace(ROTATING, start_angle_deg=45.0)
     t_us = rotating_times_us(rotating, sensor, 0, 450_000)  # a little less than one turn, two periods of the light
     p = emulate_rotating(uniform_scene(), None, t_us, 1, 1, rotating, sensor, 1).events.p.tolist()

@@ -12,6 +12,7 @@ CONFIG = VariationConfig(
     share=1.0,
     dolp_factor=[0.1, 1.3],
     dolp_exponent_spread=0.4,
+    dolp_spacing="linear",
     s0_factor=[0.5, 1.0],
     s0_exponent_spread=0.35,
     uniform_share=0.0,
@@ -41,6 +42,22 @@ def test_shapes_stay_brighter_stays_brighter_and_more_polarized_more_polarized()
     assert torch.equal(scene()[0].flatten().argsort(), s0.flatten().argsort())
     below = dolp < 0.99
     assert torch.equal(scene()[1][below].argsort(), dolp[below].argsort())
+
+
+def factors(spacing: str) -> np.ndarray:
+    config = replace(CONFIG, dolp_spacing=spacing, dolp_factor=[0.01, 1.0], dolp_exponent_spread=0.0)
+    means = [varied(scene(), config, np.random.default_rng(seed))[1].mean() for seed in range(200)]
+    return np.array(means) / float(scene()[1].mean())
+
+
+def test_a_logarithmic_factor_is_as_often_below_a_tenth_as_above_and_a_linear_one_is_not():
+    assert 0.4 < (factors("logarithmic") < 0.1).mean() < 0.6
+    assert (factors("linear") < 0.1).mean() < 0.2
+
+
+def test_a_logarithmic_factor_from_0_is_refused():
+    with pytest.raises(ValueError, match="expected numbers above 0"):
+        replace(CONFIG, dolp_spacing="logarithmic", dolp_factor=[0.0, 1.0])
 
 
 def test_with_no_share_only_angles_turn_and_all_alike():

@@ -77,7 +77,7 @@ def test_a_video_gives_what_emulate_gives_for_the_light_behind_ideal_polarizers(
 
 def test_a_dofp_sensor_sees_a_uniform_scene_as_four_sensors_do_but_half_as_large():
     """Without differences between pixels, noise and mismatch, every pixel of a channel fires alike."""
-    sensor = replace(SENSORS["clean"], contrast_threshold_sigma=0.0)
+    sensor = replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
     frames = [
         torch.tensor([level, 0.5 * level, 0.25 * level]).view(3, 1, 1).expand(3, H, W) for level in (0.2, 0.5, 1.0)
     ]

@@ -12,7 +12,9 @@ from polarnet.simulation.emulator import emulate_columns
 from polarnet.simulation.pixels.voltmeter import CAMERAS, chance_of_on
 from polarnet.simulation.presets import SENSORS
 
-CONFIG = dataclasses.replace(SENSORS["clean"], model="dvs_voltmeter", contrast_threshold_sigma=0.0)
+CONFIG = dataclasses.replace(
+    SENSORS["clean"], model="dvs_voltmeter", contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0
+)
 SIDE = 50
 
 

@@ -13,9 +13,10 @@ import torch
 import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from part_fixtures import entries_of, entries_to_change, flip, group_to_change
+from zarr.storage import ZipStore
 
 import polarnet.storage.events as store_module
-import polarnet.storage.parts as parts_module
 from polarnet.events.stream import Events, slice_time
 from polarnet.storage.events import MAX_DURATION_US, EventStore
 
@@ -78,7 +79,7 @@ def test_the_store_says_what_is_needed_to_interpret_it(finished):
 
 
 def test_any_zarr_reader_finds_a_channel_by_its_offsets_and_a_millisecond_by_its_index(finished, channels):
-    part = zarr.open_group(finished, mode="r")["part-00000"]
+    part = zarr.open_group(ZipStore(finished / "part-00000.zip"), mode="r")
     record = part.attrs["sequences"]["leaves"]
     first, _ = record["events"]
     start, stop = record["offsets"][2:4]
@@ -107,19 +108,18 @@ def test_a_window_may_be_open_at_either_end(finished, channels):
 def test_a_window_reads_only_its_own_chunks(channels, tmp_path, monkeypatch):
     """One channel of 300,000 events in 1 s: 10 ms are 3000 of them, in one or two chunks of 4096 of the 74."""
     monkeypatch.setattr(store_module, "CHUNK", 2**12)
-    monkeypatch.setattr(parts_module, "SHARD_BYTES", 2**17)
     store = EventStore.create(tmp_path / "events.zarr", ["coffee"], HEIGHT, WIDTH, {})
     store.write("coffee", channels["coffee"], DURATIONS_US["coffee"])
     store.finish()
     read = []
-    get = zarr.storage._local._get
+    get = ZipStore.get
 
-    def counted(*arguments):
-        value = get(*arguments)
+    async def counted(*arguments, **options):
+        value = await get(*arguments, **options)
         read.append(len(value))
         return value
 
-    monkeypatch.setattr(zarr.storage._local, "_get", counted)
+    monkeypatch.setattr(ZipStore, "get", counted)
     store = EventStore.open(tmp_path / "events.zarr")
     store.read("coffee")
     whole = sum(read)
@@ -128,19 +128,18 @@ def test_a_window_reads_only_its_own_chunks(channels, tmp_path, monkeypatch):
     assert sum(read) < 0.2 * whole
 
 
-def test_sequences_may_fill_several_shards_of_events_and_of_the_time_index(make_random_events, tmp_path, monkeypatch):
+def test_sequences_may_fill_several_chunks_of_events_and_of_the_time_index(make_random_events, tmp_path, monkeypatch):
     monkeypatch.setattr(store_module, "CHUNK", 128)
     monkeypatch.setattr(store_module, "MILLISECOND_CHUNK", 8)
-    monkeypatch.setattr(parts_module, "SHARD_BYTES", 2048)
     long = [make_random_events(k, 300 * (k + 1), 99_500, HEIGHT, WIDTH) for k in range(4)]
     short = [make_random_events(k, 40, 9_000, HEIGHT, WIDTH) for k in range(4)]
     store = EventStore.create(tmp_path / "events.zarr", ["long", "short"], HEIGHT, WIDTH, {}, 2)
     store.write("long", long, 99_500)
     store.write("short", short, 9_000)
     store.finish()
-    part = tmp_path / "events.zarr" / "part-00000"
-    assert len(list((part / "events" / "t" / "c").iterdir())) == 7  # 3000 and 400 events, 512 in a shard
-    assert len(list((part / "ms_to_idx" / "c").iterdir())) == 2  # 101 and 10 entries, 64 in a shard
+    entries = entries_of(tmp_path / "events.zarr" / "part-00000.zip")
+    assert len([entry for entry in entries if entry.startswith("events/t/c/")]) == 24 + 2  # 3000 and 160 events of 128
+    assert len([entry for entry in entries if entry.startswith("ms_to_idx/c/")]) == 13 + 2  # 101 and 10 entries of 8
     assert EventStore.verify(tmp_path / "events.zarr") == []
     store = EventStore.open(tmp_path / "events.zarr")
     for name, channels in (("long", long), ("short", short)):
@@ -226,24 +225,18 @@ def test_a_whole_store_has_no_problems(finished):
 
 @pytest.mark.parametrize("column", ["events/x", "events/y", "events/t", "events/p", "ms_to_idx"])
 def test_verify_names_sequence_and_column_of_a_flipped_byte(copy, column):
-    """The chunks of `leaves` come after those of `coffee` in the only shard of a part's column."""
-    (shard,) = (file for file in (copy / "part-00000" / column / "c").rglob("*") if file.is_file())
-    content = bytearray(shard.read_bytes())
-    chunks = 3 if column.startswith("events") else 2
-    array = zarr.open_group(copy, mode="r")[f"part-00000/{column}"]
-    index = content[-4 - 16 * (array.shards[0] // array.chunks[0]) : -4]  # start and length of each chunk, then a CRC
-    start, length = np.frombuffer(index, "<u8").reshape(-1, 2)[chunks - 1]
-    content[int(start + length // 2)] ^= 0x10
-    shard.write_bytes(content)
-    (problem,) = EventStore.verify(copy)
+    """The chunks of `leaves` come after the two chunks of events of `coffee`, and its one of the time index."""
+    flip(copy / "part-00000.zip", f"{column}/c/2" if column.startswith("events") else f"{column}/c/1/0")
+    problem, whole = EventStore.verify(copy)
     assert f"leaves, column {column} is unreadable" in problem
+    assert "part-00000.zip is not as it was written" in whole
 
 
-def test_verify_names_a_file_that_is_missing(copy):
-    (copy / "part-00000" / "events" / "y" / "c" / "0").unlink()
-    coffee, leaves = EventStore.verify(copy)
-    assert "coffee, column events/y is unreadable: there is no part-00000/events/y/c/0" in coffee
-    assert "leaves, column events/y is unreadable: there is no part-00000/events/y/c/0" in leaves
+def test_verify_names_a_chunk_that_is_missing(copy):
+    with entries_to_change(copy / "part-00000.zip") as entries:
+        del entries["events/y/c/2"]
+    (problem,) = EventStore.verify(copy)
+    assert "leaves, column events/y is unreadable: part-00000.zip: there is no events/y/c/2" in problem
     with pytest.raises(ValueError, match="leaves, column events/y"):
         EventStore.open(copy).read("leaves")
 
@@ -258,16 +251,16 @@ def test_verify_names_a_file_that_is_missing(copy):
     ],
 )
 def test_verify_names_events_that_a_foreign_writer_got_wrong(copy, column, place, value, message):
-    part = zarr.open_group(copy, mode="r+")["part-00000"]
-    part[column][part.attrs["sequences"]["leaves"]["events"][0] + place] = value
+    with group_to_change(copy / "part-00000.zip") as part:
+        part[column][part.attrs["sequences"]["leaves"]["events"][0] + place] = value
     with pytest.raises(ValueError, match=message):
         raise ValueError(EventStore.verify(copy)[0])
 
 
 def test_verify_notices_a_time_index_that_does_not_fit(copy):
-    part = zarr.open_group(copy, mode="r+")["part-00000"]
-    row = part.attrs["sequences"]["leaves"]["milliseconds"][0] + 100
-    part["ms_to_idx"][row, 2] = part["ms_to_idx"][row, 2] + 1
+    with group_to_change(copy / "part-00000.zip") as part:
+        row = part.attrs["sequences"]["leaves"]["milliseconds"][0] + 100
+        part["ms_to_idx"][row, 2] = part["ms_to_idx"][row, 2] + 1
     assert EventStore.verify(copy) == [f"{copy}: leaves, polarizer 90: ms_to_idx does not match events/t"]
 
 

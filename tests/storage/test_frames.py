@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from part_fixtures import entries_of, entries_to_change, flip
 
 from polarnet.storage.frames import (
     FrameStore,
@@ -111,12 +112,13 @@ def test_black_unpolarized_frames_are_not_taken_for_missing_ones(tmp_path):
     assert FrameStore.open(tmp_path / "f.zarr").intensity("a").abs().max() == 0
 
 
-def test_a_missing_file_is_an_error_and_not_a_black_frame(tmp_path):
+def test_a_missing_chunk_is_an_error_and_not_a_black_frame(tmp_path):
     store = store_at(tmp_path / "f.zarr", sequences=["a"])
     store.write("a", *frames_of(1))
     store.finish()
-    (tmp_path / "f.zarr" / "part-00000" / "dolp" / "c" / "0" / "0" / "0").unlink()
-    with pytest.raises(ValueError, match=r"a, column dolp is unreadable: there is no part-00000/dolp/c/0/0/0"):
+    with entries_to_change(tmp_path / "f.zarr" / "part-00000.zip") as entries:
+        del entries["dolp/c/0/0/0"]
+    with pytest.raises(ValueError, match=r"a, column dolp is unreadable: part-00000\.zip: there is no dolp/c/0/0/0"):
         FrameStore.open(tmp_path / "f.zarr").dolp("a")
     assert len(FrameStore.verify(tmp_path / "f.zarr")) == 1
 
@@ -140,12 +142,10 @@ def test_a_sequence_without_a_split_is_refused(tmp_path):
 
 def test_a_flipped_byte_is_found_and_named(finished, tmp_path):
     damaged = shutil.copytree(finished, tmp_path / "frames.zarr")
-    (shard,) = (file for file in (damaged / "part-00000" / "aolp" / "c").rglob("*") if file.is_file())
-    content = bytearray(shard.read_bytes())
-    content[3 * content.index(b"\xff" * 16) // 4] ^= 4  # b comes after a; the index of the shard's chunks comes last
-    shard.write_bytes(content)
-    (problem,) = FrameStore.verify(damaged)
+    flip(damaged / "part-00000.zip", "aolp/c/2/0/0")  # b comes after a
+    problem, whole = FrameStore.verify(damaged)
     assert "b, column aolp is unreadable" in problem
+    assert "part-00000.zip is not as it was written" in whole
 
 
 def masks(seed: int, n: int = FRAMES) -> torch.Tensor:
@@ -164,8 +164,7 @@ def test_a_mask_comes_back_as_it_was_whatever_the_width(tmp_path):
     assert read.frames("b").valid.shape == (33, HEIGHT, WIDTH)
     assert read.valid("b").all()
     assert FrameStore.verify(tmp_path / "frames.zarr") == []
-    (chunk,) = (file for file in (tmp_path / "frames.zarr" / "part-00000" / "valid").rglob("0") if file.is_file())
-    chunk.write_bytes(chunk.read_bytes()[:-1])
+    flip(tmp_path / "frames.zarr" / "part-00000.zip", "valid/c/0/0/0")
     assert any("a, column valid is unreadable" in problem for problem in FrameStore.verify(tmp_path / "frames.zarr"))
 
 
@@ -174,7 +173,7 @@ def test_without_masks_nothing_is_stored_about_them(finished, tmp_path):
     assert not store.masked
     assert store.valid("a") is None
     assert store.frames("a").valid is None
-    assert not (finished / "part-00000" / "valid").exists()
+    assert not [entry for entry in entries_of(finished / "part-00000.zip") if entry.startswith("valid")]
     with pytest.raises(ValueError, match="got a mask for a store without one"):
         store_at(tmp_path / "frames.zarr").write("a", *frames_of(1), masks(1))
 

@@ -1,6 +1,5 @@
 """The protocol that all stores share: make, resume, finish, open, and survive being killed."""
 
-import asyncio
 import functools
 import hashlib
 import json
@@ -10,16 +9,18 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 import zipfile
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import fsspec
 import numpy as np
 import pytest
-import zarr.storage._local
-from zarr.core.sync import sync
+import zarr
+from part_fixtures import entries_to_change
+from zarr.storage import ZipStore
 
 import polarnet.storage.parts as parts_module
 from polarnet.storage.parts import Column, StorageConfig, Store, open_group
@@ -79,14 +80,6 @@ def digest(folder: Path) -> dict[str, str]:
     }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _several_shards():
-    """Shards of four chunks of values."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(parts_module, "SHARD_BYTES", 2**13)
-        yield
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("parts") / "store.zarr"
@@ -123,14 +116,13 @@ def test_rows_are_counted_within_their_sequence(finished):
 
 
 def test_any_zarr_reader_finds_a_sequence_by_the_record_of_its_part(finished):
-    part = zarr.open_group(finished, mode="r")["part-00001"]
+    part = zarr.open_group(ZipStore(finished / "part-00001.zip"), mode="r")
     start, stop = part.attrs["sequences"]["s3"]["long"]
     assert np.array_equal(part["group/value"][start:stop], values_of("s3"))
-    assert part["group/value"].shards == (4096,)
 
 
 def test_every_sequence_starts_a_chunk_of_its_own(finished):
-    part = zarr.open_group(finished, mode="r")["part-00001"]
+    part = zarr.open_group(ZipStore(finished / "part-00001.zip"), mode="r")
     assert part.attrs["sequences"]["s2"]["long"] == [0, 6000]
     assert part.attrs["sequences"]["s3"]["long"] == [6 * 1024, 6 * 1024 + 9000]
     assert part.attrs["sequences"]["s3"]["short"] == [8, 13]
@@ -153,7 +145,7 @@ def test_a_part_takes_its_sequences_in_order(tmp_path):
     assert store.missing() == NAMES
 
 
-def test_of_two_processes_that_write_a_part_the_first_one_gives_it_its_name(tmp_path, finished):
+def test_two_processes_that_write_one_part_leave_the_bytes_of_one(tmp_path, finished):
     one, two = store_at(tmp_path / "store.zarr"), store_at(tmp_path / "store.zarr")
     for name in NAMES:
         write(one, name)
@@ -192,53 +184,70 @@ def test_a_sequence_that_does_not_exist_is_refused(finished):
         Numbers.open(finished).record("s9")
 
 
-def test_a_file_holds_at_most_256_chunks_so_that_the_index_at_its_end_stays_small():
-    assert Column("frames", "int64", 1).shard == 256
-    assert Column("frames", "uint16", 2**10, (4,)).shard == 2**10  # a chunk of SHARD_BYTES, 2**13 in these tests
+def test_a_part_is_one_file_without_a_date_or_compression_of_its_own(finished):
+    assert sorted(file.name for file in finished.iterdir()) == [*(f"part-0000{k}.zip" for k in range(3)), "zarr.json"]
+    with zipfile.ZipFile(finished / "part-00001.zip") as part:
+        entries = part.infolist()
+        assert len({entry.filename for entry in entries}) == len(entries)
+        assert {(entry.date_time, entry.compress_type) for entry in entries} == {((1980, 1, 1, 0, 0, 0), 0)}
+
+
+def test_more_parts_are_read_than_files_may_be_open(finished, monkeypatch):
+    monkeypatch.setattr(parts_module, "MAX_OPEN_PARTS", 1)
+    before = len(os.listdir("/proc/self/fd"))
+    store = Numbers.open(finished)
+    for _ in range(3):
+        assert_whole(store)
+    assert len(os.listdir("/proc/self/fd")) <= before + 1
+
+
+def test_a_forked_process_shares_no_open_file_with_its_parent(finished):
+    store = Numbers.open(finished)
+    assert_whole(store)
+    with ProcessPoolExecutor(2, mp_context=get_context("fork")) as pool:
+        readers = [pool.submit(assert_whole, store) for _ in range(8)]
+        for _ in range(8):
+            assert_whole(store)
+        assert [reader.result(60) for reader in readers] == [None] * 8
 
 
 class Killed(BaseException):
     """Stands for SIGKILL: zarr, which cleans up after an Exception, gets no chance to."""
 
 
-def test_whichever_file_a_writer_dies_in_the_rerun_ends_with_the_same_bytes(finished, tmp_path, monkeypatch):
-    """Every other time it dies in the middle of the file, else just before the file gets its name."""
-    put = zarr.storage._local._put
+def test_whichever_write_a_writer_dies_in_the_rerun_ends_with_the_same_bytes(finished, tmp_path, monkeypatch):
+    """Every other time it dies in the middle of an entry of a part, else just before or after it."""
+    writestr = zipfile.ZipFile.writestr
     path = tmp_path / "store.zarr"
     deaths = 0
     for n in range(10_000):
         count = iter(range(10_000))
-        one_at_a_time = threading.Lock()  # zarr writes from several threads, which would outlive a death that is acted
 
-        def put_or_die(target, value, exclusive=False, count=count, n=n, lock=one_at_a_time):
-            with lock:
-                if next(count) < n:
-                    return put(target, value, exclusive)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            content = bytes(value.as_buffer_like())
-            target.with_suffix(".0123.partial").write_bytes(content[: len(content) // (1 + n % 2)])
+        def write_or_die(archive, entry, content, count=count, n=n):
+            if next(count) < n:
+                return writestr(archive, entry, content)
+            if n % 2:
+                archive.fp.write(content[: len(content) // 2])
+            archive.fp.flush()
             raise Killed
 
         shutil.rmtree(path, ignore_errors=True)
         shutil.rmtree(f"{path}.tmp", ignore_errors=True)
-        monkeypatch.setattr(zarr.storage._local, "_put", put_or_die)
+        monkeypatch.setattr(zipfile.ZipFile, "writestr", write_or_die)
         try:
             write_missing_and_finish(path)
         except Killed:
             deaths += 1
-            sync(asyncio.sleep(0.01))  # writes that were waiting for their turn die as well
-            with one_at_a_time:  # and the one that was under way has ended
-                pass
         else:
             break
         finally:
-            monkeypatch.setattr(zarr.storage._local, "_put", put)
+            monkeypatch.setattr(zipfile.ZipFile, "writestr", writestr)
         write_missing_and_finish(path)
         assert digest(path) == digest(finished)
     assert deaths > 3 * len(NAMES)
 
 
-@pytest.mark.parametrize("last", ["part-00001", "store.zarr"])
+@pytest.mark.parametrize("last", ["part-00001.zip", "store.zarr"])
 def test_a_store_killed_before_any_of_its_renames_is_finished_by_the_rerun(finished, tmp_path, last):
     path = tmp_path / "store.zarr"
     shutil.copytree(finished, path)
@@ -290,7 +299,6 @@ def test_a_process_killed_at_any_moment_leaves_parts_whole_or_missing(finished, 
 
 
 def _write_slowly(path: str) -> None:
-    parts_module.SHARD_BYTES = 2**13
     store = store_at(Path(path))
     print("ready", flush=True)
     for name in store.missing():
@@ -311,35 +319,37 @@ def test_every_flipped_bit_is_an_error(copy):
     assert Numbers.verify(copy) == []
 
 
-def test_a_missing_or_cut_file_is_an_error_that_names_it_with_sequence_and_column(copy):
-    for name, column in (("part-00001/group/value/c/1", "group/value"), ("part-00001/pair/c/0/0", "pair")):
-        content = (copy / name).read_bytes()
-        (copy / name).write_bytes(content[:-3])
-        assert any(f"s3, column {column} is unreadable" in problem for problem in Numbers.verify(copy))
-        (copy / name).write_bytes(b"")
-        assert any(f"s3, column {column} is unreadable" in problem for problem in Numbers.verify(copy))
-        (copy / name).unlink()
-        message = f"s3, column {column} is unreadable: there is no {name}"
-        assert any(message in problem for problem in Numbers.verify(copy))
-        (copy / name).write_bytes(content)
-    shutil.rmtree(copy / "part-00002")
-    assert any("s4, part-00002/zarr.json is unreadable" in problem for problem in Numbers.verify(copy))
+def test_a_missing_or_cut_chunk_or_file_is_an_error_that_names_it_with_sequence_and_column(copy):
+    part = copy / "part-00001.zip"
+    content = part.read_bytes()
+    for name, column in (("group/value/c/8", "group/value"), ("pair/c/2/0", "pair")):
+        for length in (-3, 0, None):
+            with entries_to_change(part) as entries:
+                chunk = entries.pop(name)
+                if length is not None:
+                    entries[name] = chunk[:length]
+            (problem,) = Numbers.verify(copy)
+            assert f"s3, column {column} is unreadable: part-00001.zip: " in problem
+            assert length == -3 or f"there is no {name}, or nothing in it" in problem
+            part.write_bytes(content)
+    for length in (len(content) - 3, len(content) // 2, 0):
+        part.write_bytes(content[:length])
+        assert Numbers.verify(copy)
+    part.write_bytes(content)
+    (copy / "part-00002.zip").unlink()
+    assert any("s4, part-00002.zip is unreadable" in problem for problem in Numbers.verify(copy))
 
 
 def test_a_part_of_another_place_is_an_error(copy):
-    shutil.rmtree(copy / "part-00000")
-    shutil.copytree(copy / "part-00001", copy / "part-00000")
-    with pytest.raises(ValueError, match=r"s0, part-00000/zarr.json is unreadable: .* not what was written"):
+    shutil.copy(copy / "part-00001.zip", copy / "part-00000.zip")
+    with pytest.raises(ValueError, match=r"s0, part-00000\.zip is unreadable: it holds other sequences"):
         Numbers.open(copy).record("s0")
 
 
-def test_a_zip_and_a_url_are_read_and_verified_like_the_folder(finished, tmp_path):
-    with zipfile.ZipFile(tmp_path / "store.zip", "w") as archive:
-        for file in sorted(finished.rglob("*")):
-            archive.write(file, file.relative_to(finished))
+def test_a_url_is_read_and_verified_like_the_folder(finished):
     fsspec.filesystem("memory").put(str(finished), "/bucket/store.zarr", recursive=True)
     try:
-        for path in (tmp_path / "store.zip", "memory://bucket/store.zarr", finished.as_uri()):
+        for path in ("memory://bucket/store.zarr", finished.as_uri()):
             assert_whole(Numbers.open(path))
             assert Numbers.verify(path) == []
     finally:
@@ -355,9 +365,8 @@ def test_what_is_not_a_finished_store_of_this_version_is_refused(finished, copy,
         Others.open(finished)
     with pytest.raises(ValueError, match=r"expected version 4 of test\.numbers, got version 3 .* run `dvc repro`"):
         Later.open(finished)
-    (tmp_path / "text.zip").write_text("not a zip")
-    with pytest.raises(ValueError, match=r"text\.zip is unreadable"):
-        Numbers.open(tmp_path / "text.zip")
+    with pytest.raises(ValueError, match=r"part-00000\.zip: expected the folder of a store, got a file; unpack"):
+        Numbers.open(finished / "part-00000.zip")
     with pytest.raises(ValueError, match="never finished"):
         Numbers.open(_with_attribute(copy, "complete", False))
     with pytest.raises(ValueError, match=r"attributes in zarr\.json are not what was written"):

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from polarnet.networks.checkpoint import load_checkpoint, save_checkpoint
 from polarnet.networks.dolp_unet import DolpUNetConfig
 from polarnet.storage.frames import FrameStore
 from polarnet.training.dolp import dolp_task
@@ -36,7 +37,7 @@ LOOP: dict[str, Any] = {
 NETWORK = DolpUNetConfig(
     channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1, input_mixing="contrasts"
 )
-TRAIN = TrainConfig(**LOOP, representation="event_tensor", optimizer=None)
+TRAIN = TrainConfig(**LOOP, representation="event_tensor", optimizer=None, start=None)
 E2V = E2vConfig(**LOOP, arch="firenet", bins=3, ssim=1.0, lpips=0.0)
 LOSS = LossConfig(mse=1.0, ssim=1.0, lpips=0.0, stokes=0.0, uncertainty=0.0)
 
@@ -54,6 +55,26 @@ def split_of(simulated, data: str, task: Task) -> Split:
         data, str(simulated.events), str(simulated.scenes), simulated.camera, simulated.seed, threads=1
     )
     return open_split(events, str(simulated.frames), task.encode)
+
+
+def test_a_training_starts_from_the_weights_of_a_checkpoint_and_names_them(tmp_path):
+    network = dolp_task("paper", NETWORK, TRAIN, LOSS, None, seed=SEED + 1).network
+    save_checkpoint(tmp_path / "other.safetensors", network.state_dict(), {"network": "paper"})
+    start = str(tmp_path / "other.safetensors")
+    task = dolp_task("paper", NETWORK, dataclasses.replace(TRAIN, start=start), LOSS, None, SEED)
+    assert all(torch.equal(tensor, task.network.state_dict()[name]) for name, tensor in network.state_dict().items())
+    assert task.description["start_sha256"] == load_checkpoint(start)[1]["sha256"]
+    assert "start_sha256" not in dolp().description
+
+
+def test_a_training_refuses_to_start_from_a_network_of_another_size(tmp_path):
+    wider = dataclasses.replace(NETWORK, channels=[8, 8, 8])
+    network = dolp_task("paper", wider, TRAIN, LOSS, None, SEED).network
+    save_checkpoint(tmp_path / "wider.safetensors", network.state_dict(), {"network": "paper"})
+    with pytest.raises(ValueError, match="does not fit the network"):
+        dolp_task(
+            "paper", NETWORK, dataclasses.replace(TRAIN, start=str(tmp_path / "wider.safetensors")), LOSS, None, SEED
+        )
 
 
 @pytest.mark.parametrize(("new_task", "config"), [(dolp, TRAIN), (e2v, E2V)])

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.recordings.source import RecordingError
+from polarnet.runtime.extras import installation
 
 PATIENCE_S = 60  # limit for an answer; a damaged file can put a library into an endless loop
 MAX_MIB = 8192  # address space of the process; a damaged file can state any size
@@ -41,7 +42,7 @@ class IsolatedLibrary:
         RuntimeError names the package to install where the library is missing.
         """
         if sys.modules.get(self._package, True) is None or importlib.util.find_spec(self._package) is None:
-            raise RuntimeError(f"{path.name}: this format needs {self._package}: pip install 'polarnet[{self._extra}]'")
+            raise RuntimeError(f"{path.name}: this format needs {self._package}: {installation(self._extra)}")
         with self._lock:
             process = self._running()
             assert process.stdin is not None

@@ -6,7 +6,7 @@ import numpy as np
 
 from polarnet.simulation.compilation import compiled, inlined
 
-SIGNAL, LEAK, SHOT = 0, 1, 2
+SIGNAL, LEAK, SHOT, HOT = range(4)
 TIME_SHIFT, ROW_SHIFT, COLUMN_SHIFT, POLARITY_SHIFT = np.int64(33), np.int64(18), np.int64(3), np.int64(2)
 
 
@@ -22,7 +22,7 @@ class Columns(NamedTuple):
     p: np.ndarray
     """int8, +1 or -1"""
     label: np.ndarray
-    """uint8, the process behind the event: SIGNAL, LEAK or SHOT"""
+    """uint8, the process behind the event: SIGNAL, LEAK, SHOT or HOT"""
     unrounded_us: np.ndarray
     """float64, microseconds before rounding to t"""
 

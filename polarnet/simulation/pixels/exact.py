@@ -300,19 +300,24 @@ def _next_crossing(active, count, refractory_us, duration_us):
 
 @compiled
 def _insert_shots(pixels, step, active, count):
-    """Let shot noise that precedes a pixel's next crossing take its place."""
+    """Let shot noise that precedes a pixel's next crossing take its place; the crossing stands if none is accepted."""
     for a in range(count):
         i = active.pixel[a]
-        shot = pixels.next_shot_us[i] - step.start_us
-        if shot < (active.next_now[a] if active.fires[a] else step.duration_us):
-            on, off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
+        on, off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
+        shot, limit = (
+            pixels.next_shot_us[i] - step.start_us,
+            active.next_now[a] if active.fires[a] else step.duration_us,
+        )
+        replaced = False
+        while shot < limit and not replaced:
             shot_us = step.start_us + shot
             accepted, is_on = _shot(step.physics, step.shot_key, i, shot_us, on, off, pixels.dn[i])
             pixels.next_shot_us[i] += _until_next_shot(step.physics, step.shot_key, i, shot_us, on, off)
-            fires = accepted & (shot >= active.last_event[a] + step.refractory_us)
-            active.event[a], active.fires[a] = event_of(0, 0, is_on, SHOT), fires
-            active.next_change[a] = 0.0 if fires else active.change[a]
-            active.next_now[a] = shot if fires else active.now[a]
+            if accepted and shot >= active.last_event[a] + step.refractory_us:
+                active.event[a], active.fires[a] = event_of(0, 0, is_on, SHOT), 1
+                active.next_change[a], active.next_now[a] = 0.0, shot
+                replaced = True
+            shot = pixels.next_shot_us[i] - step.start_us
         active.continues[a] = pixels.next_shot_us[i] < step.stop_us
 
 

@@ -3,6 +3,8 @@
 Formulas and constants are those of v2e (Hu, Liu, Delbruck, CVPRW 2021).
 """
 
+import math
+from collections.abc import Callable
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -25,8 +27,11 @@ class PixelConfig:
 
     contrast_threshold_on: Annotated[float, Field(ge=0.01, le=10)]
     contrast_threshold_off: Annotated[float, Field(ge=0.01, le=10)]
-    contrast_threshold_sigma: NonNegativeFloat
-    """Standard deviation between pixels, drawn for each channel."""
+    contrast_threshold_sigma_on: NonNegativeFloat
+    """Standard deviation of the ON threshold between pixels, drawn for each channel."""
+    contrast_threshold_sigma_off: NonNegativeFloat
+    contrast_threshold_correlation: Annotated[float, Field(ge=-1, le=1)]
+    """Correlation of a pixel's ON and OFF thresholds."""
     cutoff_hz: NonNegativeFloat
     """Bandwidth of the photoreceptor at full brightness, less in the dark; 0: infinite."""
     leak_rate_hz: NonNegativeFloat
@@ -45,7 +50,9 @@ class Physics(NamedTuple):
 
     threshold_on: float
     threshold_off: float
-    threshold_sigma: float
+    threshold_sigma_on: float
+    threshold_sigma_off: float
+    threshold_correlation: float
     cutoff_hz: float
     leak_rate_hz: float
     leak_jitter: float
@@ -59,7 +66,9 @@ def physics_of(config: PixelConfig) -> Physics:
     return Physics(
         config.contrast_threshold_on,
         config.contrast_threshold_off,
-        config.contrast_threshold_sigma,
+        config.contrast_threshold_sigma_on,
+        config.contrast_threshold_sigma_off,
+        config.contrast_threshold_correlation,
         config.cutoff_hz,
         config.leak_rate_hz,
         config.leak_jitter,
@@ -71,16 +80,27 @@ def physics_of(config: PixelConfig) -> Physics:
 
 def threshold_maps(physics: Physics, pixels: int, key: np.uint64, channel: int) -> tuple[np.ndarray, np.ndarray]:
     """ON and OFF thresholds of the pixels of a channel, float32: normally distributed, at least `THRESHOLD_FLOOR`."""
-    on = _threshold_map(physics.threshold_on, physics.threshold_sigma, pixels, key, randomness.THRESHOLD_ON, channel)
-    off = _threshold_map(physics.threshold_off, physics.threshold_sigma, pixels, key, randomness.THRESHOLD_OFF, channel)
-    return on, off
+
+    def deviations_on() -> np.ndarray:
+        return randomness.normal_map(key, randomness.THRESHOLD_ON, channel, pixels)
+
+    def deviations_off() -> np.ndarray:
+        share, own = (
+            physics.threshold_correlation,
+            randomness.normal_map(key, randomness.THRESHOLD_OFF, channel, pixels),
+        )
+        return np.float32(share) * deviations_on() + np.float32(math.sqrt(1 - share * share)) * own if share else own
+
+    return (
+        _threshold_map(physics.threshold_on, physics.threshold_sigma_on, deviations_on, pixels),
+        _threshold_map(physics.threshold_off, physics.threshold_sigma_off, deviations_off, pixels),
+    )
 
 
-def _threshold_map(nominal: float, sigma: float, pixels: int, key: np.uint64, purpose: int, channel: int) -> np.ndarray:
+def _threshold_map(nominal: float, sigma: float, deviations: Callable[[], np.ndarray], pixels: int) -> np.ndarray:
     if sigma == 0:
         return np.full(pixels, nominal, np.float32)
-    deviations = randomness.normal_map(key, purpose, channel, pixels)
-    return np.maximum(np.float32(nominal) + np.float32(sigma) * deviations, np.float32(THRESHOLD_FLOOR))
+    return np.maximum(np.float32(nominal) + np.float32(sigma) * deviations(), np.float32(THRESHOLD_FLOOR))
 
 
 def leak_factor_map(physics: Physics, pixels: int, key: np.uint64, channel: int) -> np.ndarray:

@@ -194,15 +194,17 @@ def _count(pixels, physics, first, stop, y, w, firing, n, most):
     entries, candidates = firing.entries, firing.candidates
     count = flagged(firing.words, stop - first, candidates[0], candidates[1])
     row_end = w
-    exact_nominal = memory.itemsize == 8 and physics.threshold_sigma == 0  # v2e divides float64 by a Python float
+    double = memory.itemsize == 8  # v2e divides float64 by a Python float where all pixels have one threshold
     for c in range(count):
         j = np.uint64(candidates[0, c])  # unsigned: numba checks other indices for being negative
         while candidates[0, c] >= row_end:
             y, row_end = y + 1, row_end + w
         change = np.float64(filtered[j] - memory[j])
         on, off = np.float64(threshold_on[j]), np.float64(threshold_off[j])
-        if exact_nominal:
-            on, off = physics.threshold_on, physics.threshold_off
+        if double and physics.threshold_sigma_on == 0:
+            on = physics.threshold_on
+        if double and physics.threshold_sigma_off == 0:
+            off = physics.threshold_off
         crossed = np.int32(change / (on if change > 0 else off))
         entry = np.uint64(n)
         entries[entry, PIXEL], entries[entry, CROSSED], entries[entry, ACCEPTED] = first + candidates[0, c], crossed, 0

@@ -65,5 +65,5 @@ def test_two_readers_of_one_file_do_not_disturb_each_other(tmp_path):
 def test_without_the_library_the_error_names_the_extra(tmp_path, monkeypatch):
     (tmp_path / "e.aedat4").write_bytes(b"#!AER-DAT4.0\r\n" + bytes(100))
     monkeypatch.setitem(sys.modules, "faery", None)
-    with pytest.raises(RuntimeError, match=r"e\.aedat4: .*pip install 'polarnet\[recordings\]'"):
+    with pytest.raises(RuntimeError, match=r"e\.aedat4: .*run pip install -e '\.\[recordings\]' in the clone"):
         read_recording(tmp_path / "e.aedat4")

@@ -100,7 +100,7 @@ def test_a_damaged_file_is_refused_with_what_hdf5_says(tmp_path):
 def test_without_h5py_the_error_names_the_extra(tmp_path, monkeypatch):
     path = write_dsec(tmp_path / "e.h5")
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(RuntimeError, match=r"pip install 'polarnet\[hdf5\]'"):
+    with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[hdf5\]' in the clone"):
         read_recording(path, height=480, width=640)
 
 

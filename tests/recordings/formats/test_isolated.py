@@ -83,7 +83,7 @@ def test_what_the_library_raises_is_the_reason(library, task, arguments, message
 
 def test_a_library_that_is_not_there_is_asked_for():
     library = IsolatedLibrary("None", "no_such_package", "recordings", FILE, "")
-    with pytest.raises(RuntimeError, match=r"file\.bin: .* no_such_package: pip install 'polarnet\[recordings\]'"):
+    with pytest.raises(RuntimeError, match=r"file\.bin: .* no_such_package: run pip install -e '\.\[recordings\]'"):
         library.ask(FILE, "size")
 
 

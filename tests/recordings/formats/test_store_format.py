@@ -1,4 +1,5 @@
 import pytest
+from part_fixtures import flip
 
 from polarnet.recordings.formats import store as store_format
 from polarnet.recordings.recording import read_recording
@@ -35,10 +36,7 @@ def test_the_parts_are_named_where_none_is_chosen(store, part):
 
 
 def test_a_damaged_store_is_refused_with_the_sequence(store):
-    chunk = next(path for path in (store / "part-00001" / "events" / "x" / "c").rglob("*") if path.is_file())
-    content = bytearray(chunk.read_bytes())
-    content[len(content) // 3] ^= 1
-    chunk.write_bytes(content)
+    flip(store / "part-00001.zip", "events/x/c/0")
     with pytest.raises(RecordingError, match="wood, column events/x is unreadable"):
         read_recording(store, part="wood/0")
 

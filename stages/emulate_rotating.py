@@ -1,0 +1,22 @@
+"""Scenes of the test sets -> data/rotating: events of one camera behind a rotating polarizer, for its row."""
+
+from pathlib import Path
+
+from polarnet.config.tree import Config, hydra_stage
+from polarnet.simulation.rotating import emulate_rotating_scenes
+
+
+@hydra_stage
+def main(config: Config) -> None:
+    """Emulate the test sequences of every set in `benchmark.sets`."""
+    sources = {name: Path(config.paths.sets) / name / "scenes.zarr" for name in config.benchmark.sets}
+    sources["simulated"] = Path(config.paths.scenes)
+    for name, scenes in sources.items():
+        events, mapper = Path(config.paths.rotating) / f"{name}.zarr", config.mapper("emulate_rotating")
+        events.parent.mkdir(parents=True, exist_ok=True)
+        count = emulate_rotating_scenes(scenes, events, config.rotating, config.camera, config.seed, mapper)
+        print(f"{name}: {count} sequences")
+
+
+if __name__ == "__main__":
+    main()

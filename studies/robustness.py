@@ -1,0 +1,427 @@
+"""Methods on photographs, on measured scenes and on other sensors, in one table.
+
+python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] --measured FOLDER ... --work FOLDER
+    [--weights [NAME=]FILE ...] [--firenet FILE] [--split test|val] [--conditions NAME ...] [--limit N] [--write]
+python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] --work FOLDER --training FOLDER
+
+- `photographs`: a split of the pipeline's (`experiment=photographs`) of the folder --photographs.
+- `photographs_large`: the same splits of --photographs and of --photographs-large together.
+- `measured.SOURCE`: all measured scenes of one source. A folder with a manifest.csv (columns file, repo) has one source
+  for each repo; any other folder is one source.
+- `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS.
+- `time.5ms`: the same with windows of 5 ms.
+- `speed`: windows a second of the first weights on random events, with --threads.
+
+Nothing is trained, except the constants: `train_mean` is the mean DoLP of the training photographs, and `constant_real`
+the mean DoLP of the measured scenes of all sources but the one that is scored. --split val is for choices and --split
+test for figures. --limit takes the first N pictures of each set; --sensor-limit of the sensors alone. Events are
+simulated in memory, and pictures are kept in --work. --write puts the scores into docs/results/robustness.json.
+
+The second command scores nothing. It fills --training with links to the training photographs of both folders. A
+network trained on them (`ingest.root`) has seen no photograph of --split val and --split test.
+"""
+
+import argparse
+import csv
+import dataclasses
+import functools
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from polarnet.benchmark.resimulate import resimulated
+from polarnet.benchmark.rows import Context, available, predictions_of
+from polarnet.benchmark.score import FrameScore, scene_means, score_sequence, scored_windows
+from polarnet.config.pipeline import context_of
+from polarnet.config.tree import Config, load
+from polarnet.metrics.reliability import Reliability, reliability
+from polarnet.networks.checkpoint import load_network
+from polarnet.networks.weights import shipped_weights
+from polarnet.pictures.images import read_rgb
+from polarnet.pictures.manifest import MANIFEST, ManifestEntry, read_manifest, write_manifest
+from polarnet.pictures.polarimetry import read_intensities
+from polarnet.runtime.files import sha256
+from polarnet.runtime.machine import configure
+from polarnet.simulation.scene import polarization_from_rgb
+from polarnet.simulation.truth import synthesize
+from polarnet.stokes import Prediction, dolp, stokes_from_intensities
+from polarnet.storage.scenes import SceneStore
+from studies.measure import machine_record, uncommitted, write_section
+
+ROOT = Path(__file__).resolve().parents[1]
+SENSORS: dict[str, tuple[str, ...]] = {
+    "default": (),
+    "noisy": ("sensor=noisy",),
+    "thresholds_0.1": ("emulate.contrast_threshold_on=0.1", "emulate.contrast_threshold_off=0.1"),
+    "thresholds_0.4": ("emulate.contrast_threshold_on=0.4", "emulate.contrast_threshold_off=0.4"),
+    "off_1.4_times_on": ("emulate.contrast_threshold_off=0.28",),
+    "mismatch_0.06": ("emulate.contrast_threshold_sigma=0.06",),
+    "mismatch_half": ("emulate.contrast_threshold_sigma=0.1",),  # of a threshold of 0.2
+    "slow": ("synthesize.speed_min_px_s=10", "synthesize.speed_max_px_s=40"),
+    "fast": (
+        "synthesize.speed_min_px_s=160", "synthesize.speed_max_px_s=320", "synthesize.acceleration_max_px_s2=3200",
+    ),
+    "60_hz": ("synthesize.frame_rate_hz=60",),
+    "260x346": ("synthesize.sensor_height=260", "synthesize.sensor_width=346"),
+    "v2e": ("emulate.model=v2e",),
+    "esim": ("emulate.model=esim",),
+    "esim_gpu": ("emulate.model=esim_gpu",),
+    "dvs_voltmeter": ("emulate.model=dvs_voltmeter",),
+    "imperfect_polarizers": (
+        "polarizers.extinction_ratio=[100,100,100,100]", "polarizers.angle_error_deg=[2,-2,-2,2]",
+        "polarizers.transmission=[1,0.95,1,0.95]",
+    ),
+    "dofp": ("polarizers.layout=dofp", "synthesize.sensor_height=240", "synthesize.sensor_width=360"),
+    "saturating_readout": ("readout.max_events_per_s=300000",),  # a sensor fires 500,000 a second on average
+    "randomised": ("emulate.randomise=true",),
+}  # fmt: skip
+"""Overrides of params.yaml by name; the scenes are the same, at the same places where the sensor has the same size."""
+TIMES: dict[str, tuple[str, ...]] = {"5ms": ("synthesize.frame_rate_hz=200",)}
+"""Overrides that change the windows."""
+SIZES = ((120, 180), (260, 346), (480, 640))
+TIMED_WINDOWS, WARM_WINDOWS = 12, 4
+EVENTS_PER_PIXEL = 0.8  # a window; the default sensor's mean
+FRAME_RATE_HZ = 30.0  # of the windows that `benchmark.warmup_windows` counts
+OURS = "ours"
+CONSTANT = "constant_real"
+METHODS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
+NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published+gain")
+"""Rows that need no truth, against which ours is compared on measured scenes."""
+BANDS = {"below_0.06": (0.0, 0.06), "0.06_to_0.2": (0.06, 0.2), "above_0.2": (0.2, 1.0)}
+"""Mean DoLP of a scene."""
+
+
+class Scores(NamedTuple):
+    """Scores of one condition."""
+
+    rows: list[FrameScore]
+    dolp: dict[str, float]
+    """Mean true DoLP by scene."""
+    reliability: dict[str, Reliability]
+    """By row with expected errors."""
+
+    def __add__(self, other: "Scores") -> "Scores":  # type: ignore[override]
+        sums = {name: one + other.reliability[name] for name, one in self.reliability.items()}
+        return Scores(self.rows + other.rows, self.dolp | other.dolp, sums)
+
+
+def settings(arguments: argparse.Namespace, *overrides: str) -> Config:
+    """The configuration of a condition."""
+    common = ["experiment=photographs", f"runtime.threads={arguments.threads}", f"runtime.workers={arguments.workers}"]
+    firenet = [f"methods.firenet_published.weights={arguments.firenet}"] if arguments.firenet else []
+    return load(ROOT, [*common, *firenet, *overrides])
+
+
+def ingested(root: Path, folder: Path, *overrides: str) -> Path:
+    """Folder of the pictures of `root`, made by stage ingest if missing."""
+    if not (folder / "images" / MANIFEST).exists():
+        common = ("experiment=photographs", f"ingest.root={root}", f"paths.data={folder}", *overrides)
+        subprocess.run([sys.executable, "-m", "stages.ingest", *common], cwd=ROOT, check=True)
+    return folder / "images"
+
+
+def sources_of(folder: Path, work: Path) -> dict[str, Path]:
+    """A folder of each source of measured scenes: links by the repo column of manifest.csv, or the folder itself."""
+    manifest = folder / "manifest.csv"
+    if not manifest.exists():
+        return {folder.name: folder}
+    sources: dict[str, Path] = {}
+    with manifest.open(newline="") as file:
+        for row in csv.DictReader(file):
+            name = row["repo"].rpartition("/")[2]
+            sources[name] = work / "sources" / name
+            sources[name].mkdir(parents=True, exist_ok=True)
+            if not (link := sources[name] / row["file"]).exists():
+                link.symlink_to(folder / row["file"])
+    return sources
+
+
+def link_training(roots: Mapping[str, Path], images: Mapping[str, Path], folder: Path) -> int:
+    """Fill a folder with links to the training photographs of all roots, and return their number."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, root in roots.items():
+        for entry in read_manifest(images[name]).pictures:
+            link = folder / f"{name}_{entry.origin.replace('/', '_')}"
+            if entry.split == "train" and not link.is_symlink():
+                link.symlink_to(root / entry.origin)
+    return len(list(folder.iterdir()))
+
+
+def part_of(images: Path, folder: Path, split: str, limit: int | None) -> Path:
+    """Folder with links to the pictures of a split and their manifest."""
+    folder = folder / f"{split}_{limit or 'all'}"
+    if not (folder / MANIFEST).exists():
+        manifest = read_manifest(images)
+        pictures = tuple(entry for entry in manifest.pictures if entry.split == split)[:limit]
+        folder.mkdir(parents=True, exist_ok=True)
+        for entry in pictures:
+            (folder / entry.file).symlink_to(images / entry.file)
+        write_manifest(dataclasses.replace(manifest, pictures=pictures, skipped=()), folder)
+    return folder
+
+
+def scenes_of(images: Path, config: Config) -> SceneStore:
+    """Scenes and motions of the pictures, made beside them if missing."""
+    size, layout = config.storage.sequences_per_part, config.polarizers.layout
+    made_with = json.dumps([dataclasses.asdict(config.synthesize), layout, config.seed]).encode()
+    folder = images.with_name(f"{images.name}_{sha256(made_with)[:12]}")
+    if not (folder / "frames.zarr").exists():
+        folder.mkdir(exist_ok=True)
+        synthesize(
+            images, folder / "scenes.zarr", folder / "frames.zarr", config.synthesize, config.seed,
+            config.mapper("scenes"), size, layout=layout,
+        )  # fmt: skip
+    return SceneStore.open(folder / "scenes.zarr")
+
+
+def mean_dolp(images: Path, split: str) -> list[float]:
+    """Mean DoLP of each picture of a split."""
+
+    def of_picture(entry: ManifestEntry) -> float:
+        path = images / entry.file
+        if entry.source == "polarization":
+            intensities, valid = read_intensities(path)
+            degree = dolp(stokes_from_intensities(torch.as_tensor(intensities))).clamp(0, 1)
+            return float(degree[torch.as_tensor(valid)].mean())
+        return float(polarization_from_rgb(read_rgb(path))[1].mean())
+
+    return [of_picture(entry) for entry in read_manifest(images).pictures if entry.split == split]
+
+
+def scored_sequence(
+    name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context], constant: float
+) -> Scores:
+    """Scores of all methods on one sequence."""
+    test = resimulated(scenes, name, config.synthesize, [config.camera] * 4, config.seed)
+    baselines, _ = available(METHODS, next(iter(contexts.values())))
+    predictions = predictions_of(baselines, test, next(iter(contexts.values())))
+    predictions[CONSTANT] = Prediction(torch.full_like(test.dolp, constant))
+    for row, context in contexts.items():
+        predictions[row] = predictions_of([OURS], test, context)[OURS]
+    warmup = round(config.benchmark.warmup_windows * config.synthesize.frame_rate_hz / FRAME_RATE_HZ)
+    rows = score_sequence(test, predictions, warmup, None, torch.device("cpu"))
+    first = scored_windows(test, warmup).start
+    valid = None if test.valid is None else test.valid[first:]
+    errors = {
+        row: reliability(one.log_variance[first:], one.dolp[first:], test.dolp[first:], valid)
+        for row, one in predictions.items()
+        if one.log_variance is not None
+    }
+    truth = test.dolp[first:] if valid is None else test.dolp[first:][valid]
+    return Scores(rows, {test.scene: float(truth.mean())}, errors)
+
+
+def scored(images: Path, config: Config, contexts: Mapping[str, Context], constant: float) -> Scores:
+    """Scores of all methods on the pictures of a folder under one condition."""
+    scenes = scenes_of(images, config)
+    task = functools.partial(scored_sequence, scenes=scenes, config=config, contexts=contexts, constant=constant)
+    results = config.mapper("sequences")(task, list(scenes.sequences))
+    return functools.reduce(Scores.__add__, results)
+
+
+def table_of(scores: Scores) -> dict[str, Any]:
+    """Mean and median over scenes of each row's errors, also relative to the oracle mean's, and by mean DoLP."""
+    errors, psnr, level, corr = (scene_means(scores.rows, metric) for metric in ("mse", "psnr", "level_mse", "corr"))
+    oracle = errors["oracle_mean"]
+    table: dict[str, Any] = {"scenes": len(oracle), "mean_dolp": statistics.fmean(scores.dolp.values()), "rows": {}}
+    for row, of_scene in errors.items():
+        mse, median = statistics.fmean(of_scene.values()), statistics.median(of_scene.values())
+        bands = {
+            name: statistics.fmean(inside)
+            for name, (low, high) in BANDS.items()
+            if (inside := [of_scene[scene] for scene, mean in scores.dolp.items() if low <= mean < high])
+        }
+        table["rows"][row] = {
+            "mse": mse,
+            "median_mse": median,
+            "mse_over_oracle_mean": mse / statistics.fmean(oracle.values()),
+            "median_over_oracle_mean": median / statistics.median(oracle.values()),
+            "level_mse": statistics.fmean(level[row].values()),
+            "psnr": statistics.fmean(psnr[row].values()),
+            "corr": statistics.fmean(corr[row].values()),
+            "mse_by_dolp": bands,
+        }
+        if row in scores.reliability:
+            table["rows"][row]["error_factor"] = float(np.exp(scores.reliability[row].log_error()))
+    return table
+
+
+@torch.inference_mode()
+def windows_per_s(weights: Path, height: int, width: int) -> float:
+    """Windows a second of the network on random events, one at a time as from a camera."""
+    network, _ = load_network(weights)
+    stream: Any = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    generator = torch.Generator().manual_seed(0)
+    count = torch.poisson(torch.full((1, 4, 1, height, width), EVENTS_PER_PIXEL), generator)
+    sign = torch.randint(0, 2, count.shape, generator=generator) * 2 - 1
+    windows = torch.cat([count * sign, count], dim=2).flatten(1, 2)
+    state = None
+    for number in range(WARM_WINDOWS + TIMED_WINDOWS):
+        if number == WARM_WINDOWS:
+            start = time.perf_counter()
+        _, state = stream(windows, state)
+    return TIMED_WINDOWS / (time.perf_counter() - start)
+
+
+def headlines(tables: Mapping[str, Any], row: str) -> dict[str, Any]:
+    """Figures of one row that stand above the sections of docs/results/robustness.json."""
+    figures: dict[str, Any] = {}
+    for name in ("photographs", "photographs_large"):
+        if name in tables:
+            figures[name] = {"mse_over_oracle_mean": tables[name]["rows"][row]["mse_over_oracle_mean"]}
+    if "measured" in tables:
+        rows = tables["measured"]["rows"]
+        best = min(rows[name]["mse"] for name in NO_TRUTH if name in rows)
+        figures["measured"] = {
+            "mse_over_best_baseline": rows[row]["mse"] / best,
+            "mse_over_oracle_mean": rows[row]["mse_over_oracle_mean"],
+            "median_over_oracle_mean": rows[row]["median_over_oracle_mean"],
+        }
+        figures["calibration"] = {"measured_factor": rows[row]["error_factor"]}
+    if "sensors.default" in tables:
+        default = tables["sensors.default"]["rows"][row]["mse"]
+        of_sensor = {
+            name.removeprefix("sensors."): {
+                "mse_over_default": table["rows"][row]["mse"] / default,
+                "mse_over_oracle_mean": table["rows"][row]["mse_over_oracle_mean"],
+            }
+            for name, table in tables.items()
+            if name.startswith("sensors.")
+        }
+        worst = max(one["mse_over_default"] for one in of_sensor.values())
+        figures["sensors"] = {**of_sensor, "worst_over_default": worst}
+        if "time.5ms" in tables:
+            psnr = [tables[name]["rows"][row]["psnr"] for name in ("sensors.default", "time.5ms")]
+            figures["time"] = {"db_lost_5ms": psnr[0] - psnr[1]}
+    return figures
+
+
+def printed(tables: Mapping[str, Any], key: str) -> str:
+    """The table of one figure: a row for each method, a column for each condition."""
+    rows = list(dict.fromkeys(row for table in tables.values() for row in table["rows"]))
+    lines = [f"{key}", "condition," + ",".join(rows) + ",scenes,mean DoLP"]
+    for name, table in tables.items():
+        values = [table["rows"].get(row, {}).get(key) for row in rows]
+        cells = ["-" if value is None else f"{value:.4g}" for value in values]
+        lines.append(",".join([name, *cells, str(table["scenes"]), f"{table['mean_dolp']:.3f}"]))
+    return "\n".join(lines)
+
+
+def parsed() -> argparse.Namespace:
+    """The command line, with paths as every working directory understands them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--photographs", type=Path, required=True)
+    parser.add_argument("--photographs-large", type=Path, help="further photographs")
+    parser.add_argument("--measured", type=Path, nargs="+", default=[], help="as ingest.source=polarization takes them")
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument(
+        "--weights", nargs="+", default=[], metavar="[NAME=]FILE", help="checkpoints; default: the shipped one"
+    )
+    parser.add_argument("--training", type=Path, help="folder for links to the training photographs")
+    parser.add_argument("--firenet", type=Path, help="published weights of FireNet")
+    parser.add_argument("--split", choices=("test", "val"), default="test", help="of the photographs")
+    parser.add_argument("--conditions", nargs="+", help="only these, such as photographs measured sensors.noisy")
+    parser.add_argument("--limit", type=int, help="pictures of each set")
+    parser.add_argument("--sensor-limit", type=int, help="pictures of each sensor; default: as --limit")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=1, help="processes that share the sequences")
+    parser.add_argument("--write", action="store_true", help="write docs/results/robustness.json")
+    arguments = parser.parse_args()
+    if arguments.write and uncommitted(ROOT):
+        parser.error("the tree has uncommitted changes; commit them first, the figures name a commit")
+    for name in ("photographs", "photographs_large", "work", "firenet", "training"):
+        if path := getattr(arguments, name):
+            setattr(arguments, name, path.resolve())
+    arguments.measured = [folder.resolve() for folder in arguments.measured]
+    pairs = [given.rpartition("=") for given in arguments.weights]
+    arguments.weights = {name or OURS: Path(file).resolve() for name, _, file in pairs} or {OURS: shipped_weights()}
+    return arguments
+
+
+def conditions_of(
+    images: Mapping[str, Path], arguments: argparse.Namespace
+) -> dict[str, list[tuple[Path, tuple[str, ...]]]]:
+    """Folders of pictures and overrides by condition; `images` are the ingested photographs."""
+    work, limit = arguments.work, arguments.limit
+    parts = {name: part_of(folder, work / name, arguments.split, limit) for name, folder in images.items()}
+    conditions: dict[str, list[tuple[Path, tuple[str, ...]]]] = {"photographs": [(parts["rgb"], ())]}
+    if "more" in parts:
+        conditions["photographs_large"] = [(part, ()) for part in parts.values()]
+    for folder in arguments.measured:
+        for name, root in sources_of(folder, work).items():
+            chosen = ("ingest.source=polarization", "ingest.val_fraction=0", "ingest.test_fraction=1")
+            measured = ingested(root, work / name, *chosen)
+            conditions[f"measured.{name}"] = [(part_of(measured, work / name, "test", limit), ())]
+    small = part_of(images["rgb"], work / "rgb", arguments.split, arguments.sensor_limit or limit)
+    others = {"sensors": SENSORS, "time": TIMES}
+    return conditions | {
+        f"{kind}.{name}": [(small, overrides)] for kind, of in others.items() for name, overrides in of.items()
+    }
+
+
+def main() -> None:
+    """Score, print and perhaps write."""
+    arguments = parsed()
+    record = machine_record(ROOT)
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    given = {"rgb": arguments.photographs, "more": arguments.photographs_large}
+    roots = {name: root for name, root in given.items() if root}
+    images = {name: ingested(root, arguments.work / name) for name, root in roots.items()}
+    if arguments.training:
+        print(f"{link_training(roots, images, arguments.training)} photographs in {arguments.training}")
+        return
+    conditions = conditions_of(images, arguments)
+    wanted = arguments.conditions or ["photographs", "photographs_large", "measured", "sensors", "time", "speed"]
+    configure(settings(arguments).runtime, settings(arguments).seed)
+    train_mean = statistics.fmean(mean_dolp(images["rgb"], "train"))
+    means = {
+        name: mean_dolp(part, "test")
+        for name, parts in conditions.items()
+        if name.startswith("measured.")
+        for part, _ in parts
+    }
+    results: dict[str, Scores] = {}
+    tables: dict[str, Any] = {}
+    for name, parts in conditions.items():
+        if not any(name == one or name.startswith(f"{one}.") for one in wanted):
+            continue
+        others = [mean for source, of_source in means.items() if source != name for mean in of_source]
+        constant = statistics.fmean(others) if others else train_mean
+        for part, overrides in parts:
+            config = settings(arguments, *overrides)
+            contexts = {row: context_of(config, train_mean, file) for row, file in arguments.weights.items()}
+            one = scored(part, config, contexts, constant)
+            results[name] = results[name] + one if name in results else one
+        tables[name] = table_of(results[name])
+        print(
+            name, {row: round(one["mse_over_oracle_mean"], 3) for row, one in tables[name]["rows"].items()}, flush=True
+        )
+    if measured := [one for name, one in results.items() if name.startswith("measured.")]:
+        tables["measured"] = table_of(functools.reduce(Scores.__add__, measured))
+    for key in ("mse", "median_mse", "mse_over_oracle_mean", "median_over_oracle_mean", "level_mse", "psnr", "corr"):
+        print(printed(tables, key), end="\n\n")
+    row, weights = next(iter(arguments.weights.items()))
+    figures = headlines(tables, row)
+    if "speed" in wanted:
+        rates = {f"windows_per_s_{height}x{width}": windows_per_s(weights, height, width) for height, width in SIZES}
+        figures["speed"] = rates | {"threads": arguments.threads}
+    print(json.dumps(figures, indent=1))
+    section = {
+        "split": arguments.split, "limit": arguments.limit, "sensor_limit": arguments.sensor_limit,
+        "weights": {row: sha256(file) for row, file in arguments.weights.items()}, "tables": tables,
+    }  # fmt: skip
+    (arguments.work / f"robustness_{arguments.split}.json").write_text(json.dumps(section, indent=2) + "\n")
+    if arguments.write:
+        print(write_section(ROOT, "robustness", arguments.split, section, record, figures))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""Hot and dead pixels: their share, their rate, their silence, and their independence of light and of pieces."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from polarnet.simulation.emulator import MODELS, EmulatorConfig, emulate, emulate_columns
+from polarnet.simulation.pixels.columns import HOT, SIGNAL
+from polarnet.simulation.presets import SENSORS
+
+QUIET = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
+SIDE = 100  # pixels
+CHANNEL = SIDE * SIDE
+
+
+def constant(config: EmulatorConfig, dn: float, seconds: float):
+    """Events of 100 x 100 pixels under constant light, with labels and unrounded times."""
+    t_us = torch.linspace(0, seconds * 1e6, 11, dtype=torch.float64)
+    frames = torch.full((1, 1, SIDE, SIDE), dn).expand(len(t_us), -1, -1, -1)
+    (columns,), _ = emulate_columns(frames, t_us, config, key=3, labels=True, unrounded_times=True)
+    return columns
+
+
+def bars() -> torch.Tensor:
+    """Twelve frames of two channels in which bright and dark bars drift."""
+    phase = torch.arange(40.0) / 6 - torch.arange(12.0).view(-1, 1, 1, 1) / 3
+    return (127.5 + 100 * torch.sin(phase)).expand(-1, 2, 24, -1).contiguous()
+
+
+def places(events) -> np.ndarray:
+    return np.unique(np.asarray(events.y).astype(int) * 1000 + np.asarray(events.x))
+
+
+def test_hot_pixels_have_the_configured_share_and_rate_and_both_polarities():
+    columns = constant(dataclasses.replace(QUIET, hot_pixel_share=0.02, hot_pixel_rate_hz=50.0), 100.0, 4.0)
+    hot = len(places(columns))  # a hot pixel without an event in 4 s has probability exp(-200)
+    assert hot == pytest.approx(0.02 * CHANNEL, abs=3 * math.sqrt(0.02 * CHANNEL))
+    expected = hot * 50.0 * 4.0
+    assert len(columns.t) == pytest.approx(expected, abs=3 * math.sqrt(expected))
+    assert columns.p.sum() == pytest.approx(0, abs=3 * math.sqrt(expected))
+    assert (columns.label == HOT).all()
+
+
+def test_a_hot_pixel_is_a_poisson_process():
+    columns = constant(dataclasses.replace(QUIET, hot_pixel_share=0.02, hot_pixel_rate_hz=20.0), 100.0, 10.0)
+    pixel = columns.y.astype(int) * SIDE + columns.x
+    order = np.lexsort((columns.unrounded_us, pixel))
+    following = pixel[order][1:] == pixel[order][:-1]
+    gaps_s = np.diff(columns.unrounded_us[order])[following] * 1e-6
+    assert gaps_s.mean() == pytest.approx(1 / 20.0, rel=0.03)
+    assert gaps_s.std() == pytest.approx(gaps_s.mean(), rel=0.03)  # an exponential distribution, but for its cut end
+    counts = np.bincount(np.unique(pixel, return_inverse=True)[1])
+    assert stats.kstest((columns.unrounded_us % (1 << 16)) / (1 << 16), "uniform").pvalue > 0.001
+    assert counts.var() == pytest.approx(200, rel=0.35)  # equal to the mean
+
+
+@pytest.mark.parametrize("model", list(MODELS))
+def test_hot_pixels_fire_whatever_the_light_and_the_model(model):
+    config = dataclasses.replace(QUIET, hot_pixel_share=0.05, hot_pixel_rate_hz=80.0)
+    dark, still = constant(config, 1.0, 0.5), constant(config, 240.0, 0.5)
+    assert np.array_equal(dark.unrounded_us, still.unrounded_us)
+    frames, t_us = bars(), 3333 * torch.arange(12)
+    columns, _ = emulate_columns(frames, t_us, dataclasses.replace(config, model=model), key=7, labels=True)
+    for channel in columns:
+        hot = channel.label == HOT
+        own = channel.y.astype(int) * 40 + channel.x
+        assert hot.any()
+        assert not np.isin(own[~hot], own[hot]).any()  # their light is unseen
+
+
+@pytest.mark.parametrize("model", list(MODELS))
+def test_dead_pixels_are_silent_and_the_others_fire_as_before(model):
+    config = dataclasses.replace(SENSORS["default"], model=model, shot_noise_rate_hz=5.0)
+    frames, t_us = bars(), 3333 * torch.arange(12)
+    healthy, _ = emulate(frames, t_us, config, key=7)
+    partly, _ = emulate(frames, t_us, dataclasses.replace(config, dead_pixel_share=0.2), key=7)
+    silent = []
+    for before, after in zip(healthy, partly, strict=True):
+        dead = np.setdiff1d(places(before), places(after))
+        assert len(dead) == pytest.approx(0.2 * 960, abs=3 * math.sqrt(0.16 * 960))
+        alive = torch.from_numpy(~np.isin(before.y.numpy().astype(int) * 1000 + before.x.numpy(), dead))
+        for name in "txyp":
+            assert torch.equal(getattr(after, name), getattr(before, name)[alive])
+        silent.append(dead)
+    assert not np.array_equal(*silent)  # each channel has its own
+
+
+def test_all_pixels_dead_leave_no_event_even_of_hot_ones():
+    columns = constant(dataclasses.replace(QUIET, hot_pixel_share=1.0, dead_pixel_share=1.0), 100.0, 1.0)
+    assert len(columns.t) == len(columns.label) == len(columns.unrounded_us) == 0
+
+
+@pytest.mark.parametrize("model", list(MODELS))
+def test_pieces_threads_and_the_order_of_channels_change_no_event(model):
+    config = dataclasses.replace(
+        SENSORS["default"], model=model, hot_pixel_share=0.1, hot_pixel_rate_hz=500.0, dead_pixel_share=0.1
+    )
+    frames, t_us = bars(), 3333 * torch.arange(12)
+    whole, _ = emulate(frames, t_us, config, key=7)
+    pieces, state = [], None
+    for piece in (slice(0, 1), slice(1, 5), slice(5, 6), slice(6, 12)):
+        events, state = emulate(frames[piece], t_us[piece], config, key=7, state=state)
+        pieces.append(events)
+    turned, _ = emulate(frames.flip(1), t_us, config, key=7, channels=[1, 0], threads=2)
+    for channel, events in enumerate(whole):
+        for name in "txyp":
+            values = getattr(events, name)
+            assert torch.equal(torch.cat([getattr(p[channel], name) for p in pieces]), values)
+            assert torch.equal(getattr(turned[1 - channel], name), values)
+        order = np.lexsort((events.p, events.x, events.y, events.t))
+        assert np.array_equal(order, np.arange(len(events)))
+
+
+def test_labels_and_unrounded_times_stay_with_their_events():
+    config = dataclasses.replace(QUIET, hot_pixel_share=0.1, hot_pixel_rate_hz=500.0)
+    (columns, _), _ = emulate_columns(bars(), 3333 * torch.arange(12), config, key=7, labels=True, unrounded_times=True)
+    assert set(columns.label) == {SIGNAL, HOT}
+    assert np.array_equal(np.floor(columns.unrounded_us), columns.t)
