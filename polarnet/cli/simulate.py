@@ -14,7 +14,7 @@ from polarnet.cli.project import settings_root, working_folder
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from polarnet.cli.simulated_files import Outputs
+    from polarnet.cli.simulated_files import FORMATS, STORE, Outputs
     from polarnet.config.tree import Config
     from polarnet.pictures.clips import Clip
     from polarnet.simulation.scene import PolarizationScene
@@ -51,8 +51,8 @@ def add_to(commands: Commands) -> None:
     simulate.add_argument("words", nargs="+", metavar="INPUT", help="input, and after it words KEY=VALUE")
     simulate.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/simulate/NAME)")
     simulate.add_argument(
-        "--format", nargs="+", choices=("store", "hdf5", "text", "evt3"), default=["store"],
-        help="event store, HDF5 in DSEC's layout, text lines t x y p, Prophesee's EVT3 (default: store)",
+        "--format", nargs="+", metavar="FORMAT", default=["store"],
+        help="store, hdf5, text, evt3: event store, HDF5 in DSEC's layout, text lines t x y p, Prophesee's EVT3 (default: store)",
     )  # fmt: skip
     simulate.add_argument("--fps", type=float, metavar="HZ", help="frames a second (default: as a video states)")
     simulate.add_argument(
@@ -96,14 +96,18 @@ class _Times(NamedTuple):
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    from polarnet.cli.simulated_files import Outputs
+    from polarnet.cli.simulated_files import FORMATS, STORE, Outputs
     from polarnet.config.tree import load
     from polarnet.pictures.clips import ClipOptions, open_clip
     from polarnet.runtime.machine import configure
     from polarnet.stokes import parse_mosaic
 
     inputs = [Path(word).resolve() for word in options.words if "=" not in word or Path(word).exists()]
-    overrides = [*(word for word in options.words if "=" in word and not Path(word).exists()), *options.overrides]
+    overrides = [word for word in options.words if "=" in word and not Path(word).exists()]
+    overrides += [*(word for word in options.format if "=" in word), *options.overrides]
+    formats = list(dict.fromkeys(word for word in options.format if "=" not in word))
+    if unknown := [form for form in formats if form not in FORMATS]:
+        raise ValueError(f"--format: expected some of {', '.join(FORMATS)}, got {', '.join(unknown)}")
     if not inputs:
         raise ValueError(f"expected an input before {overrides[0]}; name a picture, a video or a folder of frames")
     for name, value in (("--fps", options.fps), ("--video-rate", options.video_rate)):
@@ -121,7 +125,7 @@ def _simulate(options: argparse.Namespace) -> int:
         config = load(settings_root(), overrides)
     configure(config.runtime, config.seed)
     outputs = Outputs(
-        list(dict.fromkeys(options.format)),
+        formats or [STORE],
         None if options.no_preview else options.video_rate,
         2.2 if clip.measured else 1.0,
     )

@@ -207,8 +207,8 @@ def test_sizes_polarizers_readout_and_upsampling_are_those_of_the_python_call():
 def test_files_for_other_tools_read_back_equal_one_a_sensor(form, suffix, capsys):
     write_video("walk.mp4", scenery(3))
     for layout in ("four_sensors", "dofp"):
-        given = ["--format", "store", form, "--no-preview", f"polarizers.layout={layout}"]
-        assert main(["simulate", "walk.mp4", "--out", layout, *given[:3], *given[3:]]) == 0
+        given = ["--format", "store", form, f"polarizers.layout={layout}", "--no-preview", "seed=1"]
+        assert main(["simulate", "walk.mp4", "--out", layout, *given]) == 0
     files = [f"four_sensors/polarizer_{angle:03d}.{suffix}" for angle in POLARIZER_ANGLES_DEG]
     assert_equal([read_recording(file).events for file in files], stored("four_sensors"))
     sensor = read_recording(f"dofp/sensor.{suffix}").events
@@ -317,6 +317,7 @@ def test_options_that_do_not_apply_and_folders_of_others_are_refused(tmp_path, c
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")
     assert "expected no --fps, --upsample" in refusal(capsys, "lake.png", "--fps", "30", "--upsample")
+    assert "expected some of store, hdf5, text, evt3, got aedat" in refusal(capsys, "walk.mp4", "--format", "aedat")
     assert "expected no --white" in refusal(capsys, "walk.mp4", "--white", "100")
     assert "--size: expected at most the frames' 24 32" in refusal(capsys, "walk.mp4", "--size", "48", "64")
     assert "emulate.contrast" in refusal(capsys, "walk.mp4", "emulate.contrast=1")
