@@ -14,7 +14,7 @@ from polarnet.cli.project import settings_root, working_folder
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from polarnet.cli.simulated_files import FORMATS, STORE, Outputs
+    from polarnet.cli.simulated_files import Outputs
     from polarnet.config.tree import Config
     from polarnet.pictures.clips import Clip
     from polarnet.simulation.scene import PolarizationScene
@@ -52,7 +52,7 @@ def add_to(commands: Commands) -> None:
     simulate.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/simulate/NAME)")
     simulate.add_argument(
         "--format", nargs="+", metavar="FORMAT", default=["store"],
-        help="store, hdf5, text, evt3: event store, HDF5 in DSEC's layout, text lines t x y p, Prophesee's EVT3 (default: store)",
+        help="store, hdf5 (in DSEC's layout), text (lines t x y p) or evt3 (Prophesee's); default: store",
     )  # fmt: skip
     simulate.add_argument("--fps", type=float, metavar="HZ", help="frames a second (default: as a video states)")
     simulate.add_argument(
