@@ -22,11 +22,11 @@ from torch import Tensor
 
 from polarnet.events.rotation import Rotation, steady_rotation
 from polarnet.events.stream import Events, concatenate
-from polarnet.runtime.machine import generator_for, seed_for
+from polarnet.runtime.machine import seed_for
 from polarnet.runtime.sections import section
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.dataset import origin_of
-from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate, randomised
+from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate
 from polarnet.simulation.motion import Trajectory, render
 from polarnet.simulation.pixels.light import FULL_SCALE
 from polarnet.simulation.polarizers import grid
@@ -164,11 +164,12 @@ def _emulate_part(
     height, width, pitch = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
     for sequence in events.parts[part]:
         record, key = scenes.read(sequence), seed_for(seed, sequence, "rotating")
-        sensor = randomised(camera.sensor, generator_for(seed, sequence, "sensor"))
+        own = camera.drawn(seed, sequence)
         scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
         trajectory = Trajectory.from_vector(record.trajectory.numpy())
-        t_us = rotating_times_us(rotating, sensor, 0, record.duration_us)
-        made = emulate_rotating(scene, trajectory, t_us, height, width, rotating, sensor, key, pitch=pitch).events
-        made, _ = read_out(made, camera.readout, key, record.duration_us)
+        t_us = rotating_times_us(rotating, own.sensor, 0, record.duration_us)
+        made = emulate_rotating(scene, trajectory, t_us, height, width, rotating, own.sensor, key, pitch=pitch).events
+        made, _ = read_out(made, own.readout, key, record.duration_us)
         empty = Events.empty(height, width)
-        events.write(sequence, [made, *[empty] * (CHANNELS - 1)], record.duration_us)
+        channels = [made, *[empty] * (CHANNELS - 1)]
+        events.write(sequence, channels, record.duration_us, camera.draws(seed, sequence))
