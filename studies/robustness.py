@@ -9,6 +9,7 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 - `measured.SOURCE`: all measured scenes of one source. A folder with a manifest.csv (columns file, repo) has one source
   for each repo; any other folder is one source.
 - `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS.
+  `ours, thresholds given` is told the contrast thresholds of the sensor (`methods.ours.thresholds`).
 - `time.5ms`: the same with windows of 5 ms.
 - `speed`: windows a second of the first weights on random events, with --threads.
 
@@ -81,7 +82,7 @@ SENSORS: dict[str, tuple[str, ...]] = {
     ),
     "dofp": ("polarizers.layout=dofp", "synthesize.sensor_height=240", "synthesize.sensor_width=360"),
     "saturating_readout": ("readout.max_events_per_s=300000",),  # a sensor fires 500,000 a second on average
-    "randomised": ("emulate.randomise=true",),
+    "randomised": ("sensor=random",),
 }  # fmt: skip
 """Overrides of params.yaml by name; the scenes are the same, at the same places where the sensor has the same size."""
 TIMES: dict[str, tuple[str, ...]] = {"5ms": ("synthesize.frame_rate_hz=200",)}
@@ -91,6 +92,7 @@ TIMED_WINDOWS, WARM_WINDOWS = 12, 4
 EVENTS_PER_PIXEL = 0.8  # a window; the default sensor's mean
 FRAME_RATE_HZ = 30.0  # of the windows that `benchmark.warmup_windows` counts
 OURS = "ours"
+CALIBRATED = "ours, thresholds given"
 CONSTANT = "constant_real"
 METHODS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
 NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published+gain")
@@ -390,6 +392,7 @@ def main() -> None:
         if name.startswith("measured.")
         for part, _ in parts
     }
+    first_weights = next(iter(arguments.weights.values()))
     results: dict[str, Scores] = {}
     tables: dict[str, Any] = {}
     for name, parts in conditions.items():
@@ -400,6 +403,10 @@ def main() -> None:
         for part, overrides in parts:
             config = settings(*common, *overrides)
             contexts = {row: context_of(config, train_mean, file) for row, file in arguments.weights.items()}
+            if name.startswith("sensors.") and not config.emulate.randomise:
+                thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
+                told = settings(*common, *overrides, f"methods.ours.thresholds={thresholds}")
+                contexts[CALIBRATED] = context_of(told, train_mean, first_weights)
             one = scored(part, config, contexts, constant)
             results[name] = results[name] + one if name in results else one
         tables[name] = table_of(results[name])
