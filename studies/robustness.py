@@ -51,6 +51,8 @@ from polarnet.pictures.manifest import MANIFEST, ManifestEntry, read_manifest, w
 from polarnet.pictures.polarimetry import read_intensities
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import configure
+from polarnet.simulation.camera import Camera
+from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.scene import polarization_from_rgb
 from polarnet.simulation.truth import synthesize
 from polarnet.stokes import Prediction, dolp, stokes_from_intensities
@@ -197,16 +199,22 @@ def mean_dolp(images: Path, split: str) -> list[float]:
 
 
 def scored_sequence(
-    name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context], constant: float
+    name: str,
+    scenes: SceneStore,
+    motion: SynthesizeConfig,
+    camera: Camera,
+    seed: int,
+    warmup: int,
+    contexts: Mapping[str, Context],
+    constant: float,
 ) -> Scores:
-    """Scores of all methods on one sequence."""
-    test = resimulated(scenes, name, config.synthesize, [config.camera] * 4, config.seed)
+    """Scores of all methods on one sequence; the first `warmup` windows are not scored."""
+    test = resimulated(scenes, name, motion, [camera] * 4, seed)
     baselines, _ = available(METHODS, next(iter(contexts.values())))
     predictions = predictions_of(baselines, test, next(iter(contexts.values())))
     predictions[CONSTANT] = Prediction(torch.full_like(test.dolp, constant))
     for row, context in contexts.items():
         predictions[row] = predictions_of([OURS], test, context)[OURS]
-    warmup = round(config.benchmark.warmup_windows * config.synthesize.frame_rate_hz / FRAME_RATE_HZ)
     rows = score_sequence(test, predictions, warmup, None, torch.device("cpu"))
     first = scored_windows(test, warmup).start
     valid = None if test.valid is None else test.valid[first:]
@@ -222,7 +230,11 @@ def scored_sequence(
 def scored(images: Path, config: Config, contexts: Mapping[str, Context], constant: float) -> Scores:
     """Scores of all methods on the pictures of a folder under one condition."""
     scenes = scenes_of(images, config)
-    task = functools.partial(scored_sequence, scenes=scenes, config=config, contexts=contexts, constant=constant)
+    warmup = round(config.benchmark.warmup_windows * config.synthesize.frame_rate_hz / FRAME_RATE_HZ)
+    task = functools.partial(
+        scored_sequence, scenes=scenes, motion=config.synthesize, camera=config.camera, seed=config.seed,
+        warmup=warmup, contexts=contexts, constant=constant,
+    )  # fmt: skip
     results = config.mapper("sequences")(task, list(scenes.sequences))
     return functools.reduce(Scores.__add__, results)
 
