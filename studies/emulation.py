@@ -278,7 +278,7 @@ def worktree_of(commit: str) -> Iterator[Path]:
             subprocess.run(["git", "worktree", "remove", "--force", str(tree)], cwd=ROOT, check=True)
 
 
-def measure_trees(trees: list[Path], rounds: int, repeats: int) -> list[dict[str, dict[str, Any]]]:
+def measure_trees(trees: list[Path], rounds: int, repeats: int) -> list[dict[str, Any]]:
     """Figures of the models in each working tree; the trees take turns as well."""
     processes: list[dict[str, dict[int, list[dict[str, Any]]]]] = [
         {name: {t: [] for t in THREADS} for name in MODELS} for _ in trees

@@ -21,9 +21,9 @@ from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import read_rgb
 from polarnet.pictures.polarimetry import demosaic
 from polarnet.simulation.motion import Pose
-from polarnet.simulation.moving_sensor import channel_frames
 from polarnet.simulation.polarizers import PolarizersConfig, analyzer_maps
 from polarnet.simulation.presets import POLARIZERS
+from polarnet.simulation.rendering import render_intensities, split_channels
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, scene_from_rgb
 from polarnet.stokes import aolp, dolp, parse_mosaic, stokes_from_intensities
 from studies.measure import machine_record, uncommitted, write_section
@@ -56,7 +56,7 @@ def channels_of(scene: PolarizationScene, polarizers: PolarizersConfig) -> Float
     """Light of the four channels, in [0, 1], of a still sensor in the middle of the scene."""
     middle = Pose(*(np.array([value]) for value in ((scene.width - 1) / 2, (scene.height - 1) / 2, 0.0, 1.0)))
     weights = analyzer_maps(polarizers, *SIZE, key=1)
-    return channel_frames(scene, middle, *SIZE, weights, polarizers)[:, 0].astype(np.float64) / 255
+    return split_channels(render_intensities(scene, middle, *SIZE, weights), polarizers)[:, 0].astype(np.float64) / 255
 
 
 def true_stokes(scene: PolarizationScene) -> Float64[Tensor, "3 h w"]:

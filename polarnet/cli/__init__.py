@@ -5,19 +5,35 @@ import sys
 from collections.abc import Sequence
 
 from polarnet import __version__
-from polarnet.cli import benchmark, networks, project, recordings, sensors, stores
+from polarnet.cli import benchmark, networks, project, recordings, sensors, simulate, stores
 from polarnet.runtime.environment import let_threads_sleep
+
+INTERRUPTED = 130  # exit status of shells after Ctrl-C
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; the exit status."""
     let_threads_sleep()
-    options = _parser().parse_args(arguments)
+    options = _options(arguments)
     try:
         return options.run(options)
     except (ValueError, FileNotFoundError, RuntimeError) as error:
         print(f"polarnet {options.command}: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print(f"polarnet {options.command}: stopped", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The arguments; words KEY=VALUE behind the options of a command with overrides count as overrides."""
+    parser = _parser()
+    options, rest = parser.parse_known_args(arguments)
+    if rest and (not hasattr(options, "overrides") or any(w.startswith("-") or "=" not in w for w in rest)):
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if rest:
+        options.overrides = [*options.overrides, *rest]
+    return options
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -28,6 +44,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"polarnet {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for subject in (project, stores, recordings, sensors, networks, benchmark):
+    for subject in (project, stores, simulate, recordings, sensors, networks, benchmark):
         subject.add_to(commands)
     return parser

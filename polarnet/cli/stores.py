@@ -20,9 +20,9 @@ def add_to(commands: Commands) -> None:
     export.add_argument("folder", type=Path, help="output folder; one file for each sequence and channel")
     export.add_argument(
         "--format",
-        choices=("hdf5", "text"),
+        choices=("hdf5", "text", "evt3"),
         default="hdf5",
-        help="HDF5 in DSEC's layout, or text lines t x y p (default: hdf5)",
+        help="HDF5 in DSEC's layout, text lines t x y p, or Prophesee's EVT3 (default: hdf5)",
     )
     export.set_defaults(run=_export)
 

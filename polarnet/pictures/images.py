@@ -138,8 +138,8 @@ def srgb_of(pixels: Float32[np.ndarray, "h w 3"], picture: Picture) -> Float32[n
 
 
 def fit(
-    pixels: Shaped[np.ndarray, "h w 3"], height: int, width: int, max_upscale: float
-) -> Float32[np.ndarray, "height width 3"]:
+    pixels: Shaped[np.ndarray, "h w c"], height: int, width: int, max_upscale: float
+) -> Float32[np.ndarray, "height width c"]:
     """The largest centred part of shape height:width, scaled to that size; integer pixels become [0, 1].
 
     Shrinks by averaging areas, enlarges by cubic interpolation, in the encoding the pixels have.

@@ -53,17 +53,40 @@ def read_measurement(files: str | os.PathLike[str] | Sequence[str | os.PathLike[
     paths = [Path(files)] if isinstance(files, (str, os.PathLike)) else [Path(file) for file in files]
     if not paths:
         raise UnreadablePicture("expected the files of a measurement, got none")
+    levels = read_levels(paths)
+    white = white_level(levels)
+    return _measurement(*levels_at_angles(levels, white, mosaic))
+
+
+def read_levels(paths: Sequence[Path]) -> Shaped[np.ndarray, "n h w"]:
+    """Code values of a group of files: of four angles, or of one raw mosaic; raises as `read_measurement`."""
     if paths[0].suffix.lower() == ".npz":
-        values, white = _scaled(_read_npz(paths[0]))
-        saturated = values >= white
-    elif ANGLE_SUFFIX.fullmatch(paths[0].stem):
-        values, white = _scaled(_read_angles(paths))
-        saturated = values >= white
-    else:
-        raw, white = _scaled(_read_raw(paths[0]))
-        values = demosaic(raw[0], mosaic)
-        saturated = demosaic((raw[0] >= white).astype(np.float64), mosaic) > 0
-    return _measurement(values / (2 * white), saturated)
+        return _read_npz(paths[0])
+    return _read_angles(paths) if ANGLE_SUFFIX.fullmatch(paths[0].stem) else _read_raw(paths[0])
+
+
+def levels_at_angles(
+    levels: Shaped[np.ndarray, "n h w"], white: float, mosaic: Mosaic | None
+) -> tuple[Float64[np.ndarray, "4 h2 w2"], Bool[np.ndarray, "4 h2 w2"]]:
+    """Intensities at 0, 45, 90 and 135 degrees, and which of them saturate; S0 is 1 at twice the level `white`.
+
+    `levels` are those of four angles, or of one raw frame of a `mosaic`, which is demosaicked.
+    """
+    values = levels.astype(np.float64)
+    if len(values) == len(POLARIZER_ANGLES_DEG):
+        return values / (2 * white), values >= white
+    assert mosaic is not None
+    saturated = demosaic((values[0] >= white).astype(np.float64), mosaic) > 0
+    return demosaic(values[0], mosaic) / (2 * white), saturated
+
+
+def without_saturation(
+    values: Float64[np.ndarray, "4 h w"], saturated: Bool[np.ndarray, "4 h w"]
+) -> Float64[np.ndarray, "4 h w"]:
+    """Intensities in which a single saturated angle of a pixel follows from the other three."""
+    i0, i45, i90, i135 = values
+    from_the_others = np.stack([i45 + i135 - i90, i0 + i90 - i135, i45 + i135 - i0, i0 + i90 - i45])
+    return np.where(saturated & (saturated.sum(axis=0) == 1), np.maximum(from_the_others, values), values)
 
 
 def demosaic(raw: Float64[np.ndarray, "h w"], mosaic: Mosaic) -> Float64[np.ndarray, "4 h2 w2"]:
@@ -129,32 +152,30 @@ def _measurement(values: Float64[np.ndarray, "4 h w"], saturated: Bool[np.ndarra
     if not trusted.any():
         raise UnreadablePicture("no pixel is lit and unsaturated at all four angles")
     residual = np.abs(i0 + i90 - i45 - i135)[trusted] / total[trusted]
-    from_the_others = np.stack([i45 + i135 - i90, i0 + i90 - i135, i45 + i135 - i0, i0 + i90 - i45])
     count = saturated.sum(axis=0)
-    recovered = np.where(saturated & (count == 1), np.maximum(from_the_others, values), values)
     return Measurement(
-        intensities=recovered.astype(np.float32),
+        intensities=without_saturation(values, saturated).astype(np.float32),
         valid=count <= 1,
         residual=float(np.median(residual)),
         saturated=float((count > 0).mean()),
     )
 
 
-def _scaled(values: Shaped[np.ndarray, "n h w"]) -> tuple[Float64[np.ndarray, "n h w"], float]:
-    """Values as floats, and the level at which they saturate.
+def white_level(values: Shaped[np.ndarray, "n h w"]) -> float:
+    """The level at which values saturate.
 
     16-bit files saturate at the lowest of 10, 12, 14 and 16 bits that holds all values, because cameras often leave the
     upper bits empty.
     """
     if values.dtype == np.uint8:
-        return values.astype(np.float64), 255.0
+        return 255.0
     if values.dtype == np.uint16:
         highest = int(values.max())
-        return values.astype(np.float64), float(min(white for white in WHITE_LEVELS if white >= highest))
+        return float(min(white for white in WHITE_LEVELS if white >= highest))
     if np.issubdtype(values.dtype, np.floating):
         if not (values.min() >= 0 and values.max() <= 1):  # false for NaN too
             raise UnreadablePicture(f"expected floats in [0, 1], got {values.min():g} to {values.max():g}")
-        return values.astype(np.float64), 1.0
+        return 1.0
     raise UnreadablePicture(f"expected 8 or 16 bits or floats in [0, 1], got {values.dtype}")
 
 

@@ -15,10 +15,8 @@ import cv2
 import numpy as np
 import OpenImageIO as oiio
 import torch
-import zarr
 from jaxtyping import Float, UInt8
 from torch import Tensor
-from zarr.codecs import BloscCodec
 
 from polarnet.events.streaming import EventWindow
 from polarnet.reports.figures import dolp_bar
@@ -32,15 +30,15 @@ from polarnet.reports.maps import (
     polarization_hsv,
 )
 from polarnet.reports.tiles import chart, data_uri, template
+from polarnet.reports.videos import open_video, with_even_sides
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
+from polarnet.storage.appended import AppendedFrames
 
-VIDEO, CODEC = "recovered.mp4", "mp4v"  # MPEG-4, which players show and browsers do not
+VIDEO = "recovered.mp4"
 FILM_FRAMES = 24
 """Minimum number of pictures in the page's animation, evenly spread (fewer if there are fewer frames)."""
 PNG_STORED, NO_FILTER = 0, 8  # no compression, libpng's PNG_FILTER_NONE: larger files, but fast to write
-FRAMES_PER_CHUNK = 32
-ZARR_CODEC = BloscCodec(cname="lz4", shuffle="shuffle")
 MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, the network needs all cores: a concurrent writing thread delays every operation
 PAGE_PICTURES = 6
@@ -88,8 +86,7 @@ class RecoveryWriter:
         self.frames = 0
         self._sample = _Sample([])
         self._scale: float | None = None
-        self._arrays: dict[str, zarr.Array] = {}
-        self._buffer: dict[str, list[np.ndarray]] = {}
+        self._arrays = AppendedFrames(folder / "recovered.zarr", ZARR_CONVENTIONS)
         self._video: cv2.VideoWriter | None = None
         # A second thread that computes on several cores would put those of the network to sleep between operations.
         self._thread = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,))
@@ -105,7 +102,7 @@ class RecoveryWriter:
     def __exit__(self, *problem: object) -> None:
         try:
             self._wait(0)
-            self._flush()
+            self._arrays.flush()
         finally:
             self._thread.shutdown(cancel_futures=True)
             if self._video is not None:
@@ -158,7 +155,8 @@ class RecoveryWriter:
             _write_png(self.folder / "png" / f"{number:06d}.png", picture)
         if "mp4" in self.outputs:
             if self._video is None:
-                self._video = _open_video(self.folder / VIDEO, self.video_rate_hz, *picture.shape[:2])
+                path = self.folder / VIDEO
+                self._video = open_video(path, self.video_rate_hz, picture.shape, "leave mp4 out of --write")
             self._video.write(np.ascontiguousarray(picture[..., ::-1]))
 
     def _picture(self, window: EventWindow, prediction: Prediction) -> UInt8[np.ndarray, "h w 3"]:
@@ -170,9 +168,7 @@ class RecoveryWriter:
             maps.append(polarization_hsv(torch.ones_like(prediction.dolp), prediction.dolp, prediction.aolp))
         maps.append(event_image(events, self._scale))
         gap = np.full((maps[0].shape[0], GAP, 3), 255, np.uint8)
-        side_by_side = np.concatenate([part for one in maps for part in (one, gap)][:-1], axis=1)
-        height, width = side_by_side.shape[:2]
-        return np.pad(side_by_side, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")  # codecs want even sides
+        return with_even_sides(np.concatenate([part for one in maps for part in (one, gap)][:-1], axis=1))
 
     def _add_to_zarr(self, window: EventWindow, prediction: Prediction) -> None:
         frame = {"t_us": np.array(window.stop_us, np.int64), "dolp": _quantised(prediction.dolp * 65535, 65535)}
@@ -180,25 +176,7 @@ class RecoveryWriter:
             frame["aolp"] = _quantised(prediction.aolp * (65536 / np.pi) % 65536, 65535)
         if prediction.log_variance is not None:
             frame["log_variance"] = prediction.log_variance.numpy().astype(np.float32)
-        for name, values in frame.items():
-            self._buffer.setdefault(name, []).append(values)
-        if len(self._buffer["t_us"]) == FRAMES_PER_CHUNK:
-            self._flush()
-
-    def _flush(self) -> None:
-        if not self._buffer:
-            return
-        if not self._arrays:
-            group = zarr.open_group(self.folder / "recovered.zarr", mode="w")
-            group.attrs["conventions"] = {name: ZARR_CONVENTIONS[name] for name in self._buffer}
-            for name, (first, *_) in self._buffer.items():
-                chunks = (FRAMES_PER_CHUNK, *first.shape)
-                self._arrays[name] = group.create_array(
-                    name, shape=(0, *first.shape), chunks=chunks, dtype=first.dtype, compressors=ZARR_CODEC
-                )
-        for name, values in self._buffer.items():
-            self._arrays[name].append(np.stack(values))
-        self._buffer.clear()
+        self._arrays.add(frame)
 
 
 def signed_events(window: EventWindow) -> Float[Tensor, "h w"]:
@@ -219,13 +197,6 @@ def _film(pictures: Sequence[np.ndarray]) -> dict[str, Any]:
     height, width = pictures[0].shape[:2]
     source = data_uri(encode_jpeg(np.concatenate(pictures)), "jpeg")
     return {"source": source, "frames": len(pictures), "height": height, "width": width}
-
-
-def _open_video(path: Path, rate_hz: float, height: int, width: int) -> cv2.VideoWriter:
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), rate_hz, (width, height))
-    if not video.isOpened():
-        raise RuntimeError(f"{path}: OpenCV cannot write it ({CODEC}); leave mp4 out of --write")
-    return video
 
 
 def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:

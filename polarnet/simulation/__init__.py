@@ -26,6 +26,7 @@ MODULE_OF = {
     "scene_from_polarization": "polarnet.simulation.scene",
     "scene_from_rgb": "polarnet.simulation.scene",
     "simulate": "polarnet.simulation.sequence",
+    "simulate_video": "polarnet.simulation.video",
     "emulate_motion": "polarnet.simulation.moving_sensor",
 }
 """Module of each public name."""

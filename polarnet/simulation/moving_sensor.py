@@ -3,7 +3,7 @@
 import functools
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Int64
 
 from polarnet.events.mosaic import join_mosaic, split_mosaic
 from polarnet.events.stream import Events
@@ -11,15 +11,7 @@ from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, em
 from polarnet.simulation.motion import Pose, Trajectory
 from polarnet.simulation.pixels.columns import Columns
 from polarnet.simulation.pixels.light import light_of_frames
-from polarnet.simulation.polarizers import (
-    IDEAL,
-    PolarizersConfig,
-    analyzer_maps,
-    analyzers,
-    channel_size,
-    mixed_with_neighbours,
-    split_cells,
-)
+from polarnet.simulation.polarizers import IDEAL, PolarizersConfig, channel_size
 from polarnet.simulation.readout import PERFECT, ReadoutConfig, read_out
 from polarnet.simulation.rendering import (
     check_inside,
@@ -27,6 +19,8 @@ from polarnet.simulation.rendering import (
     lights_of_drift,
     render_intensities,
     render_times_us,
+    split_channels,
+    weights_of,
 )
 from polarnet.simulation.scene import PolarizationScene
 from polarnet.stokes import parse_mosaic
@@ -58,34 +52,22 @@ def emulate_motion(
     events, _ = emulate_motion_steps(
         scene, trajectory, t_us, height, width, config, key, None, threads, polarizers, labels
     )
-    return _read_out(events, polarizers, readout, key, duration_us)
+    return leave_sensors(events, polarizers, readout, key, duration_us)
 
 
-def _read_out(
+def leave_sensors(
     channels: list[Events], polarizers: PolarizersConfig, readout: ReadoutConfig, key: int, duration_us: int
 ) -> list[Events]:
-    """The channels as they leave their sensors: each its own, or all four one DoFP sensor."""
+    """The channels as they leave their sensors: each its own, or all four one DoFP sensor.
+
+    Takes whole sequences, with the `key` and duration of their emulation.
+    """
     if readout.perfect:
         return channels
     if polarizers.layout == "dofp":
         mosaic = parse_mosaic(polarizers.mosaic)
         return split_mosaic(read_out(join_mosaic(channels, mosaic), readout, key, duration_us)[0], mosaic)
     return [read_out(channel, readout, key + number, duration_us)[0] for number, channel in enumerate(channels)]
-
-
-def channel_frames(
-    scene: PolarizationScene,
-    pose: Pose,
-    height: int,
-    width: int,
-    weights: Float32[np.ndarray, "sensors 3 *pixels"],
-    polarizers: PolarizersConfig,
-) -> Float32[np.ndarray, "4 n h2 w2"]:
-    """Digital numbers of the four channels; `weights` are the `analyzers` or `analyzer_maps` of the polarizers."""
-    frames = render_intensities(scene, pose, height, width, weights)
-    if polarizers.layout == "dofp":
-        frames = split_cells(mixed_with_neighbours(frames[0], polarizers.crosstalk), polarizers.mosaic)
-    return frames
 
 
 def emulation_times_us(
@@ -121,7 +103,7 @@ def emulate_motion_steps(
     check_inside(scene, pose, t_us, height, width)
     rows, columns = channel_size(polarizers.layout, height, width)
     eight_bit = MODELS[config.model].EIGHT_BIT_VIDEO
-    weights = analyzers(polarizers) if polarizers.uniform else analyzer_maps(polarizers, height, width, key)
+    weights = weights_of(polarizers, height, width, key)
     advance = functools.partial(
         emulate_lights,
         height=rows,
@@ -139,7 +121,8 @@ def emulate_motion_steps(
     pieces = []
     for first in range(0, len(t_us), CHUNK):
         chunk = slice(first, first + CHUNK)
-        frames = channel_frames(scene, Pose(*(values[chunk] for values in pose)), height, width, weights, polarizers)
+        frames = render_intensities(scene, Pose(*(values[chunk] for values in pose)), height, width, weights)
+        frames = split_channels(frames, polarizers)
         if eight_bit:
             frames = (frames + np.float32(0.5)).astype(np.uint8)
         lights = [light_of_frames(channel) for channel in frames]

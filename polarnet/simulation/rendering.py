@@ -8,6 +8,13 @@ from jaxtyping import Float32, Float64, Int64
 
 from polarnet.simulation.motion import Pose, Trajectory, render_poses
 from polarnet.simulation.pixels.light import FULL_SCALE, Light
+from polarnet.simulation.polarizers import (
+    PolarizersConfig,
+    analyzer_maps,
+    analyzers,
+    mixed_with_neighbours,
+    split_cells,
+)
 from polarnet.simulation.scene import PolarizationScene
 
 MIN_RATE_HZ = 30.0  # minimum of the adaptive rate, for a sensor at rest
@@ -82,6 +89,22 @@ def render_intensities(
 ) -> Float32[np.ndarray, "sensors n h w"]:
     """Digital numbers behind polarizers of these `weights` for any motion; the polarizers turn with the camera."""
     return behind_polarizers(render_poses(scene, pose, height, width).transpose(1, 0, 2, 3), weights)
+
+
+def split_channels(
+    frames: Float32[np.ndarray, "sensors n h w"], polarizers: PolarizersConfig
+) -> Float32[np.ndarray, "4 n h2 w2"]:
+    """Light of the four channels from that of the sensors: of four, or of one DoFP sensor."""
+    if polarizers.layout == "dofp":
+        return split_cells(mixed_with_neighbours(frames[0], polarizers.crosstalk), polarizers.mosaic)
+    return frames
+
+
+def weights_of(
+    polarizers: PolarizersConfig, height: int, width: int, key: int
+) -> Float32[np.ndarray, "sensors 3 *pixels"]:
+    """Weights of S0, S1 and S2 of each channel, or of each pixel if the pixels differ; `key` seeds the differences."""
+    return analyzers(polarizers) if polarizers.uniform else analyzer_maps(polarizers, height, width, key)
 
 
 def behind_polarizers(

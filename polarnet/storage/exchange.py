@@ -1,23 +1,27 @@
-"""Write events as other tools' files: HDF5 in DSEC's layout, and text lines `t x y p`.
+"""Write events as other tools' files: HDF5 in DSEC's layout, text lines `t x y p`, and Prophesee's EVT3.
 
-`polarnet.recordings` reads both.
+`polarnet.recordings` reads them all.
 """
 
 import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, no_type_check
 
+import numba
 import numpy as np
 
 from polarnet.events.labels import LABELS
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, slice_count
 from polarnet.runtime.extras import installation
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore, first_at_millisecond
 
 HDF5_CHUNK = 2**16  # events
+BLOCK = 2**18  # events converted at once
+EVT3_MAX_SIDE = 2**11  # x and y have 11 bits
+EVT3_WORDS_PER_EVENT = 3  # at most: row, low bits of the time, column; the high bits of the time come in addition
 
 
 def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:
@@ -51,25 +55,80 @@ def write_text(path: str | os.PathLike[str], events: Events, duration_us: int) -
     """
     with Path(path).open("w", encoding="ascii") as file:
         file.write(f"{events.width} {events.height}\n")
-        rows = zip(*(column.tolist() for column in (events.t, events.x, events.y, events.p)), strict=True)
-        file.writelines(f"{t // 1_000_000}.{t % 1_000_000:06d} {x} {y} {int(p > 0)}\n" for t, x, y, p in rows)
+        for start in range(0, len(events), BLOCK):
+            block = slice_count(events, start, start + BLOCK)
+            rows = zip(*(column.tolist() for column in (block.t, block.x, block.y, block.p)), strict=True)
+            file.writelines(f"{t // 1_000_000}.{t % 1_000_000:06d} {x} {y} {int(p > 0)}\n" for t, x, y, p in rows)
     if events.label is not None:
         lines = "".join(f"{label}\n" for label in events.label.tolist())
         Path(path).with_name(f"{Path(path).stem}_label.txt").write_text(lines, encoding="ascii")
 
 
+def write_evt3(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:
+    """Write one sensor as Prophesee's raw file of 16-bit EVT3 words, without their vectors of neighbouring pixels.
+
+    The header states the sensor's size. Such a file cannot hold the duration. ValueError for a side above 2048 px.
+    """
+    if max(events.height, events.width) > EVT3_MAX_SIDE:
+        raise ValueError(
+            f"EVT3 holds sensors of up to {EVT3_MAX_SIDE} px a side, got {events.height}x{events.width}; "
+            f"choose another format"
+        )
+    size = f"{events.width}x{events.height}"
+    header = f"% evt 3.0\n% format EVT3;height={events.height};width={events.width}\n% geometry {size}\n% end\n"
+    state = np.array([-1, -1, -1])  # high and low bits of the time, and row, of the event before
+    with Path(path).open("wb") as file:
+        file.write(header.encode("ascii"))
+        for start in range(0, len(events), BLOCK):
+            block = slice_count(events, start, start + BLOCK)
+            steps = (int(block.t[-1]) >> 12) - int(state[0])
+            words = np.empty(EVT3_WORDS_PER_EVENT * len(block) + steps, np.uint16)
+            count = _encode_evt3(*(getattr(block, name).numpy() for name in "txyp"), state, words)
+            file.write(words[:count].astype("<u2").tobytes())
+
+
+@no_type_check
+@numba.njit(nogil=True, cache=True)
+def _encode_evt3(t, x, y, p, state, words):
+    """Words by their upper 4 bits: 8 and 6 the high and low 12 bits of the time, 0 the row, 2 polarity and column.
+
+    The high bits are written each time they step, even between events, because readers count how often they wrap.
+    """
+    high, low, row = state
+    n = 0
+    for i in range(len(t)):
+        while high < t[i] >> 12:
+            high += 1
+            words[n] = 0x8000 | (high & 0xFFF)
+            low = -1
+            n += 1
+        if low != t[i] & 0xFFF:
+            low = t[i] & 0xFFF
+            words[n] = 0x6000 | low
+            n += 1
+        if row != y[i]:
+            row = y[i]
+            words[n] = row
+            n += 1
+        words[n] = 0x2000 | (p[i] > 0) << 11 | x[i]
+        n += 1
+    state[:] = high, low, row
+    return n
+
+
 FORMS: dict[str, tuple[str, Callable[[Path, Events, int], None]]] = {
     "hdf5": (".h5", write_hdf5),
     "text": (".txt", write_text),
+    "evt3": (".raw", write_evt3),
 }
 """Suffix and writer of each file format."""
 
 
 def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -> None:
-    """Write FOLDER/SEQUENCE/polarizer_{000,045,090,135}.{h5,txt} for every sequence, then FOLDER/store.json.
+    """Write FOLDER/SEQUENCE/polarizer_{000,045,090,135}.{h5,txt,raw} for every sequence, then FOLDER/store.json.
 
-    `form` is hdf5 or text. store.json holds the data that these files cannot: durations, sizes, attributes, and the
-    names of the labels in a labelled store.
+    `form` is hdf5, text or evt3. store.json holds the data that these files cannot: durations, sizes, attributes, and
+    the names of the labels in a labelled store.
     """
     folder = Path(folder)
     if form not in FORMS:

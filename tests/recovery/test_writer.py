@@ -8,8 +8,9 @@ import zarr
 from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
 from polarnet.recovery import writer as recovery
-from polarnet.recovery.writer import FRAMES_PER_CHUNK, RecoveryWriter, signed_events
+from polarnet.recovery.writer import RecoveryWriter, signed_events
 from polarnet.stokes import Prediction
+from polarnet.storage.appended import FRAMES_PER_CHUNK
 
 HEIGHT, WIDTH = 15, 21
 FRAMES = 40

@@ -11,7 +11,7 @@ import torch
 from polarnet import stokes
 from polarnet.pictures.polarimetry import demosaic
 from polarnet.simulation.motion import Pose, Sine, Trajectory
-from polarnet.simulation.moving_sensor import channel_frames, emulate_motion
+from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.pixels.light import intensity_rows
 from polarnet.simulation.polarizers import (
     IDEAL,
@@ -23,7 +23,7 @@ from polarnet.simulation.polarizers import (
     split_cells,
 )
 from polarnet.simulation.presets import SENSORS
-from polarnet.simulation.rendering import lights_of_drift, render_intensities
+from polarnet.simulation.rendering import lights_of_drift, render_intensities, split_channels
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.stokes import parse_mosaic
 
@@ -52,7 +52,9 @@ def channels_of(
     scene: PolarizationScene, polarizers: PolarizersConfig, pose: Pose | None = None, size: tuple[int, int] = (20, 30)
 ) -> torch.Tensor:
     """Light of the four channels in [0, 1]; without a pose, at the scene's middle."""
-    frames = channel_frames(scene, pose or still(), *size, analyzer_maps(polarizers, *size, key=3), polarizers)
+    frames = split_channels(
+        render_intensities(scene, pose or still(), *size, analyzer_maps(polarizers, *size, key=3)), polarizers
+    )
     return torch.from_numpy(frames[:, 0].astype(np.float64) / 255)
 
 

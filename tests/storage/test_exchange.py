@@ -4,12 +4,13 @@ import json
 import sys
 
 import h5py
+import numpy as np
 import pytest
 import torch
 
 from polarnet.recordings.recording import read_recording
 from polarnet.storage.events import EventStore
-from polarnet.storage.exchange import export_store, write_hdf5, write_text
+from polarnet.storage.exchange import export_store, write_evt3, write_hdf5, write_text
 
 HEIGHT, WIDTH = 12, 18
 
@@ -24,7 +25,7 @@ def store(tmp_path_factory, make_random_events) -> EventStore:
     return EventStore.open(path)
 
 
-@pytest.mark.parametrize(("form", "suffix"), [("hdf5", "h5"), ("text", "txt")])
+@pytest.mark.parametrize(("form", "suffix"), [("hdf5", "h5"), ("text", "txt"), ("evt3", "raw")])
 def test_an_exported_store_reads_back_as_recordings(store, tmp_path, form, suffix):
     export_store(store, str(tmp_path / "files"), form)
     for name in store.sequences:
@@ -60,6 +61,24 @@ def test_text_is_what_e2vid_reads(make_events, tmp_path):
     assert (tmp_path / "e.txt").read_text() == "18 12\n0.000005 1 2 1\n1.000001 3 4 0\n"
 
 
+def test_evt3_words_are_time_row_and_column_and_silence_keeps_the_clock_running(make_events, tmp_path):
+    """Prophesee: 0x8 high time, 0x6 low time, 0x0 row, 0x2 polarity and column; the 24 bits wrap every 16.8 s."""
+    rows = [(5, 1, 2, 1), (5, 3, 2, -1), (2**25 + 7, 17, 11, 1)]
+    write_evt3(tmp_path / "e.raw", make_events(rows, HEIGHT, WIDTH), 2**26)
+    header, _, words = (tmp_path / "e.raw").read_bytes().partition(b"% end\n")
+    words = np.frombuffer(words, "<u2")
+    assert b"% geometry 18x12" in header
+    assert words[:5].tolist() == [0x8000, 0x6005, 0x0002, 0x2801, 0x2003]
+    assert words[-4:].tolist() == [0x8000, 0x6007, 0x000B, 0x2811]
+    assert len(words) == 5 + 2**13 + 3
+    assert read_recording(tmp_path / "e.raw").events.t.tolist() == [5, 5, 2**25 + 7]
+
+
+def test_evt3_refuses_a_sensor_with_more_columns_than_its_words_count(make_events, tmp_path):
+    with pytest.raises(ValueError, match="up to 2048 px a side, got 4x2049"):
+        write_evt3(tmp_path / "e.raw", make_events([], 4, 2049), 1000)
+
+
 def test_without_h5py_the_error_names_the_extra(make_events, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[hdf5\]' in the clone"):
@@ -67,5 +86,5 @@ def test_without_h5py_the_error_names_the_extra(make_events, tmp_path, monkeypat
 
 
 def test_an_unknown_form_is_refused(store, tmp_path):
-    with pytest.raises(ValueError, match="expected a form of hdf5, text, got 'aedat'"):
+    with pytest.raises(ValueError, match="expected a form of hdf5, text, evt3, got 'aedat'"):
         export_store(store, tmp_path, "aedat")

@@ -1,0 +1,344 @@
+"""Clips: the frames of a video or of a folder, in colour or behind polarizers, one after another in constant memory."""
+
+import itertools
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, Shaped
+
+from polarnet.pictures.images import UnreadablePicture, fit, picture_extensions, read_channels, read_picture, srgb_of
+from polarnet.pictures.polarimetry import (
+    ANGLE_SUFFIX,
+    group_by_measurement,
+    levels_at_angles,
+    read_levels,
+    white_level,
+    without_saturation,
+)
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
+
+VIDEOS = frozenset(["mp4", "m4v", "mov", "avi", "mkv", "webm", "mpg", "mpeg", "wmv", "gif"])
+"""Lower-case extensions of files that are read as videos."""
+TIMES_FILE = "timestamps.txt"
+TIME_UNITS = {"us": 1.0, "ms": 1e3, "s": 1e6}
+GREEN = 1  # polarization differs between colours, and this channel has the least noise
+MIN_MOSAIC_SIDE = 6  # pixels; demosaicking leaves out the cells on the rim
+
+Size = tuple[int, int]
+Levels = Shaped[np.ndarray, "channels h w"]
+
+
+class ClipFrame(NamedTuple):
+    """One frame, scaled to the size of its clip."""
+
+    pixels: Float32[np.ndarray, "h w channels"]
+    """RGB code values in [0, 1], or linear intensities at 0, 45, 90 and 135 degrees with I0 + I90 in [0, 1]."""
+    t_us: float | None
+    """Time that the video states."""
+    saturated: float
+    """Share of pixels with a saturated angle; 0 for RGB."""
+
+
+@dataclass(frozen=True)
+class ClipOptions:
+    """How to read a clip."""
+
+    mosaic: Mosaic | None = None
+    """Angles over 2x2 pixels if the frames are raw mosaics."""
+    angles: Sequence[int] | None = None
+    """Angles of four videos, in their order; None: from their names, NAME_0, NAME_45, ..."""
+    white: float | None = None
+    """Level at which the values of a polarization camera saturate; None: from the first frame."""
+    grey: bool = False
+    """Take colour frames as grey, without polarization."""
+    size: Size | None = None
+    """Height and width to scale to, after a centred cut to this aspect ratio; None: as they are."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Frames in the order of time. `frames` starts from the first frame at each call."""
+
+    name: str
+    words: str
+    """The kind of frames, in words."""
+    measured: bool
+    """Whether the channels of a frame are four polarizers, not RGB."""
+    count: int | None
+    """Number of frames; None: not known before the end."""
+    still: bool
+    """Whether it is a picture, or a measurement, not a video of one frame."""
+    frames: Callable[[], Iterator[ClipFrame]]
+
+
+def open_clip(paths: Sequence[Path], options: ClipOptions) -> Clip:
+    """Open a video, a folder of frames, four videos behind polarizers, or the picture of a single frame.
+
+    A folder whose files are all NAME_0, NAME_45, NAME_90, NAME_135 or .npz holds measured polarization; with a
+    `mosaic`, a video or a folder holds raw mosaics. The frames of a folder follow the numbers in their names. Raises
+    FileNotFoundError or UnreadablePicture for files that are missing, damaged or do not belong together; iterating
+    raises it for later frames.
+    """
+    missing = [str(path) for path in paths if not path.exists()]
+    if missing:
+        raise FileNotFoundError(f"{', '.join(missing)}: there is no such file or folder")
+    name = paths[0].stem if paths[0].is_file() else paths[0].resolve().name
+    if len(paths) == 4 and all(_extension(path) not in VIDEOS for path in paths):
+        return _open_files([tuple(paths)], ANGLE_SUFFIX.sub(r"\g<name>", name), options)
+    if len(paths) == 4:
+        videos = _videos_by_angle(paths, options.angles)
+        return _measured(videos[0].stem.rpartition("_")[0] or name, "four polarizers", _from_videos(videos), options)
+    if len(paths) != 1:
+        raise UnreadablePicture(f"expected one file or folder, or four videos behind polarizers, got {len(paths)}")
+    (path,) = paths
+    if path.is_dir():
+        return _open_folder(path, name, options)
+    if _extension(path) in VIDEOS:
+        if options.mosaic is not None:
+            return _measured(name, "raw mosaics", _from_videos([path], mosaic=True), options)
+        return _coloured(
+            name, "grey video" if options.grey else "RGB video", _from_videos([path], colour=True), options
+        )
+    return _open_files([(path,)], name, options)
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Where the levels of frames come from."""
+
+    count: int | None
+    still: bool
+    levels: Callable[[], Iterator[tuple[str, Levels, float | None]]]
+    """Name, code values and time of each frame."""
+
+
+def _open_folder(folder: Path, name: str, options: ClipOptions) -> Clip:
+    kinds = picture_extensions() | {"npz"}
+    visible = (path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    files = sorted((path for path in visible if _extension(path) in kinds), key=_in_order)
+    if not files:
+        raise UnreadablePicture(f"{folder}: expected the pictures of a clip, found none; videos are given as files")
+    measured = all(_extension(file) == "npz" or ANGLE_SUFFIX.fullmatch(file.stem) for file in files)
+    if options.mosaic is None and measured:
+        return _open_files(group_by_measurement(files), name, options)
+    return _open_files([(file,) for file in files], name, options)
+
+
+def _open_files(groups: Sequence[tuple[Path, ...]], name: str, options: ClipOptions) -> Clip:
+    first = groups[0][0]
+    measured = _extension(first) == "npz" or len(groups[0]) > 1
+    if not measured and options.mosaic is None:
+        kind = "photograph" if len(groups) == 1 else "frames"
+        return _coloured(name, f"{'grey' if options.grey else 'RGB'} {kind}", _from_pictures(groups), options)
+
+    def levels() -> Iterator[tuple[str, Levels, float | None]]:
+        for group in groups:
+            try:
+                yield group[0].name, read_levels(group), None
+            except UnreadablePicture as error:
+                raise UnreadablePicture(f"{group[0].name}: {error}") from error
+
+    files = _Files(len(groups), len(groups) == 1, levels)
+    return _measured(name, "four polarizers" if measured else "raw mosaics", files, options)
+
+
+def _from_pictures(groups: Sequence[tuple[Path, ...]]) -> _Files:
+    def levels() -> Iterator[tuple[str, Levels, float | None]]:
+        for (path,) in groups:
+            try:
+                yield path.name, _rgb(path), None
+            except UnreadablePicture as error:
+                raise UnreadablePicture(f"{path.name}: {error}") from error
+
+    return _Files(len(groups), len(groups) == 1, levels)
+
+
+def _rgb(path: Path) -> Float32[np.ndarray, "3 h w"]:
+    """sRGB code values; a picture with one channel is grey."""
+    channels = read_channels(path)
+    if channels.shape[2] == 1:
+        return np.repeat(_unit(channels).transpose(2, 0, 1), 3, axis=0)
+    picture = read_picture(path)
+    return srgb_of(_unit(picture.pixels), picture).transpose(2, 0, 1)
+
+
+def _unit(pixels: Shaped[np.ndarray, "h w c"]) -> Float32[np.ndarray, "h w c"]:
+    white = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1
+    return pixels.astype(np.float32) / np.float32(white)
+
+
+def _from_videos(paths: Sequence[Path], *, colour: bool = False, mosaic: bool = False) -> _Files:
+    """Frames of one video, or of four that advance together: RGB in [0, 1] if `colour`, else green 8-bit levels."""
+    captures = [_capture(path) for path in paths]
+    stated = [max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT))) for capture in captures]
+    for capture in captures:
+        capture.release()
+
+    def levels() -> Iterator[tuple[str, Levels, float | None]]:
+        opened = [_capture(path) for path in paths]
+        try:
+            for number in itertools.count():
+                read = [capture.read() for capture in opened]
+                ended = [path.name for path, (there, _) in zip(paths, read, strict=True) if not there]
+                if len(ended) == len(paths):
+                    break
+                if ended:
+                    raise UnreadablePicture(
+                        f"{', '.join(ended)} ends after {number} frames, before the others; cut all to one length"
+                    )
+                planes = [_checked(path, pixels) for path, (_, pixels) in zip(paths, read, strict=True)]
+                t_us = 1000 * opened[0].get(cv2.CAP_PROP_POS_MSEC)
+                if colour:
+                    rgb = planes[0][..., ::-1].transpose(2, 0, 1)
+                    yield f"frame {number}", rgb.astype(np.float32) / np.float32(255), t_us
+                else:
+                    green = [plane[..., GREEN] for plane in planes]
+                    if len({plane.shape for plane in green}) > 1:
+                        sizes = ", ".join(
+                            f"{path.name} {plane.shape}" for path, plane in zip(paths, green, strict=True)
+                        )
+                        raise UnreadablePicture(f"expected four videos of one size, got {sizes}")
+                    yield f"frame {number}", np.stack(green), t_us
+        finally:
+            for capture in opened:
+                capture.release()
+        if number == 0:
+            raise UnreadablePicture(
+                f"{paths[0].name}: it has no frame that can be read; convert it to MP4 or PNG files"
+            )
+
+    return _Files(min(stated) or None, False, levels)
+
+
+def _capture(path: Path) -> cv2.VideoCapture:
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise UnreadablePicture(
+            f"{path.name}: OpenCV cannot open it as a video; convert it to MP4, or to a folder of PNG"
+        )
+    return capture
+
+
+def _checked(path: Path, pixels: np.ndarray) -> Shaped[np.ndarray, "h w 3"]:
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8:
+        raise UnreadablePicture(f"{path.name}: expected frames of 3 x 8 bits, got {pixels.dtype} {pixels.shape}")
+    return pixels
+
+
+def _videos_by_angle(paths: Sequence[Path], angles: Sequence[int] | None) -> list[Path]:
+    """Four videos in the order 0, 45, 90, 135."""
+    if angles is None:
+        matches = [ANGLE_SUFFIX.fullmatch(path.stem) for path in paths]
+        angles = [int(match["angle"]) for match in matches if match]
+    if sorted(angles) != list(POLARIZER_ANGLES_DEG):
+        raise UnreadablePicture(
+            f"four videos: expected one behind each of 0, 45, 90, 135 degrees, got {list(angles)}; name them NAME_0, "
+            f"NAME_45, NAME_90, NAME_135, or give --angles in their order"
+        )
+    return [path for _, path in sorted(zip(angles, paths, strict=True))]
+
+
+def _coloured(name: str, words: str, files: _Files, options: ClipOptions) -> Clip:
+    def frames() -> Iterator[ClipFrame]:
+        for rgb, t_us in _of_one_size(files):
+            pixels = np.ascontiguousarray(rgb.transpose(1, 2, 0))
+            if options.grey:
+                pixels = np.repeat(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=-1)
+            yield ClipFrame(_scaled(pixels, options.size), t_us, 0.0)
+
+    return Clip(name, words, False, files.count, files.still, frames)
+
+
+def _measured(name: str, words: str, files: _Files, options: ClipOptions) -> Clip:
+    def frames() -> Iterator[ClipFrame]:
+        white = options.white
+        for number, (levels, t_us) in enumerate(_of_one_size(files)):
+            white = white_level(levels) if white is None else white
+            if levels.max() > white:
+                raise UnreadablePicture(
+                    f"frame {number}: expected levels up to {white:g}, those of the first frame's bits, got "
+                    f"{levels.max():g}; give --white, the level at which the camera saturates"
+                )
+            _check_cells(levels)
+            values, saturated = levels_at_angles(levels, white, options.mosaic)
+            pixels = without_saturation(values, saturated).astype(np.float32).transpose(1, 2, 0)
+            yield ClipFrame(_scaled(np.ascontiguousarray(pixels), options.size), t_us, float(saturated.any(0).mean()))
+
+    return Clip(name, words, True, files.count, files.still, frames)
+
+
+def _check_cells(levels: Levels) -> None:
+    """UnreadablePicture for a raw frame that cannot hold whole cells."""
+    height, width = levels.shape[1:]
+    if len(levels) == 1 and (height % 2 or width % 2 or min(height, width) < MIN_MOSAIC_SIDE):
+        raise UnreadablePicture(
+            f"--mosaic: expected frames of even height and width, {MIN_MOSAIC_SIDE} px or more, for whole 2x2 cells, "
+            f"got {height}x{width}; cut them without shifting the cells"
+        )
+
+
+def _of_one_size(files: _Files) -> Iterator[tuple[Levels, float | None]]:
+    shape, first = None, ""
+    for name, levels, t_us in files.levels():
+        if shape is None:
+            shape, first = levels.shape, name
+        if levels.shape != shape:
+            sizes = [f"{s[1]}x{s[2]} px" + f", {s[0]} channels" * (s[0] != shape[0]) for s in (levels.shape, shape)]
+            raise UnreadablePicture(f"{name}: expected frames of one size, got {sizes[0]} after {first} of {sizes[1]}")
+        yield levels, t_us
+
+
+def _scaled(pixels: Float32[np.ndarray, "h w c"], size: Size | None) -> Float32[np.ndarray, "h2 w2 c"]:
+    if size is None:
+        return pixels
+    if size[0] > pixels.shape[0] or size[1] > pixels.shape[1]:
+        raise UnreadablePicture(
+            f"--size: expected at most the frames' {pixels.shape[0]} {pixels.shape[1]}, got {size[0]} {size[1]}"
+        )
+    return fit(pixels, *size, max_upscale=1.0)
+
+
+def _extension(path: Path) -> str:
+    return path.suffix.lower().lstrip(".")
+
+
+def _in_order(path: Path) -> list[tuple[int, str]]:
+    """Key that puts frame_2 before frame_10."""
+    words = re.split(r"(\d+)", path.name)
+    return [(int(word), "") if k % 2 else (0, word) for k, word in enumerate(words)]
+
+
+def times_from_file(path: Path, unit: str) -> Float64[np.ndarray, " n"]:
+    """Times in microseconds from a text with one a line, in `unit` (us, ms or s).
+
+    Further words of a line, and lines that start with #, are ignored. ValueError for anything else.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: there is no such file; write the time of each frame on a line of its own")
+    times = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            times.append(float(words[0]) * TIME_UNITS[unit])
+        except ValueError:
+            raise ValueError(f"{path.name}, line {number}: expected a time in {unit}, got {words[0]!r}") from None
+    return np.array(times)
+
+
+def check_times(t_us: Float64[np.ndarray, " n"], source: str) -> Int64[np.ndarray, " n"]:
+    """Times from the first frame's, in whole microseconds; ValueError if they do not increase by at least 1."""
+    whole = np.rint(t_us - t_us[:1]).astype(np.int64) if np.isfinite(t_us).all() else np.full(len(t_us), -1)
+    if (np.diff(whole) < 1).any():
+        k = int((np.diff(whole) < 1).argmax())
+        raise ValueError(
+            f"{source}: expected times that increase by at least 1 us, got {t_us[k]:.10g} and {t_us[k + 1]:.10g} us "
+            f"for frames {k} and {k + 1}; sort the frames, or name the unit with --time-unit"
+        )
+    return whole

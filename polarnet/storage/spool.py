@@ -1,0 +1,61 @@
+"""Events of a sequence on disk while they arrive: one file a column and channel, read back through memory maps."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+import numpy as np
+import torch
+
+from polarnet.events.stream import Events
+
+TYPES = {"t": np.int64, "x": np.int16, "y": np.int16, "p": np.int8}
+
+
+class EventSpool:
+    """Takes consecutive pieces of the channels of one sequence; as a context manager it closes its files."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self._files: list[dict[str, IO[bytes]]] = []
+        self._size = (0, 0)
+        folder.mkdir(parents=True)
+
+    def __enter__(self) -> "EventSpool":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for columns in self._files:
+            for file in columns.values():
+                file.close()
+
+    def append(self, channels: Sequence[Events]) -> None:
+        """Add a piece of every channel."""
+        if not self._files:
+            self._size = channels[0].height, channels[0].width
+            self._files = [{name: self._path(k, name).open("wb") for name in TYPES} for k in range(len(channels))]
+        for columns, events in zip(self._files, channels, strict=True):
+            for name, file in columns.items():
+                file.write(getattr(events, name).numpy().tobytes())
+
+    def channels(self) -> list[Events]:
+        """All events so far; their columns stay on disk until they are used."""
+        for columns in self._files:
+            for file in columns.values():
+                file.flush()
+        return [self._mapped(k) for k in range(len(self._files))]
+
+    def _mapped(self, channel: int) -> Events:
+        if self._path(channel, "t").stat().st_size == 0:
+            return Events.empty(*self._size)
+        columns = {
+            name: torch.from_numpy(np.memmap(self._path(channel, name), dtype, mode="c"))  # torch wants writable memory
+            for name, dtype in TYPES.items()
+        }
+        return Events(**columns, height=self._size[0], width=self._size[1])
+
+    def _path(self, channel: int, name: str) -> Path:
+        return self.folder / f"{channel}.{name}"

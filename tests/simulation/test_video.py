@@ -1,0 +1,155 @@
+"""Simulation in pieces, of moving sensors and of videos, and interpolated frames."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from polarnet.events.stream import concatenate
+from polarnet.runtime.machine import seed_for
+from polarnet.simulation import (
+    MOTIONS,
+    POLARIZERS,
+    SENSORS,
+    Camera,
+    PolarizationScene,
+    emulate,
+    simulate,
+    simulate_video,
+)
+from polarnet.simulation import video as video_module
+from polarnet.simulation.scene import check_scene, scene_from_polarization, scene_from_rgb
+from polarnet.simulation.upsampling import StokesFrame, upsampled
+from polarnet.simulation.video import moving_pieces, video_pieces
+from polarnet.stokes import intensities_from_stokes
+
+H, W = 24, 36
+MOTION = replace(MOTIONS["default"], sensor_height=20, sensor_width=30, duration_s=0.5, acceleration_max_px_s2=4000.0)
+
+
+def picture(height: int = 72, width: int = 96) -> torch.Tensor:
+    coarse = torch.rand(1, 3, 9, 12, generator=torch.Generator().manual_seed(2))
+    return torch.nn.functional.interpolate(coarse, (height, width), mode="bilinear")[0]
+
+
+def moving_frames(count: int, step: int) -> list[torch.Tensor]:
+    """RGB frames of a picture that moves to the left by `step` pixels a frame."""
+    large = picture(H, W + step * count)
+    return [large[:, :, step * k : step * k + W] for k in range(count)]
+
+
+def assert_equal(got, expected) -> None:
+    assert sum(map(len, expected)) > 100
+    for one, other in zip(got, expected, strict=True):
+        assert all(torch.equal(getattr(one, name), getattr(other, name)) for name in "txyp")
+
+
+@pytest.mark.parametrize("turning", [False, True])
+@pytest.mark.parametrize("polarizers", ["ideal", "micropolarizers"])
+def test_a_moving_sensor_in_pieces_gives_the_events_and_the_truth_of_simulate(turning, polarizers, monkeypatch):
+    monkeypatch.setattr(video_module, "MOTION_STEPS", 23)
+    motion = replace(MOTION, rotation_max_deg=10.0, zoom_max=1.2) if turning else MOTION
+    camera = Camera(SENSORS["noisy"], POLARIZERS[polarizers])
+    result = simulate(picture(), motion, camera, seed=3)
+    pieces = list(moving_pieces(scene_from_rgb(picture()), motion, camera, seed=3))
+    assert len(pieces) > 3
+    assert_equal([concatenate(c) for c in zip(*(piece.events for piece in pieces), strict=True)], result.events)
+    assert torch.cat([piece.t_us for piece in pieces]).tolist() == result.t_us.tolist()
+    truth = torch.cat([piece.stokes for piece in pieces])
+    torch.testing.assert_close(intensities_from_stokes(truth).clamp(0, 1), result.intensities)
+
+
+@pytest.mark.parametrize("model", ["exact", "v2e", "esim"])
+def test_a_video_gives_what_emulate_gives_for_the_light_behind_ideal_polarizers(model, monkeypatch):
+    monkeypatch.setattr(video_module, "PIECE_PIXELS", 3 * H * W)
+    frames, t_us = moving_frames(8, 1), [0, 9_000, 20_000, 30_000, 41_000, 50_000, 60_000, 75_000]
+    sensor = replace(SENSORS["default"], model=model)
+    stokes = torch.stack([scene_from_rgb(frame).stokes for frame in frames])
+    light = 255 * intensities_from_stokes(stokes)
+    light = (light + 0.5).to(torch.uint8) if model == "v2e" else light
+    expected, _ = emulate(light, np.array(t_us), sensor, seed_for(5, "video", "emulate"))
+    got = simulate_video(frames, t_us, sensor, seed=5)
+    counts = [len(events) for events in got]
+    assert counts == pytest.approx([len(events) for events in expected], rel=0.002, abs=2)
+    assert_equal(simulate_video(frames, t_us, sensor, seed=5, threads=2), got)
+
+
+def test_a_dofp_sensor_sees_a_uniform_scene_as_four_sensors_do_but_half_as_large():
+    """Without differences between pixels, noise and mismatch, every pixel of a channel fires alike."""
+    sensor = replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
+    frames = [
+        torch.tensor([level, 0.5 * level, 0.25 * level]).view(3, 1, 1).expand(3, H, W) for level in (0.2, 0.5, 1.0)
+    ]
+    mosaic = replace(POLARIZERS["ideal"], layout="dofp")
+    four, dofp = (simulate_video(frames, [0, 1000, 2000], Camera(sensor, p), 1) for p in (POLARIZERS["ideal"], mosaic))
+    for one, other in zip(four, dofp, strict=True):
+        assert (other.height, other.width) == (H // 2, W // 2)
+        assert len(one) == 4 * len(other) > 0
+        assert one.t.unique().tolist() == other.t.unique().tolist()
+
+
+def test_the_truth_of_a_dofp_sensor_is_the_mean_of_each_cell():
+    stokes = scene_from_rgb(picture(H, W)).stokes
+    camera = Camera(SENSORS["clean"], replace(POLARIZERS["ideal"], layout="dofp"))
+    (piece,) = video_pieces([StokesFrame(0, stokes), StokesFrame(1000, stokes)], camera, seed=1)
+    cells = stokes.reshape(3, H // 2, 2, W // 2, 2).mean(dim=(2, 4))
+    torch.testing.assert_close(piece.stokes, torch.stack([cells, cells]))
+
+
+def test_upsampling_moves_by_at_most_a_pixel_a_step_and_keeps_the_frames():
+    frames = [StokesFrame(10_000 * k, scene_from_rgb(rgb).stokes) for k, rgb in enumerate(moving_frames(4, 4))]
+    dense = list(upsampled(frames))
+    assert [frame.t_us for frame in dense][:: (len(dense) - 1) // 3] == [0, 10_000, 20_000, 30_000]
+    assert 4 <= (len(dense) - 1) / 3 <= 6  # four pixels a frame
+    by_time = {frame.t_us: frame.stokes for frame in dense}
+    assert all(torch.equal(by_time[frame.t_us], frame.stokes) for frame in frames)
+    for frame in dense:
+        check_scene(PolarizationScene(frame.stokes))
+
+
+def test_an_interpolated_frame_is_the_moved_picture_and_a_blend_is_not():
+    """Between two frames 4 pixels apart, away from the rim, lies the picture moved by a part of 4 pixels."""
+    large = scene_from_rgb(picture(H, W + 5)).stokes
+    first, last = large[:, :, :W], large[:, :, 4 : 4 + W]
+    between = list(upsampled([StokesFrame(0, first), StokesFrame(12_000, last)]))[1:-1]
+    assert len(between) >= 3
+    for frame in between:
+        share = frame.t_us / 12_000
+        whole, part = int(4 * share), 4 * share % 1
+        moved = (1 - part) * large[:, :, whole : whole + W] + part * large[:, :, whole + 1 : whole + 1 + W]
+        inner = np.s_[:, 6:-6, 6:-6]
+        blend = (1 - share) * first + share * last
+        assert (frame.stokes - moved)[inner].abs().mean() < 0.25 * (blend - moved)[inner].abs().mean()
+
+
+def test_a_still_video_gets_no_frames():
+    stokes = scene_from_rgb(picture(H, W)).stokes
+    assert len(list(upsampled([StokesFrame(0, stokes), StokesFrame(1000, stokes), StokesFrame(2000, stokes)]))) == 3
+
+
+def test_upsampling_leaves_at_least_a_microsecond_between_frames():
+    frames = [StokesFrame(3 * k, scene_from_rgb(rgb).stokes) for k, rgb in enumerate(moving_frames(3, 6))]
+    assert [frame.t_us for frame in upsampled(frames)] == list(range(7))
+
+
+def test_times_that_do_not_fit_the_frames_are_refused():
+    frames = moving_frames(3, 1)
+    for t_us, message in (
+        ([0, 1000], "more frames than 2"),
+        ([0, 1000, 2000, 3000], "more times than 3"),
+        ([0, 1000, 1000], "times of frames that increase"),
+        ([5, 1000, 2000], "starting at 0"),
+        ([], "starting at 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            simulate_video(frames, t_us, SENSORS["clean"], seed=1)
+
+
+def test_frames_of_different_sizes_and_unphysical_scenes_are_refused():
+    frames = moving_frames(3, 1)
+    with pytest.raises(ValueError, match=r"expected frames of 24x36 px, got \(24, 35\)"):
+        simulate_video([*frames[:2], frames[2][..., 1:]], [0, 1, 2], SENSORS["clean"], seed=1)
+    bright = PolarizationScene(scene_from_polarization(*torch.ones(3, H, W)).stokes * 2)
+    with pytest.raises(ValueError, match="scene"):
+        simulate_video([frames[0], bright], [0, 1], SENSORS["clean"], seed=1)
