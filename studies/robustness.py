@@ -243,7 +243,9 @@ def table_of(scores: Scores) -> dict[str, Any]:
     """Mean and median over scenes of each row's errors, also relative to the oracle mean's, and by mean DoLP."""
     errors, psnr, level, corr = (scene_means(scores.rows, metric) for metric in ("mse", "psnr", "level_mse", "corr"))
     oracle = errors["oracle_mean"]
-    table: dict[str, Any] = {"scenes": len(oracle), "mean_dolp": statistics.fmean(scores.dolp.values()), "rows": {}}
+    counts = {name: sum(low <= mean < high for mean in scores.dolp.values()) for name, (low, high) in BANDS.items()}
+    mean = statistics.fmean(scores.dolp.values())
+    table: dict[str, Any] = {"scenes": len(oracle), "scenes_by_dolp": counts, "mean_dolp": mean, "rows": {}}
     for row, of_scene in errors.items():
         mse, median = statistics.fmean(of_scene.values()), statistics.median(of_scene.values())
         bands = {
