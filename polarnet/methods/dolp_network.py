@@ -72,7 +72,9 @@ def open_dolp_network(setup: Setup) -> Recoverer:
 def in_steps_of_training(metadata: Mapping[str, Any], thresholds: Sequence[float]) -> Encode:
     """`event_counts` for a camera with other contrast thresholds (ON, OFF) than those of the training.
 
-    An event of threshold c changes the logarithm of the light by c, so it counts as c over the training's threshold.
+    An event of threshold c changes the logarithm of the light by c, so it counts as c over the training's threshold. If
+    both thresholds are above the training's, the smaller one counts 1: the redundancy needs no common factor, and
+    larger counts with gaps between them are unlike any in training (worse on validation photographs).
     ValueError if a threshold is not above 0, if the network takes another representation, or if its checkpoint does not
     name its thresholds.
     """
@@ -90,6 +92,7 @@ def in_steps_of_training(metadata: Mapping[str, Any], thresholds: Sequence[float
         threshold / sensor[f"contrast_threshold_{polarity}"]
         for threshold, polarity in zip(thresholds, ("on", "off"), strict=True)
     ]
+    steps = [step / max(1.0, min(steps)) for step in steps]
 
     def encode(events: Events, window_us: int) -> Float[Tensor, "2 h w"]:
         polarity, count = event_counts(events, window_us)

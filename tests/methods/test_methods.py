@@ -222,6 +222,14 @@ def test_an_event_of_half_the_threshold_counts_half(sequence):
     assert torch.equal(steps - change, count - polarity)
 
 
+def test_thresholds_above_those_of_the_training_keep_their_ratio_and_no_common_factor(sequence):
+    events = sequence.windows[0].channels[0]
+    unscaled = in_steps_of_training(TRAINED, (0.2, 0.25))(events, 1)
+    torch.testing.assert_close(in_steps_of_training(TRAINED, (0.4, 0.5))(events, 1), unscaled)
+    uneven = in_steps_of_training(TRAINED, (0.2, 0.5))(events, 1)
+    torch.testing.assert_close(in_steps_of_training(TRAINED, (0.4, 1.0))(events, 1), uneven)
+
+
 def test_thresholds_need_a_network_of_event_counts_and_its_sensor():
     with pytest.raises(ValueError, match="expected a network that takes event_counts, this one takes voxel_grid"):
         in_steps_of_training({"representation": "voxel_grid"}, (0.1, 0.1))
