@@ -288,7 +288,15 @@ HOUSE_FIGURES = {
 SEVERAL = "Several trainings: mean ± standard deviation."
 
 
-ROBUSTNESS_ROWS = ("zeros", "train_mean", "constant_real", "highpass+gain", "firenet_published+gain", "ours")
+ROBUSTNESS_ROWS = (
+    "zeros",
+    "train_mean",
+    "constant_real",
+    "highpass+gain",
+    "firenet_published+gain",
+    "ours",
+    "ours, thresholds given",
+)
 
 
 def _robustness(key: str, form: str) -> Block:

@@ -9,6 +9,7 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 - `measured.SOURCE`: all measured scenes of one source. A folder with a manifest.csv (columns file, repo) has one source
   for each repo; any other folder is one source.
 - `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS.
+  `ours, thresholds given` is told the contrast thresholds of the sensor (`methods.ours.thresholds`).
 - `time.5ms`: the same with windows of 5 ms.
 - `speed`: windows a second of the first weights on random events, with --threads.
 
@@ -50,6 +51,8 @@ from polarnet.pictures.manifest import MANIFEST, ManifestEntry, read_manifest, w
 from polarnet.pictures.polarimetry import read_intensities
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import configure
+from polarnet.simulation.camera import Camera
+from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.scene import polarization_from_rgb
 from polarnet.simulation.truth import synthesize
 from polarnet.stokes import Prediction, dolp, stokes_from_intensities
@@ -81,7 +84,7 @@ SENSORS: dict[str, tuple[str, ...]] = {
     ),
     "dofp": ("polarizers.layout=dofp", "synthesize.sensor_height=240", "synthesize.sensor_width=360"),
     "saturating_readout": ("readout.max_events_per_s=300000",),  # a sensor fires 500,000 a second on average
-    "randomised": ("emulate.randomise=true",),
+    "randomised": ("sensor=random",),
 }  # fmt: skip
 """Overrides of params.yaml by name; the scenes are the same, at the same places where the sensor has the same size."""
 TIMES: dict[str, tuple[str, ...]] = {"5ms": ("synthesize.frame_rate_hz=200",)}
@@ -91,6 +94,7 @@ TIMED_WINDOWS, WARM_WINDOWS = 12, 4
 EVENTS_PER_PIXEL = 0.8  # a window; the default sensor's mean
 FRAME_RATE_HZ = 30.0  # of the windows that `benchmark.warmup_windows` counts
 OURS = "ours"
+CALIBRATED = "ours, thresholds given"
 CONSTANT = "constant_real"
 METHODS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
 NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published+gain")
@@ -195,16 +199,22 @@ def mean_dolp(images: Path, split: str) -> list[float]:
 
 
 def scored_sequence(
-    name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context], constant: float
+    name: str,
+    scenes: SceneStore,
+    motion: SynthesizeConfig,
+    camera: Camera,
+    seed: int,
+    warmup: int,
+    contexts: Mapping[str, Context],
+    constant: float,
 ) -> Scores:
-    """Scores of all methods on one sequence."""
-    test = resimulated(scenes, name, config.synthesize, [config.camera] * 4, config.seed)
+    """Scores of all methods on one sequence; the first `warmup` windows are not scored."""
+    test = resimulated(scenes, name, motion, [camera] * 4, seed)
     baselines, _ = available(METHODS, next(iter(contexts.values())))
     predictions = predictions_of(baselines, test, next(iter(contexts.values())))
     predictions[CONSTANT] = Prediction(torch.full_like(test.dolp, constant))
     for row, context in contexts.items():
         predictions[row] = predictions_of([OURS], test, context)[OURS]
-    warmup = round(config.benchmark.warmup_windows * config.synthesize.frame_rate_hz / FRAME_RATE_HZ)
     rows = score_sequence(test, predictions, warmup, None, torch.device("cpu"))
     first = scored_windows(test, warmup).start
     valid = None if test.valid is None else test.valid[first:]
@@ -220,7 +230,11 @@ def scored_sequence(
 def scored(images: Path, config: Config, contexts: Mapping[str, Context], constant: float) -> Scores:
     """Scores of all methods on the pictures of a folder under one condition."""
     scenes = scenes_of(images, config)
-    task = functools.partial(scored_sequence, scenes=scenes, config=config, contexts=contexts, constant=constant)
+    warmup = round(config.benchmark.warmup_windows * config.synthesize.frame_rate_hz / FRAME_RATE_HZ)
+    task = functools.partial(
+        scored_sequence, scenes=scenes, motion=config.synthesize, camera=config.camera, seed=config.seed,
+        warmup=warmup, contexts=contexts, constant=constant,
+    )  # fmt: skip
     results = config.mapper("sequences")(task, list(scenes.sequences))
     return functools.reduce(Scores.__add__, results)
 
@@ -229,7 +243,9 @@ def table_of(scores: Scores) -> dict[str, Any]:
     """Mean and median over scenes of each row's errors, also relative to the oracle mean's, and by mean DoLP."""
     errors, psnr, level, corr = (scene_means(scores.rows, metric) for metric in ("mse", "psnr", "level_mse", "corr"))
     oracle = errors["oracle_mean"]
-    table: dict[str, Any] = {"scenes": len(oracle), "mean_dolp": statistics.fmean(scores.dolp.values()), "rows": {}}
+    counts = {name: sum(low <= mean < high for mean in scores.dolp.values()) for name, (low, high) in BANDS.items()}
+    mean = statistics.fmean(scores.dolp.values())
+    table: dict[str, Any] = {"scenes": len(oracle), "scenes_by_dolp": counts, "mean_dolp": mean, "rows": {}}
     for row, of_scene in errors.items():
         mse, median = statistics.fmean(of_scene.values()), statistics.median(of_scene.values())
         bands = {
@@ -390,6 +406,7 @@ def main() -> None:
         if name.startswith("measured.")
         for part, _ in parts
     }
+    first_weights = next(iter(arguments.weights.values()))
     results: dict[str, Scores] = {}
     tables: dict[str, Any] = {}
     for name, parts in conditions.items():
@@ -400,6 +417,10 @@ def main() -> None:
         for part, overrides in parts:
             config = settings(*common, *overrides)
             contexts = {row: context_of(config, train_mean, file) for row, file in arguments.weights.items()}
+            if name.startswith("sensors.") and not config.emulate.randomise:
+                thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
+                told = settings(*common, *overrides, f"methods.ours.thresholds={thresholds}")
+                contexts[CALIBRATED] = context_of(told, train_mean, first_weights)
             one = scored(part, config, contexts, constant)
             results[name] = results[name] + one if name in results else one
         tables[name] = table_of(results[name])

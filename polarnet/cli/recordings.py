@@ -134,6 +134,14 @@ def _add_method(recover: argparse.ArgumentParser) -> None:
         "--weights", type=Path, metavar="FILE", help="checkpoint of the network (default: the shipped one)"
     )
     recover.add_argument(
+        "--thresholds",
+        nargs=2,
+        type=float,
+        metavar=("ON", "OFF"),
+        help="contrast thresholds of the camera, natural-log intensity (default: those of the network's training); "
+        "`polarnet fit-sensor` measures them",
+    )
+    recover.add_argument(
         "--method", help="method of the benchmark instead of the network: cf, highpass, cf+gain, e2v, ..."
     )
     recover.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
@@ -209,7 +217,12 @@ def _recover(options: argparse.Namespace) -> int:
         raise ValueError(f"--step: expected a time such as 0.1ms, got {options.step}")
     rule = WindowRule(length_us, events, step_us)
     recoverer, words = open_method(
-        options.method, options.weights, options.device, options.precision, lambda method: setup_of(config(), method)
+        options.method,
+        options.weights,
+        options.device,
+        options.precision,
+        lambda method: setup_of(config(), method),
+        options.thresholds,
     )
     name = "live" if options.live else Path(options.input[0]).stem
     out = options.out or Path("outputs") / "recover" / name
@@ -252,10 +265,11 @@ def _recover_rotating(options: argparse.Namespace) -> int:
     from polarnet.recovery.rotating import half_turn_rule, open_rotating, rotation_of
     from polarnet.recovery.writer import RecoveryWriter
 
-    if options.method not in (None, "rotating_polarizer") or options.weights:
+    if options.method not in (None, "rotating_polarizer") or options.weights or options.thresholds:
         raise ValueError(
-            "--rotating: expected no --method but rotating_polarizer (for moving scenes) and no --weights, because a "
-            "fit without network recovers DoLP; leave it out"
+            "--rotating: expected no --method but rotating_polarizer (for moving scenes), no --weights and no "
+            "--thresholds, because a fit without network recovers DoLP with the thresholds of section modulation; "
+            "leave it out"
         )
     settings = load(settings_root())
     config, moving = settings.modulation, options.method is not None

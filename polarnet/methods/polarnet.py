@@ -1,7 +1,7 @@
 """The DoLP network that the pipeline trains: polarnet's own unless `network` selects another."""
 
-from polarnet.methods.dolp_network import DOLP_NETWORKS, open_dolp_network
-from polarnet.methods.method import Method, Weights, WeightsConfig
+from polarnet.methods.dolp_network import DOLP_NETWORKS, DolpNetworkConfig, open_dolp_network
+from polarnet.methods.method import Method, Weights
 
 METHODS = (
     Method(
@@ -9,7 +9,7 @@ METHODS = (
         label="ours",
         colour="#d6336c",
         open=open_dolp_network,
-        config=WeightsConfig,
+        config=DolpNetworkConfig,
         weights=Weights(DOLP_NETWORKS, trained_by="ours"),
         about="The DoLP network in use.",
     ),

@@ -7,12 +7,12 @@ import math
 import pytest
 import torch
 
-from polarnet.events.representations import event_tensor, voxel_grid
+from polarnet.events.representations import event_counts, event_tensor, voxel_grid
 from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
 from polarnet.events.windows import encode_windows
 from polarnet.methods import METHODS
-from polarnet.methods.dolp_network import dolp_recoverer
+from polarnet.methods.dolp_network import dolp_recoverer, in_steps_of_training
 from polarnet.methods.intensities import from_intensities, with_gain
 from polarnet.methods.intensity_network import intensity_network, load_baseline
 from polarnet.methods.method import Method, Recoverer, WeightsConfig, weights_record, why_absent
@@ -203,6 +203,40 @@ def test_more_than_dolp_is_handed_on_where_the_network_says_more(sequence):
     assert prediction.dolp.max() <= 1
     assert prediction.aolp.unique().tolist() == [0.5]
     assert prediction.log_variance.shape == (1, 18, 20)
+
+
+TRAINED = {
+    "representation": "event_counts",
+    "data": {"events_from": {"emulate": {"contrast_threshold_on": 0.2, "contrast_threshold_off": 0.25}}},
+}
+
+
+def test_an_event_of_half_the_threshold_counts_half(sequence):
+    events = sequence.windows[0].channels[0]
+    polarity, count = event_counts(events, 1)
+    assert torch.equal(in_steps_of_training(TRAINED, (0.2, 0.25))(events, 1), torch.stack([polarity, count]))
+    half = in_steps_of_training(TRAINED, (0.1, 0.125))(events, 1)
+    assert torch.equal(half, torch.stack([polarity, count]) / 2)
+    change, steps = in_steps_of_training(TRAINED, (0.1, 0.25))(events, 1)  # half of the ON events
+    assert torch.equal(steps + change, (count + polarity) / 2)
+    assert torch.equal(steps - change, count - polarity)
+
+
+def test_thresholds_above_those_of_the_training_keep_their_ratio_and_no_common_factor(sequence):
+    events = sequence.windows[0].channels[0]
+    unscaled = in_steps_of_training(TRAINED, (0.2, 0.25))(events, 1)
+    torch.testing.assert_close(in_steps_of_training(TRAINED, (0.4, 0.5))(events, 1), unscaled)
+    uneven = in_steps_of_training(TRAINED, (0.2, 0.5))(events, 1)
+    torch.testing.assert_close(in_steps_of_training(TRAINED, (0.4, 1.0))(events, 1), uneven)
+
+
+def test_thresholds_need_a_network_of_event_counts_and_its_sensor():
+    with pytest.raises(ValueError, match="expected a network that takes event_counts, this one takes voxel_grid"):
+        in_steps_of_training({"representation": "voxel_grid"}, (0.1, 0.1))
+    with pytest.raises(ValueError, match="does not name the sensor of its training"):
+        in_steps_of_training({"representation": "event_counts"}, (0.1, 0.1))
+    with pytest.raises(ValueError, match="expected numbers above 0"):
+        in_steps_of_training(TRAINED, (0.1, 0.0))
 
 
 def test_a_method_without_weights_says_what_to_do(make_setup, checkpoints, tmp_path):

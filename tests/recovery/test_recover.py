@@ -10,7 +10,7 @@ import zarr
 from polarnet.cli import main
 from polarnet.config.tree import load
 from polarnet.events.stream import Events, slice_count, slice_time
-from polarnet.events.streaming import WindowRule
+from polarnet.events.streaming import EventWindow, WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks.checkpoint import load_network, save_checkpoint
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
@@ -19,7 +19,7 @@ from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines
 from polarnet.recordings.recording import read_recording
 from polarnet.recovery import recover as recovery
-from polarnet.recovery.recover import Arrangement, frames_of, open_files, replay
+from polarnet.recovery.recover import Arrangement, frames_of, open_files, open_method, replay
 from polarnet.runtime import machine as runtime
 from polarnet.storage.events import EventStore
 
@@ -317,3 +317,15 @@ def test_shipped_weights_are_a_checkpoint_or_say_what_to_do():
         assert "--weights FILE" in str(absent)  # noqa: PT017 - a version may ship weights or not
     else:
         assert isinstance(network, torch.nn.Module)
+
+
+def test_thresholds_are_refused_for_a_method_that_does_not_use_them():
+    with pytest.raises(ValueError, match="--thresholds is for the DoLP network, highpass does not use it"):
+        open_method("highpass", None, "cpu", "fp32", lambda method: None, thresholds=(0.1, 0.1))
+
+
+def test_the_shipped_network_takes_the_thresholds_of_the_camera():
+    events = Events.empty(HEIGHT, WIDTH)
+    windows = [EventWindow([events] * 4, 0, 33_333)]
+    recoverer, _ = open_method(None, None, "cpu", "fp32", lambda method: None, thresholds=(0.1, 0.4))
+    assert recoverer.step(recoverer.start(HEIGHT, WIDTH), windows)[1].dolp.shape == (1, HEIGHT, WIDTH)
