@@ -219,14 +219,16 @@ def presets_figure() -> Figure:
         tiles[0, 0].set_title("true DoLP", loc="left", fontsize=9)
         tiles[1, 0].set_axis_off()
         for (above, below), (name, polarizers) in zip(tiles.T[1:], POLARIZERS.items(), strict=True):
-            found = dolp(inside(measured_stokes(scene, polarizers))).clamp(0, 1).float()
-            show_picture(above, dolp_image(found), LIGHT)
+            measured = dolp(inside(measured_stokes(scene, polarizers))).clamp(0, 1).float()
+            show_picture(above, dolp_image(measured), LIGHT)
             above.set_title(name.replace("_", " "), loc="left", fontsize=9)
-            below.imshow((found - truth).numpy(), cmap="RdBu_r", vmin=-ERROR_SCALE, vmax=ERROR_SCALE)
+            below.imshow((measured - truth).numpy(), cmap="RdBu_r", vmin=-ERROR_SCALE, vmax=ERROR_SCALE)
             below.set_xticks([])
             below.set_yticks([])
             below.grid(visible=False)
-            below.set_xlabel(f"RMS {float((found - truth).square().mean().sqrt()):.4f}", color=LIGHT.quiet, fontsize=8)
+            below.set_xlabel(
+                f"RMS {float((measured - truth).square().mean().sqrt()):.4f}", color=LIGHT.quiet, fontsize=8
+            )
         scale = ScalarMappable(Normalize(-ERROR_SCALE, ERROR_SCALE), "RdBu_r")
         bar = figure.colorbar(scale, cax=tiles[1, 0].inset_axes((0.05, 0.55, 0.9, 0.12)), orientation="horizontal")
         bar.set_label("measured - true DoLP", fontsize=8)

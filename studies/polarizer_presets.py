@@ -1,4 +1,4 @@
-"""What the polarizers of conf/polarizers measure: python -m studies.polarizer_presets [--write]
+"""Measurements of the polarizers of conf/polarizers: python -m studies.polarizer_presets [--write]
 
 Each preset looks at fully polarized light at 36 angles and at a built-in photograph. DoLP and AoLP come from its four
 channels by Eq. 1 to 3, without calibration.

@@ -341,7 +341,7 @@ def parsed() -> argparse.Namespace:
     )
     parser.add_argument("--training", type=Path, help="folder for links to the training photographs")
     parser.add_argument("--firenet", type=Path, help="published weights of FireNet")
-    parser.add_argument("--split", choices=("test", "val"), default="test", help="of the photographs")
+    parser.add_argument("--split", choices=("test", "val"), default="test", help="split of the photographs")
     parser.add_argument("--conditions", nargs="+", help="only these, such as photographs measured sensors.noisy")
     parser.add_argument("--limit", type=int, help="pictures of each set")
     parser.add_argument("--sensor-limit", type=int, help="pictures of each sensor; default: as --limit")
@@ -419,8 +419,8 @@ def main() -> None:
             contexts = {row: context_of(config, train_mean, file) for row, file in arguments.weights.items()}
             if name.startswith("sensors.") and not config.emulate.randomise:
                 thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
-                told = settings(*common, *overrides, f"methods.ours.thresholds={thresholds}")
-                contexts[CALIBRATED] = context_of(told, train_mean, first_weights)
+                calibrated = settings(*common, *overrides, f"methods.ours.thresholds={thresholds}")
+                contexts[CALIBRATED] = context_of(calibrated, train_mean, first_weights)
             one = scored(part, config, contexts, constant)
             results[name] = results[name] + one if name in results else one
         tables[name] = table_of(results[name])

@@ -356,8 +356,10 @@ def _fit_known(
     common = Estimate(
         correlation(*pair), _grouped_error(lambda some: correlation(*some), list(pair)), "ON and OFF of each pixel"
     )
-    found = common if math.isfinite(common.value) else None
-    _enter(estimates, missing, "contrast_threshold_correlation", found, "the thresholds do not differ between pixels")
+    estimate = common if math.isfinite(common.value) else None
+    _enter(
+        estimates, missing, "contrast_threshold_correlation", estimate, "the thresholds do not differ between pixels"
+    )
     return pair, drift
 
 

@@ -90,8 +90,8 @@ def _labels(options: argparse.Namespace) -> int:
         raise ValueError(f"{options.store}: expected a store with labels; write it again with storage.labels=true")
     channels, seconds = store.read(options.sequence), store.duration_us(options.sequence) * 1e-6
     hot = [torch.from_numpy(hot_pixels(event_counts(e), seconds, options.hot_pixel_factor)) for e in channels]
-    kept = torch.cat([~bad[e.y.long(), e.x.long()] for bad, e in zip(hot, channels, strict=True)])
-    scores = denoising_scores(torch.cat([e.label for e in channels if e.label is not None]), kept)
+    keep = torch.cat([~bad[e.y.long(), e.x.long()] for bad, e in zip(hot, channels, strict=True)])
+    scores = denoising_scores(torch.cat([e.label for e in channels if e.label is not None]), keep)
     print(f"{'cause':8s}{'events':>12s}{'in hot pixels':>15s}")
     for label, (removed, events) in scores.removed.items():
         print(f"{label:8s}{events:12,d}{removed:15,d}")

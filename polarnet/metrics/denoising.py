@@ -22,13 +22,13 @@ class DenoisingScores(NamedTuple):
     """For each label, the number of removed events and of all events."""
 
 
-def denoising_scores(label: UInt8[Array, " n"], kept: Bool[Array, " n"]) -> DenoisingScores:
-    """Scores of a denoiser that keeps the events `kept` of those with these labels (numpy or torch).
+def denoising_scores(label: UInt8[Array, " n"], keep: Bool[Array, " n"]) -> DenoisingScores:
+    """Scores of a denoiser that keeps the events `keep` of those with these labels (numpy or torch).
 
     The labels are those of `EventStore.read(...)[channel].label`, for a store written with `storage.labels`. Every
     label but `signal` is noise. ValueError for labels that do not exist and for columns of different lengths.
     """
-    labels, removed = as_tensor("label", label).numpy(), ~as_tensor("kept", kept).numpy()
+    labels, removed = as_tensor("label", label).numpy(), ~as_tensor("keep", keep).numpy()
     if labels.shape != removed.shape or (labels >= len(LABELS)).any():
         raise ValueError(
             f"expected labels 0 to {len(LABELS) - 1} and as many flags, got {len(labels)} labels up to "

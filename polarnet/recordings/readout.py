@@ -57,7 +57,7 @@ class Sweep(NamedTuple):
     """rows or columns"""
     rising: bool
     delay_us: float
-    """Of each row or column behind the one before."""
+    """Delay of each row or column behind the one before."""
 
 
 class LostRows(NamedTuple):
@@ -78,7 +78,7 @@ class Gap(NamedTuple):
 
 
 class Readout(NamedTuple):
-    """What a recording tells about the readout of its camera."""
+    """Signs of the camera's readout in a recording."""
 
     clock_step_us: int
     """Greatest common divisor of the differences of times; 0 if there is only one time."""

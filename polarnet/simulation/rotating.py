@@ -168,7 +168,7 @@ def _emulate_part(
         scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
         trajectory = Trajectory.from_vector(record.trajectory.numpy())
         t_us = rotating_times_us(rotating, drawn.sensor, 0, record.duration_us)
-        made = emulate_rotating(scene, trajectory, t_us, height, width, rotating, drawn.sensor, key, pitch=pitch).events
-        made, _ = read_out(made, drawn.readout, key, record.duration_us)
-        empty = Events.empty(height, width)
-        events.write(sequence, [made, *[empty] * (CHANNELS - 1)], record.duration_us, camera.draws(seed, sequence))
+        emulation = emulate_rotating(scene, trajectory, t_us, height, width, rotating, drawn.sensor, key, pitch=pitch)
+        output, _ = read_out(emulation.events, drawn.readout, key, record.duration_us)
+        channels = [output, *[Events.empty(height, width)] * (CHANNELS - 1)]
+        events.write(sequence, channels, record.duration_us, camera.draws(seed, sequence))

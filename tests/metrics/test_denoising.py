@@ -15,11 +15,11 @@ SIGNAL, LEAK, SHOT, HOT = range(4)
 
 def test_one_signal_and_two_of_three_noise_events_removed():
     label = np.array([SIGNAL, LEAK, SHOT, HOT, SIGNAL, SIGNAL, SIGNAL], np.uint8)
-    kept = np.array([True, True, False, False, False, True, True])
-    scores = denoising_scores(label, kept)
+    keep = np.array([True, True, False, False, False, True, True])
+    scores = denoising_scores(label, keep)
     assert scores[:3] == (2 / 3, 2 / 3, 3 / 4)
     assert scores.removed == {"signal": (1, 4), "leak": (0, 1), "shot": (1, 1), "hot": (1, 1)}
-    assert denoising_scores(torch.from_numpy(label), torch.from_numpy(kept)) == scores
+    assert denoising_scores(torch.from_numpy(label), torch.from_numpy(keep)) == scores
 
 
 def test_a_denoiser_that_removes_nothing_has_no_precision():
