@@ -52,5 +52,5 @@ def test_a_folder_with_a_manifest_has_a_source_for_each_repo(tmp_path):
 
 
 @pytest.mark.parametrize("name", SENSORS)
-def test_every_sensor_is_a_valid_configuration(name):
-    settings(*SENSORS[name])
+def test_every_sensor_but_the_default_changes_the_configuration(name):
+    assert (settings(*SENSORS[name]) == settings()) == (name == "default")
