@@ -140,7 +140,7 @@ def _draw_noise(axes: Axes) -> None:
 def _draw_refractory(axes: Axes) -> None:
     """After a step of light by a factor of e, a pixel fires five events of 0.2, each after its blind time."""
     t_us = np.arange(0, 40_001, 100.0)
-    light = np.where(t_us < 2_000, 40.0, 40 * np.e * 1.01)
+    light = np.where(t_us < 2_000, 40.0, 40 * np.exp(1) * 1.01)
     for period_ms, colour in zip((0.0, 2.0, 7.0), COLOURS, strict=False):
         events = events_under(light, t_us, replace(QUIET, refractory_period_us=1000 * period_ms))
         t_ms = events.t.numpy() / 1000
