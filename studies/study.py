@@ -28,7 +28,6 @@ from typing import Any
 
 from polarnet.reports.figures import LIGHT
 from polarnet.reports.maps import png
-from studies.blocks import best_reconstruction, seeds_of
 from studies.figures import expected_errors_figure
 from studies.measure import (
     ABLATION_KEYS,
@@ -39,6 +38,7 @@ from studies.measure import (
     read_results,
     write_section,
 )
+from studies.network_blocks import best_reconstruction, seeds_of
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAININGS: dict[str, tuple[str, ...]] = {
