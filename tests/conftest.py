@@ -38,7 +38,10 @@ SLOWEST_FIRST = (
     "storage/test_parts.py",
 )
 """Files that take longest; the others follow, so no worker is left with a long one when the rest is done."""
-LARGE_PACKAGES = ("torch", "scipy.stats", "numba", "cv2", "zarr", "matplotlib.figure", "hydra")
+LARGE_PACKAGES = (
+    "torch", "scipy.stats", "numba", "cv2", "zarr", "matplotlib.figure", "hydra", "pydantic.dataclasses", "ruamel.yaml",
+    "jinja2",
+)  # fmt: skip
 FUZZ_CASES = {"local": 50, "ci": 150}
 
 
