@@ -10,7 +10,7 @@ import torch
 
 from polarnet.events.stream import Events
 
-TYPES = {"t": np.int64, "x": np.int16, "y": np.int16, "p": np.int8, "label": np.uint8}
+TYPES: dict[str, type[np.generic]] = {"t": np.int64, "x": np.int16, "y": np.int16, "p": np.int8, "label": np.uint8}
 
 
 class EventSpool:
