@@ -44,8 +44,8 @@ def leak_drift(data: Increments, pixels: int, spread_decades: float) -> Estimate
 
     Shot noise that ends an interval shortens both kinds, so little of it remains in half their difference. Only
     increments near a threshold count. The leak takes those of long intervals away from it, so what is found of the leak
-    is removed from the increments, and the rest is estimated again. None if increments do not drift. `spread_decades` is the
-    log-normal spread of the leak between pixels, by which its mean exceeds the median.
+    is removed from the increments, and the rest is estimated again. None if increments do not drift. `spread_decades`
+    is the log-normal spread of the leak between pixels, by which its mean exceeds the median.
     """
     leaks, leak = np.zeros(GROUPS), 0.0
     thresholds = _thresholds(data, data.increment, 0.0, pixels)

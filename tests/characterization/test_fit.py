@@ -125,6 +125,14 @@ def test_intervals_that_pile_up_at_a_tick_of_the_clock_are_no_refractory_period(
     assert piled_up_us([np.repeat([1e3, 2e3, 3e3], [500, 50, 50])]) is None
 
 
+def test_shot_noise_shows_the_refractory_period_in_which_it_pauses():
+    """A million intervals at 2 Hz: two a microsecond, so the fifth shortest is about 2.5 us above 500 us."""
+    intervals_us = np.random.default_rng(1).exponential(5e5, 1_000_000)
+    assert between_shot_noise_us((500 + intervals_us).round()).value == pytest.approx(500, abs=4)
+    assert between_shot_noise_us(intervals_us.round()) is None
+    assert between_shot_noise_us((500 + intervals_us[:2000]).round()) is None
+
+
 def test_recordings_of_two_sensors_are_refused(static, moving):
     other = emulated(constant_frames(np.full(3, 200.0), 8, 8), np.arange(3) * 1e6, TRUTH, 3)
     with pytest.raises(ValueError, match="one sensor"):
