@@ -8,7 +8,7 @@ import pytest
 from polarnet.characterization.fit import fit_sensor
 from polarnet.characterization.known_light import KnownLight
 from polarnet.characterization.light import Flicker, MovingLight
-from polarnet.characterization.refractory import piled_up_us
+from polarnet.characterization.refractory import between_shot_noise_us, piled_up_us
 from polarnet.characterization.twin import (
     compare,
     constant_frames,
