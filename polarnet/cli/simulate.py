@@ -122,7 +122,7 @@ def _simulate(options: argparse.Namespace) -> int:
     times = None if clip.still else _times_of(options, clip, inputs[0])
     folder, out = working_folder(), (options.out or working_folder() / "outputs" / "simulate" / clip.name).resolve()
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
-        config = load(settings_root(), overrides)
+        config = load(settings_root(), overrides, folder)
     if config.storage.labels and (unable := [form for form in formats if form not in LABEL_FORMATS]):
         raise ValueError(
             f"storage.labels=true: expected formats that hold labels ({', '.join(LABEL_FORMATS)}), "
