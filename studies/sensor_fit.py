@@ -1,4 +1,4 @@
-"""Accuracy of `polarnet fit-sensor` on simulated sensors: python -m studies.sensor_fit [--sensors N] [--write]
+"""Accuracy of `polarnet fit-sensor` on simulated sensors: python -m studies.sensor_fit [--seed N] [--write]
 
 Each sensor is drawn from RANGES and recorded by the pixel model `exact`: under constant light, before drifting dead
 leaves whose light is rendered 1000 times a second, and before lamps that flicker. The fit gets the events and, for the
@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from polarnet.characterization.fit import KnownLight, SensorFit, fit_sensor
+from polarnet.characterization.fit import SensorFit, fit_sensor
+from polarnet.characterization.known_light import KnownLight
 from polarnet.characterization.light import Flicker, MovingLight
 from polarnet.characterization.twin import constant_frames, drifting_leaves, emulated, flicker_light
 from polarnet.events.stream import Events
@@ -70,11 +71,11 @@ PARAMETERS = {
 """Parameters of the emulator whose names differ from those in the results."""
 
 
-def drawn_sensor(number: int) -> EmulatorConfig:
-    """Sensor `number` of the study."""
+def drawn_sensor(number: int, seed: int) -> EmulatorConfig:
+    """Sensor `number` of the draws of `seed`."""
     ranges = {name: list(bounds) for name, bounds in RANGES.items()}
     camera = Camera(replace(SENSORS["default"], model="exact", randomise=ranges))
-    sensor = camera.drawn(1, f"sensor {number}").sensor
+    sensor = camera.drawn(seed, f"sensor {number}").sensor
     sigmas = {
         f"contrast_threshold_sigma_{polarity}": min(
             getattr(sensor, f"contrast_threshold_sigma_{polarity}"),
@@ -136,9 +137,9 @@ def row_of(sensor: EmulatorConfig, fit: SensorFit) -> dict[str, Any]:
     return {"truth": truth, "estimate": {name: value and round(value, 5) for name, value in estimate.items()}}
 
 
-def fitted(number: int, kind: str, frame_rate_hz: int) -> dict[str, Any]:
+def fitted(number: int, seed: int, kind: str, frame_rate_hz: int) -> dict[str, Any]:
     """Simulate and fit sensor `number`; prints its row."""
-    sensor, key = drawn_sensor(number), 1000 + number
+    sensor, key = drawn_sensor(number, seed), 1000 * seed + number
     known = [leaves(sensor, key, frame_rate_hz)] if kind == "frames" else lamps(sensor, key)
     row = row_of(sensor, fit_sensor(static_recording(sensor, key), STATIC_LIGHT, known))
     print(number, kind, json.dumps(row), flush=True)
@@ -149,13 +150,15 @@ def main() -> None:
     """The command line."""
     parser = command_line(__doc__, "docs/results/camera.json")
     parser.add_argument("--sensors", type=int, default=12)
+    parser.add_argument("--seed", type=int, default=1, help="of the drawn sensors (default: 1, the documented ones)")
     parser.add_argument("--frame-rate", type=int, default=100, help="frames per second that the fit gets")
     parser.add_argument("--light", nargs="+", choices=("frames", "flicker"), default=["frames", "flicker"])
     arguments = arguments_of(parser)
     record = machine_record(ROOT)
     for kind in arguments.light:
-        rows = [fitted(number, kind, arguments.frame_rate) for number in range(arguments.sensors)]
+        rows = [fitted(number, arguments.seed, kind, arguments.frame_rate) for number in range(arguments.sensors)]
         settings: dict[str, Any] = {
+            "seed": arguments.seed,
             "height": HEIGHT,
             "width": WIDTH,
             "static_s": STATIC_S,

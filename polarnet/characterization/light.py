@@ -18,12 +18,13 @@ from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION
 TIMES_FILE = "timestamps.txt"
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of sRGB's primaries (IEC 61966-2-1)
 STEPS_PER_CYCLE = 256  # linear pieces of a flicker's cycle: 3e-4 of the contrast off at most
+PIECES = 4  # linear in time, between two frames
 SETTLED = 12.0  # time constants of the photoreceptor after which a cycle repeats itself
 
 
 @dataclass(frozen=True)
 class MovingLight:
-    """Light on every pixel at successive times; linear in the pixel's response between two frames."""
+    """Light on every pixel at successive times; between two frames the pixel's response is a cubic (`_responses`)."""
 
     frames: Float32[np.ndarray, "n h w"]
     """DN"""
@@ -115,8 +116,10 @@ def moving_responses(
 ) -> Float64[np.ndarray, " n"]:
     """Filtered response of each event's pixel at its time; NaN outside the frames' times.
 
-    Events are ordered by pixel, then time. The filter is that of `pixels.exact`: between two frames the response is
-    linear in time and the bandwidth that at their mean light. It starts adapted to the first frame.
+    Events are ordered by pixel, then time. Between two frames the response to the light is the cubic of the slopes of
+    parabolas through three frames (Catmull and Rom), in `PIECES` pieces. A straight line would cut corners, which moves
+    increments of short and long intervals by different amounts and so feigns a leak. The filter is that of
+    `pixels.exact` with the bandwidth at the mean light of a piece. It starts adapted to the first frame.
     """
     frames = light.frames.reshape(len(light.frames), -1)
     starts = np.searchsorted(pixel, np.arange(frames.shape[1] + 1))
@@ -150,30 +153,51 @@ def _response(dn):
 
 
 @compiled
+def _light(response):
+    knee = math.log(KNEE)
+    return max(response, 0.0) * (KNEE / knee) if response <= knee else math.exp(response)
+
+
+@compiled
 def _responses(frames, times_us, starts, t_us, cutoff_hz):
     values = np.full(t_us.size, np.nan)
+    frame_count = times_us.size
     for i in range(starts.size - 1):
         event, stop = starts[i], starts[i + 1]
         while event < stop and t_us[event] < times_us[0]:
             event += 1
-        lag, before = 0.0, _response(np.float64(frames[0, i]))
-        for k in range(times_us.size - 1):
+        lag, before, after = 0.0, _response(np.float64(frames[0, i])), _response(np.float64(frames[1, i]))
+        tangent = (after - before) / (times_us[1] - times_us[0])
+        for k in range(frame_count - 1):
             if event >= stop:
                 break
             duration = times_us[k + 1] - times_us[k]
-            after = _response(np.float64(frames[k + 1, i]))
-            slope = (after - before) / duration
-            mean = 0.5 * (np.float64(frames[k, i]) + np.float64(frames[k + 1, i]))
-            per_us = 2e-6 * math.pi * cutoff_hz * (mean + DARK_OFFSET) / SATURATION
-            while event < stop and t_us[event] < times_us[k + 1]:
-                since = t_us[event] - times_us[k]
-                values[event] = before + slope * since
+            beyond, next_tangent = after, (after - before) / duration
+            if k + 2 < frame_count:  # slope of the parabola through three frames
+                beyond, next_duration = _response(np.float64(frames[k + 2, i])), times_us[k + 2] - times_us[k + 1]
+                next_tangent *= next_duration / (duration + next_duration)
+                next_tangent += (beyond - after) / next_duration * (duration / (duration + next_duration))
+            c1, rise = tangent * duration, after - before
+            c2, c3 = 3 * rise - 2 * c1 - next_tangent * duration, c1 + next_tangent * duration - 2 * rise
+            piece_us, response, piece_start_us = duration / PIECES, before, times_us[k]
+            light = _light(response)
+            for piece in range(1, PIECES + 1):
+                u = piece / PIECES
+                response_after = before + u * (c1 + u * (c2 + u * c3))
+                slope = (response_after - response) / piece_us
+                light_after = _light(response_after)
+                per_us = 2e-6 * math.pi * cutoff_hz * (0.5 * (light + light_after) + DARK_OFFSET) / SATURATION
+                end_us = times_us[k + 1] if piece == PIECES else piece_start_us + piece_us
+                while event < stop and t_us[event] < end_us:
+                    since = t_us[event] - piece_start_us
+                    values[event] = response + slope * since
+                    if cutoff_hz > 0:
+                        decay = math.exp(-per_us * since)
+                        values[event] += lag * decay - slope * (1 - decay) / per_us
+                    event += 1
                 if cutoff_hz > 0:
-                    decay = math.exp(-per_us * since)
-                    values[event] += lag * decay - slope * (1 - decay) / per_us
-                event += 1
-            if cutoff_hz > 0:
-                decay = math.exp(-per_us * duration)
-                lag = lag * decay - slope * (1 - decay) / per_us
-            before = after
+                    decay = math.exp(-per_us * piece_us)
+                    lag = lag * decay - slope * (1 - decay) / per_us
+                response, light, piece_start_us = response_after, light_after, end_us
+            before, after, tangent = after, beyond, next_tangent
     return values

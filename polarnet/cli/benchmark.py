@@ -66,7 +66,7 @@ def _benchmark(options: argparse.Namespace) -> int:
     weights = options.weights.resolve() if options.weights else None
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
         chosen = [f"benchmark.methods=[{options.methods}]"] if scenes and options.methods else []
-        config = load(settings, [*options.overrides, *chosen])
+        config = load(settings, [*options.overrides, *chosen], folder)
         configure(config.runtime, config.seed)
         if scenes is None:
             return _study(options, config, out, weights)

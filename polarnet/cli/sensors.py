@@ -70,7 +70,8 @@ def add_to(commands: Commands) -> None:
 
 
 def _fit_sensor(options: argparse.Namespace) -> int:
-    from polarnet.characterization.fit import KnownLight, fit_sensor
+    from polarnet.characterization.fit import fit_sensor
+    from polarnet.characterization.known_light import KnownLight
     from polarnet.characterization.light import Flicker, read_light
     from polarnet.characterization.twin import compare, fitted_parameters, fitted_sensor
     from polarnet.config.experiments import preset_values
@@ -171,7 +172,9 @@ def preset_text(name: str, values: dict[str, float]) -> str:
 def _preset_path(name: str) -> Path:
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
         raise ValueError(f"--name: expected letters, digits, - and _, got {name!r}")
-    path = working_folder() / "conf" / "sensor" / f"{name}.yaml"
+    path, shipped = (root / "conf" / "sensor" / f"{name}.yaml" for root in (working_folder(), settings_root()))
+    if shipped.exists() and shipped != path:
+        raise ValueError(f"--name: polarnet has a sensor {name}; choose another name")
     if path.exists() and WRITTEN_BY not in path.read_text(encoding="utf-8"):
         raise ValueError(f"--name: {path} exists and was not written by fit-sensor; choose another name")
     return path

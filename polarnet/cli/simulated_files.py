@@ -23,7 +23,7 @@ from polarnet.simulation.moving_sensor import leave_sensors
 from polarnet.simulation.video import Drawn, Piece
 from polarnet.storage.appended import FRAMES_PER_CHUNK, AppendedFrames
 from polarnet.storage.events import MAX_DURATION_US, EventStore
-from polarnet.storage.exchange import FORMS
+from polarnet.storage.exchange import FORMS, label_file
 from polarnet.storage.frames import (
     CONVENTIONS,
     dequantise_fraction,
@@ -34,6 +34,7 @@ from polarnet.storage.spool import EventSpool
 
 STORE = "store"
 FORMATS = (STORE, *FORMS)
+LABEL_FORMATS = tuple(form for form in FORMATS if form != "evt3")  # those that hold the label of an event
 EVENTS, TRUTH, VIDEO, PICTURE, SPOOL = "events.zarr", "truth.zarr", "preview.mp4", "preview.png", "spool"
 TRUTH_CONVENTIONS = {
     "t_us": CONVENTIONS["t_us"],
@@ -52,6 +53,8 @@ class Outputs(NamedTuple):
     """Pictures a second of the preview; None: no preview."""
     gamma: float
     """Gamma of S0 in the preview."""
+    labels: bool
+    """Whether the files of events hold the label of each event, which the pieces must then have."""
 
 
 class Written(NamedTuple):
@@ -90,7 +93,7 @@ def write_simulation(
     started = time.perf_counter()
     truth = AppendedFrames(folder / TRUTH, TRUTH_CONVENTIONS)
     duration_us, frames, polarized = 0, 0, False
-    with EventSpool(folder / SPOOL) as spool:
+    with EventSpool(folder / SPOOL, outputs.labels) as spool:
         with tqdm(total=total, desc="simulate", unit="frame") as bar:
             for piece in pieces:
                 duration_us = piece.stop_us
@@ -109,7 +112,7 @@ def write_simulation(
         camera = drawn.camera
         channels = leave_sensors(spool.channels(), camera.polarizers, camera.readout, drawn.key, duration_us)
         run_s = time.perf_counter() - started
-        files = _write_events(folder, name, channels, drawn, duration_us, outputs.formats, attributes)
+        files = _write_events(folder, name, channels, drawn, duration_us, outputs, attributes)
         if outputs.video_rate_hz is not None:
             files += _write_preview(folder, channels, outputs.video_rate_hz, outputs.gamma)
         size, counts = (channels[0].height, channels[0].width), tuple(map(len, channels))
@@ -132,17 +135,17 @@ def _write_events(
     channels: Sequence[Events],
     drawn: Drawn,
     duration_us: int,
-    formats: Sequence[str],
+    outputs: Outputs,
     attributes: dict[str, Any],
 ) -> list[str]:
     """Files of the events: one for each sensor of the camera in formats of cameras, and all channels in the store."""
     polarizers = drawn.camera.polarizers
-    others = [form for form in FORMS if form in formats]
+    others = [form for form in FORMS if form in outputs.formats]
     files = []
-    with tqdm(total=len(formats), desc="write", unit="format") as bar:
-        if STORE in formats:
+    with tqdm(total=len(outputs.formats), desc="write", unit="format") as bar:
+        if STORE in outputs.formats:
             size = channels[0].height, channels[0].width
-            store = EventStore.create(folder / EVENTS, [name], *size, attributes)
+            store = EventStore.create(folder / EVENTS, [name], *size, attributes, labelled=outputs.labels)
             store.write(name, channels, duration_us)
             store.finish()
             files.append(EVENTS)
@@ -157,6 +160,8 @@ def _write_events(
             for sensor, events in sensors.items():
                 write(folder / f"{sensor}{suffix}", events, duration_us)
                 files.append(f"{sensor}{suffix}")
+                if form == "text" and outputs.labels:
+                    files.append(label_file(Path(f"{sensor}{suffix}")).name)
             bar.update()
     return files
 

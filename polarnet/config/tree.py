@@ -8,7 +8,7 @@ import os
 import re
 import sys
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Annotated, Any, TypeVar
 
@@ -256,21 +256,24 @@ def typed(node: DictConfig) -> Config:
     return Config(**values)
 
 
-def load(root: Path, overrides: list[str] | None = None) -> Config:
+def load(root: Path, overrides: list[str] | None = None, presets: Path | None = None) -> Config:
     """Load the configuration of the project at `root`, outside any Hydra application.
 
-    Raises ValueError for an unknown key, an invalid value, or an ablation that changes nothing.
+    Overrides may also choose presets from conf/ of the folder `presets`, which need not be a project. Raises
+    ValueError for an unknown key, an invalid value, or an ablation that changes nothing.
     """
     overrides = overrides or []
-    check_overrides(root, overrides)
+    check_overrides(root, overrides, presets)
     os.environ[ROOT_VARIABLE] = str(root)
+    if presets and presets != root and (presets / "conf").is_dir():
+        overrides = [*overrides, f"hydra.searchpath=['file://{root}','file://{presets / 'conf'}']"]
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(root / "conf")):
         config = typed(hydra.compose("config", overrides=overrides))
         _check_ablation(root, config, overrides)
     return config
 
 
-def check_overrides(root: Path, overrides: list[str]) -> None:
+def check_overrides(root: Path, overrides: list[str], presets: Path | None = None) -> None:
     """Raise ValueError for an override of a key that is not a setting, or of a group that has no such choice.
 
     The groups are `experiment`, `sensor`, `polarizers` and `ablation`. Hydra refuses both as well, but this message
@@ -281,7 +284,7 @@ def check_overrides(root: Path, overrides: list[str]) -> None:
         key, _, value = override.partition("=")
         key = key.lstrip("+~").split("@")[0]
         if key in groups:
-            _check_choices(root, key, value)
+            _check_choices([root, presets] if presets else [root], key, value)
         elif not key.startswith(("hydra.", "hydra/")) and (refusal := unknown_key(Config, key.split("."))):
             raise ValueError(refusal)
 
@@ -382,12 +385,12 @@ def _check_lpips(config: Config) -> None:
         with_lpips(config, purpose, functools.partial(look, purpose))
 
 
-def _check_choices(root: Path, group: str, value: str) -> None:
+def _check_choices(roots: Sequence[Path], group: str, value: str) -> None:
     """Raise ValueError if a name or pattern for `group`, alone, in a list or in glob(...), matches no file.
 
     Other Hydra syntax, such as choice(...), is left to Hydra to check.
     """
-    known = preset_names(root, group)
+    known = sorted({name for root in roots for name in preset_names(root, group)})
     plain = CHOICES.fullmatch(value)
     for name in (word.strip("[]'\" ") for word in (plain[1].split(",") if plain else [])):
         if not fnmatch.filter(["null", *known], name):

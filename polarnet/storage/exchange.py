@@ -61,7 +61,12 @@ def write_text(path: str | os.PathLike[str], events: Events, duration_us: int) -
             file.writelines(f"{t // 1_000_000}.{t % 1_000_000:06d} {x} {y} {int(p > 0)}\n" for t, x, y, p in rows)
     if events.label is not None:
         lines = "".join(f"{label}\n" for label in events.label.tolist())
-        Path(path).with_name(f"{Path(path).stem}_label.txt").write_text(lines, encoding="ascii")
+        label_file(Path(path)).write_text(lines, encoding="ascii")
+
+
+def label_file(path: Path) -> Path:
+    """The file of the labels that belong to a file of `write_text`."""
+    return path.with_name(f"{path.stem}_label.txt")
 
 
 def write_evt3(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:

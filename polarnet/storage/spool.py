@@ -10,14 +10,18 @@ import torch
 
 from polarnet.events.stream import Events
 
-TYPES = {"t": np.int64, "x": np.int16, "y": np.int16, "p": np.int8}
+TYPES: dict[str, type[np.generic]] = {"t": np.int64, "x": np.int16, "y": np.int16, "p": np.int8, "label": np.uint8}
 
 
 class EventSpool:
-    """Takes consecutive pieces of the channels of one sequence; as a context manager it closes its files."""
+    """Takes consecutive pieces of the channels of one sequence; as a context manager it closes its files.
 
-    def __init__(self, folder: Path):
+    Labels are kept if `labels`; every piece must then have them.
+    """
+
+    def __init__(self, folder: Path, labels: bool = False):
         self.folder = folder
+        self._types = TYPES if labels else {name: dtype for name, dtype in TYPES.items() if name != "label"}
         self._files: list[dict[str, IO[bytes]]] = []
         self._size = (0, 0)
         folder.mkdir(parents=True)
@@ -36,7 +40,7 @@ class EventSpool:
         """Add a piece of every channel."""
         if not self._files:
             self._size = channels[0].height, channels[0].width
-            self._files = [{name: self._path(k, name).open("wb") for name in TYPES} for k in range(len(channels))]
+            self._files = [{name: self._path(k, name).open("wb") for name in self._types} for k in range(len(channels))]
         for columns, events in zip(self._files, channels, strict=True):
             for name, file in columns.items():
                 file.write(getattr(events, name).numpy().tobytes())
@@ -46,16 +50,18 @@ class EventSpool:
         for columns in self._files:
             for file in columns.values():
                 file.flush()
-        return [self._mapped(k) for k in range(len(self._files))]
+        return [self._channel(k) for k in range(len(self._files))]
 
-    def _mapped(self, channel: int) -> Events:
-        if self._path(channel, "t").stat().st_size == 0:
-            return Events.empty(*self._size)
+    def _channel(self, channel: int) -> Events:
         columns = {
-            name: torch.from_numpy(np.memmap(self._path(channel, name), dtype, mode="c"))  # torch wants writable memory
-            for name, dtype in TYPES.items()
+            name: torch.from_numpy(_mapped(self._path(channel, name), dtype)) for name, dtype in self._types.items()
         }
         return Events(**columns, height=self._size[0], width=self._size[1])
 
     def _path(self, channel: int, name: str) -> Path:
         return self.folder / f"{channel}.{name}"
+
+
+def _mapped(path: Path, dtype: type[np.generic]) -> np.ndarray:
+    """The column in a file, in memory that torch may write to; a memory map cannot be empty."""
+    return np.memmap(path, dtype, mode="c") if path.stat().st_size else np.empty(0, dtype)

@@ -5,8 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from polarnet.characterization.fit import KnownLight, fit_sensor, refractory_period_us
+from polarnet.characterization.fit import fit_sensor
+from polarnet.characterization.known_light import KnownLight
 from polarnet.characterization.light import Flicker, MovingLight
+from polarnet.characterization.refractory import between_shot_noise_us, piled_up_us
 from polarnet.characterization.twin import (
     compare,
     constant_frames,
@@ -115,12 +117,20 @@ def test_without_frames_the_twin_has_the_event_rate_of_the_recording(moving):
 
 def test_the_refractory_period_is_where_intervals_pile_up():
     free = np.random.default_rng(1).uniform(5e3, 1e5, 1000).round()
-    assert refractory_period_us([np.append(free, np.full(200, 500.0))]).value == 500
-    assert refractory_period_us([free]) is None
+    assert piled_up_us([np.append(free, np.full(200, 500.0))]).value == 500
+    assert piled_up_us([free]) is None
 
 
 def test_intervals_that_pile_up_at_a_tick_of_the_clock_are_no_refractory_period():
-    assert refractory_period_us([np.repeat([1e3, 2e3, 3e3], [500, 50, 50])]) is None
+    assert piled_up_us([np.repeat([1e3, 2e3, 3e3], [500, 50, 50])]) is None
+
+
+def test_shot_noise_shows_the_refractory_period_in_which_it_pauses():
+    """A million intervals at 2 Hz: two a microsecond, so the fifth shortest is about 2.5 us above 500 us."""
+    intervals_us = np.random.default_rng(1).exponential(5e5, 1_000_000)
+    assert between_shot_noise_us((500 + intervals_us).round()).value == pytest.approx(500, abs=4)
+    assert between_shot_noise_us(intervals_us.round()) is None
+    assert between_shot_noise_us((500 + intervals_us[:2000]).round()) is None
 
 
 def test_recordings_of_two_sensors_are_refused(static, moving):

@@ -29,10 +29,16 @@ def test_below_20_digital_numbers_the_response_is_linear_in_the_light():
 
 
 def test_the_photoreceptor_lags_a_ramp_by_one_time_constant():
-    light = light_of([100, 100 * math.e], [0, 1000])  # 1 per second
-    bandwidth_hz = 50 * ((100 + 100 * math.e) / 2 + 20) / 275
+    light = light_of(100 * np.exp([0, 0.85, 0.9, 0.95]), [0, 850, 900, 950])  # 1 per second
+    bandwidth_hz = 50 * (100 * math.exp(0.9) + 20) / 275
     lag = math.log(100) + 0.9 - responses(light, [900], 50.0)[0]
-    assert lag == pytest.approx(1 / (2 * math.pi * bandwidth_hz), rel=1e-4)
+    assert lag == pytest.approx(1 / (2 * math.pi * bandwidth_hz), rel=0.02)
+
+
+def test_a_parabola_of_the_logarithm_is_met_between_frames():
+    """4 + 0.1 (t / 10 ms)^2: 4.225 at 15 ms, where a straight line between the frames gives 4.25."""
+    light = light_of(np.exp([4, 4.1, 4.4, 4.9]), [0, 10, 20, 30])
+    assert responses(light, [15], 0.0) == pytest.approx([4.225])
 
 
 def test_events_outside_the_frames_have_no_response():

@@ -1,11 +1,14 @@
 """polarnet fit-sensor: table, sensor and page."""
 
+import cv2
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 
 from polarnet.cli import main
 from polarnet.config.tree import load
 from polarnet.runtime.files import shipped_settings
+from polarnet.storage.events import EventStore
 
 SIDE = 10
 
@@ -17,8 +20,10 @@ def ramps(tmp_path, monkeypatch):
     frames = tmp_path / "frames"
     frames.mkdir()
     for k in range(61):
-        np.save(frames / f"{k:03d}.npy", np.full((SIDE, SIDE), 160.0 if k % 2 else 40.0))
-    (frames / "timestamps.txt").write_text("\n".join(str(1_000_000 * k) for k in range(61)))
+        for part in range(20):  # the light bends at the corners of the swing, up to the first frame after them
+            portion = part / 20 if k % 2 == 0 else 1 - part / 20
+            np.save(frames / f"{20 * k + part:04d}.npy", np.full((SIDE, SIDE), 40.0 * 4**portion))
+    (frames / "timestamps.txt").write_text("\n".join(str(50_000 * k) for k in range(1220)))
     rows = []
     for k in range(1, 60):
         for event in range(8):
@@ -28,6 +33,10 @@ def ramps(tmp_path, monkeypatch):
     return tmp_path
 
 
+SMALL = ["synthesize.sensor_height=20", "synthesize.sensor_width=30", "synthesize.duration_s=0.1",
+         "ingest.height=60", "ingest.width=90", "synthesize.acceleration_max_px_s2=8000", "benchmark.lpips=false",
+         "train.crop=null", "baselines.e2v.crop=null", "baselines.e2p.crop=null", "loss.lpips=0",
+         "baselines.e2v.lpips=0", "baselines.e2p.lpips=0", "baselines.e2p.intensity_lpips=0"]  # fmt: skip
 FIT = ["fit-sensor", "--format", "text", "--height", str(SIDE), "--width", str(SIDE)]
 
 
@@ -76,6 +85,27 @@ def test_options_that_do_not_fit_are_refused_with_a_remedy(ramps, capsys, argume
     assert main([*FIT, "--name", "mine", *arguments]) == 1
     assert remedy in capsys.readouterr().err
     assert not (ramps / "conf").exists()
+
+
+def test_outside_a_clone_the_sensor_works_in_the_folder_where_it_was_fitted(ramps, capsys):
+    assert main([*FIT, "--name", "mine", "--moving", "moving.txt", "--frames", "frames"]) == 0
+    cv2.imwrite("photo.png", np.random.default_rng(1).integers(0, 256, (60, 80, 3), np.uint8))
+    clip = ["simulate", "photo.png", *SMALL, "--no-preview"]
+    assert main([*clip, "--out", "fitted", "sensor=mine"]) == 0
+    written = YAML(typ="safe").load(ramps / "conf" / "sensor" / "mine.yaml")["emulate"]
+    assert main([*clip, "--out", "same", *(f"emulate.{name}={value}" for name, value in written.items())]) == 0
+    assert main([*clip, "--out", "default"]) == 0
+    stores = [EventStore.open(f"{name}/events.zarr") for name in ("fitted", "same", "default")]
+    fitted, same, default = ([events.t.tolist() for events in store.read(store.sequences[0])] for store in stores)
+    assert fitted == same != default
+    capsys.readouterr()
+    assert main([*clip, "sensor=other"]) == 1
+    assert "default, mine, noisy" in capsys.readouterr().err
+
+
+def test_a_sensor_of_polarnet_is_not_shadowed(ramps, capsys):
+    assert main([*FIT, "--name", "noisy", "--moving", "moving.txt"]) == 1
+    assert "choose another name" in capsys.readouterr().err
 
 
 def test_a_sensor_that_fit_sensor_did_not_write_is_not_replaced(ramps, capsys):

@@ -37,8 +37,9 @@ class PixelConfig:
     source_follower_hz: NonNegativeFloat
     """Bandwidth of the source follower behind the photoreceptor, in any light; 0: infinite, as in v2e.
 
-    The two form a second-order low-pass (Lichtsteiner, Posch, Delbruck, JSSC 2008). v2e keeps only the photoreceptor's
-    pole, because it usually dominates (Hu, Liu, Delbruck, CVPRW 2021).
+    Photoreceptor and source follower are stages of the pixel's circuit (Lichtsteiner, Posch, Delbruck, JSSC 2008), and
+    together a second-order low-pass. v2e has one pole: its code (`low_pass_filter` of v2ecore/emulator_utils.py) says
+    that it was of second order once, and that "one pole is nearly always dominant".
     """
     leak_rate_hz: NonNegativeFloat
     """ON events per second of a pixel that sees no change."""

@@ -1,0 +1,105 @@
+"""Recordings under known light, and the change of the filtered log light between events of a pixel."""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from polarnet.characterization.flicker_clock import exact_frequency, flicker_phase
+from polarnet.characterization.increments import Intervals, PixelEvents, chosen_pixels, intervals_of, undisturbed
+from polarnet.characterization.light import Flicker, MovingLight, flicker_cycle, flicker_responses, moving_responses
+from polarnet.events.stream import Events
+
+SETTLING_US = 100_000  # after the first frame, whose photoreceptor state is unknown
+BLOCK = 8  # consecutive intervals of a pixel in one half of the data
+
+
+@dataclass(frozen=True)
+class KnownLight:
+    """A recording under known light."""
+
+    name: str
+    events: Events
+    light: MovingLight | Flicker
+
+
+class Source(NamedTuple):
+    """Intervals of a recording under known light, and the filtered response at its events for a bandwidth."""
+
+    name: str
+    events: PixelEvents
+    intervals: Intervals
+    responses: Callable[[PixelEvents, float], Float64[np.ndarray, " n"]]
+    moves: bool
+    """Whether the light is one of frames."""
+
+
+class Increments(NamedTuple):
+    """Increments in the direction of the events' polarity."""
+
+    increment: Float64[np.ndarray, " n"]
+    duration_s: Float64[np.ndarray, " n"]
+    pixel: Int64[np.ndarray, " n"]
+    on: Bool[np.ndarray, " n"]
+    block: Int64[np.ndarray, " n"]
+
+
+def source_of(known: KnownLight, events: PixelEvents, refractory_us: float) -> Source:
+    """The intervals of a recording under known light that neither start-up nor refractory period disturbs."""
+    intervals = undisturbed(intervals_of(events), refractory_us)
+    light = known.light
+    if isinstance(light, MovingLight):
+        after = events.t_us[intervals.start] >= light.t_us[0] + SETTLING_US
+        intervals = Intervals(*(column[after] for column in intervals))
+
+        def responses(some: PixelEvents, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
+            return moving_responses(light, some.pixel, some.t_us, cutoff_hz)
+    else:
+        flicker = exact_frequency(light, events)
+
+        @functools.cache
+        def cycle_and_phase(cutoff_hz: float) -> tuple[Float64[np.ndarray, " k"], float]:
+            cycle = flicker_cycle(flicker, cutoff_hz)
+            return cycle, flicker_phase(cycle, flicker.frequency_hz, events, intervals)
+
+        def responses(some: PixelEvents, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
+            cycle, phase = cycle_and_phase(cutoff_hz)
+            return flicker_responses(cycle, flicker.frequency_hz, phase, some.t_us)
+
+    return Source(known.name, events, intervals, responses, isinstance(light, MovingLight))
+
+
+def increments_of(sources: Sequence[Source], cutoff_hz: float) -> Increments:
+    """Increments of all sources, for a photoreceptor of bandwidth `cutoff_hz` at full brightness (0: infinite)."""
+    columns: list[tuple[np.ndarray, ...]] = []
+    for source in sources:
+        response, intervals = source.responses(source.events, cutoff_hz), source.intervals
+        sign = np.where(intervals.on, 1.0, -1.0)
+        increment = sign * (response[intervals.stop] - response[intervals.start])
+        covered = np.isfinite(increment)
+        columns.append(
+            tuple(
+                column[covered]
+                for column in (
+                    increment,
+                    intervals.duration_us * 1e-6,
+                    intervals.pixel,
+                    intervals.on,
+                    np.arange(len(increment)) // BLOCK,
+                )
+            )
+        )
+    return Increments(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
+
+
+def at_pixels(source: Source, mask: Bool[np.ndarray, " pixels"]) -> Source:
+    """The part of a source at some pixels."""
+    selected = mask[source.events.pixel]
+    number = np.cumsum(selected) - 1
+    chosen = mask[source.intervals.pixel]
+    start, stop = number[source.intervals.start[chosen]], number[source.intervals.stop[chosen]]
+    rest = (column[chosen] for column in source.intervals[2:])
+    return source._replace(events=chosen_pixels(source.events, mask), intervals=Intervals(start, stop, *rest))
