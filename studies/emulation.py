@@ -48,7 +48,7 @@ from polarnet.simulation.moving_sensor import emulate_motion, emulate_motion_ste
 from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.storage.events import EventStore
-from studies.measure import machine_record, uncommitted
+from studies.measure import arguments_of, command_line, machine_record
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results" / "emulation.json"
@@ -318,8 +318,7 @@ def measure(rounds: int, repeats: int, before: str | None) -> dict[str, Any]:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/emulation.json")
+    parser = command_line(__doc__, "docs/results/emulation.json")
     parser.add_argument("--rounds", type=int, default=3, help="processes of each model and number of threads")
     parser.add_argument("--repeats", type=int, default=9, help="runs of each process; the median of all counts")
     parser.add_argument(
@@ -329,12 +328,10 @@ def main() -> None:
     parser.add_argument("--before", metavar="COMMIT", help="earlier commit to time in the same rounds")
     parser.add_argument("--one", choices=list(MODELS), help=argparse.SUPPRESS)
     parser.add_argument("--threads", type=int, default=1, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    arguments = arguments_of(parser)
     if arguments.one:
         print(json.dumps(measure_one(arguments.one, arguments.threads, arguments.repeats)))
         return
-    if arguments.write and (changed := uncommitted(ROOT)):
-        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
     figures: dict[str, Any] = machine_record(ROOT)
     print(f"{figures['machine']}, {figures['cores']} cores, load {figures['load']}")
     if not arguments.only_paper_set:

@@ -27,7 +27,7 @@ from hypothesis import strategies as st
 
 from polarnet.recordings.formats import isolated
 from polarnet.recordings.recording import FORMATS
-from studies.measure import machine_record, read_results, uncommitted, write_section
+from studies.measure import arguments_of, command_line, machine_record, read_results, uncommitted, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
 KEPT = ROOT / "outputs" / "fuzz"
@@ -89,31 +89,31 @@ def fuzz(form: str, cases: int, state: str) -> dict[str, Any]:
             progress |= {"batches": one["batches"], "cases": endings.total(), "endings": dict(sorted(endings.items()))}
             progress["seconds"] = round(before_s + time.monotonic() - start, 1)
             results_file.write_text(json.dumps(progress))
-            print(f"{form:14s} {found['cases']:6d} cases in {found['seconds']:6.1f} s: {found['endings']}", flush=True)
+            print(
+                f"{form:14s} {progress['cases']:6d} cases in {progress['seconds']:6.1f} s: {progress['endings']}",
+                flush=True,
+            )
     if process.returncode:
-        sys.exit(f"{form}: after {found['cases']} cases its process ended with status {process.returncode}")
+        sys.exit(f"{form}: after {progress['cases']} cases its process ended with status {process.returncode}")
     return progress
 
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
+    parser = command_line(__doc__, "docs/results/recordings.json")
     parser.add_argument("--cases", type=int, default=10_000, help="for each reader")
     parser.add_argument("--readers", nargs="*", choices=list(FORMATS), default=list(FORMATS))
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    arguments = arguments_of(parser)
     KEPT.mkdir(parents=True, exist_ok=True)
     if arguments.one:
         form, first, cases = arguments.one
         run_cases(form, int(first), int(cases))
         return
-    changed = uncommitted(ROOT)
-    if arguments.write and changed:
-        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
     record = machine_record(ROOT)
-    results = {form: fuzz(form, arguments.cases, f"{record['commit']} {changed}") for form in arguments.readers}
-    print(f"{min(one['cases'] for one in found.values())} cases a reader passed, of {len(found)} readers")
+    state = f"{record['commit']} {uncommitted(ROOT)}"
+    results = {form: fuzz(form, arguments.cases, state) for form in arguments.readers}
+    print(f"{min(one['cases'] for one in results.values())} cases a reader passed, of {len(results)} readers")
     if arguments.write:
         readers = read_results(ROOT, "recordings").get("fuzz", {}).get("readers", {}) | {
             form: {key: one[key] for key in ("cases", "endings", "seconds")} | {"commit": record["commit"]}

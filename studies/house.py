@@ -5,7 +5,6 @@ RANGE is a commit that added a baseline, or FROM..TO for a branch; git then says
 the figures into docs/results/house.json.
 """
 
-import argparse
 import ast
 import json
 import re
@@ -15,7 +14,7 @@ from statistics import median, quantiles
 from typing import Any
 
 from polarnet.reports.provenance import git
-from studies.measure import machine_record, read_results, uncommitted, write_section
+from studies.measure import arguments_of, command_line, machine_record, read_results, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("polarnet", "stages", "studies", "tests", "conf", "docs")
@@ -119,16 +118,13 @@ def total(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
 
 def main() -> None:
     """Print the figures, and write them if asked."""
-    parser = argparse.ArgumentParser(
-        prog="python -m studies.house", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__, "docs/results/house.json")
     parser.add_argument("--published", metavar="RANGE", help="commits that added a baseline with published weights")
     parser.add_argument("--trained", metavar="RANGE", help="commits that added a trained baseline")
     parser.add_argument(
         "--uses", metavar="WORD", choices=[*RETIRED, "all"], help="list the lines that use a retired word"
     )
-    parser.add_argument("--write", action="store_true", help="write docs/results/house.json; needs a committed tree")
-    options = parser.parse_args()
+    options = arguments_of(parser)
     if options.uses:
         for path, text in tracked_texts(ROOT):
             for number, line in enumerate(text.splitlines(), 1):
@@ -136,8 +132,6 @@ def main() -> None:
                 if options.uses in words or (words and options.uses == "all"):
                     print(f"{path}:{number}: {line.strip()}")
         return
-    if options.write and (changed := uncommitted(ROOT)):
-        parser.error(f"commit first, because the figures name a commit; changed:\n{changed}")
     measured = figures(ROOT, options.published, options.trained)
     print(json.dumps(measured, indent=2))
     if options.write:

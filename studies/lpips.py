@@ -12,7 +12,6 @@ figures into docs/results/lpips.json, with the rows of docs/results/pipeline.jso
 docs/results/sweep.json.
 """
 
-import argparse
 import json
 import statistics
 import time
@@ -37,7 +36,7 @@ from polarnet.training.dolp import dolp_task
 from polarnet.training.loop import train_batch
 from polarnet.training.optimizers import OPTIMIZERS
 from polarnet.training.sequences import Batch
-from studies.measure import machine_record, read_results, uncommitted, write_section
+from studies.measure import arguments_of, command_line, machine_record, read_results, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
 HEIGHT, WIDTH = 120, 180
@@ -160,15 +159,12 @@ def elsewhere() -> dict[str, int]:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, "docs/results/lpips.json")
     parser.add_argument("--squeeze", metavar="FILE", help="weights of the squeeze backbone")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=usable_cores())
     parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
-    parser.add_argument("--write", action="store_true", help="write docs/results/lpips.json")
-    arguments = parser.parse_args()
-    if arguments.write and (changed := uncommitted(ROOT)):
-        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    arguments = arguments_of(parser)
     record = machine_record(ROOT)
     print(f"{record['machine']}, {record['cores']} cores, load {record['load']}")
     cost, headlines = measure(networks(arguments.squeeze), arguments.rounds, arguments.threads, arguments.device)

@@ -51,6 +51,21 @@ def uncommitted(root: Path, *allowed: str) -> str:
     return git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", *but_for)
 
 
+def command_line(about: str | None, written: str) -> argparse.ArgumentParser:
+    """Parser of a study with the option `--write`; `arguments_of` parses with it."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true", help=f"write {written}; needs a committed tree")
+    return parser
+
+
+def arguments_of(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """The command's arguments; `--write` with uncommitted changes ends the program."""
+    arguments = parser.parse_args()
+    if arguments.write and (changed := uncommitted(ROOT)):
+        parser.error(f"--write: commit first, because the figures name a commit; changed:\n{changed}")
+    return arguments
+
+
 def read_results(root: Path, name: str) -> dict[str, Any]:
     """Content of docs/results/NAME.json; empty if the file does not exist yet."""
     path = root / "docs" / "results" / f"{name}.json"

@@ -3,10 +3,8 @@
 Every point, line and event in them comes from the simulation itself; where a formula is drawn, its label says so.
 """
 
-import argparse
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -21,7 +19,7 @@ from matplotlib.figure import Figure
 from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events
 from polarnet.reports.figures import LIGHT, chart_style, show_picture
-from polarnet.reports.maps import dolp_image, intensity_image, png
+from polarnet.reports.maps import dolp_image, intensity_image
 from polarnet.reports.overview import OFF, ON
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.motion import Sine, Trajectory, frame_times_us
@@ -33,7 +31,7 @@ from polarnet.simulation.readout import PERFECT, read_out
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.stokes import POLARIZER_ANGLES_DEG, dolp, parse_mosaic
 from studies.polarizer_presets import channels_of, inside, measured_stokes, photograph, true_stokes
-from studies.simulation_pictures import FOLDER, LINE, QUIET, few_colours
+from studies.simulation_pictures import LINE, QUIET, write_pictures
 
 COLOURS = ("#1c2330", "#2f7fc1", "#3f9c6d", "#e08a1e")
 STILL = Sine(0.0, 0.0, 0.0)
@@ -351,17 +349,5 @@ FIGURES = {
 }
 
 
-def main() -> None:
-    """Write all pictures."""
-    parser = argparse.ArgumentParser(description="Draw the pictures of docs/physics.md.")
-    parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help=f"default: {FOLDER}")
-    folder = parser.parse_args().folder
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, figure in FIGURES.items():
-        path = folder / f"{name}.png"
-        path.write_bytes(few_colours(png(figure()), PALETTE))
-        print(f"{path}: {path.stat().st_size / 1024:.0f} kB")
-
-
 if __name__ == "__main__":
-    main()
+    write_pictures(FIGURES, "Draw the pictures of docs/physics.md.", PALETTE)

@@ -4,7 +4,6 @@ Each preset looks at fully polarized light at 36 angles and at a built-in photog
 channels by Eq. 1 to 3, without calibration.
 """
 
-import argparse
 import json
 import math
 from collections.abc import Mapping
@@ -26,7 +25,7 @@ from polarnet.simulation.presets import POLARIZERS
 from polarnet.simulation.rendering import render_intensities, split_channels
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, scene_from_rgb
 from polarnet.stokes import aolp, dolp, parse_mosaic, stokes_from_intensities
-from studies.measure import machine_record, uncommitted, write_section
+from studies.measure import arguments_of, command_line, machine_record, write_section
 
 ROOT = Path(__file__).parents[1]
 SIZE = (200, 300)  # rows and columns of the sensor
@@ -105,11 +104,8 @@ def measured(presets: Mapping[str, PolarizersConfig]) -> dict[str, Any]:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="write docs/results/camera.json")
-    arguments = parser.parse_args()
-    if arguments.write and (changed := uncommitted(ROOT)):
-        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    parser = command_line(__doc__, "docs/results/camera.json")
+    arguments = arguments_of(parser)
     record, section = machine_record(ROOT), measured(POLARIZERS)
     print(json.dumps(section, indent=2))
     if arguments.write:

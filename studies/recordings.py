@@ -34,7 +34,7 @@ from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.recording import open_recording
 from polarnet.storage.events import EventStore
 from studies.celex5_writer import write_celex5_bin
-from studies.measure import machine_record, read_results, uncommitted, write_section
+from studies.measure import arguments_of, command_line, machine_record, read_results, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
 PART = 1_000_000  # events that are written at a time, and microseconds that they take
@@ -310,19 +310,16 @@ def measure(name: str, sizes: list[int], repeats: int) -> dict[str, dict[str, An
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
+    parser = command_line(__doc__, "docs/results/recordings.json")
     parser.add_argument("--full", action="store_true", help="100 M events too")
     parser.add_argument("--formats", nargs="*", choices=list(FILES), default=list(FILES))
     parser.add_argument("--repeats", type=int, default=5, help="runs of which the fastest counts")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    arguments = arguments_of(parser)
     if arguments.one:
         reader, path, small = arguments.one
         print(json.dumps(measure_one(reader, Path(path), Path(small), arguments.repeats)))
         return
-    if arguments.write and (changed := uncommitted(ROOT)):
-        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
     for name in arguments.formats:
         record = machine_record(ROOT)
         record["versions"] |= {

@@ -14,7 +14,6 @@ an event to the frame that contains it.
 pictures of the stream, or those of the high-pass filter if the network is untrained.
 """
 
-import argparse
 import json
 import shutil
 import statistics
@@ -47,7 +46,7 @@ from polarnet.recovery.recover import Input, Summary, frames_of, recover
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import precision_on, tune
 from polarnet.simulation import simulate
-from studies.measure import machine_record, uncommitted
+from studies.measure import arguments_of, command_line, machine_record
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results" / "recordings.json"
@@ -121,17 +120,14 @@ def figures_of(summary: Summary, step_ms: float) -> dict[str, float]:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
+    parser = command_line(__doc__, "docs/results/recordings.json")
     parser.add_argument("--weights", type=Path, help="checkpoint of the network")
     parser.add_argument(
         "--precision", choices=("auto", "fp32", "bf16"), default="auto", help="number format of the network"
     )
     parser.add_argument("--seconds", type=float, default=10.0, help="length of the stream in seconds")
     parser.add_argument("--picture", type=Path, help="file for the pictures of a run")
-    arguments = parser.parse_args()
-    if arguments.write and (changed := uncommitted(ROOT)):
-        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    arguments = arguments_of(parser)
     config = load(ROOT)
     tune()
     figures: dict[str, Any] = machine_record(ROOT)

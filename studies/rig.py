@@ -12,7 +12,6 @@ one (800 x 1280, images of 120 x 180). `--write` merges the figures into docs/re
 or `rig_full`. `--docs` draws the pictures of docs/recordings.md and docs/recordings-dot.md instead.
 """
 
-import argparse
 import json
 import shutil
 import tempfile
@@ -46,8 +45,8 @@ from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.storage.exchange import write_hdf5
 from polarnet.storage.frames import FrameStore
-from studies.measure import BENCHMARK_KEYS, machine_record, uncommitted, write_section
-from studies.simulated_rig import RigConfig, RigTruth, true_dolp, write_rig
+from studies.measure import BENCHMARK_KEYS, arguments_of, command_line, machine_record, write_section
+from studies.simulated_rig import RigConfig, RigTruth, spread_us, true_dolp, write_rig
 from studies.simulation_pictures import few_colours
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -175,8 +174,7 @@ def since_landmark(events: Events, capture: str, found: Calibrated) -> Events:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/recordings.json")
+    parser = command_line(__doc__, "docs/results/recordings.json")
     parser.add_argument("--targets", type=int, default=8, help="number of targets, with eight captures each")
     parser.add_argument("--full", action="store_true", help="the whole sensor")
     parser.add_argument(
@@ -187,9 +185,7 @@ def main() -> None:
         "--pictures", type=Path, default=ROOT / "outputs" / "rig", help="folder for diagnostic pictures"
     )
     parser.add_argument("--docs", action="store_true", help="only draw the pictures of the pages on recordings")
-    arguments = parser.parse_args()
-    if arguments.write and (changed := uncommitted(ROOT)):
-        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    arguments = arguments_of(parser)
     config = load(ROOT, [f"paths.data={arguments.data.absolute()}"])
     recordings = replace(config.recordings, enabled=True, **({} if arguments.full else QUARTER))
     rig = FULL_RIG if arguments.full else RIG

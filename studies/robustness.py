@@ -57,7 +57,7 @@ from polarnet.simulation.scene import polarization_from_rgb
 from polarnet.simulation.truth import synthesize
 from polarnet.stokes import Prediction, dolp, stokes_from_intensities
 from polarnet.storage.scenes import SceneStore
-from studies.measure import machine_record, uncommitted, write_section
+from studies.measure import arguments_of, command_line, machine_record, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
 SENSORS: dict[str, tuple[str, ...]] = {
@@ -331,7 +331,7 @@ def printed(tables: Mapping[str, Any], key: str) -> str:
 
 def parsed() -> argparse.Namespace:
     """The command line, with paths as every working directory understands them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, "docs/results/robustness.json")
     parser.add_argument("--photographs", type=Path, required=True)
     parser.add_argument("--photographs-large", type=Path, help="further photographs")
     parser.add_argument("--measured", type=Path, nargs="+", default=[], help="as ingest.source=polarization takes them")
@@ -347,10 +347,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--sensor-limit", type=int, help="pictures of each sensor; default: as --limit")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1, help="processes that share the sequences")
-    parser.add_argument("--write", action="store_true", help="write docs/results/robustness.json")
-    arguments = parser.parse_args()
-    if arguments.write and uncommitted(ROOT):
-        parser.error("the tree has uncommitted changes; commit them first, the figures name a commit")
+    arguments = arguments_of(parser)
     for name in ("photographs", "photographs_large", "work", "firenet", "training"):
         if path := getattr(arguments, name):
             setattr(arguments, name, path.resolve())

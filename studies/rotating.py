@@ -7,7 +7,6 @@ bandwidth, except in `assumed_threshold`. Moving scenes are compared with the tr
 `--write` puts the figures into docs/results/camera.json and draws docs/pictures/rotating_polarizer.png.
 """
 
-import argparse
 import itertools
 import json
 import math
@@ -32,7 +31,7 @@ from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.rotating import RotatingConfig, emulate_rotating, rotating_times_us
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, scene_from_rgb
 from polarnet.stokes import Prediction, aolp, dolp
-from studies.measure import machine_record, uncommitted, write_section
+from studies.measure import arguments_of, command_line, machine_record, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
 PICTURE = ROOT / "docs" / "pictures" / "rotating_polarizer.png"
@@ -247,11 +246,8 @@ def curves_figure(curves: Mapping[str, list[Mapping[str, float]]]) -> Figure:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="write docs/results/camera.json and the picture")
-    arguments = parser.parse_args()
-    if arguments.write and (changed := uncommitted(ROOT)):
-        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    parser = command_line(__doc__, "docs/results/camera.json and the picture")
+    arguments = arguments_of(parser)
     record = machine_record(ROOT)
     torch.set_num_threads(1)
     figures, curves = measure(load(ROOT))

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from polarnet.pictures.manifest import read_manifest
-from studies.measure import ABLATION_KEYS, machine_record, uncommitted, write_section
+from studies.measure import ABLATION_KEYS, arguments_of, command_line, machine_record, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
 HELD_OUT = 1 / 3  # share of the remaining photographs
@@ -80,15 +80,12 @@ def scored(name: str, seed: int, photographs: Path, arguments: argparse.Namespac
 
 def parsed() -> argparse.Namespace:
     """The command line, with paths as every working directory understands them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, "docs/results/scenes.json")
     parser.add_argument("--photographs", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=2, help="trainings of each choice")
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
-    parser.add_argument("--write", action="store_true", help="write docs/results/scenes.json")
-    arguments = parser.parse_args()
-    if arguments.write and uncommitted(ROOT):
-        parser.error("the tree has uncommitted changes; commit them first, the figures name a commit")
+    arguments = arguments_of(parser)
     arguments.photographs, arguments.work = arguments.photographs.resolve(), arguments.work.resolve()
     return arguments
 

@@ -7,7 +7,6 @@ leaves, 8-bit frames at --frame-rate. It knows nothing of the sensor. Two fits a
 `sensor_fit_flicker`.
 """
 
-import argparse
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -25,7 +24,7 @@ from polarnet.runtime.machine import generator_for
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.presets import SENSORS
-from studies.measure import machine_record, uncommitted, write_section
+from studies.measure import arguments_of, command_line, machine_record, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
 HEIGHT, WIDTH = 60, 80
@@ -149,15 +148,12 @@ def fitted(number: int, seed: int, kind: str, frame_rate_hz: int) -> dict[str, A
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, "docs/results/camera.json")
     parser.add_argument("--sensors", type=int, default=12)
     parser.add_argument("--seed", type=int, default=1, help="of the drawn sensors (default: 1, the documented ones)")
     parser.add_argument("--frame-rate", type=int, default=100, help="frames per second that the fit gets")
     parser.add_argument("--light", nargs="+", choices=("frames", "flicker"), default=["frames", "flicker"])
-    parser.add_argument("--write", action="store_true", help="write docs/results/camera.json")
-    arguments = parser.parse_args()
-    if arguments.write and (changed := uncommitted(ROOT)):
-        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    arguments = arguments_of(parser)
     record = machine_record(ROOT)
     for kind in arguments.light:
         rows = [fitted(number, arguments.seed, kind, arguments.frame_rate) for number in range(arguments.sensors)]

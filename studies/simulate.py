@@ -7,7 +7,6 @@ events, seconds and events/s into docs/results/camera.json, section `simulate_in
 docs/pictures/simulate.png.
 """
 
-import argparse
 import contextlib
 import io
 import json
@@ -26,7 +25,7 @@ from polarnet.events.mosaic import places_of
 from polarnet.simulation import BUILTIN_PHOTOS, read_rgb, scene_from_rgb
 from polarnet.stokes import POLARIZER_ANGLES_DEG, intensities_from_stokes, parse_mosaic
 from polarnet.storage.events import EventStore
-from studies.measure import machine_record, uncommitted, write_section
+from studies.measure import arguments_of, command_line, machine_record, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
 PHOTO = "astronaut"
@@ -107,12 +106,9 @@ def run_of(words: list[str], folder: Path) -> dict[str, Any]:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="write docs/results/camera.json")
+    parser = command_line(__doc__, "docs/results/camera.json")
     parser.add_argument("--picture", action="store_true", help="draw docs/pictures/simulate.png")
-    arguments = parser.parse_args()
-    if arguments.write and (changed := uncommitted(ROOT)):
-        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
+    arguments = arguments_of(parser)
     record = machine_record(ROOT)
     with tempfile.TemporaryDirectory() as name, contextlib.chdir(name):
         kinds = samples(Path(name))

@@ -6,7 +6,7 @@ Every line and every event in them comes from the simulation itself.
 import argparse
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -268,17 +268,17 @@ FIGURES = {
 }
 
 
-def main() -> None:
-    """Write all pictures."""
-    parser = argparse.ArgumentParser(description="Draw pictures of docs/simulation.md and docs/physics.md.")
+def write_pictures(figures: Mapping[str, Callable[[], Figure]], about: str, colours: int = COLOURS) -> None:
+    """Command line of a module of pictures: write every figure as NAME.png into a folder."""
+    parser = argparse.ArgumentParser(description=about)
     parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help=f"default: {FOLDER}")
     folder = parser.parse_args().folder
     folder.mkdir(parents=True, exist_ok=True)
-    for name, figure in FIGURES.items():
+    for name, figure in figures.items():
         path = folder / f"{name}.png"
-        path.write_bytes(few_colours(png(figure())))
+        path.write_bytes(few_colours(png(figure()), colours))
         print(f"{path}: {path.stat().st_size / 1024:.0f} kB")
 
 
 if __name__ == "__main__":
-    main()
+    write_pictures(FIGURES, "Draw pictures of docs/simulation.md and docs/physics.md.")

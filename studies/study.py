@@ -28,9 +28,17 @@ from typing import Any
 
 from polarnet.reports.figures import LIGHT
 from polarnet.reports.maps import png
-from studies.blocks import best_reconstruction, seeds_of
 from studies.figures import expected_errors_figure
-from studies.measure import ABLATION_KEYS, machine_record, measure_benchmark, read_results, uncommitted, write_section
+from studies.measure import (
+    ABLATION_KEYS,
+    arguments_of,
+    command_line,
+    machine_record,
+    measure_benchmark,
+    read_results,
+    write_section,
+)
+from studies.network_blocks import best_reconstruction, seeds_of
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAININGS: dict[str, tuple[str, ...]] = {
@@ -103,7 +111,7 @@ def over_seeds(seeds: list[dict[str, Any]]) -> dict[str, Any]:
 
 def parsed() -> argparse.Namespace:
     """The command line, with paths as every working directory understands them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, "docs/results")
     parser.add_argument("--photographs", type=Path, required=True)
     parser.add_argument("--measured", type=Path, required=True, help="scenes as ingest.source=polarization takes them")
     parser.add_argument("--work", type=Path, required=True)
@@ -123,10 +131,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=1, help="seed of the trainings; all seeds share the data")
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     parser.add_argument("--workers", type=int, default=1, help="processes that share the benchmark's sequences")
-    parser.add_argument("--write", action="store_true", help="write docs/results")
-    arguments = parser.parse_args()
-    if arguments.write and uncommitted(ROOT):
-        parser.error("the tree has uncommitted changes; commit them first, the figures name a commit")
+    arguments = arguments_of(parser)
     if "ours" not in arguments.rows and not arguments.ours and not arguments.only:
         parser.error(f"--rows {' '.join(arguments.rows)}: expected ours among them, or --ours FILE")
     pairs = [given.split("=", 1) for given in arguments.published]

@@ -41,7 +41,7 @@ from polarnet.recovery.recover import PIXELS_AT_ONCE
 from polarnet.runtime.machine import configure, device_of, limit_threads, precision_on, usable_cores
 from polarnet.stokes import Prediction
 from polarnet.training.loop import autocast
-from studies.measure import machine_record, uncommitted, write_section
+from studies.measure import arguments_of, command_line, machine_record, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
 HEIGHT, WIDTH = 120, 180
@@ -213,21 +213,18 @@ def headlines(networks: dict[str, Any]) -> dict[str, Any]:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="merge the figures into docs/results/network.json")
+    parser = command_line(__doc__, "docs/results/network.json")
     parser.add_argument("--rounds", type=int, default=3, help="turns of every setting")
     parser.add_argument("--threads", type=int, default=usable_cores())
     parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
     parser.add_argument("--compile", action="store_true", help="measure torch.compile as well")
     parser.add_argument("--networks", nargs="+", choices=list(NETWORKS), default=list(NETWORKS))
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    arguments = arguments_of(parser)
     if arguments.one:
         name, setting = arguments.one
         print(json.dumps(measure_one(name, setting, arguments.threads, arguments.device)))
         return
-    if arguments.write and (changed := uncommitted(ROOT)):
-        parser.error(f"commit first, the figures name a commit; changed:\n{changed}")
     record = machine_record(ROOT)
     print(f"{record['machine']}, {record['cores']} cores, load {record['load']}")
     settings = list(SETTINGS if arguments.compile else SETTINGS[:2])

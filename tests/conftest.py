@@ -14,24 +14,34 @@ HERE = Path(__file__).parent
 SLOWEST_FIRST = (
     "pipeline/test_stages.py",
     "pipeline/test_dvc.py",
-    "training/test_loop.py",
-    "networks/test_onnx_export.py",
     "reference/test_golden.py",
-    "config/test_config.py",
-    "runtime/test_cluster.py",
-    "pipeline/test_interruptions.py",
-    "training/test_parallel.py",
     "cli/test_own_scenes.py",
     "benchmark/test_benchmark.py",
-    "training/test_calibration.py",
+    "training/test_loop.py",
+    "networks/test_onnx_export.py",
+    "characterization/test_fit.py",
+    "captures/test_rig.py",
+    "config/test_config.py",
+    "runtime/test_cluster.py",
     "recovery/test_recover.py",
-    "storage/test_parts.py",
+    "training/test_calibration.py",
     "methods/test_methods.py",
+    "recordings/test_recorded_readout.py",
+    "cli/test_simulate.py",
     "reports/test_page.py",
+    "methods/test_rotating_polarizer.py",
+    "training/test_parallel.py",
     "config/test_sweep.py",
+    "pipeline/test_interruptions.py",
+    "training/test_e2p_task.py",
+    "benchmark/test_row_results.py",
+    "storage/test_parts.py",
 )
 """Files that take longest; the others follow, so no worker is left with a long one when the rest is done."""
-LARGE_PACKAGES = ("torch", "scipy.stats", "numba", "cv2", "zarr", "matplotlib.figure", "hydra")
+LARGE_PACKAGES = (
+    "torch", "scipy.stats", "numba", "cv2", "zarr", "matplotlib.figure", "hydra", "pydantic.dataclasses", "ruamel.yaml",
+    "jinja2",
+)  # fmt: skip
 FUZZ_CASES = {"local": 50, "ci": 150}
 
 
@@ -94,6 +104,16 @@ def unchecked_annotations() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", was)
+
+
+@pytest.fixture
+def forked_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the worker processes of `pmap` fork from one that has imported polarnet, which saves their imports."""
+    from types import SimpleNamespace
+
+    from preloaded import FORKSERVER
+
+    monkeypatch.setattr("polarnet.runtime.cluster.multiprocessing", SimpleNamespace(get_context=lambda _: FORKSERVER))
 
 
 class Simulated(NamedTuple):

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 STAGES = sorted(path.stem for path in (Path(__file__).parents[1] / "stages").glob("[a-z]*.py"))
@@ -15,19 +16,26 @@ FORKSERVER = multiprocessing.get_context("forkserver")
 FORKSERVER.set_forkserver_preload([*(f"stages.{stage}" for stage in STAGES), "distributed"])
 
 
-def run_stage(root: Path, stage: str, arguments: list[str]) -> subprocess.CompletedProcess[str]:
-    """The exit status and output of `python -m stages.STAGE ARGUMENTS` in `root`; `stdout` holds both streams."""
+def run_stage(
+    root: Path, stage: str, arguments: list[str], prepare: Callable[[], None] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """The exit status and output of `python -m stages.STAGE ARGUMENTS` in `root`; `stdout` holds both streams.
+
+    `prepare` changes the stage's process before the stage starts.
+    """
     with tempfile.NamedTemporaryFile(mode="r") as output:
-        process = FORKSERVER.Process(target=_main, args=(root, stage, arguments, output.name))
+        process = FORKSERVER.Process(target=_main, args=(root, stage, arguments, output.name, prepare))
         process.start()
         process.join()
         return subprocess.CompletedProcess([stage, *arguments], process.exitcode or 0, output.read())
 
 
-def _main(root: Path, stage: str, arguments: list[str], output: str) -> None:
+def _main(root: Path, stage: str, arguments: list[str], output: str, prepare: Callable[[], None] | None) -> None:
     descriptor = os.open(output, os.O_WRONLY | os.O_APPEND)
     for standard in (1, 2):
         os.dup2(descriptor, standard)
     os.chdir(root)
+    if prepare:
+        prepare()
     sys.argv = [f"stages.{stage}", *arguments]
     __import__(f"stages.{stage}", fromlist=["main"]).main()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.cli.outputs import WORK, run_folder
-from polarnet.cli.parsers import Commands
+from polarnet.cli.parsers import Commands, add_hot_pixel_factor, add_stored_sequence
 from polarnet.cli.project import settings_root
 
 READING_OPTIONS = ("format", "height", "width", "clock_mhz")
@@ -42,12 +42,7 @@ def _add_inspection(commands: Commands) -> None:
     inspect.add_argument("file", type=Path, help="file of a camera, or an event store with --part")
     add_reading(inspect)
     inspect.add_argument("--part", metavar="SEQUENCE/ANGLE", help="sequence and channel of an event store: NAME/45")
-    inspect.add_argument(
-        "--hot-pixel-factor",
-        type=float,
-        default=4.0,
-        help="a pixel is hot above this multiple of the third busiest of the 5 x 5 pixels around it (default: 4)",
-    )
+    add_hot_pixel_factor(inspect)
     inspect.add_argument("--picture", type=Path, help="PNG of the busiest moment (default: outputs/inspect/FILE.png)")
     inspect.add_argument(
         "--hot-pixels", type=Path, metavar="PNG", help="PNG of the number of events of each pixel (default: not drawn)"
@@ -170,8 +165,7 @@ def _add_replay(commands: Commands) -> None:
         description="Prints the events of a stored sequence at the pace of the recording. Pipe them into "
         "`polarnet recover - --live` to try live recovery without a camera.",
     )
-    replay.add_argument("store", help="event store: folder or fsspec URL")
-    replay.add_argument("sequence", help="name of the sequence")
+    add_stored_sequence(replay)
     replay.add_argument("--speed", type=float, default=1.0, help="speed relative to the recording (default: 1)")
     replay.set_defaults(run=_replay)
 

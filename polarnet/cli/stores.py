@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from polarnet.cli.outputs import run_folder
-from polarnet.cli.parsers import Commands
+from polarnet.cli.parsers import Commands, add_hot_pixel_factor, add_stored_sequence
 
 PICTURE_US = 33_333
 
@@ -32,14 +32,8 @@ def add_to(commands: Commands) -> None:
         description="Needs an event store that was written with storage.labels=true. Score a denoiser of your own with "
         "polarnet.metrics.denoising.denoising_scores.",
     )
-    labels.add_argument("store", help="event store: folder or fsspec URL")
-    labels.add_argument("sequence", help="name of the sequence")
-    labels.add_argument(
-        "--hot-pixel-factor",
-        type=float,
-        default=4.0,
-        help="a pixel is hot above this multiple of the third busiest of the 5 x 5 pixels around it (default: 4)",
-    )
+    add_stored_sequence(labels)
+    add_hot_pixel_factor(labels)
     labels.add_argument(
         "--picture",
         type=Path,

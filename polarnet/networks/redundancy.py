@@ -29,8 +29,8 @@ MAX_CORRELATION = 0.95  # limit on the correlation of A and B, which bias correc
 
 
 def faded(
-    x: Float[Tensor, "t *b"], keep: Float[Tensor, "*k"], state: Float[Tensor, "*s"] | None
-) -> Float[Tensor, "t *s"]:
+    x: Float[Tensor, " t *b"], keep: Float[Tensor, "*k"], state: Float[Tensor, "*s"] | None
+) -> Float[Tensor, " t *s"]:
     """Return running sums after each of t windows; each window multiplies earlier contributions by `keep`.
 
     `state` is the last sum of the previous windows; None at the start. `x` and `keep` are broadcast to its shape.

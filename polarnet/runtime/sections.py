@@ -12,7 +12,7 @@ from pydantic import AfterValidator, ConfigDict, ValidationError
 from pydantic.dataclasses import dataclass
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, coerce_numbers_to_str=True, defer_build=True)
+STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, coerce_numbers_to_str=True)
 EXPECTED = {
     "greater_than": "> {gt:g}",
     "greater_than_equal": ">= {ge:g}",
@@ -35,18 +35,16 @@ def section(config_class: type[Section]) -> type[Section]:
     A `__post_init__` may check fields together; its ValueError starts with the name of a field.
     """
     checked: Any = dataclass(config_class, frozen=True, config=STRICT)
-    init = checked.__init__
+    validate = checked.__init__
 
-    @functools.wraps(init)
-    def init_in_words(self: Any, *args: Any, **values: Any) -> None:
+    @functools.wraps(validate)
+    def init(self: Any, *args: Any, **values: Any) -> None:
         try:
-            init(self, *args, **values)
-        except ValidationError as error:
+            validate(self, *args, **values)
+        except ValidationError as error:  # pydantic has no hook that words a whole error anew
             raise ValueError("\n".join(_in_words(checked, one) for one in error.errors())) from None
-        finally:
-            checked.__init__ = init_in_words  # pydantic puts its own there when it builds the class at the first use
 
-    checked.__init__ = init_in_words
+    checked.__init__ = init
     return checked
 
 

@@ -108,8 +108,8 @@ def weights_of(
 
 
 def behind_polarizers(
-    stokes: Float32[np.ndarray, "3 *shape"], weights: Float32[np.ndarray, "sensors 3 *pixels"]
-) -> Float32[np.ndarray, "sensors *shape"]:
+    stokes: Float32[np.ndarray, " 3 *shape"], weights: Float32[np.ndarray, "sensors 3 *pixels"]
+) -> Float32[np.ndarray, " sensors *shape"]:
     """Digital numbers behind polarizers that weight S0, S1 and S2: alike at all pixels, or with a weight for each."""
     s0, s1, s2 = stokes
     return np.maximum(np.stack([a * s0 + b * s1 + c * s2 for a, b, c in weights]), 0) * FULL_SCALE

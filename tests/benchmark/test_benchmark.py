@@ -151,6 +151,7 @@ def test_a_predicted_value_that_is_not_a_number_is_named(sequence):
         at_stored_precision("m", "a", Prediction(sequence.dolp))
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_two_processes_give_the_rows_of_one(five_scenes, context, tmp_path):
     chosen = config(methods=["zeros", "cf"])
     mapper = functools.partial(pmap, workers=2, label="test")

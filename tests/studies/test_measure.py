@@ -4,11 +4,14 @@ import subprocess
 import pytest
 
 from polarnet.reports.provenance import git
+from studies import measure
 from studies.blocks import BLOCKS
 from studies.measure import (
     BENCHMARK_KEYS,
     _timed,
     ablation_about,
+    arguments_of,
+    command_line,
     machine_record,
     measure_ablation,
     measure_benchmark,
@@ -230,3 +233,13 @@ def test_figures_are_kept_where_the_tests_fail(tmp_path):
     later = json.loads(measure_tests(root).read_text())
     assert later == record | {"test_minutes": later["test_minutes"], "test_commit": git(root, "rev-parse", "HEAD")}
     assert (root / "docs" / "pictures" / "overview.png").read_bytes() == b"picture"
+
+
+def test_figures_of_a_changed_tree_may_be_measured_but_not_written(monkeypatch, capsys):
+    monkeypatch.setattr(measure, "uncommitted", lambda root: "M code.py")
+    monkeypatch.setattr("sys.argv", ["study"])
+    assert not arguments_of(command_line("A study.", "docs/results/a.json")).write
+    monkeypatch.setattr("sys.argv", ["study", "--write"])
+    with pytest.raises(SystemExit):
+        arguments_of(command_line("A study.", "docs/results/a.json"))
+    assert "commit first, because the figures name a commit; changed:\nM code.py" in capsys.readouterr().err

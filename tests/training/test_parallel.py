@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.multiprocessing
+from preloaded import FORKSERVER
 from test_loop import CPU, TRAIN, run, small_task
 
 from polarnet.networks.checkpoint import load_checkpoint
@@ -30,7 +31,9 @@ def test_two_processes_train_like_one_with_the_same_batches(stores, tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    torch.multiprocessing.spawn(train_as, (port, stores, tmp_path / "two"), nprocs=2)
+    torch.multiprocessing.start_processes(
+        train_as, (port, stores, tmp_path / "two"), nprocs=2, start_method=FORKSERVER.get_start_method()
+    )
     alone = run(small_task(), stores, tmp_path / "one", CONFIG)
     assert not list((tmp_path / "two" / "resume").iterdir())
     curves = [read_history(out) for out in (alone, tmp_path / "two" / "out")]
