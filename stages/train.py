@@ -44,7 +44,7 @@ def _task(config: Config) -> tuple[LoopConfig, Task]:
         task = dolp_task(config.network, config.network_config, config.train, loss, lpips(loss.lpips), config.seed)
         return config.train, task
     baseline, settings = BASELINES[config.baseline], getattr(config.baselines, config.baseline)
-    largest = max(getattr(settings, key) for key in baseline.lpips)
+    largest = max((getattr(settings, key) for key in baseline.lpips), default=0.0)
     return settings, baseline.task(settings, lpips(largest), config.seed)
 
 
