@@ -24,6 +24,7 @@ from polarnet.events.stream import Events
 
 MAX_LEAK_ERROR = 0.05  # relative; where shot noise hides the leak, ages are few, and their error is no measure of it
 MIN_PIXELS = 50
+MAX_SWING = 0.3  # of the OFF rate under constant light; larger: something moved or flickered
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,11 @@ def fit_sensor(
     noise = estimate_noise(ordered[0]) if static is not None else None
     if noise is not None:
         ordered = [chosen_pixels(events, ~noise.hot) for events in ordered]  # hot pixels do not follow the light
+        if noise.swing > MAX_SWING:
+            notes.append(
+                f"the rate of OFF events in the static recording varies by {noise.swing:.0%} beyond chance: its light was "
+                f"not constant, so its noise, hot pixels and refractory period mean nothing; record a still scene"
+            )
     durations_us = [intervals_of(one).duration_us for one in ordered]
     dead_time = piled_up_us(durations_us) or (between_shot_noise_us(durations_us[0]) if noise else None)
     reason = "no intervals of a pixel pile up at a shortest one, and shot noise is too rare to show it"

@@ -25,6 +25,7 @@ PRIOR_SPREAD_DECADES, PRIOR_JITTER, PRIOR_WIDTH = 0.1, 0.1, 0.5  # v2e's values;
 YOUNG = 0.4  # ages below this part of the mean leak interval see shot noise alone
 FAR = 6.0  # standard deviations beyond which the leak is certain not to have fired
 SHORTEST_S = 1e-6
+SWING_PARTS = 20
 
 
 class Noise(NamedTuple):
@@ -46,6 +47,8 @@ class Noise(NamedTuple):
     hot_rates_hz: Float64[np.ndarray, " hot"]
     """Events per second of each hot pixel."""
     duration_s: float
+    swing: float
+    """Relative standard deviation of the OFF rate over 20 parts of the time, beyond chance; 0 under constant light."""
 
 
 class _Ages(NamedTuple):
@@ -91,7 +94,19 @@ def estimate_noise(events: PixelEvents) -> Noise:
         hot=hot,
         hot_rates_hz=counts[hot] / duration_s,
         duration_s=duration_s,
+        swing=rate_swing(ordinary.t_us[~ordinary.on], events.t_us),
     )
+
+
+def rate_swing(times_us: Float64[np.ndarray, " n"], every_us: Float64[np.ndarray, " m"]) -> float:
+    """Relative standard deviation of a rate over equal parts of a recording, less that of a Poisson process.
+
+    `every_us` are the times of all events, which span the recording.
+    """
+    if len(times_us) == 0:
+        return 0.0
+    counts, _ = np.histogram(times_us, SWING_PARTS, (every_us.min(), every_us.max()))
+    return math.sqrt(max(counts.var(ddof=1) - counts.mean(), 0.0)) / float(counts.mean())
 
 
 def nominal_shot_noise_hz(

@@ -9,6 +9,7 @@ from polarnet.characterization.noise import (
     hot_under_constant_light,
     mean_inverse,
     nominal_shot_noise_hz,
+    rate_swing,
 )
 
 PIXELS, DURATION_S = 600, 60.0
@@ -59,3 +60,11 @@ def test_a_pixel_is_hot_above_ten_times_the_median_and_ten_events():
 def test_too_few_events_are_refused():
     with pytest.raises(ValueError, match="record for longer"):
         estimate_noise(recorded([np.arange(5.0)], [np.ones(5, bool)]))
+
+
+def test_the_rate_of_a_poisson_process_does_not_swing_and_that_of_a_passing_edge_does():
+    generator = np.random.default_rng(5)
+    steady = generator.uniform(0, 1e6, 2000)
+    assert rate_swing(steady, steady) < 0.06
+    edge = np.concatenate([steady, generator.uniform(4e5, 5e5, 2000)])  # two of 20 parts have eleven times the rate
+    assert rate_swing(edge, edge) == pytest.approx(1.54, abs=0.1)  # 100 and 1,100: mean 200, deviation 308
