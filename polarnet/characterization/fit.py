@@ -76,8 +76,8 @@ def fit_sensor(
         ordered = [chosen_pixels(events, ~noise.hot) for events in ordered]  # hot pixels do not follow the light
         if noise.swing > MAX_SWING:
             notes.append(
-                f"the rate of OFF events in the static recording varies by {noise.swing:.0%} beyond chance: its light was "
-                f"not constant, so its noise, hot pixels and refractory period mean nothing; record a still scene"
+                f"the rate of OFF events in the static recording varies by {noise.swing:.0%} beyond chance: its light "
+                f"was not constant, so its noise, hot pixels and refractory period mean nothing; record a still scene"
             )
     durations_us = [intervals_of(one).duration_us for one in ordered]
     dead_time = piled_up_us(durations_us) or (between_shot_noise_us(durations_us[0]) if noise else None)

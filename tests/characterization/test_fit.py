@@ -88,7 +88,7 @@ def test_without_known_light_thresholds_are_missing_and_keep_the_default(static)
 
 def test_a_moving_recording_given_as_the_static_one_is_noted(fit, moving):
     assert not any("constant" in note for note in fit.notes)
-    assert "light was not constant" in fit_sensor(moving.events, 200.0, []).notes[0]
+    assert "was not constant" in fit_sensor(moving.events, 200.0, []).notes[0]
 
 
 def test_hot_pixels_are_counted_and_their_rate_is_their_mean(fit, static):
