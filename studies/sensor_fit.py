@@ -150,7 +150,7 @@ def main() -> None:
     """The command line."""
     parser = command_line(__doc__, "docs/results/camera.json")
     parser.add_argument("--sensors", type=int, default=12)
-    parser.add_argument("--seed", type=int, default=1, help="of the drawn sensors (default: 1, the documented ones)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the drawn sensors; 1: the documented ones")
     parser.add_argument("--frame-rate", type=int, default=100, help="frames per second that the fit gets")
     parser.add_argument("--light", nargs="+", choices=("frames", "flicker"), default=["frames", "flicker"])
     arguments = arguments_of(parser)
