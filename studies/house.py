@@ -29,7 +29,7 @@ RETIRED = {
     "evened for drawn towards one polarization": r"\b(?:un)?evened\b",
     "private names": r"\b_shoot\w*|\b_settle\w*|\b_hand_back\w*|\b_check_taken\b|\bOF_LOG_VARIANCE\b"
     r"|\bkept_in_memory\b",
-    "participles as names": r"\b(?:found|seen|told|shown|kept|made)\b(?=(?:: [^\"']*)? = )",
+    "participles as names": r"\b(?:found|seen|told|shown|kept|made)\b(?=(?:: [^\"'\n]*)? = )",
     "what as a noun phrase": r"(?:\"\"\"|# )What (?!.*\?)",
     "of before a noun": r"(?:\"\"\"|# )Of (?!.*\?)|help=f?\"(?:of|where) ",
 }
