@@ -29,10 +29,10 @@ def test_below_20_digital_numbers_the_response_is_linear_in_the_light():
 
 
 def test_the_photoreceptor_lags_a_ramp_by_one_time_constant():
-    light = light_of(100 * np.exp([0, 0.85, 0.9, 0.95]), [0, 850, 900, 950])  # 1 per second
-    bandwidth_hz = 50 * (100 * math.exp(0.9) + 20) / 275
+    light = light_of([100, 100 * math.e], [0, 1000])  # 1 per second, in four pieces: the last from 750 to 1000 ms
+    bandwidth_hz = 50 * ((100 * math.exp(0.75) + 100 * math.e) / 2 + 20) / 275
     lag = math.log(100) + 0.9 - responses(light, [900], 50.0)[0]
-    assert lag == pytest.approx(1 / (2 * math.pi * bandwidth_hz), rel=0.02)
+    assert lag == pytest.approx(1 / (2 * math.pi * bandwidth_hz), rel=1e-4)
 
 
 def test_a_parabola_of_the_logarithm_is_met_between_frames():
