@@ -37,9 +37,9 @@ PATIENCE_S = 5  # with libraries that a damaged file sends round in circles; the
 
 def run_cases(form: str, first: int, cases: int) -> None:
     """In a process of its own: a line of JSON for each batch from number `first` on."""
-    sys.path[:0] = [str(ROOT / "tests" / "recordings")]
-    from conftest import random_events
+    sys.path[:0] = [str(ROOT / "tests" / "recordings"), str(ROOT / "tests")]
     from damaged_files import DAMAGE, EVENTS, Sample
+    from recording_fixtures import random_events
 
     isolated.PATIENCE_S = PATIENCE_S
     with tempfile.TemporaryDirectory() as folder:

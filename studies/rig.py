@@ -31,7 +31,7 @@ from polarnet.benchmark.score import FrameScore, summary
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig, read_event_capture
 from polarnet.captures.imported import import_targets
 from polarnet.captures.targets import Calibrated, calibrate_targets
-from polarnet.config.pipeline import context_of, made_set
+from polarnet.config.pipeline import RECORDINGS, context_of, made_set, rows_of_set
 from polarnet.config.tree import Config, load
 from polarnet.events.stream import Events, slice_time
 from polarnet.pictures.dead_leaves import dead_leaves
@@ -123,7 +123,7 @@ def clock_zero_us(truth: RigTruth, found: Calibrated) -> float:
 def benchmarked(folder: Path, names: list[str], config: Config) -> dict[str, dict[str, Any]]:
     """The benchmark's scores over all targets, each in a store of its own, printed as a table."""
     context = context_of(config, train_mean=None)
-    methods, absent = available(config.benchmark.methods, context)
+    methods, absent = available(rows_of_set(RECORDINGS, config.benchmark.methods), context)
     benchmark = replace(config.benchmark, methods=methods, panel_scenes=0)
     rows: list[FrameScore] = []
     costs: dict[str, dict[str, Any]] = {}
