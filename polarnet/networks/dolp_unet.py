@@ -33,7 +33,8 @@ class DolpUNetConfig:
     residual_blocks: NonNegativeInt
     """Number of residual blocks; the paper has two, R1 and R2."""
     input_mixing: Annotated[str, one_of(("polarizers", "contrasts"))]
-    """Input of C1. polarizers: the four channels, as in the paper; contrasts: their sum and differences."""
+    """Input of C1. polarizers: the four event tensors, as in the paper; contrasts: their sum and differences, on a
+    logarithmic scale."""
 
     def __post_init__(self):
         if len(self.channels) != 3 or len(self.swin_heads) != 2:
@@ -46,8 +47,8 @@ class DolpUNetConfig:
 class DolpUNet(nn.Module):
     """The paper's recurrent network from event tensors of four channels to DoLP, window by window.
 
-    The input of C1 is the four tensors, mixed according to `input_mixing` and `compressed`. The output is linear, so
-    that gradients do not vanish near 0 or 1. It can therefore leave [0, 1]; code that scores or displays it clamps it.
+    The input of C1 is the four tensors, mixed according to `input_mixing`. The output is linear, so that
+    gradients do not vanish near 0 or 1. It can therefore leave [0, 1]; code that scores or displays it clamps it.
     """
 
     representation = "event_tensor"
@@ -84,7 +85,7 @@ class DolpUNet(nn.Module):
     ) -> tuple[Prediction, list[Tensor]]:
         """Process t windows of b streams at once: same result as `forward` per window, in fewer operations."""
         t, b, _, height, width = inputs.shape
-        x = compressed(self.mix(inputs)).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+        x = self.mix(inputs).flatten(0, 1).contiguous(memory_format=torch.channels_last)
         x = F.pad(x, (0, -width % STRIDE, 0, -height % STRIDE))  # the padding holds no events
         state1, state2 = state or (None, None)
 
@@ -102,4 +103,7 @@ class DolpUNet(nn.Module):
         return Prediction(dolp), [state1, state2]
 
 
-INPUT_MIXINGS: dict[str, Callable[[Tensor], Tensor]] = {"polarizers": lambda events: events, "contrasts": contrasts}
+INPUT_MIXINGS: dict[str, Callable[[Tensor], Tensor]] = {
+    "polarizers": lambda events: events,
+    "contrasts": lambda events: compressed(contrasts(events)),
+}

@@ -26,6 +26,7 @@ from polarnet.pictures.images import (
     write_png,
 )
 from polarnet.pictures.manifest import (
+    SPLITS,
     Manifest,
     ManifestEntry,
     Skipped,
@@ -318,6 +319,12 @@ def _check_not_empty(config: IngestConfig, manifest: Manifest) -> None:
     for split, fraction in (("train", 1 - val - test), ("val", val), ("test", test)):
         if fraction > 0 and not manifest.counts[split]:
             logger.warning("no picture is in split %s: %d pictures are few", split, len(manifest.pictures))
+    if config.source != "builtin" and config.limit is not None and len(manifest.pictures) < config.limit:
+        counts = ", ".join(f"{manifest.counts[split]} {split}" for split in SPLITS)
+        logger.warning(
+            "ingest.limit=%d: the folder has only %d usable pictures, split into %s; for other numbers change "
+            "ingest.val_fraction and ingest.test_fraction", config.limit, len(manifest.pictures), counts,
+        )  # fmt: skip
 
 
 def _refuse_folder(config: IngestConfig, found: int, ignored: int, skipped: Sequence[Skipped]) -> NoReturn:

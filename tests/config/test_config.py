@@ -79,7 +79,7 @@ def test_a_typo_on_the_command_line_is_refused_with_the_keys_there_are(project_r
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("experiment=smok", r"experiment: there is no 'smok'; conf/experiment has demo, paper, photographs, smoke$"),
+        ("experiment=smok", r"experiment: there is no 'smok'; conf/experiment has demo, paper, paper_small, photographs, smoke$"),
         ("sensor=noizy", r"sensor: there is no 'noizy'; conf/sensor has clean, default, noisy, random$"),
         ("ablation=glob(moz*)", r"ablation: there is no 'moz\*'; conf/ablation has crop, "),
         ("ablation=nothing,panoramma", r"ablation: there is no 'panoramma'; conf/ablation has crop, memories, "),
@@ -185,6 +185,18 @@ def test_the_paper_experiment_holds_the_papers_values(project_root):
     assert (config.train.learning_rate, config.train.batch_size, config.train.epochs) == (1e-4, 2, 250)
     assert (config.loss.mse, config.loss.ssim, config.loss.lpips) == (1.0, 1.0, 10.0)
     assert (config.lpips.backbone, config.benchmark.lpips_backbone) == ("vgg", "vgg")
+    assert config.used_baselines == ["e2v"]  # E2P is trained only if a row asks for it
+    with_e2p = load(project_root, ["experiment=paper", "baselines.trained=[e2v,e2p]", "benchmark.methods=[e2p,ours]"])
+    assert with_e2p.used_baselines == ["e2p"]
+
+
+def test_the_small_paper_experiment_differs_from_the_papers_in_size_alone(project_root):
+    paper, small = (preset_values(project_root, "experiment", name) for name in ("paper", "paper_small"))
+    assert set(paper) == set(small)
+    assert {key for key in paper if paper[key] != small[key]} == {
+        "ingest.limit", "ingest.val_fraction", "ingest.test_fraction", "storage.sequences_per_part", "train.epochs",
+        "train.precision", "baselines.e2v.epochs", "baselines.e2v.windows", "baselines.e2v.crop",
+    }  # fmt: skip
 
 
 def hide_lpips_weights(torch_home: Path) -> None:
@@ -287,7 +299,7 @@ def test_a_preset_keeps_comments_and_unrelated_values_and_the_base_undoes_it(pro
 
 
 def test_an_unknown_preset_lists_the_ones_there_are(project):
-    with pytest.raises(ValueError, match="no preset 'papper'; there are experiment: demo, paper, photographs, smoke;"):
+    with pytest.raises(ValueError, match="no preset 'papper'; there are experiment: demo, paper, paper_small, photographs, smoke;"):
         write_preset(project, "papper")
 
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -67,6 +69,16 @@ def test_every_parameter_has_a_gradient_from_two_windows():
     network = small()
     network.unroll(torch.randn(2, 1, 4, 16, 16))[0].dolp.sum().backward()
     assert [name for name, p in network.named_parameters() if p.grad is None or not p.grad.any()] == []
+
+
+@torch.no_grad()
+def test_the_papers_input_is_the_four_event_tensors_as_they_are():
+    torch.manual_seed(0)
+    network, tensors = DolpUNet(replace(SMALL, input_mixing="polarizers")).eval(), 3 * torch.randn(1, 4, 12, 20)
+    seen = []
+    network.c1.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    network(tensors)
+    torch.testing.assert_close(seen[0], tensors, rtol=0, atol=0)
 
 
 def test_inputs_are_compressed_logarithmically_with_their_sign():

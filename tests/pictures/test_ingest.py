@@ -158,6 +158,19 @@ def test_a_limit_takes_the_same_pictures_whatever_they_are_called(tmp_path):
     assert chosen[0] == chosen[1]
 
 
+def test_fewer_pictures_than_the_limit_are_announced_with_the_split(tmp_path, caplog):
+    (tmp_path / "pictures").mkdir()
+    for i in range(10):
+        Image.fromarray(photograph(i)).save(tmp_path / "pictures" / f"{i}.png")
+    config = dataclasses.replace(CONFIG, root=str(tmp_path / "pictures"), val_fraction=0.05, test_fraction=0.05)
+    for limit, messages in ((11, 1), (10, 0)):
+        caplog.clear()
+        ingest(dataclasses.replace(config, limit=limit), 1, tmp_path / "images", map)
+        assert len(caplog.messages) == messages
+        split = "ingest.limit=11: the folder has only 10 usable pictures, split into 8 train, 1 val, 1 test; "
+        assert all(message.startswith(split) for message in caplog.messages)
+
+
 def test_ingest_replaces_what_was_there(tmp_path):
     config = dataclasses.replace(CONFIG, root=str(tmp_path / "pictures"))
     (tmp_path / "pictures").mkdir()
