@@ -6,12 +6,14 @@ from pathlib import Path
 from polarnet.captures.imported import start_over
 from polarnet.captures.targets import calibrate_targets
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.reports.recordings import draw_calibration
+from polarnet.reports.recordings import draw_calibration, draw_sequence
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
 
 
 @hydra_stage
 def main(config: Config) -> None:
-    """Find the start times, write both stores, and plot the evidence for the start times."""
+    """Find the start times, write both stores, and draw the start times' evidence and the paper's Fig. 8."""
     out = Path(config.paths.calibrated)
     if not config.recordings.enabled:
         start_over(out, enabled=False)
@@ -22,8 +24,10 @@ def main(config: Config) -> None:
         targets = calibrate_targets(Path(config.paths.imported), out, config.recordings, about)
     except ValueError as error:
         raise SystemExit(str(error)) from None
+    events, frames = EventStore.open(out / "events.zarr"), FrameStore.open(out / "frames.zarr")
     for target in targets:
         draw_calibration(target, config.recordings, out / f"{target.name}.png")
+        draw_sequence(events.read(target.name), frames.frames(target.name), out / f"{target.name}_figure_8")
         print(f"{target.name}: {target.duration_us * 1e-6:.2f} s, hot pixels {sum(target.hot.values())}")
 
 

@@ -4,10 +4,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from polarnet.reports.legend import LABELS
-from polarnet.reports.tables import COLUMNS, COSTS, paired_lines, score_table, standing
+from polarnet.reports.tables import COLUMNS, COSTS, as_markdown, paired_lines, score_table, standing
 from studies.network_blocks import NETWORK_BLOCKS
+from studies.paper import duration_rows, table_rows
 from studies.rotating import CURVES
-from studies.tables import Block, Columns, Results, Row, as_markdown, listed
+from studies.tables import Block, Columns, Results, Row, listed
 
 ROOT = Path(__file__).resolve().parents[1]
 GOLDEN_CASES = 23  # 15 of v2e, 8 of ESIM
@@ -65,10 +66,13 @@ def _benchmark_lines(name: str) -> Callable[[Results], list[str]]:
 
 
 def _benchmark(name: str) -> Block:
+    def rows(results: Results) -> str:
+        warmup_windows = results["about"][name]["warmup_windows"]
+        return as_markdown(score_table(results[name], BENCHMARK_COLUMNS, warmup_windows=warmup_windows))
+
     caption = f"{{about[{name}][scenes]}} scenes, {{about[{name}][frames]}} frames. {{origin}}"
     return Block(
-        "benchmark", name, "studies.study", lambda results: as_markdown(score_table(results[name], BENCHMARK_COLUMNS)),
-        caption=caption, lines=_benchmark_lines(name),
+        "benchmark", name, "studies.study", rows, caption=caption, lines=_benchmark_lines(name),
     )  # fmt: skip
 
 
@@ -209,6 +213,23 @@ BLOCKS = NETWORK_BLOCKS | {
         "house", "house", "studies.house --write",
         lambda results: [{"name": name, **one} for name, one in results["house"]["folders"].items()],
         {"folder": "`{name}`", "files": "{files:,}", "lines": "{lines:,}"}, caption="",
+    ),
+    "paper-rows": Block(
+        "paper", "rows", "studies.paper", table_rows,
+        {
+            "the paper": "{row}", "section": "{paper}", "status": "{status}", "where in polarnet": "{where}",
+            "note": "{note}", "tested by": "{test}",
+        },
+        "{rows_total} rows: {rows_exact} exact, {rows_chosen} chosen, {rows_stated} stated.",
+    ),
+    "paper-duration": Block(
+        "lpips", "cost", "studies.lpips", duration_rows,
+        {
+            "experiment": "`{name}`", "precision": "{precision}", "windows": "{windows:,}",
+            "windows/s": "{rate:.2f}", "hours": "{hours:.0f}",
+        },
+        "Training of the network with its loss, VGG included, on two cores; without E2VID, validation and simulation. "
+        "{origin}",
     ),
     "polarizer-presets": Block(
         "camera", "polarizer_presets", "studies.polarizer_presets",

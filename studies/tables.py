@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from statistics import fmean, stdev
 from typing import Any
 
-from polarnet.reports.tables import Table
-
 Results = Mapping[str, Any]
 Row = Mapping[str, Any]
 Columns = Mapping[str, str]
@@ -88,16 +86,3 @@ def origin(record: Mapping[str, Any]) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
     where = f"{record['machine']}, load {record['load']:.1f} before the start"
     return f"On {cores} ({where}; {versions}; commit `{record['commit'][:10]}`)."
-
-
-def as_markdown(table: Table) -> str:
-    """A GitHub table: best values in bold, intervals small below their values, notes at the end."""
-    lines = ["| | " + " | ".join(table.headings) + " |", "|---|" + "---:|" * len(table.headings)]
-    for row in table.rows:
-        cells = (
-            (f"**{cell.text}**" if cell.best else cell.text)
-            + (f"<br><sub>{cell.interval}</sub>" if cell.interval else "")
-            for cell in row.cells
-        )
-        lines.append(f"| {row.label} | " + " | ".join(cells) + " |")
-    return "\n".join(lines + [f"\n{note}" for note in table.notes])

@@ -23,7 +23,7 @@ from polarnet.benchmark.resimulate import sequence_at
 from polarnet.benchmark.rows import Context, opened, predictions_of
 from polarnet.benchmark.score import FrameScore, mean_scores, score_sequence
 from polarnet.benchmark.sequences import TestSequence
-from polarnet.events.stream import Events, slice_count
+from polarnet.events.stream import Events, slice_count, slice_time
 from polarnet.events.streaming import EventWindow
 from polarnet.methods import METHODS
 from polarnet.metrics.similarity import correlation, mse, psnr
@@ -112,6 +112,24 @@ def _means(rows: Sequence[FrameScore], method: str) -> dict[str, Any]:
     return {"frames": len(of_method), "scenes": len(scenes), **mean_scores(of_method, SHOWN)[method]}
 
 
+def growing_window(channels: Sequence[Events], t_us: int) -> EventWindow:
+    """All events before a time, as one window from time 0 (Fig. 11a)."""
+    return EventWindow([slice_time(events, 0, t_us) for events in channels], 0, t_us)
+
+
+def last_window(channels: Sequence[Events], count: int, t_us: int) -> EventWindow:
+    """The last `count` events of each channel before a time, as one window from the first of them (Fig. 11b)."""
+    last = _last(channels, count, t_us)
+    return EventWindow(last, min((int(events.t[0]) for events in last if len(events)), default=t_us), t_us)
+
+
+def recovered_alone(windows: Sequence[EventWindow], method: str, context: Context) -> Float[Tensor, "n h w"]:
+    """DoLP from each window alone, without a state."""
+    recoverer, first = opened(METHODS[method], context), windows[0].channels[0]
+    start = recoverer.start(first.height, first.width)
+    return torch.cat([recoverer.step(start, [window])[1].dolp.cpu() for window in windows])
+
+
 @torch.no_grad()
 def sliding_recovery(
     sequence: TestSequence, count: int, t_us: Sequence[int], carry: bool, method: str, context: Context
@@ -125,9 +143,7 @@ def sliding_recovery(
     start = recoverer.start(sequence.events[0].height, sequence.events[0].width)
     state, frames = start, []
     for t in t_us:
-        channels = _last(sequence.events, count, t)
-        first_us = min((int(events.t[0]) for events in channels if len(events)), default=t)
-        after, prediction = recoverer.step(state, [EventWindow(channels, first_us, t)])
+        after, prediction = recoverer.step(state, [last_window(sequence.events, count, t)])
         state = after if carry else start
         frames.append(prediction.dolp[0].cpu())
     return torch.stack(frames)

@@ -5,7 +5,7 @@ landmark enters a region of the picture. That moment is time 0 of the clock that
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -16,6 +16,7 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from polarnet.events.stream import Events, concatenate, crop
+from polarnet.pictures.clips import TIMES_FILE, VIDEOS, ClipOptions, check_times, open_clip, times_from_file
 from polarnet.recordings.formats.celex5_bin import Picture, celex5_pictures
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
@@ -93,13 +94,16 @@ class IntensityCapture(NamedTuple):
 
 
 def find_captures(folder: Path) -> dict[str, Path]:
-    """The eight files of a target: events_0.*, ..., events_135.*, intensity_0.*, ..., intensity_135.*.
+    """The eight captures of a target: events_0.*, ..., events_135.*, intensity_0.*, ..., intensity_135.*.
 
+    An intensity capture is a BIN file, a video, or a folder of frames; intensity_0.txt holds the times of a video.
     RecordingError where a capture has no file or more than one.
     """
     captures = {}
     for name in (*EVENT_CAPTURES, *INTENSITY_CAPTURES):
-        files = sorted(path for path in folder.glob(f"{name}.*") if path.stem == name)
+        files = sorted(path for path in folder.glob(f"{name}*") if path.stem == name)
+        if name in INTENSITY_CAPTURES:
+            files = [path for path in files if path.suffix != ".txt"]
         if len(files) != 1:
             there = ", ".join(path.name for path in files) or "none"
             raise RecordingError(
@@ -143,18 +147,41 @@ def read_event_capture(path: Path, config: RecordingsConfig) -> Events:
 
 
 def read_intensity_capture(path: Path, config: RecordingsConfig) -> IntensityCapture:
-    """The pictures of a BIN file; RecordingError where it has fewer than two, or they have no times."""
+    """The pictures of a BIN file, a video or a folder of frames, whose values are linear in light.
+
+    RecordingError where there are fewer than two, where they have no times or are smaller than the sensor.
+    """
     (top, left), (height, width) = config.crop_corner, config.crop
     times, pictures, region = [], [], []
-    for k, picture in enumerate(celex5_pictures(path)):
+    bin_file = path.is_file() and path.suffix.lower().lstrip(".") not in VIDEOS
+    for k, picture in enumerate(celex5_pictures(path) if bin_file else _frames(path)):
+        if any(side < used for side, used in zip(picture.intensity.shape, config.sensor, strict=True)):
+            size = "x".join(map(str, picture.intensity.shape))
+            raise RecordingError(f"{path.name}: recordings.sensor is {config.sensor}, its pictures are {size}")
         times.append(_stamp_us(path, k, picture, config))
         pictures.append(picture.intensity[top : top + height, left : left + width].copy())
         region.append(float(region_of(picture.intensity, config).mean()) / STEPS_OF_8_BITS)
     if len(pictures) < 2:
         raise RecordingError(f"{path.name}: expected at least two full pictures, got {len(pictures)}")
     stamps_us = np.array(times, np.int64)
-    t_us = stamps_us if config.picture_rate_hz else regular_times_us(path.name, stamps_us)
+    if bin_file and config.picture_rate_hz is None:
+        t_us = regular_times_us(path.name, stamps_us)
+    else:
+        t_us = check_times(stamps_us.astype(np.float64), path.name) + stamps_us[0]
     return IntensityCapture(t_us, np.stack(pictures), np.array(region))
+
+
+def _frames(path: Path) -> Iterator[Picture]:
+    """Frames of a video or a folder as grey pictures on the scale of a BIN file, timed by a text or the video."""
+    file = path / TIMES_FILE if path.is_dir() else path.with_suffix(".txt")
+    stated = times_from_file(file, "us") if file.is_file() else None
+    clip = open_clip([path], ClipOptions(grey=True))
+    for k, frame in enumerate(clip.frames()):
+        if stated is not None and k >= len(stated):
+            raise RecordingError(f"{path.name}: expected a time for each frame, {file.name} has only {len(stated)}")
+        t_us = frame.t_us if stated is None else float(stated[k])
+        grey = np.rint(frame.pixels[..., 0] * (255 * STEPS_OF_8_BITS)).astype(np.uint16)
+        yield Picture(None if t_us is None else round(t_us), grey)
 
 
 def reduced(crop: UInt16[np.ndarray, "h w"], config: RecordingsConfig) -> Float32[np.ndarray, "h2 w2"]:
@@ -240,8 +267,8 @@ def _stamp_us(path: Path, k: int, picture: Picture, config: RecordingsConfig) ->
         return round(k * 1e6 / config.picture_rate_hz)
     if picture.t_us is None:
         raise RecordingError(
-            f"{path.name}: its pictures have no times (recorded without the IMU's data); "
-            f"set recordings.picture_rate_hz to the rate they were taken at"
+            f"{path.name}: its pictures have no times (a BIN file recorded without the IMU's data, or frames without "
+            f"{TIMES_FILE}); set recordings.picture_rate_hz to the rate they were taken at"
         )
     return picture.t_us
 

@@ -48,7 +48,7 @@ def import_targets(root: Path, out: Path, config: RecordingsConfig) -> list[str]
     start_over(out, enabled=True)
     attributes = {
         "sensor": list(config.sensor),
-        "files": {name: {key: sha256(path) for key, path in find_captures(root / name).items()} for name in names},
+        "files": {name: {key: _hash(path) for key, path in find_captures(root / name).items()} for name in names},
     }
     store = EventStore.create(out / "events.zarr", names, config.sensor[0], config.sensor[1], attributes)
     for name in names:
@@ -86,6 +86,11 @@ def open_target(imported: Path, name: str) -> Target:
             pictures = np.load(folder / f"{capture}.npy", mmap_mode="r")
             intensities[capture] = IntensityCapture(times["t_us"], pictures, times["region"])
     return Target(name, events, intensities, clocks["given_us"])
+
+
+def _hash(capture: Path) -> str:
+    """SHA-256 of a capture's file, or of the files of its folder one after another, by name."""
+    return sha256(*(sorted(capture.iterdir()) if capture.is_dir() else [capture]))
 
 
 def start_over(out: Path, *, enabled: bool) -> None:

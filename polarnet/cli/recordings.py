@@ -66,7 +66,8 @@ def _add_recovery(commands: Commands) -> None:
     recover = commands.add_parser(
         "recover",
         help="recover DoLP and AoLP from recordings or from a running camera",
-        description="Writes frames, pictures, a video and a page. INPUT is one of: four files, one for each polarizer, "
+        description="Writes frames, pictures, a video and a page. With a --method that reconstructs intensity, any "
+        "other file of a camera gives plain intensity. INPUT is one of: four files, one for each polarizer, "
         "with --angles; one file of a camera with polarizers on its pixels, with --mosaic; one file of a "
         "camera behind a rotating polarizer, with --rotating or --triggers; an event store; a folder of "
         "division-of-time captures; with --live, a growing file or standard input (-) with lines `t x y p angle`.",
@@ -126,8 +127,9 @@ def _add_method(recover: argparse.ArgumentParser) -> None:
         "--rotating: half a turn)",
     )
     recover.add_argument(
-        "--weights", type=Path, metavar="FILE", help="checkpoint of the network (default: the shipped one)"
-    )
+        "--weights", type=Path, metavar="FILE",
+        help="checkpoint of the network (default: the shipped one), or file of the --method's network"
+    )  # fmt: skip
     recover.add_argument(
         "--thresholds",
         nargs=2,
@@ -231,16 +233,19 @@ def _recover(options: argparse.Namespace) -> int:
             arrangement = Arrangement(options.angles, mosaic, options.sequence)
             size = (options.size[0], options.size[1]) if options.size else None
             files, captures = [Path(path) for path in options.input], lambda: config().recordings
-            source = open_files(files, arrangement, read, size, folder / WORK, captures)
+            source = open_files(files, arrangement, read, size, folder / WORK, captures, _reconstructs(options.method))
         check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
-        source = source._replace(pieces=check.watch(source.pieces))
+        if source.channels == len(POLARIZER_ANGLES_DEG):
+            source = source._replace(pieces=check.watch(source.pieces))
         writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
         summary = recover(source, rule, recoverer, writer)
         left_out = {kind: count for kind, count in lines.counts.items() if count} if lines else {}
-        notes = [*check.findings(), *([f"Unusable lines were left out: {left_out}."] if left_out else [])]
+        notes = check.findings() if source.channels > 1 else []
+        notes += [f"Unusable lines were left out: {left_out}."] if left_out else []
         counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)
         facts = facts_of(source, rule, words, summary)
-        facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
+        if source.channels > 1:
+            facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
         page = writer.write_page(source.name, facts, notes)
     for key, value in facts.items():
         print(f"{key:11s} {value}")
@@ -248,6 +253,13 @@ def _recover(options: argparse.Namespace) -> int:
         print(f"polarnet recover: warning: {note}", file=sys.stderr)
     print(f"page        {out / page.name}")
     return 0
+
+
+def _reconstructs(method: str | None) -> bool:
+    """Whether a method reconstructs intensity from one channel; NAME+gain needs four."""
+    from polarnet.methods import METHODS
+
+    return method in METHODS and METHODS[method].reconstructs and METHODS[method].wraps is None
 
 
 def _recover_rotating(options: argparse.Namespace) -> int:

@@ -16,7 +16,7 @@ SHORTEST_STEP_US = 100
 
 
 class EventWindow(NamedTuple):
-    """Events of the four channels (0, 45, 90, 135 degrees) with start_us <= t < stop_us."""
+    """Events with start_us <= t < stop_us of the four channels (0, 45, 90, 135 degrees), or of one channel."""
 
     channels: Sequence[Events]
     start_us: int
@@ -74,20 +74,20 @@ class WindowCutter:
     later window needs are dropped. Times count from 0.
     """
 
-    def __init__(self, rule: WindowRule, height: int, width: int):
+    def __init__(self, rule: WindowRule, height: int, width: int, channels: int = 4):
         self.rule = rule
-        self._held = [Events.empty(height, width) for _ in range(4)]
+        self._held = [Events.empty(height, width)] * channels
         self._next_us = rule.length_us if rule.length_us is not None else rule.step_us
         self._start_us = 0
 
     def add(self, channels: Sequence[Events], until_us: int) -> Iterator[EventWindow]:
         """Add new events; yields the windows that are complete once every event before `until_us` has arrived.
 
-        ValueError unless there are four channels of the same size as before, with no event earlier than those already
-        added.
+        ValueError unless there are as many channels as before, of the same size, with no event earlier than those
+        already added.
         """
-        if len(channels) != 4:
-            raise ValueError(f"expected the events of four polarizers, got {len(channels)} channels")
+        if len(channels) != len(self._held):
+            raise ValueError(f"expected the events of {len(self._held)} channels, got {len(channels)} channels")
         self._held = [concatenate([held, new]) for held, new in zip(self._held, channels, strict=True)]
         if self.rule.length_us is not None:
             return self._by_time(self.rule.length_us, until_us)

@@ -123,7 +123,7 @@ def open_filter(setup: Setup, intensity: Callable[[Image], Image]) -> Recoverer:
         for window in windows:
             new = [slice_time(events, state.t_us, window.stop_us) for events in window.channels]
             state = integrate(state, new, window.stop_us, setup.config)
-            images.append(image_of(state, setup.config, intensity))
+            images.append(image_of(state, setup.config, intensity)[: len(new)])
         return state, from_intensities(torch.stack(images))
 
     return Recoverer(functools.partial(at_rest, 4), predict, takes_events_once=True)

@@ -88,6 +88,6 @@ def intensity_network(network: Any, setup: Setup, *, normalised: bool = True, sh
     return Recoverer(lambda height, width: None, predict, network=network)
 
 
-def voxel_grids(window: EventWindow, bins: int) -> Float[Tensor, "4 bins h w"]:
+def voxel_grids(window: EventWindow, bins: int) -> Float[Tensor, "c bins h w"]:
     """Voxel grid of each channel."""
     return torch.stack([voxel_grid(events, bins) for events in window.channels])

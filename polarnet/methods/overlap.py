@@ -51,9 +51,9 @@ def advance(recoverer: Recoverer, history: History, windows: Sequence[EventWindo
     return history, prediction
 
 
-def warm_up(recoverer: Recoverer, height: int, width: int) -> None:
+def warm_up(recoverer: Recoverer, height: int, width: int, channels: int = 4) -> None:
     """Run two empty windows, so that kernels are loaded before the first real window."""
-    nothing = [Events.empty(height, width)] * 4
+    nothing = [Events.empty(height, width)] * channels
     state = recoverer.start(height, width)
     for k in range(2):  # without and with a state
         state, _ = recoverer.step(state, [EventWindow(nothing, 1000 * k, 1000 * (k + 1))])

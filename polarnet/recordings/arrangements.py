@@ -55,6 +55,11 @@ def read_mosaic(
     return _from_first_event(split_mosaic(read(Path(path)).events, mosaic))
 
 
+def read_plain(path: Path, read: Callable[[Path], Recording]) -> list[Events]:
+    """One channel: all events of a camera without polarizers; time starts with its first event."""
+    return _from_first_event([read(path).events])
+
+
 def shifted(events: Events, origin_us: int) -> Events:
     """The same events, with `origin_us` as time 0."""
     return Events(events.t - origin_us, events.x, events.y, events.p, events.height, events.width)

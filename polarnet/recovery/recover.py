@@ -26,7 +26,7 @@ from polarnet.methods.method import Method, Recoverer, Setup, each_map, why_abse
 from polarnet.methods.overlap import advance, begin, warm_up
 from polarnet.networks.checkpoint import load_network
 from polarnet.networks.weights import shipped_weights
-from polarnet.recordings.arrangements import read_four, read_mosaic
+from polarnet.recordings.arrangements import read_four, read_mosaic, read_plain
 from polarnet.recordings.live import LiveLines, Piece, live_lines
 from polarnet.recordings.recording import Recording, detect_format
 from polarnet.recovery.writer import RecoveryWriter
@@ -54,7 +54,7 @@ class Arrangement:
 
 
 class Input(NamedTuple):
-    """Events of four channels of equal size, read whole or piece by piece."""
+    """Events of channels of equal size, read whole or piece by piece."""
 
     name: str
     height: int
@@ -62,6 +62,8 @@ class Input(NamedTuple):
     pieces: Iterable[Piece]
     duration_us: int | None
     """None for live input, whose duration is unknown."""
+    channels: int = 4
+    """4, or 1 for a camera without polarizers, of which only intensity can be recovered."""
 
 
 class Frame(NamedTuple):
@@ -103,24 +105,26 @@ def open_files(
     size: tuple[int, int] | None,
     work: Path,
     captures: Callable[[], RecordingsConfig],
+    plain: bool = False,
 ) -> Input:
-    """Read four channels from files, starting at time 0 and reduced to `size` (height, width) if given.
+    """Read channels from files, starting at time 0 and reduced to `size` (height, width) if given.
 
     Four files hold one channel each, in the order of `arrangement.angles`, and are read by `read`. A single path is a
     recording of a camera with a mosaic, an event store, or a folder of division-of-time captures. Captures are
-    calibrated in `work` with the settings that `captures` returns. A ValueError or FileNotFoundError says what is
+    calibrated in `work` with the settings that `captures` returns. With `plain`, any other file is one channel, of a
+    camera without polarizers. A ValueError or FileNotFoundError says what is
     missing.
     """
     missing = [str(path) for path in paths if not path.exists()]
     if missing:
         raise FileNotFoundError(f"{', '.join(missing)}: there is no such file")
     name = paths[0].name if len(paths) == 1 else ", ".join(path.name for path in paths)
-    channels = _channels(paths, arrangement, read, work, captures)
+    channels = _channels(paths, arrangement, read, work, captures, plain)
     duration_us = max((int(events.t[-1]) + 1 for events in channels if len(events)), default=0)
     if size is not None:
         channels = [downscale(events, *size, keep_rate=True) for events in channels]
     pieces = [Piece(channels, duration_us, time.perf_counter())]
-    return Input(name, channels[0].height, channels[0].width, pieces, duration_us)
+    return Input(name, channels[0].height, channels[0].width, pieces, duration_us, len(channels))
 
 
 def _channels(
@@ -129,6 +133,7 @@ def _channels(
     read: Callable[[Path], Recording],
     work: Path,
     captures: Callable[[], RecordingsConfig],
+    plain: bool,
 ) -> Sequence[Events]:
     if len(paths) == 4:
         if arrangement.angles is None:
@@ -145,9 +150,12 @@ def _channels(
         return _captures(path, work, captures())
     if detect_format(path) == "store":
         return _sequence(EventStore.open(path), path, arrangement.sequence)
+    if plain:
+        return read_plain(path, read)
     raise ValueError(
         f"{path.name} is one file of events: say where the polarizers of its pixels are, such as --mosaic "
-        f"'90 45 / 135 0', or give four files with --angles, an event store, or a folder of {EVENT_CAPTURES[0]}.*, ..."
+        f"'90 45 / 135 0', or give four files with --angles, an event store, or a folder of {EVENT_CAPTURES[0]}.*, "
+        f"...; for its intensity alone, give a --method that reconstructs it, such as firenet or highpass"
     )
 
 
@@ -192,7 +200,7 @@ def open_method(
     """Open a method for `recover` and describe it in words.
 
     Without a `name` the method is the DoLP network with `weights`, else the shipped weights. Any other method runs
-    with the settings of `setup_of`. `precision` applies to networks: fp32, bf16,
+    with the settings of `setup_of`, and with `weights` if given. `precision` applies to networks: fp32, bf16,
     or auto, which selects bf16 if the device has units for it. `thresholds` are the camera's contrast thresholds, ON
     and OFF, for the DoLP network. A ValueError or FileNotFoundError says what is missing.
     """
@@ -216,9 +224,11 @@ def open_method(
         )
     if thresholds is not None:
         raise ValueError(f"--thresholds is for the DoLP network, {name} does not use it")
-    if weights is not None:
-        raise ValueError(f"--weights is for the DoLP network; set methods.{method.section}.weights for {name}")
+    if weights is not None and method.weights is None:
+        raise ValueError(f"--weights: {name} has no weights; leave it out")
     setup = dataclasses.replace(setup_of(method), device=place, precision=precision)
+    if weights is not None:
+        setup = dataclasses.replace(setup, weights=weights)
     if reason := why_absent(method, setup):
         raise ValueError(f"--method {name}: {reason}")
     return method.open(setup), name
@@ -232,8 +242,8 @@ def frames_of(
     Windows that are already available, such as those of a file, are processed in batches of up to `pixels_at_once`
     pixels.
     """
-    warm_up(recoverer, source.height, source.width)
-    cutter = WindowCutter(rule, source.height, source.width)
+    warm_up(recoverer, source.height, source.width, source.channels)
+    cutter = WindowCutter(rule, source.height, source.width, source.channels)
     history = begin(recoverer, source.height, source.width)
     most = max(1, pixels_at_once // (source.height * source.width))
     for piece in source.pieces:

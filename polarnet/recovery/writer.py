@@ -1,6 +1,7 @@
 """Write the results of `polarnet recover`: numbers (Zarr, EXR), pictures (PNG), a video, and a page.
 
-A picture shows DoLP, AoLP and the events of the window side by side. Everything is written as frames arrive, in
+A picture shows DoLP, AoLP and the events of the window side by side; of a camera without polarizers, the intensity and
+the events. Everything is written as frames arrive, in
 constant memory.
 """
 
@@ -19,14 +20,14 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from polarnet.events.streaming import EventWindow
-from polarnet.reports.figures import dolp_bar
+from polarnet.reports.figures import dolp_bar, wheel_figure
 from polarnet.reports.maps import (
     dolp_image,
     encode_jpeg,
     encode_png,
     event_full_scale,
     event_image,
-    hue_wheel,
+    intensity_image,
     polarization_hsv,
 )
 from polarnet.reports.tiles import chart, data_uri, template
@@ -48,6 +49,7 @@ ZARR_CONVENTIONS = {
     "t_us": "time, microseconds from the first event: the end of the window that a frame was recovered from",
     "dolp": "degree of linear polarization, divided by 65535",
     "aolp": "angle of linear polarization in radians in [0, pi), divided by 65536 and times pi",
+    "intensity": "intensity from 0 to 1, divided by 65535, of a camera without polarizers; it has no dolp",
     "log_variance": "natural logarithm of the variance that the network expects of its own DoLP",
 }
 
@@ -84,6 +86,7 @@ class RecoveryWriter:
     def __init__(self, folder: Path, outputs: Collection[str], video_rate_hz: float):
         self.folder, self.outputs, self.video_rate_hz = folder, outputs, video_rate_hz
         self.frames = 0
+        self._plain = False
         self._sample = _Sample([])
         self._scale: float | None = None
         self._arrays = AppendedFrames(folder / "recovered.zarr", ZARR_CONVENTIONS)
@@ -110,6 +113,7 @@ class RecoveryWriter:
 
     def add(self, window: EventWindow, prediction: Prediction) -> None:
         """Add a frame on the CPU; returns before it is written, unless the queue is long or cores are few."""
+        self._plain = plain_intensity(prediction) is not None
         self._waiting.append(self._thread.submit(self._write, self.frames, window, prediction))
         self._wait(MAX_QUEUED if usable_cores() > FEW_CORES else 0)
         self.frames += 1
@@ -127,11 +131,12 @@ class RecoveryWriter:
             title=title,
             facts=facts,
             notes=notes,
+            plain=self._plain,
             video=VIDEO if self._video is not None else None,
             film=_film([one.pixels for one in pictures]) if pictures else None,
             pictures=[(one.t_us / 1000, data_uri(encode_png(one.pixels), "png")) for one in large],
             dolp_bar=chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
-            wheel=data_uri(encode_png(hue_wheel(192)), "png"),
+            wheel=chart(wheel_figure, "colour wheel: direction is AoLP, distance from the centre is DoLP"),
         )
         path = self.folder / "index.html"
         path.write_text(page, encoding="utf-8")
@@ -163,7 +168,8 @@ class RecoveryWriter:
         events = signed_events(window)
         present = event_full_scale(events)
         self._scale = present if self._scale is None else SCALE_INERTIA * self._scale + (1 - SCALE_INERTIA) * present
-        maps = [dolp_image(prediction.dolp)]
+        plain = plain_intensity(prediction)
+        maps = [dolp_image(prediction.dolp) if plain is None else intensity_image(plain)]
         if prediction.aolp is not None:
             maps.append(polarization_hsv(torch.ones_like(prediction.dolp), prediction.dolp, prediction.aolp))
         maps.append(event_image(events, self._scale))
@@ -171,12 +177,21 @@ class RecoveryWriter:
         return with_even_sides(np.concatenate([part for one in maps for part in (one, gap)][:-1], axis=1))
 
     def _add_to_zarr(self, window: EventWindow, prediction: Prediction) -> None:
-        frame = {"t_us": np.array(window.stop_us, np.int64), "dolp": _quantised(prediction.dolp * 65535, 65535)}
+        plain = plain_intensity(prediction)
+        name, values = ("dolp", prediction.dolp) if plain is None else ("intensity", plain)
+        frame = {"t_us": np.array(window.stop_us, np.int64), name: _quantised(values * 65535, 65535)}
         if prediction.aolp is not None:
             frame["aolp"] = _quantised(prediction.aolp * (65536 / np.pi) % 65536, 65535)
         if prediction.log_variance is not None:
             frame["log_variance"] = prediction.log_variance.numpy().astype(np.float32)
         self._arrays.add(frame)
+
+
+def plain_intensity(prediction: Prediction) -> Float[Tensor, "h w"] | None:
+    """Intensity of a frame of a camera without polarizers; None for any other frame."""
+    if prediction.intensities is None or len(prediction.intensities) > 1:
+        return None
+    return prediction.intensities[0].float()
 
 
 def signed_events(window: EventWindow) -> Float[Tensor, "h w"]:
@@ -207,8 +222,14 @@ def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
 
 
 def _write_exr(path: Path, prediction: Prediction) -> None:
-    """Write the channels DoLP and, if present, AoLP (radians) and log_variance, as half floats."""
-    maps = {"DoLP": prediction.dolp, "AoLP": prediction.aolp, "log_variance": prediction.log_variance}
+    """Write the channels DoLP and, if present, AoLP (radians) and log_variance, as half floats; or intensity alone."""
+    plain = plain_intensity(prediction)
+    maps = {
+        "DoLP": prediction.dolp if plain is None else None,
+        "intensity": plain,
+        "AoLP": prediction.aolp,
+        "log_variance": prediction.log_variance,
+    }
     known: dict[str, Any] = {name: values for name, values in maps.items() if values is not None}
     height, width = prediction.dolp.shape
     spec = oiio.ImageSpec(width, height, len(known), oiio.HALF)

@@ -3,9 +3,8 @@
 Figures are returned, not shown; `polarnet.reports.maps.png` encodes them.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -22,7 +21,7 @@ from torch import Tensor
 from polarnet.metrics.similarity import mse, psnr
 from polarnet.reports.artefacts import Panel
 from polarnet.reports.legend import GENERAL, Legend, in_order, with_structure
-from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image, png
+from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image, hue_wheel
 from polarnet.reports.tables import COLUMNS
 
 
@@ -57,18 +56,19 @@ ReliabilityCurve = Sequence[tuple[float, float, int]]
 """Predicted squared error, measured squared error and number of pixels of each bin."""
 
 
-def comparison_panel(panels: Sequence[Panel], path: Path, legend: Legend = GENERAL, theme: Theme = LIGHT) -> None:
-    """Write a picture like the paper's Fig. 10, with a row per panel.
+def comparison_figure(
+    panels: Sequence[Panel], methods: Iterable[str], legend: Legend = GENERAL, theme: Theme = LIGHT
+) -> Figure:
+    """Draw panels like the paper's Fig. 9 and 10: a row each, with events, truth and the DoLP of `methods`.
 
-    A row shows events, truth and each method, with MSE and PSNR below. Methods that predict one value everywhere are
-    left out.
+    MSE and PSNR stand below each method. Methods that predict one value everywhere are left out.
     """
     if not panels:
         raise ValueError("a comparison needs at least one panel, got none")
-    methods = with_structure(panels[0].dolp)
+    methods = with_structure(methods)
     headings = ["events, 0°", "true DoLP", *map(legend.label, methods)]
     with matplotlib.rc_context(chart_style(theme)):
-        figure, grid = _tile_grid(len(panels), len(headings), panels[0].truth_dolp.shape, theme)
+        figure, grid = tile_grid(len(panels), len(headings), panels[0].truth_dolp.shape, theme)
         for panel, row in zip(panels, grid, strict=True):
             full_scale = event_full_scale(panel.events)
             tiles = [(event_image(panel.events[0], full_scale), ""), (dolp_image(panel.truth_dolp), "")]
@@ -79,11 +79,10 @@ def comparison_panel(panels: Sequence[Panel], path: Path, legend: Legend = GENER
             row[0].set_ylabel(_short(panel.sequence), color=theme.quiet, fontsize=6)
         for axes, heading in zip(grid[0], headings, strict=True):
             axes.set_title(heading, color=theme.text, fontsize=8, pad=4)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(png(figure))
+    return figure
 
 
-def _tile_grid(rows: int, columns: int, shape: Sequence[int], theme: Theme) -> tuple[Figure, np.ndarray]:
+def tile_grid(rows: int, columns: int, shape: Sequence[int], theme: Theme) -> tuple[Figure, np.ndarray]:
     """A figure and its axes for pictures of `shape`, with a colour bar of DoLP beside the first row."""
     tile, gap, left, right, top, below = 1.35, 0.06, 0.22, 0.5, 0.26, 0.2  # inches
     tile_height = tile * shape[0] / shape[1]
@@ -190,6 +189,26 @@ def dolp_bar(theme: Theme) -> Figure:
         figure = Figure(figsize=(2.1, 0.32), facecolor="none")
     _colour_bar(figure, figure.add_axes((0.06, 0.6, 0.88, 0.38)), theme, "horizontal", label_size=8.0)
     return figure
+
+
+def wheel_figure(theme: Theme) -> Figure:
+    """The colour wheel of AoLP with its angles, legend of `maps.polarization_hsv`."""
+    with matplotlib.rc_context(chart_style(theme)):
+        figure = Figure(figsize=(1.3, 1.2), facecolor="none")
+        draw_wheel(figure.add_axes((0.18, 0.13, 0.64, 0.7)), theme, size=192, label_size=8.0)
+    return figure
+
+
+def draw_wheel(axes: Axes, theme: Theme, size: int, label_size: float) -> None:
+    """Draw the wheel of `size` pixels, with the angle of polarization at four directions."""
+    axes.imshow(hue_wheel(size))
+    axes.axis("off")
+    for angle, (across, up, sideways, upright) in {
+        "0°": (1.05, 0.5, "left", "center"), "45°": (0.87, 0.88, "left", "bottom"),
+        "90°": (0.5, 1.03, "center", "bottom"), "135°": (0.13, 0.88, "right", "bottom"),
+    }.items():  # fmt: skip
+        place: dict[str, Any] = {"transform": axes.transAxes, "ha": sideways, "va": upright}
+        axes.text(across, up, angle, color=theme.quiet, fontsize=label_size, **place)
 
 
 def chart_style(theme: Theme) -> dict[Any, Any]:

@@ -2,12 +2,15 @@
 
 import io
 import math
+from pathlib import Path
 
 import cv2
 import matplotlib
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.colors import Colormap, LinearSegmentedColormap, hsv_to_rgb
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -51,13 +54,18 @@ def intensity_image(intensity: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w 3
 def polarization_hsv(
     s0: Float[Tensor, "h w"], dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Hue is AoLP (radians, period pi: 0 red, 60 degrees green, 120 blue), saturation DoLP, value S0 (paper Fig. 3).
+    """Hue is AoLP (radians, period pi: 0 red, 60 degrees green, 120 blue), saturation DoLP, value S0 (paper Fig. 4).
 
     This inverts the simulation's reading of photographs, so a simulated scene looks like its photograph.
     """
     hue_deg = 360 * (aolp / math.pi).remainder(1.0)
     hsv = np.stack([hue_deg.numpy(force=True), *(x.clamp(0, 1).numpy(force=True) for x in (dolp, s0))], axis=-1)
     return _bytes(cv2.cvtColor(hsv.astype(np.float32), cv2.COLOR_HSV2RGB))
+
+
+def paper_map(dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """The map of the paper's Fig. 3: hue is AoLP (radians), saturation 1, value DoLP."""
+    return polarization_hsv(dolp, torch.ones_like(dolp), aolp)
 
 
 def hue_wheel(size: int) -> UInt8[np.ndarray, "size size 4"]:
@@ -82,6 +90,15 @@ def png(figure: Figure) -> bytes:
     compression = {"compress_level": 9}
     figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None}, pil_kwargs=compression)
     return buffer.getvalue()
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PATH.png and as PATH.pdf, whose text and lines scale; the same figure gives the same bytes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.with_name(f"{path.name}.png").write_bytes(png(figure))
+    FigureCanvasPdf(figure)
+    unstamped = dict.fromkeys(("Creator", "Producer", "CreationDate"))
+    figure.savefig(path.with_name(f"{path.name}.pdf"), dpi=DOTS_PER_INCH, metadata=unstamped)
 
 
 def encode_png(picture: UInt8[np.ndarray, "h w channels"]) -> bytes:

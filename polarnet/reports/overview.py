@@ -11,8 +11,8 @@ from matplotlib.patches import FancyArrowPatch
 
 from polarnet.events.stream import Events
 from polarnet.reports.artefacts import Overview
-from polarnet.reports.figures import LIGHT, chart_style, show_picture
-from polarnet.reports.maps import dolp_image, hue_wheel, intensity_image, polarization_hsv
+from polarnet.reports.figures import LIGHT, chart_style, draw_wheel, show_picture
+from polarnet.reports.maps import dolp_image, intensity_image, polarization_hsv
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 ON, OFF = "#d0312d", "#1f5fb8"
@@ -97,14 +97,7 @@ def _source(figure: Figure, x: float, overview: Overview) -> None:
         axes.plot(across, down, color="black", linewidth=2.4, alpha=0.6)
         axes.plot(across, down, color="white", linewidth=1.2)
     axes.set(xlim=(0, columns), ylim=(rows, 0))
-    wheel = _place(figure, x + 0.4, 1.0, 1.2, 1.2)
-    wheel.imshow(hue_wheel(480))
-    wheel.axis("off")
-    for angle, (across, up, sideways, upright) in {
-        "0°": (1.05, 0.5, "left", "center"), "45°": (0.87, 0.88, "left", "bottom"),
-        "90°": (0.5, 1.03, "center", "bottom"), "135°": (0.13, 0.88, "right", "bottom"),
-    }.items():  # fmt: skip
-        wheel.text(across, up, angle, transform=wheel.transAxes, ha=sideways, va=upright, color=LIGHT.quiet, fontsize=9)
+    draw_wheel(_place(figure, x + 0.4, 1.0, 1.2, 1.2), LIGHT, size=480, label_size=9)
     text = "hue → AoLP\nsaturation → DoLP\nvalue → S0"
     style: dict[str, Any] = {"color": LIGHT.quiet, "fontsize": 9.5, "ha": "center", "va": "center", "linespacing": 1.5}
     _text(figure, x + PICTURE_WIDTH / 2, 0.52, text, **style)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from polarnet.methods import METHODS
 from polarnet.pictures.manifest import SPLITS
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, Results, read_artefacts, read_results
-from polarnet.reports.figures import comparison_panel, dolp_bar, training_curves
+from polarnet.reports.figures import comparison_figure, dolp_bar, training_curves, wheel_figure
 from polarnet.reports.legend import (
     LABELS,
     NAMED_BY_NETWORK,
@@ -18,8 +18,9 @@ from polarnet.reports.legend import (
     lpips_about,
     network_label,
 )
-from polarnet.reports.maps import encode_jpeg, encode_png, hue_wheel, png
+from polarnet.reports.maps import encode_jpeg, png
 from polarnet.reports.overview import overview_figure
+from polarnet.reports.paper import write_paper_files
 from polarnet.reports.provenance import Run
 from polarnet.reports.tables import (
     COLUMNS,
@@ -76,13 +77,15 @@ class Card(NamedTuple):
 
 
 def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder: Path) -> Path:
-    """Write index.html and, beside it, overview.png and comparison.png; `baselines` are those trained for the run.
+    """Write index.html and, beside it, overview.png, comparison.png and the folder paper; `baselines` were trained.
 
-    The page needs no other file and no network. FileNotFoundError names missing artefacts and the stage to run.
+    The folder holds the paper's Table 2 and figures 9 and 10 (`polarnet.reports.paper`). The page needs no other file
+    and no network. FileNotFoundError names missing artefacts and the stage to run.
     """
     artefacts = read_artefacts(paths, baselines)
     legend = legend_of(artefacts.results.details["weights"])
     folder.mkdir(parents=True, exist_ok=True)
+    write_paper_files(folder / "paper", [artefacts.results, *artefacts.sets], legend)
     overview = None
     if artefacts.overview is not None:
         overview = png(overview_figure(artefacts.overview))
@@ -109,7 +112,8 @@ def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str])
 def _write_page(folder: Path, name: str, results: Results, legend: Legend, context: Mapping[str, Any]) -> Path:
     """Fill a template into index.html, and write the panels as comparison.png; no such file without panels."""
     if results.panels:
-        comparison_panel(results.panels, folder / "comparison.png", legend)
+        figure = comparison_figure(results.panels, results.panels[0].dolp, legend)
+        (folder / "comparison.png").write_bytes(png(figure))
     path = folder / "index.html"
     path.write_text(template(name).render(context), encoding="utf-8")
     return path
@@ -121,7 +125,7 @@ def _results_context(results: Results, legend: Legend) -> dict[str, Any]:
     return {
         "metrics": metrics,
         "details": details,
-        "scores": score_table(metrics, labels=labels),
+        "scores": score_table(metrics, labels=labels, warmup_windows=details["warmup_windows"]),
         "error_parts": score_table(metrics, columns=ERROR_PARTS, labels=labels),
         "costs": score_table(metrics, columns=COSTS, labels=labels),
         "standing": standing(metrics, labels),
@@ -133,7 +137,7 @@ def _results_context(results: Results, legend: Legend) -> dict[str, Any]:
         "distribution": distribution(details["scene_means"], legend),
         "reliability": reliability_chart(details, legend),
         "dolp_bar": chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
-        "wheel": data_uri(encode_png(hue_wheel(192)), "png"),
+        "wheel": chart(wheel_figure, "colour wheel: direction is AoLP, distance from the centre is DoLP"),
         "panels": [TileRow(panel.sequence, panel_tiles(panel, legend)) for panel in results.panels],
         "polarization": [TileRow(panel.sequence, polarization_tiles(panel, legend)) for panel in results.panels],
     }
@@ -177,7 +181,7 @@ def _set(one: Results, legend: Legend) -> dict[str, Any]:
         "about": SET_ABOUT.get(one.name, ""),
         "scenes": len(one.details["scenes"]),
         "frames": one.details["frames"],
-        "scores": score_table(one.metrics, labels=legend.labels),
+        "scores": score_table(one.metrics, labels=legend.labels, warmup_windows=one.details["warmup_windows"]),
     }
 
 

@@ -7,20 +7,33 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
 from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
 from polarnet.captures.targets import Calibrated
 from polarnet.events.labels import LABELS
-from polarnet.events.stream import Events, select
+from polarnet.events.representations import event_tensor
+from polarnet.events.stream import Events, select, slice_time
 from polarnet.recordings.formats.celex5_bin import WHITE
 from polarnet.recordings.inspection import Inspection
 from polarnet.recordings.pixels import event_counts
-from polarnet.reports.maps import encode_png, event_full_scale, event_image, intensity_image, png
+from polarnet.reports.maps import (
+    DOLP_COLOURS,
+    dolp_image,
+    encode_png,
+    event_full_scale,
+    event_image,
+    intensity_image,
+    png,
+    write_figure,
+)
 from polarnet.stokes import POLARIZER_ANGLES_DEG
+from polarnet.storage.frames import Frames
 
 COLOURS = ("#d6336c", "#e08a1e", "#3d8fd9", "#4aa37c")
 LABEL_COLOURS = ("#e08a1e", "#3d8fd9", "#d6336c")  # leak, shot noise, hot pixels
+SEQUENCE_COLUMNS = 5
 SPAN_MS = 60.0  # on each side of the start
 
 
@@ -44,6 +57,35 @@ def draw_calibration(target: Calibrated, config: RecordingsConfig, path: Path) -
         f"{target.name}: {target.duration_us * 1e-6:.2f} s, hot pixels {', '.join(map(str, target.hot.values()))}"
     )
     path.write_bytes(png(figure))
+
+
+def draw_sequence(events: Sequence[Events], frames: Frames, path: Path) -> None:
+    """Write the paper's Fig. 8 of a calibrated target as PATH.png and PATH.pdf.
+
+    A column is a time. Rows are event tensors of the window before it and intensities, each at 0, 45, 90 and 135
+    degrees, and DoLP. Intensities are scaled to the brightest pixel of the sequence.
+    """
+    chosen = np.linspace(1, len(frames.t_us) - 1, min(SEQUENCE_COLUMNS, len(frames.t_us) - 1)).round().astype(int)
+    height, width = frames.dolp.shape[1:]
+    figure = Figure(figsize=(1.4 * len(chosen) + 0.8, (1.4 * height / width + 0.06) * 9 + 0.3), layout="constrained")
+    grid = figure.subplots(9, len(chosen), squeeze=False)
+    white = float(frames.intensity.max()) or 1.0
+    for column, k in zip(grid.T, chosen.tolist(), strict=True):
+        start, stop = (int(t) for t in frames.t_us[k - 1 : k + 1])
+        tensors = torch.stack([event_tensor(slice_time(channel, start, stop), stop - start) for channel in events])
+        full_scale = event_full_scale(tensors)
+        pictures = [event_image(tensor, full_scale) for tensor in tensors]
+        pictures += [intensity_image(plane / white) for plane in frames.intensity[k]]
+        for axes, picture in zip(column, [*pictures, dolp_image(frames.dolp[k])], strict=True):
+            axes.imshow(picture)
+            axes.set(xticks=[], yticks=[])
+        column[0].set_title(f"{stop / 1000:.0f} ms", fontsize=8)
+    names = [f"{kind} {angle}°" for kind in ("events", "intensity") for angle in POLARIZER_ANGLES_DEG]
+    for axes, name in zip(grid[:, 0], [*names, "DoLP"], strict=True):
+        axes.set_ylabel(name, fontsize=7)
+    bar = figure.colorbar(ScalarMappable(cmap=DOLP_COLOURS), ax=grid[8, :].tolist(), ticks=[0, 0.5, 1])
+    bar.ax.tick_params(labelsize=7)
+    write_figure(figure, path)
 
 
 def draw_hot_pixels(counts: np.ndarray, hot: Bool[np.ndarray, "h w"], path: Path) -> None:

@@ -1,5 +1,7 @@
 """Benchmark scores as tables: selected, rounded and ranked once, then written as Markdown, plain text or HTML."""
 
+import csv
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -118,8 +120,11 @@ def score_table(
     scores: Scores,
     columns: Mapping[str, Column] = MappingProxyType(COLUMNS),
     labels: Mapping[str, str] = LABELS,
+    warmup_windows: int | None = None,
 ) -> Table:
     """Scores of the methods in the fixed order; a metric without any value gets no column.
+
+    With `warmup_windows`, a note states which windows are scored.
 
     The LPIPS heading names the backbone from the rows' `lpips_backbone`. Rows of another camera are not ranked, and a
     note says so. Methods missing in `labels` come last, under their own key.
@@ -151,13 +156,71 @@ def score_table(
     )
     about = f"LPIPS ({backbone}): version 0.1 on the features of {LPIPS_BACKBONES[backbone]}." if backbone else ""
     notes = [about] if about and "lpips" in keys else []
+    notes += [] if warmup_windows is None else [window_rule(warmup_windows)]
     notes += [ANOTHER_CAMERA] if len(ranked) < len(methods) else []
     return Table(tuple(columns[key].heading for key in keys), rows, tuple(notes))
+
+
+def window_rule(warmup_windows: int) -> str:
+    """The sentence beside a table: what a window is, and which windows count."""
+    return (
+        "A window is the events between two frames of the truth, start included and end excluded; its truth is the "
+        f"frame at its end. The first {warmup_windows} windows of each sequence count for no method."
+    )
 
 
 def paper_table(experiment: Literal["simulated", "real"]) -> Table:
     """Published figures: one of the two experiments in the paper's Table 2."""
     return score_table(PAPER_TABLE_2[experiment], labels=PAPER_LABELS)
+
+
+def as_markdown(table: Table, groups: Sequence[str] = ()) -> str:
+    """A GitHub table: best values in bold, intervals small below their values, notes at the end.
+
+    `groups` name equal shares of the columns, in the headings.
+    """
+    headings = _grouped(table, groups)
+    lines = ["| | " + " | ".join(headings) + " |", "|---|" + "---:|" * len(headings)]
+    for row in table.rows:
+        cells = (
+            (f"**{cell.text}**" if cell.best else cell.text)
+            + (f"<br><sub>{cell.interval}</sub>" if cell.interval else "")
+            for cell in row.cells
+        )
+        lines.append(f"| {row.label} | " + " | ".join(cells) + " |")
+    return "\n".join(lines + [f"\n{note}" for note in table.notes])
+
+
+def as_csv(table: Table, groups: Sequence[str] = ()) -> str:
+    """Comma-separated values as printed, with a line of headings; `groups` as in `as_markdown`."""
+    lines = io.StringIO()
+    writer = csv.writer(lines, lineterminator="\n")
+    writer.writerow(["method", *_grouped(table, groups)])
+    writer.writerows([row.label, *(cell.text for cell in row.cells)] for row in table.rows)
+    return lines.getvalue().rstrip("\n")
+
+
+def as_latex(table: Table, groups: Sequence[str] = ()) -> str:
+    """A LaTeX tabular for booktabs: best values in bold, notes as comments; `groups` as in `as_markdown`."""
+    width = len(table.headings) // max(1, len(groups))
+    lines = [rf"% {note}" for note in table.notes]
+    lines += [rf"\begin{{tabular}}{{l{'r' * len(table.headings)}}}", r"\toprule"]
+    if groups:
+        lines.append(" & ".join(["", *(rf"\multicolumn{{{width}}}{{c}}{{{group}}}" for group in groups)]) + r" \\")
+    rows = [["Method", *table.headings]]
+    rows += [[row.label, *(rf"\textbf{{{c.text}}}" if c.best else c.text for c in row.cells)] for row in table.rows]
+    head, *body = (" & ".join(row).replace("↓", r"$\downarrow$").replace("↑", r"$\uparrow$") for row in rows)
+    return "\n".join(
+        [*lines, rf"{head} \\", r"\midrule", *(rf"{row} \\" for row in body), r"\bottomrule", r"\end{tabular}"]
+    )
+
+
+def _grouped(table: Table, groups: Sequence[str]) -> list[str]:
+    """Headings with the name of their group before them."""
+    if not groups:
+        return [*table.headings]
+    width = len(table.headings) // len(groups)
+    return [f"{groups[k // width]} {heading}" for k, heading in enumerate(table.headings)]
 
 
 def as_plain(table: Table) -> str:

@@ -19,6 +19,7 @@ from polarnet.reports.maps import (
     event_full_scale,
     event_image,
     intensity_image,
+    paper_map,
     png,
     polarization_hsv,
 )
@@ -71,12 +72,13 @@ def panel_tiles(panel: Panel, legend: Legend) -> list[Tile]:
 
 
 def polarization_tiles(panel: Panel, legend: Legend) -> list[Tile]:
-    """Tiles of the true S0, DoLP and AoLP, alone and combined in colour; then each method with AoLP, at the true S0."""
+    """Tiles of the true S0, DoLP and AoLP, alone and in the two colour maps; then methods with AoLP, at the true S0."""
     ones, s0 = torch.ones_like(panel.truth_s0), panel.truth_s0
     tiles = [
         tile(intensity_image(s0), "true S0"),
         tile(dolp_image(panel.truth_dolp), "true DoLP"),
         tile(polarization_hsv(ones, ones, panel.truth_aolp), "true AoLP"),
+        tile(paper_map(panel.truth_dolp, panel.truth_aolp), "truth, S = 1", "as the paper's Fig. 3"),
         tile(polarization_hsv(s0, panel.truth_dolp, panel.truth_aolp), "truth"),
     ]
     return tiles + [

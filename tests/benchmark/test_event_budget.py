@@ -6,6 +6,9 @@ from polarnet.benchmark.event_budget import (
     by_sliding_window,
     by_window_length,
     events_per_pixel,
+    growing_window,
+    last_window,
+    recovered_alone,
     since_start,
     sliding_recovery,
 )
@@ -30,6 +33,18 @@ def test_frames_of_overlapping_windows_stand_alone_unless_the_state_is_carried(s
     carried = sliding_recovery(sequence, 50, times, True, "ours", context)
     torch.testing.assert_close(carried[0], alone[0])
     assert not torch.equal(carried[-1], alone[-1])
+
+
+def test_a_growing_window_holds_all_events_so_far(sequence, context):
+    windows = [growing_window(sequence.events, t_us) for t_us in (1000, 2000)]
+    for window in windows:
+        assert (window.start_us, window.stop_us) in ((0, 1000), (0, 2000))
+        expected = [int((events.t < window.stop_us).sum()) for events in sequence.events]
+        assert list(map(len, window.channels)) == expected
+    together = recovered_alone(windows, "ours", context)
+    torch.testing.assert_close(together[1], recovered_alone(windows[1:], "ours", context)[0])
+    (last,) = sliding_recovery(sequence, 50, [2000], False, "ours", context)
+    torch.testing.assert_close(recovered_alone([last_window(sequence.events, 50, 2000)], "ours", context)[0], last)
 
 
 def test_every_frame_falls_into_one_bin_of_events_per_pixel(make_sequence, context):

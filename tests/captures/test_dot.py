@@ -2,17 +2,21 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from polarnet.captures.dot import (
+    EVENT_CAPTURES,
+    INTENSITY_CAPTURES,
     IntensityCapture,
     event_start_us,
     find_captures,
     given_starts,
     intensity_start_us,
     landmark_starts,
+    read_intensity_capture,
     reduced,
     regular_times_us,
 )
@@ -48,6 +52,65 @@ def test_the_papers_values_are_the_default(project_root):
     assert (config.sensor, config.region, config.crop, config.size) == ([800, 1280], [45, 2], [480, 720], [120, 180])
     assert (config.dark_level, config.negative_events) == (30.0, 45)
     assert not config.enabled
+
+
+def write_frames(folder, pictures):
+    folder.mkdir()
+    for k, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / f"frame_{k}.png"), picture)
+    return folder
+
+
+@pytest.fixture
+def grey_pictures():
+    return np.random.default_rng(0).integers(0, 256, (12, HEIGHT, WIDTH), np.uint8)
+
+
+def test_frames_of_a_folder_are_an_intensity_capture_with_the_times_of_its_text(config, grey_pictures, tmp_path):
+    folder = write_frames(tmp_path / "intensity_0", grey_pictures)
+    with pytest.raises(RecordingError, match=r"intensity_0: its pictures have no times .*timestamps\.txt"):
+        read_intensity_capture(folder, config)
+    times = [1000 + 700 * k * k for k in range(len(grey_pictures))]
+    (folder / "timestamps.txt").write_text("".join(f"{t}\n" for t in times))
+    capture = read_intensity_capture(folder, config)
+    assert capture.t_us.tolist() == times  # of no regular clock
+    (top, left), (height, width) = config.crop_corner, config.crop
+    cropped = grey_pictures[:, top : top + height, left : left + width]
+    assert np.array_equal(capture.pictures, 16 * cropped.astype(np.uint16))
+    assert capture.region[0] == pytest.approx(grey_pictures[0, :45, -2:].mean())
+    assert read_intensity_capture(folder, replace(config, picture_rate_hz=50.0)).t_us[:2].tolist() == [0, 20_000]
+    (folder / "timestamps.txt").write_text("0\n10\n")
+    with pytest.raises(RecordingError, match=r"expected a time for each frame, timestamps\.txt has only 2"):
+        read_intensity_capture(folder, config)
+
+
+def test_a_16_bit_frame_has_the_values_of_its_8_bit_twin(config, grey_pictures, tmp_path):
+    rate = replace(config, picture_rate_hz=50.0)
+    eight = read_intensity_capture(write_frames(tmp_path / "eight", grey_pictures), rate)
+    sixteen = read_intensity_capture(write_frames(tmp_path / "sixteen", grey_pictures.astype(np.uint16) * 257), rate)
+    assert np.array_equal(eight.pictures, sixteen.pictures)
+
+
+def test_a_video_is_an_intensity_capture_with_its_own_times_or_those_beside_it(config, tmp_path):
+    frames = np.linspace(60, 200, 12).astype(np.uint8)
+    video = cv2.VideoWriter(str(tmp_path / "intensity_0.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 50.0, (WIDTH, HEIGHT))
+    for level in frames:
+        video.write(np.full((HEIGHT, WIDTH, 3), level, np.uint8))
+    video.release()
+    capture = read_intensity_capture(tmp_path / "intensity_0.mp4", config)
+    assert np.diff(capture.t_us).tolist() == [20_000] * 11
+    np.testing.assert_allclose(capture.pictures.mean(axis=(1, 2)) / 16, frames, atol=4)  # MPEG-4 is lossy
+    (tmp_path / "intensity_0.txt").write_text("".join(f"{5000 * k}\n" for k in range(12)))
+    assert read_intensity_capture(tmp_path / "intensity_0.mp4", config).t_us[-1] == 55_000
+    for name in (*EVENT_CAPTURES, *INTENSITY_CAPTURES[1:]):
+        (tmp_path / f"{name}.bin").touch()
+    assert find_captures(tmp_path)["intensity_0"].suffix == ".mp4"
+
+
+def test_pictures_smaller_than_the_sensor_are_refused(config, tmp_path):
+    folder = write_frames(tmp_path / "intensity_0", np.zeros((2, HEIGHT - 1, WIDTH), np.uint8))
+    with pytest.raises(RecordingError, match=r"recordings\.sensor is \[80, 60\], its pictures are 79x60"):
+        read_intensity_capture(folder, replace(config, picture_rate_hz=50.0))
 
 
 def test_an_intensity_capture_starts_with_the_first_picture_whose_mean_is_below_30(config):

@@ -58,6 +58,9 @@ def test_the_event_budget_asks_its_three_questions_on_the_test_sequences_alone(c
     monkeypatch.setattr(studies, "SLIDING_FRAMES", 3)
     results = studies.run_event_budget(config, tmp_path / "out", ["oracle_mean", "ours"], None, weights)
     assert results["sequences"] == ["d-0"]
+    assert {path.name for path in (tmp_path / "out").glob("figure_11*")} == {
+        f"figure_11{part}_simulated.{kind}" for part in "ab" for kind in ("png", "pdf")
+    }
     assert set(results["since_start"]) == set(results["window_length"]) == {"oracle_mean", "ours"}
     assert [entry["window_us"] for entry in results["window_length"]["ours"]] == list(studies.WINDOW_LENGTHS_US)
     assert {entry["spacing_us"] for entry in results["sliding"]} == {studies.SPACING_US}

@@ -1,15 +1,22 @@
 """The stages themselves, at toy size, with the command lines that DVC calls (`trial` starts two as DVC does)."""
 
+import dataclasses
 import hashlib
 import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import preloaded
 import pytest
+import torch
 
 from polarnet.cli.project import hydra_runs
+from polarnet.config.tree import load
 from polarnet.metrics.lpips import PURPOSES
+from polarnet.pictures.dead_leaves import dead_leaves
+from polarnet.simulation.scene import scene_from_rgb
+from studies.simulated_rig import RigConfig, write_rig
 
 TINY = [
     "ingest.dead_leaves=4",
@@ -103,6 +110,63 @@ def test_a_row_run_alone_gives_the_scores_of_one_pass_over_all_rows(project_root
             alone, together = (json.loads((f / "simulated" / "results.json").read_text()) for f in (one, all_rows))
             assert alone["frames"] == together["frames"]
             assert alone["reliability"] == together["reliability"]
+
+
+RIG = RigConfig(
+    speed_px_s=80.0, longest_delay_s=0.25, duration_s=0.3, picture_rate_hz=60.0, full_well_electrons=20000.0,
+    read_noise=2.0, hot_pixels=3, file_type="bin",
+)  # fmt: skip
+RIG_SIZE = {"sensor": [96, 160], "region": [24, 2], "negative_events": 24, "crop": [64, 96], "size": [16, 24]}
+
+
+@pytest.fixture(scope="module")
+def paper(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data folder after experiment=paper on the eight built-in photographs and one target of a simulated rig."""
+    folder = tmp_path_factory.mktemp("paper")
+    config = load(project_root, ["experiment=paper"])
+    captures, picture = (
+        dataclasses.replace(config.recordings, **RIG_SIZE),
+        dead_leaves(np.random.default_rng(3), 96, 200),
+    )
+    scene = scene_from_rgb(torch.from_numpy(picture).permute(2, 0, 1) * 0.85 + 0.1)
+    emulator = dataclasses.replace(config.emulate, model="exact", render_rate_hz=300.0, cutoff_hz=3000.0)
+    write_rig(folder / "targets" / "one", scene, RIG, captures, emulator, seed=1)
+    size = [f"recordings.{key}={value}".replace(" ", "") for key, value in RIG_SIZE.items()]
+    overrides = [
+        "experiment=paper", "ingest.source=builtin", "ingest.dead_leaves=0", "ingest.test_fraction=0.2",
+        "benchmark.methods=[zeros,cf,e2v,ours]", "recordings.enabled=true", f"recordings.root={folder / 'targets'}",
+        *size,
+    ]  # fmt: skip
+    for _, stage, own in hydra_runs(project_root, config.used_baselines):
+        run_stage(project_root, stage, folder / "data", *overrides, *own)
+    return folder / "data"
+
+
+def test_the_paper_experiment_goes_through_every_stage_at_reduced_sizes(paper):
+    assert json.loads((paper / "images" / "manifest.json").read_text())["counts"]["train"] == 4  # of 8 photographs
+    networks = {name: json.loads((paper / "train" / name / "best.json").read_text()) for name in ("ours", "e2v")}
+    assert {name: one["network"] for name, one in networks.items()} == {"ours": "paper", "e2v": "e2vid"}
+    assert networks["ours"]["config"]["input_mixing"] == "polarizers"
+    assert networks["ours"]["lpips"]["backbone"] == "vgg"
+    assert not (paper / "train" / "e2p").exists()
+    for folder in (paper / "benchmark", paper / "benchmark" / "sets" / "recordings"):
+        metrics = json.loads((folder / "metrics.json").read_text())
+        assert list(metrics) == ["zeros", "cf", "e2v", "ours"]
+        assert all(row["lpips_backbone"] == "vgg" and row["lpips"] > 0 for row in metrics.values())
+    calibration = json.loads((paper / "calibrated" / "calibration.json").read_text())["one"]
+    assert calibration["start_us"] == calibration["landmark_us"]
+    assert not any(calibration["hot_pixels"].values())
+    assert (paper / "calibrated" / "one_figure_8.pdf").stat().st_size > 0
+
+
+def test_the_paper_experiment_leaves_table_2_and_its_figures(paper):
+    files = {path.name for path in (paper / "report" / "paper").iterdir()}
+    assert files == {"table_2.md", "table_2.csv", "table_2.tex"} | {
+        f"figure_{number}.{kind}" for number in (9, 10) for kind in ("png", "pdf")
+    }
+    rows = (paper / "report" / "paper" / "table_2.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows] == ["method", "CF", "E2V: E2VID", "ours: the paper's network"]
+    assert rows[0].count("LPIPS (vgg)") == 2
 
 
 def test_pictures_are_split_by_source(data):

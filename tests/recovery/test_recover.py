@@ -14,6 +14,7 @@ from polarnet.events.streaming import EventWindow, WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks.checkpoint import load_network, save_checkpoint
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.networks.firenet import FireNet
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines
@@ -233,6 +234,32 @@ def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, 
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.parametrize("method", ["highpass", "firenet"])
+def test_a_method_that_reconstructs_intensity_gives_the_video_of_a_camera_without_polarizers(
+    method, channels, tmp_path, at_root, capsys
+):
+    file = write_lines(tmp_path / "camera.txt", channels[1])
+    weights = []
+    if method == "firenet":
+        torch.manual_seed(0)
+        network, path = FireNet(5), tmp_path / "mine.safetensors"
+        save_checkpoint(path, network.state_dict(), {"network": "firenet", "config": {"bins": network.bins}})
+        weights = ["--weights", str(path)]
+    assert main(["recover", str(file), "--method", method, "--out", str(tmp_path / "out"), *weights]) == 0
+    assert (tmp_path / "out" / "recovered.mp4").stat().st_size > 0
+    group = zarr.open_group(tmp_path / "out" / "recovered.zarr", mode="r")
+    assert set(group.array_keys()) == {"t_us", "intensity"}
+    assert group["intensity"].shape == (3, HEIGHT, WIDTH)
+    assert "Intensity from events: camera.txt" in (tmp_path / "out" / "index.html").read_text()
+    four = [*[str(file)] * 4, "--angles", "0", "45", "90", "135"]  # the same light behind all
+    assert main(["recover", *four, "--method", method, "--out", str(tmp_path / "four"), *weights]) == 0
+    dolp = zarr.open_group(tmp_path / "four" / "recovered.zarr", mode="r")["dolp"][:]
+    assert not dolp.any()
+    capsys.readouterr()
+    assert main(["recover", str(file), "--method", f"{method}+gain", "--out", str(tmp_path / "gain"), *weights]) != 0
+    assert "is one file of events: say where the polarizers" in capsys.readouterr().err
+
+
 def test_a_second_recovery_replaces_the_first_and_other_files_are_refused(store, tmp_path, at_root, capsys):
     out, arguments = tmp_path / "out", ("recover", str(store), "--sequence", "lake", "--method", "highpass")
     arguments = (*arguments, "--out", str(out), "--write")
@@ -305,7 +332,7 @@ def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):
         ([one, one, "--live"], "--live: expected one file or -, got 2"),
         ([tmp_path / "none.csv"], "there is no such file"),
     ):
-        assert run(*files, "--method", "cf", out=tmp_path / "out") == 1
+        assert run(*files, "--method", "cf+gain", out=tmp_path / "out") == 1
         assert not (tmp_path / "out").exists()
         assert reason in capsys.readouterr().err
 

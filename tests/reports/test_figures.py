@@ -7,12 +7,13 @@ from polarnet.reports.artefacts import Panel
 from polarnet.reports.figures import (
     DARK,
     LIGHT,
-    comparison_panel,
+    comparison_figure,
     dolp_bar,
     reliability_figure,
     score_distribution,
     score_line,
     training_curves,
+    wheel_figure,
 )
 from polarnet.reports.maps import png
 
@@ -32,6 +33,7 @@ def scene(*methods):
         lambda: training_curves({"mse": CURVE}, CURVE, "validation", LIGHT),
         lambda: score_distribution(SCORES, DARK),
         lambda: dolp_bar(LIGHT),
+        lambda: wheel_figure(DARK),
         lambda: reliability_figure({"ours": [(0.01, 0.02, 100), (0.1, 0.1, 300)]}, DARK),
     ],
 )
@@ -41,31 +43,30 @@ def test_the_same_figure_gives_the_same_bytes_without_date_or_software(draw):
     assert not any(chunk in data for chunk in (b"Software", b"tIME", b"Creation"))
 
 
-def test_a_comparison_panel_gives_the_same_bytes(tmp_path):
-    for name in ("one.png", "two.png"):
-        comparison_panel([scene("cf", "ours")], tmp_path / name)
-    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+def panel(rows):
+    return png(comparison_figure(rows, rows[0].dolp))
 
 
-def test_a_comparison_panel_grows_by_a_row_a_scene_and_a_column_a_method(tmp_path):
+def test_a_comparison_panel_gives_the_same_bytes():
+    assert panel([scene("cf", "ours")]) == panel([scene("cf", "ours")])
+
+
+def test_a_comparison_panel_grows_by_a_row_a_scene_and_a_column_a_method():
     def size(rows):
-        comparison_panel(rows, tmp_path / "panel.png")
-        return cv2.imread(str(tmp_path / "panel.png")).shape[:2]
+        return cv2.imdecode(np.frombuffer(panel(rows), np.uint8), cv2.IMREAD_COLOR).shape[:2]
 
     height, width = size([scene("ours")])
     assert size([scene("ours")] * 2)[0] > 1.5 * height
     assert size([scene("cf", "ours")])[1] > 1.2 * width
 
 
-def test_constants_have_no_place_in_a_comparison_panel(tmp_path):
-    comparison_panel([scene("ours")], tmp_path / "one.png")
-    comparison_panel([scene("zeros", "oracle_mean", "ours")], tmp_path / "two.png")
-    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+def test_constants_have_no_place_in_a_comparison_panel():
+    assert panel([scene("ours")]) == panel([scene("zeros", "oracle_mean", "ours")])
 
 
-def test_a_panel_of_no_scene_is_an_error(tmp_path):
+def test_a_panel_of_no_scene_is_an_error():
     with pytest.raises(ValueError, match="at least one panel"):
-        comparison_panel([], tmp_path / "panel.png")
+        comparison_figure([], [])
 
 
 def test_a_frame_that_is_off_by_a_tenth_everywhere_scores_an_mse_of_a_hundredth_and_20_db():
@@ -92,3 +93,11 @@ def test_every_term_of_the_losses_has_a_readable_name_in_the_legend():
 def test_epochs_count_from_one_on_the_axis():
     line = training_curves({"mse": CURVE}, CURVE, "validation", LIGHT).axes[0].lines[0]
     assert list(line.get_xdata()) == [1, 2, 3]
+
+
+def test_the_wheel_has_its_angles_beside_it():
+    (axes,) = wheel_figure(LIGHT).axes
+    places = {text.get_text(): text.get_position() for text in axes.texts}
+    assert set(places) == {"0°", "45°", "90°", "135°"}
+    assert places["0°"][0] > 1 > places["90°"][0] > places["135°"][0]
+    assert places["90°"][1] > 1 > places["0°"][1]

@@ -12,6 +12,7 @@ from polarnet.reports.maps import (
     event_image,
     hue_wheel,
     intensity_image,
+    paper_map,
     polarization_hsv,
 )
 
@@ -30,6 +31,12 @@ def test_fully_polarized_light_shows_its_angle_as_hue(aolp_deg, colour):
 def test_unpolarized_light_is_grey_whatever_its_angle():
     assert tuple(polarization_hsv(pixel(1), pixel(0), pixel(1.0))[0, 0]) == WHITE
     assert tuple(polarization_hsv(pixel(0.2), pixel(0), pixel(1.0))[0, 0]) == (51, 51, 51)
+
+
+def test_the_papers_map_has_the_angle_as_hue_and_dolp_as_value():
+    assert tuple(paper_map(pixel(1), pixel(math.radians(60)))[0, 0]) == GREEN
+    assert tuple(paper_map(pixel(0.2), pixel(0))[0, 0]) == (51, 0, 0)
+    assert tuple(paper_map(pixel(0), pixel(1.0))[0, 0]) == (0, 0, 0)
 
 
 def test_no_light_is_black():

@@ -6,13 +6,13 @@ from polarnet.reports.tables import (
     COLUMNS,
     ERROR_PARTS,
     PAPER_TABLE_2,
+    as_markdown,
     as_plain,
     paired_lines,
     paper_table,
     score_table,
     standing,
 )
-from studies.tables import as_markdown
 
 SCORES = {
     "ours": {"mse": 0.02, "psnr": 17.0, "ssim": 0.4, "lpips": None, "corr": 0.6, "ms_per_window": 19.04},

@@ -62,8 +62,8 @@ class Picture(NamedTuple):
 
     t_us: int | None
     """The computer's time on arrival, to the millisecond; None in files without it."""
-    intensity: UInt16[np.ndarray, "800 1280"]
-    """0 to 4095; brighter is larger."""
+    intensity: UInt16[np.ndarray, "h w"]
+    """800 x 1280 pixels from a BIN file; 0 to 4095; brighter is larger."""
 
 
 def matches(path: Path, head: bytes) -> bool:
