@@ -5,12 +5,13 @@ import os
 import sys
 from pathlib import Path
 
+from polarnet.config.pipeline import set_folder
 from polarnet.config.tables import collect_rows
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.reports.artefacts import ReportPaths
+from polarnet.reports.artefacts import ReportPaths, read_results, results_table
 from polarnet.reports.page import write_report
 from polarnet.reports.provenance import Run, facts
-from polarnet.reports.tables import as_plain, score_table
+from polarnet.reports.tables import as_plain
 
 PLUMBING = ("rows", "row", "baseline", "paths", "runtime", "cluster")  # what does not affect results
 
@@ -22,8 +23,8 @@ def main(config: Config) -> None:
         tables = collect_rows(config)
     except FileNotFoundError as error:
         raise SystemExit(str(error)) from None
-    for name, scores in tables.items():
-        print(f"\ntest set {name}\n" + as_plain(score_table(scores)))
+    for name in tables:
+        print(f"\ntest set {name}\n" + as_plain(results_table(read_results(set_folder(config, name)))))
     paths = ReportPaths(**{f.name: Path(getattr(config.paths, f.name)) for f in dataclasses.fields(ReportPaths)})
     parameters = {name: value for name, value in dataclasses.asdict(config).items() if name not in PLUMBING}
     overrides = [override for override in sys.argv[1:] if not override.startswith("hydra.")]

@@ -3,7 +3,8 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from polarnet.reports.legend import LABELS
+from polarnet.config.experiments import preset_values
+from polarnet.reports.legend import LABELS, legend_of
 from polarnet.reports.tables import COLUMNS, COSTS, as_markdown, paired_lines, score_table, standing
 from studies.network_blocks import NETWORK_BLOCKS
 from studies.paper import duration_rows, table_rows
@@ -76,6 +77,12 @@ def _benchmark(name: str) -> Block:
     )  # fmt: skip
 
 
+def _demo_table(scores: Results, weights: Results) -> str:
+    """Scores measured with the values of params.yaml; `weights` name the network behind each row."""
+    warmup_windows = preset_values(ROOT, "experiment", "demo")["benchmark.warmup_windows"]
+    return as_markdown(score_table(scores, labels=legend_of(weights).labels, warmup_windows=warmup_windows))
+
+
 HOUSE_FIGURES = {
     "package_lines": "lines of Python in `polarnet/`",
     "top_level_modules": "modules at the top level of `polarnet/`",
@@ -116,7 +123,8 @@ def _sensor_fit(section: str, stimulus: str) -> Block:
 
 BLOCKS = NETWORK_BLOCKS | {
     "pipeline-scores": Block(
-        "pipeline", "metrics", "studies.measure", lambda results: as_markdown(score_table(results["metrics"])),
+        "pipeline", "metrics", "studies.measure",
+        lambda results: _demo_table(results["metrics"], results.get("weights", {})),
         caption="Means over the test scenes; small figures are 95 % bootstrap intervals over scenes. {origin}",
         lines=lambda results: ["\n".join(f"- {line}" for line in standing(results["metrics"]))],
     ),
@@ -163,7 +171,7 @@ BLOCKS = NETWORK_BLOCKS | {
         "At least {fuzz[cases_per_reader]:,} damaged files for each reader; none ended otherwise. {origin}",
     ),
     "rig": Block(
-        "recordings", "rig", "studies.rig", lambda results: as_markdown(score_table(results["rig"]["benchmark"])),
+        "recordings", "rig", "studies.rig", lambda results: _demo_table(results["rig"]["benchmark"], {}),
         caption="{rig[captures]} captures of a simulated sensor, {rig[sensor][1]} x {rig[sensor][0]} pixels. Start "
         "times found from the landmark are right within {rig[start_error_frames_max]:.2f} camera frames; refined "
         "ones agree within {rig[refined_error_ms_max]:.2f} ms. The zero of their common clock is a convention, up to "

@@ -115,7 +115,8 @@ def measure_pipeline(root: Path) -> Path:
         if again:
             raise RuntimeError(f"a second make repro ran {', '.join(again)}; everything should have been cached")
         record["metrics"] = scores_and_costs(clone / "data" / "benchmark")
-        record["lpips"] = json.loads((clone / "data" / "benchmark" / "details.json").read_text())["lpips"]
+        details = json.loads((clone / "data" / "benchmark" / "details.json").read_text())
+        record |= {key: details[key] for key in ("lpips", "weights")}
         shutil.copy(clone / "data" / "report" / "overview.png", root / "docs" / "pictures" / "overview.png")
         (root / DEMO_METRICS).parent.mkdir(parents=True, exist_ok=True)
         for name in ("dvc.lock", DEMO_METRICS):

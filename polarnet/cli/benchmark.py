@@ -75,12 +75,13 @@ def _benchmark(options: argparse.Namespace) -> int:
 
 def _own_scenes(options: argparse.Namespace, config: "Config", scenes: Path, out: Path, weights: Path | None) -> int:
     from polarnet.cli.own_scenes import benchmark_folder
-    from polarnet.reports.tables import as_plain, score_table
+    from polarnet.reports.artefacts import read_results, results_table
+    from polarnet.reports.tables import as_plain
 
     command = f"polarnet benchmark --scenes {options.scenes}"
     with run_folder(out, "benchmark --scenes") as folder:
-        metrics, notes = benchmark_folder(config, scenes, options.kind, folder, out / WORK, weights, command)
-    print(as_plain(score_table(metrics)))
+        notes = benchmark_folder(config, scenes, options.kind, folder, out / WORK, weights, command)
+    print(as_plain(results_table(read_results(out))))
     for note in notes:
         print(note)
     print(f"page: {out / 'index.html'}")

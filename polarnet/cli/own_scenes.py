@@ -2,7 +2,6 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 from polarnet.benchmark.conditions import announced, configured
 from polarnet.benchmark.results import write_benchmark
@@ -28,8 +27,8 @@ SET_THEM = "To score on sequences like those of the training, add to the command
 
 def benchmark_folder(
     config: Config, root: Path, kind: str, out: Path, work: Path, weights: Path | None, command: str
-) -> tuple[dict[str, dict[str, Any]], list[str]]:
-    """Run the benchmark on a folder of photographs or measured scenes, without training; return (metrics, notes).
+) -> list[str]:
+    """Run the benchmark on a folder of photographs or measured scenes, without training; return the notes.
 
     `out` receives metrics.json, cost.json, details.json, frames.csv, panels and index.html. `work` receives the
     pictures, scenes and events, so a stopped run resumes and a second run only runs the methods. Methods without
@@ -67,9 +66,9 @@ def benchmark_folder(
         "left_out": notes,
         "weights": weights_used(methods, context),
     }
-    metrics = write_benchmark(out, benchmark, settings, config.seed, about)
+    write_benchmark(out, benchmark, settings, config.seed, about)
     write_set_page(out, test_set.name, command, [*conditions["warnings"], *notes])
-    return metrics, notes
+    return notes
 
 
 def _rotating_events(config: Config, work: Path) -> Path:

@@ -14,7 +14,9 @@ from torch import Tensor
 
 from polarnet.events.stream import Events
 from polarnet.pictures.manifest import SPLITS, Manifest, read_manifest
+from polarnet.reports.legend import legend_of
 from polarnet.reports.maps import polarization_hsv
+from polarnet.reports.tables import Table, score_table
 from polarnet.simulation.motion import Pose, Trajectory, sensor_to_scene
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
@@ -177,6 +179,12 @@ def read_results(folder: Path) -> Results:
     return Results(
         details.get("set", folder.name), metrics, details, [*map(_panel, sorted((folder / "panels").glob("*.npz")))]
     )
+
+
+def results_table(results: Results) -> Table:
+    """The scores of a test set, with labels that name the networks and a note on the windows that count."""
+    labels, warmup_windows = legend_of(results.details["weights"]).labels, results.details["warmup_windows"]
+    return score_table(results.metrics, labels=labels, warmup_windows=warmup_windows)
 
 
 def training_history(folder: Path) -> History:
