@@ -225,7 +225,7 @@ BLOCKS = NETWORK_BLOCKS | {
     "paper-rows": Block(
         "paper", "rows", "studies.paper", table_rows,
         {
-            "the paper": "{row}", "section": "{paper}", "status": "{status}", "where in polarnet": "{where}",
+            "the paper": "{row}", "section": "§ {paper}", "status": "{status}", "where in polarnet": "{where}",
             "note": "{note}", "tested by": "{test}",
         },
         "{rows_total} rows: {rows_exact} exact, {rows_chosen} chosen, {rows_stated} stated.",
@@ -233,7 +233,7 @@ BLOCKS = NETWORK_BLOCKS | {
     "paper-duration": Block(
         "lpips", "cost", "studies.lpips", duration_rows,
         {
-            "experiment": "`{name}`", "precision": "{precision}", "windows": "{windows:,}",
+            "experiment": "`{name}`", "precision": "{precision}", "training": "{windows:,} windows",
             "windows/s": "{rate:.2f}", "hours": "{hours:.0f}",
         },
         "Training of the network with its loss, VGG included, on two cores; without E2VID, validation and simulation. "

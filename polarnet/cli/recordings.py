@@ -20,6 +20,7 @@ OPTIONS_BY_INPUT = {
     "four files": {"angles", "size", *READING_OPTIONS},
     "one file with --mosaic": {"mosaic", "size", *READING_OPTIONS},
     "one file with --rotating or --triggers": {"rotating", "triggers", "start_angle", "size", *READING_OPTIONS},
+    "one file without polarizers": {"size", *READING_OPTIONS},
     "an event store or a folder": {"sequence", "size"},
 }
 """Options of `polarnet recover` that apply to each kind of input."""
@@ -327,6 +328,8 @@ def refuse_unused_options(options: argparse.Namespace) -> None:
         kind = "one file with --mosaic"
     elif Path(options.input[0]).is_dir():
         kind = "an event store or a folder"
+    elif _reconstructs(options.method):
+        kind = "one file without polarizers"
     else:
         return  # reading the input will name the missing option
     unused = set().union(*OPTIONS_BY_INPUT.values()) - OPTIONS_BY_INPUT[kind]
