@@ -58,7 +58,7 @@ def counts(rows: Sequence[PaperRow]) -> dict[str, int]:
 
 def table_rows(results: Results) -> list[Row]:
     """The list as rows of the docs' table."""
-    rows = []
+    rows: list[Row] = []
     for row in read_rows(ROOT):
         values = ", ".join(f"`{key}: {_printed(value)}`" for key, value in row.values.items())
         files = ", ".join(f"[{Path(file).name}](../{file})" for file in row.where)
@@ -83,7 +83,7 @@ def duration_rows(lpips: Results) -> list[Row]:
         "fp32": paper["step_ms"]["vgg"] / 1000 / paper["frames"],
         network["precision"]: 1 / network["train_frames_per_s"] + vgg_s,
     }
-    rows = []
+    rows: list[Row] = []
     for name in ("paper", "paper_small"):
         values = preset_values(ROOT, "experiment", name)
         share = 1 - values["ingest.val_fraction"] - values["ingest.test_fraction"]

@@ -176,9 +176,11 @@ def _frames(path: Path) -> Iterator[Picture]:
     file = path / TIMES_FILE if path.is_dir() else path.with_suffix(".txt")
     stated = times_from_file(file, "us") if file.is_file() else None
     clip = open_clip([path], ClipOptions(grey=True))
+    if stated is not None and clip.count not in (None, len(stated)):
+        raise RecordingError(
+            f"{path.name}: expected a time for each of {clip.count} frames, {file.name} has {len(stated)}"
+        )
     for k, frame in enumerate(clip.frames()):
-        if stated is not None and k >= len(stated):
-            raise RecordingError(f"{path.name}: expected a time for each frame, {file.name} has only {len(stated)}")
         t_us = frame.t_us if stated is None else float(stated[k])
         grey = np.rint(frame.pixels[..., 0] * (255 * STEPS_OF_8_BITS)).astype(np.uint16)
         yield Picture(None if t_us is None else round(t_us), grey)

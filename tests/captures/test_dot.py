@@ -80,7 +80,7 @@ def test_frames_of_a_folder_are_an_intensity_capture_with_the_times_of_its_text(
     assert capture.region[0] == pytest.approx(grey_pictures[0, :45, -2:].mean())
     assert read_intensity_capture(folder, replace(config, picture_rate_hz=50.0)).t_us[:2].tolist() == [0, 20_000]
     (folder / "timestamps.txt").write_text("0\n10\n")
-    with pytest.raises(RecordingError, match=r"expected a time for each frame, timestamps\.txt has only 2"):
+    with pytest.raises(RecordingError, match=r"expected a time for each of 12 frames, timestamps\.txt has 2"):
         read_intensity_capture(folder, config)
 
 

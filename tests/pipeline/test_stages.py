@@ -134,6 +134,7 @@ def paper(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     size = [f"recordings.{key}={value}".replace(" ", "") for key, value in RIG_SIZE.items()]
     overrides = [
         "experiment=paper", "ingest.source=builtin", "ingest.dead_leaves=0", "ingest.test_fraction=0.2",
+        "synthesize.sensor_height=24", "synthesize.sensor_width=32",
         "benchmark.methods=[zeros,cf,e2v,ours]", "recordings.enabled=true", f"recordings.root={folder / 'targets'}",
         *size,
     ]  # fmt: skip
