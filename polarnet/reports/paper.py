@@ -30,7 +30,7 @@ def write_paper_files(folder: Path, results: Sequence[Results], legend: Legend) 
         if one.panels:
             methods = [row for row in METHODS if row in one.panels[0].dolp]
             write_figure(comparison_figure(one.panels, methods, legend), folder / FIGURES[name])
-    if set(sets) == set(EXPERIMENTS):
+    if set(sets) == set(EXPERIMENTS) and set(METHODS).intersection(*(one.metrics for one in sets.values())):
         warmup_windows = sets["simulated"].details["warmup_windows"]
         table = table_2(sets["recordings"].metrics, sets["simulated"].metrics, legend, warmup_windows)
         groups = tuple(EXPERIMENTS.values())
