@@ -120,7 +120,7 @@ def score_table(
     scores: Scores,
     columns: Mapping[str, Column] = MappingProxyType(COLUMNS),
     labels: Mapping[str, str] = LABELS,
-    warmup_windows: int | None = None,
+    warmup_windows: float | int | None = None,
 ) -> Table:
     """Scores of the methods in the fixed order; a metric without any value gets no column.
 
@@ -161,7 +161,7 @@ def score_table(
     return Table(tuple(columns[key].heading for key in keys), rows, tuple(notes))
 
 
-def window_rule(warmup_windows: int) -> str:
+def window_rule(warmup_windows: float | int) -> str:
     """The sentence beside a table: what a window is, and which windows count."""
     return (
         "A window is the events between two frames of the truth, start included and end excluded; its truth is the "
