@@ -82,8 +82,10 @@ def comparison_figure(
     return figure
 
 
-def tile_grid(rows: int, columns: int, shape: Sequence[int], theme: Theme) -> tuple[Figure, np.ndarray]:
-    """A figure and its axes for pictures of `shape`, with a colour bar of DoLP beside the first row."""
+def tile_grid(
+    rows: int, columns: int, shape: Sequence[int], theme: Theme, bar_row: int = 0
+) -> tuple[Figure, np.ndarray]:
+    """A figure and its axes for pictures of `shape`, with a colour bar of DoLP beside row `bar_row`."""
     tile, gap, left, right, top, below = 1.35, 0.06, 0.22, 0.5, 0.26, 0.2  # inches
     tile_height = tile * shape[0] / shape[1]
     width, height = left + columns * (tile + gap) + right, top + rows * (tile_height + below)
@@ -92,7 +94,7 @@ def tile_grid(rows: int, columns: int, shape: Sequence[int], theme: Theme) -> tu
     figure.subplots_adjust(
         left / width, below / height, 1 - (right + gap) / width, 1 - top / height, gap / tile, below / tile_height
     )
-    place = grid[0, -1].get_position()
+    place = grid[bar_row, -1].get_position()
     bar = figure.add_axes((place.x1 + (gap + 0.04) / width, place.y0, 0.09 / width, place.height))
     _colour_bar(figure, bar, theme, "vertical", label_size=6.0)
     return figure, grid

@@ -73,7 +73,7 @@ class Moment(NamedTuple):
 def figure_11(moments: Sequence[Moment]) -> Figure:
     """Draw event tensors, the DoLP recovered from them and the true DoLP, with t and n above each column."""
     with matplotlib.rc_context(chart_style(LIGHT)):
-        figure, grid = tile_grid(3, len(moments), moments[0].truth.shape, LIGHT)
+        figure, grid = tile_grid(3, len(moments), moments[0].truth.shape, LIGHT, bar_row=1)
         for k, moment in enumerate(moments):
             tensor = event_image(moment.tensor, event_full_scale(moment.tensor))
             for axes, picture in zip(
