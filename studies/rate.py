@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import torch
 
-from polarnet.benchmark.between import frames_between
+from polarnet.benchmark.between_windows import frames_between
 from polarnet.benchmark.resimulate import resimulated, sequence_at
 from polarnet.benchmark.rows import Context, opened, predictions_of
 from polarnet.benchmark.score import FrameScore, score_sequence

@@ -72,7 +72,8 @@ class Between(NamedTuple):
     """(x, y) in pixels per microsecond: the point now at p was at p + velocity * t, t microseconds ago; 0 where the
     events confirm no motion."""
     maps: Float[Tensor, "c h2 w2"]
-    """atanh(s1), atanh(s2), DoLP and, if predicted, the log-variance, continued beyond the border by `reach` + 1."""
+    """DoLP, the log-variance if predicted, and atanh(s1), atanh(s2) if AoLP is predicted; continued beyond the border
+    by `reach` + 1."""
     change: Float[Tensor, "2 h w"]
     """Change of atanh(s1) and atanh(s2) since the end of the window, counted by the events."""
     t_us: int
@@ -80,21 +81,15 @@ class Between(NamedTuple):
 
 
 def anchored(before: Between | None, window: EventWindow, prediction: Prediction, config: BetweenConfig) -> Between:
-    """State at the end of a window, whose frame is `prediction`; `before` is the state of the previous window.
-
-    ValueError for a prediction without AoLP.
-    """
-    stokes = prediction.stokes
-    if stokes is None:
-        if prediction.aolp is None:
-            raise ValueError(
-                "frames between windows: expected a method that predicts AoLP, this one predicts DoLP alone; leave "
-                "--rate out"
-            )
-        stokes = prediction.dolp * torch.stack([torch.cos(2 * prediction.aolp), torch.sin(2 * prediction.aolp)])
-    maps = [torch.atanh(stokes.float().clamp(-MAX_DEGREE, MAX_DEGREE)), prediction.dolp.float()[None]]
+    """State at the end of a window, whose frame is `prediction`; `before` is the state of the previous window."""
+    maps = [prediction.dolp.float()[None]]
     if prediction.log_variance is not None:
         maps.append(prediction.log_variance.float()[None])
+    stokes = prediction.stokes
+    if stokes is None and prediction.aolp is not None:
+        stokes = prediction.dolp * torch.stack([torch.cos(2 * prediction.aolp), torch.sin(2 * prediction.aolp)])
+    if stokes is not None:
+        maps.append(torch.atanh(stokes.float().clamp(-MAX_DEGREE, MAX_DEGREE)))
     beyond = config.reach + 1
     padded = F.pad(torch.cat(maps)[None], (beyond, beyond, beyond, beyond), mode="replicate")[0]
     velocity = torch.zeros(2) if before is None else _velocity(before.window, window, config.reach)
@@ -106,24 +101,25 @@ def carried(state: Between, channels: Sequence[Events], t_us: int, config: Betwe
 
     Let u be (atanh s1, atanh s2) at the end of the window, u(p + d) the same moved by the displacement d, and e the
     change counted by events. Then u(p + d) + share * mean(e - (u(p + d) - u(p))) is the frame at p. DoLP moves too, and
-    changes as the length of (s1, s2) does. At the end of the window, the frame is that of the method.
+    changes as the length of (s1, s2) does. A frame without AoLP moves only. At the end of the window, the frame is that
+    of the method.
     """
     change = _counted(state.change, [slice_time(events, state.t_us, t_us) for events in channels], config)
     state = state._replace(change=change, t_us=t_us)
     elapsed_us = t_us - state.window.stop_us
     if elapsed_us == 0:
         return state, state.prediction
+    beyond = config.reach + 1
     displacement = (state.velocity * elapsed_us).clamp(-config.reach, config.reach)
-    moved = _shifted(state.maps, displacement.tolist(), config.reach + 1)
-    along = moved[:2]
-    stokes = torch.tanh(along)
-    dolp, length = moved[2], torch.hypot(*stokes)
-    if config.share:
-        unexplained = state.change - (along - _shifted(state.maps[:2], [0.0, 0.0], config.reach + 1))
-        stokes = torch.tanh(along + config.share * _box_means(unexplained, config.width))
-        dolp = dolp + torch.hypot(*stokes) - length
+    moved = _shifted(state.maps, displacement.tolist(), beyond)
+    dolp, log_variance = moved[0], None if state.prediction.log_variance is None else moved[1]
+    if state.prediction.aolp is None:
+        return state, Prediction(dolp, None, log_variance)
+    along = moved[-2:]
+    unexplained = change - (along - _shifted(state.maps[-2:], (0.0, 0.0), beyond))
+    stokes = torch.tanh(along + config.share * _box_means(unexplained, config.width))
+    dolp = dolp + torch.hypot(*stokes) - torch.hypot(*torch.tanh(along))
     aolp = torch.remainder(torch.atan2(stokes[1], stokes[0]) / 2, math.pi)
-    log_variance = moved[3] if len(moved) > 3 else None
     return state, Prediction(dolp.clamp(0, 1), aolp, log_variance, stokes)
 
 

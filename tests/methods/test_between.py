@@ -155,9 +155,13 @@ def test_a_method_without_s1_and_s2_goes_by_its_dolp_and_aolp():
     torch.testing.assert_close(frames[0].stokes, frames[1].stokes)
 
 
-def test_a_method_without_aolp_is_refused():
-    with pytest.raises(ValueError, match="expected a method that predicts AoLP"):
-        anchored(None, window_of(NONE), Prediction(torch.zeros(HEIGHT, WIDTH)), EVENTS_ALONE)
+def test_a_frame_without_aolp_moves_and_takes_no_events():
+    frame = Prediction(pattern().dolp)
+    state = anchored(None, window_of(NONE), frame, EVENTS_ALONE)._replace(velocity=torch.tensor([0.001, 0.0]))
+    channels = [events_of((WINDOW_US, 10, 10, 1)), NONE, NONE, NONE]
+    _, moved = carried(state, channels, WINDOW_US + 1000, EVENTS_ALONE)
+    torch.testing.assert_close(moved.dolp[:, :-1], frame.dolp[:, 1:])
+    assert (moved.aolp, moved.stokes, moved.log_variance) == (None, None, None)
 
 
 def test_settings_take_the_thresholds_of_a_camera_and_odd_widths_only(project_root):
