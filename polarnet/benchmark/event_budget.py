@@ -185,7 +185,7 @@ def between_windows(
     method: str,
     config: BetweenConfig,
     context: Context,
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """Mean scores of frames every `spacing_us`, carried on between windows of `window_us`, as `by_sliding_window`."""
     times = list(range(span_us[0], span_us[1] + 1, spacing_us))
     recoverer = opened(METHODS[method], context)
