@@ -1,10 +1,10 @@
+import dataclasses
 from collections import Counter
 
 import pytest
 
 from polarnet.benchmark.score import FrameScore
 from polarnet.config.pipeline import context_of
-from polarnet.config.tree import load
 from polarnet.networks.weights import shipped_weights
 from polarnet.storage.scenes import SceneStore
 from studies.rate import rated_scores
@@ -54,20 +54,13 @@ def test_the_loss_between_windows_is_the_larger_of_photographs_and_measured_scen
     assert headlines(tables, "ours")["time"] == {"db_lost_2000hz": pytest.approx(0.3)}
 
 
-def test_frames_between_windows_are_scored_sixteen_times_a_window(simulated, project_root):
-    camera, scenes = settings().camera, SceneStore.open(simulated.scenes)
-    config = load(
-        project_root, ["synthesize.duration_s=0.2", "synthesize.sensor_height=18", "synthesize.sensor_width=24"]
-    )
+def test_frames_between_windows_are_scored_sixteen_times_a_window(simulated):
+    config, scenes = settings(), SceneStore.open(simulated.scenes)
+    motion = dataclasses.replace(config.synthesize, duration_s=0.2)  # 6 windows, 2 of them warm-up
     contexts = {"ours": context_of(config, 0.3, shipped_weights())}
-    rows, degree = rated_scores("a-0", scenes, config.synthesize, camera, 3, 2, contexts, config.between)
+    rows, degree = rated_scores("a-0", scenes, motion, config.camera, 3, 2, contexts, config.between)
     numbers = Counter(row.method for row in rows)
-    assert numbers == {
-        "oracle_mean": 48,
-        "ours": 48,
-        "ours, held": 48,
-        "ours, window ends": 4,
-    }  # 6 windows, 2 of warm-up
+    assert numbers == {"oracle_mean": 48, "ours": 48, "ours, held": 48, "ours, window ends": 4}
     carried, held = ([row.mse for row in rows if row.method == name] for name in ("ours", "ours, held"))
     assert carried != held
     assert 0 < degree < 1
