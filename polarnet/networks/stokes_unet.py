@@ -33,6 +33,7 @@ from polarnet.networks.redundancy import (
     length,
     neighbourhoods,
 )
+from polarnet.networks.sensitivity import Equaliser, Scale, scale_features
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
@@ -43,7 +44,7 @@ MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate
 WIDE = (3, 9)  # widths in pixels of the neighbourhoods that contribute fine structure, besides the single pixel
 MAX_DOLP = 0.98  # largest DoLP passed to atanh, to keep it finite
 PANORAMA_TENSORS = 1 + len(Panorama._fields)  # events of the previous window, then the panorama
-NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window; the rest of the state is missing
+NO_STATE: list[Any] = [None] * (4 + len(WIDE))  # before the first window; the rest of the state is missing
 LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
 LOG_VARIANCE_OUTPUTS = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
 
@@ -126,7 +127,7 @@ class StokesUNet(nn.Module):
     representation = "event_counts"
     predicts_stokes = True
     optimizer = "muon"
-    outputs = ("choose", "gains", "trust", "add")
+    outputs = ("choose", "gains", "trust", "add", "scale.out")
 
     def __init__(self, config: StokesUNetConfig, in_channels: int = 4 * IMAGES):
         super().__init__()
@@ -142,6 +143,8 @@ class StokesUNet(nn.Module):
         memories, scales = len(config.memories), len(config.scales)
         solved = (memories * len(config.decays) + 1) * scales
         half, quarter, *smaller = config.channels
+        self.equaliser = Equaliser()
+        self.scale = Scale()
         self.moments = SecondMoments(memories)
         self.solve = LeastSquares(memories, len(config.decays), scales)
         self.slopes = SlopeMoments()
@@ -192,19 +195,27 @@ class StokesUNet(nn.Module):
         t, b, _, height, width = inputs.shape
         inputs = F.pad(inputs, (0, -width % STRIDE, 0, -height % STRIDE))  # the padding holds no events
         polarity, count = inputs.unflatten(2, (4, IMAGES)).unbind(3)
-        before_sums, before_moments, *others = state or NO_STATE
+        before_sensitivity, others = (state or NO_STATE)[:2], (state or NO_STATE)[2:]
+        equalised, sensitivity = self.equaliser(polarity, count, before_sensitivity if state else [])
+        polarity, count = equalised.polarity, equalised.count
+        before_sums, before_moments, *others = others
         before_wide, others = others[: len(WIDE)], others[len(WIDE) :]
         before_panorama, recurrent = others[:PANORAMA_TENSORS], others[PANORAMA_TENSORS:]
 
         keep = inputs.new_tensor(self.memories).view(-1, 1, 1, 1)
-        sums = faded(polarity.unsqueeze(2), keep, before_sums)  # t, b, memory, polarizer
-        from_sums, moments = self._candidates(sums.flatten(0, 1), b, before_moments)
-        wide = _wide_differences(polarity, before_wide, keep)
         images, certain, panorama = self._panorama(polarity, (height, width), before_panorama)
+        scale = self.scale(scale_features(images, equalised.total.flatten(), equalised.mismatch.flatten()))
+        images, count = scale * self.step * images, scale * count.flatten(0, 1)
+        each_window = scale.view(t, b, 1, 1, 1, 1)
+        unscaled = faded(polarity.unsqueeze(2), keep, before_sums)  # t, b, memory, polarizer
+        sums = each_window * unscaled
+        from_sums, moments = self._candidates(sums.flatten(0, 1), b, before_moments)
+        unscaled_wide = _wide_differences(polarity, before_wide, keep)
+        wide = [each_window * means for means in unscaled_wide]
         from_slopes = self._slope_candidates(images)
         candidates = Candidates(*(torch.cat(pair, dim=1) for pair in zip(from_sums, from_slopes, strict=True)))
 
-        x2 = on_blocks(self.stem, _event_images(sums.flatten(0, 1), count.flatten(0, 1)))
+        x2 = on_blocks(self.stem, _event_images(sums.flatten(0, 1), count))
         x2 = F.relu(x2 + self.from_mosaic(_panorama_images(images, certain)))
         y4, recurrent = self._quarter(x2, candidates, b, recurrent)
         y2 = self.at_half(self.up_half(y4, skip=x2))
@@ -225,7 +236,11 @@ class StokesUNet(nn.Module):
         log_variance = LOG_VARIANCE + added[:, 3] + F.interpolate(self.expected(features), scale_factor=2)[:, 0]
         maps = [dolp[:, 0], aolp, log_variance, stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
-        return prediction, features, [sums[-1], moments, *(means[-1] for means in wide), *panorama, *recurrent]
+        return (
+            prediction,
+            features,
+            [*sensitivity, unscaled[-1], moments, *(means[-1] for means in unscaled_wide), *panorama, *recurrent],
+        )
 
     @torch.no_grad()
     def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:
@@ -269,7 +284,7 @@ class StokesUNet(nn.Module):
         """Follow the panorama over t windows; return its four images, its certainty from 0 to 1, and the next state.
 
         The four images are the mean of the four log intensities, atanh(s1), atanh(s2), and
-        ((log I0 + log I90) - (log I45 + log I135)) / 2. They are given after each window at half resolution, each up to
+        ((log I0 + log I90) - (log I45 + log I135)) / 2. They are given in steps after each window at half resolution, each up to
         an additive constant.
 
         The sensor covers the first rows and columns, `sensor` of them. Without the panorama (`without`), the images and
@@ -293,7 +308,7 @@ class StokesUNet(nn.Module):
             images = torch.cat([one.level[..., : own.shape[-2], : own.shape[-1]] for one in panoramas])
             certain = torch.cat([certainty(one, self.memory) for one in panoramas])
             own = F.pad(panorama.own, (0, own.shape[-1] - width, 0, own.shape[-2] - height))
-            return self.step * images, certain, [events[-1], panorama.level, own, panorama.explained]
+            return images, certain, [events[-1], panorama.level, own, panorama.explained]
 
     def _quarter(
         self, x2: Float[Tensor, "n c h2 w2"], candidates: Candidates, streams: int, state: list[Tensor]
