@@ -13,7 +13,8 @@ from polarnet.events.representations import REPRESENTATIONS, Encode, event_count
 from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Recoverer, Setup, State, WeightsConfig, each_map, weights_file
-from polarnet.networks.checkpoint import load_network
+from polarnet.methods.window_length import of_any_length
+from polarnet.networks.checkpoint import load_network, trained_window_us
 from polarnet.networks.registry import NETWORKS
 from polarnet.networks.stokes_unet import StokesUNet
 from polarnet.runtime.sections import section
@@ -44,9 +45,8 @@ def dolp_recoverer(
 ) -> Recoverer:
     """Wrap a network and the metadata of its checkpoint (`load_network`) as a method.
 
-    `precision` is fp32 or bf16 (autocast). Windows should be as long as in training. For DoLP at a higher rate, let
-    windows of that length overlap (`polarnet.methods.overlap`). `thresholds` are the camera's contrast thresholds, ON
-    and OFF (`told`).
+    `precision` is fp32 or bf16 (autocast). Windows may have any length (`polarnet.methods.window_length`).
+    `thresholds` are the camera's contrast thresholds, ON and OFF (`told`).
     """
     place = torch.device(device)
     ready: Any = network.to(place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
@@ -60,7 +60,9 @@ def dolp_recoverer(
             prediction, state = ready.unroll(inputs, state)
         return state, each_map(prediction, lambda field: field[:, 0])
 
-    return Recoverer(lambda height, width: None, predict, network=ready)
+    recoverer = Recoverer(lambda height, width: None, predict, network=ready)
+    trained_us = trained_window_us(metadata)
+    return recoverer if trained_us is None else of_any_length(recoverer, trained_us)
 
 
 def open_dolp_network(setup: Setup) -> Recoverer:
