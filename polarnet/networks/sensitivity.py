@@ -22,6 +22,7 @@ BLOCKS = 3  # width of a neighbourhood in blocks
 MISMATCH = (0.01, 1.5)  # limits of the estimated variance of relative sensitivities
 WEIGHTS = (0.02, 3.0)  # limits of an event's weight
 OUTLIER = 2.0  # limit of a pixel's relative deviation, so that a hot pixel cannot dominate the mismatch
+SPARSE = 2  # the mismatch is estimated from every SPARSE-th pixel along each axis
 MIN_POWER = 1e-2  # lower limit of the mean squared count
 
 
@@ -65,18 +66,21 @@ class Equaliser(nn.Module):
         weighted, sums, mismatches = [], [], []
         for now in events:
             totals = totals + now
-            mean = _near(totals * (1 + change))
-            deviation = torch.minimum((totals - mean).abs(), OUTLIER * (mean + 1))
-            power = mean.square().mean((-1, -2), keepdim=True).clamp(min=MIN_POWER)
-            mismatch = ((deviation.square() - noise * mean).mean((-1, -2), keepdim=True) / power).clamp(*MISMATCH)
+            mean = _near(torch.addcmul(totals, totals, change))
+            some, some_mean = totals[..., ::SPARSE, ::SPARSE], mean[..., ::SPARSE, ::SPARSE]
+            deviation = torch.minimum((some - some_mean).abs(), OUTLIER * (some_mean + 1))
+            power = some_mean.square().mean((-1, -2), keepdim=True).clamp(min=MIN_POWER)
+            excess = (deviation.square() - noise * some_mean).mean((-1, -2), keepdim=True)
+            mismatch = (excess / power).clamp(*MISMATCH)
             prior = pull * noise / mismatch
             weight = ((mean + prior) / (totals + prior)).clamp(*WEIGHTS)
-            on, off = (half.mean((1, 2, 3), keepdim=True) + surplus for half in totals.split(4, dim=1))
+            change = weight.detach() - 1
+            mean_counts = mean.mean((-1, -2), keepdim=True)
+            on, off = (half.mean(1, keepdim=True) + surplus for half in mean_counts.split(4, dim=1))
             balance = (off / on).sqrt()  # over a while, the light rises as much as it falls
             both = torch.cat([balance, 1 / balance], dim=1).repeat_interleave(4, dim=1)
-            weighted.append(now * weight * both)
-            change = weight.detach() - 1
-            sums.append((totals * (1 + change)).mean((1, 2, 3)))
+            weighted.append(now * (weight * both))
+            sums.append(mean_counts.mean((1, 2, 3)))
             mismatches.append(mismatch.detach().mean((1, 2, 3)))
         on, off = torch.stack(weighted).split(4, dim=2)
         return Equalised(on - off, on + off, torch.stack(sums), torch.stack(mismatches)), [totals, change]
