@@ -139,7 +139,7 @@ def _add_method(recover: argparse.ArgumentParser) -> None:
         nargs=2,
         type=float,
         metavar=("ON", "OFF"),
-        help="contrast thresholds of the camera, natural-log intensity (default: those of the network's training); "
+        help="contrast thresholds of the camera, natural-log intensity (default: estimated from the events); "
         "`polarnet fit-sensor` measures them",
     )
     recover.add_argument(
