@@ -7,20 +7,23 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.cli.outputs import WORK, run_folder
-from polarnet.cli.parsers import Commands, add_hot_pixel_factor, add_stored_sequence
+from polarnet.cli.parsers import Commands, add_cleaning, add_hot_pixel_factor, add_stored_sequence, cleaning_of
 from polarnet.cli.project import settings_root
 
 READING_OPTIONS = ("format", "height", "width", "clock_mhz")
 """Options that describe a camera's file where the file itself does not."""
 
+CLEANING_OPTIONS = ("hot_pixels", "background")
+"""Options that remove noise before recovery."""
+
 NETWORK_WINDOW = "33.333ms"
 
 OPTIONS_BY_INPUT = {
-    "--live": {"mosaic"},
-    "four files": {"angles", "size", *READING_OPTIONS},
-    "one file with --mosaic": {"mosaic", "size", *READING_OPTIONS},
+    "--live": {"mosaic", *CLEANING_OPTIONS},
+    "four files": {"angles", "size", *CLEANING_OPTIONS, *READING_OPTIONS},
+    "one file with --mosaic": {"mosaic", "size", *CLEANING_OPTIONS, *READING_OPTIONS},
     "one file with --rotating or --triggers": {"rotating", "triggers", "start_angle", "size", *READING_OPTIONS},
-    "an event store or a folder": {"sequence", "size"},
+    "an event store or a folder": {"sequence", "size", *CLEANING_OPTIONS},
 }
 """Options of `polarnet recover` that apply to each kind of input."""
 
@@ -72,6 +75,7 @@ def _add_recovery(commands: Commands) -> None:
         "division-of-time captures; with --live, a growing file or standard input (-) with lines `t x y p angle`.",
     )
     _add_input(recover)
+    add_cleaning(recover)
     _add_method(recover)
     _add_output(recover)
     add_reading(recover)
@@ -195,6 +199,7 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.config.pipeline import setup_of
     from polarnet.config.tree import load
     from polarnet.events.streaming import WindowRule, parse_window
+    from polarnet.recordings.noise import Cleaner
     from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recordings.recording import read_recording
     from polarnet.recovery.recover import Arrangement, facts_of, open_files, open_live, open_method, recover
@@ -221,17 +226,18 @@ def _recover(options: argparse.Namespace) -> int:
     name = "live" if options.live else Path(options.input[0]).stem
     out = options.out or Path("outputs") / "recover" / name
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
-    lines = None
+    cleaner, lines = Cleaner(cleaning_of(options), mosaic), None
     with run_folder(out, "recover") as folder:
         if options.live:
             print(f"writing frames to {folder}; the folder becomes {out} at the end", file=sys.stderr)
             source, lines = open_live(options.input[0], mosaic, options.idle)
+            source = source._replace(pieces=cleaner.live(source.pieces))
         else:
             read = functools.partial(read_recording, **_reading(options))
             arrangement = Arrangement(options.angles, mosaic, options.sequence)
             size = (options.size[0], options.size[1]) if options.size else None
             files, captures = [Path(path) for path in options.input], lambda: config().recordings
-            source = open_files(files, arrangement, read, size, folder / WORK, captures)
+            source = open_files(files, arrangement, read, size, folder / WORK, captures, cleaner)
         check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
         source = source._replace(pieces=check.watch(source.pieces))
         writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
@@ -241,6 +247,8 @@ def _recover(options: argparse.Namespace) -> int:
         counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)
         facts = facts_of(source, rule, words, summary)
         facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
+        if any(getattr(options, option) for option in CLEANING_OPTIONS):
+            facts["removed"] = cleaner.sentence()
         page = writer.write_page(source.name, facts, notes)
     for key, value in facts.items():
         print(f"{key:11s} {value}")

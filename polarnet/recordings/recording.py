@@ -14,7 +14,7 @@ from polarnet.events.stream import MAX_SIDE, Events, concatenate
 from polarnet.recordings.formats import aedat2, celex5_bin, celex5_csv, faery, hdf5, prophesee, store, text
 from polarnet.recordings.formats.lines import HEAD_BYTES
 from polarnet.recordings.repair import repaired
-from polarnet.recordings.source import Block, Choices, RecordingError, Source
+from polarnet.recordings.source import Block, CameraFrames, Choices, RecordingError, Source
 
 CHUNK_EVENTS = 2**20
 
@@ -26,15 +26,17 @@ class Format(NamedTuple):
     matches: Callable[[Path, bytes], bool]
     """Whether a file that starts with these bytes has this format."""
     open: Callable[[Path, Choices], Source]
+    frames: Callable[[Path], CameraFrames] | None = None
+    """Read the frames that the camera recorded beside its events; None for formats without frames."""
 
 
 FORMATS = {
     "store": Format("our own event store", store.matches, store.open_store),
-    "e2p": Format("HDF5 of E2P, for the PDAVIS", hdf5.matches_e2p, hdf5.open_e2p),
+    "e2p": Format("HDF5 of E2P, for the PDAVIS", hdf5.matches_e2p, hdf5.open_e2p, hdf5.e2p_frames),
     "esfp": Format("HDF5 of ESfP, one sensor behind a rotating polarizer", hdf5.matches_esfp, hdf5.open_esfp),
     "dsec": Format("HDF5 of DSEC", hdf5.matches_dsec, hdf5.open_dsec),
-    "aedat4": Format("AEDAT4 of iniVation", faery.matches_aedat4, faery.open_aedat4),
-    "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", aedat2.matches, aedat2.open_aedat2),
+    "aedat4": Format("AEDAT4 of iniVation", faery.matches_aedat4, faery.open_aedat4, faery.aedat4_frames),
+    "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", aedat2.matches, aedat2.open_aedat2, aedat2.aedat2_frames),
     "event_stream": Format("Event Stream (.es)", faery.matches_event_stream, faery.open_event_stream),
     "evt": Format("EVT2 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
     "dat": Format("DAT of Prophesee", prophesee.matches_dat, prophesee.open_dat),

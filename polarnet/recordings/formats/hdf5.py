@@ -9,7 +9,15 @@ from typing import Any
 import numpy as np
 
 from polarnet.recordings.formats.isolated import IsolatedLibrary
-from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, sensor_size
+from polarnet.recordings.source import (
+    BLOCK_EVENTS,
+    Block,
+    CameraFrames,
+    Choices,
+    RecordingError,
+    Source,
+    sensor_size,
+)
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 DSEC_COLUMNS = ("events/t", "events/x", "events/y", "events/p")
@@ -17,6 +25,8 @@ ESFP_COLUMNS = ("t", "x", "y", "p")
 TRIGGERS = "triggers"  # times of a trigger signal in microseconds
 MAX_WHOLE = 2**53  # largest whole number that a float holds exactly
 E2P_COLUMNS = 4  # columns of /events: t in microseconds, x, y, p of 0 or 1
+E2P_FRAMES, E2P_MAPS = ("frame_ts", "frame"), ("intensity", "dolp", "aolp")
+E2P_WHITE = 255.0  # of its maps: S0 / 2 and DoLP 1, AoLP 90 degrees; -90 degrees are 0
 
 Description = dict[str, Any]
 
@@ -113,6 +123,29 @@ def open_e2p(path: Path, choices: Choices) -> Source:
     return Source(*sensor_size(path, choices, height, width), blocks)
 
 
+def e2p_frames(path: Path) -> CameraFrames:
+    """Frames of E2P's HDF5: times /frame_ts, mosaics /frame, and maps /intensity, /dolp, /aolp of half the size."""
+    tables = _described(path)["tables"]
+    names = [name for name in (*E2P_FRAMES, *E2P_MAPS) if name in tables]
+    if "frame_ts" not in names or not ({"frame"} <= set(names) or set(E2P_MAPS) <= set(names)):
+        raise RecordingError(
+            f"{path.name}: expected /frame_ts, and /frame or {', '.join(f'/{name}' for name in E2P_MAPS)}, as true "
+            f"polarization, got {', '.join(names) or 'none of them'}"
+        )
+    lengths = {name: tables[name][0][0] for name in names}
+    if len(set(lengths.values())) > 1:
+        raise RecordingError(f"{path.name}: expected one length of all tables of frames, got {lengths}")
+    blocks = [*_read(path, tuple(names), lengths["frame_ts"])]
+    values = {name: np.concatenate([block[k] for block in blocks]) for k, name in enumerate(names)} if blocks else {}
+    if not values:
+        raise RecordingError(f"{path.name}: expected frames as true polarization, there are 0")
+    maps = None
+    if set(E2P_MAPS) <= set(names):
+        s0, dolp, aolp = (values[name] / np.float32(E2P_WHITE) for name in E2P_MAPS)
+        maps = s0, dolp, np.remainder(np.pi * (aolp - 0.5), np.pi).astype(np.float32)
+    return CameraFrames(_microseconds(path, values["frame_ts"]), values.get("frame"), maps)
+
+
 def _has_tables(path: Path, head: bytes, names: tuple[str, ...]) -> bool:
     if not head.startswith(MAGIC):
         return False
@@ -123,7 +156,7 @@ def _has_tables(path: Path, head: bytes, names: tuple[str, ...]) -> bool:
 
 
 def _described(path: Path) -> Description:
-    tables = [*DSEC_COLUMNS, *ESFP_COLUMNS, "events", TRIGGERS]
+    tables = [*DSEC_COLUMNS, *ESFP_COLUMNS, "events", TRIGGERS, *E2P_FRAMES, *E2P_MAPS]
     return _library.ask(path, "describe", tables, ["t_offset", "height", "width", "sensor_resolution"])
 
 
