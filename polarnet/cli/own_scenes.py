@@ -30,8 +30,11 @@ from polarnet.storage.scenes import SceneStore
 SET_THEM = "To score on sequences like those of the training, add to the command, or write into params.yaml:"
 
 
-RECORDED = {"sentence": "Real events; windows lie between the recordings' frames, whose polarization is the truth.",
-            "warnings": []}  # fmt: skip
+RECORDED = {
+    "sentence": "Windows lie between the recordings' frames, whose polarization is the truth.",
+    "recorded": True,
+    "warnings": [],
+}
 
 
 class Inputs(NamedTuple):

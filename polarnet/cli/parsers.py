@@ -2,10 +2,13 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
     from polarnet.recordings.noise import Cleaning
+
+READING_OPTIONS = ("format", "height", "width", "clock_mhz")
+"""Options that describe a camera's file where the file itself does not."""
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """Object to which modules of commands add their parsers."""
@@ -54,3 +57,16 @@ def cleaning_of(options: argparse.Namespace) -> "Cleaning":
         if not Path(hot).is_file():
             raise FileNotFoundError(f"--hot-pixels {options.hot_pixels}: expected {FOUND} or a file, there is none")
     return Cleaning(hot, options.hot_pixel_factor, within_us)
+
+
+def add_reading(command: argparse.ArgumentParser) -> None:
+    """Add `READING_OPTIONS`."""
+    command.add_argument("--format", help="format if it cannot be recognised: text, celex5_csv, celex5_bin, dat, ...")
+    command.add_argument("--height", type=int, help="rows of the sensor, if the file does not state them")
+    command.add_argument("--width", type=int, help="columns of the sensor, if the file does not state them")
+    command.add_argument("--clock-mhz", type=float, help="clock of a CeleX-5 (default: 100)")
+
+
+def reading_of(options: argparse.Namespace) -> dict[str, Any]:
+    """Values of `READING_OPTIONS`."""
+    return {name: getattr(options, name) for name in READING_OPTIONS}

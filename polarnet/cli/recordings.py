@@ -4,14 +4,19 @@ import argparse
 import functools
 import sys
 from pathlib import Path
-from typing import Any
 
 from polarnet.cli.outputs import WORK, run_folder
-from polarnet.cli.parsers import Commands, add_cleaning, add_hot_pixel_factor, add_stored_sequence, cleaning_of
+from polarnet.cli.parsers import (
+    READING_OPTIONS,
+    Commands,
+    add_cleaning,
+    add_hot_pixel_factor,
+    add_reading,
+    add_stored_sequence,
+    cleaning_of,
+    reading_of,
+)
 from polarnet.cli.project import settings_root
-
-READING_OPTIONS = ("format", "height", "width", "clock_mhz")
-"""Options that describe a camera's file where the file itself does not."""
 
 CLEANING_OPTIONS = ("hot_pixels", "background")
 """Options that remove noise before recovery."""
@@ -51,18 +56,6 @@ def _add_inspection(commands: Commands) -> None:
         "--hot-pixels", type=Path, metavar="PNG", help="PNG of the number of events of each pixel (default: not drawn)"
     )
     inspect.set_defaults(run=_inspect)
-
-
-def add_reading(command: argparse.ArgumentParser) -> None:
-    """Add `READING_OPTIONS`."""
-    command.add_argument("--format", help="format if it cannot be recognised: text, celex5_csv, celex5_bin, dat, ...")
-    command.add_argument("--height", type=int, help="rows of the sensor, if the file does not state them")
-    command.add_argument("--width", type=int, help="columns of the sensor, if the file does not state them")
-    command.add_argument("--clock-mhz", type=float, help="clock of a CeleX-5 (default: 100)")
-
-
-def _reading(options: argparse.Namespace) -> dict[str, Any]:
-    return {name: getattr(options, name) for name in READING_OPTIONS}
 
 
 def _add_recovery(commands: Commands) -> None:
@@ -179,7 +172,7 @@ def _inspect(options: argparse.Namespace) -> int:
     from polarnet.recordings.recording import open_recording
     from polarnet.reports.recordings import recording_picture
 
-    recording = open_recording(options.file, part=options.part, **_reading(options))
+    recording = open_recording(options.file, part=options.part, **reading_of(options))
     inspection = inspect_recording(recording, options.hot_pixel_factor)
     for finding in findings(inspection):
         print(finding)
@@ -233,7 +226,7 @@ def _recover(options: argparse.Namespace) -> int:
             source, lines = open_live(options.input[0], mosaic, options.idle)
             source = source._replace(pieces=cleaner.live(source.pieces))
         else:
-            read = functools.partial(read_recording, **_reading(options))
+            read = functools.partial(read_recording, **reading_of(options))
             arrangement = Arrangement(options.angles, mosaic, options.sequence)
             size = (options.size[0], options.size[1]) if options.size else None
             files, captures = [Path(path) for path in options.input], lambda: config().recordings
@@ -281,7 +274,7 @@ def _recover_rotating(options: argparse.Namespace) -> int:
     rule = half_turn_rule(rotation, 0.5 if moving else config.window_turns, length_us, step_us)
     out = options.out or Path("outputs") / "recover" / file.stem
     with run_folder(out, "recover") as folder:
-        source, rotation = open_rotating(file, rotation, functools.partial(read_recording, **_reading(options)), size)
+        source, rotation = open_rotating(file, rotation, functools.partial(read_recording, **reading_of(options)), size)
         writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
         if moving:
             recoverer = half_turns_recoverer(settings.methods.rotating_polarizer, rotation)
