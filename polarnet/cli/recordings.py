@@ -65,7 +65,8 @@ def _add_recovery(commands: Commands) -> None:
         description="Writes frames, pictures, a video and a page. INPUT is one of: four files, one for each polarizer, "
         "with --angles; one file of a camera with polarizers on its pixels, with --mosaic; one file of a "
         "camera behind a rotating polarizer, with --rotating or --triggers; an event store; a folder of "
-        "division-of-time captures; with --live, a growing file or standard input (-) with lines `t x y p angle`.",
+        "division-of-time captures; with --live, a growing file or standard input (-) with lines `t x y p angle`, or a "
+        "camera with --mosaic: dv://HOST:PORT of a program that streams its events, or dv://camera.",
     )
     _add_input(recover)
     add_cleaning(recover)
@@ -200,6 +201,7 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
     refuse_unused_options(options)
+    cleaning = cleaning_of(options)
     if options.rotating is not None or options.triggers is not None:
         return _recover_rotating(options)
     config = functools.cache(lambda: load(settings_root()))
@@ -219,7 +221,7 @@ def _recover(options: argparse.Namespace) -> int:
     name = "live" if options.live else Path(options.input[0]).stem
     out = options.out or Path("outputs") / "recover" / name
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
-    cleaner, lines = Cleaner(cleaning_of(options), mosaic), None
+    cleaner, lines = Cleaner(cleaning, mosaic), None
     with run_folder(out, "recover") as folder:
         if options.live:
             print(f"writing frames to {folder}; the folder becomes {out} at the end", file=sys.stderr)

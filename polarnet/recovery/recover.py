@@ -28,6 +28,7 @@ from polarnet.networks.checkpoint import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import read_four, read_mosaic
 from polarnet.recordings.live import LiveLines, Piece, live_lines
+from polarnet.recordings.live_camera import SCHEME, LiveCamera
 from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.recording import Recording, detect_format
 from polarnet.recovery.writer import RecoveryWriter
@@ -175,8 +176,16 @@ def _captures(folder: Path, work: Path, config: RecordingsConfig) -> Sequence[Ev
     return EventStore.open(work / "calibrated" / "events.zarr").read(target.name)
 
 
-def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> tuple[Input, LiveLines]:
-    """Read lines live from standard input (-) or from a growing file, until it has not grown for `idle_s` seconds."""
+def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> tuple[Input, LiveLines | LiveCamera]:
+    """Read live from standard input (-), a growing file or a camera (dv://...), until `idle_s` seconds without data.
+
+    ValueError for a camera without a mosaic.
+    """
+    if path.startswith(SCHEME):
+        if mosaic is None:
+            raise ValueError(f"{path}: expected --mosaic, the polarizers of the camera's pixels, with a camera")
+        camera = LiveCamera(path, mosaic, idle_s)
+        return Input(path, camera.height, camera.width, camera, None), camera
     if path != STANDARD_INPUT and not Path(path).is_file():
         raise FileNotFoundError(f"{path}: there is no such file; - reads standard input")
     source = sys.stdin.buffer if path == STANDARD_INPUT else open(path, "rb")  # noqa: SIM115 - read until the end
