@@ -6,6 +6,8 @@ from pathlib import Path
 from polarnet.reports.legend import LABELS
 from polarnet.reports.tables import COLUMNS, COSTS, paired_lines, score_table, standing
 from studies.network_blocks import NETWORK_BLOCKS
+from studies.noise import NOISE_BLOCK
+from studies.recorded import RECORDED_BLOCK
 from studies.rotating import CURVES
 from studies.tables import Block, Columns, Results, Row, as_markdown, listed
 
@@ -127,6 +129,8 @@ BLOCKS = NETWORK_BLOCKS | {
     ),
     "benchmark-simulated": _benchmark("simulated"),
     "benchmark-measured": _benchmark("measured"),
+    "noise": NOISE_BLOCK,
+    "recorded": RECORDED_BLOCK,
     "emulation": Block(
         "emulation", "paper_set", "studies.emulation",
         lambda results: [{"name": name, **one} for name, one in results.items() if "seconds_1_thread" in str(one)],

@@ -23,11 +23,13 @@ from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.recordings.noise import Cleaning
 from polarnet.recordings.recording import FORMATS
 from polarnet.recordings.truth import read_truth
+from polarnet.reports.tables import score_table
 from polarnet.simulation.sets import make_folder_set
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from studies.e2p_writer import WHITE, mosaicked, write_e2p
 from studies.measure import ROOT, arguments_of, command_line, machine_record, write_section
+from studies.tables import Block, as_markdown
 
 PHOTOGRAPHS = ("astronaut", "coffee", "rocket")
 NO_CLEANING = Cleaning(None, 4.0, None)
@@ -72,6 +74,17 @@ def measured(config: Config, work: Path, photographs: Sequence[Path]) -> tuple[d
     scores, notes = benchmark_recordings(config, folder, MOSAIC, NO_CLEANING, out, work / "work", None, command)
     print("\n".join(notes))
     return {"scores": scores, "reader_errors": reader_errors(made, folder)}, out
+
+
+RECORDED_BLOCK = Block(
+    "recorded",
+    "simulated",
+    "studies.recorded",
+    lambda results: as_markdown(score_table(results["simulated"]["scores"])),
+    caption="Simulated photographs in E2P's layout. The truth reader's DoLP differs from the simulated one by at most "
+    "{simulated[reader_errors][dolp]:.4f}, its AoLP by at most {simulated[reader_errors][aolp_deg]:.2f} degrees: "
+    "half a step of the file's 8 bits. {origin}",
+)
 
 
 def figures_of(scores: Mapping[str, Any]) -> dict[str, int]:
