@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.benchmark.rows import predictions_of
-from polarnet.benchmark.score import mean_scores, score_sequence
+from polarnet.benchmark.score import FrameScore, mean_scores, score_sequence
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import load
 from polarnet.events.labels import LABELS
@@ -57,7 +57,8 @@ def measured(work: Path, photographs: Sequence[Path]) -> dict[str, Any]:
         (work / "pictures" / photograph.name).symlink_to(photograph)
     make_folder_set(work / "pictures", "photographs", work / "made", config.recipe, config.mapper)
     test_set, context = made_set("noisy", work / "made"), context_of(config, None, shipped_weights())
-    before, after, rows = Counter[str](), {name: Counter[str]() for name in CLEANINGS}, {name: [] for name in CLEANINGS}
+    before, after = Counter[str](), {name: Counter[str]() for name in CLEANINGS}
+    rows: dict[str, list[FrameScore]] = {name: [] for name in CLEANINGS}
     for sequence in map(test_set.sequence, test_set.sequences):
         before += causes(sequence.events)
         for name, cleaning in CLEANINGS.items():

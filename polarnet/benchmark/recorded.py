@@ -93,7 +93,8 @@ def read_recorded(
             f"{path.name}: expected events and frames on one clock, got events from {first_us} to {last_us} us and "
             f"frames from {truth.t_us[0]} to {truth.t_us[-1]} us; bring them onto one clock"
         )
-    truth = Truth(*(one[during if isinstance(one, np.ndarray) else torch.from_numpy(during)] for one in truth))
+    maps = (one[torch.from_numpy(during)] for one in (truth.intensity, truth.dolp, truth.aolp, truth.valid))
+    truth = Truth(truth.t_us[during], *maps, truth.light[during])
     notes = [f"{name}: {note}" for note in clock_notes(truth.t_us, frame_lag(events, truth))]
     start_us, stop_us = int(truth.t_us[0]), int(truth.t_us[-1])
     cleaner = Cleaner(cleaning, mosaic)

@@ -53,12 +53,10 @@ def _convert(options: argparse.Namespace) -> int:
     last_us = int(events.t[-1]) if len(events) else 0
     stop_us = last_us - origin_us + 1 if span[1] is None else span[1]
     if stop_us <= start_us:
-        raise ValueError(
-            f"expected --stop after --start, within {last_us - origin_us} us, got {start_us}, {stop_us} us"
-        )
+        raise ValueError(f"expected --stop after --start, got {start_us} to {stop_us} us of {last_us - origin_us} us")
     part = shifted(slice_time(events, origin_us + start_us, origin_us + stop_us), origin_us + start_us)
     with replaced(options.out) as temporary:
-        FORMS[form][1](temporary, part, min(stop_us, last_us - origin_us + 1) - start_us)
+        FORMS[form][1](temporary, part, max(0, min(stop_us, last_us - origin_us + 1) - start_us))
     print(
         f"{options.file} ({recording.format}) -> {options.out} ({form}): {len(part):,} of {len(events):,} events, "
         f"time 0 is {origin_us + start_us} us"
