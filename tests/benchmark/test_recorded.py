@@ -35,8 +35,8 @@ NOTHING = Cleaning(None, 4.0, None)
 TINY = [
     "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.2", "synthesize.sensor_height=40",
     "synthesize.sensor_width=56", "benchmark.warmup_windows=1", "benchmark.bootstrap_samples=10",
-    "benchmark.panel_scenes=1", "benchmark.lpips=false", "runtime.threads=1", "train.crop=null", "baselines.e2v.crop=null",
-    "baselines.e2p.crop=null",
+    "benchmark.panel_scenes=1", "benchmark.lpips=false", "runtime.threads=1",
+    "baselines.e2v.crop=null", "baselines.e2p.crop=null",
 ]  # fmt: skip
 
 

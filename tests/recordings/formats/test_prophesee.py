@@ -75,7 +75,7 @@ def test_the_sensors_name_stands_for_its_size(tmp_path):
 
 def test_other_versions_of_evt_are_refused(tmp_path):
     (tmp_path / "e.raw").write_bytes(b"% evt 4.0\n1234")
-    with pytest.raises(RecordingError, match="states EVT 2 or 3, got 4"):
+    with pytest.raises(RecordingError, match=r"states EVT 2, 2\.1 or 3, got 4"):
         read_recording(tmp_path / "e.raw")
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
+from studies.rosbag_writer import write_bag
 
 EVENTS = [(5, 3, 4, 1), (1_000_009, 7, 0, -1), (1_000_010, 0, 5, 1)]
 
@@ -16,53 +17,21 @@ def rosbags():
     return pytest.importorskip("rosbags", reason="the extra rosbag is not installed")
 
 
-def write_bag(path, topics=("/dvs/events",), form="ros1", package="dvs_msgs", events=EVENTS):
-    """Write a message with all but the last event, and one with the last."""
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import Writer as Writer2
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    from polarnet.recordings.formats.rosbag_tasks import EVENT, EVENT_ARRAY
-
-    store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
-    for name, text in (("Event", EVENT), ("EventArray", EVENT_ARRAY)):
-        text = text.replace("builtin_interfaces/Time", "time" if form == "ros1" else "builtin_interfaces/Time")
-        store.register(get_types_from_msg(text, f"{package}/msg/{name}"))
-    kinds = store.types
-    time, header = kinds["builtin_interfaces/msg/Time"], kinds["std_msgs/msg/Header"]
-
-    def message(rows):
-        stamp = header(**({"seq": 0} if form == "ros1" else {}), stamp=time(sec=0, nanosec=0), frame_id="")
-        made = [
-            kinds[f"{package}/msg/Event"](x=x, y=y, ts=time(sec=t // 10**6, nanosec=t % 10**6 * 1000), polarity=p > 0)
-            for t, x, y, p in rows
-        ]
-        return kinds[f"{package}/msg/EventArray"](header=stamp, height=6, width=8, events=made)
-
-    name = f"{package}/msg/EventArray"
-    with Writer1(path) if form == "ros1" else Writer2(path, version=9) as bag:
-        for topic in topics:
-            connection = bag.add_connection(topic, name, typestore=store)
-            for k, rows in enumerate((events[:-1], events[-1:])):
-                data = (
-                    store.serialize_ros1(message(rows), name)
-                    if form == "ros1"
-                    else store.serialize_cdr(message(rows), name)
-                )
-                bag.write(connection, k, data)
+def write(path, topics=("/dvs/events",), form="ros1", package="dvs_msgs"):
+    write_bag(path, EVENTS, 6, 8, topics, form, package)
     return path
 
 
 @pytest.mark.parametrize(("form", "package"), [("ros1", "dvs_msgs"), ("ros2", "prophesee_event_msgs")])
 def test_events_of_a_bag_arrive_in_microseconds_with_the_sensors_size(rosbags, tmp_path, form, package):
-    recording = read_recording(write_bag(tmp_path / ("e.bag" if form == "ros1" else "e"), form=form, package=package))
+    recording = read_recording(write(tmp_path / ("e.bag" if form == "ros1" else "e"), form=form, package=package))
     events = recording.events
     assert (recording.format, events.height, events.width) == ("rosbag", 6, 8)
     assert [events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist()] == np.array(EVENTS).T.tolist()
 
 
 def test_a_bag_of_several_topics_needs_the_topic(rosbags, tmp_path):
-    path = write_bag(tmp_path / "e.bag", ("/left", "/right"))
+    path = write(tmp_path / "e.bag", ("/left", "/right"))
     with pytest.raises(RecordingError, match=r"or --part TOPIC, got /left, /right"):
         read_recording(path)
     assert len(read_recording(path, part="/right").events) == 3
@@ -70,11 +39,11 @@ def test_a_bag_of_several_topics_needs_the_topic(rosbags, tmp_path):
 
 def test_a_bag_without_events_lists_what_it_has(rosbags, tmp_path):
     with pytest.raises(RecordingError, match=r"got only /e \(other_msgs/msg/EventArray\)"):
-        read_recording(write_bag(tmp_path / "e.bag", ("/e",), package="other_msgs"))
+        read_recording(write(tmp_path / "e.bag", ("/e",), package="other_msgs"))
 
 
 def test_a_damaged_bag_is_refused(rosbags, tmp_path):
-    path = write_bag(tmp_path / "e.bag")
+    path = write(tmp_path / "e.bag")
     path.write_bytes(path.read_bytes()[:-300])
     with pytest.raises(RecordingError, match=r"e\.bag: rosbags cannot read it: .*the bag is damaged"):
         read_recording(path)
