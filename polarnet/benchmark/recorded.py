@@ -93,8 +93,15 @@ def read_recorded(
             f"{path.name}: expected events and frames on one clock, got events from {first_us} to {last_us} us and "
             f"frames from {truth.t_us[0]} to {truth.t_us[-1]} us; bring them onto one clock"
         )
-    maps = (one[torch.from_numpy(during)] for one in (truth.intensity, truth.dolp, truth.aolp, truth.valid))
-    truth = Truth(truth.t_us[during], *maps, truth.light[during])
+    keep = torch.from_numpy(during)
+    truth = Truth(
+        truth.t_us[during],
+        truth.intensity[keep],
+        truth.dolp[keep],
+        truth.aolp[keep],
+        truth.valid[keep],
+        truth.light[during],
+    )
     notes = [f"{name}: {note}" for note in clock_notes(truth.t_us, frame_lag(events, truth))]
     start_us, stop_us = int(truth.t_us[0]), int(truth.t_us[-1])
     cleaner = Cleaner(cleaning, mosaic)
