@@ -137,7 +137,7 @@ def test_evt21_has_32_pixels_in_a_word_of_64_bits(tmp_path, header):
     high = 8 << 60 | 3 << 32
     words = [evt21(1, 9, 0, 0, 1), high, evt21(1, 5, 32, 7, 0b101), evt21(0, 63, 608, 479, 1 << 31)]
     path = tmp_path / "e.raw"
-    path.write_bytes(header + b"% end\n" + np.array(words, "<u8").tobytes())
+    path.write_bytes(header + np.array(words, "<u8").tobytes())
     recording = read_recording(path)
     events = recording.events
     assert (recording.format, events.height, events.width, recording.repairs) == ("evt", 480, 640, {"orphans": 1})
