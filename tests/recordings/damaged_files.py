@@ -64,7 +64,7 @@ class Sample:
     def __init__(self, form: str, folder: Path, events: Events):
         self.form = form
         self._size = {"height": events.height, "width": events.width} if form == "esfp" else {}  # the file has no size
-        self.path = folder / f"sample.{form}"
+        self.path = folder / f"sample.{'bag' if form == 'rosbag' else form}"
         write_sample(form, self.path, events)
         self._files = sorted(path for path in [self.path, *self.path.rglob("*")] if path.is_file())
         self._sound = [file.read_bytes() for file in self._files]
@@ -114,8 +114,7 @@ def write_sample(form: str, path: Path, events: Events) -> None:
     elif form == "rosbag":
         pytest.importorskip("rosbags", reason="the extra rosbag is not installed")
         rows = list(zip(*(getattr(events, name).tolist() for name in "txyp"), strict=True))
-        write_bag(path.with_suffix(".bag"), rows, events.height, events.width)
-        path.with_suffix(".bag").rename(path)
+        write_bag(path, rows, events.height, events.width)
     elif form in ("aedat4", "event_stream"):
         faery = pytest.importorskip("faery")
         rows = np.array(list(zip(events.t, events.x, events.y, events.p > 0, strict=True)), faery.EVENTS_DTYPE)
