@@ -12,6 +12,7 @@ from polarnet.reports.legend import LABELS, in_order
 from polarnet.reports.tables import COLUMNS, ERROR_PARTS
 from studies.designs import DESIGNS
 from studies.measure import ABLATION_KEYS, ablation_about
+from studies.rate import ENDS, HELD, OURS, RATED
 from studies.scenes import CHOICES
 from studies.tables import Block, Columns, Results, Row, listed, origin
 
@@ -230,6 +231,18 @@ def _robustness(key: str, form: str) -> Block:
     )  # fmt: skip
 
 
+def _between_rows(results: Results) -> Iterator[Row]:
+    """PSNR of frames between windows, by kind of scenes."""
+    for name, table in results["test"]["tables"].items():
+        if name.startswith(RATED):
+            psnr = {row: one["psnr"] for row, one in table["rows"].items()}
+            ends = psnr[OURS + ENDS]
+            yield {
+                "kind": name.removeprefix(f"{RATED}."), "scenes": table["scenes"], "ends": ends,
+                "carried": ends - psnr[OURS], "held": ends - psnr[OURS + HELD],
+            }  # fmt: skip
+
+
 NETWORK_BLOCKS = {
     "headline": Block(
         "network", "seed_1", "studies.study", _headline_rows,
@@ -322,6 +335,13 @@ NETWORK_BLOCKS = {
         "Rows are in the order of validation MSE; ± is the standard deviation over seeds. LPIPS has the backbone "
         "`{loss_weights[lpips_backbone]}`. {origin}",
         _overrides("loss_weights"),
+    ),
+    "between": Block(
+        "robustness", "test", "studies.robustness --write", _between_rows,
+        {
+            "scenes": "{kind}", "number": "{scenes}", "window ends, dB": "{ends:.2f}",
+            "carried on, dB lost": "{carried:.2f}", "held, dB lost": "{held:.2f}",
+        },
     ),
     "robustness": _robustness("mse_over_oracle_mean", ".2f"),
     "robustness-median": _robustness("median_over_oracle_mean", ".2f"),

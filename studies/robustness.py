@@ -11,7 +11,9 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 - `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS.
   `ours, thresholds given` is told the contrast thresholds of the sensor (`methods.ours.thresholds`).
 - `time.5ms`: the same with windows of 5 ms.
-- `speed`: windows a second of the first weights on random events, with --threads.
+- `time.2000hz.photographs`, `time.2000hz.measured`: frames between windows (`polarnet recover --rate 2000`), on the
+  pictures of the sensors and on all measured scenes, at 16 times between the ends of two windows (`studies.rate`).
+- `speed`: windows a second of the first weights on random events, and ms of a frame between windows, with --threads.
 
 Nothing is trained, except the constants: `train_mean` is the mean DoLP of the training photographs, and `constant_real`
 the mean DoLP of the measured scenes of all sources but the one that is scored. --split val is for choices and --split
@@ -31,7 +33,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,6 +60,7 @@ from polarnet.simulation.truth import synthesize
 from polarnet.stokes import Prediction, dolp, stokes_from_intensities
 from polarnet.storage.scenes import SceneStore
 from studies.measure import arguments_of, command_line, machine_record, write_section
+from studies.rate import ENDS, EVENTS_PER_PIXEL, FRAME_RATE_HZ, OURS, RATE_HZ, RATED, ms_per_frame, rated_scores
 
 ROOT = Path(__file__).resolve().parents[1]
 SENSORS: dict[str, tuple[str, ...]] = {
@@ -91,9 +94,6 @@ TIMES: dict[str, tuple[str, ...]] = {"5ms": ("synthesize.frame_rate_hz=200",)}
 """Overrides that change the windows."""
 SIZES = ((120, 180), (260, 346), (480, 640))
 TIMED_WINDOWS, WARM_WINDOWS = 12, 4
-EVENTS_PER_PIXEL = 0.8  # a window; the default sensor's mean
-FRAME_RATE_HZ = 30.0  # of the windows that `benchmark.warmup_windows` counts
-OURS = "ours"
 CALIBRATED = "ours, thresholds given"
 CONSTANT = "constant_real"
 METHODS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
@@ -227,14 +227,25 @@ def scored_sequence(
     return Scores(rows, {test.scene: float(truth.mean())}, errors)
 
 
-def scored(images: Path, config: Config, contexts: Mapping[str, Context], constant: float) -> Scores:
-    """Scores of all methods on the pictures of a folder under one condition."""
+def rated_sequence(name: str, **settings: Any) -> Scores:
+    """Scores of the frames between the windows of one sequence (`studies.rate.rated_scores`)."""
+    rows, degree = rated_scores(name, **settings)
+    return Scores(rows, {rows[0].scene: degree}, {})
+
+
+def scored(
+    images: Path, config: Config, contexts: Mapping[str, Context], constant: float, rated: bool = False
+) -> Scores:
+    """Scores of all methods on the pictures of a folder under one condition; `rated`: of frames between windows."""
     scenes = scenes_of(images, config)
     warmup = round(config.benchmark.warmup_windows * config.synthesize.frame_rate_hz / FRAME_RATE_HZ)
-    task = functools.partial(
-        scored_sequence, scenes=scenes, motion=config.synthesize, camera=config.camera, seed=config.seed,
-        warmup=warmup, contexts=contexts, constant=constant,
-    )  # fmt: skip
+    common: dict[str, Any] = {
+        "scenes": scenes, "motion": config.synthesize, "camera": config.camera, "seed": config.seed,
+        "warmup": warmup, "contexts": contexts,
+    }  # fmt: skip
+    task: Callable[[str], Scores] = functools.partial(scored_sequence, **common, constant=constant)
+    if rated:
+        task = functools.partial(rated_sequence, **common, between=config.between)
     results = config.mapper("sequences")(task, list(scenes.sequences))
     return functools.reduce(Scores.__add__, results)
 
@@ -315,6 +326,10 @@ def headlines(tables: Mapping[str, Any], row: str) -> dict[str, Any]:
         if "time.5ms" in tables:
             psnr = [tables[name]["rows"][row]["psnr"] for name in ("sensors.default", "time.5ms")]
             figures["time"] = {"db_lost_5ms": psnr[0] - psnr[1]}
+    rated = [table["rows"] for name, table in tables.items() if name.startswith(RATED)]
+    if rated:
+        lost = max(rows[row + ENDS]["psnr"] - rows[row]["psnr"] for rows in rated)
+        figures["time"] = figures.get("time", {}) | {f"db_lost_{RATE_HZ}hz": lost}
     return figures
 
 
@@ -373,6 +388,10 @@ def conditions_of(
             conditions[f"measured.{name}"] = [(part_of(measured, work / name, "test", limit), ())]
     small = part_of(images["rgb"], work / "rgb", arguments.split, arguments.sensor_limit or limit)
     others = {"sensors": SENSORS, "time": TIMES}
+    scenes = [part for name, parts in conditions.items() if name.startswith("measured.") for part in parts]
+    conditions[f"{RATED}.photographs"] = [(small, ())]
+    if scenes:
+        conditions[f"{RATED}.measured"] = scenes
     return conditions | {
         f"{kind}.{name}": [(small, overrides)] for kind, of in others.items() for name, overrides in of.items()
     }
@@ -418,7 +437,7 @@ def main() -> None:
                 thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
                 calibrated = settings(*common, *overrides, f"methods.ours.thresholds={thresholds}")
                 contexts[CALIBRATED] = context_of(calibrated, train_mean, first_weights)
-            one = scored(part, config, contexts, constant)
+            one = scored(part, config, contexts, constant, rated=name.startswith(RATED))
             results[name] = results[name] + one if name in results else one
         tables[name] = table_of(results[name])
         print(
@@ -432,7 +451,8 @@ def main() -> None:
     figures = headlines(tables, row)
     if "speed" in wanted:
         rates = {f"windows_per_s_{height}x{width}": windows_per_s(weights, height, width) for height, width in SIZES}
-        figures["speed"] = rates | {"threads": arguments.threads}
+        between = {f"ms_per_{RATE_HZ}hz_frame_{h}x{w}": ms_per_frame(h, w, config.between) for h, w in SIZES}
+        figures["speed"] = rates | between | {"threads": arguments.threads}
     print(json.dumps(figures, indent=1))
     section = {
         "split": arguments.split, "limit": arguments.limit, "sensor_limit": arguments.sensor_limit,

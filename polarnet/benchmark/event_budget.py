@@ -4,7 +4,8 @@ Three studies run on the test sequences:
 
 - quality against the events per pixel since the start of the motion (Fig. 11a; the paper finds about one);
 - quality against the length of the windows;
-- overlapping windows of the last N events of each channel, one every fraction of a millisecond (Fig. 11b).
+- frames every fraction of a millisecond (Fig. 11b), from overlapping windows of the last N events of each channel, or
+  carried on from window to window (`polarnet.methods.between`).
 
 Events per pixel are the mean over the four channels, as in the paper.
 """
@@ -19,6 +20,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 from tqdm import tqdm
 
+from polarnet.benchmark.between_windows import frames_between
 from polarnet.benchmark.resimulate import sequence_at
 from polarnet.benchmark.rows import Context, opened, predictions_of
 from polarnet.benchmark.score import FrameScore, mean_scores, score_sequence
@@ -26,6 +28,7 @@ from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import Events, slice_count
 from polarnet.events.streaming import EventWindow
 from polarnet.methods import METHODS
+from polarnet.methods.between import BetweenConfig
 from polarnet.metrics.similarity import correlation, mse, psnr
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
@@ -172,14 +175,44 @@ def by_sliding_window(
     return table
 
 
+def between_windows(
+    scenes: SceneStore,
+    events: EventStore,
+    sequences: Sequence[str],
+    span_us: tuple[int, int],
+    spacing_us: int,
+    window_us: int,
+    method: str,
+    config: BetweenConfig,
+    context: Context,
+) -> dict[str, Any]:
+    """Mean scores of frames every `spacing_us`, carried on between windows of `window_us`, as `by_sliding_window`."""
+    times = list(range(span_us[0], span_us[1] + 1, spacing_us))
+    recoverer = opened(METHODS[method], context)
+    of_sequences = []
+    for name in tqdm(sequences, "frames between windows", unit="sequence"):
+        channels = events.read(name)
+        run = sequence_at(scenes, name, channels, torch.arange(0, span_us[1] + 1, window_us))
+        truth = sequence_at(scenes, name, channels, torch.tensor([times[0] - spacing_us, *times]))
+        frames = frames_between(run, times, recoverer, config).carried.dolp
+        of_sequences.append(_frame_scores(frames, truth))
+    means = {name: float(np.mean([scores[name] for scores in of_sequences])) for name in of_sequences[0]}
+    return {"window_us": window_us, "spacing_us": spacing_us, **means}
+
+
 def _sliding_scores(
     sequence: TestSequence, per_pixel: float, times: Sequence[int], carry: bool, method: str, context: Context
 ) -> Mapping[str, float]:
     first = sequence.events[0]
     count = max(2, round(per_pixel * first.height * first.width))
     frames = sliding_recovery(sequence, count, times, carry, method, context)
-    truth, valid = sequence.dolp, sequence.valid
     spans = [_length_us(last) for last in _last(sequence.events, count, times[len(times) // 2])]
+    return {**_frame_scores(frames, sequence), "window_ms": float(np.mean(spans)) / 1000}
+
+
+def _frame_scores(frames: Float[Tensor, "n h w"], sequence: TestSequence) -> dict[str, float]:
+    """Mean scores of DoLP at the times of a sequence's truth, and its mean change from frame to frame."""
+    truth, valid = sequence.dolp, sequence.valid
     scores = {
         "mse": mse(frames, truth, valid),
         "psnr": psnr(frames, truth, valid),
@@ -189,5 +222,4 @@ def _sliding_scores(
         **{name: float(values.mean()) for name, values in scores.items()},
         "change": float(frames.diff(dim=0).abs().mean()),
         "true_change": float(truth.diff(dim=0).abs().mean()),
-        "window_ms": float(np.mean(spans)) / 1000,
     }

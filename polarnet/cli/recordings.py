@@ -24,11 +24,11 @@ CLEANING_OPTIONS = ("hot_pixels", "background")
 NETWORK_WINDOW = "33.333ms"
 
 OPTIONS_BY_INPUT = {
-    "--live": {"mosaic", *CLEANING_OPTIONS},
-    "four files": {"angles", "size", *CLEANING_OPTIONS, *READING_OPTIONS},
-    "one file with --mosaic": {"mosaic", "size", *CLEANING_OPTIONS, *READING_OPTIONS},
+    "--live": {"mosaic", "rate", *CLEANING_OPTIONS},
+    "four files": {"angles", "size", "rate", *CLEANING_OPTIONS, *READING_OPTIONS},
+    "one file with --mosaic": {"mosaic", "size", "rate", *CLEANING_OPTIONS, *READING_OPTIONS},
     "one file with --rotating or --triggers": {"rotating", "triggers", "start_angle", "size", *READING_OPTIONS},
-    "an event store or a folder": {"sequence", "size", *CLEANING_OPTIONS},
+    "an event store or a folder": {"sequence", "size", "rate", *CLEANING_OPTIONS},
 }
 """Options of `polarnet recover` that apply to each kind of input."""
 
@@ -124,6 +124,12 @@ def _add_method(recover: argparse.ArgumentParser) -> None:
         "--rotating: half a turn)",
     )
     recover.add_argument(
+        "--rate",
+        type=float,
+        metavar="HZ",
+        help="frames a second, such as 2000: events carry each frame on to the next window (default: a frame a window)",
+    )
+    recover.add_argument(
         "--weights", type=Path, metavar="FILE", help="checkpoint of the network (default: the shipped one)"
     )
     recover.add_argument(
@@ -131,7 +137,7 @@ def _add_method(recover: argparse.ArgumentParser) -> None:
         nargs=2,
         type=float,
         metavar=("ON", "OFF"),
-        help="contrast thresholds of the camera, natural-log intensity (default: those of the network's training); "
+        help="contrast thresholds of the camera, natural-log intensity (default: estimated from the events); "
         "`polarnet fit-sensor` measures them",
     )
     recover.add_argument(
@@ -196,7 +202,8 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.recordings.noise import Cleaner
     from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recordings.recording import read_recording
-    from polarnet.recovery.recover import Arrangement, facts_of, open_files, open_live, open_method, recover
+    from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
+    from polarnet.recovery.recover import Arrangement, facts_of, frames_of, open_files, open_live, open_method, recover
     from polarnet.recovery.writer import RecoveryWriter
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
@@ -218,6 +225,11 @@ def _recover(options: argparse.Namespace) -> int:
         lambda method: setup_of(config(), method),
         options.thresholds,
     )
+    frames: Any = frames_of
+    if options.rate is not None:
+        check_rate(options.rate, rule, recoverer)
+        rate = Rate(options.rate, config().between.with_thresholds(options.thresholds))
+        frames = functools.partial(frames_at_rate, rate=rate)
     name = "live" if options.live else Path(options.input[0]).stem
     out = options.out or Path("outputs") / "recover" / name
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
@@ -236,11 +248,13 @@ def _recover(options: argparse.Namespace) -> int:
         check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
         source = source._replace(pieces=check.watch(source.pieces))
         writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
-        summary = recover(source, rule, recoverer, writer)
+        summary = recover(source, rule, recoverer, writer, frames)
         left_out = {kind: count for kind, count in lines.counts.items() if count} if lines else {}
         notes = [*check.findings(), *([f"Unusable lines were left out: {left_out}."] if left_out else [])]
         counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)
         facts = facts_of(source, rule, words, summary)
+        if options.rate is not None:
+            facts["rate"] = f"{options.rate:g} frames a second, carried on by the events from window to window"
         facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
         if any(getattr(options, option) for option in CLEANING_OPTIONS):
             facts["removed"] = cleaner.sentence()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.benchmark.conditions import announced, configured, stored
-from polarnet.benchmark.event_budget import by_sliding_window, by_window_length, since_start
+from polarnet.benchmark.event_budget import between_windows, by_sliding_window, by_window_length, since_start
 from polarnet.benchmark.rows import ROWS, metadata_used, why_left_out
 from polarnet.benchmark.run import train_mean_dolp
 from polarnet.benchmark.sensitivity import sensitivity
@@ -41,6 +41,7 @@ def run_event_budget(
     lengths = [length for length in WINDOW_LENGTHS_US if settle_us + length <= end_us]
     first = min(end_us // 2, end_us - SPACING_US)
     span = (first, min(first + SLIDING_FRAMES * SPACING_US, end_us))
+    window_us = round(1e6 / config.synthesize.frame_rate_hz)
     results = {
         "methods": list(methods),
         "sequences": list(sequences),
@@ -48,6 +49,9 @@ def run_event_budget(
         "since_start": since_start((tests.sequence(name) for name in sequences), methods, context),
         "window_length": by_window_length(scenes, tests.events, sequences, lengths, settle_us, methods, context),
         "sliding": by_sliding_window(scenes, tests.events, sequences, span, SPACING_US, "ours", context),
+        "between": between_windows(
+            scenes, tests.events, sequences, span, SPACING_US, window_us, "ours", config.between, context
+        ),
     }
     return _written(out, "event_budget", results, png(event_budget_figure(results, LIGHT)))
 

@@ -21,6 +21,7 @@ from polarnet.benchmark.score import BenchmarkConfig
 from polarnet.captures.dot import RecordingsConfig
 from polarnet.config.experiments import preset_names, preset_values
 from polarnet.methods import METHODS, module_of, trained_rows
+from polarnet.methods.between import BetweenConfig
 from polarnet.methods.postprocessing import PostprocessingConfig
 from polarnet.methods.rotating_polarizer import ModulationConfig
 from polarnet.methods.stokes_gain import GainConfig
@@ -135,6 +136,7 @@ class Config:
     train: TrainConfig
     lpips: LpipsConfig
     methods: MethodsConfig
+    between: BetweenConfig
     baselines: BaselinesConfig
     benchmark: BenchmarkConfig
     rows: dict[RowName, RowConfig]

@@ -1,5 +1,6 @@
 """Recurrent networks that predict DoLP from the events of a window, as methods."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -12,13 +13,14 @@ from polarnet.events.representations import REPRESENTATIONS, Encode, event_count
 from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Recoverer, Setup, State, WeightsConfig, each_map, weights_file
-from polarnet.networks.checkpoint import load_network
+from polarnet.methods.window_length import of_any_length
+from polarnet.networks.checkpoint import load_network, trained_window_us
 from polarnet.networks.registry import NETWORKS
+from polarnet.networks.stokes_unet import StokesUNet
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
 DOLP_NETWORKS = tuple(NETWORKS)
-COUNTS = "event_counts"  # the representation whose images scale with the threshold
 
 
 @section
@@ -26,7 +28,7 @@ class DolpNetworkConfig(WeightsConfig):
     """Section `methods.ours` of params.yaml."""
 
     thresholds: Annotated[list[PositiveFloat], Field(min_length=2, max_length=2)] | None
-    """Contrast thresholds of the camera, ON and OFF; null: those of the training."""
+    """Contrast thresholds of the camera, ON and OFF, in natural-log intensity; null: estimated from the events."""
 
 
 def encoded(windows: Sequence[EventWindow], encode: Encode) -> Float[Tensor, "n c h w"]:
@@ -43,15 +45,14 @@ def dolp_recoverer(
 ) -> Recoverer:
     """Wrap a network and the metadata of its checkpoint (`load_network`) as a method.
 
-    `precision` is fp32 or bf16 (autocast). Windows should be as long as in training. For DoLP at a higher rate, let
-    windows of that length overlap (`polarnet.methods.overlap`). `thresholds` are the camera's contrast thresholds, ON
-    and OFF: its events then count in the steps that the network was trained with (`in_steps_of_training`).
+    `precision` is fp32 or bf16 (autocast). Windows may have any length (`polarnet.methods.window_length`).
+    `thresholds` are the camera's contrast thresholds, ON and OFF (`told`).
     """
     place = torch.device(device)
     ready: Any = network.to(place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
     encode = REPRESENTATIONS[metadata["representation"]]
     if thresholds is not None:
-        encode = in_steps_of_training(metadata, thresholds)
+        encode = told(ready, metadata, thresholds)
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
         inputs = encoded(windows, encode)[:, None].to(place)
@@ -59,7 +60,9 @@ def dolp_recoverer(
             prediction, state = ready.unroll(inputs, state)
         return state, each_map(prediction, lambda field: field[:, 0])
 
-    return Recoverer(lambda height, width: None, predict, network=ready)
+    recoverer = Recoverer(lambda height, width: None, predict, network=ready)
+    trained_us = trained_window_us(metadata)
+    return recoverer if trained_us is None else of_any_length(recoverer, trained_us)
 
 
 def open_dolp_network(setup: Setup) -> Recoverer:
@@ -69,30 +72,23 @@ def open_dolp_network(setup: Setup) -> Recoverer:
     return dolp_recoverer(network, metadata, setup.device, setup.precision, thresholds)
 
 
-def in_steps_of_training(metadata: Mapping[str, Any], thresholds: Sequence[float]) -> Encode:
-    """`event_counts` for a camera with other contrast thresholds (ON, OFF) than those of the training.
+def told(network: nn.Module, metadata: Mapping[str, Any], thresholds: Sequence[float]) -> Encode:
+    """Tell a network the camera's contrast thresholds (ON, OFF), and return the encoding of events that it then needs.
 
-    An event of threshold c changes the logarithm of the light by c, so it counts as c over the training's threshold. If
-    both thresholds are above the training's, the smaller one counts 1: the redundancy needs no common factor, and
-    larger counts with gaps between them are unlike any in training (worse on validation photographs).
-    ValueError if a threshold is not above 0, if the network takes another representation, or if its checkpoint does not
-    name its thresholds.
+    The network uses their geometric mean instead of its own estimate, and each event counts as its threshold over this
+    mean. ValueError if a threshold is not above 0, or for a network that estimates no threshold.
     """
     if min(thresholds) <= 0:
         raise ValueError(f"thresholds: expected numbers above 0 (ON, OFF), got {list(thresholds)}")
-    if metadata["representation"] != COUNTS:
-        raise ValueError(
-            f"thresholds: expected a network that takes {COUNTS}, this one takes {metadata['representation']}; "
-            f"leave the thresholds out"
-        )
-    sensor = metadata.get("data", {}).get("events_from", {}).get("emulate")
-    if sensor is None:
-        raise ValueError("thresholds: the checkpoint does not name the sensor of its training; leave them out")
-    steps = [
-        threshold / sensor[f"contrast_threshold_{polarity}"]
-        for threshold, polarity in zip(thresholds, ("on", "off"), strict=True)
-    ]
-    steps = [step / max(1.0, min(steps)) for step in steps]
+    if not isinstance(network, StokesUNet):
+        raise ValueError(f"thresholds: expected network polarnet, got {metadata['network']}; leave the thresholds out")
+    mean = math.sqrt(math.prod(thresholds))
+    network.scale.given = mean / network.step
+    return weighted_counts([threshold / mean for threshold in thresholds])
+
+
+def weighted_counts(steps: Sequence[float]) -> Encode:
+    """Return `event_counts` in which an ON and an OFF event count as `steps`."""
 
     def encode(events: Events, window_us: int) -> Float[Tensor, "2 h w"]:
         polarity, count = event_counts(events, window_us)

@@ -77,6 +77,12 @@ def load_network(path: str | os.PathLike[str]) -> tuple[nn.Module, dict[str, Any
     return network.eval(), metadata
 
 
+def trained_window_us(metadata: Mapping[str, Any]) -> int | None:
+    """Return the length of a training's windows in microseconds; None unless its events were simulated."""
+    settings = metadata.get("data", {}).get("events_from", {}).get("scenes", {}).get("synthesize")
+    return round(1e6 / settings["frame_rate_hz"]) if settings else None
+
+
 def load_tensors(network: nn.Module, tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> None:
     """Copy the tensors of a file into `network`; ValueError names a missing, surplus or differently shaped tensor."""
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}

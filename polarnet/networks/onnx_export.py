@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from polarnet.events.representations import REPRESENTATIONS, channels_of
+from polarnet.networks.checkpoint import trained_window_us
 from polarnet.runtime.extras import installation
 from polarnet.runtime.files import replaced
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
@@ -157,7 +158,7 @@ def _description(
         "format": FORMAT,
         "network": metadata["network"],
         "representation": metadata["representation"],
-        "window_us": _window_us(metadata),
+        "window_us": trained_window_us(metadata),
         "events": {
             "shape": shape,
             "polarizers_deg": POLARIZER_ANGLES_DEG,
@@ -172,12 +173,6 @@ def _description(
         ],
         "checkpoint": dict(metadata),
     }
-
-
-def _window_us(metadata: Mapping[str, Any]) -> int | None:
-    """Window length of the training in microseconds; None unless its events were simulated."""
-    settings = metadata.get("data", {}).get("events_from", {}).get("scenes", {}).get("synthesize")
-    return round(1e6 / settings["frame_rate_hz"]) if settings else None
 
 
 def _check_path(path: Path) -> None:

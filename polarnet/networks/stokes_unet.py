@@ -33,15 +33,18 @@ from polarnet.networks.redundancy import (
     length,
     neighbourhoods,
 )
+from polarnet.networks.sensitivity import Equaliser
+from polarnet.networks.threshold import Scale, scale_features
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
 STRIDE = 4  # stride of the largest recurrent layer; height and width are padded to multiples of it
 IMAGES = 2  # input images per channel: sum of polarities and number of events (representation `event_counts`)
-PARTS = ("redundancy", "slopes", "sums", "recurrence", "panorama")
+PARTS = ("redundancy", "slopes", "sums", "recurrence", "panorama", "sensitivity", "scale")
 MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate
 WIDE = (3, 9)  # widths in pixels of the neighbourhoods that contribute fine structure, besides the single pixel
 MAX_DOLP = 0.98  # largest DoLP passed to atanh, to keep it finite
+SENSITIVITY_TENSORS = 2  # numbers of ON and OFF events, and the change of their weights
 PANORAMA_TENSORS = 1 + len(Panorama._fields)  # events of the previous window, then the panorama
 NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window; the rest of the state is missing
 LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
@@ -71,7 +74,7 @@ class StokesUNetConfig:
     panorama_renewal: Annotated[float, Field(ge=0, le=1)]
     panorama_fade: Annotated[float, Field(ge=0, le=1)]
     panorama_step: PositiveFloat
-    """Change of natural-log intensity per event."""
+    """Change of natural-log intensity per event of the sensor whose scale (`polarnet.networks.threshold`) is 1."""
     panorama_scale: PositiveInt
     """Width of the neighbourhood whose mean comes from the network instead of the panorama, in pixels at quarter
     resolution, odd."""
@@ -80,7 +83,7 @@ class StokesUNetConfig:
     without: list[str]
     """Parts (of PARTS) to ablate. redundancy: all candidates are 0; slopes: the panorama's candidates are 0; sums: the
     gains that move (s1, s2) by event sums are 0; recurrence: recurrent layers restart in each window; panorama: no
-    panorama."""
+    panorama; sensitivity: events keep their weights; scale: every sensor has the threshold `panorama_step`."""
 
     def __post_init__(self):
         if len(self.channels) < 3 or not (self.memories and self.decays and self.scales):
@@ -106,6 +109,9 @@ class Candidates(NamedTuple):
 class StokesUNet(nn.Module):
     """Recurrent network from the events of four channels to DoLP, AoLP and DoLP's expected squared error.
 
+    0. Sensor: each event is weighted by its pixel's estimated threshold relative to other pixels'
+       (`polarnet.networks.sensitivity`), and all event sums by the sensor's estimated threshold
+       (`polarnet.networks.threshold`).
     1. Mixing: the redundancy gives candidates for (s1, s2) from changes in time and from the panorama's slopes. The
        U-Net mixes these candidates and a constant with weights for each pixel. The mixture is coarse but on the true
        scale.
@@ -116,8 +122,9 @@ class StokesUNet(nn.Module):
        it as an input and chooses its weight at each pixel.
     4. Correction: the U-Net sees the result and adds an unconstrained correction.
 
-    The state is a list: the event sums, the sums of moments, the sums averaged over each width of `WIDE`, the events of
-    the previous window with the panorama, and the states of the recurrent layers.
+    The state is a list: the numbers of ON and OFF events and the change of their weights, the event sums, the sums of
+    moments, the sums averaged over each width of `WIDE`, the events of the previous window with the panorama, and the
+    states of the recurrent layers.
 
     DoLP is predicted separately from the length of (s1, s2). Where (s1, s2) are uncertain, their mean is too short,
     like any mean over angles. The outputs are linear, as in the paper's network.
@@ -126,7 +133,7 @@ class StokesUNet(nn.Module):
     representation = "event_counts"
     predicts_stokes = True
     optimizer = "muon"
-    outputs = ("choose", "gains", "trust", "add")
+    outputs = ("choose", "gains", "trust", "add", "scale.out")
 
     def __init__(self, config: StokesUNetConfig, in_channels: int = 4 * IMAGES):
         super().__init__()
@@ -142,6 +149,8 @@ class StokesUNet(nn.Module):
         memories, scales = len(config.memories), len(config.scales)
         solved = (memories * len(config.decays) + 1) * scales
         half, quarter, *smaller = config.channels
+        self.equaliser = Equaliser()
+        self.scale = Scale()
         self.moments = SecondMoments(memories)
         self.solve = LeastSquares(memories, len(config.decays), scales)
         self.slopes = SlopeMoments()
@@ -192,19 +201,26 @@ class StokesUNet(nn.Module):
         t, b, _, height, width = inputs.shape
         inputs = F.pad(inputs, (0, -width % STRIDE, 0, -height % STRIDE))  # the padding holds no events
         polarity, count = inputs.unflatten(2, (4, IMAGES)).unbind(3)
-        before_sums, before_moments, *others = state or NO_STATE
+        equalised, sensitivity = self.equaliser(polarity, count, state[:SENSITIVITY_TENSORS] if state else [])
+        if "sensitivity" not in self.without:
+            polarity, count = equalised.polarity, equalised.events
+        before_sums, before_moments, *others = state[SENSITIVITY_TENSORS:] if state else NO_STATE
         before_wide, others = others[: len(WIDE)], others[len(WIDE) :]
         before_panorama, recurrent = others[:PANORAMA_TENSORS], others[PANORAMA_TENSORS:]
 
         keep = inputs.new_tensor(self.memories).view(-1, 1, 1, 1)
-        sums = faded(polarity.unsqueeze(2), keep, before_sums)  # t, b, memory, polarizer
+        panorama, certain, next_panorama = self._panorama(polarity, (height, width), before_panorama)
+        clues = scale_features(panorama, equalised.total.flatten(), equalised.mismatch.flatten())
+        scale = torch.ones_like(certain) if "scale" in self.without else self.scale(clues)
+        images, of_window = scale * self.step * panorama, scale.view(t, b, 1, 1, 1, 1)
+        steps = faded(polarity.unsqueeze(2), keep, before_sums)  # t, b, memory, polarizer
+        wide_steps = _wide_differences(polarity, before_wide, keep)
+        sums, wide = of_window * steps, [of_window * means for means in wide_steps]
         from_sums, moments = self._candidates(sums.flatten(0, 1), b, before_moments)
-        wide = _wide_differences(polarity, before_wide, keep)
-        images, certain, panorama = self._panorama(polarity, (height, width), before_panorama)
         from_slopes = self._slope_candidates(images)
         candidates = Candidates(*(torch.cat(pair, dim=1) for pair in zip(from_sums, from_slopes, strict=True)))
 
-        x2 = on_blocks(self.stem, _event_images(sums.flatten(0, 1), count.flatten(0, 1)))
+        x2 = on_blocks(self.stem, _event_images(sums.flatten(0, 1), scale * count.flatten(0, 1)))
         x2 = F.relu(x2 + self.from_mosaic(_panorama_images(images, certain)))
         y4, recurrent = self._quarter(x2, candidates, b, recurrent)
         y2 = self.at_half(self.up_half(y4, skip=x2))
@@ -225,7 +241,8 @@ class StokesUNet(nn.Module):
         log_variance = LOG_VARIANCE + added[:, 3] + F.interpolate(self.expected(features), scale_factor=2)[:, 0]
         maps = [dolp[:, 0], aolp, log_variance, stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
-        return prediction, features, [sums[-1], moments, *(means[-1] for means in wide), *panorama, *recurrent]
+        state = [*sensitivity, steps[-1], moments, *(means[-1] for means in wide_steps), *next_panorama, *recurrent]
+        return prediction, features, state
 
     @torch.no_grad()
     def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:
@@ -269,8 +286,8 @@ class StokesUNet(nn.Module):
         """Follow the panorama over t windows; return its four images, its certainty from 0 to 1, and the next state.
 
         The four images are the mean of the four log intensities, atanh(s1), atanh(s2), and
-        ((log I0 + log I90) - (log I45 + log I135)) / 2. They are given after each window at half resolution, each up to
-        an additive constant.
+        ((log I0 + log I90) - (log I45 + log I135)) / 2. They are given after each window in steps, at half resolution,
+        each up to an additive constant.
 
         The sensor covers the first rows and columns, `sensor` of them. Without the panorama (`without`), the images and
         the certainty are 0.
@@ -293,7 +310,7 @@ class StokesUNet(nn.Module):
             images = torch.cat([one.level[..., : own.shape[-2], : own.shape[-1]] for one in panoramas])
             certain = torch.cat([certainty(one, self.memory) for one in panoramas])
             own = F.pad(panorama.own, (0, own.shape[-1] - width, 0, own.shape[-2] - height))
-            return self.step * images, certain, [events[-1], panorama.level, own, panorama.explained]
+            return images, certain, [events[-1], panorama.level, own, panorama.explained]
 
     def _quarter(
         self, x2: Float[Tensor, "n c h2 w2"], candidates: Candidates, streams: int, state: list[Tensor]

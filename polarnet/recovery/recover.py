@@ -65,7 +65,7 @@ class Input(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Prediction for one window, on the CPU, with its timing."""
+    """Prediction at the end of a window, on the CPU, with its timing."""
 
     window: EventWindow
     prediction: Prediction
@@ -250,7 +250,7 @@ def frames_of(
     history = begin(recoverer, source.height, source.width)
     most = max(1, pixels_at_once // (source.height * source.width))
     for piece in source.pieces:
-        for windows in _runs(cutter.add(piece.channels, piece.until_us), most):
+        for windows in runs_of(cutter.add(piece.channels, piece.until_us), most):
             start = time.perf_counter()
             history, prediction = advance(recoverer, history, windows)
             maps = each_map(prediction, Tensor.cpu)
@@ -260,7 +260,7 @@ def frames_of(
                 yield Frame(window, frame, (done - start) / len(windows), done - piece.read_at)
 
 
-def _runs(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWindow]]:
+def runs_of(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWindow]]:
     """Group adjacent windows, which neither overlap nor leave gaps, into batches of up to `most`."""
     run: list[EventWindow] = []
     for window in windows:
@@ -272,8 +272,14 @@ def _runs(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWindo
         yield run
 
 
-def recover(source: Input, rule: WindowRule, recoverer: Recoverer, writer: RecoveryWriter) -> Summary:
-    """Recover and write every frame, with a progress bar; ValueError if the input is shorter than one window."""
+def recover(
+    source: Input,
+    rule: WindowRule,
+    recoverer: Recoverer,
+    writer: RecoveryWriter,
+    frames: Callable[[Input, WindowRule, Recoverer], Iterable[Frame]] = frames_of,
+) -> Summary:
+    """Recover and write all `frames`, with a progress bar; ValueError if the input is shorter than one window."""
     live = source.duration_us is None
     steps: list[float] = []
     latencies: list[float] = []
@@ -282,7 +288,7 @@ def recover(source: Input, rule: WindowRule, recoverer: Recoverer, writer: Recov
         writer,
         tqdm(total=source.duration_us, desc="recover", unit_scale=1e-6, bar_format=LIVE_BAR if live else BAR) as bar,
     ):
-        for frame in frames_of(source, rule, recoverer):
+        for frame in frames(source, rule, recoverer):
             writer.add(frame.window, frame.prediction)
             steps.append(frame.step_s)
             latencies.append(frame.latency_s)

@@ -45,7 +45,7 @@ PAGE_PICTURES = 6
 GAP = 4  # pixels between the maps of a picture
 SCALE_INERTIA = 0.9  # share of the previous picture's full scale of events, which prevents flicker
 ZARR_CONVENTIONS = {
-    "t_us": "time, microseconds from the first event: the end of the window that a frame was recovered from",
+    "t_us": "time of the frame, microseconds from the first event; without --rate the end of its window",
     "dolp": "degree of linear polarization, divided by 65535",
     "aolp": "angle of linear polarization in radians in [0, pi), divided by 65536 and times pi",
     "log_variance": "natural logarithm of the variance that the network expects of its own DoLP",

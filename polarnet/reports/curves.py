@@ -22,7 +22,10 @@ SETTING_LABELS = {
 
 
 def event_budget_figure(results: Mapping[str, Any], theme: Theme) -> Figure:
-    """PSNR and correlation against events per pixel since the start, window length, and overlapping windows."""
+    """PSNR and correlation against events per pixel since the start, by window length, and of frames more often.
+
+    Those come from overlapping windows (against their events per pixel), or are carried on between windows (a line).
+    """
     with matplotlib.rc_context(chart_style(theme)):
         figure = Figure(figsize=(9.6, 5.0), layout="constrained", facecolor="none")
         axes = figure.subplots(2, 3, sharey="row")
@@ -44,6 +47,11 @@ def event_budget_figure(results: Mapping[str, Any], theme: Theme) -> Figure:
                     linestyle="-" if carry else ":",
                     label="state carried on" if carry else "each window alone",
                 )
+            between = results["between"]
+            label_of_line = f"carried on between windows of {between['window_us'] / 1000:.0f} ms"
+            sliding.axhline(
+                between[metric], color=GENERAL.colour("ours"), linewidth=1.4, linestyle="--", label=label_of_line
+            )
             _log_ticks(sliding, sorted({entry["events_per_pixel"] for entry in results["sliding"]}))
             start.set_ylabel(label)
         axes[0][0].set_title("since the start (dashed: the paper's 1.04)", loc="left", fontsize=9)

@@ -1,8 +1,10 @@
 import pytest
 import torch
 
+from polarnet.benchmark.between_windows import frames_between
 from polarnet.benchmark.event_budget import (
     EVENTS_PER_PIXEL,
+    between_windows,
     by_sliding_window,
     by_window_length,
     events_per_pixel,
@@ -10,6 +12,9 @@ from polarnet.benchmark.event_budget import (
     sliding_recovery,
 )
 from polarnet.benchmark.resimulate import sequence_at
+from polarnet.benchmark.rows import opened
+from polarnet.config.tree import load
+from polarnet.methods import METHODS
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
 
@@ -97,3 +102,16 @@ def test_overlapping_windows_are_scored_as_they_are_recovered(scenes_and_events,
     frames = sliding_recovery(sequence, round(0.25 * 18 * 24), times, False, "ours", context)
     assert entry["mse"] == pytest.approx(float((frames - sequence.dolp).square().mean()), rel=1e-5)
     assert entry["change"] == pytest.approx(float(frames.diff(dim=0).abs().mean()), rel=1e-5)
+
+
+def test_frames_between_windows_are_scored_at_their_own_times(scenes_and_events, context, project_root):
+    scenes, events = scenes_and_events
+    config = load(project_root).between
+    entry = between_windows(scenes, events, ["b-0"], (150_000, 152_000), 1_000, 40_000, "ours", config, context)
+    times = [150_000, 151_000, 152_000]
+    truth = sequence_at(scenes, "b-0", events.read("b-0"), torch.tensor([149_000, *times])).dolp
+    run = sequence_at(scenes, "b-0", events.read("b-0"), torch.arange(0, 160_000, 40_000))
+    frames = frames_between(run, times, opened(METHODS["ours"], context), config).carried.dolp
+    assert entry["mse"] == pytest.approx(float((frames - truth).square().mean()), rel=1e-5)
+    assert entry["true_change"] == pytest.approx(float(truth.diff(dim=0).abs().mean()), rel=1e-5)
+    assert (entry["window_us"], entry["spacing_us"]) == (40_000, 1_000)

@@ -61,6 +61,7 @@ def test_the_event_budget_asks_its_three_questions_on_the_test_sequences_alone(c
     assert set(results["since_start"]) == set(results["window_length"]) == {"oracle_mean", "ours"}
     assert [entry["window_us"] for entry in results["window_length"]["ours"]] == list(studies.WINDOW_LENGTHS_US)
     assert {entry["spacing_us"] for entry in results["sliding"]} == {studies.SPACING_US}
+    assert (results["between"]["window_us"], results["between"]["spacing_us"]) == (33_333, studies.SPACING_US)
     assert json.loads((tmp_path / "out" / "event_budget.json").read_text()) == results
     assert matplotlib.image.imread(tmp_path / "out" / "event_budget.png").std() > 0
 

@@ -7,12 +7,13 @@ import math
 import pytest
 import torch
 
+from polarnet.config.tree import load
 from polarnet.events.representations import event_counts, event_tensor, voxel_grid
 from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
 from polarnet.events.windows import encode_windows
 from polarnet.methods import METHODS
-from polarnet.methods.dolp_network import dolp_recoverer, in_steps_of_training
+from polarnet.methods.dolp_network import dolp_recoverer, told, weighted_counts
 from polarnet.methods.intensities import from_intensities, with_gain
 from polarnet.methods.intensity_network import intensity_network, load_baseline
 from polarnet.methods.method import Method, Recoverer, WeightsConfig, weights_record, why_absent
@@ -20,6 +21,7 @@ from polarnet.methods.postprocessing import postprocessed
 from polarnet.networks.checkpoint import load_network
 from polarnet.networks.e2p import E2p, interleaved
 from polarnet.networks.firenet import FireNet
+from polarnet.networks.stokes_unet import StokesUNet
 from polarnet.stokes import Prediction, intensities_from_stokes, stokes_from_polarization
 
 RECONSTRUCTING = [name for name, method in METHODS.items() if method.reconstructs and method.wraps is None]
@@ -205,38 +207,32 @@ def test_more_than_dolp_is_handed_on_where_the_network_says_more(sequence):
     assert prediction.log_variance.shape == (1, 18, 20)
 
 
-TRAINED = {
-    "representation": "event_counts",
-    "data": {"events_from": {"emulate": {"contrast_threshold_on": 0.2, "contrast_threshold_off": 0.25}}},
-}
-
-
 def test_an_event_of_half_the_threshold_counts_half(sequence):
     events = sequence.windows[0].channels[0]
     polarity, count = event_counts(events, 1)
-    assert torch.equal(in_steps_of_training(TRAINED, (0.2, 0.25))(events, 1), torch.stack([polarity, count]))
-    half = in_steps_of_training(TRAINED, (0.1, 0.125))(events, 1)
-    assert torch.equal(half, torch.stack([polarity, count]) / 2)
-    change, steps = in_steps_of_training(TRAINED, (0.1, 0.25))(events, 1)  # half of the ON events
+    assert torch.equal(weighted_counts((1.0, 1.0))(events, 1), torch.stack([polarity, count]))
+    change, steps = weighted_counts((0.5, 1.0))(events, 1)
     assert torch.equal(steps + change, (count + polarity) / 2)
     assert torch.equal(steps - change, count - polarity)
 
 
-def test_thresholds_above_those_of_the_training_keep_their_ratio_and_no_common_factor(sequence):
+@pytest.fixture
+def stokes_unet(project_root):
+    return StokesUNet(load(project_root).networks.polarnet)
+
+
+def test_a_network_that_is_told_the_thresholds_does_not_estimate_them(sequence, stokes_unet):
     events = sequence.windows[0].channels[0]
-    unscaled = in_steps_of_training(TRAINED, (0.2, 0.25))(events, 1)
-    torch.testing.assert_close(in_steps_of_training(TRAINED, (0.4, 0.5))(events, 1), unscaled)
-    uneven = in_steps_of_training(TRAINED, (0.2, 0.5))(events, 1)
-    torch.testing.assert_close(in_steps_of_training(TRAINED, (0.4, 1.0))(events, 1), uneven)
+    encode = told(stokes_unet, {"network": "polarnet"}, (0.1, 0.4))
+    assert stokes_unet.scale.given == pytest.approx(0.2 / stokes_unet.step)
+    assert torch.equal(encode(events, 1), weighted_counts((0.5, 2.0))(events, 1))
 
 
-def test_thresholds_need_a_network_of_event_counts_and_its_sensor():
-    with pytest.raises(ValueError, match="expected a network that takes event_counts, this one takes voxel_grid"):
-        in_steps_of_training({"representation": "voxel_grid"}, (0.1, 0.1))
-    with pytest.raises(ValueError, match="does not name the sensor of its training"):
-        in_steps_of_training({"representation": "event_counts"}, (0.1, 0.1))
+def test_thresholds_need_a_network_that_has_a_use_for_them(stokes_unet):
+    with pytest.raises(ValueError, match="expected network polarnet, got paper; leave the thresholds out"):
+        told(torch.nn.Identity(), {"network": "paper"}, (0.1, 0.1))
     with pytest.raises(ValueError, match="expected numbers above 0"):
-        in_steps_of_training(TRAINED, (0.1, 0.0))
+        told(stokes_unet, {"network": "polarnet"}, (0.1, 0.0))
 
 
 def test_a_method_without_weights_says_what_to_do(make_setup, checkpoints, tmp_path):

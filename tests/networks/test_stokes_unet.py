@@ -28,7 +28,7 @@ CONFIG = replace(
 def network(**changes: Any) -> StokesUNet:
     torch.manual_seed(0)
     built = StokesUNet(replace(CONFIG, **changes))
-    for last in (built.choose, built.gains, built.add, built.trust):  # which begin with zeros
+    for last in (built.choose, built.gains, built.add, built.trust, built.scale.out):  # which begin with zeros
         torch.nn.init.normal_(last.weight, std=0.1)
     return built.eval()
 
@@ -61,7 +61,7 @@ def test_any_height_and_width_come_back_with_everything_predicted():
         assert prediction.stokes.shape == (2, 2, height, width)
         assert prediction.aolp.min() >= 0
         assert prediction.aolp.max() < math.pi
-        assert len(state) == 1 + 1 + 2 + 4 + 3
+        assert len(state) == 2 + 1 + 1 + 2 + 4 + 3
 
 
 @torch.no_grad()
@@ -164,9 +164,7 @@ def test_the_panorama_gives_the_pattern_and_the_network_the_level():
 
 
 def test_a_part_that_there_is_not_is_named():
-    with pytest.raises(
-        ValueError, match="without: expected some of redundancy, slopes, sums, recurrence, panorama, got attention"
-    ):
+    with pytest.raises(ValueError, match=f"without: expected some of {', '.join(PARTS)}, got attention"):
         network(without=["attention"])
 
 

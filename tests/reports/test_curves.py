@@ -21,6 +21,7 @@ BUDGET = {
         for x in (0.25, 1.0)
         for carry in (False, True)
     ],
+    "between": {"window_us": 33333, "spacing_us": 500, **scores(0.9)},
 }
 SETTINGS = {
     "speed": [{"value": v, "scores": {"cf": scores(0.1), "ours": scores(0.6)}} for v in (0.5, 1.0)],
@@ -42,6 +43,12 @@ def test_the_figures_are_drawn_the_same_each_time(theme):
         content = png(draw(results, theme))
         assert content == png(draw(results, theme))
         assert matplotlib.image.imread(io.BytesIO(content)).std() > 0
+
+
+def test_frames_carried_on_between_windows_are_a_line_beside_the_overlapping_windows():
+    sliding = event_budget_figure(BUDGET, LIGHT).axes[2]
+    (line,) = [one for one in sliding.lines if one.get_label() == "carried on between windows of 33 ms"]
+    assert set(line.get_ydata()) == {10.9}
 
 
 def test_the_papers_answer_is_marked_in_the_event_budget():

@@ -1,6 +1,13 @@
+import dataclasses
+from collections import Counter
+
 import pytest
 
 from polarnet.benchmark.score import FrameScore
+from polarnet.config.pipeline import context_of
+from polarnet.networks.weights import shipped_weights
+from polarnet.storage.scenes import SceneStore
+from studies.rate import rated_scores
 from studies.robustness import SENSORS, Scores, headlines, settings, sources_of, table_of
 
 ERRORS = {"pale": 0.001, "middle": 0.01, "strong": 0.1}
@@ -37,6 +44,26 @@ def test_measured_scenes_are_compared_with_the_best_row_that_needs_no_truth():
     rows = table_of(scores())
     rows["rows"]["ours"]["error_factor"] = 1.2
     assert headlines({"measured": rows}, "ours")["measured"]["mse_over_best_baseline"] == pytest.approx(0.2)
+
+
+def test_the_loss_between_windows_is_the_larger_of_photographs_and_measured_scenes():
+    def rated(ends: float, between: float) -> dict:
+        return {"rows": {"ours": {"psnr": between}, "ours, window ends": {"psnr": ends}}}
+
+    tables = {"time.2000hz.photographs": rated(20.0, 19.9), "time.2000hz.measured": rated(23.0, 22.7)}
+    assert headlines(tables, "ours")["time"] == {"db_lost_2000hz": pytest.approx(0.3)}
+
+
+def test_frames_between_windows_are_scored_sixteen_times_a_window(simulated):
+    config, scenes = settings(), SceneStore.open(simulated.scenes)
+    motion = dataclasses.replace(config.synthesize, duration_s=0.2)  # 6 windows, 2 of them warm-up
+    contexts = {"ours": context_of(config, 0.3, shipped_weights())}
+    rows, degree = rated_scores("a-0", scenes, motion, config.camera, 3, 2, contexts, config.between)
+    numbers = Counter(row.method for row in rows)
+    assert numbers == {"oracle_mean": 48, "ours": 48, "ours, held": 48, "ours, window ends": 4}
+    carried, held = ([row.mse for row in rows if row.method == name] for name in ("ours", "ours, held"))
+    assert carried != held
+    assert 0 < degree < 1
 
 
 def test_a_folder_with_a_manifest_has_a_source_for_each_repo(tmp_path):
