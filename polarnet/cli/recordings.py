@@ -4,6 +4,7 @@ import argparse
 import functools
 import sys
 from pathlib import Path
+from typing import Any
 
 from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.parsers import (
