@@ -7,7 +7,9 @@ from polarnet.config.experiments import preset_values
 from polarnet.reports.legend import LABELS, legend_of
 from polarnet.reports.tables import COLUMNS, COSTS, as_markdown, paired_lines, score_table, standing
 from studies.network_blocks import NETWORK_BLOCKS
+from studies.noise import NOISE_BLOCK
 from studies.paper import duration_rows, table_rows
+from studies.recorded import RECORDED_BLOCK
 from studies.rotating import CURVES
 from studies.tables import Block, Columns, Results, Row, listed
 
@@ -139,6 +141,8 @@ BLOCKS = NETWORK_BLOCKS | {
     ),
     "benchmark-simulated": _benchmark("simulated"),
     "benchmark-measured": _benchmark("measured"),
+    "noise": NOISE_BLOCK,
+    "recorded": RECORDED_BLOCK,
     "emulation": Block(
         "emulation", "paper_set", "studies.emulation",
         lambda results: [{"name": name, **one} for name, one in results.items() if "seconds_1_thread" in str(one)],

@@ -83,7 +83,7 @@ def checkpoints(tmp_path_factory):
         files[name] = folder / f"{name}.safetensors"
         save_checkpoint(files[name], build(5).state_dict(), {"network": name, "config": {"bins": 5}, "in_channels": 5})
     files["e2v"] = files["firenet"]
-    for name, build in {"firenet": FireNet, "firenetplus": FireNet, "e2vid": E2vid}.items():
+    for name, build in {"firenet": FireNet, "firenetplus": FireNet, "e2vid": E2vid, "e2p": E2p}.items():
         files[f"{name}_published"] = folder / f"{name}.pth.tar"
         torch.save({"state_dict": build(5).state_dict()}, files[f"{name}_published"])
     files["cista_tc"] = folder / "cista_tc.pth.tar"

@@ -1,4 +1,4 @@
-"""Command that scores methods: on your own scenes, or in studies of the pipeline's test sequences."""
+"""Command that scores methods: on your own scenes or recordings, or in studies of the pipeline's test sequences."""
 
 import argparse
 import contextlib
@@ -6,25 +6,35 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from polarnet.cli.outputs import MARKER, WORK, run_folder
-from polarnet.cli.parsers import Commands
+from polarnet.cli.parsers import Commands, add_cleaning, cleaning_of
 from polarnet.cli.project import project_root, settings_root, working_folder
 
 if TYPE_CHECKING:
     from polarnet.config.tree import Config
+    from polarnet.recordings.noise import Cleaning
+
+PDAVIS = "90 45 / 135 0"
 
 
 def add_to(commands: Commands) -> None:
     """Add the command benchmark."""
     benchmark = commands.add_parser(
         "benchmark",
-        help="score every method on your own scenes, or study event budget and sensitivity",
+        help="score every method on your own scenes or recordings, or study event budget and sensitivity",
         description="--scenes simulates event sequences from the pictures of a folder, runs every method whose weights "
-        "are available, prints the table and writes it with a page; it trains nothing. --event-budget and "
-        "--sensitivity study the pipeline's own test sequences. params.yaml sets sizes, motion and sensor.",
+        "are available, prints the table and writes it with a page; it trains nothing. --recordings does the same "
+        "on recordings of a camera with a polarizer mosaic that hold frames. --event-budget and --sensitivity study "
+        "the pipeline's own test sequences. params.yaml sets sizes, motion and sensor.",
     )
     asked = benchmark.add_mutually_exclusive_group(required=True)
     asked.add_argument(
         "--scenes", type=Path, metavar="FOLDER", help="photographs or measured polarization, subfolders included"
+    )
+    asked.add_argument(
+        "--recordings",
+        type=Path,
+        metavar="FOLDER",
+        help="recordings with frames: HDF5 of E2P, AEDAT-2 and AEDAT4 of a DAVIS, subfolders included",
     )
     asked.add_argument("--event-budget", action="store_true", help="quality against events per pixel (paper, Fig. 11)")
     asked.add_argument(
@@ -41,6 +51,12 @@ def add_to(commands: Commands) -> None:
         help="content of FOLDER; auto recognises .npz files and NAME_0, NAME_45, ... as measured polarization "
         "(default: auto)",
     )  # fmt: skip
+    benchmark.add_argument(
+        "--mosaic",
+        metavar="'A B / C D'",
+        help="polarizers of 2x2 pixels of --recordings (default: 90 45 / 135 0)",
+    )
+    add_cleaning(benchmark)
     benchmark.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/benchmark/NAME)")
     benchmark.add_argument(
         "--methods", help="methods, separated by commas (default: benchmark.methods; studies have a list of their own)"
@@ -54,33 +70,45 @@ def _benchmark(options: argparse.Namespace) -> int:
     from polarnet.config.tree import load
     from polarnet.runtime.machine import configure
 
-    if options.scenes and options.limit is not None:
+    own = options.scenes or options.recordings
+    if own and options.limit is not None:
         raise ValueError(
-            "--limit applies to --event-budget and --sensitivity only; --scenes scores every picture of its folder"
+            "--limit applies to --event-budget and --sensitivity only; a folder of your own is scored as a whole"
         )
-    settings = settings_root() if options.scenes else project_root()  # a study needs the pipeline's test sequences
+    if not options.recordings and (options.mosaic or options.hot_pixels or options.background):
+        raise ValueError("--mosaic, --hot-pixels and --background apply to --recordings only; leave them out")
+    settings = settings_root() if own else project_root()  # a study needs the pipeline's test sequences
     folder = working_folder()
-    scenes = options.scenes.resolve() if options.scenes else None
-    name = scenes.name if scenes else "event_budget" if options.event_budget else "sensitivity"
+    root = own.resolve() if own else None
+    name = root.name if root else "event_budget" if options.event_budget else "sensitivity"
     out = (options.out or folder / "outputs" / "benchmark" / name).resolve()
     weights = options.weights.resolve() if options.weights else None
+    cleaning = cleaning_of(options)
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
-        chosen = [f"benchmark.methods=[{options.methods}]"] if scenes and options.methods else []
+        chosen = [f"benchmark.methods=[{options.methods}]"] if own and options.methods else []
         config = load(settings, [*options.overrides, *chosen], folder)
         configure(config.runtime, config.seed)
-        if scenes is None:
+        if root is None:
             return _study(options, config, out, weights)
-        return _own_scenes(options, config, scenes, out, weights)
+        return _own_folder(options, config, root, cleaning, out, weights)
 
 
-def _own_scenes(options: argparse.Namespace, config: "Config", scenes: Path, out: Path, weights: Path | None) -> int:
-    from polarnet.cli.own_scenes import benchmark_folder
+def _own_folder(
+    options: argparse.Namespace, config: "Config", root: Path, cleaning: "Cleaning", out: Path, weights: Path | None
+) -> int:
+    from polarnet.cli.own_scenes import benchmark_folder, benchmark_recordings
     from polarnet.reports.artefacts import read_results, results_table
     from polarnet.reports.tables import as_plain
+    from polarnet.stokes import parse_mosaic
 
-    command = f"polarnet benchmark --scenes {options.scenes}"
-    with run_folder(out, "benchmark --scenes") as folder:
-        notes = benchmark_folder(config, scenes, options.kind, folder, out / WORK, weights, command)
+    kind = "--scenes" if options.scenes else "--recordings"
+    command = f"polarnet benchmark {kind} {options.scenes or options.recordings}"
+    with run_folder(out, f"benchmark {kind}") as folder:
+        if options.scenes:
+            notes = benchmark_folder(config, root, options.kind, folder, out / WORK, weights, command)
+        else:
+            mosaic = parse_mosaic(options.mosaic or PDAVIS)
+            notes = benchmark_recordings(config, root, mosaic, cleaning, folder, out / WORK, weights, command)
     print(as_plain(results_table(read_results(out))))
     for note in notes:
         print(note)

@@ -4,10 +4,15 @@ import importlib.metadata
 import platform
 import shutil
 from collections.abc import Iterator
+from pathlib import Path
 
 import psutil
 import torch
 
+from polarnet.cli.project import settings_root
+from polarnet.config.pipeline import setup_of
+from polarnet.config.tree import load
+from polarnet.methods import METHODS
 from polarnet.metrics.lpips import BACKBONES
 from polarnet.metrics.lpips_weights import local_source
 from polarnet.runtime.machine import bf16_units, usable_cores
@@ -29,6 +34,24 @@ def findings() -> Iterator[str]:
     memory = psutil.virtual_memory()
     yield f"memory     {memory.available / 2**30:.1f} of {memory.total / 2**30:.1f} GiB free"
     yield f"disk       {shutil.disk_usage('.').free / 2**30:.1f} GiB free here"
+
+
+def rows_for(file: Path) -> Iterator[str]:
+    """Rows that can use a file of weights, with the parameters of its network; ValueError if there are none."""
+    config, reasons, matches = load(settings_root()), {}, 0
+    for method in METHODS.values():
+        if method.weights is None or method.wraps is not None:
+            continue
+        try:
+            recoverer = method.open(setup_of(config, method, file))
+        except (ValueError, FileNotFoundError, KeyError) as error:
+            reasons[method.name] = str(error).partition("\n")[0][:160]
+            continue
+        matches += 1
+        count = sum(one.numel() for one in recoverer.network.parameters()) if recoverer.network else 0
+        yield f"{file.name}: methods.{method.name}.weights ({method.label}), {count:,} parameters"
+    if not matches:
+        raise ValueError(f"{file}: no method can use it; " + "; ".join(f"{n}: {text}" for n, text in reasons.items()))
 
 
 def _lpips(backbone: str) -> str:

@@ -1,28 +1,50 @@
-"""The benchmark on a user's own folder of photographs or measured polarization, without training."""
+"""The benchmark on a user's own folder of photographs, measured polarization or recordings, without training."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from polarnet.benchmark.conditions import announced, configured
+from polarnet.benchmark.recorded import make_recorded_set
 from polarnet.benchmark.results import write_benchmark
-from polarnet.benchmark.rows import available, metadata_used, weights_used
-from polarnet.benchmark.run import run_benchmark, train_mean_dolp
+from polarnet.benchmark.rows import Context, available, metadata_used, weights_used
+from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, with_lpips
 from polarnet.methods import METHODS, is_rotating
 from polarnet.metrics.lpips import NO_RECORD
-from polarnet.metrics.lpips_weights import find_weights
+from polarnet.metrics.lpips_weights import Weights, find_weights
 from polarnet.metrics.similarity import Lpips
 from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest
+from polarnet.recordings.noise import Cleaning
 from polarnet.reports.page import write_set_page
 from polarnet.simulation.rotating import emulate_rotating_scenes
 from polarnet.simulation.sets import make_folder_set
 from polarnet.simulation.truth import motions_of
+from polarnet.stokes import Mosaic
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 
 SET_THEM = "To score on sequences like those of the training, add to the command, or write into params.yaml:"
+
+
+RECORDED = {
+    "sentence": "Windows lie between the recordings' frames, whose polarization is the truth.",
+    "recorded": True,
+    "warnings": [],
+}
+
+
+class Inputs(NamedTuple):
+    """Inputs of a run besides its test set, and what cannot run."""
+
+    context: Context
+    methods: list[str]
+    left_out: dict[str, str]
+    """Reason by row."""
+    lpips: Weights | None
 
 
 def benchmark_folder(
@@ -37,38 +59,75 @@ def benchmark_folder(
     uses the shipped one. Raises ValueError if the folder has no usable file, or if the weights for an LPIPS column are
     missing.
     """
-    if weights is not None and not weights.is_file():
-        raise ValueError(
-            f"--weights {weights}: expected a checkpoint of the DoLP network (.safetensors), found no such file"
-        )
-    lpips_weights = with_lpips(config, "benchmark", find_weights)  # the pipeline need not have found them before
-    lpips = None if lpips_weights is None else Lpips.of(lpips_weights.backbone, lpips_weights.tensors)
-    train_mean = _train_mean(config)
-    wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
-    context = context_of(config, train_mean, weights or shipped_weights())
-    methods, left_out = available(wanted, context)
+    inputs = _inputs(config, weights)
     used = configured(config.synthesize, config.emulate)
-    conditions = announced(used, metadata_used(methods, context), SET_THEM)
+    conditions = announced(used, metadata_used(inputs.methods, inputs.context), SET_THEM)
     try:
         make_folder_set(root, kind, work, config.recipe, config.mapper)
     except ValueError as error:
         raise ValueError(f"--scenes {root}: no scene to score. {error}") from error
-    notes = [*_skipped(config, work), *(_left_out(row, reason) for row, reason in left_out.items())]
-    settings = dataclasses.replace(config.benchmark, methods=methods)
-    rotating = _rotating_events(config, work) if any(map(is_rotating, methods)) else None
+    notes = [*_skipped(config, work), *(_left_out(row, reason) for row, reason in inputs.left_out.items())]
+    rotating = _rotating_events(config, work) if any(map(is_rotating, inputs.methods)) else None
     test_set = made_set(root.resolve().name, work, rotating)
-    benchmark = run_benchmark(test_set, context, settings, lpips, config.mapper("benchmark"))
-    about = {
-        "set": test_set.name,
-        "conditions": conditions,
-        "lpips": NO_RECORD if lpips_weights is None else lpips_weights.record,
-        "train_mean": train_mean,
-        "left_out": notes,
-        "weights": weights_used(methods, context),
-    }
-    write_benchmark(out, benchmark, settings, config.seed, about)
-    write_set_page(out, test_set.name, command, [*conditions["warnings"], *notes])
+    _scored(config, inputs, test_set, out, {"conditions": conditions, "left_out": notes}, command)
     return notes
+
+
+def benchmark_recordings(
+    config: Config,
+    root: Path,
+    mosaic: Mosaic,
+    cleaning: Cleaning,
+    out: Path,
+    work: Path,
+    weights: Path | None,
+    command: str,
+) -> list[str]:
+    """Run the benchmark on a folder of recordings with true polarization, as `benchmark_folder` does on scenes.
+
+    Windows lie between the recordings' frames.
+    """
+    inputs = _inputs(config, weights)
+    for row in filter(is_rotating, inputs.methods):
+        inputs.left_out[row] = "recordings hold the events of four channels, not of one camera behind a rotating one"
+    inputs = inputs._replace(methods=[row for row in inputs.methods if not is_rotating(row)])
+    try:
+        notes = make_recorded_set(root, work, mosaic, cleaning)
+    except ValueError as error:
+        raise ValueError(f"--recordings {error}") from error
+    notes += [_left_out(row, reason) for row, reason in inputs.left_out.items()]
+    test_set = made_set(root.resolve().name, work)
+    _scored(config, inputs, test_set, out, {"conditions": RECORDED, "left_out": notes}, command)
+    return notes
+
+
+def _inputs(config: Config, weights: Path | None) -> Inputs:
+    if weights is not None and not weights.is_file():
+        raise ValueError(
+            f"--weights {weights}: expected a checkpoint of the DoLP network (.safetensors), found no such file"
+        )
+    lpips = with_lpips(config, "benchmark", find_weights)  # the pipeline need not have found them before
+    wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
+    context = context_of(config, _train_mean(config), weights or shipped_weights())
+    return Inputs(context, *available(wanted, context), lpips)
+
+
+def _scored(
+    config: Config, inputs: Inputs, test_set: BenchmarkSet, out: Path, about: Mapping[str, Any], command: str
+) -> None:
+    """Run the rows on a test set and write scores and page."""
+    settings = dataclasses.replace(config.benchmark, methods=inputs.methods)
+    lpips = None if inputs.lpips is None else Lpips.of(inputs.lpips.backbone, inputs.lpips.tensors)
+    benchmark = run_benchmark(test_set, inputs.context, settings, lpips, config.mapper("benchmark"))
+    details = {
+        "set": test_set.name,
+        "lpips": NO_RECORD if inputs.lpips is None else inputs.lpips.record,
+        "train_mean": inputs.context.train_mean,
+        "weights": weights_used(inputs.methods, inputs.context),
+        **about,
+    }
+    write_benchmark(out, benchmark, settings, config.seed, details)
+    write_set_page(out, test_set.name, command, [*about["conditions"]["warnings"], *about["left_out"]])
 
 
 def _rotating_events(config: Config, work: Path) -> Path:

@@ -13,6 +13,12 @@ from polarnet.runtime.files import shipped_settings
 def add_to(commands: Commands) -> None:
     """Add the commands doctor, preset, run and stages."""
     doctor = commands.add_parser("doctor", help="report versions, device, bf16 support, LPIPS weights, memory and disk")
+    doctor.add_argument(
+        "--weights",
+        type=Path,
+        metavar="FILE",
+        help="check a file of weights, and name the rows that can use it",
+    )
     doctor.set_defaults(run=_doctor)
 
     preset = commands.add_parser("preset", help="write a named experiment or sensor into params.yaml, keeping comments")
@@ -54,9 +60,11 @@ def working_folder() -> Path:
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from polarnet.cli.doctor import findings
+    from polarnet.cli.doctor import findings, rows_for
 
-    for finding in findings():
+    if options.weights is not None and not options.weights.is_file():
+        raise FileNotFoundError(f"--weights {options.weights}: there is no such file")
+    for finding in rows_for(options.weights) if options.weights else findings():
         print(finding)
     return 0
 

@@ -7,21 +7,30 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.cli.outputs import WORK, run_folder
-from polarnet.cli.parsers import Commands, add_hot_pixel_factor, add_stored_sequence
+from polarnet.cli.parsers import (
+    READING_OPTIONS,
+    Commands,
+    add_cleaning,
+    add_hot_pixel_factor,
+    add_reading,
+    add_stored_sequence,
+    cleaning_of,
+    reading_of,
+)
 from polarnet.cli.project import settings_root
 
-READING_OPTIONS = ("format", "height", "width", "clock_mhz")
-"""Options that describe a camera's file where the file itself does not."""
+CLEANING_OPTIONS = ("hot_pixels", "background")
+"""Options that remove noise before recovery."""
 
 NETWORK_WINDOW = "33.333ms"
 
 OPTIONS_BY_INPUT = {
-    "--live": {"mosaic", "rate"},
-    "four files": {"angles", "size", "rate", *READING_OPTIONS},
-    "one file with --mosaic": {"mosaic", "size", "rate", *READING_OPTIONS},
+    "--live": {"mosaic", "rate", *CLEANING_OPTIONS},
+    "four files": {"angles", "size", "rate", *CLEANING_OPTIONS, *READING_OPTIONS},
+    "one file with --mosaic": {"mosaic", "size", "rate", *CLEANING_OPTIONS, *READING_OPTIONS},
     "one file with --rotating or --triggers": {"rotating", "triggers", "start_angle", "size", *READING_OPTIONS},
-    "one file without polarizers": {"size", *READING_OPTIONS},
-    "an event store or a folder": {"sequence", "size", "rate"},
+    "one file without polarizers": {"size", *CLEANING_OPTIONS, *READING_OPTIONS},
+    "an event store or a folder": {"sequence", "size", "rate", *CLEANING_OPTIONS},
 }
 """Options of `polarnet recover` that apply to each kind of input."""
 
@@ -51,18 +60,6 @@ def _add_inspection(commands: Commands) -> None:
     inspect.set_defaults(run=_inspect)
 
 
-def add_reading(command: argparse.ArgumentParser) -> None:
-    """Add `READING_OPTIONS`."""
-    command.add_argument("--format", help="format if it cannot be recognised: text, celex5_csv, celex5_bin, dat, ...")
-    command.add_argument("--height", type=int, help="rows of the sensor, if the file does not state them")
-    command.add_argument("--width", type=int, help="columns of the sensor, if the file does not state them")
-    command.add_argument("--clock-mhz", type=float, help="clock of a CeleX-5 (default: 100)")
-
-
-def _reading(options: argparse.Namespace) -> dict[str, Any]:
-    return {name: getattr(options, name) for name in READING_OPTIONS}
-
-
 def _add_recovery(commands: Commands) -> None:
     recover = commands.add_parser(
         "recover",
@@ -71,9 +68,11 @@ def _add_recovery(commands: Commands) -> None:
         "other file of a camera gives plain intensity. INPUT is one of: four files, one for each polarizer, "
         "with --angles; one file of a camera with polarizers on its pixels, with --mosaic; one file of a "
         "camera behind a rotating polarizer, with --rotating or --triggers; an event store; a folder of "
-        "division-of-time captures; with --live, a growing file or standard input (-) with lines `t x y p angle`.",
+        "division-of-time captures; with --live, a growing file or standard input (-) with lines `t x y p angle`, or a "
+        "camera with --mosaic: dv://HOST:PORT of a program that streams its events, or dv://camera.",
     )
     _add_input(recover)
+    add_cleaning(recover)
     _add_method(recover)
     _add_output(recover)
     add_reading(recover)
@@ -184,7 +183,7 @@ def _inspect(options: argparse.Namespace) -> int:
     from polarnet.recordings.recording import open_recording
     from polarnet.reports.recordings import recording_picture
 
-    recording = open_recording(options.file, part=options.part, **_reading(options))
+    recording = open_recording(options.file, part=options.part, **reading_of(options))
     inspection = inspect_recording(recording, options.hot_pixel_factor)
     for finding in findings(inspection):
         print(finding)
@@ -204,6 +203,7 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.config.pipeline import setup_of
     from polarnet.config.tree import load
     from polarnet.events.streaming import WindowRule, parse_window
+    from polarnet.recordings.noise import Cleaner
     from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recordings.recording import read_recording
     from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
@@ -212,6 +212,7 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
     refuse_unused_options(options)
+    cleaning = cleaning_of(options)
     if options.rotating is not None or options.triggers is not None:
         return _recover_rotating(options)
     config = functools.cache(lambda: load(settings_root()))
@@ -236,17 +237,19 @@ def _recover(options: argparse.Namespace) -> int:
     name = "live" if options.live else Path(options.input[0]).stem
     out = options.out or Path("outputs") / "recover" / name
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
-    lines = None
+    cleaner, lines = Cleaner(cleaning, mosaic), None
     with run_folder(out, "recover") as folder:
         if options.live:
             print(f"writing frames to {folder}; the folder becomes {out} at the end", file=sys.stderr)
             source, lines = open_live(options.input[0], mosaic, options.idle)
+            source = source._replace(pieces=cleaner.live(source.pieces))
         else:
-            read = functools.partial(read_recording, **_reading(options))
+            read = functools.partial(read_recording, **reading_of(options))
             arrangement = Arrangement(options.angles, mosaic, options.sequence)
             size = (options.size[0], options.size[1]) if options.size else None
             files, captures = [Path(path) for path in options.input], lambda: config().recordings
-            source = open_files(files, arrangement, read, size, folder / WORK, captures, _reconstructs(options.method))
+            plain = _reconstructs(options.method)
+            source = open_files(files, arrangement, read, size, folder / WORK, captures, plain, cleaner)
         check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
         if source.channels == len(POLARIZER_ANGLES_DEG):
             source = source._replace(pieces=check.watch(source.pieces))
@@ -261,6 +264,8 @@ def _recover(options: argparse.Namespace) -> int:
             facts["rate"] = f"{options.rate:g} frames a second, carried on by the events from window to window"
         if source.channels > 1:
             facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
+        if any(getattr(options, option) for option in CLEANING_OPTIONS):
+            facts["removed"] = cleaner.sentence()
         page = writer.write_page(source.name, facts, notes)
     for key, value in facts.items():
         print(f"{key:11s} {value}")
@@ -300,7 +305,7 @@ def _recover_rotating(options: argparse.Namespace) -> int:
     rule = half_turn_rule(rotation, 0.5 if moving else config.window_turns, length_us, step_us)
     out = options.out or Path("outputs") / "recover" / file.stem
     with run_folder(out, "recover") as folder:
-        source, rotation = open_rotating(file, rotation, functools.partial(read_recording, **_reading(options)), size)
+        source, rotation = open_rotating(file, rotation, functools.partial(read_recording, **reading_of(options)), size)
         writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
         if moving:
             recoverer = half_turns_recoverer(settings.methods.rotating_polarizer, rotation)

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from polarnet.cli.parsers import Commands
+from polarnet.cli.parsers import READING_OPTIONS, Commands, add_reading
 from polarnet.cli.project import settings_root, working_folder
-from polarnet.cli.recordings import READING_OPTIONS, add_reading
 
 if TYPE_CHECKING:
     from polarnet.characterization.fit import SensorFit

@@ -13,6 +13,8 @@ import torch
 from polarnet.events.stream import Events, concatenate, slice_count
 
 SHORTEST_STEP_US = 100
+TRAINED_WINDOW_US = 33_333
+"""Window length in the training of the networks, 1/30 s."""
 
 
 class EventWindow(NamedTuple):

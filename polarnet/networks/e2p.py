@@ -17,6 +17,7 @@ from torch.nn import functional as F
 
 from polarnet.networks.firenet import ConvGRU, ResidualBlock
 from polarnet.networks.published import PublishedNetwork
+from polarnet.stokes import aolp
 
 CHANNELS = 32
 BRANCHES = ("intensity", "aolp", "dolp")
@@ -34,18 +35,21 @@ class E2p(PublishedNetwork):
     label = "E2P"
     first_layer = "branches.dolp.head.pattern1.weight"
 
-    def __init__(self, bins: int):
+    def __init__(self, bins: int, aolp_channels: int = 1):
+        """`aolp_channels` is 2 for the newer published files, whose AoLP is the sine and cosine of twice the angle."""
         super().__init__(bins)
-        self.branches = nn.ModuleDict({name: Branch(bins) for name in BRANCHES})
+        channels = {"intensity": 1, "aolp": aolp_channels, "dolp": 1}
+        self.branches = nn.ModuleDict({name: Branch(bins, channels[name]) for name in BRANCHES})
         self.fusion_weight1 = CrossBranchGate()
         self.fusion_weight2 = CrossBranchGate()
 
     def forward(
         self, mosaic: Float[Tensor, "b bins h w"], state: list[Tensor] | None = None
-    ) -> tuple[Float[Tensor, "b 3 h//2 w//2"], list[Tensor]]:
+    ) -> tuple[Float[Tensor, "b maps h//2 w//2"], list[Tensor]]:
         """Return intensity, AoLP and DoLP at the end of one window, and the next state; `state` is None at the start.
 
-        The input is an unnormalised voxel grid. AoLP is coded as in `coded_aolp`. The outputs are not clamped.
+        The input is an unnormalised voxel grid. AoLP is coded as in `coded_aolp`, or takes two maps, the sine and
+        cosine of twice the angle. The outputs are not clamped.
         """
         if mosaic.shape[1] != self.bins or mosaic.shape[-1] % 2 or mosaic.shape[-2] % 2:
             raise ValueError(f"this E2P takes {self.bins} bins of even height and width, got {tuple(mosaic.shape[1:])}")
@@ -60,6 +64,12 @@ class E2p(PublishedNetwork):
         x = self.fusion_weight2([branch.R2(h) for branch, h in zip(branches, second, strict=True)])
         maps = torch.cat([branch.pred(y) for branch, y in zip(branches, x, strict=True)], dim=1)
         return maps.float(), [*first, *second]
+
+    @classmethod
+    def variant(cls, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+        """The number of maps of AoLP in a published file."""
+        head = tensors.get("branches.aolp.pred.weight")
+        return {} if head is None else {"aolp_channels": len(head)}
 
     @classmethod
     def own_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -77,12 +87,12 @@ class E2p(PublishedNetwork):
 class Branch(nn.Module):
     """Layers of one of the three maps; `E2p.forward` connects them."""
 
-    def __init__(self, bins: int):
+    def __init__(self, bins: int, maps: int):
         super().__init__()
         self.head = MosaicHead(bins)
         self.G1, self.G2 = ConvGRU(CHANNELS), ConvGRU(CHANNELS)
         self.R1, self.R2 = ResidualBlock(CHANNELS), ResidualBlock(CHANNELS)
-        self.pred = nn.Conv2d(CHANNELS, 1, 3, padding=1)
+        self.pred = nn.Conv2d(CHANNELS, maps, 3, padding=1)
         for gru in (self.G1, self.G2):
             for gate in (gru.reset_gate, gru.update_gate, gru.out_gate):
                 nn.init.orthogonal_(gate.weight)
@@ -147,3 +157,11 @@ def decoded_aolp(code: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
     """Invert `coded_aolp`: radians in [0, pi) for any code."""
     angle = math.pi * torch.remainder(code - 0.5, 1.0)
     return torch.where(angle >= math.pi, 0.0, angle)
+
+
+def angle_of(maps: Float[Tensor, "*b maps h w"]) -> Float[Tensor, "*b h w"]:
+    """AoLP in radians, [0, pi), from the maps of one window: coded, or as sine and cosine of twice the angle."""
+    if maps.shape[-3] == len(BRANCHES):
+        return decoded_aolp(maps[..., 1, :, :])
+    sine, cosine = maps[..., 1, :, :], maps[..., 2, :, :]
+    return aolp(torch.stack([torch.ones_like(sine), cosine, sine], dim=-3))

@@ -1,6 +1,7 @@
 """Base of the recurrent networks with published weights: one window after another, and files of their authors."""
 
 import os
+import pickle
 from collections.abc import Mapping
 from typing import Any, ClassVar, TypeVar
 
@@ -9,6 +10,33 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 Network = TypeVar("Network", bound="PublishedNetwork")
+
+
+class StandIn:
+    """Replaces an object of the authors' code, such as their settings, in a file whose tensors alone are needed."""
+
+    def __init__(self, *arguments: Any):
+        pass
+
+    def __setstate__(self, state: Any) -> None:
+        pass
+
+
+def read_content(path: str | os.PathLike[str]) -> Any:
+    """Content of a torch file, without running code from it: objects of other classes than torch's become `StandIn`.
+
+    ValueError for a file that torch cannot read that way.
+    """
+    try:
+        unknown = torch.serialization.get_unsafe_globals_in_checkpoint(path)
+    except (ValueError, RuntimeError):  # older files than zips, which hold no others
+        unknown = []
+    inert: list[Any] = [(type(name.rpartition(".")[2], (StandIn,), {}), name) for name in unknown]
+    try:
+        with torch.serialization.safe_globals(inert):
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+        raise ValueError(f"{path} is not a file of weights that torch can read: {str(error)[:200]}") from None
 
 
 class PublishedNetwork(nn.Module):
@@ -41,17 +69,22 @@ class PublishedNetwork(nn.Module):
     @classmethod
     def load(cls: type[Network], path: str | os.PathLike[str]) -> Network:
         """Load a published file without running code from it; ValueError if it belongs to another network."""
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = read_content(path)
         tensors = cls.own_names(cls.published_tensors(path, content if isinstance(content, dict) else {}))
         first = tensors.get(cls.first_layer)
         if first is None:
             raise ValueError(f"{path} holds no {cls.label}: expected a tensor {cls.first_layer}")
-        network = cls(bins=first.shape[1])
+        network = cls(bins=first.shape[1], **cls.variant(tensors))
         try:
             network.load_state_dict(tensors)
         except RuntimeError as error:
             raise ValueError(f"{path} holds no {cls.label}: expected tensors of the published size: {error}") from None
         return network.eval()
+
+    @classmethod
+    def variant(cls, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Arguments beside `bins`, for networks that were published in several variants."""
+        return {}
 
     @classmethod
     def published_tensors(cls, path: str | os.PathLike[str], content: Mapping[str, Any]) -> Mapping[str, Tensor]:

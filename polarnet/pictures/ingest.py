@@ -36,6 +36,7 @@ from polarnet.pictures.manifest import (
 )
 from polarnet.pictures.polarimetry import (
     group_by_measurement,
+    parse_raw_mosaic,
     read_measurement,
     shrink,
     write_intensities,
@@ -43,7 +44,6 @@ from polarnet.pictures.polarimetry import (
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import generator_for
 from polarnet.runtime.sections import one_of, section
-from polarnet.stokes import parse_mosaic
 
 logger = logging.getLogger(__name__)
 
@@ -71,12 +71,13 @@ class IngestConfig:
     val_fraction: Annotated[float, Field(ge=0, le=1)]
     test_fraction: Annotated[float, Field(ge=0, le=1)]
     mosaic: str
-    """Polarizer angles of the 2x2 pixels of a raw mosaic, even row / odd row (source=polarization)."""
+    """Polarizer angles of the 2x2 pixels of a raw mosaic, even row / odd row, after RGGB or another order of a colour
+    sensor (source=polarization)."""
     residual_max: PositiveFloat
     """Largest accepted median of |I0 + I90 - I45 - I135| / S0 (source=polarization)."""
 
     def __post_init__(self):
-        parse_mosaic(self.mosaic)
+        parse_raw_mosaic(self.mosaic)
         if self.val_fraction + self.test_fraction > 1:
             raise ValueError(
                 f"val_fraction: expected <= 1 - test_fraction = {1 - self.test_fraction:g}, got {self.val_fraction}"
@@ -219,7 +220,7 @@ def _convert_polarization(item: tuple[int, Source], config: IngestConfig, folder
     """Read, check and shrink one measurement to `folder`/source-<number>.npz, or return the reason why not."""
     number, source = item
     try:
-        measured = read_measurement(source.files, parse_mosaic(config.mosaic))
+        measured = read_measurement(source.files, *parse_raw_mosaic(config.mosaic))
         if measured.residual > config.residual_max:
             raise UnreadablePicture(
                 f"the angles do not fit: the median of |I0 + I90 - I45 - I135| / S0 is {measured.residual:.4f}, more "

@@ -17,11 +17,12 @@ from jaxtyping import Bool, Float32, Float64, Shaped
 from torch import Tensor
 
 from polarnet.pictures.images import UnreadablePicture, read_channels
-from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, parse_mosaic
 
 ANGLE_SUFFIX = re.compile(r"(?P<name>.+)_0*(?P<angle>0|45|90|135)")
 WHITE_LEVELS = (2**10 - 1, 2**12 - 1, 2**14 - 1, 2**16 - 1)  # of sensors whose values come as 16 bits
 STEPS = 2**16 - 1  # of the files written here
+COLOURS = ("RGGB", "BGGR", "GRBG", "GBRG")  # of the four blocks of 2x2 pixels in a colour sensor's 4x4 (Sony IMX250MYR)
 NPZ_KEYS = tuple(f"I{angle}" for angle in POLARIZER_ANGLES_DEG)
 
 
@@ -44,8 +45,21 @@ def group_by_measurement(files: Sequence[str | os.PathLike[str]]) -> list[tuple[
     return [tuple(sorted(group)) for group in groups.values()]
 
 
-def read_measurement(files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], mosaic: Mosaic) -> Measurement:
+def parse_raw_mosaic(order: str) -> tuple[Mosaic, str | None]:
+    """Angles of a raw mosaic, and its colours if any: "90 45 / 135 0", or "RGGB 90 45 / 135 0" of a colour sensor.
+
+    The colours are those of the four blocks of 2x2 pixels in each 4x4. ValueError for other text.
+    """
+    colours, _, angles = order.strip().partition(" ")
+    return (parse_mosaic(angles), colours) if colours in COLOURS else (parse_mosaic(order), None)
+
+
+def read_measurement(
+    files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], mosaic: Mosaic, colours: str | None = None
+) -> Measurement:
     """The measurement in a group of files: four pictures, one .npz with I0, I45, I90, I135, or one raw mosaic.
+
+    `mosaic` and `colours` are those of `parse_raw_mosaic`.
 
     A single saturated angle follows from the other three, I0 + I90 = I45 + I135; a pixel with more is not valid.
     Raises UnreadablePicture if files are missing, damaged, or do not belong together.
@@ -55,7 +69,7 @@ def read_measurement(files: str | os.PathLike[str] | Sequence[str | os.PathLike[
         raise UnreadablePicture("expected the files of a measurement, got none")
     levels = read_levels(paths)
     white = white_level(levels)
-    return _measurement(*levels_at_angles(levels, white, mosaic))
+    return _measurement(*levels_at_angles(levels, white, mosaic, colours))
 
 
 def read_levels(paths: Sequence[Path]) -> Shaped[np.ndarray, "n h w"]:
@@ -66,7 +80,7 @@ def read_levels(paths: Sequence[Path]) -> Shaped[np.ndarray, "n h w"]:
 
 
 def levels_at_angles(
-    levels: Shaped[np.ndarray, "n h w"], white: float, mosaic: Mosaic | None
+    levels: Shaped[np.ndarray, "n h w"], white: float, mosaic: Mosaic | None, colours: str | None = None
 ) -> tuple[Float64[np.ndarray, "4 h2 w2"], Bool[np.ndarray, "4 h2 w2"]]:
     """Intensities at 0, 45, 90 and 135 degrees, and which of them saturate; S0 is 1 at twice the level `white`.
 
@@ -76,8 +90,8 @@ def levels_at_angles(
     if len(values) == len(POLARIZER_ANGLES_DEG):
         return values / (2 * white), values >= white
     assert mosaic is not None
-    saturated = demosaic((values[0] >= white).astype(np.float64), mosaic) > 0
-    return demosaic(values[0], mosaic) / (2 * white), saturated
+    saturated = demosaic((values[0] >= white).astype(np.float64), mosaic, colours) > 0
+    return demosaic(values[0], mosaic, colours) / (2 * white), saturated
 
 
 def without_saturation(
@@ -89,23 +103,34 @@ def without_saturation(
     return np.where(saturated & (saturated.sum(axis=0) == 1), np.maximum(from_the_others, values), values)
 
 
-def demosaic(raw: Float64[np.ndarray, "h w"], mosaic: Mosaic) -> Float64[np.ndarray, "4 h2 w2"]:
+def demosaic(
+    raw: Float64[np.ndarray, "h w"], mosaic: Mosaic, colours: str | None = None
+) -> Float64[np.ndarray, "4 h2 w2"]:
     """Each angle at the centre of every 2x2 cell but those on the rim: shape (h // 2 - 2, w // 2 - 2).
 
     The four pixels of a cell look at four places, and an edge between them would look polarized. So each angle is
     interpolated bilinearly, with weights 9, 3, 3, 1 of 16, where all four then agree: half a pixel right of and below
     the cell's first pixel.
+
+    A sensor with `colours` has cells of 4x4 pixels, of which the mean of the two green blocks counts: polarization
+    differs between colours. The mean of an angle's two pixels lies half a pixel from the cell's centre.
     """
-    height, width = raw.shape[0] // 2, raw.shape[1] // 2
+    cell, near = (2, 3) if colours is None else (4, 7)
+    height, width = raw.shape[0] // cell, raw.shape[1] // cell
+    greens = [(0, 0)] if colours is None else [divmod(k, 2) for k, colour in enumerate(colours) if colour == "G"]
     at_angle = {}
     for row in (0, 1):
         for column in (0, 1):
-            samples = raw[row : 2 * height : 2, column : 2 * width : 2]
+            blocks = [
+                raw[2 * down + row : cell * height : cell, 2 * right + column : cell * width : cell]
+                for down, right in greens
+            ]
+            samples = blocks[0] if colours is None else (blocks[0] + blocks[1]) / 2
             # the centre of a cell lies below its upper samples and above its lower ones
             vertical = samples[2:] if row == 0 else samples[:-2]
-            samples = (3 * samples[1:-1] + vertical) / 4
+            samples = (near * samples[1:-1] + vertical) / (near + 1)
             horizontal = samples[:, 2:] if column == 0 else samples[:, :-2]
-            at_angle[mosaic[row][column]] = (3 * samples[:, 1:-1] + horizontal) / 4
+            at_angle[mosaic[row][column]] = (near * samples[:, 1:-1] + horizontal) / (near + 1)
     return np.stack([at_angle[angle] for angle in POLARIZER_ANGLES_DEG])
 
 

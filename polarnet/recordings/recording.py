@@ -11,10 +11,10 @@ import numpy as np
 import torch
 
 from polarnet.events.stream import MAX_SIDE, Events, concatenate
-from polarnet.recordings.formats import aedat2, celex5_bin, celex5_csv, faery, hdf5, prophesee, store, text
+from polarnet.recordings.formats import aedat2, celex5_bin, celex5_csv, faery, hdf5, prophesee, rosbag, store, text
 from polarnet.recordings.formats.lines import HEAD_BYTES
 from polarnet.recordings.repair import repaired
-from polarnet.recordings.source import Block, Choices, RecordingError, Source
+from polarnet.recordings.source import Block, CameraFrames, Choices, RecordingError, Source
 
 CHUNK_EVENTS = 2**20
 
@@ -26,23 +26,29 @@ class Format(NamedTuple):
     matches: Callable[[Path, bytes], bool]
     """Whether a file that starts with these bytes has this format."""
     open: Callable[[Path, Choices], Source]
+    frames: Callable[[Path], CameraFrames] | None = None
+    """Read the frames that the camera recorded beside its events; None for formats without frames."""
 
 
 FORMATS = {
     "store": Format("our own event store", store.matches, store.open_store),
-    "e2p": Format("HDF5 of E2P, for the PDAVIS", hdf5.matches_e2p, hdf5.open_e2p),
+    "e2p": Format("HDF5 of E2P, for the PDAVIS", hdf5.matches_e2p, hdf5.open_e2p, hdf5.e2p_frames),
     "esfp": Format("HDF5 of ESfP, one sensor behind a rotating polarizer", hdf5.matches_esfp, hdf5.open_esfp),
+    "metavision": Format("HDF5 of Prophesee", hdf5.matches_metavision, hdf5.open_metavision),
+    "rosbag": Format("bags of ROS 1 and ROS 2", rosbag.matches, rosbag.open_rosbag),
     "dsec": Format("HDF5 of DSEC", hdf5.matches_dsec, hdf5.open_dsec),
-    "aedat4": Format("AEDAT4 of iniVation", faery.matches_aedat4, faery.open_aedat4),
-    "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", aedat2.matches, aedat2.open_aedat2),
+    "aedat4": Format("AEDAT4 of iniVation", faery.matches_aedat4, faery.open_aedat4, faery.aedat4_frames),
+    "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", aedat2.matches, aedat2.open_aedat2, aedat2.aedat2_frames),
     "event_stream": Format("Event Stream (.es)", faery.matches_event_stream, faery.open_event_stream),
-    "evt": Format("EVT2 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
+    "evt": Format("EVT2, EVT2.1 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
     "dat": Format("DAT of Prophesee", prophesee.matches_dat, prophesee.open_dat),
     "text": Format("lines `t x y p`", text.matches, text.open_text),
     "celex5_csv": Format("CSV of a CeleX-5", celex5_csv.matches, celex5_csv.open_celex5_csv),
     "celex5_bin": Format("BIN of a CeleX-5", celex5_bin.matches, celex5_bin.open_celex5_bin),
 }
 """Ordered as they are tried on a file of unknown format."""
+FOLDERS = ("store", "rosbag")
+"""Formats of which a folder may be the file."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +144,7 @@ def detect_format(path: str | os.PathLike[str]) -> str:
         if not head:
             raise RecordingError(f"{path.name}: the file is empty")
     for name, form in FORMATS.items():
-        if (name == "store" or head) and form.matches(path, head):
+        if (name in FOLDERS or head) and form.matches(path, head):
             return name
     raise RecordingError(
         f"{path.name}: its content is of none of the formats {', '.join(FORMATS)}; if it is one of them, say which"

@@ -66,6 +66,17 @@ class Source:
     blocks: Callable[[Counter[str]], Iterator[Block]]
 
 
+class CameraFrames(NamedTuple):
+    """Frames that a camera with a polarizer mosaic recorded beside its events, on the same clock."""
+
+    t_us: np.ndarray
+    """n times in microseconds, those of the middle of the exposure where the file gives it."""
+    levels: np.ndarray | None
+    """n x height x width code values, proportional to light: uint8, or uint16; None if the file has only maps."""
+    maps: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    """S0 (1 at saturation), DoLP and AoLP (radians, [0, pi)), n x height/2 x width/2 each, if the file has them."""
+
+
 def word_blocks(
     path: Path, start: int, dtype: np.dtype | str, words: int, counts: Counter[str]
 ) -> Iterator[np.ndarray]:

@@ -19,7 +19,7 @@ from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
 from polarnet.captures.imported import import_targets
 from polarnet.captures.targets import calibrate_targets
 from polarnet.events.stream import Events, downscale
-from polarnet.events.streaming import SHORTEST_STEP_US, EventWindow, WindowCutter, WindowRule
+from polarnet.events.streaming import SHORTEST_STEP_US, TRAINED_WINDOW_US, EventWindow, WindowCutter, WindowRule
 from polarnet.methods import METHODS
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.methods.method import Method, Recoverer, Setup, each_map, why_absent
@@ -28,6 +28,8 @@ from polarnet.networks.checkpoint import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import read_four, read_mosaic, read_plain
 from polarnet.recordings.live import LiveLines, Piece, live_lines
+from polarnet.recordings.live_camera import SCHEME, LiveCamera
+from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.recording import Recording, detect_format
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import RuntimeConfig, device_of, precision_on, tune
@@ -38,8 +40,6 @@ STANDARD_INPUT = "-"
 PIXELS_AT_ONCE = 4 * 120 * 180  # total over the windows of one batch; bounds the memory of a network
 BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}{postfix}]"
 LIVE_BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
-TRAINED_WINDOW_US = 33_333
-"""Window length in the training of the networks, 1/30 s."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +106,11 @@ def open_files(
     work: Path,
     captures: Callable[[], RecordingsConfig],
     plain: bool = False,
+    clean: Cleaner | None = None,
 ) -> Input:
     """Read channels from files, starting at time 0 and reduced to `size` (height, width) if given.
+
+    `clean` removes noise before the reduction.
 
     Four files hold one channel each, in the order of `arrangement.angles`, and are read by `read`. A single path is a
     recording of a camera with a mosaic, an event store, or a folder of division-of-time captures. Captures are
@@ -121,6 +124,8 @@ def open_files(
     name = paths[0].name if len(paths) == 1 else ", ".join(path.name for path in paths)
     channels = _channels(paths, arrangement, read, work, captures, plain)
     duration_us = max((int(events.t[-1]) + 1 for events in channels if len(events)), default=0)
+    if clean is not None:
+        channels = clean(channels, duration_us)
     if size is not None:
         channels = [downscale(events, *size, keep_rate=True) for events in channels]
     pieces = [Piece(channels, duration_us, time.perf_counter())]
@@ -179,8 +184,16 @@ def _captures(folder: Path, work: Path, config: RecordingsConfig) -> Sequence[Ev
     return EventStore.open(work / "calibrated" / "events.zarr").read(target.name)
 
 
-def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> tuple[Input, LiveLines]:
-    """Read lines live from standard input (-) or from a growing file, until it has not grown for `idle_s` seconds."""
+def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> tuple[Input, LiveLines | LiveCamera]:
+    """Read live from standard input (-), a growing file or a camera (dv://...), until `idle_s` seconds without data.
+
+    ValueError for a camera without a mosaic.
+    """
+    if path.startswith(SCHEME):
+        if mosaic is None:
+            raise ValueError(f"{path}: expected --mosaic, the polarizers of the camera's pixels, with a camera")
+        camera = LiveCamera(path, mosaic, idle_s)
+        return Input(path, camera.height, camera.width, camera, None), camera
     if path != STANDARD_INPUT and not Path(path).is_file():
         raise FileNotFoundError(f"{path}: there is no such file; - reads standard input")
     source = sys.stdin.buffer if path == STANDARD_INPUT else open(path, "rb")  # noqa: SIM115 - read until the end

@@ -39,7 +39,7 @@ def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -
     if events.label is not None:
         columns["label"] = events.label.numpy()
     compressed = {"chunks": (min(HDF5_CHUNK, len(events)),), "compression": "gzip", "shuffle": True}
-    with _h5py().File(path, "w") as file:
+    with h5py_module().File(path, "w") as file:
         for name, values in columns.items():
             file.create_dataset(f"events/{name}", data=values, **(compressed if len(events) else {}))
         file["ms_to_idx"] = first_at_millisecond(events.t, duration_us).astype(np.uint64)
@@ -159,7 +159,8 @@ def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -
     (folder / "store.json").write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
 
 
-def _h5py() -> Any:
+def h5py_module() -> Any:
+    """The package h5py; RuntimeError with the way to install it if it is missing."""
     try:
         import h5py
     except ImportError:

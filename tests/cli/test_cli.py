@@ -29,6 +29,21 @@ def store(tmp_path):
     return path
 
 
+def test_doctor_names_the_rows_that_can_use_a_file_of_weights(tmp_path, capsys):
+    import torch
+
+    from polarnet.networks.e2p import E2p
+
+    torch.save({"state_dict": E2p(5, aolp_channels=2).state_dict()}, tmp_path / "e2p.pth")
+    assert main(["doctor", "--weights", str(tmp_path / "e2p.pth")]) == 0
+    printed = capsys.readouterr().out
+    assert "e2p.pth: methods.e2p_published.weights (E2P, published weights), 512,790 parameters" in printed
+    assert "firenet" not in printed
+    (tmp_path / "x.pth").write_bytes(b"nothing")
+    assert main(["doctor", "--weights", str(tmp_path / "x.pth")]) == 1
+    assert "no method can use it" in capsys.readouterr().err
+
+
 def test_doctor_names_versions_device_and_what_to_do_about_missing_weights(capsys):
     assert main(["doctor"]) == 0
     printed = capsys.readouterr().out

@@ -84,7 +84,7 @@ def test_filters_come_first_then_reconstructions_then_networks_of_dolp():
     kinds = [(method.weights is not None, not method.reconstructs) for method in METHODS.values()]
     assert kinds == sorted(kinds)
     assert list(METHODS)[:4] == ["cf", "highpass", "cf+gain", "highpass+gain"]
-    assert list(METHODS)[-3:] == ["e2p", "paper", "ours"]
+    assert list(METHODS)[-4:] == ["e2p", "e2p_published", "paper", "ours"]
 
 
 def test_dolp_outside_0_and_1_is_clamped_for_every_method(sequence):

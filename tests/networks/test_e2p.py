@@ -1,9 +1,11 @@
 import math
+import pathlib
 
+import numpy as np
 import pytest
 import torch
 
-from polarnet.networks.e2p import E2p, MosaicHead, coded_aolp, decoded_aolp, interleaved
+from polarnet.networks.e2p import E2p, MosaicHead, angle_of, coded_aolp, decoded_aolp, interleaved
 
 
 @pytest.fixture(scope="module")
@@ -86,8 +88,7 @@ def test_aolp_is_coded_from_minus_90_to_90_degrees():
     assert 0 <= outside.min() <= outside.max() < math.pi
 
 
-def test_the_authors_names_are_understood(network, tmp_path):
-    """head_i.pattern1.0, head_i.conv, G1_i.reset_gate, R2_i.conv1, pred_i, fusion_weight1.conv1.0 and so on."""
+def by_the_authors_names(network):
     letters = {"intensity": "i", "aolp": "a", "dolp": "d"}
     theirs = {}
     for name, tensor in network.state_dict().items():
@@ -97,12 +98,50 @@ def test_the_authors_names_are_understood(network, tmp_path):
         if parts[1].startswith("pattern") or (parts[0].startswith("fusion") and parts[1] != "conv4"):
             parts.insert(2, "0")
         theirs[".".join(parts)] = tensor
+    return theirs
+
+
+def test_the_authors_names_are_understood(network, tmp_path):
+    """head_i.pattern1.0, head_i.conv, G1_i.reset_gate, R2_i.conv1, pred_i, fusion_weight1.conv1.0 and so on."""
+    theirs = by_the_authors_names(network)
     assert {"head_i.pattern1.0.weight", "G1_d.reset_gate.bias", "fusion_weight2.conv4.weight"} < theirs.keys()
     assert {"fusion_weight1.conv1.0.weight", "head_a.conv.bias", "pred_a.weight"} < theirs.keys()
     assert E2p.own_names(theirs).keys() == network.state_dict().keys()
     torch.save({"state_dict": theirs}, tmp_path / "e2p.pth")
     loaded = E2p.load(tmp_path / "e2p.pth").state_dict()
     assert all(torch.equal(loaded[name], tensor) for name, tensor in network.state_dict().items())
+
+
+class AuthorsConfig:
+    """The published files hold an object of the authors' `parse_config.ConfigParser`, with paths and numbers in it."""
+
+    def __init__(self):
+        self.save_dir, self.loss = pathlib.PurePosixPath("saved/models"), np.float64(0.5)
+
+    def __setstate__(self, state):
+        raise AssertionError("code of the authors was run")
+
+
+def test_a_published_file_of_the_new_head_loads_beside_its_authors_objects_which_are_not_run(tmp_path):
+    torch.manual_seed(2)
+    new = E2p(5, aolp_channels=2)
+    content = {"arch": "V16", "epoch": 3, "state_dict": by_the_authors_names(new), "config": AuthorsConfig()}
+    torch.save(content, tmp_path / "e2p.pth")
+    loaded = E2p.load(tmp_path / "e2p.pth")
+    assert loaded.branches["aolp"].pred.weight.shape[0] == 2
+    with torch.no_grad():
+        voxels = torch.randn(1, 5, 32, 32)
+        maps, _ = loaded(voxels)
+        assert torch.equal(maps, new.eval()(voxels)[0])
+        assert maps.shape == (1, 4, 16, 16)
+
+
+def test_the_new_heads_maps_are_sine_then_cosine_of_twice_the_angle():
+    angles = torch.tensor([0.0, 30, 45, 90, 135, 179]).deg2rad().view(1, 1, 6)
+    maps = torch.stack([0 * angles, 3 * torch.sin(2 * angles), 3 * torch.cos(2 * angles), 0 * angles], dim=1)
+    torch.testing.assert_close(angle_of(maps), angles)
+    old = torch.stack([0 * angles, coded_aolp(angles), 0 * angles], dim=1)
+    torch.testing.assert_close(angle_of(old), angles)
 
 
 def test_a_file_that_holds_something_else_is_refused(tmp_path):

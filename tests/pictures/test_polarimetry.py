@@ -16,6 +16,7 @@ from polarnet.pictures.polarimetry import (
     Measurement,
     demosaic,
     group_by_measurement,
+    parse_raw_mosaic,
     read_intensities,
     read_measurement,
     shrink,
@@ -292,3 +293,24 @@ def test_a_path_may_be_text_and_one_file_needs_no_list(tmp_path):
     assert group_by_measurement([str(tmp_path / "s_0.png")]) == [(tmp_path / "s_0.png",)]
     with pytest.raises(UnreadablePicture, match="expected the files of a measurement, got none"):
         read_measurement([], SONY)
+
+
+def test_a_colour_mosaic_counts_its_green_pixels_where_all_angles_agree():
+    mosaic, colours = parse_raw_mosaic("RGGB 90 45 / 135 0")
+    assert (mosaic, colours) == (((90, 45), (135, 0)), "RGGB")
+    assert parse_raw_mosaic("90 45 / 135 0") == (mosaic, None)
+    y, x = np.mgrid[:24, :32].astype(np.float64)
+    raw = np.full((24, 32), 1e6)  # red and blue must not matter
+    slopes = {0: (60, 2, 1), 45: (90, 1, 2), 90: (100, 1, 0), 135: (70, 2, -1)}
+    for row in (0, 1):
+        for column in (0, 1):
+            level, across, down = slopes[mosaic[row][column]]
+            green = ((y // 2 + x // 2) % 2 == 1) & (y % 2 == row) & (x % 2 == column)
+            raw[green] = (level + across * x + down * y)[green]
+    planes = demosaic(raw, mosaic, colours)
+    assert planes.shape == (4, 4, 6)
+    centre_y, centre_x = np.mgrid[4:20:4, 4:28:4] + 1.5
+    for plane, (level, across, down) in zip(planes, slopes.values(), strict=True):
+        np.testing.assert_allclose(plane, level + across * centre_x + down * centre_y)
+    with pytest.raises(ValueError, match="mosaic: expected the angles"):
+        parse_raw_mosaic("RGBG 90 45 / 135 0")

@@ -16,6 +16,7 @@ from polarnet.recordings.source import REPAIRS, RecordingError
 from polarnet.storage.events import EventStore
 from polarnet.storage.exchange import write_hdf5, write_text
 from studies.celex5_writer import write_celex5_bin, write_celex5_csv
+from studies.rosbag_writer import write_bag
 
 EVENTS = 60
 PLACES = st.one_of(st.integers(0, 200), st.integers(0, 2**20))
@@ -63,7 +64,7 @@ class Sample:
     def __init__(self, form: str, folder: Path, events: Events):
         self.form = form
         self._size = {"height": events.height, "width": events.width} if form == "esfp" else {}  # the file has no size
-        self.path = folder / f"sample.{form}"
+        self.path = folder / f"sample.{'bag' if form == 'rosbag' else form}"
         write_sample(form, self.path, events)
         self._files = sorted(path for path in [self.path, *self.path.rglob("*")] if path.is_file())
         self._sound = [file.read_bytes() for file in self._files]
@@ -96,6 +97,24 @@ def write_sample(form: str, path: Path, events: Events) -> None:
             columns = {"t": events.t, "x": events.x, "y": events.y, "p": events.p > 0}
             for name, column in columns.items():
                 file[name] = column.numpy()
+    elif form == "metavision":
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w") as file:
+            columns = {
+                "x": ("<u2", events.x),
+                "y": ("<u2", events.y),
+                "p": ("<i2", events.p > 0),
+                "t": ("<i8", events.t),
+            }
+            table = np.zeros(len(events), [(name, kind) for name, (kind, _) in columns.items()])
+            for name, (_, column) in columns.items():
+                table[name] = column.numpy()
+            file["CD/events"] = table
+            file.attrs["geometry"] = f"{events.width}x{events.height}"
+    elif form == "rosbag":
+        pytest.importorskip("rosbags", reason="the extra rosbag is not installed")
+        rows = list(zip(*(getattr(events, name).tolist() for name in "txyp"), strict=True))
+        write_bag(path, rows, events.height, events.width)
     elif form in ("aedat4", "event_stream"):
         faery = pytest.importorskip("faery")
         rows = np.array(list(zip(events.t, events.x, events.y, events.p > 0, strict=True)), faery.EVENTS_DTYPE)

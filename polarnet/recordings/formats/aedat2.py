@@ -1,8 +1,11 @@
 """AEDAT-2 files of jAER from a DAVIS (such as the PDAVIS): a header of # lines, then 8 bytes per event, big endian.
 
 The first four bytes are an address: y from the bottom in bits 22 to 30, x in bits 12 to 21, the polarity in bit 11.
-Entries with bit 31 (a picture's sample) or bit 10 (from the IMU or outside) set are not pixel events. The other four
+Entries with bit 31 (a frame's sample) or bit 10 (from the IMU or outside) set are not pixel events. The other four
 bytes are microseconds.
+
+A frame has two samples of each pixel, of 10 bits: one after its reset (bits 10 and 11 are 0) and one after the exposure
+(bit 10 is 1, bit 11 is 0). Light is their difference.
 """
 
 import re
@@ -15,6 +18,7 @@ import numpy as np
 from polarnet.recordings.source import (
     BLOCK_EVENTS,
     Block,
+    CameraFrames,
     Choices,
     RecordingError,
     Source,
@@ -29,6 +33,7 @@ LAST_LINE = b"#End Of ASCII Header"  # only in newer files; an event can begin w
 MAX_HEADER_BYTES = 2**20  # jAER writes its settings into the header
 ENTRY = np.dtype([("address", ">u4"), ("t", ">u4")])
 NO_EVENT = 1 << 31 | 1 << 10
+SAMPLE, RESET_READ, SIGNAL_READ = 1 << 31, 0, 1  # a frame's sample, and the two values of its bits 10 and 11
 SENSORS = {b"346": (260, 346), b"240": (180, 240), b"128": None}
 """Height and width by the number in the camera's class name in the header; the DVS128 uses another address layout."""
 
@@ -40,6 +45,49 @@ def matches(path: Path, head: bytes) -> bool:
 
 def open_aedat2(path: Path, choices: Choices) -> Source:
     """Open the events of a DAVIS; times that wrap after 71 minutes are unwrapped."""
+    start, height, width = _described(path, choices)
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        entries = word_blocks(path, start, ENTRY, BLOCK_EVENTS, counts)
+        for t, events in unwrapped(block[block["address"] & NO_EVENT == 0] for block in entries):
+            address = events["address"].astype(np.int64)
+            yield Block(t, address >> 12 & 0x3FF, height - 1 - (address >> 22 & 0x1FF), address >> 11 & 1)
+
+    return Source(height, width, blocks)
+
+
+def aedat2_frames(path: Path) -> CameraFrames:
+    """Frames of a DAVIS: the light of every pixel; the time is the mean of the middles of the pixels' exposures.
+
+    A frame that lacks samples, such as the last one of a file, is left out. RecordingError if none is complete.
+    """
+    start, height, width = _described(path, Choices())
+    times, frames = [], []
+    reset, reset_us = np.full(height * width, -1), np.zeros(height * width, np.int64)
+    light, middle_us = np.full(height * width, -1), np.zeros(height * width)
+    for t, block in unwrapped(word_blocks(path, start, ENTRY, BLOCK_EVENTS, Counter())):
+        address = block["address"].astype(np.int64)
+        pixel = (height - 1 - (address >> 22 & 0x1FF)) * width + (address >> 12 & 0x3FF)
+        kind = address >> 10 & 3
+        samples = np.flatnonzero((address & SAMPLE != 0) & (kind <= SIGNAL_READ) & (pixel >= 0) & (pixel < len(light)))
+        for run in np.split(samples, np.flatnonzero(np.diff(kind[samples])) + 1):
+            where, value, now = pixel[run], address[run] & 0x3FF, t[run]
+            if (kind[run] == RESET_READ).all():
+                reset[where], reset_us[where], light[where] = value, now, -1
+                continue
+            light[where] = np.where(reset[where] < 0, -1, np.maximum(reset[where] - value, 0))
+            middle_us[where] = (reset_us[where] + now) / 2
+            if (light >= 0).all():
+                times.append(round(middle_us.mean()))
+                frames.append(light.astype(np.uint16))
+                light[:] = -1
+    if not frames:
+        raise RecordingError(f"{path.name}: expected frames of the DAVIS as true polarization, there are none")
+    return CameraFrames(np.array(times), np.stack(frames).reshape(-1, height, width))
+
+
+def _described(path: Path, choices: Choices) -> tuple[int, int, int]:
+    """Bytes of the header, height and width."""
     header, after, ended = header_lines(path, b"#", LAST_LINE, MAX_HEADER_BYTES)
     if not header.startswith(MAGIC) or (not ended and after.startswith(b"#")):
         raise RecordingError(f"{path.name}: expected AEDAT-2's header of # lines, and events after it")
@@ -47,12 +95,4 @@ def open_aedat2(path: Path, choices: Choices) -> Source:
     size = SENSORS[chip[1]] if chip else (None, None)
     if size is None:
         raise RecordingError(f"{path.name}: expected the recording of a DAVIS, got one of a DVS128")
-    height, width = sensor_size(path, choices, *size)
-
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
-        entries = word_blocks(path, len(header), ENTRY, BLOCK_EVENTS, counts)
-        for t, events in unwrapped(block[block["address"] & NO_EVENT == 0] for block in entries):
-            address = events["address"].astype(np.int64)
-            yield Block(t, address >> 12 & 0x3FF, height - 1 - (address >> 22 & 0x1FF), address >> 11 & 1)
-
-    return Source(height, width, blocks)
+    return len(header), *sensor_size(path, choices, *size)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from polarnet.recordings.formats.isolated import IsolatedLibrary
-from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size
+from polarnet.recordings.source import Block, CameraFrames, Choices, RecordingError, Source, sensor_size
 
 AEDAT4 = b"#!AER-DAT4"
 EVENT_STREAM = b"Event Stream"
@@ -41,6 +41,16 @@ def open_aedat4(path: Path, choices: Choices) -> Source:
 def open_event_stream(path: Path, choices: Choices) -> Source:
     """Open the change events of a DVS or ATIS."""
     return _source(path, choices, "es")
+
+
+def aedat4_frames(path: Path) -> CameraFrames:
+    """The grey frames of the file, with the middle of their exposure, else the time of the frame."""
+    answer = _library.ask(path, "frames")
+    if answer is None:
+        raise RecordingError(
+            f"{path.name}: expected raw frames of one size and one channel as true polarization, there are none"
+        )
+    return CameraFrames(*answer)
 
 
 def _source(path: Path, choices: Choices, file_type: str) -> Source:

@@ -33,6 +33,17 @@ def block(path: str, file_type: str, reader: int, number: int) -> list[np.ndarra
     return [np.concatenate([packet[name] for packet in batch]) for name in ("t", "x", "y", "on")] if batch else None
 
 
+def frames(path: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Times and grey levels of all frames; None if there are none, or if they differ in size."""
+    times, levels = [], []
+    for track, packet in faery.aedat.Decoder(path):
+        if track.data_type == "frame" and packet.pixels.ndim == 2:
+            start, end = packet.exposure_start_t, packet.exposure_end_t
+            times.append((start + end) // 2 if 0 < start < end else packet.t)
+            levels.append(packet.pixels)
+    return (np.array(times), np.stack(levels)) if len({one.shape for one in levels}) == 1 else None
+
+
 def gathered(packets: Iterator[np.ndarray]) -> list[np.ndarray]:
     """Packets with about as many events as an answer holds; empty at the end."""
     batch, count = [], 0
@@ -47,4 +58,4 @@ def close(path: str, reader: int) -> None:
     streams.pop(reader, None)
 
 
-TASKS: dict[str, Callable[..., Any]] = {"size": size, "block": block, "close": close}
+TASKS: dict[str, Callable[..., Any]] = {"size": size, "block": block, "frames": frames, "close": close}

@@ -1,6 +1,7 @@
-"""HDF5 files of three kinds: columns of events in DSEC's layout or ESfP's, and E2P's polarization camera (PDAVIS)."""
+"""HDF5 files of four kinds: columns of events in DSEC's layout or ESfP's, E2P's polarization camera, Prophesee's."""
 
 import contextlib
+import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,14 +10,25 @@ from typing import Any
 import numpy as np
 
 from polarnet.recordings.formats.isolated import IsolatedLibrary
-from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, sensor_size
+from polarnet.recordings.source import (
+    BLOCK_EVENTS,
+    Block,
+    CameraFrames,
+    Choices,
+    RecordingError,
+    Source,
+    sensor_size,
+)
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 DSEC_COLUMNS = ("events/t", "events/x", "events/y", "events/p")
 ESFP_COLUMNS = ("t", "x", "y", "p")
+METAVISION = "CD/events"
 TRIGGERS = "triggers"  # times of a trigger signal in microseconds
 MAX_WHOLE = 2**53  # largest whole number that a float holds exactly
 E2P_COLUMNS = 4  # columns of /events: t in microseconds, x, y, p of 0 or 1
+E2P_FRAMES, E2P_MAPS = ("frame_ts", "frame"), ("intensity", "dolp", "aolp")
+E2P_WHITE = 255.0  # of its maps: S0 / 2 and DoLP 1, AoLP 90 degrees; -90 degrees are 0
 
 Description = dict[str, Any]
 
@@ -25,7 +37,8 @@ _library = IsolatedLibrary(
     "h5py",
     "hdf5",
     Path(__file__).with_name("hdf5_tasks.py"),
-    "the file is damaged, or compressed with a filter that needs pip install hdf5plugin",
+    "the file is damaged, or compressed with a filter that is not installed: pip install hdf5plugin; for Prophesee's "
+    "ECF install the HDF5 plugin of Metavision or OpenEB and name its folder in HDF5_PLUGIN_PATH",
 )
 
 
@@ -37,6 +50,11 @@ def matches_e2p(path: Path, head: bytes) -> bool:
 def matches_esfp(path: Path, head: bytes) -> bool:
     """Whether the file has the four columns of events at its top."""
     return _has_tables(path, head, ESFP_COLUMNS)
+
+
+def matches_metavision(path: Path, head: bytes) -> bool:
+    """Whether the file has Prophesee's table of events."""
+    return _has_tables(path, head, (METAVISION,))
 
 
 def matches_dsec(path: Path, head: bytes) -> bool:
@@ -113,6 +131,50 @@ def open_e2p(path: Path, choices: Choices) -> Source:
     return Source(*sensor_size(path, choices, height, width), blocks)
 
 
+def e2p_frames(path: Path) -> CameraFrames:
+    """Frames of E2P's HDF5: times /frame_ts, mosaics /frame, and maps /intensity, /dolp, /aolp of half the size."""
+    tables = _described(path)["tables"]
+    names = [name for name in (*E2P_FRAMES, *E2P_MAPS) if name in tables]
+    if "frame_ts" not in names or not ({"frame"} <= set(names) or set(E2P_MAPS) <= set(names)):
+        raise RecordingError(
+            f"{path.name}: expected /frame_ts, and /frame or {', '.join(f'/{name}' for name in E2P_MAPS)}, as true "
+            f"polarization, got {', '.join(names) or 'none of them'}"
+        )
+    lengths = {name: tables[name][0][0] for name in names}
+    if len(set(lengths.values())) > 1:
+        raise RecordingError(f"{path.name}: expected one length of all tables of frames, got {lengths}")
+    blocks = [*_read(path, tuple(names), lengths["frame_ts"])]
+    values = {name: np.concatenate([block[k] for block in blocks]) for k, name in enumerate(names)} if blocks else {}
+    if not values:
+        raise RecordingError(f"{path.name}: expected frames as true polarization, there are 0")
+    maps = None
+    if set(E2P_MAPS) <= set(names):
+        s0, dolp, aolp = (values[name] / np.float32(E2P_WHITE) for name in E2P_MAPS)
+        maps = s0, dolp, np.remainder(np.pi * (aolp - 0.5), np.pi).astype(np.float32)
+    return CameraFrames(_microseconds(path, values["frame_ts"]), values.get("frame"), maps)
+
+
+def open_metavision(path: Path, choices: Choices) -> Source:
+    """Open the table CD/events of Prophesee: records of x, y, p of 1 or 0, and t in microseconds.
+
+    The attribute geometry is "WIDTHxHEIGHT". Its own compression, ECF, needs Prophesee's HDF5 plugin.
+    """
+    description = _described(path)
+    (length, *_), kind = description["tables"][METAVISION]
+    if kind != "V":
+        raise RecordingError(f"{path.name}: expected records of x, y, p, t in {METAVISION}, got type {kind!r}")
+    stated = re.fullmatch(r"(\d{1,5})x(\d{1,5})", str(description["values"].get("geometry")))
+    width, height = map(int, stated.groups()) if stated else (None, None)
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        for (table,) in _read(path, (METAVISION,), length):
+            if missing := set("txyp") - set(table.dtype.names or ()):
+                raise RecordingError(f"{path.name}: expected x, y, p, t in {METAVISION}, there is no {min(missing)}")
+            yield Block(_microseconds(path, table["t"]), table["x"], table["y"], table["p"])
+
+    return Source(*sensor_size(path, choices, height, width), blocks)
+
+
 def _has_tables(path: Path, head: bytes, names: tuple[str, ...]) -> bool:
     if not head.startswith(MAGIC):
         return False
@@ -123,8 +185,8 @@ def _has_tables(path: Path, head: bytes, names: tuple[str, ...]) -> bool:
 
 
 def _described(path: Path) -> Description:
-    tables = [*DSEC_COLUMNS, *ESFP_COLUMNS, "events", TRIGGERS]
-    return _library.ask(path, "describe", tables, ["t_offset", "height", "width", "sensor_resolution"])
+    tables = [*DSEC_COLUMNS, *ESFP_COLUMNS, "events", TRIGGERS, METAVISION, *E2P_FRAMES, *E2P_MAPS]
+    return _library.ask(path, "describe", tables, ["t_offset", "height", "width", "sensor_resolution", "geometry"])
 
 
 def _read(path: Path, tables: tuple[str, ...], length: int) -> Iterator[list[np.ndarray]]:

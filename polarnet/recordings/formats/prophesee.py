@@ -1,4 +1,4 @@
-"""Files of Prophesee's cameras, little endian: EVT2, EVT3 (raw) and DAT. Each begins with lines that start with %.
+"""Files of Prophesee's cameras, little endian: EVT2, EVT2.1, EVT3 (raw) and DAT. Each begins with lines of %.
 
 EVT sends the high bits of the time occasionally, and the low bits in between. A sensor's clock sometimes steps back by
 some microseconds within the same high bits. Times are those of the words, regardless of earlier ones. DAT has 8 bytes
@@ -29,7 +29,7 @@ from polarnet.recordings.source import (
 PREFIX, LAST_LINE = b"% ", b"% end"
 MAX_HEADER_BYTES = 2**16
 EVT_BLOCK_WORDS = 2**17
-MAX_PER_WORD = 12  # events per EVT3 word
+MAX_PER_WORD = {"2": 1, "2.1": 32, "3": 12}  # events by version
 SENSORS = {b"gen31": (480, 640), b"gen3": (480, 640), b"gen4": (720, 1280), b"imx636": (720, 1280),
            b"genx320": (320, 320)}  # fmt: skip
 """Height and width by the sensor's name in the header of EVT; files of 2020 state nothing else."""
@@ -48,19 +48,21 @@ def matches_dat(path: Path, head: bytes) -> bool:
 
 
 def open_evt(path: Path, choices: Choices) -> Source:
-    """Open the events of EVT2 or EVT3; the sensor's size comes from the header, or from the sensor's name there."""
+    """Open the events of EVT2, 2.1 or 3; the sensor's size comes from the header, or from the sensor's name there."""
     header, _, _ = header_lines(path, PREFIX, LAST_LINE, MAX_HEADER_BYTES)
-    stated = re.search(rb"% (?:evt |format EVT)(\d(?:\.\d)?)", header)
-    version = stated[1].decode().removesuffix(".0") if stated else "none"
-    if version not in ("2", "3"):
-        raise RecordingError(f"{path.name}: expected a header of % lines that states EVT 2 or 3, got {version}")
+    stated = re.search(rb"% (?:evt |format EVT)(\d)\.?(\d)?", header)
+    version = b".".join(filter(None, stated.groups())).decode().removesuffix(".0") if stated else "none"
+    if version not in MAX_PER_WORD:
+        raise RecordingError(f"{path.name}: expected a header of % lines that states EVT 2, 2.1 or 3, got {version}")
+    if b"endianness=legacy" in header:
+        raise RecordingError(f"{path.name}: expected EVT 2.1 of little endian, got endianness=legacy; record it again")
     height, width = sensor_size(path, choices, *_evt_size(header))
-    word, decode = {"2": ("<u4", _decode_evt2), "3": ("<u2", _decode_evt3)}[version]
+    word, decode = {"2": ("<u4", _decode_evt2), "2.1": ("<u8", _decode_evt21), "3": ("<u2", _decode_evt3)}[version]
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
         state = np.array([-1, 0, 0, -1, 0, 0])  # high bits of the time, their wraps, low bits, y, base x, its polarity
         for words in word_blocks(path, len(header), word, EVT_BLOCK_WORDS, counts):
-            columns = [np.empty(MAX_PER_WORD * len(words), t) for t in (np.int64, np.int16, np.int16, np.int8)]
+            columns = [np.empty(MAX_PER_WORD[version] * len(words), t) for t in (np.int64, np.int16, np.int16, np.int8)]
             events, orphans = decode(words, state, *columns)
             counts["orphans"] += int(orphans)
             yield Block(*(column[:events] for column in columns))
@@ -127,6 +129,31 @@ def _decode_evt2(words, state, t, x, y, p):
             t[n] = ((turns << 28 | high) << 6) | (word >> 22 & 0x3F)
             x[n], y[n], p[n] = word >> 11 & 0x7FF, word & 0x7FF, kind
             n += 1
+    state[0], state[1] = high, turns
+    return n, orphans
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _decode_evt21(words, state, t, x, y, p):
+    """Decode words of 64 bits by their upper 4 bits: 0 OFF, 1 ON, 32 pixels from x on, 8 the time's upper bits."""
+    high, turns = state[0], state[1]
+    n, orphans = 0, 0
+    for i in range(len(words)):
+        upper, valid = np.int64(words[i] >> np.uint64(32)), np.int64(words[i] & np.uint64(0xFFFFFFFF))
+        kind = upper >> 28
+        if kind == 8:
+            before, high = high, upper & 0xFFFFFFF
+            turns += before - high > 2**27
+        elif kind <= 1:
+            if high < 0:
+                orphans += 1
+                continue
+            now, column = ((turns << 28 | high) << 6) | (upper >> 22 & 0x3F), upper >> 11 & 0x7FF
+            for k in range(32):
+                if valid >> k & 1:
+                    t[n], x[n], y[n], p[n] = now, column + k, upper & 0x7FF, kind
+                    n += 1
     state[0], state[1] = high, turns
     return n, orphans
 

@@ -127,3 +127,46 @@ def test_triggers_are_read_where_present(tmp_path):
     assert trigger_times_us(write_esfp(tmp_path / "e.h5", [10, 20, 30])).tolist() == [10, 20, 30]
     with pytest.raises(RecordingError, match="expected a table /triggers"):
         trigger_times_us(write_esfp(tmp_path / "f.h5"))
+
+
+PROPHESEE = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+
+
+def write_metavision(path, rows, geometry="640x480", dtype=PROPHESEE, **options):
+    with h5py.File(path, "w") as file:
+        file.create_dataset("CD/events", data=np.array(rows, dtype), **options)
+        if geometry:
+            file.attrs["geometry"] = geometry
+    return path
+
+
+def test_prophesees_table_has_records_of_x_y_p_t_and_its_geometry(tmp_path):
+    path = write_metavision(tmp_path / "e.hdf5", [(639, 0, 1, 5), (0, 479, 0, 9)], chunks=(2,), compression="gzip")
+    recording = read_recording(path)
+    events = recording.events
+    assert (recording.format, events.height, events.width) == ("metavision", 480, 640)
+    assert [events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist()] == [
+        [5, 9],
+        [639, 0],
+        [0, 479],
+        [1, -1],
+    ]
+    with pytest.raises(RecordingError, match="the file does not say how large the sensor is"):
+        read_recording(write_metavision(tmp_path / "f.hdf5", [(1, 2, 1, 5)], None))
+    other = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2")])
+    with pytest.raises(RecordingError, match="expected x, y, p, t in CD/events, there is no t"):
+        read_recording(write_metavision(tmp_path / "g.hdf5", [(1, 2, 1)], dtype=other))
+
+
+def test_prophesees_own_compression_names_the_plugin_that_it_needs(tmp_path):
+    ecf, optional = 0x8ECF, 1  # optional, so that HDF5 writes a file for it without having the filter
+    with h5py.File(tmp_path / "e.hdf5", "w") as file:
+        file.attrs["geometry"] = "640x480"
+        settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        settings.set_chunk((2,))
+        settings.set_filter(ecf, optional)
+        kind, space = h5py.h5t.py_create(PROPHESEE), h5py.h5s.create_simple((2,))
+        table = h5py.h5d.create(file.create_group("CD").id, b"events", kind, space, settings)
+        table.write_direct_chunk((0,), bytes(8), filter_mask=0)
+    with pytest.raises(RecordingError, match=r"for Prophesee's ECF install the HDF5 plugin.*HDF5_PLUGIN_PATH"):
+        read_recording(tmp_path / "e.hdf5")

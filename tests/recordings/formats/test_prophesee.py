@@ -75,7 +75,7 @@ def test_the_sensors_name_stands_for_its_size(tmp_path):
 
 def test_other_versions_of_evt_are_refused(tmp_path):
     (tmp_path / "e.raw").write_bytes(b"% evt 4.0\n1234")
-    with pytest.raises(RecordingError, match="states EVT 2 or 3, got 4"):
+    with pytest.raises(RecordingError, match=r"states EVT 2, 2\.1 or 3, got 4"):
         read_recording(tmp_path / "e.raw")
 
 
@@ -124,3 +124,28 @@ def test_other_dat_files_are_refused_with_the_reason(tmp_path, content, message)
     (tmp_path / "e.dat").write_bytes(content)
     with pytest.raises(RecordingError, match=rf"e\.dat: .*{message}"):
         read_recording(tmp_path / "e.dat", height=720, width=1280)
+
+
+def evt21(kind, low6_us, x, y, valid):
+    return kind << 60 | low6_us << 54 | x << 43 | y << 32 | valid
+
+
+@pytest.mark.parametrize(
+    "header", [b"% evt 2.1\n% geometry 640x480\n% end\n", b"% format EVT21;height=480;width=640\n% end\n"]
+)
+def test_evt21_has_32_pixels_in_a_word_of_64_bits(tmp_path, header):
+    high = 8 << 60 | 3 << 32
+    words = [evt21(1, 9, 0, 0, 1), high, evt21(1, 5, 32, 7, 0b101), evt21(0, 63, 608, 479, 1 << 31)]
+    path = tmp_path / "e.raw"
+    path.write_bytes(header + np.array(words, "<u8").tobytes())
+    recording = read_recording(path)
+    events = recording.events
+    assert (recording.format, events.height, events.width, recording.repairs) == ("evt", 480, 640, {"orphans": 1})
+    assert events.t.tolist() == [3 * 64 + 5, 3 * 64 + 5, 3 * 64 + 63]
+    assert [events.x.tolist(), events.y.tolist(), events.p.tolist()] == [[32, 34, 639], [7, 7, 479], [1, 1, -1]]
+
+
+def test_evt21_with_exchanged_halves_of_words_is_refused(tmp_path):
+    (tmp_path / "e.raw").write_bytes(b"% evt 2.1\n% format EVT21;endianness=legacy;height=480;width=640\n% end\n")
+    with pytest.raises(RecordingError, match="got endianness=legacy"):
+        read_recording(tmp_path / "e.raw")

@@ -1,0 +1,53 @@
+"""Bags of ROS 1 (.bag) and ROS 2 (a folder with metadata.yaml), read by the package rosbags.
+
+Events are messages EventArray of dvs_msgs or prophesee_event_msgs: height, width and events of x, y, ts, polarity.
+"""
+
+import contextlib
+import itertools
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+from polarnet.recordings.formats.isolated import IsolatedLibrary
+from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size
+
+MAGIC = b"#ROSBAG V"
+
+_library = IsolatedLibrary(
+    "rosbags", "rosbags", "rosbag", Path(__file__).with_name("rosbag_tasks.py"), "the bag is damaged"
+)
+_readers = itertools.count()
+
+
+def matches(path: Path, head: bytes) -> bool:
+    """Whether it is a bag of ROS 1, or the folder of a bag of ROS 2."""
+    return (path / "metadata.yaml").exists() if path.is_dir() else head.startswith(MAGIC)
+
+
+def open_rosbag(path: Path, choices: Choices) -> Source:
+    """Open the events of a bag with one topic of them, or of the topic that `part` names."""
+    if path.is_file() and path.suffix != ".bag":
+        raise RecordingError(f"{path.name}: expected a name that ends in .bag, by which rosbags tells bags; rename it")
+    topics, others = _library.ask(path, "topics")
+    if choices.part not in topics and (choices.part is not None or len(topics) != 1):
+        raise RecordingError(
+            f"{path.name}: expected one topic of EventArray (dvs_msgs or prophesee_event_msgs), or --part TOPIC, got "
+            f"{', '.join(topics) or f'only {others}'}"
+        )
+    topic = choices.part or topics[0]
+    height, width = sensor_size(path, choices, *_library.ask(path, "size", topic))
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        reader = next(_readers)
+        try:
+            for number in itertools.count():
+                columns = _library.ask(path, "block", topic, reader, number)
+                if columns is None:
+                    return
+                yield Block(*columns)
+        finally:
+            with contextlib.suppress(RecordingError, RuntimeError):
+                _library.ask(path, "close", reader)
+
+    return Source(height, width, blocks)

@@ -1,0 +1,134 @@
+"""Remove noise from events before recovery: those of hot pixels, and background activity.
+
+Background activity is events that no neighbour supports: an edge that moves over a pixel moves over the pixels around
+it too (Delbruck, "Frame-free dynamic digital vision", 2008).
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple, no_type_check
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Bool
+
+from polarnet.events.mosaic import places_of
+from polarnet.events.stream import Events, select
+from polarnet.recordings.live import Piece
+from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
+from polarnet.stokes import Mosaic
+
+FOUND = "found"
+NEVER = np.iinfo(np.int64).min // 2
+
+
+class Cleaning(NamedTuple):
+    """Noise to remove, as the user asks for it."""
+
+    hot: str | None
+    """A file of hot pixels, lines `x y` of the sensor; `FOUND`: look for them; None: keep them."""
+    hot_factor: float
+    """A pixel is found to be hot above this multiple of the third busiest of the 5 x 5 pixels around it."""
+    background_us: int | None
+    """An event stays if one of its 8 neighbours of the channel fired within this time before it; None: all stay."""
+
+
+class Cleaner:
+    """Removes noise from the pieces of a recording; `removed` counts the events, `hot` the hot pixels.
+
+    `mosaic` is the arrangement of the sensor's polarizers, whose channels have half its rows and columns; None if each
+    channel has a sensor. Found hot pixels need the whole recording in one piece: ValueError for live input.
+    """
+
+    def __init__(self, cleaning: Cleaning, mosaic: Mosaic | None):
+        self.removed = {"hot pixels": 0, "background activity": 0}
+        self.hot = 0
+        self._cleaning, self._mosaic = cleaning, mosaic
+        self._bad: list[Bool[np.ndarray, "h w"]] | None = None
+        self._last: list[np.ndarray] = []
+
+    def __call__(self, channels: Sequence[Events], duration_us: int) -> list[Events]:
+        """The channels of a whole recording, or of its next piece, without noise."""
+        if self._bad is None:
+            self._bad = [self._hot(events, k, duration_us) for k, events in enumerate(channels)]
+            self._last = [np.full((e.height + 2, e.width + 2), NEVER) for e in channels]
+            self.hot = sum(int(bad.sum()) for bad in self._bad)
+        clean = [without_pixels(events, bad) for events, bad in zip(channels, self._bad, strict=True)]
+        self.removed["hot pixels"] += sum(map(len, channels)) - sum(map(len, clean))
+        if self._cleaning.background_us is not None:
+            before = sum(map(len, clean))
+            clean = [
+                without_background(events, self._cleaning.background_us, last)
+                for events, last in zip(clean, self._last, strict=True)
+            ]
+            self.removed["background activity"] += before - sum(map(len, clean))
+        return clean
+
+    def live(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
+        """Clean pieces as they arrive."""
+        if self._cleaning.hot == FOUND:
+            raise ValueError(f"--hot-pixels {FOUND}: expected a file of hot pixels for live input, `x y` a line")
+        for piece in pieces:
+            yield piece._replace(channels=self(piece.channels, piece.until_us))
+
+    def sentence(self) -> str:
+        """The count of what was removed."""
+        return ", ".join(
+            f"{count:,} events of {f'{self.hot} ' if kind == 'hot pixels' else ''}{kind}"
+            for kind, count in self.removed.items()
+        )
+
+    def _hot(self, events: Events, channel: int, duration_us: int) -> Bool[np.ndarray, "h w"]:
+        if self._cleaning.hot is None:
+            return np.zeros((events.height, events.width), bool)
+        if self._cleaning.hot == FOUND:
+            return hot_pixels(event_counts(events), duration_us * 1e-6, self._cleaning.hot_factor)
+        cell = 1 if self._mosaic is None else 2
+        listed = read_hot_pixels(Path(self._cleaning.hot), cell * events.height, cell * events.width)
+        if self._mosaic is None:
+            return listed
+        row, column = places_of(self._mosaic)[channel]
+        return listed[row::2, column::2]
+
+
+def read_hot_pixels(path: Path, height: int, width: int) -> Bool[np.ndarray, "h w"]:
+    """Pixels listed in a text file, `x y` a line; ValueError for other lines and for pixels that are off the sensor."""
+    bad = np.zeros((height, width), bool)
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        if len(words) != 2 or not all(word.isdigit() for word in words):
+            raise ValueError(f"{path.name}, line {number}: expected `x y` of a hot pixel, got {line!r}")
+        x, y = map(int, words)
+        if x >= width or y >= height:
+            raise ValueError(f"{path.name}, line {number}: pixel {x} {y} is not on the sensor of {height}x{width} px")
+        bad[y, x] = True
+    return bad
+
+
+def without_background(events: Events, within_us: int, last_us: np.ndarray | None = None) -> Events:
+    """Events that a neighbour supports: one of the 8 pixels around fired at most `within_us` before.
+
+    `last_us` holds the time of each pixel's last event with a border of one pixel, and is updated, so that a stream can
+    come in pieces; None: nothing came before.
+    """
+    if last_us is None:
+        last_us = np.full((events.height + 2, events.width + 2), NEVER)
+    keep = _supported(events.t.numpy(), events.x.numpy(), events.y.numpy(), within_us, last_us)
+    return select(events, torch.from_numpy(keep))
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _supported(t, x, y, within_us, last):
+    keep = np.zeros(len(t), np.bool_)
+    for i in range(len(t)):
+        row, column = np.int64(y[i]) + 1, np.int64(x[i]) + 1
+        for dy in range(-1, 2):
+            for dx in range(-1, 2):
+                if (dy != 0 or dx != 0) and t[i] - last[row + dy, column + dx] <= within_us:
+                    keep[i] = True
+        last[row, column] = t[i]
+    return keep

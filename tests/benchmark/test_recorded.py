@@ -1,0 +1,159 @@
+"""`polarnet benchmark --recordings` on files in E2P's layout."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from recording_fixtures import make_events, make_random_events
+
+from polarnet.benchmark.recorded import clock_notes, frame_lag, make_recorded_set, read_recorded
+from polarnet.cli import main
+from polarnet.config.tree import load
+from polarnet.events.mosaic import join_mosaic
+from polarnet.events.stream import Events
+from polarnet.methods import METHODS
+from polarnet.networks.e2p import MOSAIC
+from polarnet.pictures.dead_leaves import dead_leaves
+from polarnet.pictures.images import write_png
+from polarnet.recordings.arrangements import shifted
+from polarnet.recordings.noise import Cleaning
+from polarnet.recordings.recording import read_recording
+from polarnet.recordings.source import RecordingError
+from polarnet.recordings.truth import read_truth
+from polarnet.runtime.machine import generator_for
+from polarnet.simulation.sets import make_folder_set
+from polarnet.storage.frames import FrameStore
+from studies.e2p_writer import WHITE, mosaicked, write_e2p
+from studies.recorded import write_recordings
+
+__all__ = ["make_events", "make_random_events"]
+
+pytest.importorskip("h5py")
+
+NOTHING = Cleaning(None, 4.0, None)
+TINY = [
+    "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.2", "synthesize.sensor_height=40",
+    "synthesize.sensor_width=56", "benchmark.warmup_windows=1", "benchmark.bootstrap_samples=10",
+    "benchmark.panel_scenes=1", "benchmark.lpips=false", "runtime.threads=1",
+    "baselines.e2v.crop=null", "baselines.e2p.crop=null",
+]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def usual_kernels():
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.fixture(scope="module")
+def made(project_root, tmp_path_factory):
+    """A simulated set, and beside it the folder `recordings` with its sequences as files of E2P."""
+    folder = tmp_path_factory.mktemp("made")
+    (folder / "pictures").mkdir()
+    write_png(folder / "pictures" / "beach.png", dead_leaves(generator_for(1, "beach", "picture"), 100, 150), bits=8)
+    config = load(project_root, TINY)
+    make_folder_set(folder / "pictures", "photographs", folder / "set", config.recipe, config.mapper)
+    write_recordings(folder / "set", folder / "recordings")
+    return folder
+
+
+@pytest.fixture
+def recording(made):
+    (path,) = (made / "recordings").glob("*.h5")
+    return path
+
+
+def test_every_method_has_its_row_and_the_truth_is_that_of_the_files(
+    made, checkpoints, project_root, tmp_path, monkeypatch, capsys
+):
+    (made / "recordings" / "notes.txt").write_text("no recording at all")
+    monkeypatch.chdir(project_root)
+    weights = [f"methods.{row}.weights={file}" for row, file in checkpoints.items() if row != "ours"]
+    rows = [*METHODS, "zeros", "oracle_mean"]
+    arguments = ["--methods", ",".join(rows), "--weights", str(checkpoints["ours"]), "--out", str(tmp_path / "out")]
+    paths = [f"paths.data={tmp_path / 'nothing'}"]
+    assert main(["benchmark", "--recordings", str(made / "recordings"), *arguments, *TINY, *paths, *weights]) == 0
+    (made / "recordings" / "notes.txt").unlink()
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert set(metrics) == set(rows) - {"rotating_polarizer"}
+    assert all(np.isfinite(scores["mse"]) for scores in metrics.values())
+    printed = capsys.readouterr().out
+    assert "notes.txt was skipped" in printed
+    assert "rotating_polarizer was left out: recordings hold the events of four channels" in printed
+    assert "hardly agree" not in printed
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert "polarnet benchmark --recordings" in page
+    stored = FrameStore.open(tmp_path / "out" / "work" / "frames.zarr")
+    known = FrameStore.open(made / "set" / "frames.zarr")
+    (name,), (original,) = stored.sequences, known.sequences
+    assert (stored.dolp(name) - known.dolp(original)).abs().max() < 0.5 / 255 + 2e-5
+    assert stored.t_us(name).tolist() == known.t_us(original).tolist()
+
+
+def test_events_and_frames_on_one_clock_agree_and_a_shift_is_found(recording):
+    events, truth = read_recording(recording).events, read_truth(recording, MOSAIC)
+    lag = frame_lag(events, truth)
+    assert lag.agreement > 0.3
+    assert abs(lag.lag_us) < 8000  # light does not change evenly between frames
+    assert clock_notes(truth.t_us, lag) == []
+    late = frame_lag(shifted(events, 30_000), truth)  # the same events, 30 ms earlier
+    assert late.lag_us == pytest.approx(30_000 + lag.lag_us, abs=6000)
+    (note,) = clock_notes(truth.t_us, late)
+    assert "ms late against the events" in note
+
+
+def test_events_that_have_nothing_to_do_with_the_frames_are_reported(recording, make_random_events):
+    truth = read_truth(recording, MOSAIC)
+    noise = make_random_events(0, 20_000, int(truth.t_us[-1]), 80, 112)
+    (note,) = clock_notes(truth.t_us, frame_lag(noise, truth))
+    assert "whether they are on one clock is unknown" in note
+
+
+def test_windows_of_another_length_than_in_training_are_reported(recording):
+    truth = read_truth(recording, MOSAIC)
+    (note,) = clock_notes(3 * truth.t_us, frame_lag(read_recording(recording).events, truth))
+    assert "windows between frames are 100.0 ms long; networks were trained on 33.3 ms" in note
+
+
+def test_frames_far_from_the_events_are_refused(recording, tmp_path):
+    truth = read_truth(recording, MOSAIC)
+    levels = np.rint(WHITE * truth.light.clip(0, 1)).astype(np.uint8)
+    path = tmp_path / "far.h5"
+    write_e2p(path, read_recording(recording).events, truth.t_us + 10_000_000, levels, None)
+    with pytest.raises(RecordingError, match=r"far\.h5: expected events and frames on one clock, got events from"):
+        read_recorded(path, "far", MOSAIC, NOTHING)
+
+
+def test_a_folder_without_recordings_says_what_was_expected(tmp_path, make_events):
+    with pytest.raises(ValueError, match="expected a folder of recordings, got none"):
+        make_recorded_set(tmp_path / "none", tmp_path / "work", MOSAIC, NOTHING)
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "e.txt").write_text("4 4\n1 2 3 1\n")
+    with pytest.raises(ValueError, match=r"no recording with true polarization. e\.txt was skipped: expected a format"):
+        make_recorded_set(tmp_path / "in", tmp_path / "work", MOSAIC, NOTHING)
+
+
+def test_hot_pixels_of_a_recording_are_removed_before_it_is_scored(recording, tmp_path):
+    events, truth = read_recording(recording).events, read_truth(recording, MOSAIC)
+    t = torch.arange(int(events.t[0]), int(events.t[-1]), 200)
+    places = torch.full_like(t, 20).short()
+    hot = Events(t, places, places, torch.ones_like(t).to(torch.int8), 80, 112)
+    from polarnet.events.stream import merge
+
+    levels = np.rint(WHITE * truth.light.clip(0, 1)).astype(np.uint8)
+    (tmp_path / "in").mkdir()
+    write_e2p(tmp_path / "in" / "hot.h5", merge([events, hot]), truth.t_us, levels, None)
+    clean = read_recorded(tmp_path / "in" / "hot.h5", "hot", MOSAIC, Cleaning("found", 4.0, None))
+    kept = join_mosaic(clean.channels, MOSAIC)
+    assert not ((kept.x == 20) & (kept.y == 20)).any()
+    (note,) = clean.notes
+    assert "of 1 hot pixels" in note
+    assert mosaicked(truth.intensity.numpy()).shape == truth.light.shape
+
+
+def test_options_of_recordings_do_not_apply_elsewhere(tmp_path, capsys):
+    assert main(["benchmark", "--scenes", str(tmp_path), "--hot-pixels", "found"]) == 1
+    assert "apply to --recordings only" in capsys.readouterr().err
+    assert main(["benchmark", "--recordings", str(tmp_path), "--background", "20ev"]) == 1
+    assert "--background: expected a time such as 10ms" in capsys.readouterr().err

@@ -1,0 +1,60 @@
+"""`polarnet convert`."""
+
+import numpy as np
+import pytest
+import torch
+from recording_fixtures import events_of, random_events
+
+from polarnet.cli import main
+from polarnet.recordings.recording import read_recording
+from polarnet.storage.exchange import write_text
+
+EVENTS = [(1_000_000, 3, 4, 1), (1_250_000, 5, 6, -1), (1_500_000, 0, 0, 1), (1_750_000, 7, 7, -1)]
+
+
+@pytest.fixture
+def recording(tmp_path):
+    write_text(tmp_path / "in.txt", events_of(EVENTS, 8, 9), 2_000_000)
+    return tmp_path / "in.txt"
+
+
+@pytest.mark.parametrize("name", ["out.h5", "out.txt", "out.raw"])
+def test_all_events_arrive_in_every_format_with_time_0_at_the_first(recording, tmp_path, name, capsys):
+    pytest.importorskip("h5py")
+    assert main(["convert", str(recording), str(tmp_path / name)]) == 0
+    events = read_recording(tmp_path / name).events
+    assert (events.height, events.width) == (8, 9)
+    rows = torch.stack([events.t, events.x.long(), events.y.long(), events.p.long()], 1).tolist()
+    assert rows == [[t - 1_000_000, x, y, p] for t, x, y, p in EVENTS]
+    assert "4 of 4 events, time 0 is 1000000 us" in capsys.readouterr().out
+
+
+def test_a_span_is_half_open_and_counts_from_the_first_event(recording, tmp_path, capsys):
+    out = tmp_path / "out.txt"
+    assert main(["convert", str(recording), str(out), "--start", "250ms", "--stop", "0.75s"]) == 0
+    assert read_recording(out).events.t.tolist() == [0, 250_000]
+    assert "2 of 4 events, time 0 is 1250000 us" in capsys.readouterr().out
+    assert main(["convert", str(recording), str(out), "--start", "1s", "--stop", "500ms"]) == 1
+    assert "expected --stop after --start, got 1000000 to 500000 us" in capsys.readouterr().err
+    assert read_recording(out).events.t.tolist() == [0, 250_000]
+
+
+def test_what_cannot_be_converted_is_refused(recording, tmp_path, capsys):
+    assert main(["convert", str(recording), str(tmp_path / "out.xyz")]) == 1
+    assert "expected a suffix of .h5, .hdf5, .txt, .raw, or --to FORMAT" in capsys.readouterr().err
+    assert main(["convert", str(recording), str(recording)]) == 1
+    assert "expected another file than the one to convert" in capsys.readouterr().err
+    assert main(["convert", str(recording), str(tmp_path / "o.txt"), "--stop", "5ev"]) == 1
+    assert "--stop: expected a time such as 500ms" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.txt"]
+
+
+def test_events_go_round_through_three_formats_unchanged(tmp_path, capsys):
+    pytest.importorskip("h5py")
+    events = random_events(3, 2000, 10**6, 40, 50)
+    write_text(tmp_path / "a.txt", events, 10**6)
+    for source, target in (("a.txt", "b.raw"), ("b.raw", "c.h5"), ("c.h5", "d.txt")):
+        assert main(["convert", str(tmp_path / source), str(tmp_path / target)]) == 0
+    back = read_recording(tmp_path / "d.txt").events
+    assert np.array_equal(back.t, events.t - events.t[0])
+    assert all(torch.equal(getattr(back, name), getattr(events, name)) for name in "xyp")
