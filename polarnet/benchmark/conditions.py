@@ -23,6 +23,9 @@ RANGES_BEFORE = {
 """Parameters whose range older checkpoints record under a key of its own."""
 
 
+SPEEDS = ("synthesize.speed_min_px_s", "synthesize.speed_max_px_s")
+
+
 class Conditions(NamedTuple):
     """The sections `synthesize` and `emulate` that sequences were made with; unknown keys are absent."""
 
@@ -128,11 +131,30 @@ def _warning(used: Conditions, trained: Conditions | None, advice: str) -> str:
         return "the checkpoint does not say what it was trained on, so size and sensor were not compared."
     here, there = used.values, trained.values
     keys = [key for key in there if key in here and here[key] != there[key]]
+    nearest = dict(there)
+    ranges = trained.emulate.get("randomise")
+    if ranges and used.emulate and not used.emulate["randomise"]:  # one sensor, against those that the training drew
+        keys.remove("emulate.randomise")
+        for name, (low, high) in ranges.items():
+            key, value = f"emulate.{name}", used.emulate[name]
+            there[key], nearest[key] = [low, high], min(max(value, low), high)
+            if value != nearest[key]:
+                keys.append(key)
+    if _within_speeds(here, there):
+        keys = [key for key in keys if key not in SPEEDS]
     if not keys:
         return ""
     both = ", ".join(f"{key} {_printed(here[key])} (training: {_printed(there[key])})" for key in keys)
-    settings = " ".join(f"{key}={_printed(there[key])}" for key in keys)
+    settings = " ".join(f"{key}={_printed(nearest[key])}" for key in keys)
     return f"these sequences differ from those of its training: {both}. {advice} {settings}"
+
+
+def _within_speeds(here: Mapping[str, Any], there: Mapping[str, Any]) -> bool:
+    """Whether the speeds of the sequences lie within those of the training."""
+    low, high = SPEEDS
+    if any(key not in values for key in SPEEDS for values in (here, there)):
+        return False
+    return bool(there[low] <= here[low] and here[high] <= there[high])
 
 
 def _printed(value: Any) -> str:

@@ -60,7 +60,7 @@ class Equaliser(nn.Module):
         `state` is empty at the start. Otherwise it holds the numbers of ON and OFF events so far, and the change of
         their weights from 1.
         """
-        events = torch.cat([count + polarity, count - polarity], dim=2) / 2
+        events = F.relu(torch.cat([count + polarity, count - polarity], dim=2)) / 2
         totals, change = state or [torch.zeros_like(events[0])] * 2
         noise, pull, surplus = self.log_noise.exp(), self.log_pull.exp(), self.log_surplus.exp()
         weighted, sums, mismatches = [], [], []

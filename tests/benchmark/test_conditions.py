@@ -100,10 +100,21 @@ def test_a_checkpoint_with_one_deviation_for_both_thresholds_is_compared_by_toda
     assert line.endswith("Set emulate.contrast_threshold_sigma_off=0.03 emulate.dead_pixel_share=0.0")
 
 
-def test_the_ranges_of_an_old_checkpoint_are_said_as_todays(config):
-    (line,) = warnings(
-        configured(config.synthesize, config.emulate), {"ours": checkpoint_before(config, randomise=True)}, "Set"
-    )
-    assert "emulate.randomise null (training: {contrast_threshold_on:[0.08,0.31]," in line
-    assert "contrast_threshold_sigma_off:[0.02,0.06],cutoff_hz:[30.0,300.0]," in line
-    assert "emulate.cutoff_hz" not in line
+def test_a_sensor_and_a_speed_within_the_ranges_of_the_training_are_no_difference(config):
+    trained = {"ours": checkpoint_before(config, randomise=True)}
+    assert warnings(configured(config.synthesize, config.emulate), trained, "Set") == []
+    slower = dataclasses.replace(config.synthesize, speed_min_px_s=50.0)
+    assert warnings(configured(slower, config.emulate), {"ours": checkpoint(config)}, "Set") == []
+
+
+def test_a_sensor_beyond_the_ranges_of_the_training_is_said_with_the_range_and_the_nearest_value(config):
+    trained = {"ours": checkpoint_before(config, randomise=True)}
+    other = dataclasses.replace(config.emulate, cutoff_hz=400.0)
+    (line,) = warnings(configured(config.synthesize, other), trained, "Set")
+    assert line.endswith("emulate.cutoff_hz 400.0 (training: [30.0,300.0]). Set emulate.cutoff_hz=300.0")
+
+
+def test_a_drawn_sensor_is_a_difference_for_a_training_that_drew_none(config):
+    drawn = dataclasses.replace(config.emulate, randomise={"cutoff_hz": [30.0, 300.0]})
+    (line,) = warnings(configured(config.synthesize, drawn), {"ours": checkpoint(config)}, "Set")
+    assert "emulate.randomise {cutoff_hz:[30.0,300.0]} (training: null)" in line

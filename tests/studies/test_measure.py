@@ -212,7 +212,7 @@ def test_figures_are_kept_where_the_tests_fail(tmp_path):
         (root / folder / ".keep").write_text("")
     (root / "data" / "benchmark" / "metrics.json").write_text('{"ours": {"mse": 0.1}}')
     (root / "data" / "benchmark" / "cost.json").write_text('{"ours": {"params": 7}}')
-    (root / "data" / "benchmark" / "details.json").write_text('{"lpips": {"backbone": "alex"}}')
+    (root / "data" / "benchmark" / "details.json").write_text('{"lpips": {"backbone": "alex"}, "weights": {}}')
     (root / "data" / "report" / "overview.png").write_bytes(b"picture")
     (root / "Makefile").write_text("setup:\n\t@true\nrepro:\n\t@echo stages > dvc.lock\ntest:\n\t@false\n")
     git(root, "init", "--quiet")
