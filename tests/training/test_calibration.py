@@ -78,24 +78,24 @@ def test_errors_are_expected_where_they_are_and_dolp_is_what_it_was(stores, task
     task, config = task_of(), dataclasses.replace(TRAIN, precision=precision)
     torch.nn.init.normal_(task.network.add.weight, std=0.1, generator=torch.Generator().manual_seed(1))
     split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
-    sequence = split.train[0]
 
     def recovered():
         with torch.no_grad():
-            return task.network.unroll(sequence.inputs[:, None], None)[0]
+            return [task.network.unroll(sequence.inputs[:, None], None)[0] for sequence in split.train]
 
     before = recovered()
     mean_squared = calibrate(task, split.train, config, CPU, 0)["mse"]
     after = recovered()
     for name in ("dolp", "aolp", "stokes"):
-        torch.testing.assert_close(getattr(after, name), getattr(before, name))
-    errors = (after.dolp[:, 0].clamp(0, 1) - sequence.dolp).square()
-    alike = torch.full_like(errors, mean_squared).log()
-    likelihood = [
-        (errors * torch.exp(-v) + v).mean() for v in (before.log_variance[:, 0], alike, after.log_variance[:, 0])
-    ]
+        for new, old in zip(after, before, strict=True):
+            torch.testing.assert_close(getattr(new, name), getattr(old, name))
+    truth = torch.stack([sequence.dolp for sequence in split.train])
+    errors = (torch.stack([one.dolp[:, 0] for one in after]).clamp(0, 1) - truth).square()
+    fitted = torch.stack([one.log_variance[:, 0] for one in after])
+    alike, untrained = torch.full_like(errors, mean_squared).log(), torch.stack([b.log_variance[:, 0] for b in before])
+    likelihood = [(errors * torch.exp(-v) + v).mean() for v in (untrained, alike, fitted)]
     assert likelihood[2] < likelihood[1] < likelihood[0]
-    assert after.log_variance.exp().mean().item() == pytest.approx(errors.mean().item(), rel=0.3)
+    assert fitted.exp().mean().item() == pytest.approx(errors.mean().item(), rel=0.3)
 
 
 def test_of_what_it_has_seen_nothing_of_it_expects_the_errors_of_a_guess(stores, task_of):
