@@ -35,7 +35,7 @@ class Recorded(NamedTuple):
     channels: Sequence[Events]
     truth: Truth
     notes: list[str]
-    """What is worth knowing before its scores are read, a sentence each."""
+    """Warnings about its clock and its noise, a sentence each."""
 
 
 def make_recorded_set(

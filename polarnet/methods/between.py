@@ -24,13 +24,15 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 from torch.nn import functional as F
 
+from polarnet.events.representations import event_counts
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow
 from polarnet.networks.panorama import displacements
+from polarnet.networks.redundancy import box_means
+from polarnet.networks.stokes_unet import MAX_DOLP
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
-MAX_DEGREE = 0.98  # largest |s1|, |s2| passed to atanh, to keep it finite
 CHANNELS = ((0, 1), (1, 1), (0, -1), (1, -1))
 """For each channel, the row of (atanh s1, atanh s2) that its events change, and the sign for an ON event."""
 
@@ -89,7 +91,7 @@ def anchored(before: Between | None, window: EventWindow, prediction: Prediction
     if stokes is None and prediction.aolp is not None:
         stokes = prediction.dolp * torch.stack([torch.cos(2 * prediction.aolp), torch.sin(2 * prediction.aolp)])
     if stokes is not None:
-        maps.append(torch.atanh(stokes.float().clamp(-MAX_DEGREE, MAX_DEGREE)))
+        maps.append(torch.atanh(stokes.float().clamp(-MAX_DOLP, MAX_DOLP)))
     beyond = config.reach + 1
     padded = F.pad(torch.cat(maps)[None], (beyond, beyond, beyond, beyond), mode="replicate")[0]
     velocity = torch.zeros(2) if before is None else _velocity(before.window, window, config.reach)
@@ -117,7 +119,7 @@ def carried(state: Between, channels: Sequence[Events], t_us: int, config: Betwe
         return state, Prediction(dolp, None, log_variance)
     along = moved[-2:]
     unexplained = change - (along - _shifted(state.maps[-2:], (0.0, 0.0), beyond))
-    stokes = torch.tanh(along + config.share * _box_means(unexplained, config.width))
+    stokes = torch.tanh(along + config.share * box_means(unexplained[None], config.width)[0])
     dolp = dolp + torch.hypot(*stokes) - torch.hypot(*torch.tanh(along))
     aolp = torch.remainder(torch.atan2(stokes[1], stokes[0]) / 2, math.pi)
     return state, Prediction(dolp.clamp(0, 1), aolp, log_variance, stokes)
@@ -133,11 +135,7 @@ def _velocity(before: EventWindow, window: EventWindow, reach: int) -> Float[Ten
 
 def _polarity(window: EventWindow) -> Float[Tensor, "h w"]:
     """Sum of polarities of the four channels."""
-    first = window.channels[0]
-    image = torch.zeros(first.height * first.width)
-    for events in window.channels:
-        image.index_add_(0, _pixel(events), events.p.float())
-    return image.view(first.height, first.width)
+    return torch.stack([event_counts(events, window.length_us)[0] for events in window.channels]).sum(0)
 
 
 def _counted(
@@ -166,12 +164,3 @@ def _shifted(padded: Float[Tensor, "c h2 w2"], displacement: Sequence[float], be
     if y != top:
         part = torch.lerp(part[:, :height], part[:, 1 : height + 1], y - top)
     return part[:, :height, :width]
-
-
-def _box_means(x: Float[Tensor, "c h w"], width: int) -> Float[Tensor, "c h w"]:
-    """Means over `width` x `width` pixels around each pixel; the border continues beyond the image."""
-    beyond = width // 2
-    height, columns = x.shape[-2:]
-    x = F.pad(x[None], (beyond, beyond, beyond, beyond), mode="replicate")[0] / width**2
-    x = sum((x[..., k : k + columns] for k in range(1, width)), x[..., :columns])
-    return sum((x[:, k : k + height] for k in range(1, width)), x[:, :height])
