@@ -15,8 +15,8 @@ def add_to(commands: Commands) -> None:
     demo = commands.add_parser(
         "demo",
         help="a first result in a minute: simulate a built-in photograph and recover its DoLP",
-        description="Simulates a camera with four polarizers that moves over a photograph of scikit-image, and recovers "
-        "DoLP and AoLP from its events with the shipped weights. Trains nothing and downloads nothing. "
+        description="Simulates a camera with four polarizers that moves over a photograph of scikit-image, and "
+        "recovers DoLP and AoLP from its events with the shipped weights. Trains nothing and downloads nothing. "
         "`polarnet simulate` and `polarnet recover` do the two halves, on files of your own.",
     )
     demo.add_argument("--photograph", choices=PHOTOGRAPHS, default=PHOTOGRAPHS[0], help="default: astronaut")
