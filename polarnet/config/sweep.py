@@ -48,16 +48,22 @@ class SweepTable(Callback):
         points = sweep_points(folder)
         if not points:
             return
-        rows = sweep_rows(points)
-        table = f"{sweep_table(rows)}\n\n{ABOUT}\n{best_point(rows)}"
-        (folder / "comparison.md").write_text(f"{table}\n")
-        (folder / "comparison.json").write_text(json.dumps({"rows": rows, "points": points}, indent=2) + "\n")
-        write_csv(rows, folder / "comparison.csv")
-        if axes := swept_axes(rows):
-            (folder / "comparison.png").write_bytes(_plot(axes))
-        print(f"\n{table}\nwritten to {folder / 'comparison.md'}, .json, .csv and .png")
+        print(f"\n{write_comparison(folder)}")
         if failed := sum(point["failure"] is not None for point in points):
             raise SystemExit(f"{failed} of {len(points)} points failed; the table has their reasons")
+
+
+def write_comparison(folder: Path) -> str:
+    """Write comparison.md, .json, .csv and, of points that differ, .png into a sweep's folder; the table and files."""
+    points = sweep_points(folder)
+    rows = sweep_rows(points)
+    table = f"{sweep_table(rows)}\n\n{ABOUT}\n{best_point(rows)}"
+    (folder / "comparison.md").write_text(f"{table}\n")
+    (folder / "comparison.json").write_text(json.dumps({"rows": rows, "points": points}, indent=2) + "\n")
+    write_csv(rows, folder / "comparison.csv")
+    if axes := swept_axes(rows):
+        (folder / "comparison.png").write_bytes(_plot(axes))
+    return f"{table}\nwritten to {folder / 'comparison.md'}, .json, .csv and .png"
 
 
 def finished(job: Path, overrides: Sequence[str]) -> bool:
