@@ -84,7 +84,9 @@ def best_point(rows: Sequence[Mapping[str, Any]]) -> str:
     if not best["validation"]:
         return "No point finished."
     mse, count = best["validation"]["mse"], len(best["seeds"])
-    words = f"Best: {' '.join(best['overrides']) or 'the settings of params.yaml'}, validation MSE {mse['mean']:.4f}"
+    shared = set(best["overrides"]).intersection(*(row["overrides"] for row in rows[1:])) if rows[1:] else set()
+    own = " ".join(one for one in best["overrides"] if one not in shared)
+    words = f"Best: {own or 'the settings of params.yaml'}, validation MSE {mse['mean']:.4f}"
     if mse["std"] is None:
         return f"{words}, of one seed; sweep over seed=1,2,3 for an interval."
     half = float(t.ppf(0.975, count - 1)) * mse["std"] / count**0.5
