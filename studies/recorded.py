@@ -71,8 +71,9 @@ def measured(config: Config, work: Path, photographs: Sequence[Path]) -> tuple[d
     write_recordings(made, folder)
     out.mkdir()
     command = "polarnet benchmark --recordings recordings"
-    scores, notes = benchmark_recordings(config, folder, MOSAIC, NO_CLEANING, out, work / "work", None, command)
+    notes = benchmark_recordings(config, folder, MOSAIC, NO_CLEANING, out, work / "work", None, command)
     print("\n".join(notes))
+    scores = json.loads((out / "metrics.json").read_text())
     return {"scores": scores, "reader_errors": reader_errors(made, folder)}, out
 
 
