@@ -71,8 +71,9 @@ def measured(config: Config, work: Path, photographs: Sequence[Path]) -> tuple[d
     write_recordings(made, folder)
     out.mkdir()
     command = "polarnet benchmark --recordings recordings"
-    scores, notes = benchmark_recordings(config, folder, MOSAIC, NO_CLEANING, out, work / "work", None, command)
+    notes = benchmark_recordings(config, folder, MOSAIC, NO_CLEANING, out, work / "work", None, command)
     print("\n".join(notes))
+    scores = json.loads((out / "metrics.json").read_text())
     return {"scores": scores, "reader_errors": reader_errors(made, folder)}, out
 
 
@@ -83,7 +84,7 @@ RECORDED_BLOCK = Block(
     lambda results: as_markdown(score_table(results["simulated"]["scores"])),
     caption="Simulated photographs in E2P's layout. The truth reader's DoLP differs from the simulated one by at most "
     "{simulated[reader_errors][dolp]:.4f}, its AoLP by at most {simulated[reader_errors][aolp_deg]:.2f} degrees: "
-    "half a step of the file's 8 bits. {origin}",
+    "half a step between the file's whole numbers. {origin}",
 )
 
 

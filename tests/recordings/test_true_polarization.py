@@ -1,6 +1,7 @@
 """True polarization from files in published layouts, written with known polarization."""
 
 import math
+from datetime import timedelta
 
 import numpy as np
 import pytest
@@ -110,6 +111,43 @@ def test_frames_of_a_davis_are_the_difference_of_two_samples_in_the_middle_of_th
     truth = read_truth(path, MOSAIC)
     near = np.s_[1:20, 1:20]  # where no level wraps
     assert (truth.dolp[0][near] - true_dolp[near]).abs().max() < 1e-6
+
+
+def write_aedat4(path, frames, events):
+    dv = pytest.importorskip("dv_processing", reason="the extra live is not installed")
+    resolution = frames[0][0].shape[::-1]
+    config = dv.io.MonoCameraWriter.Config("DAVIS346")
+    config.addEventStream(resolution)
+    config.addFrameStream(resolution)
+    writer = dv.io.MonoCameraWriter(str(path), config)
+    store = dv.EventStore()
+    for t, x, y, p in events:
+        store.push_back(t, x, y, p > 0)
+    writer.writeEvents(store)
+    for raw, start, exposure_us in frames:
+        frame = dv.Frame(start, raw)
+        frame.exposure = timedelta(microseconds=exposure_us)
+        writer.writeFrame(frame)
+    return path
+
+
+def test_frames_of_aedat4_have_the_middle_of_their_exposure_and_the_known_polarization(tmp_path):
+    raw, true_dolp, true_aolp = known(20, 24)
+    frames = [(raw, 1000, 8000), (raw, 34_000, 8000), (raw, 67_000, 2000)]
+    truth = read_truth(write_aedat4(tmp_path / "e.aedat4", frames, [(5000, 3, 4, 1)]), MOSAIC)
+    assert truth.t_us.tolist() == [5000, 38_000, 68_000]
+    inside = np.s_[:, 1:-1, 1:-1]
+    assert (truth.dolp[inside] - true_dolp[None][inside]).abs().max() < 1e-7
+    assert torch.sin(truth.aolp[inside] - true_aolp[None][inside]).abs().max() < 1e-6
+
+
+def test_aedat4_without_frames_says_so(tmp_path):
+    path = write_aedat4(tmp_path / "e.aedat4", [(known(20, 24)[0], 1000, 8000)], [(5000, 3, 4, 1)])
+    faery = pytest.importorskip("faery")
+    stream = faery.events_stream_from_file(path)
+    stream.to_file(tmp_path / "events.aedat4")
+    with pytest.raises(RecordingError, match="expected raw frames of one size and one channel"):
+        read_truth(tmp_path / "events.aedat4", MOSAIC)
 
 
 def test_a_frame_without_all_its_samples_is_left_out(tmp_path):
