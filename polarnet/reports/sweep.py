@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 
 import matplotlib
 import numpy as np
-from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
@@ -22,14 +21,14 @@ def parallel_coordinates(
     with matplotlib.rc_context(chart_style(theme)):
         figure = Figure(figsize=(2.2 * (len(values) + 1), 3.6), layout="constrained", facecolor=theme.face)
         axes = figure.subplots()
-        colours = ScalarMappable(Normalize(min(scores), max(scores)), "viridis_r")
+        colours, scaled = matplotlib.colormaps["viridis_r"], Normalize(min(scores), max(scores))
         heights = [_height_of(column) for column in values.values()]
         span = max(scores) - min(scores) or 1.0
         for number in sorted(range(len(scores)), key=lambda number: -scores[number]):
             best = number == int(np.argmin(scores))
             levels = [height[column[number]] for height, column in zip(heights, values.values(), strict=True)]
             levels.append((scores[number] - min(scores)) / span)
-            axes.plot(levels, color=colours.to_rgba(scores[number]), linewidth=3.0 if best else 1.3)
+            axes.plot(levels, color=colours(scaled(scores[number])), linewidth=3.0 if best else 1.3)
         for place, height in enumerate(heights):
             for value, level in height.items():
                 axes.text(place + 0.04, level, value, fontsize=8, va="bottom", color=theme.text)

@@ -4,13 +4,9 @@ import ctypes
 import hashlib
 import os
 import platform
-<<<<<<< HEAD
-from collections.abc import Callable, Iterator
-=======
 import signal
 import sys
-from collections.abc import Iterator
->>>>>>> main
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
