@@ -71,14 +71,13 @@ def launchers(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     scores = {}
     for name, chosen in LAUNCHERS.items():
         paths = [f"hydra.sweep.dir={folder / name}", f"paths.resume={folder / name / 'resume'}"]
-        sweep = ["--multirun", *chosen, *SWEEP, SWEEP_ROWS, *paths]
-        stage("trial", options, *sweep)
+        stage("trial", options, *chosen, *SWEEP, SWEEP_ROWS, *paths, "--multirun")
         scores[name] = _points(folder / name)
     jobs = sorted(path.parent for path in (folder / "basic").glob("*/finished.json"))
     (jobs[-1] / "finished.json").unlink()  # as if the sweep had been killed before its last point ended
     before = {job: (job / "benchmark" / "metrics.json").stat().st_mtime_ns for job in jobs}
     paths = [f"hydra.sweep.dir={folder / 'basic'}", f"paths.resume={folder / 'basic' / 'resume'}"]
-    stage("trial", options, "--multirun", *SWEEP, SWEEP_ROWS, *paths)
+    stage("trial", options, *SWEEP, SWEEP_ROWS, *paths, "--multirun")
     again = sum((job / "benchmark" / "metrics.json").stat().st_mtime_ns != before[job] for job in jobs[:-1])
     equal = all(one == scores["basic"] for one in scores.values()) and _points(folder / "basic") == scores["basic"]
     return {"launchers_equal": equal, "resumed_trials_lost": again, "points": len(jobs), "launchers": [*LAUNCHERS]}

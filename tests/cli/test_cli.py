@@ -168,7 +168,7 @@ def test_a_command_on_a_clone_says_so_elsewhere(tmp_path, monkeypatch, capsys, c
 def test_a_run_with_another_sensor_has_a_folder_of_its_own(project_root, monkeypatch, capsys):
     calls = []
 
-    def ran(command, cwd):
+    def ran(command, cwd, preexec_fn):
         calls.append(command)
         return subprocess.CompletedProcess(command, 0)
 
