@@ -4,12 +4,13 @@ import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from polarnet.events.stream import Events
@@ -70,6 +71,8 @@ class Panel(NamedTuple):
     truth_s0: Float[Tensor, "h w"]
     dolp: Mapping[str, Float[Tensor, "h w"]]
     aolp: Mapping[str, Float[Tensor, "h w"]]
+    film: Mapping[str, Shaped[Tensor, "n ..."]] = MappingProxyType({})
+    """Times and maps of the scene's frames, named as in `polarnet.benchmark.run.Panel` without `film_`."""
 
 
 class Overview(NamedTuple):
@@ -267,7 +270,9 @@ def _panel(file: Path) -> Panel:
 
     truth = {name: tensors[name] for name in ("events", "truth_dolp", "truth_aolp", "truth_s0")}
     window, t_us = int(tensors["window"]), int(tensors["t_us"])
-    return Panel(file.stem, window, t_us, **truth, dolp=by_method("dolp_"), aolp=by_method("aolp_"))
+    return Panel(
+        file.stem, window, t_us, **truth, dolp=by_method("dolp_"), aolp=by_method("aolp_"), film=by_method("film_")
+    )
 
 
 def _json(path: Path) -> Any:
