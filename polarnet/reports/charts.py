@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import altair as alt
 
@@ -33,13 +33,13 @@ def vega_bundle() -> str:
     """Vega, Vega-Lite and Vega-Embed as one script, so that a page needs no network."""
     import vl_convert
 
-    return vl_convert.javascript_bundle()
+    return vl_convert.javascript_bundle()  # type: ignore[call-arg]  # its stub lacks the default
 
 
 def score_chart(metrics: Mapping[str, Mapping[str, Any]], columns: Mapping[str, Column], legend: Legend) -> Spec:
     """Scores with their 95 % intervals, one metric at a time."""
     methods = in_order(metrics)
-    values = [
+    values: list[dict[str, Any]] = [
         _score(columns[key], key, legend, method, metrics[method])
         for key in columns
         for method in methods
@@ -74,7 +74,7 @@ def scatter_chart(means: Mapping[str, Mapping[str, float]], legend: Legend) -> S
     rivals = [method for method in in_order(means) if method != "ours"]
     if "ours" not in means or not rivals:
         return None
-    values = [
+    values: list[dict[str, Any]] = [
         {"scene": scene, "rival": legend.label(rival), "other": means[rival][scene], "ours": ours}
         for rival in rivals
         for scene, ours in means["ours"].items()
@@ -97,7 +97,7 @@ def scatter_chart(means: Mapping[str, Mapping[str, float]], legend: Legend) -> S
 def spread_chart(means: Mapping[str, Mapping[str, float]], legend: Legend) -> Spec:
     """MSE of every scene and method; the stroke is the median."""
     methods = in_order(means)
-    values = [
+    values: list[dict[str, Any]] = [
         {"method": legend.label(method), "colour": legend.colour(method), "scene": scene, "mse": mse}
         for method in methods
         for scene, mse in means[method].items()
@@ -117,13 +117,13 @@ def spread_chart(means: Mapping[str, Mapping[str, float]], legend: Legend) -> Sp
 
 def training_chart(history: History, output: str) -> Sequence[Spec]:
     """Loss terms (logarithmic) and validation PSNR over epochs from 1: two charts, one below the other on a phone."""
-    losses = [
+    losses: list[dict[str, Any]] = [
         {"epoch": epoch + 1, "term": term_label(term), "loss": loss}
         for term, values in history.loss.items()
         for epoch, loss in enumerate(values)
     ]
     scores = [{"epoch": epoch + 1, "psnr": psnr} for epoch, psnr in enumerate(history.validation["psnr"])]
-    kind = "log" if all(value["loss"] > 0 for value in losses) else "linear"
+    kind: Literal["log", "linear"] = "log" if all(value["loss"] > 0 for value in losses) else "linear"
     epochs = alt.X("epoch:Q", title="epoch", axis=alt.Axis(tickMinStep=1, format="d"), scale=alt.Scale(nice=False))
     loss = alt.Chart(alt.Data(values=losses)).mark_line(point=True)
     y = alt.Y("loss:Q", title="training loss", scale=alt.Scale(type=kind), axis=alt.Axis(tickCount=5, format="~g"))
@@ -141,7 +141,7 @@ def term_label(name: str) -> str:
 
 def reliability_chart(details: Mapping[str, Any], legend: Legend) -> Spec | None:
     """Measured against predicted squared error; dots grow with the pixels. None if no method predicts its error."""
-    values = [
+    values: list[dict[str, Any]] = [
         {"method": legend.label(method), "expected": expected, "measured": measured, "pixels": pixels}
         for method, entry in details.get("reliability", {}).items()
         for expected, measured, pixels in entry["curve"]
@@ -175,7 +175,7 @@ def rates_chart(rates: Sequence[EventRate]) -> Spec:
 def sets_chart(sets: Sequence[Results], titles: Mapping[str, str], legend: Legend) -> Spec | None:
     """Heat map: MSE of each method on each test set, divided by the best constant's. None for a single set."""
     constant = "oracle_mean"
-    values = [
+    values: list[dict[str, Any]] = [
         {
             "method": legend.label(method),
             "set": titles.get(one.name, one.name),

@@ -139,7 +139,7 @@ def _write_page(
         if panel.film
     ]
     charts = {**_result_charts(results, legend), **charts}
-    values = _results_context(results, legend, films) | context
+    values = _results_context(results, legend, films) | dict(context)
     values |= {
         "charts": charts,
         "charts_json": embedded_json(charts),
@@ -227,8 +227,8 @@ def extremes(results: Results, legend: Legend, films: set[str]) -> list[tuple[st
     for scene, mse in sorted(means[method].items(), key=lambda item: -item[1]):
         known = {row: means[row][scene] for row in others if scene in means[row]}
         best = min(known, key=lambda row: known[row], default=None)
-        rival = ("", None) if best is None else (legend.label(best), known[best])
-        scores.append(SceneScore(scene, mse, *rival, sequences.get(scene)))
+        label = "" if best is None else legend.label(best)
+        scores.append(SceneScore(scene, mse, label, known.get(best or ""), sequences.get(scene)))
     count = min(SCENES_AT_EACH_END, (len(scores) + 1) // 2)
     return [("Worst scenes", scores[:count]), ("Best scenes", scores[count:][-SCENES_AT_EACH_END:][::-1])]
 
@@ -263,7 +263,8 @@ def _trainings(artefacts: Artefacts) -> tuple[list[dict[str, Any]], dict[str, Sp
     """Template values and charts of each training."""
     histories = [("ours: ", artefacts.ours, "DoLP")]
     histories += [_baseline(name, history) for name, history in artefacts.baselines.items()]
-    trainings, charts = [], {}
+    trainings: list[dict[str, Any]] = []
+    charts: dict[str, Spec] = {}
     for number, (row, history, output) in enumerate(histories):
         names = [f"training_{number}_{kind}" for kind in ("loss", "psnr")]
         charts |= dict(zip(names, training_chart(history, output), strict=True))
