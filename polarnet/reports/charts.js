@@ -5,7 +5,7 @@
   const draw = (place) => {
     const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
     const [text, quiet, line] = ["--text", "--quiet", "--line"].map(colour);
-    const axis = { labelColor: quiet, titleColor: quiet, gridColor: line, domainColor: line, tickColor: line, labelLimit: 150 };
+    const axis = { labelColor: quiet, titleColor: quiet, gridColor: line, domainColor: line, tickColor: line, labelLimit: 170, labelFontSize: 11, titleFontSize: 11, titleFontWeight: 500 };
     const config = {
       background: null, font: "system-ui, sans-serif", view: { stroke: null }, axis,
       legend: { labelColor: text, titleColor: quiet, labelLimit: 200, orient: "top", columns: 2 },

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
-from polarnet.methods import METHODS
+from polarnet.methods import METHODS, is_rotating
 from polarnet.pictures.manifest import SPLITS
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, Results, read_artefacts, read_results
 from polarnet.reports.charts import (
@@ -144,7 +144,7 @@ def _write_page(
         "charts": charts,
         "charts_json": embedded_json(charts),
         "player_json": embedded_json(player_data(films)) if films else None,
-        "vega": Markup(vega_bundle()),
+        "vega_bundle": Markup(vega_bundle()),
         "script": script,
     }
     path = folder / "index.html"
@@ -163,8 +163,8 @@ def _results_context(results: Results, legend: Legend, films: Sequence[Film]) ->
         "error_parts": score_table(metrics, columns=ERROR_PARTS, labels=legend.labels),
         "costs": score_table(metrics, columns=COSTS, labels=legend.labels),
         "extremes": extremes(results, legend, {film.name for film in films}),
-        "ours": legend.label("ours" if "ours" in metrics else _best_method(metrics)),
-        "rows": glossary(metrics, details["weights"]),
+        "ours": _spoken("ours" if "ours" in metrics else _best_method(metrics), legend),
+        "glossary": glossary(metrics, details["weights"]),
         "lpips_about": lpips_about(details["lpips"]),
         "published": {experiment: paper_table(experiment) for experiment in ("simulated", "real")},
         "notes": [],
@@ -196,8 +196,8 @@ def verdict(metrics: Scores, details: Mapping[str, Any], legend: Legend) -> str:
     method = "ours" if "ours" in metrics else _best_method(metrics)
     mse, scenes = metrics[method]["mse"], len(details["scenes"])
     plural = "" if scenes == 1 else "s"
-    start = f"{legend.label(method)} recovers DoLP with a mean squared error of {mse:.4f} on {scenes} scene{plural}"
-    rivals = {row: metrics[row]["mse"] for row in with_structure(metrics) if row != method}
+    start = f"{_spoken(method, legend)} recovers DoLP with a mean squared error of {mse:.4f} on {scenes} scene{plural}"
+    rivals = {row: metrics[row]["mse"] for row in with_structure(metrics) if row != method and not is_rotating(row)}
     parts = []
     if rivals:
         best = min(rivals, key=lambda row: rivals[row])
@@ -205,6 +205,12 @@ def verdict(metrics: Scores, details: Mapping[str, Any], legend: Legend) -> str:
     if (constant := metrics.get("oracle_mean", {}).get("mse")) and method != "oracle_mean":
         parts.append(f"{_against(mse, constant)} the best constant")
     return start + (f": {' and '.join(parts)}." if parts else ".")
+
+
+def _spoken(method: str, legend: Legend) -> str:
+    """Label for a sentence, with a capital and without the row's key."""
+    label = legend.label(method).removeprefix("ours: ")
+    return label[:1].upper() + label[1:]
 
 
 def _against(mse: float, other: float) -> str:
@@ -221,7 +227,7 @@ def extremes(results: Results, legend: Legend, films: set[str]) -> list[tuple[st
     """The worst and the best scenes of ours (without it: of the best method), by MSE."""
     means = results.details["scene_means"].get("mse", {})
     method = "ours" if "ours" in means else _best_method(results.metrics)
-    others = [row for row in with_structure(means) if row != method]
+    others = [row for row in with_structure(means) if row != method and not is_rotating(row)]
     sequences = {scene: name for name in films for scene in means[method] if name.startswith(scene)}
     scores = []
     for scene, mse in sorted(means[method].items(), key=lambda item: -item[1]):
@@ -255,7 +261,15 @@ def _data(artefacts: Artefacts) -> dict[str, Any]:
             split: {name: data_uri(encode_jpeg(small), "jpeg") for name, small in artefacts.thumbnails[split].items()}
             for split in SPLITS
         },
-        "rates": artefacts.rates,
+        "rates": [
+            (one.split, one.sequences, f"{one.seconds:.1f}", f"{one.events:,}", f"{one.per_pixel_second:.1f}")
+            for one in artefacts.rates
+        ],
+        "skipped": [(one.file, one.reason) for one in manifest.skipped],
+        "licences": [
+            (one.name, one.split, one.origin, one.author or "not stated", one.licence or "not stated")
+            for one in manifest.pictures
+        ],
     }
 
 

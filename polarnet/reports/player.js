@@ -125,9 +125,10 @@ class Player {
     });
     this.find("panes").replaceChildren(...this.panes.map((pane) => pane.figure));
     const names = this.panes.map((pane) => pane.title);
-    const truth = Math.max(0, this.shown.findIndex((map) => map.source === "truth" && map.kind === quantity));
-    option(this.find("left"), names, truth);
-    option(this.find("right"), names, names.length - 1);
+    const truth = this.shown.findIndex((map) => map.source === "truth" && map.kind === quantity);
+    const first = this.shown.findIndex((map) => map.source !== "truth" && map.kind === quantity);
+    option(this.find("left"), names, Math.max(0, truth));
+    option(this.find("right"), names, first < 0 ? names.length - 1 : first);
     this.find("wipe").hidden = names.length < 2;
     this.legends();
     this.draw();

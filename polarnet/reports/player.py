@@ -55,11 +55,11 @@ class Film(NamedTuple):
 
 
 def panel_film(panel: Panel, legend: Legend, title: str = "") -> Film:
-    """The film of a benchmark's panel: events, truth and the methods that are no constants."""
+    """The film of a benchmark's panel: events, truth, ours, and the other methods that are no constants."""
     film = panel.film
     maps = [Map("Events", "events", film["events"].numpy())]
-    maps += [Map(TRUTH, kind, film[f"truth_{kind}"].numpy()) for kind in ("s0", "dolp", "aolp")]
-    for method in with_structure(panel.dolp):
+    maps += [Map(TRUTH, kind, film[f"truth_{kind}"].numpy()) for kind in ("s0", "aolp", "dolp")]
+    for method in sorted(with_structure(panel.dolp), key=lambda method: method != "ours"):
         kinds: tuple[Kind, ...] = ("dolp", "aolp")
         maps += [
             Map(legend.label(method), kind, film[f"{kind}_{method}"].numpy())
