@@ -13,7 +13,7 @@ CUT_OFF = """() => [document.documentElement, ...document.querySelectorAll("sect
   .filter((one) => one.scrollWidth > one.clientWidth + 1 && one.clientWidth > 0)
   .filter((one) => !one.closest("thead") || getComputedStyle(one.closest("thead")).clipPath === "none")
   .map((one) => `${one.tagName} ${one.className} ${one.textContent.slice(0, 40)}`)"""
-"""Elements whose content is wider than they are; 1 px for rounding. Headings that only screen readers see are left out."""
+"""Elements whose content is wider than they are; 1 px for rounding. Headings for screen readers alone do not count."""
 
 
 def chromium_path() -> str | None:
@@ -82,7 +82,7 @@ def cut_off(page: Any) -> list[str]:
 def axe_serious(page: Any) -> list[str]:
     """Serious and critical faults that axe-core finds, each with the first element."""
     page.evaluate(_axe())
-    found = page.evaluate("axe.run()")
+    found = page.evaluate("axe.run(document, { resultTypes: ['violations'] })")
     return [
         f"{fault['id']}: {fault['help']}: {fault['nodes'][0]['html'][:200]}"
         for fault in found["violations"]

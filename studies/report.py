@@ -1,12 +1,14 @@
-"""The report page in headless Chromium: python -m studies.report --data FOLDER [--write]
+"""The report page in headless Chromium: python -m studies.report --page FILE --benchmark FOLDER [--write]
 
-FOLDER is the `paths.data` of a finished run of the pipeline, such as `polarnet run experiment=smoke paths.data=FOLDER`.
+FILE is the report of a run, such as outputs/run/smoke/report/index.html of `polarnet run experiment=smoke`. FOLDER is
+the output of `polarnet benchmark --scenes`, or data/benchmark.
 
-- `console_errors`, `outside_requests`, `cut_off_elements`: on FOLDER/report/index.html at 400, 800 and 1400 pixels, in
-  light and dark, with every part of the page open.
+- `console_errors`, `outside_requests`, `cut_off_elements`: on FILE at 400, 800 and 1400 pixels, in light and dark, with
+  every part of the page open.
 - `axe_serious`: serious and critical accessibility faults that axe-core finds, in light and dark.
 - `page_mb_50_scenes`, `open_seconds_50_scenes`: size of a page with 50 scenes, and the median time until its player
-  shows the first. The scenes of FOLDER repeat under other names; sizes and times do not depend on the content.
+  shows the first. The scenes of FOLDER repeat under other names: it is a measurement of the page, not of
+  50 different scenes.
 
 `--write` puts the figures into docs/results/report.json. Other commands add their own keys there.
 """
@@ -20,6 +22,8 @@ import time
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from polarnet.reports.page import write_set_page
 from studies.browser import axe_serious, chromium_path, cut_off, opened, wait_for_player, wear
@@ -90,25 +94,34 @@ def measured(arguments: argparse.Namespace) -> dict[str, Any]:
 
     with sync_playwright() as playwright, tempfile.TemporaryDirectory() as work:
         browser = playwright.chromium.launch(executable_path=chromium_path())
-        figures: dict[str, Any] = dict(faults(browser, arguments.data.resolve() / "report" / "index.html"))
-        page = repeated(arguments.data / "benchmark", Path(work) / "repeated")
+        figures: dict[str, Any] = dict(faults(browser, arguments.page.resolve()))
+        page = repeated(arguments.benchmark, Path(work) / "repeated")
         figures["page_mb_50_scenes"] = round(page.stat().st_size / 1e6, 2)
         figures["open_seconds_50_scenes"] = round(opening_seconds(browser, page), 2)
         browser.close()
     return figures
 
 
+def sizes(benchmark: Path) -> dict[str, Any]:
+    """Size of the films that were repeated: scenes, and frames, height and width of a film; methods in the table."""
+    panels = sorted((benchmark / "panels").glob("*.npz"))
+    with np.load(panels[0]) as arrays:
+        frames, height, width = arrays["film_truth_dolp"].shape
+    methods = len(json.loads((benchmark / "metrics.json").read_text()))
+    return {"scenes": len(panels), "frames": frames, "height": height, "width": width, "methods": methods}
+
+
 def main() -> None:
     """Measure, print and perhaps write."""
     parser = command_line(__doc__, "docs/results/report.json")
-    parser.add_argument("--data", type=Path, required=True, help="paths.data of a finished run")
+    parser.add_argument("--page", type=Path, required=True, help="index.html of a report")
+    parser.add_argument("--benchmark", type=Path, required=True, help="folder with metrics.json and panels")
     arguments = arguments_of(parser)
     record = machine_record(ROOT)
     figures = measured(arguments)
     print(json.dumps(figures, indent=2))
     if arguments.write:
-        size = json.loads((arguments.data / "benchmark" / "details.json").read_text())["frames"]
-        print(write_section(ROOT, "report", "page", {"scored_frames": size}, record, figures))
+        print(write_section(ROOT, "report", "page", sizes(arguments.benchmark), record, figures))
 
 
 if __name__ == "__main__":
