@@ -52,7 +52,10 @@ def test_the_first_table_has_the_seven_scores_at_most_and_the_best_is_marked(pag
 
 
 def test_every_picture_says_what_it_shows(page):
-    assert all(re.search(r'alt="[^"]+"', tag) for tag in re.findall(r"<img[^>]*>", page))
+    html = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)  # the plotting library writes tags too
+    tags = re.findall(r"<img[^>]*>", html)
+    assert len(tags) > 5
+    assert all(re.search(r'alt="[^"]+"', tag) for tag in tags)
 
 
 def test_the_page_says_which_networks_are_behind_its_rows(page):
