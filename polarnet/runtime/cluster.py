@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from tqdm import tqdm
 
 from polarnet.runtime.extras import installation
-from polarnet.runtime.machine import limit_threads, tune, usable_cores
+from polarnet.runtime.machine import end_with_parent, limit_threads, tune, usable_cores
 
 ATTEMPTS = 4  # Dask's own limit for a task whose workers die (allowed-failures 3)
 
@@ -67,6 +67,7 @@ def _over_processes(
 
 
 def _start_worker(threads: int) -> None:
+    end_with_parent()
     limit_threads(threads)
     tune()
 
