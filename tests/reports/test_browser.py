@@ -76,15 +76,15 @@ def test_the_time_slider_changes_the_picture_and_its_time(browser, files):
 
 def test_the_wipe_shows_one_picture_at_each_end_and_both_between(browser, files):
     with opened(browser, files["report"], 800, "light") as (page, _):
-        seen = []
+        pictures = []
         for place in (0, 50, 100):
             page.locator("[data-role=divide]").fill(str(place))
-            seen.append(picture(page, "wiped"))
+            pictures.append(picture(page, "wiped"))
         panes = page.evaluate("[...document.querySelectorAll('.panes canvas')].map((c) => c.toDataURL())")
         left, right = (int(page.input_value(f"[data-role={side}]")) for side in ("left", "right"))
-        assert seen[0] == panes[right]
-        assert seen[2] == panes[left]
-        assert len(set(seen)) == 3
+        assert pictures[0] == panes[right]
+        assert pictures[2] == panes[left]
+        assert len(set(pictures)) == 3
 
 
 def test_play_moves_on_and_pause_stops(browser, files):
