@@ -82,10 +82,10 @@ def cut_off(page: Any) -> list[str]:
 def axe_serious(page: Any) -> list[str]:
     """Serious and critical faults that axe-core finds, each with the first element."""
     page.evaluate(_axe())
-    results = page.evaluate("axe.run(document, { resultTypes: ['violations'] })")
+    audit = page.evaluate("axe.run(document, { resultTypes: ['violations'] })")
     return [
         f"{fault['id']}: {fault['help']}: {fault['nodes'][0]['html'][:200]}"
-        for fault in results["violations"]
+        for fault in audit["violations"]
         if fault["impact"] in SERIOUS
     ]
 
