@@ -1,6 +1,6 @@
 """The report page in headless Chromium: python -m studies.report --page FILE --benchmark FOLDER [--write]
 
-FILE is the report of a run, such as outputs/run/smoke/report/index.html of `polarnet run experiment=smoke`. FOLDER is
+FILE is the report of a run, or the page of `polarnet benchmark --scenes`, which has no trainings. FOLDER is
 the output of `polarnet benchmark --scenes`, or data/benchmark.
 
 - `console_errors`, `outside_requests`, `cut_off_elements`: on FILE at 400, 800 and 1400 pixels, in light and dark, with

@@ -4,7 +4,7 @@ A strip stacks a map's frames as one grey WebP, so that the page knows values, n
 sine of twice the angle, because a lossy picture of the angle itself would blur the jump from 180 to 0 degrees.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -24,7 +24,8 @@ Kind = Literal["events", "s0", "dolp", "aolp"]
 
 MAX_SIDE = 320  # pixels of a map's longer side; larger maps are reduced
 MAX_FRAMES = 24  # with two maps a frame, MAX_SIDE * MAX_FRAMES stays below the 16,383 rows of a WebP
-QUALITY: Mapping[Kind, int] = {"events": 70, "s0": 75, "dolp": 80, "aolp": 60}
+MAX_PAGE_FRAMES = 200  # over all scenes: a page of 50 scenes has 4 frames of each and stays below 30 MB
+QUALITY: Mapping[Kind, int] = {"events": 50, "s0": 60, "dolp": 55, "aolp": 25}
 TRUTH = "truth"
 
 COLOURS = {
@@ -69,11 +70,12 @@ def panel_film(panel: Panel, legend: Legend, title: str = "") -> Film:
     return Film(f"{title}: {panel.sequence}" if title else panel.sequence, film["t_us"].tolist(), maps)
 
 
-def player_data(films: Iterable[Film]) -> dict[str, Any]:
+def player_data(films: Sequence[Film]) -> dict[str, Any]:
     """Content of the player's JSON: colour tables and scenes with their strips."""
+    frames = min(MAX_FRAMES, max(1, MAX_PAGE_FRAMES // max(1, len(films))))
     return {
         "colours": {name: table.tobytes().hex() for name, table in COLOURS.items()},
-        "scenes": [_scene(film) for film in films],
+        "scenes": [_scene(film, frames) for film in films],
     }
 
 
@@ -94,8 +96,8 @@ def write_player(
     return path
 
 
-def _scene(film: Film) -> dict[str, Any]:
-    chosen = np.unique(np.linspace(0, len(film.t_us) - 1, min(MAX_FRAMES, len(film.t_us))).round().astype(int))
+def _scene(film: Film, frames: int) -> dict[str, Any]:
+    chosen = np.unique(np.linspace(0, len(film.t_us) - 1, min(frames, len(film.t_us))).round().astype(int))
     maps = [(one, _reduced(one.frames[chosen], one.kind)) for one in film.maps]
     height, width = maps[0][1].shape[1:]
     return {
