@@ -107,6 +107,13 @@ def unchecked_annotations() -> Iterator[None]:
 
 
 @pytest.fixture
+def brief_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measure the cost of a benchmark row once on one window; a full measurement takes longer than the scores."""
+    for name in ("COUNTED_WINDOWS", "TIMED_WINDOWS", "REPEATS"):
+        monkeypatch.setattr(f"polarnet.benchmark.cost.{name}", 1)
+
+
+@pytest.fixture
 def forked_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the worker processes of `pmap` fork from one that has imported polarnet, which saves their imports."""
     from types import SimpleNamespace

@@ -15,6 +15,8 @@ from polarnet.runtime.cluster import pmap
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import FrameStore
 
+pytestmark = pytest.mark.usefixtures("brief_costs")
+
 
 def config(**changes):
     values = {

@@ -18,6 +18,8 @@ from polarnet.recordings.live import Piece
 from polarnet.recovery.recover import Input, frames_of
 from polarnet.reports.tables import score_table
 
+pytestmark = pytest.mark.usefixtures("brief_costs")
+
 EVENT = 0.01
 """DoLP that an event adds at its pixel, in the module that docs/methods.md shows."""
 

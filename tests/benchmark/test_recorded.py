@@ -26,6 +26,8 @@ from polarnet.storage.frames import FrameStore
 from studies.e2p_writer import WHITE, mosaicked, write_e2p
 from studies.recorded import write_recordings
 
+pytestmark = pytest.mark.usefixtures("brief_costs")
+
 __all__ = ["make_events", "make_random_events"]
 
 pytest.importorskip("h5py")

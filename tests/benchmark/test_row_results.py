@@ -9,6 +9,8 @@ from polarnet.benchmark.row_results import RowRecord, read_record, read_rows, wr
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.score import BenchmarkConfig
 
+pytestmark = pytest.mark.usefixtures("brief_costs")
+
 ROWS = ["zeros", "cf", "ours"]
 
 

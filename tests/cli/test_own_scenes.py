@@ -14,6 +14,8 @@ from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import write_png
 from polarnet.runtime.machine import generator_for
 
+pytestmark = pytest.mark.usefixtures("brief_costs")
+
 TINY = [
     "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.2", "synthesize.sensor_height=60",
     "synthesize.sensor_width=90", "benchmark.methods=[zeros,train_mean,oracle_mean,cf,rotating_polarizer,ours]",

@@ -41,6 +41,7 @@ def fail_on_two(value: int) -> int:
     return value
 
 
+@pytest.mark.usefixtures("forked_workers")
 @pytest.mark.parametrize("workers", [1, 2])
 def test_results_come_in_the_order_of_the_items(workers):
     assert pmap(square, list(range(7)), workers=workers, label="squares") == [0, 1, 4, 9, 16, 25, 36]
