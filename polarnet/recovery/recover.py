@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from torch import Tensor
-from tqdm import tqdm
 
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
 from polarnet.captures.imported import import_targets
@@ -33,6 +32,7 @@ from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.recording import Recording, detect_format
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import RuntimeConfig, device_of, precision_on, tune
+from polarnet.runtime.progress import ProgressBar
 from polarnet.stokes import Mosaic, Prediction
 from polarnet.storage.events import EventStore
 
@@ -296,7 +296,9 @@ def recover(
     last_us, started = 0, time.perf_counter()
     with (
         writer,
-        tqdm(total=source.duration_us, desc="recover", unit_scale=1e-6, bar_format=LIVE_BAR if live else BAR) as bar,
+        ProgressBar(
+            total=source.duration_us, desc="recover", unit_scale=1e-6, bar_format=LIVE_BAR if live else BAR
+        ) as bar,
     ):
         for frame in frames(source, rule, recoverer):
             writer.add(frame.window, frame.prediction)
