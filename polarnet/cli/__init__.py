@@ -6,14 +6,13 @@ from collections.abc import Sequence
 
 from polarnet import __version__
 from polarnet.cli import benchmark, convert, networks, project, recordings, sensors, simulate, stores
-from polarnet.runtime.environment import let_threads_sleep
-
-INTERRUPTED = 130  # exit status of shells after Ctrl-C
+from polarnet.runtime.environment import INTERRUPTED, STOPPED, let_threads_sleep, silence_bindings
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; the exit status."""
     let_threads_sleep()
+    silence_bindings()
     options = _options(arguments)
     try:
         return options.run(options)
@@ -21,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"polarnet {options.command}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print(f"polarnet {options.command}: stopped", file=sys.stderr)
+        print(f"polarnet {options.command}: {STOPPED}", file=sys.stderr)
         return INTERRUPTED
 
 

@@ -12,7 +12,7 @@ from polarnet.runtime.files import shipped_settings
 
 def add_to(commands: Commands) -> None:
     """Add the commands doctor, preset, run and stages."""
-    doctor = commands.add_parser("doctor", help="report versions, device, bf16 support, LPIPS weights, memory and disk")
+    doctor = commands.add_parser("doctor", help="report versions, device, weights, extras, memory and disk")
     doctor.add_argument(
         "--weights",
         type=Path,

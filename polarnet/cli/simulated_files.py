@@ -14,8 +14,7 @@ from polarnet import stokes
 from polarnet.events.mosaic import join_mosaic
 from polarnet.events.stream import Events
 from polarnet.reports.maps import encode_png
-from polarnet.reports.preview import true_pictures
-from polarnet.reports.videos import VideoWriter
+from polarnet.reports.preview import write_true_video
 from polarnet.runtime.progress import ProgressBar
 from polarnet.simulation.moving_sensor import leave_sensors
 from polarnet.simulation.video import Drawn, Piece
@@ -166,13 +165,7 @@ def _write_events(
 
 def _write_preview(folder: Path, channels: Sequence[Events], rate_hz: float, gamma: float) -> list[str]:
     """Write a video with one picture for the events between two true frames, and its busiest picture."""
-    truth = open_truth(folder / TRUTH, "")
-    busiest, most = None, -1
-    with VideoWriter(folder / VIDEO, rate_hz) as video:
-        for picture, count in true_pictures(channels, truth, gamma):
-            if count > most:
-                busiest, most = picture, count
-            video.add(picture)
+    busiest = write_true_video(folder / VIDEO, channels, open_truth(folder / TRUTH, ""), rate_hz, gamma)
     if busiest is None:
         return []
     (folder / PICTURE).write_bytes(encode_png(busiest))

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -22,7 +23,7 @@ from polarnet.reports.maps import (
     intensity_image,
     polarization_hsv,
 )
-from polarnet.reports.videos import with_even_sides
+from polarnet.reports.videos import VideoWriter, with_even_sides
 from polarnet.runtime.progress import ProgressBar
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.true_frames import TrueFrame, TrueFrames
@@ -123,6 +124,19 @@ def true_pictures(
         span = int(truth.t_us[k - 1]), int(truth.t_us[k])
         window = [slice_time(events, *span) for events in channels]
         yield sheet.truth(window, truth[k], span, gamma), sum(map(len, window))
+
+
+def write_true_video(
+    path: Path, channels: Sequence[Events], truth: TrueFrames, rate_hz: float = 30.0, gamma: float = 1.0
+) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Write the pictures of `true_pictures` as a video; returns the one with most events, None if there is none."""
+    busiest, most = None, -1
+    with VideoWriter(path, rate_hz) as video:
+        for picture, count in true_pictures(channels, truth, gamma):
+            video.add(picture)
+            if count > most:
+                busiest, most = picture, count
+    return busiest
 
 
 def foot_of(span_us: tuple[int, int], count: int) -> str:

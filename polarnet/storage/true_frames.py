@@ -54,6 +54,10 @@ class TrueFrames:
         first = number - number % FRAMES_PER_CHUNK
         return self._block(first, min(first + FRAMES_PER_CHUNK, len(self)))[number - first]
 
+    def has(self, t_us: int, within_us: float) -> bool:
+        """Whether there is a frame at a time, give or take `within_us`."""
+        return bool((np.abs(self.t_us - t_us) <= within_us).any())
+
     def at(self, t_us: int) -> TrueFrame:
         """The frame closest to a time."""
         return self[int(np.abs(self.t_us - t_us).argmin())]
@@ -66,20 +70,12 @@ def truth_beside(store: str | os.PathLike[str]) -> Path | None:
 
 
 def open_truth(path: str | os.PathLike[str], sequence: str) -> TrueFrames:
-    """Open the true frames of a sequence; ValueError if a frame store does not have the sequence."""
+    """Open the true frames of a sequence; ValueError if a frame store lacks the sequence."""
     group = open_group(path)
     if group.attrs.get("format") != FrameStore.FORMAT:
         return _appended(group)
     store = FrameStore.open(path)
-    if sequence not in store.sequences:
-        raise ValueError(f"{path}: {named(sequence, store.sequences)}")
     return _stored(store, sequence)
-
-
-def named(sequence: str | None, sequences: list[str]) -> str:
-    """Message about a sequence that is not in a store: it lists those that are."""
-    listed = ", ".join(sequences[:8]) + (f", ... ({len(sequences)})" if len(sequences) > 8 else "")
-    return f"expected a sequence of {listed}, got {sequence!r}; `polarnet list STORE` lists them all"
 
 
 def _appended(group: zarr.Group) -> TrueFrames:

@@ -212,7 +212,7 @@ def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channel
 
 
 @pytest.mark.parametrize(("arguments", "reason"), [
-    ((), "say --sequence, one of lake, road; got None"),
+    ((), "--sequence: expected a sequence of lake, road; got None"),
     (("--sequence", "lake", "--method", "oracle_mean"), "expected a method of cf"),
     (("--sequence", "lake", "--method", "e2vid_published"), "no weights are given"),
     (("--sequence", "lake", "--method", "cf", "--window", "1s"),
