@@ -60,8 +60,8 @@ def benchmark_folder(
     """Run the benchmark on a folder of photographs or measured scenes, without training; return the notes.
 
     `out` receives metrics.json, cost.json, details.json, frames.csv, panels and index.html. `work` receives the
-    pictures, scenes and events, so a stopped run resumes and a second run only runs the methods. `limit` is the maximum number of pictures.
-    Methods without
+    pictures, scenes and events, so a stopped run resumes and a second run only runs the methods. `limit` is the
+    maximum number of pictures. Methods without
     weights are left out and unusable files are skipped; `notes` lists both. Size, duration and sensor are printed
     first, with a warning if a network was trained with others. `weights` is a checkpoint of the DoLP network; None
     uses the shipped one. Raises ValueError if the folder has no usable file, or if the weights for an LPIPS column are

@@ -242,8 +242,8 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recordings.recording import read_recording
     from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
-    from polarnet.recovery.recover import Arrangement, facts_of, frames_of, open_files, open_live, open_method, recover
     from polarnet.recovery.scores import TruthScores
+    from polarnet.recovery.stream import Arrangement, facts_of, frames_of, open_files, open_live, open_method, recover
     from polarnet.recovery.writer import RecoveryWriter
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
@@ -350,8 +350,8 @@ def _recover_rotating(options: argparse.Namespace) -> int:
     from polarnet.methods.half_turns import half_turns_recoverer
     from polarnet.methods.rotating_polarizer import rotating_recoverer
     from polarnet.recordings.recording import read_recording
-    from polarnet.recovery.recover import facts_of, recover
     from polarnet.recovery.rotating import half_turn_rule, open_rotating, rotation_of
+    from polarnet.recovery.stream import facts_of, recover
     from polarnet.recovery.writer import RecoveryWriter
 
     if options.method not in (None, "rotating_polarizer") or options.weights or options.thresholds:
@@ -421,7 +421,7 @@ def refuse_unused_options(options: argparse.Namespace) -> None:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    from polarnet.recovery.recover import replay
+    from polarnet.recovery.stream import replay
     from polarnet.storage.events import EventStore
 
     def write(data: bytes) -> None:

@@ -4,8 +4,9 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
-from polarnet.metrics.similarity import aolp_error_deg, correlation, mse, psnr, ssim
-from polarnet.recovery.recover import Frame
+from polarnet.metrics.scores import frame_scores
+from polarnet.recovery.stream import Frame
+from polarnet.stokes import Prediction
 from polarnet.storage.true_frames import TrueFrames
 
 MAX_GAP = 0.01  # of a window, between the end of a window and its true frame
@@ -33,14 +34,10 @@ class TruthScores:
             self.unmatched += 1
             return
         true = self.truth.at(frame.window.stop_us)
-        dolp, aolp = frame.prediction.dolp[None], frame.prediction.aolp
-        truth, valid = true.dolp[None], None if true.valid is None else true.valid[None]
-        scores = {
-            "mse": mse(dolp, truth, valid), "psnr": psnr(dolp, truth, valid), "ssim": ssim(dolp, truth, valid),
-            "corr": correlation(dolp, truth, valid),
-        }  # fmt: skip
-        if aolp is not None:
-            scores["aolp_deg"] = aolp_error_deg(aolp[None], true.aolp[None], truth, valid)
+        aolp = frame.prediction.aolp
+        prediction = Prediction(frame.prediction.dolp[None], None if aolp is None else aolp[None])
+        valid = None if true.valid is None else true.valid[None]
+        scores = frame_scores(prediction, true.dolp[None], true.aolp[None], valid)
         for name, values in scores.items():
             self.scores.setdefault(name, []).append(float(values))
 
