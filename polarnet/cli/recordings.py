@@ -1,6 +1,7 @@
 """Commands for recordings: inspect, recover DoLP, replay."""
 
 import argparse
+import contextlib
 import functools
 import sys
 from pathlib import Path
@@ -34,12 +35,12 @@ BESIDE = ""
 NETWORK_WINDOW = "33.333ms"
 
 OPTIONS_BY_INPUT = {
-    "--live": {"mosaic", "rate", *CLEANING_OPTIONS},
-    "four files": {"angles", "size", "rate", *CLEANING_OPTIONS, *READING_OPTIONS},
-    "one file with --mosaic": {"mosaic", "size", "rate", *CLEANING_OPTIONS, *READING_OPTIONS},
+    "--live": {"mosaic", "rate", "rerun", *CLEANING_OPTIONS},
+    "four files": {"angles", "size", "rate", "rerun", *CLEANING_OPTIONS, *READING_OPTIONS},
+    "one file with --mosaic": {"mosaic", "size", "rate", "rerun", *CLEANING_OPTIONS, *READING_OPTIONS},
     "one file with --rotating or --triggers": {"rotating", "triggers", "start_angle", "size", *READING_OPTIONS},
-    "one file without polarizers": {"size", *CLEANING_OPTIONS, *READING_OPTIONS},
-    "an event store or a folder": {"sequence", "truth", "size", "rate", *CLEANING_OPTIONS},
+    "one file without polarizers": {"size", "rerun", *CLEANING_OPTIONS, *READING_OPTIONS},
+    "an event store or a folder": {"sequence", "truth", "size", "rate", "rerun", *CLEANING_OPTIONS},
 }
 """Options of `polarnet recover` that apply to each kind of input."""
 
@@ -195,6 +196,10 @@ def _add_output(recover: argparse.ArgumentParser) -> None:
         "--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), help="file types to write (default: zarr png mp4)"
     )
     recover.add_argument(
+        "--rerun", type=Path, metavar="FILE|viewer",
+        help="also log events, frames, expected errors and timings for Rerun: into FILE.rrd, or to the running viewer",
+    )  # fmt: skip
+    recover.add_argument(
         "--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)"
     )
 
@@ -242,9 +247,10 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recordings.recording import read_recording
     from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
-    from polarnet.recovery.scores import TruthScores
     from polarnet.recovery.stream import Arrangement, facts_of, frames_of, open_files, open_live, open_method, recover
+    from polarnet.recovery.watching import TruthScores, logged
     from polarnet.recovery.writer import RecoveryWriter
+    from polarnet.reports.rerun_log import RerunLog
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
     refuse_unused_options(options)
@@ -298,7 +304,11 @@ def _recover(options: argparse.Namespace) -> int:
         if scores:
             run, watch = frames, scores.watch
             frames = lambda *inputs: watch(run(*inputs))  # noqa: E731
-        summary = recover(source, rule, recoverer, writer, frames)
+        with contextlib.ExitStack() as stack:
+            if options.rerun:
+                log, inner = stack.enter_context(RerunLog(options.rerun, source.name)), frames
+                frames = lambda *inputs: logged(log, inner(*inputs), options.live)  # noqa: E731
+            summary = recover(source, rule, recoverer, writer, frames)
         left_out = {kind: count for kind, count in lines.counts.items() if count} if lines else {}
         notes = check.findings() if source.channels > 1 else []
         notes += [f"Unusable lines were left out: {left_out}."] if left_out else []
