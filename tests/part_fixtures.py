@@ -12,7 +12,7 @@ from zarr.abc.buffer import Buffer
 from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
-from polarnet.storage.parts import DIGEST_LENGTH, _digests
+from polarnet.storage.parts import DIGEST_LENGTH, _digests, _signed
 
 LOCAL_HEADER = struct.Struct("<4s5HLLLHH")
 
@@ -38,7 +38,7 @@ def flip(part: Path, entry: str) -> None:
 
 @contextmanager
 def entries_to_change(part: Path) -> Iterator[dict[str, Buffer]]:
-    """The entries of a part, for a foreign writer; the part is then written again, with the digest of its new bytes."""
+    """The entries of a part, for a foreign writer; part and header then get the digest of the new bytes."""
     buffer = default_buffer_prototype().buffer
     with zipfile.ZipFile(part) as archive:
         entries = {name: buffer.from_bytes(archive.read(name)) for name in archive.namelist()}
@@ -51,6 +51,10 @@ def entries_to_change(part: Path) -> Iterator[dict[str, Buffer]]:
         digest, _ = _digests(file)
         file.seek(-DIGEST_LENGTH, os.SEEK_END)
         file.write(digest)
+    store = zarr.open_group(part.parent, mode="r+")
+    header = {key: value for key, value in store.attrs.items() if key != "checksum"}
+    header["digests"][part.stem] = digest.decode()
+    store.attrs.put(_signed(header))
 
 
 @contextmanager

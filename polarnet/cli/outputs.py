@@ -7,6 +7,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from polarnet.runtime.files import claimed
+
 MARKER = "run.json"
 """File that names the command whose run a folder holds."""
 WORK = "work"
@@ -19,21 +21,23 @@ def run_folder(folder: Path, command: str) -> Iterator[Path]:
 
     They replace the files of an earlier run of `command` there. After an error or an interruption, `folder` is
     unchanged. FOLDER.partial then remains only if it contains a file, and the next run replaces it. Raises ValueError
-    if either folder contains other files.
+    if either folder contains other files, or while another run writes to `folder`.
     """
     partial = folder.resolve().with_name(f"{folder.resolve().name}.partial")
     for each in (folder, partial):
         _check_owner(each, command)
-    if partial.exists():
-        shutil.rmtree(partial)
     absent = [each for each in (partial, *partial.parents) if not each.exists()]
-    partial.mkdir(parents=True)
-    (partial / MARKER).write_text(json.dumps({"command": f"polarnet {command}"}) + "\n", encoding="utf-8")
-    try:
-        yield partial
-    except BaseException:
-        _clean_up(partial, absent)
-        raise
+    partial.mkdir(parents=True, exist_ok=True)
+    with claimed(partial / MARKER):
+        for earlier in _entries(partial):
+            _remove(earlier)
+        shutil.rmtree(partial / WORK, ignore_errors=True)
+        (partial / MARKER).write_text(json.dumps({"command": f"polarnet {command}"}) + "\n", encoding="utf-8")
+        try:
+            yield partial
+        except BaseException:
+            _clean_up(partial, absent)
+            raise
     folder.mkdir(exist_ok=True)
     for earlier in _entries(folder):
         _remove(earlier)
@@ -45,8 +49,9 @@ def run_folder(folder: Path, command: str) -> Iterator[Path]:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """Entries of a folder other than `WORK`; none if the folder does not exist."""
-    return [path for path in folder.iterdir() if path.name != WORK] if folder.is_dir() else []
+    """Entries of a folder other than `WORK` and the lock of a run; none if the folder does not exist."""
+    others = (WORK, f"{MARKER}.lock.tmp")
+    return [path for path in folder.iterdir() if path.name not in others] if folder.is_dir() else []
 
 
 def _check_owner(folder: Path, command: str) -> None:

@@ -83,6 +83,7 @@ def _preset(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace) -> int:
     from polarnet.config.experiments import BASE
     from polarnet.config.tree import load
+    from polarnet.runtime.machine import end_with_parent
 
     root = project_root()
     chosen = dict(item.split("=", 1) for item in options.overrides if "=" in item)
@@ -91,7 +92,8 @@ def _run(options: argparse.Namespace) -> int:
     overrides = [*options.overrides, *([] if "paths.data" in chosen else [f"paths.data={folder}"])]
     for name, stage, own in hydra_runs(root, load(root, options.overrides).used_baselines):
         print(f"== {name}", flush=True)
-        status = subprocess.run([sys.executable, "-m", f"stages.{stage}", *overrides, *own], cwd=root).returncode
+        command = [sys.executable, "-m", f"stages.{stage}", *overrides, *own]
+        status = subprocess.run(command, cwd=root, preexec_fn=end_with_parent).returncode
         if status:
             print(f"polarnet run: stage {name} failed; the results of earlier stages are in {folder}", file=sys.stderr)
             return status

@@ -307,7 +307,7 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
         if _file_of(main).stem != "weights":  # that stage searches for weights and may download them
             or_exit(lambda: _check_lpips(config))
         configure(config.runtime, config.seed)
-        main(config)
+        or_refuse(lambda: main(config), f"stage {_file_of(main).stem}")
 
     return hydra_command(checked)
 
@@ -445,3 +445,16 @@ def or_exit(check: Callable[[], T]) -> T:
         return check()
     except ValueError as error:
         raise SystemExit(f"configuration error: {error}") from None
+
+
+def or_refuse(work: Callable[[], T], name: str) -> T:
+    """Return the result of `work`; a refusal or a lack of room ends the program with one line, without a traceback.
+
+    Hydra's variable HYDRA_FULL_ERROR=1 brings the traceback back.
+    """
+    try:
+        return work()
+    except (ValueError, OSError, RuntimeError, MemoryError) as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        raise SystemExit(f"{name}: {error or type(error).__name__}") from None

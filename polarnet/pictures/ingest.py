@@ -41,7 +41,7 @@ from polarnet.pictures.polarimetry import (
     shrink,
     write_intensities,
 )
-from polarnet.runtime.files import sha256
+from polarnet.runtime.files import claimed, sha256
 from polarnet.runtime.machine import generator_for
 from polarnet.runtime.sections import one_of, section
 
@@ -101,21 +101,23 @@ def ingest(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Man
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`. Neither the mapper nor
     the order of the files changes the result. The pictures are written beside `folder` first, so that it is never half
-    full. Logs a warning for every file skipped; raises ValueError if no picture is left.
+    full. Logs a warning for every file skipped; raises ValueError if no picture is left, or while another process fills
+    `folder`.
     """
     temporary = folder.with_name(folder.name + ".tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    if config.source == "builtin":
-        manifest = _ingest_builtin(config, seed, temporary, mapper)
-    else:
-        manifest = _ingest_folder(config, temporary, mapper)
-    for skipped in manifest.skipped:
-        logger.warning("skipped %s: %s", skipped.file, skipped.reason)
-    _check_not_empty(config, manifest)
-    write_manifest(manifest, temporary)
-    shutil.rmtree(folder, ignore_errors=True)
-    temporary.rename(folder)
+    with claimed(folder):
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True)
+        if config.source == "builtin":
+            manifest = _ingest_builtin(config, seed, temporary, mapper)
+        else:
+            manifest = _ingest_folder(config, temporary, mapper)
+        for skipped in manifest.skipped:
+            logger.warning("skipped %s: %s", skipped.file, skipped.reason)
+        _check_not_empty(config, manifest)
+        write_manifest(manifest, temporary)
+        shutil.rmtree(folder, ignore_errors=True)
+        temporary.rename(folder)
     return manifest
 
 

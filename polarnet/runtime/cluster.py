@@ -9,7 +9,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
 from polarnet.runtime.extras import installation
-from polarnet.runtime.machine import limit_threads, tune, usable_cores
+from polarnet.runtime.machine import end_with_parent, limit_threads, tune, usable_cores
 from polarnet.runtime.progress import ProgressBar as Bar
 
 ATTEMPTS = 4  # Dask's own limit for a task whose workers die (allowed-failures 3)
@@ -68,6 +68,7 @@ def _over_processes(
 
 def _start_worker(threads: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a worker without a traceback
+    end_with_parent()
     limit_threads(threads)
     tune()
 

@@ -4,6 +4,8 @@ import ctypes
 import hashlib
 import os
 import platform
+import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -16,6 +18,7 @@ from polarnet.runtime.sections import section
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
 MAX_KEPT = 2**30  # bytes
+PR_SET_PDEATHSIG = 1  # prctl.h
 MAX_MIXED = 2**20  # bytes; larger tensors get separate memory while long-lived ones are allocated
 
 
@@ -105,6 +108,12 @@ def precision_on(device: torch.device, precision: str) -> str:
     if precision == "auto":
         return "bf16" if bf16_units(device) else "fp32"
     return precision
+
+
+def end_with_parent() -> None:
+    """Let Linux kill this process when the one that started it ends, however that ends; no effect on other systems."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def keep_freed_memory() -> None:

@@ -43,7 +43,7 @@ class EventStore(Store):
     """Sequences of events in four channels; see `create` and `open`."""
 
     FORMAT = "polarnet.events"
-    VERSION = 3
+    VERSION = 4
     height: int
     width: int
     labelled: bool

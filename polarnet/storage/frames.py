@@ -100,7 +100,7 @@ class FrameStore(SplitStore):
     """Frames of sequences, each in the split train, val or test; see `create` and `open`."""
 
     FORMAT = "polarnet.frames"
-    VERSION = 4
+    VERSION = 5
     n_frames: int
     """Maximum number of frames of a sequence."""
     height: int

@@ -1,6 +1,6 @@
 """The layout of every store, a folder of parts: how one is created, resumed, finished, read and verified.
 
-    NAME.zarr/zarr.json            header: format, version, names of the sequences, attributes
+    NAME.zarr/zarr.json            header: format, version, names of the sequences, attributes, SHA-256 of each part
     NAME.zarr/part-00000.zip       a part: a zip of a Zarr group
         zarr.json                  record of each sequence of the part: its rows in the columns, its numbers
         events/t/...               one column: the rows of these sequences, one sequence after the other
@@ -14,6 +14,7 @@ missing parts. `finish` marks the store complete and renames it. The same sequen
 the parts.
 """
 
+import contextlib
 import functools
 import hashlib
 import json
@@ -36,7 +37,7 @@ from zarr.abc.buffer import Buffer
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
 from zarr.storage import FsspecStore, LocalStore, MemoryStore, WrapperStore, ZipStore
 
-from polarnet.runtime.files import sha256
+from polarnet.runtime.files import claimed, sha256
 from polarnet.runtime.sections import section
 
 COMPRESSION_LEVEL = 1  # for zstd; higher levels cost 10-100 times the time for 6 % fewer bytes
@@ -85,6 +86,8 @@ class Store:
     sequences_per_part: int
     attributes: dict[str, Any]
     """Metadata given by the store's creator."""
+    digests: Mapping[str, str] = {}
+    """SHA-256 of each part of a finished store, so that a part of another store is refused."""
 
     def __init__(self, path: str, header: Header):
         self.path = path
@@ -100,6 +103,7 @@ class Store:
         self._opened = functools.lru_cache(MAX_OPEN_PARTS)(self._open)
         self._records: dict[str, Header] = {}
         self._unfinished: dict[str, _Part] = {}
+        self._claim = contextlib.ExitStack()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.path, self.header)
@@ -120,7 +124,8 @@ class Store:
     ) -> S:
         """Create a store to write at PATH.tmp, or resume the unfinished one there if its header is equal.
 
-        One process creates the store and sends it to the others that write.
+        One process creates the store and sends it to the others that write. ValueError while a store that another
+        process created at `path` is unfinished.
         """
         if not sequences:
             raise ValueError("expected at least one name, got none")
@@ -141,10 +146,12 @@ class Store:
         except (TypeError, ValueError) as error:
             raise ValueError(f"the attributes of a store must be finite, plain JSON: {error}") from None
         folder = Path(path).with_name(Path(path).name + ".tmp")
+        store = cls(str(folder), header)
+        store._claim.enter_context(claimed(Path(path)))
         if _unsigned(folder) != header:
             shutil.rmtree(folder, ignore_errors=True)
         zarr.open_group(folder, mode="a", zarr_format=3).attrs.put(_signed({**header, "complete": False}))
-        return cls(str(folder), header)
+        return store
 
     @classmethod
     def open(cls: type[S], path: str | os.PathLike[str]) -> S:
@@ -186,7 +193,8 @@ class Store:
         folder = Path(self.path)
         for leftover in [*folder.glob("*.tmp"), *folder.glob("*.partial")]:  # of processes killed while writing
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
-        zarr.open_group(folder, mode="r+").attrs.put(_signed({**self.header, "complete": True}))
+        digests = {part: self._written_digest(part) for part in self.parts}
+        zarr.open_group(folder, mode="r+").attrs.put(_signed({**self.header, "digests": digests, "complete": True}))
         final = folder.with_name(folder.name.removesuffix(".tmp"))
         replaced = final.with_name(final.name + ".old")
         shutil.rmtree(replaced, ignore_errors=True)
@@ -194,6 +202,7 @@ class Store:
             os.replace(final, replaced)  # a folder cannot be renamed onto one that is not empty
         os.replace(folder, final)
         shutil.rmtree(replaced, ignore_errors=True)
+        self._claim.close()
 
     def is_written(self, sequence: str) -> bool:
         """Whether the part of a sequence is complete."""
@@ -231,8 +240,6 @@ class Store:
             try:
                 group, _ = self._opened(os.getpid(), part)
                 records: Any = group.attrs["sequences"]
-                if list(records) != self.parts[part]:
-                    raise ValueError("it holds other sequences")
             except Exception as error:  # Zarr raises many kinds of exceptions
                 raise ValueError(f"{self.path}: {sequence}, {part}.zip is unreadable: {error}; {REPAIR}") from error
             self._records[part] = records
@@ -289,7 +296,7 @@ class Store:
                     digest, written = _digests(file)
             except OSError:
                 digest, written = b"", None
-            if digest != written:
+            if digest != written or digest.decode() != store.digests[part]:
                 problems.append(f"{path}: {part}.zip is not as it was written; {REPAIR}")
         return problems
 
@@ -308,7 +315,15 @@ class Store:
     def _open(self, process: int, part: str) -> tuple[zarr.Group, dict[str, Any]]:
         """The group of a part, and room for its arrays; a forked process must not share its parent's open file."""
         file = self._file(part)
+        if part in self.digests and self._written_digest(part) != self.digests[part]:
+            raise ValueError("it is not the part that was written into this store")
         return open_group(f"zip::{file}" if "://" in file else file), {}
+
+    def _written_digest(self, part: str) -> str:
+        """The digest at the end of a part, which says what its content was when it was written."""
+        with fsspec.open(self._file(part)) as file:
+            file.seek(-DIGEST_LENGTH, os.SEEK_END)
+            return file.read().decode("ascii", "replace")
 
 
 class _Part:
@@ -434,6 +449,6 @@ def _unsigned(folder: Path) -> Header | None:
     """The header that `create_parts` gave to a store; None if there is no store."""
     try:
         header = json.loads((folder / "zarr.json").read_text())["attributes"]
-        return {key: value for key, value in header.items() if key not in ("complete", "checksum")}
+        return {key: value for key, value in header.items() if key not in ("digests", "complete", "checksum")}
     except (OSError, ValueError, KeyError):
         return None

@@ -76,7 +76,7 @@ class SceneStore(SplitStore):
     """
 
     FORMAT = "polarnet.scenes"
-    VERSION = 4
+    VERSION = 5
     scene_of: dict[str, str]
     """Name of the scene of each sequence."""
     largest_picture: list[int]

@@ -3,10 +3,12 @@
 The outputs contain no dates or durations, so equal trainings write equal bytes.
 """
 
+import contextlib
 import json
 import math
 import shutil
 import time
+import zipfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -17,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from polarnet.networks.checkpoint import save_checkpoint
-from polarnet.runtime.files import replaced, sha256
+from polarnet.runtime.files import claimed, replaced, sha256
 from polarnet.runtime.progress import ProgressBar
 from polarnet.training.history import Row, best_row, write_history
 from polarnet.training.parallel import place
@@ -67,7 +69,8 @@ class Recorder:
 
     `metadata` records everything that determines the weights. It goes into the JSON of the best and last checkpoints,
     and its hash names the folder of the running checkpoint. `finish` deletes the running checkpoint. Old files in `out`
-    are removed first. If several processes share a training, only the first one writes.
+    are removed first. If several processes share a training, only the first one writes. ValueError while another
+    training writes into `out`.
     """
 
     def __init__(self, out: Path, resume: Path, metadata: Mapping[str, Any], keep_every_s: float = KEEP_EVERY_S):
@@ -76,16 +79,21 @@ class Recorder:
         self.running = resume / key[:16]
         self.kept_at = time.monotonic()
         self.writes = place()[0] == 0
+        self._claim = contextlib.ExitStack()
         if self.writes:
+            self._claim.enter_context(claimed(out))
             shutil.rmtree(out, ignore_errors=True)
             out.mkdir(parents=True)
 
     def resume(self, network: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
-        """Restore network and optimizer from the running checkpoint, if it exists, and return the progress."""
+        """Restore network and optimizer from the running checkpoint, if it exists, and return the progress.
+
+        ValueError if the file is damaged.
+        """
         file = self.running / "running.pt"
         if not file.exists():
             return Progress()
-        content = torch.load(file, map_location="cpu", weights_only=True)
+        content = _read(file)
         network.load_state_dict(content["network"])
         optimizer.load_state_dict(content["optimizer"])
         progress = Progress(**content["progress"])
@@ -139,6 +147,7 @@ class Recorder:
         """Delete the running checkpoint, because the training is complete."""
         if self.writes:
             shutil.rmtree(self.running, ignore_errors=True)
+            self._claim.close()
 
     def _write(self, progress: Progress, network: nn.Module) -> None:
         last = progress.history[-1]
@@ -146,6 +155,18 @@ class Recorder:
         save_checkpoint(self.out / "last.safetensors", network.state_dict(), {**self.metadata, **_result(last)})
         save_checkpoint(self.out / "best.safetensors", progress.best, {**self.metadata, **_result(best)})
         write_history(self.out, progress.history)
+
+
+def _read(file: Path) -> dict[str, Any]:
+    """A running checkpoint whose bytes all have the checksums in its zip, which torch does not compare."""
+    try:
+        with zipfile.ZipFile(file) as entries:
+            damaged = entries.testzip()
+        if damaged is None:
+            return torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch and zipfile raise many kinds of exceptions
+        damaged = str(error)
+    raise ValueError(f"{file} is damaged ({damaged}); delete it to start the training anew")
 
 
 def _result(row: Row) -> dict[str, Any]:

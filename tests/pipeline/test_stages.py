@@ -112,6 +112,20 @@ def test_a_row_run_alone_gives_the_scores_of_one_pass_over_all_rows(project_root
             assert alone["reliability"] == together["reliability"]
 
 
+def test_a_damaged_input_ends_a_stage_with_one_line_that_names_the_file(project_root, data, tmp_path):
+    shutil.copytree(data / "scenes.zarr", tmp_path / "scenes.zarr")
+    part = tmp_path / "scenes.zarr" / "part-00000.zip"
+    content = bytearray(part.read_bytes())
+    content[len(content) // 2] ^= 1
+    part.write_bytes(content)
+    arguments = [*TINY, f"paths.data={tmp_path}", f"hydra.run.dir={tmp_path / 'log'}"]
+    done = preloaded.run_stage(project_root, "emulate", arguments)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stdout
+    assert done.stdout.splitlines()[-1].startswith(f"stage emulate: {tmp_path / 'scenes.zarr'}: ")
+    assert "part-00000.zip" in done.stdout.splitlines()[-1]
+
+
 RIG = RigConfig(
     speed_px_s=80.0, longest_delay_s=0.25, duration_s=0.3, picture_rate_hz=60.0, full_well_electrons=20000.0,
     read_noise=2.0, hot_pixels=3, file_type="bin",

@@ -1,5 +1,8 @@
 import os
 import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -26,6 +29,12 @@ def die_always(value: int) -> int:
     return value
 
 
+def note_and_sleep(folder: str) -> None:
+    """Leaves the number of its process in the folder."""
+    Path(folder, str(os.getpid())).touch()
+    time.sleep(600)
+
+
 def fail_on_two(value: int) -> int:
     if value == 2:
         raise ValueError("two is not allowed here")
@@ -46,6 +55,23 @@ def test_a_killed_worker_loses_nothing(tmp_path):
     items = [(str(tmp_path / "died"), value) for value in range(6)]
     assert pmap(die_once, items, workers=2, label="values") == list(range(6))
     assert (tmp_path / "died").exists()
+
+
+def test_workers_end_with_the_process_that_started_them(tmp_path):
+    script = "import sys, test_cluster as t; t.pmap(t.note_and_sleep, [sys.argv[1]] * 2, workers=2, label='asleep')"
+    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    main = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], env={**os.environ, "PYTHONPATH": paths})
+    until(lambda: len(list(tmp_path.iterdir())) == 2)
+    main.kill()
+    main.wait()
+    until(lambda: not any(Path("/proc", note.name).exists() for note in tmp_path.iterdir()))
+
+
+def until(true) -> None:
+    start = time.monotonic()
+    while not true():
+        assert time.monotonic() - start < 60
+        time.sleep(0.05)
 
 
 @pytest.mark.usefixtures("forked_workers")

@@ -1,6 +1,7 @@
 """The protocol that all stores share: make, resume, finish, open, and survive being killed."""
 
 import functools
+import gc
 import hashlib
 import json
 import os
@@ -294,8 +295,28 @@ def test_a_process_killed_at_any_moment_leaves_parts_whole_or_missing(finished, 
             assert np.array_equal(store.read_column("group/value", name), values_of(name))
         assert done <= set(NAMES) - set(left)
         done = set(NAMES) - set(left)
+        del store
+        gc.collect()  # the claim on the path ends with the store
     write_missing_and_finish(path)
     assert digest(path) == digest(finished)
+
+
+def test_a_second_writer_is_refused_while_the_first_lives(tmp_path):
+    path = tmp_path / "store.zarr"
+    script = "import sys, test_parts as t; store = t.store_at(t.Path(sys.argv[1])); print('ready', flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", script, str(path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
+    ) as writer:
+        assert writer.stdout is not None
+        assert writer.stdout.readline() == b"ready\n"
+        with pytest.raises(ValueError, match=r"store\.zarr: another process is writing it; wait until that has ended"):
+            store_at(path)
+        writer.kill()
+    write_missing_and_finish(path)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["store.zarr"]
 
 
 def _write_slowly(path: str) -> None:
@@ -342,8 +363,20 @@ def test_a_missing_or_cut_chunk_or_file_is_an_error_that_names_it_with_sequence_
 
 def test_a_part_of_another_place_is_an_error(copy):
     shutil.copy(copy / "part-00001.zip", copy / "part-00000.zip")
-    with pytest.raises(ValueError, match=r"s0, part-00000\.zip is unreadable: it holds other sequences"):
+    with pytest.raises(ValueError, match=r"s0, part-00000\.zip is unreadable: it is not the part that was written"):
         Numbers.open(copy).record("s0")
+
+
+def test_an_older_part_of_the_same_sequences_is_an_error(copy, tmp_path):
+    other = store_at(tmp_path / "other.zarr")
+    for name in NAMES:
+        other.append(name, {"group/value": values_of(name)[::-1], "pair": pairs_of(name)}, {"number": 0})
+    other.finish()
+    shutil.copy(tmp_path / "other.zarr" / "part-00000.zip", copy / "part-00000.zip")
+    with pytest.raises(ValueError, match=r"s0, part-00000\.zip is unreadable: it is not the part that was written"):
+        Numbers.open(copy).record("s0")
+    (problem,) = {message for message in Numbers.verify(copy) if "not as it was written" in message}
+    assert "part-00000.zip" in problem
 
 
 def test_a_url_is_read_and_verified_like_the_folder(finished):

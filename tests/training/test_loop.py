@@ -1,6 +1,7 @@
 """The loop at a size where a whole training takes a second: CPU, fp32."""
 
 import dataclasses
+import io
 import json
 import math
 from pathlib import Path
@@ -108,6 +109,30 @@ def test_a_training_killed_at_any_step_and_resumed_ends_as_if_nothing_had_happen
 ):
     killed(small_task(), killed_at, stores, tmp_path)
     assert bytes_of(run(small_task(), stores, tmp_path)) == undisturbed
+
+
+def test_a_damaged_running_checkpoint_is_refused_wherever_the_damage_is(stores, tmp_path):
+    killed(small_task(), 6, stores, tmp_path)
+    (file,) = (tmp_path / "resume").rglob("running.pt")
+    whole = file.read_bytes()
+    for place in range(1000, len(whole), len(whole) // 12):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 16]) + whole[place + 1 :])
+        try:
+            assert same_content(torch.load(file, weights_only=True), whole)  # padding, which no one reads
+        except Exception:
+            with pytest.raises(
+                ValueError, match=r"running\.pt is damaged \(.+\); delete it to start the training anew"
+            ):
+                run(small_task(), stores, tmp_path)
+    file.write_bytes(whole[:-100])
+    with pytest.raises(ValueError, match=r"running\.pt is damaged"):
+        run(small_task(), stores, tmp_path)
+
+
+def same_content(content: Any, whole: bytes) -> bool:
+    """Whether a running checkpoint holds what its undamaged bytes hold; AssertionError where tensors differ."""
+    torch.testing.assert_close(content, torch.load(io.BytesIO(whole), weights_only=True), rtol=0, atol=0)
+    return True
 
 
 @pytest.mark.parametrize("killed_at", [4, 9])
