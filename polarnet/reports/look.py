@@ -7,9 +7,10 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from polarnet.events.representations import polarity_sums
 from polarnet.events.stream import Events
 from polarnet.reports.maps import angle_image, dolp_image, intensity_image, polarization_hsv
-from polarnet.reports.preview import Panel, Sheet, foot_of, polarity_sums
+from polarnet.reports.preview import Panel, Sheet, foot_of
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
 
 

@@ -13,6 +13,7 @@ from matplotlib.font_manager import findfont
 from matplotlib.ft2font import FT2Font
 from torch import Tensor
 
+from polarnet.events.representations import polarity_sums
 from polarnet.events.stream import Events, slice_time
 from polarnet.reports.maps import (
     DOLP_TABLE,
@@ -143,12 +144,6 @@ def foot_of(span_us: tuple[int, int], count: int) -> str:
     """Line of text below a picture: the time span of its events, their number, and their colours."""
     start, stop = (time / 1000 for time in span_us)
     return f"{start:.1f} to {stop:.1f} ms    {count:,} events    ON red, OFF blue"
-
-
-def polarity_sums(events: Events) -> Float[Tensor, "h w"]:
-    """ON minus OFF events of each pixel."""
-    pixels = events.y.long() * events.width + events.x
-    return torch.zeros(events.height * events.width).index_add(0, pixels, events.p.float()).view(events.height, -1)
 
 
 def _white(height: int, width: int) -> UInt8[np.ndarray, "height width 3"]:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from polarnet.events.representations import polarity_sums
 from polarnet.events.streaming import TRAINED_WINDOW_US, EventWindow
 from polarnet.reports.maps import angle_image, dolp_image, event_full_scale, event_image, intensity_image
-from polarnet.reports.preview import polarity_sums
 from polarnet.runtime.extras import installation
 from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore

@@ -40,7 +40,7 @@ def test_an_exported_sequence_gives_the_frames_of_the_store(simulated, tmp_path)
         chosen = options[:-2] if out == "c" else options
         assert main(["recover", str(source), "--out", str(tmp_path / out), *chosen]) == 0
     first, second, third = (zarr.open_group(tmp_path / name / "recovered.zarr", mode="r") for name in "abc")
-    count = min(len(second["dolp"]), len(first["dolp"]))
+    count = min(second["dolp"].shape[0], first["dolp"].shape[0])
     assert count >= 5
     np.testing.assert_array_equal(first["dolp"][:count], second["dolp"][:count])
     np.testing.assert_array_equal(second["dolp"][:], third["dolp"][:])

@@ -74,7 +74,7 @@ def test_the_page_needs_no_network_and_escapes_names(written):
     page = (written / "index.html").read_text()
     assert "a &amp; b" in page
     assert "one note" in page
-    assert page.count("data:image/png") >= 6
+    assert page.count("data:image/webp") == 3  # strips of events, DoLP and AoLP
     assert 'src="http' not in page
     assert '<video src="recovered.mp4" controls' in page
     assert (written / "recovered.png").exists()
@@ -85,7 +85,6 @@ def test_without_an_angle_two_maps_are_shown_and_nothing_else_is_written(tmp_pat
         for k in range(3):
             writer.add(window(k), frame(k, angle=False))
     writer.write_page("x", {}, [])
-    assert "steps(3,jump-none)" in (tmp_path / "index.html").read_text()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["index.html", "recovered.png", "recovered.zarr"]
     assert "aolp" not in zarr.open_group(tmp_path / "recovered.zarr", mode="r")
 
