@@ -28,7 +28,7 @@ def add_to(commands: Commands) -> None:
         "--rerun",
         type=Path,
         metavar="FILE|viewer",
-        help="log an event store for Rerun instead: FILE.rrd, or the viewer",
+        help="log an event store for Rerun instead of a page",
     )
     view.add_argument("--no-browser", action="store_true", help="write the page without opening it")
     add_reading(view)
