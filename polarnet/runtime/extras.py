@@ -15,6 +15,7 @@ EXTRAS = {
     "remote": "stores in a bucket",
     "export": "polarnet onnx",
     "rerun": "polarnet view --rerun",
+    "sweep": "sweeps and searches",
 }
 """Task of each extra."""
 
