@@ -19,7 +19,7 @@ from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines
 from polarnet.recordings.recording import read_recording
-from polarnet.recovery import recover as recovery
+from polarnet.recovery import stream as recovery
 from polarnet.recovery.stream import Arrangement, frames_of, open_files, open_method, replay
 from polarnet.runtime import machine as runtime
 from polarnet.storage.events import EventStore
