@@ -30,6 +30,7 @@ from polarnet.metrics.lpips_weights import LpipsConfig, local_source
 from polarnet.networks.registry import NETWORKS, NetworkConfig
 from polarnet.pictures.ingest import IngestConfig
 from polarnet.runtime.cluster import pmap
+from polarnet.runtime.environment import INTERRUPTED, STOPPED
 from polarnet.runtime.machine import RuntimeConfig, configure, threads_of
 from polarnet.runtime.sections import one_of, section, unknown_key
 from polarnet.simulation.camera import Camera
@@ -324,7 +325,11 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         overrides = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
         or_exit(lambda: check_overrides(root, overrides))
         logging.captureWarnings(True)
-        run()
+        try:
+            run()
+        except KeyboardInterrupt:
+            print(f"stages.{_file_of(main).stem}: {STOPPED}", file=sys.stderr)
+            raise SystemExit(INTERRUPTED) from None
 
     return command_line
 

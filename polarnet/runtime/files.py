@@ -7,6 +7,9 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+PACKAGE = Path(__file__).parents[1]
+INSTALLED = PACKAGE / "config" / "settings"
+
 
 def sha256(*parts: bytes | memoryview | Path) -> str:
     """Hexadecimal SHA-256 of the parts one after another; a path stands for the content of its file."""
@@ -22,9 +25,12 @@ def sha256(*parts: bytes | memoryview | Path) -> str:
 
 def shipped_settings() -> Path:
     """Folder of params.yaml and conf/ beside the code: the copy that setup.py puts into a wheel, or the source tree."""
-    package = Path(__file__).parents[1]
-    installed = package / "config" / "settings"
-    return installed if installed.is_dir() else package.parent
+    return PACKAGE.parent if in_source_tree() else INSTALLED
+
+
+def in_source_tree() -> bool:
+    """Whether the code lies in a clone, and not in a wheel, which has a copy of the settings."""
+    return not INSTALLED.is_dir()
 
 
 @contextmanager

@@ -72,9 +72,12 @@ def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Re
     return _make(folder, recipe, mapper, functools.partial(_hold_out, images), _content(images))
 
 
-def make_folder_set(root: Path, kind: str, folder: Path, recipe: Recipe, mapper: MakeMapper) -> bool:
+def make_folder_set(
+    root: Path, kind: str, folder: Path, recipe: Recipe, mapper: MakeMapper, limit: int | None = None
+) -> bool:
     """Every photograph or measured scene under `root`, all in the test split. False if the folder is complete already.
 
+    With a `limit`, only so many pictures, in the order of the hashes of their content.
     `kind` is photographs, polarization, or auto, which looks at the files. Raises ValueError if
     no picture can be used.
     """
@@ -83,7 +86,7 @@ def make_folder_set(root: Path, kind: str, folder: Path, recipe: Recipe, mapper:
         raise ValueError(f"{root}: expected a folder of photographs or of measured polarization, got {actual}")
     source = "polarization" if (kind if kind != "auto" else kind_of(root)) == "polarization" else "folder"
     chosen = dataclasses.replace(
-        recipe.ingest, source=source, root=str(root), limit=None, val_fraction=0.0, test_fraction=1.0
+        recipe.ingest, source=source, root=str(root), limit=limit, val_fraction=0.0, test_fraction=1.0
     )
     recipe = dataclasses.replace(recipe, ingest=chosen)
     return _make(folder, recipe, mapper, lambda to: ingest(chosen, recipe.seed, to, mapper("ingest")), _content(root))

@@ -43,6 +43,7 @@ from polarnet.runtime.sections import section
 COMPRESSION_LEVEL = 1  # for zstd; higher levels cost 10-100 times the time for 6 % fewer bytes
 DIGEST_LENGTH = 64  # characters of a SHA-256
 MAX_OPEN_PARTS = 64  # an open part has a file descriptor and about 2 MB of directory
+MAX_LISTED = 8  # names of sequences in a message
 REPAIR = "write this store again, or copy it again from where it is whole"
 
 Header = dict[str, Any]
@@ -301,7 +302,7 @@ class Store:
 
     def _part(self, sequence: str) -> str:
         if sequence not in self._part_of:
-            raise ValueError(f"{self.path}: there is no {sequence!r} among its {len(self.sequences)} sequences")
+            raise ValueError(f"{self.path}: {unknown_sequence(sequence, self.sequences)}")
         return self._part_of[sequence]
 
     def _is_whole(self, part: str) -> bool:
@@ -387,6 +388,14 @@ class _WholeStore(WrapperStore[Any]):
         if "/c/" in key and not content:
             raise FileNotFoundError(f"there is no {key}, or nothing in it")
         return content
+
+
+def unknown_sequence(sequence: str | None, sequences: list[str]) -> str:
+    """Message about a sequence that a store does not have: it lists those that the store has."""
+    listed = ", ".join(sequences[:MAX_LISTED])
+    if len(sequences) > MAX_LISTED:
+        listed += f", ... (`polarnet list` names all {len(sequences)})"
+    return f"expected a sequence of {listed}; got {sequence!r}"
 
 
 def open_group(path: str | os.PathLike[str]) -> zarr.Group:

@@ -17,10 +17,10 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from polarnet.networks.checkpoint import save_checkpoint
 from polarnet.runtime.files import claimed, replaced, sha256
+from polarnet.runtime.progress import ProgressBar
 from polarnet.training.history import Row, best_row, write_history
 from polarnet.training.parallel import place
 from polarnet.training.sequences import Batch
@@ -97,7 +97,7 @@ class Recorder:
         network.load_state_dict(content["network"])
         optimizer.load_state_dict(content["optimizer"])
         progress = Progress(**content["progress"])
-        tqdm.write(f"resuming in epoch {progress.epoch + 1}, from {file}")
+        ProgressBar.write(f"resuming in epoch {progress.epoch + 1}, from {file}")
         if self.writes and progress.history and not progress.visits:
             self._write(progress, network)  # __init__ emptied `out`, so the last epoch's files are written again
         return progress
@@ -120,7 +120,7 @@ class Recorder:
 
     def show(self, batches: Iterable[Batch], progress: Progress, visits: int, epochs: int) -> Iterator[Batch]:
         """Yield the batches and show a progress bar that counts visits to sequences."""
-        with tqdm(
+        with ProgressBar(
             total=visits, initial=progress.visits, desc=f"epoch {progress.epoch + 1}/{epochs}", unit="visit",
             disable=not self.writes,
         ) as bar:  # fmt: skip
@@ -134,7 +134,7 @@ class Recorder:
         progress.end_epoch(network.state_dict(), scores)
         if not self.writes:
             return
-        tqdm.write("  validation: " + "  ".join(f"{name} {value:.4f}" for name, value in scores.items()))
+        ProgressBar.write("  validation: " + "  ".join(f"{name} {value:.4f}" for name, value in scores.items()))
         self._write(progress, network)
 
     def calibrated(self, progress: Progress, network: nn.Module, expected_errors: Mapping[str, int | float]) -> None:

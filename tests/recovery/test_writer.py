@@ -59,7 +59,7 @@ def test_exr_holds_the_floats_and_names_them(written):
     assert pixels == pytest.approx({"DoLP": 0.175, "AoLP": 0.35, "log_variance": -0.175}, abs=1e-3)
 
 
-def test_pictures_and_video_show_three_maps_side_by_side(written):
+def test_pictures_show_three_maps_side_by_side_and_the_video_labels_them(written):
     picture = cv2.imread(str(written / "png" / "000039.png"))
     assert picture.shape == (16, 72, 3)  # 3 * 21 + 2 * 4, brought to even sides
     assert len(list((written / "png").iterdir())) == FRAMES
@@ -67,7 +67,7 @@ def test_pictures_and_video_show_three_maps_side_by_side(written):
     while video.read()[0]:
         count += 1
     assert count == FRAMES
-    assert video.get(cv2.CAP_PROP_FRAME_WIDTH) == 72
+    assert video.get(cv2.CAP_PROP_FRAME_WIDTH) == 536  # 2 enlarged panels of 252, a gap of 8, margins of 12
 
 
 def test_the_page_needs_no_network_and_escapes_names(written):
@@ -76,7 +76,7 @@ def test_the_page_needs_no_network_and_escapes_names(written):
     assert "one note" in page
     assert page.count("data:image/webp") == 3  # strips of events, DoLP and AoLP
     assert 'src="http' not in page
-    assert '<a href="recovered.mp4">' in page
+    assert '<video src="recovered.mp4" controls' in page
     assert (written / "recovered.png").exists()
 
 
