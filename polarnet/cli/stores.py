@@ -11,8 +11,10 @@ PICTURE_US = 33_333
 
 def add_to(commands: Commands) -> None:
     """Add the commands verify, export and labels."""
-    verify = commands.add_parser("verify", help="check every byte of a store of events, frames or scenes")
-    verify.add_argument("store", help="store: folder or fsspec URL")
+    verify = commands.add_parser("verify", help="check every byte of a store, a checkpoint or a data folder")
+    verify.add_argument(
+        "store", help="store (folder or fsspec URL), checkpoint (.safetensors), running.pt or data folder"
+    )
     verify.set_defaults(run=_verify)
 
     export = commands.add_parser("export", help="export an event store to files for other tools")
@@ -43,20 +45,17 @@ def add_to(commands: Commands) -> None:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from polarnet.storage.events import EventStore
-    from polarnet.storage.frames import FrameStore
-    from polarnet.storage.parts import open_group
-    from polarnet.storage.scenes import SceneStore
+    from polarnet.cli.verification import verified
 
-    stores = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}
-    form = open_group(options.store).attrs.get("format")
-    if form not in stores:
-        raise ValueError(f"{options.store}: expected a store of format {', '.join(stores)}, got {form!r}")
-    problems = stores[form].verify(options.store)
+    results = list(verified(options.store))
+    if not results:
+        raise ValueError(f"{options.store}: expected a store, a checkpoint or a folder that holds some, found none")
+    problems = [problem for _, found in results for problem in found]
     for problem in problems:
         print(problem)
-    if not problems:
-        print(f"{options.store}: every sequence is intact")
+    for name, found in results:
+        if not found:
+            print(f"{name}: intact")
     return 1 if problems else 0
 
 

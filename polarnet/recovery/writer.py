@@ -5,6 +5,7 @@ the events. Everything is written as frames arrive, in
 constant memory.
 """
 
+import shutil
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -40,6 +41,7 @@ VIDEO = "recovered.mp4"
 FILM_FRAMES = 24
 """Minimum number of pictures in the page's animation, evenly spread (fewer if there are fewer frames)."""
 PNG_STORED, NO_FILTER = 0, 8  # no compression, libpng's PNG_FILTER_NONE: larger files, but fast to write
+MIN_FREE_BYTES = 2**26  # of the disk, which the last frames, the video's index and the page need
 MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, the network needs all cores: a concurrent writing thread delays every operation
 PAGE_PICTURES = 6
@@ -147,6 +149,8 @@ class RecoveryWriter:
             self._waiting.popleft().result()
 
     def _write(self, number: int, window: EventWindow, prediction: Prediction) -> None:
+        if shutil.disk_usage(self.folder).free < MIN_FREE_BYTES:
+            raise OSError(f"{self.folder}: the disk is full; all {number} frames up to here are whole")
         if "zarr" in self.outputs:
             self._add_to_zarr(window, prediction)
         if "exr" in self.outputs:
