@@ -79,7 +79,7 @@ def read_images(folder: Path) -> str:
 def read_training(folder: Path) -> str:
     """The best weights of a training with their record, and its history."""
     tensors, metadata = load_checkpoint(folder / "best.safetensors")
-    return digest(metadata, read_history(folder), *tensors.items(), *tensors.values())
+    return digest(metadata, read_history(folder), *(part for name in sorted(tensors) for part in (name, tensors[name])))
 
 
 def read_row(folder: Path) -> str:

@@ -144,7 +144,7 @@ def test_labels_counts_causes_and_scores_the_removal_of_hot_pixels(store, tmp_pa
 
 def test_verify_of_something_else_says_what_was_expected(tmp_path, capsys):
     assert main(["verify", str(tmp_path / "nothing.zarr")]) == 1
-    assert "there is no Zarr v3 group" in capsys.readouterr().err
+    assert "there is no Zarr v3 group" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("command", [["preset", "smoke"], ["run"], ["stages"], ["benchmark", "--event-budget"]])
@@ -157,7 +157,7 @@ def test_a_command_on_a_clone_says_so_elsewhere(tmp_path, monkeypatch, capsys, c
 def test_a_run_with_another_sensor_has_a_folder_of_its_own(project_root, monkeypatch, capsys):
     calls = []
 
-    def ran(command, cwd):
+    def ran(command, **options):
         calls.append(command)
         return subprocess.CompletedProcess(command, 0)
 
