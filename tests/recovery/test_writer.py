@@ -107,11 +107,13 @@ def test_a_full_disk_stops_at_a_whole_frame_and_says_so(tmp_path, cores, monkeyp
     free = iter([2**30] * 3 + [2**20] * FRAMES)
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(recovery.shutil, "disk_usage", lambda _: usage._replace(free=next(free)))
-    with (
-        pytest.raises(OSError, match=r"the disk is full; all 3 frames"),
-        RecoveryWriter(tmp_path, ("zarr", "png"), 30.0) as writer,
-    ):
-        for k in range(FRAMES):
-            writer.add(window(k), frame(k))
+
+    def write() -> None:
+        with RecoveryWriter(tmp_path, ("zarr", "png"), 30.0) as writer:
+            for k in range(FRAMES):
+                writer.add(window(k), frame(k))
+
+    with pytest.raises(OSError, match=r"the disk is full; all 3 frames"):
+        write()
     assert [cv2.imread(str(path)).shape for path in sorted((tmp_path / "png").iterdir())] == [(16, 72, 3)] * 3
     assert len(zarr.open_group(tmp_path / "recovered.zarr", mode="r")["t_us"]) == 3
