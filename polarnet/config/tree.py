@@ -296,7 +296,7 @@ def check_overrides(root: Path, overrides: list[str], presets: Path | None = Non
 
 def _refuse_aliases(file: Path) -> None:
     """ValueError for an alias, of which a short YAML file can make billions of values."""
-    for event in YAML(typ="safe").parse(file):
+    for event in YAML(typ="safe").parse(file.read_text(encoding="utf-8")):
         if isinstance(event, AliasEvent):
             raise ValueError(f"{file}: expected no YAML aliases, got *{event.anchor}; write the value out")
 

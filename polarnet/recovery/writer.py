@@ -106,9 +106,9 @@ class RecoveryWriter:
     def __exit__(self, *problem: object) -> None:
         try:
             self._wait(0)
-            self._arrays.flush()
         finally:
             self._thread.shutdown(cancel_futures=True)
+            self._arrays.flush()  # after an error, too: the frames up to it are whole
             if self._video is not None:
                 self._video.release()
 
