@@ -116,4 +116,4 @@ def test_a_full_disk_stops_at_a_whole_frame_and_says_so(tmp_path, cores, monkeyp
     with pytest.raises(OSError, match=r"the disk is full; all 3 frames"):
         write()
     assert [cv2.imread(str(path)).shape for path in sorted((tmp_path / "png").iterdir())] == [(16, 72, 3)] * 3
-    assert len(zarr.open_group(tmp_path / "recovered.zarr", mode="r")["t_us"]) == 3
+    assert zarr.open_group(tmp_path / "recovered.zarr", mode="r")["t_us"].shape == (3,)
