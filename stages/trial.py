@@ -3,7 +3,8 @@
 `python -m stages.trial -m loss.mse=1.0 loss.ssim=0.0,1.0 seed=1,2,3` runs every combination on the pipeline's existing
 sequences and ends with one table (polarnet.config.sweep). Jobs may run in parallel.
 
-A failed point writes the reason to `failure.txt`; the other points continue.
+A failed point writes the reason to `failure.txt`; the other points continue. The same command with the same
+`hydra.sweep.dir` continues an interrupted sweep: a point whose folder is finished is not run again.
 """
 
 import io
@@ -17,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from polarnet.config.sweep import FAILURE
+from polarnet.config.sweep import FAILURE, finished, mark_finished
 from polarnet.config.tree import hydra_command
 
 # The trained network and the references for it; no other method of the benchmark depends on the training.
@@ -36,6 +37,10 @@ def main(node: DictConfig) -> None:
     overrides = list(hydra.overrides.task)
     if not any(override.startswith("benchmark.methods=") for override in overrides):
         overrides.append(REFERENCE_METHODS)
+    if finished(job, overrides):
+        print(f"{job} is finished already")
+        return
+    (job / FAILURE).unlink(missing_ok=True)
     failure = None
     for stage in ("train", "benchmark"):
         folders = [f"paths.{name}={job / name}" for name in ("train", "benchmark")]
@@ -44,6 +49,8 @@ def main(node: DictConfig) -> None:
         if failure:
             (job / FAILURE).write_text(f"{stage}: {failure}\n")
             break
+    else:
+        mark_finished(job, overrides)
     if failure and hydra.mode == RunMode.RUN:  # in a multirun the sweep table reports it and sets the exit status
         raise SystemExit(1)
 

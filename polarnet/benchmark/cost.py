@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
-from torch.utils.flop_counter import FlopCounterMode, sdpa_flop
+from torch.utils.flop_counter import flop_registry, sdpa_flop, shape_wrapper
 
 from polarnet.benchmark.rows import Context, opened, predictions_of
 from polarnet.benchmark.score import Cost
@@ -24,10 +24,10 @@ TIMED_WINDOWS = 10
 REPEATS = 3  # number of timings; the median is reported
 MIB = 2**20
 
-# FLOPs of fused attention on CPUs, which torch's own counter (2.13) omits.
-CPU_ATTENTION = {
-    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: lambda q, k, v, *_, out_shape=None, **__: sdpa_flop(
-        q, k, v
+# Formulas of torch's own counter (2.13), and that of fused attention on CPUs, which it omits.
+FLOPS = flop_registry | {
+    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: shape_wrapper(
+        lambda q, k, v, *_, out_shape=None, **__: sdpa_flop(q, k, v)
     )
 }
 
@@ -42,13 +42,13 @@ def cost_of(row: str, sequence: TestSequence, context: Context) -> Cost:
 
     counted, timed = run(COUNTED_WINDOWS), run(TIMED_WINDOWS)
     counted()  # compiles and allocates
-    with FlopCounterMode(display=False, custom_mapping=CPU_ATTENTION) as counter:
+    with _Flops() as flops:
         counted()
     peak = _peak_bytes(counted, context.device)
     windows = len(sequence.dolp)
     return Cost(
         ms_per_window=1000 * statistics.median(_seconds(timed) for _ in range(REPEATS)) / min(TIMED_WINDOWS, windows),
-        gflop=counter.get_total_flops() / min(COUNTED_WINDOWS, windows) / 1e9 if network is not None else None,
+        gflop=flops.total / min(COUNTED_WINDOWS, windows) / 1e9 if network is not None else None,
         params=sum(p.numel() for p in network.parameters()) if network is not None else 0,
         peak_mib=peak / MIB,
     )
@@ -93,7 +93,28 @@ def _peak_bytes(run: Callable[[], Any], device: torch.device) -> float:
     return float(arrays + tensors.highest)
 
 
-class _TensorMemory(TorchDispatchMode):
+class _Observer(TorchDispatchMode):
+    """A mode that sees every operation; torch.compile skips it by default, and to say so imports for 1.5 s."""
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False
+
+
+class _Flops(_Observer):
+    """Adds up the FLOPs of operations."""
+
+    total = 0
+
+    def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run the operation and count it, if it has a formula."""
+        out = operation(*args, **(kwargs or {}))
+        if (formula := FLOPS.get(operation.overloadpacket)) is not None:
+            self.total += formula(*args, **(kwargs or {}), out_val=out)
+        return out
+
+
+class _TensorMemory(_Observer):
     """Tracks the bytes of live tensors that operations return; scratch memory inside kernels is not counted."""
 
     def __init__(self) -> None:

@@ -12,7 +12,6 @@ from typing import NamedTuple, no_type_check
 import numba
 import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int64, UInt16
-from scipy.optimize import minimize_scalar
 
 from polarnet.events.stream import Events
 
@@ -115,6 +114,8 @@ def best_lag(
 
     A coarse search every 2 ms maximises the agreement; Brent's method then minimises the spread, to 20 us.
     """
+    from scipy.optimize import minimize_scalar  # half a second, which every stage would pay
+
     searched = np.arange(-within_us, within_us + STEP_US / 2, STEP_US)
     agreements = np.array([agreement(pairs.polarity, changes(pairs, lag, t_us, logs)) for lag in searched.tolist()])
     best = float(searched[int(agreements.argmax())])

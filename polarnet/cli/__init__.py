@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 
 from polarnet import __version__
-from polarnet.cli import benchmark, convert, networks, project, recordings, sensors, simulate, stores
+from polarnet.cli import benchmark, convert, demo, networks, project, recordings, sensors, simulate, stores
 from polarnet.runtime.environment import let_threads_sleep
 
 INTERRUPTED = 130  # exit status of shells after Ctrl-C
@@ -44,6 +44,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"polarnet {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for subject in (project, stores, simulate, recordings, convert, sensors, networks, benchmark):
+    for subject in (demo, project, stores, simulate, recordings, convert, sensors, networks, benchmark):
         subject.add_to(commands)
     return parser

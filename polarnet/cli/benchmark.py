@@ -68,7 +68,7 @@ def add_to(commands: Commands) -> None:
 
 def _benchmark(options: argparse.Namespace) -> int:
     from polarnet.config.tree import load
-    from polarnet.runtime.machine import configure
+    from polarnet.runtime.machine import configure, usable_cores
 
     own = options.scenes or options.recordings
     if own and options.limit is not None:
@@ -86,7 +86,8 @@ def _benchmark(options: argparse.Namespace) -> int:
     cleaning = cleaning_of(options)
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
         chosen = [f"benchmark.methods=[{options.methods}]"] if own and options.methods else []
-        config = load(settings, [*options.overrides, *chosen], folder)
+        workers = [f"runtime.workers={usable_cores()}"] if own else []  # an override replaces it
+        config = load(settings, [*workers, *options.overrides, *chosen], folder)
         configure(config.runtime, config.seed)
         if root is None:
             return _study(options, config, out, weights)

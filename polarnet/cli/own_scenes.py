@@ -1,7 +1,8 @@
 """The benchmark on a user's own folder of photographs, measured polarization or recordings, without training."""
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest
 from polarnet.recordings.noise import Cleaning
 from polarnet.reports.page import write_set_page
+from polarnet.runtime.machine import on_one_thread
 from polarnet.simulation.rotating import emulate_rotating_scenes
 from polarnet.simulation.sets import make_folder_set
 from polarnet.simulation.truth import motions_of
@@ -118,7 +120,12 @@ def _scored(
     """Run the rows on a test set and write scores and page."""
     settings = dataclasses.replace(config.benchmark, methods=inputs.methods)
     lpips = None if inputs.lpips is None else Lpips.of(inputs.lpips.backbone, inputs.lpips.tensors)
-    benchmark = run_benchmark(test_set, inputs.context, settings, lpips, config.mapper("benchmark"))
+    mapper = config.mapper("benchmark")
+
+    def mapped(task: Callable[[str], Any], names: Sequence[str]) -> list[Any]:
+        return mapper(functools.partial(on_one_thread, task), names)
+
+    benchmark = run_benchmark(test_set, inputs.context, settings, lpips, mapped)
     details = {
         "set": test_set.name,
         "lpips": NO_RECORD if inputs.lpips is None else inputs.lpips.record,

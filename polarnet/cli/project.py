@@ -1,13 +1,19 @@
 """Commands for a clone of polarnet: its settings and its stages."""
 
 import argparse
+import json
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from polarnet.cli.parsers import Commands
 from polarnet.runtime.files import shipped_settings
+
+CODE = ("polarnet/", "stages/")
+"""Dependencies of stages that are code."""
 
 
 def add_to(commands: Commands) -> None:
@@ -29,7 +35,12 @@ def add_to(commands: Commands) -> None:
     run.add_argument("overrides", nargs="*", help="overrides for Hydra: experiment=smoke seed=2 paths.data=FOLDER")
     run.set_defaults(run=_run)
 
-    stages = commands.add_parser("stages", help="list the stages in order")
+    stages = commands.add_parser("stages", help="list the stages in order, or those whose code is newer than dvc.lock")
+    stages.add_argument(
+        "--unlocked",
+        action="store_true",
+        help="list the stages whose code or values differ from those in dvc.lock; exit status 1 if there are any",
+    )
     stages.set_defaults(run=_stages)
 
 
@@ -120,5 +131,27 @@ def hydra_runs(root: Path, baselines: list[str]) -> list[tuple[str, str, list[st
 def _stages(options: argparse.Namespace) -> int:
     from polarnet.config.experiments import stage_names
 
-    print("\n".join(stage_names(project_root())))
-    return 0
+    if not options.unlocked:
+        print("\n".join(stage_names(project_root())))
+        return 0
+    command = [sys.executable, "-m", "dvc", "status", "--json"]
+    status = subprocess.run(command, cwd=project_root(), capture_output=True, text=True)
+    if status.returncode:
+        raise RuntimeError(f"dvc status failed: {status.stderr.strip()}")
+    changed = unlocked(json.loads(status.stdout))
+    for stage, files in changed.items():
+        print(f"{stage}: {', '.join(files)}")
+    return 1 if changed else 0
+
+
+def unlocked(status: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Code and settings of each stage that differ from dvc.lock, from `dvc status --json`; data do not count."""
+    changed = {}
+    for stage, changes in status.items():
+        named = [change for change in changes if isinstance(change, dict)]
+        deps = [item for change in named for item in change.get("changed deps", {}).items()]
+        files = [path for path, how in deps if isinstance(how, dict) or (how == "modified" and path.startswith(CODE))]
+        files += [change for change in changes if change == "changed command"]
+        if files:
+            changed[stage] = files
+    return changed

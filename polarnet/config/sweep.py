@@ -15,6 +15,8 @@ from polarnet.training.history import HISTORY, best_row, read_history
 
 FAILURE = "failure.txt"
 """File in the folder of a failed job with the reason in one line."""
+FINISHED = "finished.json"
+"""File in the folder of a finished job with its overrides."""
 COLUMNS = {
     "validation": {"mse": "validation MSE ↓", "psnr": "validation PSNR ↑"},
     "test": {
@@ -46,14 +48,49 @@ class SweepTable(Callback):
         points = sweep_points(folder)
         if not points:
             return
-        rows = sweep_rows(points)
-        table = sweep_table(rows)
-        (folder / "comparison.md").write_text(f"{table}\n\n{ABOUT}\n")
-        (folder / "comparison.json").write_text(json.dumps({"rows": rows, "points": points}, indent=2) + "\n")
-        write_csv(rows, folder / "comparison.csv")
-        print(f"\n{table}\n\n{ABOUT}\nwritten to {folder / 'comparison.md'}, .json and .csv")
+        print(f"\n{write_comparison(folder)}")
         if failed := sum(point["failure"] is not None for point in points):
             raise SystemExit(f"{failed} of {len(points)} points failed; the table has their reasons")
+
+
+def write_comparison(folder: Path) -> str:
+    """Write comparison.md, .json, .csv and, of points that differ, .png into a sweep's folder; the table and files."""
+    points = sweep_points(folder)
+    rows = sweep_rows(points)
+    table = f"{sweep_table(rows)}\n\n{ABOUT}\n{best_point(rows)}"
+    (folder / "comparison.md").write_text(f"{table}\n")
+    (folder / "comparison.json").write_text(json.dumps({"rows": rows, "points": points}, indent=2) + "\n")
+    write_csv(rows, folder / "comparison.csv")
+    if axes := swept_axes(rows):
+        (folder / "comparison.png").write_bytes(_plot(axes))
+    return f"{table}\nwritten to {folder / 'comparison.md'}, .json, .csv and .png"
+
+
+def finished(job: Path, overrides: Sequence[str]) -> bool:
+    """Whether the folder of a job holds the results of these overrides."""
+    return _read(job / FINISHED) == list(overrides)
+
+
+def mark_finished(job: Path, overrides: Sequence[str]) -> None:
+    """Record that the folder of a job holds the results of these overrides."""
+    (job / FINISHED).write_text(json.dumps(list(overrides)) + "\n")
+
+
+def best_point(rows: Sequence[Mapping[str, Any]]) -> str:
+    """One sentence on the first of `sweep_rows`, with the 95 % interval of the mean over seeds (Student's t)."""
+    from scipy.stats import t  # slow to import
+
+    best = rows[0]
+    if not best["validation"]:
+        return "No point finished."
+    mse, count = best["validation"]["mse"], len(best["seeds"])
+    shared = set(best["overrides"]).intersection(*(row["overrides"] for row in rows[1:])) if rows[1:] else set()
+    own = " ".join(one for one in best["overrides"] if one not in shared)
+    words = f"Best: {own or 'the settings of params.yaml'}, validation MSE {mse['mean']:.4f}"
+    if mse["std"] is None:
+        return f"{words}, of one seed; sweep over seed=1,2,3 for an interval."
+    half = float(t.ppf(0.975, count - 1)) * mse["std"] / count**0.5
+    return f"{words}, 95 % interval over {count} seeds {mse['mean'] - half:.4f} to {mse['mean'] + half:.4f}."
 
 
 def sweep_points(folder: Path) -> list[dict[str, Any]]:
@@ -100,6 +137,19 @@ def mean_scores(scores: Sequence[Mapping[str, float | None]], names: Mapping[str
     return means
 
 
+def swept_axes(rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, list[str]], list[float], str] | None:
+    """Values of each swept key and the validation MSE of each finished row, and its heading; None if none finished."""
+    done = [row for row in rows if row["validation"]]
+    given = [dict(one.lstrip("+").split("=", 1) for one in row["overrides"]) for row in done]
+    keys = [
+        key for key in dict.fromkeys(key for one in given for key in one) if len({one.get(key) for one in given}) > 1
+    ]
+    if not keys:
+        return None
+    scores = [row["validation"]["mse"]["mean"] for row in done]
+    return {key: [one.get(key, "-") for one in given] for key in keys}, scores, COLUMNS["validation"]["mse"]
+
+
 def sweep_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Format `sweep_rows` as a Markdown table."""
     headings = [heading for names in COLUMNS.values() for heading in names.values()]
@@ -127,6 +177,14 @@ def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
                 for name, score in row[split].items():
                     line |= {f"{split}_{name}": score["mean"], f"{split}_{name}_std": score["std"]}
             writer.writerow({**line, "notes": "; ".join(row["notes"])})
+
+
+def _plot(axes: tuple[dict[str, list[str]], list[float], str]) -> bytes:
+    from polarnet.reports.figures import LIGHT  # every stage imports this module, and only a sweep draws
+    from polarnet.reports.maps import png
+    from polarnet.reports.sweep import parallel_coordinates
+
+    return png(parallel_coordinates(*axes, LIGHT))
 
 
 def _point(job: Path) -> dict[str, Any]:

@@ -6,9 +6,9 @@ import os
 import platform
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import numba
 import numpy as np
@@ -21,6 +21,9 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
 MAX_KEPT = 2**30  # bytes
 PR_SET_PDEATHSIG = 1  # prctl.h
 MAX_MIXED = 2**20  # bytes; larger tensors get separate memory while long-lived ones are allocated
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 @section
@@ -76,6 +79,12 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def on_one_thread(function: Callable[[Item], Result], item: Item) -> Result:
+    """`function(item)` in `one_thread`: a result that does not depend on the number of workers."""
+    with one_thread():
+        return function(item)
 
 
 def threads_of(config: RuntimeConfig) -> int:

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
-from scipy.optimize import minimize
 from torch import Tensor
 
 RIDGES = (0.01, 0.1, 1.0, 10.0, 100.0)  # penalties on coefficients of unit-variance features; the largest removes them
@@ -64,6 +63,8 @@ def fitted(scenes: Sequence[Scene]) -> ExpectedErrors:
 
 
 def _fitted(scenes: Sequence[Scene], ridge: float) -> ExpectedErrors:
+    from scipy.optimize import minimize  # half a second, which every stage would pay
+
     features, squared = (torch.cat(field).numpy() for field in zip(*scenes, strict=True))
     mean, spread = features.mean(0), features.std(0)
     scale = np.where(spread > MIN_SPREAD, 1 / spread.clip(MIN_SPREAD), 0)

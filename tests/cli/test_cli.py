@@ -7,6 +7,7 @@ import torch
 from part_fixtures import flip
 
 from polarnet.cli import main
+from polarnet.cli.project import unlocked
 from polarnet.events.stream import Events
 from polarnet.storage.events import EventStore
 
@@ -60,6 +61,16 @@ def test_the_stages_come_in_the_order_they_run_in(capsys, project_root, monkeypa
         "benchmark@highpass", "benchmark@cf+gain", "benchmark@highpass+gain", "benchmark@e2v",
         "benchmark@rotating_polarizer", "benchmark@ours", "report",
     ]  # fmt: skip
+
+
+def test_a_stage_is_unlocked_by_its_code_and_settings_but_not_by_missing_data():
+    changes = {"data/images": "deleted", "polarnet/events": "modified", "params.yaml": {"seed": "modified"}}
+    status = {
+        "emulate": [{"changed deps": changes}, {"changed outs": {"data/events.zarr": "not in cache"}}],
+        "sets": [{"changed deps": {"data/images": "modified"}}],
+        "weights": ["changed command"],
+    }
+    assert unlocked(status) == {"emulate": ["polarnet/events", "params.yaml"], "weights": ["changed command"]}
 
 
 def test_verify_finds_a_flipped_byte_and_names_the_sequence(store, capsys):

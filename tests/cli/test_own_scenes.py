@@ -18,6 +18,7 @@ TINY = [
     "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.2", "synthesize.sensor_height=60",
     "synthesize.sensor_width=90", "benchmark.methods=[zeros,train_mean,oracle_mean,cf,rotating_polarizer,ours]",
     "benchmark.warmup_windows=1", "benchmark.bootstrap_samples=10", "benchmark.panel_scenes=1", "runtime.threads=1",
+    "runtime.workers=1",
 ]  # fmt: skip
 
 

@@ -6,7 +6,15 @@ import preloaded
 import pytest
 from omegaconf import OmegaConf
 
-from polarnet.config.sweep import SweepTable, sweep_points, sweep_rows, sweep_table
+from polarnet.config.sweep import (
+    SweepTable,
+    finished,
+    mark_finished,
+    sweep_points,
+    sweep_rows,
+    sweep_table,
+    swept_axes,
+)
 
 
 def scored(mse, lpips=None):
@@ -75,7 +83,24 @@ def test_a_sweep_with_a_failed_point_writes_its_tables_and_ends_with_an_error(sw
     lines = list(csv.DictReader(io.StringIO((sweep / "comparison.csv").read_text())))
     assert [line["validation_mse"] for line in lines] == ["0.04", "0.08", ""]
     assert lines[0]["seeds"] == "1 2"
-    assert "Ranked by validation MSE" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "Ranked by validation MSE" in printed
+    # Student's t of 95 % and two seeds is 12.71: 0.04 -+ 12.71 * 0.01414 / sqrt(2)
+    assert "Best: loss.ssim=0.0, validation MSE 0.0400, 95 % interval over 2 seeds -0.0871 to 0.1671." in printed
+    assert (sweep / "comparison.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_axes_of_the_plot_are_the_keys_that_differ_and_only_finished_points_have_lines(sweep):
+    keys, scores, _ = swept_axes(sweep_rows(sweep_points(sweep)))
+    assert keys == {"loss.ssim": ["0.0", "1.0"]}
+    assert scores == pytest.approx([0.04, 0.08])
+
+
+def test_a_job_is_finished_for_its_own_overrides_alone(tmp_path):
+    assert not finished(tmp_path, ["seed=1"])
+    mark_finished(tmp_path, ["seed=1"])
+    assert finished(tmp_path, ["seed=1"])
+    assert not finished(tmp_path, ["seed=2"])
 
 
 def test_a_refused_point_is_a_row_with_its_reason_and_stops_no_other(project_root, tmp_path):

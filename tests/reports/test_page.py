@@ -54,7 +54,7 @@ def test_the_first_table_has_the_seven_scores_at_most_and_the_best_is_marked(pag
 def test_every_picture_says_what_it_shows(page):
     html = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)  # the plotting library writes tags too
     tags = re.findall(r"<img[^>]*>", html)
-    assert len(tags) > 5
+    assert len(tags) >= 5
     assert all(re.search(r'alt="[^"]+"', tag) for tag in tags)
 
 

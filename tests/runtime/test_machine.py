@@ -64,3 +64,9 @@ def test_a_large_array_takes_the_memory_of_the_one_before():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     np.ones(bytes_each, np.uint8)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before < bytes_each / resource.getpagesize() / 4
+
+
+def test_a_task_on_one_thread_leaves_the_threads_of_its_process_as_they_were():
+    torch.set_num_threads(2)
+    assert runtime.on_one_thread(lambda item: (item, torch.get_num_threads()), "coffee") == ("coffee", 1)
+    assert torch.get_num_threads() == 2
