@@ -16,8 +16,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _options(arguments)
     try:
         return options.run(options)
-    except (ValueError, FileNotFoundError, RuntimeError) as error:
-        print(f"polarnet {options.command}: {error}", file=sys.stderr)
+    except (ValueError, OSError, RuntimeError, MemoryError) as error:
+        print(f"polarnet {options.command}: {error or type(error).__name__}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(f"polarnet {options.command}: {STOPPED}", file=sys.stderr)

@@ -38,8 +38,10 @@ def add_to(commands: Commands) -> None:
     listing.add_argument("store", help="store: folder or fsspec URL")
     listing.set_defaults(run=_list)
 
-    verify = commands.add_parser("verify", help="check every byte of a store of events, frames or scenes")
-    verify.add_argument("store", help="store: folder or fsspec URL")
+    verify = commands.add_parser("verify", help="check every byte of a store, a checkpoint or a data folder")
+    verify.add_argument(
+        "store", help="store (folder or fsspec URL), checkpoint (.safetensors), running.pt or data folder"
+    )
     verify.set_defaults(run=_verify)
 
     export = commands.add_parser("export", help="export an event store to files for other tools")
@@ -169,11 +171,17 @@ def _video(options: argparse.Namespace) -> int:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    problems = _kind_of(options.store).verify(options.store)
+    from polarnet.cli.verification import verified
+
+    results = list(verified(options.store))
+    if not results:
+        raise ValueError(f"{options.store}: expected a store, a checkpoint or a folder that holds some, found none")
+    problems = [problem for _, found in results for problem in found]
     for problem in problems:
         print(problem)
-    if not problems:
-        print(f"{options.store}: every sequence is intact")
+    for name, found in results:
+        if not found:
+            print(f"{name}: intact")
     return 1 if problems else 0
 
 

@@ -15,6 +15,8 @@ from typing import Annotated, Any, TypeVar
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from ruamel.yaml import YAML
+from ruamel.yaml.events import AliasEvent
 
 from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.score import BenchmarkConfig
@@ -282,6 +284,7 @@ def check_overrides(root: Path, overrides: list[str], presets: Path | None = Non
     The groups are `experiment`, `sensor`, `polarizers` and `ablation`. Hydra refuses both as well, but this message
     lists the available keys and choices.
     """
+    _refuse_aliases(root / "params.yaml")
     groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
     for override in overrides:
         key, _, value = override.partition("=")
@@ -290,6 +293,13 @@ def check_overrides(root: Path, overrides: list[str], presets: Path | None = Non
             _check_choices([root, presets] if presets else [root], key, value)
         elif not key.startswith(("hydra.", "hydra/")) and (refusal := unknown_key(Config, key.split("."))):
             raise ValueError(refusal)
+
+
+def _refuse_aliases(file: Path) -> None:
+    """ValueError for an alias, of which a short YAML file can make billions of values."""
+    for event in YAML(typ="safe").parse(file.read_text(encoding="utf-8")):
+        if isinstance(event, AliasEvent):
+            raise ValueError(f"{file}: expected no YAML aliases, got *{event.anchor}; write the value out")
 
 
 def hydra_stage(main: Stage) -> Callable[[], None]:

@@ -5,6 +5,7 @@ the events. The video's pictures are labelled and also show polarization with th
 written as frames arrive, in constant memory.
 """
 
+import shutil
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -40,6 +41,7 @@ from polarnet.storage.true_frames import TrueFrames
 
 VIDEO = "recovered.mp4"
 PNG_STORED, NO_FILTER = 0, 8  # no compression, libpng's PNG_FILTER_NONE: larger files, but fast to write
+MIN_FREE_BYTES = 2**26  # of the disk, which the last frames, the video's index and the page need
 MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, the network needs all cores: a concurrent writing thread delays every operation
 SHEET_PICTURES = 3  # of recovered.png
@@ -118,9 +120,9 @@ class RecoveryWriter:
     def __exit__(self, *problem: object) -> None:
         try:
             self._wait(0)
-            self._arrays.flush()
         finally:
             self._thread.shutdown(cancel_futures=True)
+            self._arrays.flush()  # after an error, too: the frames up to it are whole
             self._video.close()
 
     def add(self, window: EventWindow, prediction: Prediction) -> None:
@@ -147,6 +149,8 @@ class RecoveryWriter:
             self._waiting.popleft().result()
 
     def _write(self, number: int, window: EventWindow, prediction: Prediction) -> None:
+        if shutil.disk_usage(self.folder).free < MIN_FREE_BYTES:
+            raise OSError(f"{self.folder}: the disk is full; all {number} frames up to here are whole")
         if "zarr" in self.outputs:
             self._add_to_zarr(window, prediction)
         if "exr" in self.outputs:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from polarnet.networks.checkpoint import save_checkpoint
-from polarnet.runtime.files import claimed, replaced, sha256
+from polarnet.runtime.files import claimed, replaced, seal, sha256
 from polarnet.runtime.progress import ProgressBar
 from polarnet.training.history import Row, best_row, write_history
 from polarnet.training.parallel import place
@@ -93,7 +93,7 @@ class Recorder:
         file = self.running / "running.pt"
         if not file.exists():
             return Progress()
-        content = _read(file)
+        content = read_running(file)
         network.load_state_dict(content["network"])
         optimizer.load_state_dict(content["optimizer"])
         progress = Progress(**content["progress"])
@@ -142,6 +142,7 @@ class Recorder:
         result = _result(best_row(progress.history))
         metadata = {**self.metadata, **result, "expected_errors": dict(expected_errors)}
         save_checkpoint(self.out / "best.safetensors", network.state_dict(), metadata)
+        seal(self.out)
 
     def finish(self) -> None:
         """Delete the running checkpoint, because the training is complete."""
@@ -155,10 +156,14 @@ class Recorder:
         save_checkpoint(self.out / "last.safetensors", network.state_dict(), {**self.metadata, **_result(last)})
         save_checkpoint(self.out / "best.safetensors", progress.best, {**self.metadata, **_result(best)})
         write_history(self.out, progress.history)
+        seal(self.out)
 
 
-def _read(file: Path) -> dict[str, Any]:
-    """A running checkpoint whose bytes all have the checksums in its zip, which torch does not compare."""
+def read_running(file: Path) -> dict[str, Any]:
+    """A running checkpoint whose bytes all have the checksums in its zip, which torch does not compare.
+
+    ValueError if the file is damaged.
+    """
     try:
         with zipfile.ZipFile(file) as entries:
             damaged = entries.testzip()

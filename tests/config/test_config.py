@@ -389,3 +389,9 @@ def test_the_one_deviation_of_earlier_versions_is_refused_with_the_two_of_today(
         match=r"contrast_threshold_sigma is not a setting; .*did you mean contrast_threshold_sigma_on or contrast_",
     ):
         load(project, ["emulate.contrast_threshold_sigma=0.05"])
+
+
+def test_an_alias_bomb_is_refused_at_once(project_root, tmp_path):
+    (tmp_path / "params.yaml").write_text("a: &a [1, 1]\nb: &b [*a, *a]\n")
+    with pytest.raises(ValueError, match=r"params\.yaml: expected no YAML aliases, got \*a"):
+        check_overrides(tmp_path, [])

@@ -1,3 +1,5 @@
+import shutil
+
 import cv2
 import numpy as np
 import OpenImageIO as oiio
@@ -99,3 +101,19 @@ def test_a_failure_while_writing_reaches_whoever_recovers(tmp_path, cores):
 def test_events_of_all_polarizers_add_up():
     assert signed_events(window(2))[3, 2] == 4
     assert signed_events(window(2)).sum() == 4
+
+
+def test_a_full_disk_stops_at_a_whole_frame_and_says_so(tmp_path, cores, monkeypatch):
+    free = iter([2**30] * 3 + [2**20] * FRAMES)
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(recovery.shutil, "disk_usage", lambda _: usage._replace(free=next(free)))
+
+    def write() -> None:
+        with RecoveryWriter(tmp_path, ("zarr", "png"), 30.0) as writer:
+            for k in range(FRAMES):
+                writer.add(window(k), frame(k))
+
+    with pytest.raises(OSError, match=r"the disk is full; all 3 frames"):
+        write()
+    assert [cv2.imread(str(path)).shape for path in sorted((tmp_path / "png").iterdir())] == [(16, 72, 3)] * 3
+    assert zarr.open_group(tmp_path / "recovered.zarr", mode="r")["t_us"].shape == (3,)
