@@ -43,7 +43,9 @@ def malus_figure() -> Figure:
         figure = Figure(figsize=(6.4, 3.0), layout="constrained", facecolor=LIGHT.face)
         axes = figure.subplots()
         for degree, colour in zip(DEGREES, COLOURS, strict=True):
-            axes.plot(range(181), [_behind(degree, angle) for angle in range(181)], color=colour, label=f"DoLP {degree:g}")
+            axes.plot(
+                range(181), [_behind(degree, angle) for angle in range(181)], color=colour, label=f"DoLP {degree:g}"
+            )
             marked = [_behind(degree, angle) for angle in POLARIZER_ANGLES_DEG]
             axes.plot(POLARIZER_ANGLES_DEG, marked, "o", color=colour)
         axes.axvline(AOLP_DEG, color=LIGHT.quiet, linestyle=":", label=f"AoLP {AOLP_DEG:g}°")
@@ -89,7 +91,9 @@ def architecture_figure() -> Figure:
     for stage in sources:  # dvc.yaml lists a stage after those it reads from
         column[stage] = 1 + max((column[source] for source in sources[stage]), default=-1)
     rows = {c: [stage for stage in column if column[stage] == c] for c in range(max(column.values()) + 1)}
-    place = {stage: (c, (len(row) - 1) / 2 - row.index(stage) + SHIFT * (c % 2)) for c, row in rows.items() for stage in row}
+    place = {
+        stage: (c, (len(row) - 1) / 2 - row.index(stage) + SHIFT * (c % 2)) for c, row in rows.items() for stage in row
+    }
     with matplotlib.rc_context(chart_style(LIGHT)):
         figure = Figure(figsize=(9.6, 3.4), layout="constrained", facecolor=LIGHT.face)
         axes = figure.subplots()

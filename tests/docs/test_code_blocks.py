@@ -9,6 +9,7 @@ import re
 import shlex
 import tomllib
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -72,14 +73,16 @@ def test_a_command_of_the_documentation_is_accepted_by_its_parser(page, words, m
         module, *rest = arguments[arguments.index("-m") + 1 :]
         assert importlib.util.find_spec(module) is not None
         if module.startswith("stages."):
-            check_overrides(ROOT, [_first_choice(word) for word in rest if "=" in word and not word.startswith(("ablation=", "--"))])
+            overrides = [word for word in rest if "=" in word and not word.startswith(("ablation=", "--"))]
+            check_overrides(ROOT, [_first_choice(word) for word in overrides])
     elif program == "polarnet":
         _options(arguments)
     elif program == "dvc":
         from dvc.cli import parse_args
 
         parse_args(arguments)
-        check_overrides(ROOT, [a for flag, a in zip(arguments, arguments[1:]) if flag == "-S" and not a.startswith("+")])
+        values = [value for flag, value in pairwise(arguments) if flag == "-S"]
+        check_overrides(ROOT, [value for value in values if not value.startswith("+")])
     elif program == "make":
         targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
         assert set(arguments) <= set(targets)
@@ -116,7 +119,8 @@ def folder(tmp_path_factory):
     small = ["synthesize.sensor_height=60", "synthesize.sensor_width=80", "synthesize.duration_s=0.2"]
     with contextlib.chdir(folder):
         drawn = "emulate.randomise={cutoff_hz: [100.0, 300.0]}"
-        assert main(["simulate", "coffee-00.png", *small, drawn, "storage.labels=true", "--no-preview", "--out", "out"]) == 0
+        settings = [*small, drawn, "storage.labels=true"]
+        assert main(["simulate", "coffee-00.png", *settings, "--no-preview", "--out", "out"]) == 0
         (folder / "data").mkdir()
         for name in ("data/events.zarr", "labelled.zarr"):
             (folder / name).symlink_to(folder / "out" / "events.zarr")
