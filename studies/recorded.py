@@ -84,7 +84,7 @@ RECORDED_BLOCK = Block(
     lambda results: as_markdown(score_table(results["simulated"]["scores"])),
     caption="Simulated photographs in E2P's layout. The truth reader's DoLP differs from the simulated one by at most "
     "{simulated[reader_errors][dolp]:.4f}, its AoLP by at most {simulated[reader_errors][aolp_deg]:.2f} degrees: "
-    "half a step of the file's 8 bits. {origin}",
+    "half a step between the file's whole numbers. {origin}",
 )
 
 

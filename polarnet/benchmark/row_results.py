@@ -91,7 +91,9 @@ def read_rows(folders: Mapping[str, Path], test_set: str) -> Benchmark:
 def write_panel(folder: Path, panel: Panel) -> None:
     """Write SEQUENCE.npz: `window`, `t_us` and the maps of a panel by their names."""
     arrays: dict[str, Any] = {name: frame.numpy() for name, frame in panel.maps.items()}
-    np.savez(folder / f"{panel.sequence}.npz", window=np.int64(panel.window), t_us=np.int64(panel.t_us), **arrays)
+    np.savez_compressed(
+        folder / f"{panel.sequence}.npz", window=np.int64(panel.window), t_us=np.int64(panel.t_us), **arrays
+    )
 
 
 def read_panel(path: Path) -> Panel:

@@ -6,19 +6,21 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Shaped
 from torch import Tensor
 
 from polarnet.benchmark.references import mean_dolp
 from polarnet.benchmark.rows import Context, predictions_of
 from polarnet.benchmark.score import BenchmarkConfig, Cost, FrameScore, score_sequence, scored_windows
 from polarnet.benchmark.sequences import TestSequence
-from polarnet.events.representations import event_tensor
+from polarnet.events.representations import event_tensor, polarity_sums
+from polarnet.events.stream import slice_time
 from polarnet.events.windows import encode_windows
 from polarnet.metrics.reliability import HIGHEST, LOWEST, Reliability, reliability
 from polarnet.metrics.similarity import Lpips
 from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore
+from polarnet.storage.film import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.storage.frames import (
     FrameStore,
     dequantise_angle,
@@ -27,22 +29,28 @@ from polarnet.storage.frames import (
     quantise_fraction,
 )
 
+MAX_FILM_FRAMES = 12
+"""Frames of the report's player for each scene; they keep a page of 50 scenes below 30 MB."""
+
 
 @dataclass(frozen=True)
 class Panel:
-    """One window of one sequence: its events, the truth, and the predictions of rows."""
+    """One window of one sequence and a film of its scored windows: events, truth, and predictions of rows."""
 
     sequence: str
     window: int
     t_us: int
-    maps: Mapping[str, Float[Tensor, "*channel h w"]]
+    maps: Mapping[str, Shaped[Tensor, "..."]]
     """`events` (the four event tensors, Eq. 5), `truth_dolp`, `truth_aolp`, `truth_s0`; `dolp_ROW` and, if the row
-    predicts it, `aolp_ROW`."""
+    predicts it, `aolp_ROW`. The film has `film_t_us`, and the same maps as bytes over the frames, after `film_`:
+    `film_events` is ON minus OFF of the four channels (128: none), `film_aolp_ROW` is 256 for pi."""
 
     def of_row(self, row: str) -> "Panel":
         """The same window with the predictions of one row."""
-        names = [name for name in self.maps if not name.startswith(("dolp_", "aolp_"))]
-        maps = {name: self.maps[name] for name in (*names, f"dolp_{row}", f"aolp_{row}") if name in self.maps}
+        predicted = ("dolp_", "aolp_", "film_dolp_", "film_aolp_")
+        names = [name for name in self.maps if not name.startswith(predicted)]
+        own = [prefix + row for prefix in predicted]
+        maps = {name: self.maps[name] for name in (*names, *own) if name in self.maps}
         return replace(self, maps=maps)
 
 
@@ -196,17 +204,34 @@ def _reliability(
 
 
 def _panel(sequence: TestSequence, predictions: Mapping[str, Prediction], warmup_windows: int) -> Panel:
-    """Panel of the middle scored window."""
+    """Panel of the middle scored window, with a film of windows spread evenly over the scored ones."""
     windows = scored_windows(sequence, warmup_windows)
     k = windows[len(windows) // 2]
+    count = min(MAX_FILM_FRAMES, len(windows))
+    film = [windows[round(i * (len(windows) - 1) / max(count - 1, 1))] for i in range(count)]
     maps = {
         "events": encode_windows(sequence.events, sequence.t_us[k : k + 2], event_tensor)[0],
         "truth_dolp": sequence.dolp[k],
         "truth_aolp": sequence.aolp[k],
         "truth_s0": sequence.s0[k],
-    }
+    } | _film_of_truth(sequence, film)
     for row, prediction in predictions.items():
         maps[f"dolp_{row}"] = prediction.dolp[k]
+        maps[f"film_dolp_{row}"] = fraction_bytes(prediction.dolp[film])
         if prediction.aolp is not None:
             maps[f"aolp_{row}"] = prediction.aolp[k]
+            maps[f"film_aolp_{row}"] = angle_bytes(prediction.aolp[film])
     return Panel(sequence.name, k, int(sequence.t_us[k + 1]), maps)
+
+
+def _film_of_truth(sequence: TestSequence, film: Sequence[int]) -> dict[str, Tensor]:
+    """Events and truth of the windows `film`, as bytes."""
+    spans = [sequence.t_us[k : k + 2].tolist() for k in film]
+    counts = [[polarity_sums(slice_time(events, *span)) for events in sequence.events] for span in spans]
+    return {
+        "film_t_us": sequence.t_us[[k + 1 for k in film]],
+        "film_events": signed_bytes(torch.stack([torch.stack(channels).sum(0) for channels in counts])),
+        "film_truth_s0": fraction_bytes(sequence.s0[film]),
+        "film_truth_dolp": fraction_bytes(sequence.dolp[film]),
+        "film_truth_aolp": angle_bytes(sequence.aolp[film]),
+    }

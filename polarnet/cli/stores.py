@@ -1,16 +1,29 @@
-"""Commands for stores: verify, export, labels."""
+"""Commands for stores: view, verify, export, labels."""
 
 import argparse
 from pathlib import Path
 
 from polarnet.cli.outputs import run_folder
-from polarnet.cli.parsers import Commands, add_hot_pixel_factor, add_stored_sequence
+from polarnet.cli.parsers import Commands, add_hot_pixel_factor, add_reading, add_stored_sequence, reading_of
 
 PICTURE_US = 33_333
 
 
 def add_to(commands: Commands) -> None:
-    """Add the commands verify, export and labels."""
+    """Add the commands view, verify, export and labels."""
+    view = commands.add_parser(
+        "view",
+        help="look at a store, a recording or a recovery in a page that plays it",
+        description="Writes a page that plays events, S0, DoLP and AoLP, and opens it in the browser.",
+        epilog="example: polarnet view data/frames.zarr --sequence lake-00",
+    )
+    view.add_argument("path", type=Path, help="store, folder with stores (of simulate or recover), or a camera's file")
+    view.add_argument("--sequence", nargs="+", default=[], metavar="NAME", help="sequences (default: the first twelve)")
+    view.add_argument("--out", type=Path, help="page (default: outputs/view/NAME.html)")
+    view.add_argument("--no-browser", action="store_true", help="write the page without opening it")
+    add_reading(view)
+    view.set_defaults(run=_view)
+
     verify = commands.add_parser("verify", help="check every byte of a store of events, frames or scenes")
     verify.add_argument("store", help="store: folder or fsspec URL")
     verify.set_defaults(run=_verify)
@@ -40,6 +53,24 @@ def add_to(commands: Commands) -> None:
         help="PNG of 33 ms in the middle of the sequence, coloured by cause (default: not drawn)",
     )
     labels.set_defaults(run=_labels)
+
+
+def _view(options: argparse.Namespace) -> int:
+    import functools
+    import webbrowser
+
+    from polarnet.recordings.recording import read_recording
+    from polarnet.reports.player import write_player
+    from polarnet.reports.viewing import films_of
+
+    films = films_of(options.path, options.sequence, functools.partial(read_recording, **reading_of(options)))
+    path = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_player(path, f"{options.path}", films, {"command": f"polarnet view {options.path}"})
+    print(f"page {path}")
+    if not options.no_browser:
+        webbrowser.open(path.resolve().as_uri())
+    return 0
 
 
 def _verify(options: argparse.Namespace) -> int:

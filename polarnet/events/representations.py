@@ -26,6 +26,12 @@ def event_tensor(events: Events, window_us: int) -> Float[Tensor, "h w"]:
     return image.view(events.height, events.width)
 
 
+def polarity_sums(events: Events) -> Float[Tensor, "h w"]:
+    """ON minus OFF events of each pixel."""
+    image = torch.zeros(events.height * events.width, device=events.p.device)
+    return image.index_add(0, _pixel(events), events.p.float()).view(events.height, -1)
+
+
 def voxel_grid(events: Events, bins: int) -> Float[Tensor, "bins h w"]:
     """Each polarity split between the two nearest of `bins` instants (E2VID, Rebecq et al. 2019).
 

@@ -56,13 +56,13 @@ def of_any_length(recoverer: Recoverer, trained_us: int) -> Recoverer:
 
 def _recent(before: Sequence[EventWindow], window: EventWindow, trained_us: int) -> tuple[EventWindow, ...]:
     """Return the latest windows without gaps whose joint length is nearest to `trained_us`, at least the last one."""
-    kept = [window]
+    last = [window]
     for earlier in reversed(before):
         more = window.stop_us - earlier.start_us
-        if earlier.stop_us != kept[0].start_us or more - trained_us > trained_us - (window.stop_us - kept[0].start_us):
+        if earlier.stop_us != last[0].start_us or more - trained_us > trained_us - (window.stop_us - last[0].start_us):
             break
-        kept.insert(0, earlier)
-    return tuple(kept)
+        last.insert(0, earlier)
+    return tuple(last)
 
 
 def _joined(windows: Sequence[EventWindow]) -> EventWindow:

@@ -81,9 +81,16 @@ class StokesUNetConfig:
     panorama_share: Annotated[float, Field(ge=0.01, le=0.99)]
     """Initial weight of the panorama where it is certain. The U-Net learns a weight for each pixel."""
     without: list[str]
-    """Parts (of PARTS) to ablate. redundancy: all candidates are 0; slopes: the panorama's candidates are 0; sums: the
-    gains that move (s1, s2) by event sums are 0; recurrence: recurrent layers restart in each window; panorama: no
-    panorama; sensitivity: events keep their weights; scale: every sensor has the threshold `panorama_step`."""
+    """Parts (of PARTS) to ablate.
+
+    - redundancy: all candidates are 0
+    - slopes: the panorama's candidates are 0
+    - sums: the gains that move (s1, s2) by event sums are 0
+    - recurrence: recurrent layers restart in each window
+    - panorama: there is none
+    - sensitivity: events keep their weights
+    - scale: every sensor has the threshold `panorama_step`
+    """
 
     def __post_init__(self):
         if len(self.channels) < 3 or not (self.memories and self.decays and self.scales):
@@ -122,9 +129,9 @@ class StokesUNet(nn.Module):
        it as an input and chooses its weight at each pixel.
     4. Correction: the U-Net sees the result and adds an unconstrained correction.
 
-    The state is a list: the numbers of ON and OFF events and the change of their weights, the event sums, the sums of
-    moments, the sums averaged over each width of `WIDE`, the events of the previous window with the panorama, and the
-    states of the recurrent layers.
+    The state is a list. It starts with the numbers of ON and OFF events and the change of their weights, the event
+    sums, the sums of moments, and the sums averaged over each width of `WIDE`. The events of the previous window with
+    the panorama follow, then the states of the recurrent layers.
 
     DoLP is predicted separately from the length of (s1, s2). Where (s1, s2) are uncertain, their mean is too short,
     like any mean over angles. The outputs are linear, as in the paper's network.

@@ -20,29 +20,26 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from polarnet.events.streaming import EventWindow
-from polarnet.reports.figures import dolp_bar, wheel_figure
 from polarnet.reports.maps import (
     dolp_image,
-    encode_jpeg,
     encode_png,
     event_full_scale,
     event_image,
     intensity_image,
     polarization_hsv,
 )
-from polarnet.reports.tiles import chart, data_uri, template
+from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map, write_player
 from polarnet.reports.videos import open_video, with_even_sides
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
 from polarnet.storage.appended import AppendedFrames
+from polarnet.storage.film import angle_bytes, fraction_bytes, signed_bytes
 
 VIDEO = "recovered.mp4"
-FILM_FRAMES = 24
-"""Minimum number of pictures in the page's animation, evenly spread (fewer if there are fewer frames)."""
 PNG_STORED, NO_FILTER = 0, 8  # no compression, libpng's PNG_FILTER_NONE: larger files, but fast to write
 MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, the network needs all cores: a concurrent writing thread delays every operation
-PAGE_PICTURES = 6
+SHEET_PICTURES = 3  # of recovered.png
 GAP = 4  # pixels between the maps of a picture
 SCALE_INERTIA = 0.9  # share of the previous picture's full scale of events, which prevents flicker
 ZARR_CONVENTIONS = {
@@ -59,6 +56,8 @@ class Picture(NamedTuple):
 
     t_us: int
     pixels: UInt8[np.ndarray, "h w 3"]
+    maps: Mapping[Kind, UInt8[Tensor, "h w"]]
+    """The maps as bytes (`polarnet.storage.film`), for the page."""
 
 
 @dataclass
@@ -71,7 +70,7 @@ class _Sample:
     def offer(self, number: int, picture: Picture) -> None:
         if number % self.every == 0:
             self.pictures.append(picture)
-        if len(self.pictures) > 2 * FILM_FRAMES:
+        if len(self.pictures) > 2 * MAX_FRAMES:
             self.pictures, self.every = self.pictures[::2], 2 * self.every
 
 
@@ -121,26 +120,14 @@ class RecoveryWriter:
     def write_page(self, title: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:
         """Write index.html and recovered.png; call it after the `with` block."""
         pictures = self._sample.pictures
-        places = np.linspace(0, len(pictures) - 1, min(PAGE_PICTURES, len(pictures))).round().astype(int)
-        large = [pictures[k] for k in places]
-        if large:
+        if pictures:
             margin = ((GAP, GAP), (GAP, GAP), (0, 0))
-            sheet = [np.pad(one.pixels, margin, constant_values=255) for one in large[1::2] or large]
+            places = np.linspace(0, len(pictures) - 1, SHEET_PICTURES + 2).round().astype(int)[1:-1]
+            sheet = [np.pad(pictures[k].pixels, margin, constant_values=255) for k in np.unique(places)]
             (self.folder / "recovered.png").write_bytes(encode_png(np.concatenate(sheet)))
-        page = template("recovery.html.jinja").render(
-            title=title,
-            facts=facts,
-            notes=notes,
-            plain=self._plain,
-            video=VIDEO if self._video is not None else None,
-            film=_film([one.pixels for one in pictures]) if pictures else None,
-            pictures=[(one.t_us / 1000, data_uri(encode_png(one.pixels), "png")) for one in large],
-            dolp_bar=chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
-            wheel=chart(wheel_figure, "colour wheel: direction is AoLP, distance from the centre is DoLP"),
-        )
-        path = self.folder / "index.html"
-        path.write_text(page, encoding="utf-8")
-        return path
+        video = VIDEO if self._video is not None else None
+        films = [_film(title, pictures)] if pictures else []
+        return write_player(self.folder / "index.html", title, films, facts, notes, video)
 
     def _wait(self, most: int) -> None:
         while len(self._waiting) > most:
@@ -155,7 +142,7 @@ class RecoveryWriter:
         if not drawn and number % self._sample.every:
             return
         picture = self._picture(window, prediction)
-        self._sample.offer(number, Picture(window.stop_us, picture))
+        self._sample.offer(number, Picture(window.stop_us, picture, _byte_maps(window, prediction)))
         if "png" in self.outputs:
             _write_png(self.folder / "png" / f"{number:06d}.png", picture)
         if "mp4" in self.outputs:
@@ -207,11 +194,24 @@ def _quantised(values: Tensor, largest: int) -> np.ndarray:
     return values.round().clamp(0, largest).numpy().astype(np.uint16)
 
 
-def _film(pictures: Sequence[np.ndarray]) -> dict[str, Any]:
-    """Pictures stacked into one image, through which the page's style moves."""
-    height, width = pictures[0].shape[:2]
-    source = data_uri(encode_jpeg(np.concatenate(pictures)), "jpeg")
-    return {"source": source, "frames": len(pictures), "height": height, "width": width}
+def _byte_maps(window: EventWindow, prediction: Prediction) -> dict[Kind, UInt8[Tensor, "h w"]]:
+    """The maps of a frame as bytes."""
+    plain = plain_intensity(prediction)
+    maps: dict[Kind, Tensor] = {"events": signed_bytes(signed_events(window))}
+    if plain is not None:
+        return maps | {"s0": fraction_bytes(plain)}
+    if prediction.intensities is not None:
+        maps["s0"] = fraction_bytes(prediction.intensities[::2].float().mean(0))
+    maps["dolp"] = fraction_bytes(prediction.dolp)
+    return maps if prediction.aolp is None else maps | {"aolp": angle_bytes(prediction.aolp)}
+
+
+def _film(title: str, pictures: Sequence[Picture]) -> Film:
+    """The film of a recovery for the page's player."""
+    maps = [
+        Map("recovered", kind, torch.stack([one.maps[kind] for one in pictures]).numpy()) for kind in pictures[0].maps
+    ]
+    return Film(title, [one.t_us for one in pictures], maps)
 
 
 def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:

@@ -1,15 +1,16 @@
 """Read the pipeline's outputs for the report."""
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from polarnet.events.stream import Events
@@ -70,6 +71,8 @@ class Panel(NamedTuple):
     truth_s0: Float[Tensor, "h w"]
     dolp: Mapping[str, Float[Tensor, "h w"]]
     aolp: Mapping[str, Float[Tensor, "h w"]]
+    film: Mapping[str, Shaped[Tensor, "n ..."]] = MappingProxyType({})
+    """Times and maps of the scene's frames, named as in `polarnet.benchmark.run.Panel` without `film_`."""
 
 
 class Overview(NamedTuple):
@@ -131,7 +134,7 @@ class Artefacts:
 
     manifest: Manifest
     results: Results
-    """Results on the simulated test set, panels of photographs first."""
+    """Results on the simulated test set; panels of photographs first, those with the most varied DoLP before others."""
     sets: Sequence[Results]
     """Results on the other test sets."""
     ours: History
@@ -154,7 +157,9 @@ def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
     pictures = [entry for entry in manifest.pictures if entry.name in names]  # others are too small for the sensor
     pictures.sort(key=lambda entry: entry.source == "dead_leaves")  # photographs first
     generated = {entry.name for entry in pictures if entry.source == "dead_leaves"}
-    panels = sorted(results.panels, key=lambda panel: scenes.scene_of[panel.sequence] in generated)
+    panels = sorted(
+        results.panels, key=lambda p: (scenes.scene_of[p.sequence] in generated, -float(p.truth_dolp.std()))
+    )
     return Artefacts(
         manifest=manifest,
         results=results._replace(panels=panels),
@@ -162,7 +167,7 @@ def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
         ours=training_history(paths.train / OURS),
         baselines={name: training_history(paths.train / name) for name in baselines},
         rates=event_rates(events, frames),
-        overview=_overview(panels, generated, scenes, frames, events),
+        overview=_overview(panels, scenes, frames, events),
         thumbnails={
             split: thumbnails([entry.name for entry in pictures if entry.split == split], scenes) for split in SPLITS
         },
@@ -222,14 +227,11 @@ def thumbnails(pictures: Sequence[str], scenes: SceneStore) -> dict[str, UInt8[n
     return small
 
 
-def _overview(
-    panels: Sequence[Panel], generated: Collection[str], scenes: SceneStore, frames: FrameStore, events: EventStore
-) -> Overview | None:
-    """Data of the panel with the largest variation of the true DoLP, from a photograph if there is one."""
-    panels = [panel for panel in panels if OURS in panel.dolp]
-    if not panels:
+def _overview(panels: Sequence[Panel], scenes: SceneStore, frames: FrameStore, events: EventStore) -> Overview | None:
+    """Data of the first panel, which has the largest variation of the true DoLP; None without one of the network."""
+    panel = next((panel for panel in panels if OURS in panel.dolp), None)
+    if panel is None:
         return None
-    panel = min(panels, key=lambda p: (scenes.scene_of[p.sequence] in generated, -float(p.truth_dolp.std())))
     scene = scenes.read(panel.sequence)
     start_us = int(frames.t_us(panel.sequence)[panel.window])
     trajectory = Trajectory.from_vector(scene.trajectory.numpy())
@@ -267,7 +269,9 @@ def _panel(file: Path) -> Panel:
 
     truth = {name: tensors[name] for name in ("events", "truth_dolp", "truth_aolp", "truth_s0")}
     window, t_us = int(tensors["window"]), int(tensors["t_us"])
-    return Panel(file.stem, window, t_us, **truth, dolp=by_method("dolp_"), aolp=by_method("aolp_"))
+    return Panel(
+        file.stem, window, t_us, **truth, dolp=by_method("dolp_"), aolp=by_method("aolp_"), film=by_method("film_")
+    )
 
 
 def _json(path: Path) -> Any:

@@ -1,9 +1,9 @@
-"""Figures drawn with matplotlib: comparison panels, training curves, distributions of scores over scenes.
+"""Figures drawn with matplotlib for use outside the page: comparison panels, reliability, the wheel of AoLP.
 
 Figures are returned, not shown; `polarnet.reports.maps.png` encodes them.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,9 +20,8 @@ from torch import Tensor
 
 from polarnet.metrics.similarity import mse, psnr
 from polarnet.reports.artefacts import Panel
-from polarnet.reports.legend import GENERAL, Legend, in_order, with_structure
+from polarnet.reports.legend import GENERAL, Legend, with_structure
 from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image, hue_wheel
-from polarnet.reports.tables import COLUMNS
 
 
 @dataclass(frozen=True)
@@ -38,19 +37,6 @@ class Theme:
 
 LIGHT = Theme(text="#1c2330", quiet="#667085", grid="#e4e7ec", face="#ffffff")
 DARK = Theme(text="#e6e9ef", quiet="#98a2b3", grid="#313947", face="#161b24")
-
-TERMS = {
-    "mse": "MSE",
-    "mae": "MAE",
-    "ssim_loss": "1 - SSIM",
-    "lpips": "LPIPS",
-    "stokes": "S1/S0, S2/S0",
-    "uncertainty": "likelihood of the error",
-}
-"""Legend labels of loss terms."""
-
-BRANCHES = {"intensity": "intensity", "aolp": "AoLP", "dolp": "DoLP"}
-"""Outputs of a network with one loss per output; their terms are named BRANCH_TERM."""
 
 ReliabilityCurve = Sequence[tuple[float, float, int]]
 """Predicted squared error, measured squared error and number of pixels of each bin."""
@@ -100,70 +86,6 @@ def tile_grid(
     return figure, grid
 
 
-def training_curves(
-    loss: Mapping[str, Sequence[float]], validation: Sequence[float], validation_label: str, theme: Theme
-) -> Figure:
-    """Loss terms of training on the left (logarithmic), a validation score on the right, over epochs from 1."""
-    with matplotlib.rc_context(chart_style(theme)):
-        figure = Figure(figsize=(5.7, 2.5), layout="constrained", facecolor="none")
-        left, right = figure.subplots(1, 2)
-        for axes, curves, label in ((left, loss, "training loss"), (right, {"": validation}, validation_label)):
-            for term, values in curves.items():
-                axes.plot(range(1, len(values) + 1), values, marker="o", markersize=3, label=_term(term))
-            axes.set_xlabel("epoch")
-            axes.set_title(label, loc="left", fontsize=9)
-            axes.xaxis.get_major_locator().set_params(integer=True)
-            if len(curves) > 1:
-                axes.legend(frameon=False, fontsize=7, labelcolor=theme.text)
-        if all(value > 0 for values in loss.values() for value in values):
-            left.set_yscale("log")
-            _plain_log_ticks(left.yaxis)
-    return figure
-
-
-def _term(name: str) -> str:
-    branch, _, term = name.partition("_")
-    return f"{BRANCHES[branch]}: {TERMS[term]}" if branch in BRANCHES and term in TERMS else TERMS.get(name, name)
-
-
-def score_distribution(
-    per_scene: Mapping[str, Mapping[str, Sequence[float]]], theme: Theme, legend: Legend = GENERAL
-) -> Figure:
-    """One plot per metric, with a box per method and a dot per test scene.
-
-    `per_scene` is metric, then method, then the scenes' means. Boxes span the quartiles, whiskers all scenes.
-    """
-    metrics = [key for key in COLUMNS if key in per_scene]
-    methods = in_order(dict.fromkeys(method for key in metrics for method in per_scene[key]))
-    with matplotlib.rc_context(chart_style(theme)):
-        figure = Figure(figsize=(9.4, 0.62 + 0.27 * len(methods)), layout="constrained", facecolor="none")
-        for axes, metric in zip(np.atleast_1d(figure.subplots(1, len(metrics), sharey=True)), metrics, strict=True):
-            for position, method in enumerate(methods):
-                _strip(axes, position, per_scene[metric].get(method, ()), legend.colour(method), theme)
-            axes.set_title(COLUMNS[metric].heading, loc="left", fontsize=9)
-            if metric == "mse":
-                axes.set_xscale("log")  # errors of good and bad methods differ by an order of magnitude
-                _plain_log_ticks(axes.xaxis)
-            axes.set_yticks(range(len(methods)), [*map(legend.label, methods)])
-            axes.set_ylim(len(methods) - 0.4, -0.6)
-            axes.grid(axis="y", visible=False)
-            axes.tick_params(axis="y", length=0)
-    return figure
-
-
-def reliability_figure(curves: Mapping[str, ReliabilityCurve], theme: Theme, legend: Legend = GENERAL) -> Figure:
-    """Measured against predicted squared error of DoLP, a line per method; calibrated errors lie on the diagonal.
-
-    `curves` are those of `polarnet.metrics.reliability`: predicted, measured, pixels. Dots grow with the pixels.
-    """
-    with matplotlib.rc_context(chart_style(theme)):
-        figure = Figure(figsize=(3.4, 3.2), facecolor="none")
-        lines = [(legend.label(method), legend.colour(method), curve) for method, curve in curves.items()]
-        draw_reliability(figure.add_subplot(), lines, theme)
-    figure.tight_layout()
-    return figure
-
-
 def draw_reliability(axes: Axes, lines: Sequence[tuple[str, str, ReliabilityCurve]], theme: Theme) -> None:
     """Draw measured against predicted squared error, and the diagonal; a line has label, colour and curve."""
     ends = [value for _, _, curve in lines for predicted, measured, _ in curve for value in (predicted, measured)]
@@ -183,22 +105,6 @@ def score_line(recovered: Float[Tensor, "h w"], truth: Float[Tensor, "h w"]) -> 
     """MSE and PSNR of one frame, as the text below its picture."""
     error, ratio = (float(score(recovered[None], truth[None])) for score in (mse, psnr))
     return f"{error:.4f} · {ratio:.2f} dB"
-
-
-def dolp_bar(theme: Theme) -> Figure:
-    """Colour bar of `maps.dolp_image`."""
-    with matplotlib.rc_context(chart_style(theme)):
-        figure = Figure(figsize=(2.1, 0.32), facecolor="none")
-    _colour_bar(figure, figure.add_axes((0.06, 0.6, 0.88, 0.38)), theme, "horizontal", label_size=8.0)
-    return figure
-
-
-def wheel_figure(theme: Theme) -> Figure:
-    """The colour wheel of AoLP with its angles, legend of `maps.polarization_hsv`."""
-    with matplotlib.rc_context(chart_style(theme)):
-        figure = Figure(figsize=(1.3, 1.2), facecolor="none")
-        draw_wheel(figure.add_axes((0.18, 0.13, 0.64, 0.7)), theme, size=192, label_size=8.0)
-    return figure
 
 
 def draw_wheel(axes: Axes, theme: Theme, size: int, label_size: float) -> None:
@@ -259,20 +165,6 @@ def _plain_log_ticks(axis: Axis) -> None:
     axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.set_minor_locator(NullLocator())
-
-
-def _strip(axes: Axes, position: int, values: Sequence[float], colour: str, theme: Theme) -> None:
-    known = np.array([value for value in values if np.isfinite(value)])
-    if len(known) == 0:
-        return
-    axes.boxplot(
-        known, positions=[position], orientation="horizontal", widths=0.62, whis=(0, 100), patch_artist=True,
-        manage_ticks=False,
-        boxprops={"facecolor": colour, "alpha": 0.28, "linewidth": 0}, medianprops={"color": theme.text},
-        whiskerprops={"color": colour, "linewidth": 0.8}, capprops={"linewidth": 0},
-    )  # fmt: skip
-    offset = (np.arange(len(known)) % 5 - 2) * 0.08  # spreads overlapping dots without randomness
-    axes.scatter(known, position + offset, s=6, color=colour, alpha=0.8, linewidths=0, zorder=3)
 
 
 def _short(name: str) -> str:

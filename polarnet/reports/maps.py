@@ -1,5 +1,6 @@
 """Pictures of tensors (events, DoLP, polarization as hue, saturation and value), and picture files of them."""
 
+import base64
 import io
 import math
 from pathlib import Path
@@ -111,6 +112,11 @@ def encode_jpeg(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
     return _encoded(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
 
 
+def data_uri(content: bytes, kind: str) -> str:
+    """Encode a picture file's content as a data URI."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
 def _encoded(kind: str, picture: UInt8[np.ndarray, "h w channels"], options: list[int]) -> bytes:
     order = [2, 1, 0, 3][: picture.shape[-1]]  # OpenCV writes BGR
     done, data = cv2.imencode(kind, picture[..., order], options)
@@ -122,7 +128,7 @@ def _bytes(unit: np.ndarray) -> np.ndarray:
     return np.rint(unit * 255).astype(np.uint8)
 
 
-def _table(colours: Colormap) -> UInt8[np.ndarray, "n 3"]:
+def table_of(colours: Colormap) -> UInt8[np.ndarray, "n 3"]:
     """The colours of a colour map as bytes."""
     return _bytes(colours(np.arange(colours.N))[:, :3])
 
@@ -132,4 +138,4 @@ def _coloured(unit: np.ndarray, table: UInt8[np.ndarray, "n 3"]) -> UInt8[np.nda
     return table.take(np.minimum((unit * len(table)).astype(np.intp), len(table) - 1), axis=0)
 
 
-DOLP_TABLE, EVENT_TABLE = _table(matplotlib.colormaps[DOLP_COLOURS]), _table(EVENT_COLOURS)
+DOLP_TABLE, EVENT_TABLE = table_of(matplotlib.colormaps[DOLP_COLOURS]), table_of(EVENT_COLOURS)

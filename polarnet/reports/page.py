@@ -2,64 +2,65 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from polarnet.methods import METHODS
+from markupsafe import Markup
+
+from polarnet.methods import METHODS, is_rotating
 from polarnet.pictures.manifest import SPLITS
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, Results, read_artefacts, read_results
-from polarnet.reports.figures import comparison_figure, dolp_bar, training_curves, wheel_figure
+from polarnet.reports.charts import (
+    Spec,
+    rates_chart,
+    reliability_chart,
+    scatter_chart,
+    score_chart,
+    sets_chart,
+    spread_chart,
+    training_chart,
+    vega_bundle,
+)
+from polarnet.reports.figures import comparison_figure
+from polarnet.reports.html import embedded_json, script, template
 from polarnet.reports.legend import (
     LABELS,
     NAMED_BY_NETWORK,
     Legend,
     glossary,
+    in_order,
     legend_of,
     lpips_about,
     network_label,
+    with_structure,
 )
-from polarnet.reports.maps import encode_jpeg, png
+from polarnet.reports.maps import data_uri, encode_jpeg, png
 from polarnet.reports.overview import overview_figure
 from polarnet.reports.paper import write_paper_files
+from polarnet.reports.player import Film, panel_film, player_data
 from polarnet.reports.provenance import Run
-from polarnet.reports.tables import (
-    COLUMNS,
-    COSTS,
-    ERROR_PARTS,
-    SET_TITLES,
-    Scores,
-    paired_lines,
-    paper_table,
-    score_table,
-    standing,
-)
-from polarnet.reports.tiles import (
-    Tile,
-    TileRow,
-    chart,
-    data_uri,
-    distribution,
-    event_tiles,
-    panel_tiles,
-    polarization_tiles,
-    reliability_chart,
-    template,
-)
+from polarnet.reports.tables import COLUMNS, COSTS, ERROR_PARTS, SET_TITLES, Scores, Table, paper_table, score_table
 
-CARDS = {
-    "psnr": "PSNR",
+HEADINGS = {
     "mse": "MSE",
+    "psnr": "PSNR, dB",
     "ssim": "SSIM",
-    "corr": "correlation",
-    "ms_per_window": "time per window",
+    "lpips": "LPIPS",
+    "corr": "Correlation",
+    "aolp_deg": "AoLP error, °",
+    "ms_per_window": "Time, ms",
 }
+"""Columns of the first table; all others are one click away."""
+PAGE_COLUMNS = {key: replace(COLUMNS[key], label=heading) for key, heading in HEADINGS.items()}
+SCENES_AT_EACH_END = 3
+MAX_FIGURE_PANELS = 4
 SOURCE_NAMES = {
     "photograph": "photographs",
     "dead_leaves": "generated dead leaves",
     "folder": "of your own",
     "polarization": "of measured polarization",
 }
-MAX_EVENT_ROWS = 2
 SET_ABOUT = {
     "complex_motion": "The same held-out pictures while the camera turns, zooms and moves faster (section sets).",
     "measured": "Scenes whose polarization a camera measured, seen by a simulated event camera: real DoLP and AoLP, "
@@ -68,12 +69,16 @@ SET_ABOUT = {
 }
 
 
-class Card(NamedTuple):
-    """A score at the top of the page."""
+class SceneScore(NamedTuple):
+    """A scene among the best or worst of a method."""
 
-    label: str
-    value: str
-    rivals: str
+    scene: str
+    mse: float
+    rival: str
+    """Label of the best other method there."""
+    rival_mse: float | None
+    film: str | None
+    """Name of the scene in the player; None if it is not there."""
 
 
 def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder: Path) -> Path:
@@ -83,19 +88,28 @@ def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder:
     and no network. FileNotFoundError names missing artefacts and the stage to run.
     """
     artefacts = read_artefacts(paths, baselines)
-    legend = legend_of(artefacts.results.details["weights"])
+    results, legend = artefacts.results, legend_of(artefacts.results.details["weights"])
     folder.mkdir(parents=True, exist_ok=True)
-    write_paper_files(folder / "paper", [artefacts.results, *artefacts.sets], legend)
+    write_paper_files(folder / "paper", [results, *artefacts.sets], legend)
     overview = None
     if artefacts.overview is not None:
         overview = png(overview_figure(artefacts.overview))
         (folder / "overview.png").write_bytes(overview)
-    context = _context(artefacts, legend) | {
-        "run": run,
+    trainings, charts = _trainings(artefacts)
+    charts |= {"rates": rates_chart(artefacts.rates)}
+    if heat := sets_chart([results, *artefacts.sets], SET_TITLES, legend):
+        charts["sets"] = heat
+    context = {
+        "title": "polarnet report",
+        "command": run.command,
+        "facts": run.facts,
         "sections": _sections(run.parameters),
         "overview": None if overview is None else data_uri(overview, "png"),
+        "sets": [_set(one, legend) for one in artefacts.sets],
+        "trainings": trainings,
+        "data": _data(artefacts),
     }
-    return _write_page(folder, "page.html.jinja", artefacts.results, legend, context)
+    return _write_page(folder, [results, *artefacts.sets], legend, context, charts)
 
 
 def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str]) -> Path:
@@ -104,74 +118,125 @@ def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str])
     `notes` are sentences for the reader of the table, such as the methods that did not run and the reasons.
     """
     results = read_results(folder)
-    legend = legend_of(results.details["weights"])
-    context = {"title": title, "command": command, "notes": notes, "labels": legend.labels}
-    return _write_page(folder, "set.html.jinja", results, legend, _results_context(results, legend) | context)
+    legend, weights = legend_of(results.details["weights"]), results.details["weights"]
+    facts = {legend.label(row): f"{file['file']} (sha256 {file['sha256'][:16]})" for row, file in weights.items()}
+    context = {"title": f"polarnet benchmark: {title}", "command": command, "notes": notes, "facts": facts}
+    return _write_page(folder, [results], legend, context, {})
 
 
-def _write_page(folder: Path, name: str, results: Results, legend: Legend, context: Mapping[str, Any]) -> Path:
-    """Fill a template into index.html, and write the panels as comparison.png; no such file without panels."""
+def _write_page(
+    folder: Path, sets: Sequence[Results], legend: Legend, context: Mapping[str, Any], charts: Mapping[str, Spec]
+) -> Path:
+    """Fill the template into index.html, and write the panels as comparison.png; no such file without panels."""
+    results = sets[0]
     if results.panels:
-        figure = comparison_figure(results.panels, results.panels[0].dolp, legend)
+        figure = comparison_figure(results.panels[:MAX_FIGURE_PANELS], results.panels[0].dolp, legend)
         (folder / "comparison.png").write_bytes(png(figure))
+    films = [
+        panel_film(panel, legend, "" if one is results else SET_TITLES.get(one.name, one.name))
+        for one in sets
+        for panel in one.panels
+        if panel.film
+    ]
+    charts = {**_result_charts(results, legend), **charts}
+    values = _results_context(results, legend, films) | dict(context)
+    values |= {
+        "charts": charts,
+        "charts_json": embedded_json(charts),
+        "player_json": embedded_json(player_data(films)) if films else None,
+        "vega_bundle": Markup(vega_bundle()),
+        "script": script,
+    }
     path = folder / "index.html"
-    path.write_text(template(name).render(context), encoding="utf-8")
+    path.write_text(template("page.html.jinja").render(values), encoding="utf-8")
     return path
 
 
-def _results_context(results: Results, legend: Legend) -> dict[str, Any]:
-    """Template values of the results on the test set."""
-    metrics, details, labels = results.metrics, results.details, legend.labels
+def _results_context(results: Results, legend: Legend, films: Sequence[Film]) -> dict[str, Any]:
+    """Template values of the results on the test set, and empty values of what only a pipeline's report has."""
+    metrics, details = results.metrics, results.details
     return {
-        "metrics": metrics,
         "details": details,
-        "scores": score_table(metrics, labels=labels, warmup_windows=details["warmup_windows"]),
-        "error_parts": score_table(metrics, columns=ERROR_PARTS, labels=labels),
-        "costs": score_table(metrics, columns=COSTS, labels=labels),
-        "standing": standing(metrics, labels),
-        "paired": paired_lines(details.get("paired", {}), labels=labels),
-        "rows": glossary(metrics, details["weights"]),
+        "verdict": verdict(metrics, details, legend),
+        "scores": _page_table(results, legend),
+        "all_scores": score_table(metrics, labels=legend.labels),
+        "error_parts": score_table(metrics, columns=ERROR_PARTS, labels=legend.labels),
+        "costs": score_table(metrics, columns=COSTS, labels=legend.labels),
+        "extremes": extremes(results, legend, {film.name for film in films}),
+        "ours": _spoken("ours" if "ours" in metrics else _best_method(metrics), legend),
+        "glossary": glossary(metrics, details["weights"]),
         "lpips_about": lpips_about(details["lpips"]),
-        "paper_simulated": paper_table("simulated"),
-        "paper_real": paper_table("real"),
-        "distribution": distribution(details["scene_means"], legend),
-        "reliability": reliability_chart(details, legend),
-        "dolp_bar": chart(dolp_bar, "colour bar of DoLP from 0 to 1"),
-        "wheel": chart(wheel_figure, "colour wheel: direction is AoLP, distance from the centre is DoLP"),
-        "panels": [TileRow(panel.sequence, panel_tiles(panel, legend)) for panel in results.panels],
-        "polarization": [TileRow(panel.sequence, polarization_tiles(panel, legend)) for panel in results.panels],
+        "published": {experiment: paper_table(experiment) for experiment in ("simulated", "real")},
+        "notes": [],
+        "sections": {},
+        "overview": None,
+        "sets": [],
+        "trainings": [],
+        "data": None,
     }
 
 
-def _context(artefacts: Artefacts, legend: Legend) -> dict[str, Any]:
-    """Template values of a pipeline's data, trainings and results on all test sets."""
-    manifest, results = artefacts.manifest, artefacts.results
-    context = _results_context(results, legend)
-    networks = [("ours: ", artefacts.ours, "DoLP")]
-    networks += [_baseline(name, history) for name, history in artefacts.baselines.items()]
-    return context | {
-        "cards": _cards(results.metrics, legend),
-        "overview_name": None if artefacts.overview is None else artefacts.overview.name,
-        "sets": [_set(one, legend) for one in artefacts.sets],
-        "panels": context["panels"]
-        + [
-            TileRow(f"{SET_TITLES.get(one.name, one.name)}: {panel.sequence}", panel_tiles(panel, legend))
-            for one in artefacts.sets
-            for panel in one.panels
-        ],
-        "events": [TileRow(panel.sequence, event_tiles(panel)) for panel in results.panels[:MAX_EVENT_ROWS]],
-        "rates": artefacts.rates,
-        "training": {
-            f"{row}{network_label(history.network)}, events to {output}": _training(history, output)
-            for row, history, output in networks
-        },
-        "ours": legend.labels["ours"],
-        "ours_has_aolp": any("ours" in panel.aolp for panel in results.panels),
-        "manifest": manifest,
-        "source_names": SOURCE_NAMES,
-        "sources": Counter(entry.source for entry in manifest.pictures),
-        "splits": [_thumbnails(artefacts, split) for split in SPLITS],
+def _page_table(results: Results, legend: Legend) -> Table:
+    return score_table(results.metrics, PAGE_COLUMNS, legend.labels, results.details["warmup_windows"])
+
+
+def _result_charts(results: Results, legend: Legend) -> dict[str, Spec]:
+    means = results.details["scene_means"].get("mse", {})
+    charts = {
+        "scores": score_chart(results.metrics, PAGE_COLUMNS, legend),
+        "spread": spread_chart(means, legend),
+        "scatter": scatter_chart(means, legend),
+        "reliability": reliability_chart(results.details, legend),
     }
+    return {name: spec for name, spec in charts.items() if spec is not None}
+
+
+def verdict(metrics: Scores, details: Mapping[str, Any], legend: Legend) -> str:
+    """One sentence: the error of ours, beside the best other method and the best constant."""
+    method = "ours" if "ours" in metrics else _best_method(metrics)
+    mse, scenes = metrics[method]["mse"], len(details["scenes"])
+    plural = "" if scenes == 1 else "s"
+    start = f"{_spoken(method, legend)} recovers DoLP with a mean squared error of {mse:.4f} on {scenes} scene{plural}"
+    rivals = {row: metrics[row]["mse"] for row in with_structure(metrics) if row != method and not is_rotating(row)}
+    parts = []
+    if rivals:
+        best = min(rivals, key=lambda row: rivals[row])
+        parts.append(f"{_against(mse, rivals[best])} the best other method ({legend.label(best)})")
+    if (constant := metrics.get("oracle_mean", {}).get("mse")) and method != "oracle_mean":
+        parts.append(f"{_against(mse, constant)} the best constant")
+    return start + (f": {' and '.join(parts)}." if parts else ".")
+
+
+def _spoken(method: str, legend: Legend) -> str:
+    """Label for a sentence, with a capital and without the row's key."""
+    label = legend.label(method).removeprefix("ours: ")
+    return label[:1].upper() + label[1:]
+
+
+def _against(mse: float, other: float) -> str:
+    change = round(100 * (mse / other - 1)) if other else 0
+    return f"{abs(change)} % {'lower' if change < 0 else 'higher'} than" if change else "the same as"
+
+
+def _best_method(metrics: Scores) -> str:
+    """The method with the lowest MSE; among the references if no method was run."""
+    return min(with_structure(metrics) or in_order(metrics), key=lambda row: metrics[row]["mse"])
+
+
+def extremes(results: Results, legend: Legend, films: set[str]) -> list[tuple[str, list[SceneScore]]]:
+    """The worst and the best scenes of ours (without it: of the best method), by MSE."""
+    means = results.details["scene_means"].get("mse", {})
+    method = "ours" if "ours" in means else _best_method(results.metrics)
+    others = [row for row in with_structure(means) if row != method and not is_rotating(row)]
+    sequences = {scene: name for name in films for scene in means[method] if name.startswith(scene)}
+    scores = []
+    for scene, mse in sorted(means[method].items(), key=lambda item: -item[1]):
+        known = {row: means[row][scene] for row in others if scene in means[row]}
+        best = min(known, key=lambda row: known[row], default=None)
+        label = "" if best is None else legend.label(best)
+        scores.append(SceneScore(scene, mse, label, known.get(best or ""), sequences.get(scene)))
+    count = min(SCENES_AT_EACH_END, (len(scores) + 1) // 2)
+    return [("Worst scenes", scores[:count]), ("Best scenes", scores[count:][-SCENES_AT_EACH_END:][::-1])]
 
 
 def _set(one: Results, legend: Legend) -> dict[str, Any]:
@@ -181,47 +246,59 @@ def _set(one: Results, legend: Legend) -> dict[str, Any]:
         "about": SET_ABOUT.get(one.name, ""),
         "scenes": len(one.details["scenes"]),
         "frames": one.details["frames"],
-        "scores": score_table(one.metrics, labels=legend.labels, warmup_windows=one.details["warmup_windows"]),
+        "scores": _page_table(one, legend),
     }
 
 
-def _cards(metrics: Scores, legend: Legend) -> list[Card]:
-    """The network's scores, each with those of its rivals."""
-    if "ours" not in metrics:
-        return []
-    cards = []
-    for key, label in CARDS.items():
-        column = COLUMNS[key]
-        others = [m for m in ("e2v", "oracle_mean" if column.ranked else "cf") if m in metrics]
-        rivals = [f"{legend.label(m)} {column.printed(metrics[m][key])}" for m in others]
-        cards.append(Card(label, column.printed(metrics["ours"][key]) + column.unit, ", ".join(rivals)))
-    return cards
+def _data(artefacts: Artefacts) -> dict[str, Any]:
+    """Template values of the pictures: counts, thumbnails by split, licences."""
+    manifest = artefacts.manifest
+    sources = Counter(entry.source for entry in manifest.pictures)
+    return {
+        "manifest": manifest,
+        "sources": ", ".join(f"{count} {SOURCE_NAMES.get(source, source)}" for source, count in sources.items()),
+        "thumbnails": {
+            split: {name: data_uri(encode_jpeg(small), "jpeg") for name, small in artefacts.thumbnails[split].items()}
+            for split in SPLITS
+        },
+        "rates": [
+            (one.split, one.sequences, f"{one.seconds:.1f}", f"{one.events:,}", f"{one.per_pixel_second:.1f}")
+            for one in artefacts.rates
+        ],
+        "skipped": [(one.file, one.reason) for one in manifest.skipped],
+        "licences": [
+            (one.name, one.split, one.origin, one.author or "not stated", one.licence or "not stated")
+            for one in manifest.pictures
+        ],
+    }
 
 
-def _thumbnails(artefacts: Artefacts, split: str) -> TileRow:
-    tiles = [Tile(data_uri(encode_jpeg(small), "jpeg"), name) for name, small in artefacts.thumbnails[split].items()]
-    return TileRow(split, tiles, artefacts.manifest.counts[split] - len(tiles))
+def _trainings(artefacts: Artefacts) -> tuple[list[dict[str, Any]], dict[str, Spec]]:
+    """Template values and charts of each training."""
+    histories = [("ours: ", artefacts.ours, "DoLP")]
+    histories += [_baseline(name, history) for name, history in artefacts.baselines.items()]
+    trainings: list[dict[str, Any]] = []
+    charts: dict[str, Spec] = {}
+    for number, (row, history, output) in enumerate(histories):
+        names = [f"training_{number}_{kind}" for kind in ("loss", "psnr")]
+        charts |= dict(zip(names, training_chart(history, output), strict=True))
+        psnr = history.validation["psnr"]
+        trainings.append(
+            {
+                "title": f"{row}{network_label(history.network)}, events to {output}",
+                "charts": names,
+                "epochs": len(psnr),
+                "best_epoch": history.best_epoch + 1,
+                "best_psnr": psnr[history.best_epoch],
+            }
+        )
+    return trainings, charts
 
 
 def _baseline(name: str, history: History) -> tuple[str, History, str]:
     """Row (if its label does not name the network), training and output of a trained baseline."""
     row = f"{LABELS[name]}: " if name in NAMED_BY_NETWORK else ""
     return row, history, "intensity" if METHODS[name].reconstructs else "polarization"
-
-
-def _training(history: History, output: str) -> dict[str, Any]:
-    psnr = history.validation["psnr"]
-    curves = chart(
-        lambda theme: training_curves(history.loss, psnr, f"validation PSNR of {output}, dB", theme),
-        "training loss and validation PSNR over epochs",
-    )
-    return {
-        "chart": curves,
-        "epochs": len(psnr),
-        "best_epoch": history.best_epoch + 1,
-        "of": output,
-        "best_psnr": psnr[history.best_epoch],
-    }
 
 
 def _sections(parameters: Mapping[str, Any]) -> dict[str, list[tuple[str, Any]]]:

@@ -11,6 +11,7 @@ from matplotlib.font_manager import findfont
 from matplotlib.ft2font import FT2Font
 from torch import Tensor
 
+from polarnet.events.representations import polarity_sums
 from polarnet.events.stream import Events
 from polarnet.reports.maps import DOLP_TABLE, dolp_image, event_full_scale, event_image, intensity_image
 from polarnet.reports.videos import with_even_sides
@@ -84,12 +85,6 @@ class Preview:
             _write(foot[6:], "1", end)
             _write(foot[6:], "DoLP 0", left - 6 - _text("DoLP 0").shape[1])
         return foot
-
-
-def polarity_sums(events: Events) -> Float[Tensor, "h w"]:
-    """ON minus OFF events of each pixel."""
-    pixels = events.y.long() * events.width + events.x
-    return torch.zeros(events.height * events.width).index_add(0, pixels, events.p.float()).view(events.height, -1)
 
 
 def _white(height: int, width: int) -> UInt8[np.ndarray, "height width 3"]:

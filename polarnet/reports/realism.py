@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from polarnet.characterization.twin import INTERVAL_EDGES_US, Comparison
 from polarnet.reports.figures import Theme, chart_style
-from polarnet.reports.tiles import Chart, chart, template
+from polarnet.reports.html import Chart, chart, template
 
 LABELS = {"recording": "recording", "twin": "simulated twin"}
 

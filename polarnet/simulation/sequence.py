@@ -49,7 +49,7 @@ def simulate(
 
     Raises TypeError for arguments of another kind. Raises ValueError for integers (divide 8 bits by 255, 16 bits by
     65535), values outside [0, 1], another order of axes, NaN and infinity, unphysical scenes, and pictures
-    too small for the sensor and its motion; the message gives the remedy.
+    too small for the sensor and its motion. The message gives the remedy.
     """
     for name, value, kinds, example in (
         ("motion", motion, (SynthesizeConfig,), 'MOTIONS["default"]'),

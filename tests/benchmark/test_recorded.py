@@ -144,8 +144,8 @@ def test_hot_pixels_of_a_recording_are_removed_before_it_is_scored(recording, tm
     (tmp_path / "in").mkdir()
     write_e2p(tmp_path / "in" / "hot.h5", merge([events, hot]), truth.t_us, levels, None)
     clean = read_recorded(tmp_path / "in" / "hot.h5", "hot", MOSAIC, Cleaning("found", 4.0, None))
-    kept = join_mosaic(clean.channels, MOSAIC)
-    assert not ((kept.x == 20) & (kept.y == 20)).any()
+    joined = join_mosaic(clean.channels, MOSAIC)
+    assert not ((joined.x == 20) & (joined.y == 20)).any()
     (note,) = clean.notes
     assert "of 1 hot pixels" in note
     assert mosaicked(truth.intensity.numpy()).shape == truth.light.shape

@@ -126,8 +126,8 @@ def test_events_that_the_motion_explains_change_nothing():
     config = BetweenConfig(reach=12, share=0.5, width=1, threshold_on=0.2, threshold_off=0.2)
     state = anchored(None, window_of(NONE), pattern(), config)._replace(velocity=torch.tensor([1.0, 0.0]) / 1000)
     _, moved = carried(state, [NONE] * 4, WINDOW_US + 1000, MOTION_ALONE)
-    told = state._replace(change=torch.atanh(moved.stokes) - torch.atanh(pattern().stokes))
-    _, frame = carried(told, [NONE] * 4, WINDOW_US + 1000, config)
+    corrected = state._replace(change=torch.atanh(moved.stokes) - torch.atanh(pattern().stokes))
+    _, frame = carried(corrected, [NONE] * 4, WINDOW_US + 1000, config)
     torch.testing.assert_close(frame.dolp, moved.dolp, atol=1e-5, rtol=0)
 
 

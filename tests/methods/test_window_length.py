@@ -19,10 +19,10 @@ def cut(sequence, length_us):
 
 def spans_seen(sequence, lengths_us):
     """The windows that a method trained on TRAINED_US sees, given windows of these lengths one by one."""
-    seen = []
+    runs = []
 
     def predict(state, windows):
-        seen.append([(window.start_us, window.stop_us) for window in windows])
+        runs.append([(window.start_us, window.stop_us) for window in windows])
         return None, Prediction(torch.zeros(len(windows), 18, 20))
 
     recoverer = of_any_length(Recoverer(lambda height, width: None, predict), TRAINED_US)
@@ -32,7 +32,7 @@ def spans_seen(sequence, lengths_us):
         state, prediction = recoverer.step(state, [EventWindow(channels, start, start + length)])
         assert len(prediction.dolp) == 1
         start += length
-    return seen
+    return runs
 
 
 @pytest.fixture

@@ -75,10 +75,10 @@ def test_every_parameter_has_a_gradient_from_two_windows():
 def test_the_papers_input_is_the_four_event_tensors_as_they_are():
     torch.manual_seed(0)
     network, tensors = DolpUNet(replace(SMALL, input_mixing="polarizers")).eval(), 3 * torch.randn(1, 4, 12, 20)
-    seen = []
-    network.c1.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    inputs_of_c1 = []
+    network.c1.register_forward_pre_hook(lambda _, inputs: inputs_of_c1.append(inputs[0]))
     network(tensors)
-    torch.testing.assert_close(seen[0], tensors, rtol=0, atol=0)
+    torch.testing.assert_close(inputs_of_c1[0], tensors, rtol=0, atol=0)
 
 
 def test_inputs_are_compressed_logarithmically_with_their_sign():

@@ -18,8 +18,8 @@ def test_an_event_stays_if_one_of_its_8_neighbours_fired_within_the_time(make_ev
     events = make_events(
         [(0, 1, 1, 1), (100, 1, 1, 1), (200, 2, 2, -1), (300, 4, 2, 1), (1200, 1, 2, 1), (1201, 0, 0, 1)], 4, 6
     )
-    kept = without_background(events, 1000)
-    assert kept.t.tolist() == [200, 1200]  # (1, 1) has no neighbour before it, (4, 2) is two pixels from (2, 2)
+    remaining = without_background(events, 1000)
+    assert remaining.t.tolist() == [200, 1200]  # (1, 1) has no neighbour before it, (4, 2) is two pixels from (2, 2)
     assert without_background(events, 1101).t.tolist() == [200, 1200, 1201]
 
 

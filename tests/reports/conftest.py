@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from polarnet.benchmark.results import write_benchmark
-from polarnet.benchmark.run import Benchmark, BenchmarkSet, Panel
+from polarnet.benchmark.run import Benchmark, BenchmarkSet, _panel
 from polarnet.benchmark.score import BenchmarkConfig, Cost, score_sequence
 from polarnet.events.stream import Events
 from polarnet.pictures.images import write_png
@@ -91,11 +91,7 @@ def run_methods(events, frames, folder):
         answers = {method: Prediction(frames) for method, frames in dolp.items()}
         answers["e2v"] = Prediction(dolp["e2v"], sequence.aolp)
         rows += score_sequence(sequence, answers, 1, None, torch.device("cpu"))
-        k = 3
-        maps = {"events": torch.randn(4, 24, 36), "truth_dolp": truth[k], "truth_aolp": sequence.aolp[k]}
-        maps |= {"truth_s0": sequence.s0[k], "aolp_e2v": sequence.aolp[k]}
-        maps |= {f"dolp_{method}": frames[k] for method, frames in dolp.items()}
-        panels.append(Panel(sequence.name, k, int(sequence.t_us[k + 1]), maps))
+        panels.append(_panel(sequence, answers, 1))
     about = {
         "lpips": {"backbone": None, "sha256": None, "source": None},
         "weights": {

@@ -28,27 +28,34 @@ def page(folder):
 
 
 def test_the_page_needs_no_other_file_and_no_network(page):
-    sources = re.findall(r'(?:src|srcset|href)="([^"]*)"', page)
+    markup = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    sources = re.findall(r'(?:src|srcset|href)="([^"]*)"', markup)
     assert sources
-    assert all(source.startswith(("data:", "#")) for source in sources)
-    assert not re.search(r"<script|<link|@import|url\(", page)
+    assert all(source.startswith("data:") for source in sources)
+    assert not re.search(r"<script[^>]* src=|<link|@import|url\(", page.split("<script>")[0])
 
 
-def test_every_link_leads_to_a_section(page):
-    targets = re.findall(r'href="#(\w+)"', page)
-    assert len(targets) == 9
-    assert all(f'<section id="{target}">' in page for target in targets)
+def test_one_sentence_says_how_good_ours_is_beside_the_best_other_method_and_the_best_constant(page):
+    lead = re.search(r'<p class="lead">(.*?)</p>', page)[1]
+    assert lead.startswith("The paper&#39;s network recovers DoLP with a mean squared error of 0.0")
+    assert re.search(r"\d+ % lower than the best other method \(E2V: FireNet\) and \d+ % lower than the best", lead)
+    assert lead.count(".") == 2  # the decimal point and the end
+
+
+def test_the_first_table_has_the_seven_scores_at_most_and_the_best_is_marked(page):
+    first = re.search(r"<table.*?</table>", page, re.DOTALL)[0]
+    assert re.findall(r'scope="col">([^<]*)<', first) == [
+        "Method", "MSE ↓", "PSNR, dB ↑", "SSIM ↑", "Correlation ↑", "AoLP error, ° ↓", "Time, ms ↓",
+    ]  # fmt: skip
+    ours = re.search(r'<tr class="m-ours">.*?</tr>', first, re.DOTALL)[0]
+    assert 'class="best"' in ours
 
 
 def test_every_picture_says_what_it_shows(page):
-    assert all(re.search(r'alt="[^"]+"', tag) for tag in re.findall(r"<img[^>]*>", page))
-
-
-def test_the_network_is_best_here_and_the_papers_table_stands_beside(page):
-    ours = re.search(r'<tr class="m-ours">.*?</tr>', page)[0]
-    assert '<td class="best">' in ours
-    assert "15.56" in page
-    assert "27.48" in page
+    html = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)  # the plotting library writes tags too
+    tags = re.findall(r"<img[^>]*>", html)
+    assert len(tags) > 5
+    assert all(re.search(r'alt="[^"]+"', tag) for tag in tags)
 
 
 def test_the_page_says_which_networks_are_behind_its_rows(page):
@@ -62,7 +69,7 @@ def test_the_page_says_which_networks_are_behind_its_rows(page):
 def test_a_baseline_that_no_row_uses_is_neither_drawn_nor_explained(page):
     text = re.sub(r"data:image/[^\"]+", "", page)  # base64, in which any three letters may stand by chance
     assert "E2P" not in text
-    assert "2 networks trained on them" in page
+    assert page.count("events to ") >= 2
 
 
 def test_the_papers_figures_are_told_from_those_of_the_run(page):
@@ -82,8 +89,8 @@ def test_without_lpips_the_table_has_no_such_column_and_the_page_no_warning(page
 
 
 def test_parameters_are_listed_with_their_full_keys(page):
-    assert "<code>networks.paper.channels</code></td><td>[32, 64]" in page
-    assert "<code>lpips.path</code></td><td>null" in page
+    assert "<code>networks.paper.channels</code></dt><dd>[32, 64]" in page
+    assert "<code>lpips.path</code></dt><dd>null" in page
 
 
 def test_text_from_files_is_escaped(page):
@@ -96,8 +103,21 @@ def test_skipped_files_are_named(page):
     assert "cannot be read: ends early" in page
 
 
-def test_a_network_without_aolp_is_not_shown_in_colour(page):
-    assert "recovers DoLP alone" in page
+def test_the_player_has_the_scenes_with_events_truth_and_the_methods_that_are_no_constants(page):
+    player = json.loads(re.search(r'data-role="data">(.*?)</script>', page)[1])
+    for scene in player["scenes"]:
+        kinds = {(one["source"], one["kind"]) for one in scene["maps"]}
+        assert kinds == {
+            ("Events", "events"), ("truth", "s0"), ("truth", "aolp"), ("truth", "dolp"),
+            ("ours: the paper's network", "dolp"), ("E2V: FireNet", "dolp"), ("E2V: FireNet", "aolp"),
+        }  # fmt: skip
+    assert len(player["scenes"]) == 2
+    assert player["scenes"][0]["name"].startswith("tree")  # photographs come before generated pictures
+
+
+def test_the_worst_scene_is_named_first_and_leads_to_the_player(page):
+    buttons = re.findall(r'data-scene="([^"]*)"', page)
+    assert sorted(buttons) == ["leaf-00", "tree-00"]
 
 
 def test_two_pictures_lie_beside_the_page_for_use_elsewhere(folder):
@@ -111,8 +131,8 @@ def test_a_benchmark_without_panels_and_without_ours_still_gives_a_page(paths, t
     del metrics["ours"]
     (benchmark / "metrics.json").write_text(json.dumps(metrics))
     page = write_report(dataclasses.replace(paths, benchmark=benchmark), ["e2v"], RUN, tmp_path / "report").read_text()
-    assert "kept no window of the network" in page
-    assert 'class="card"' not in page
+    assert 'class="player"' not in page
+    assert '<p class="lead">E2V: FireNet recovers DoLP' in page
 
 
 def test_the_same_artefacts_give_the_same_page(paths, page, tmp_path):
@@ -124,7 +144,8 @@ def test_a_further_test_set_has_its_table_and_its_pictures(paths, tmp_path):
     shutil.copytree(paths.benchmark, benchmark)
     shutil.copytree(paths.benchmark, benchmark / "sets" / "measured")
     page = write_report(dataclasses.replace(paths, benchmark=benchmark), ["e2v"], RUN, tmp_path / "report").read_text()
-    assert page.count("Measured polarization") >= 3  # heading, caption, pictures
+    assert "<h3>Measured polarization</h3>" in page
+    assert '"name":"Measured polarization: tree-00"' in page  # in the player
     assert "Scenes whose polarization a camera measured" in page
-    assert "ours is better in" in page
+    assert 'data-chart="sets"' in page  # the heat map
     assert "10.40" in page  # GFLOP of ours

@@ -29,9 +29,9 @@ def opened(path: str) -> AnyReader:
 def topics(path: str) -> tuple[list[str], str]:
     """Topics of events, and a list of the others with their types."""
     with opened(path) as bag:
-        found = sorted({one.topic for one in bag.connections if one.msgtype in EVENT_ARRAYS})
-        others = sorted({f"{one.topic} ({one.msgtype})" for one in bag.connections if one.topic not in found})
-        return found, ", ".join(others)[:300]
+        chosen = sorted({one.topic for one in bag.connections if one.msgtype in EVENT_ARRAYS})
+        others = sorted({f"{one.topic} ({one.msgtype})" for one in bag.connections if one.topic not in chosen})
+        return chosen, ", ".join(others)[:300]
 
 
 def messages(path: str, topic: str) -> Iterator[Any]:

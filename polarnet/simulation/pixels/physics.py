@@ -38,8 +38,8 @@ class PixelConfig:
     """Bandwidth of the source follower behind the photoreceptor, in any light; 0: infinite, as in v2e.
 
     Photoreceptor and source follower are stages of the pixel's circuit (Lichtsteiner, Posch, Delbruck, JSSC 2008), and
-    together a second-order low-pass. v2e has one pole: its code (`low_pass_filter` of v2ecore/emulator_utils.py) says
-    that it was of second order once, and that "one pole is nearly always dominant".
+    together a second-order low-pass. One pole is what v2e has: its code (`low_pass_filter` of
+    v2ecore/emulator_utils.py) says that it was of second order once, and that "one pole is nearly always dominant".
     """
     leak_rate_hz: NonNegativeFloat
     """ON events per second of a pixel that sees no change."""

@@ -1,0 +1,278 @@
+// Plays the films of a page: colours the grey strips, shares time, zoom and cursor among pictures, wipes between two.
+"use strict";
+
+const TITLES = { events: "Events", s0: "S0", dolp: "DoLP", aolp: "AoLP", error: "error of DoLP" };
+const FRAMES_PER_SECOND = 6;
+const FULL_ERROR = 0.5; // DoLP at the end of the colours
+
+/** Grey values of a strip: a byte for each pixel of each frame. */
+async function strip(source, width) {
+  const image = new Image();
+  image.src = source;
+  await image.decode();
+  const canvas = new OffscreenCanvas(width, image.height);
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.drawImage(image, 0, 0);
+  const rgba = context.getImageData(0, 0, width, image.height).data;
+  return Uint8ClampedArray.from({ length: rgba.length / 4 }, (_, i) => rgba[4 * i]);
+}
+
+/** Bytes of a map over the frames; AoLP comes as cosine and sine of twice the angle. */
+async function decoded(map, width) {
+  const values = await strip(map.strip, width);
+  if (map.kind !== "aolp") return values;
+  const half = values.length / 2;
+  return Uint8ClampedArray.from({ length: half }, (_, i) => {
+    const angle = Math.atan2(values[half + i] - 128, values[i] - 128);
+    return Math.floor((angle / (2 * Math.PI) + 1) * 256) % 256;
+  });
+}
+
+function printed(kind, value, scale) {
+  if (kind === "events") return ((value - 128) / 127 * scale).toFixed(0);
+  if (kind === "aolp") return `${(value / 256 * 180).toFixed(0)}°`;
+  return (value / 255 * (kind === "error" ? FULL_ERROR : 1)).toFixed(2);
+}
+
+function option(select, labels, chosen) {
+  select.replaceChildren(...labels.map((label, i) => new Option(label, i, i === chosen, i === chosen)));
+}
+
+class Player {
+  constructor(root) {
+    this.root = root;
+    this.find = (role) => root.querySelector(`[data-role=${role}]`);
+    const data = JSON.parse(this.find("data").textContent);
+    this.scenes = data.scenes;
+    this.colours = Object.fromEntries(
+      Object.entries(data.colours).map(([name, hex]) => [name, hex.match(/../g).map((byte) => parseInt(byte, 16))])
+    );
+    this.cursor = null;
+    this.view = { zoom: 1, x: 50, y: 50 };
+    option(this.find("scene"), this.scenes.map((scene) => scene.name), 0);
+    this.listen();
+    this.show(0);
+  }
+
+  listen() {
+    const on = (role, event, action) => this.find(role).addEventListener(event, action);
+    on("scene", "change", (event) => this.show(Number(event.target.value)));
+    on("time", "input", () => this.draw());
+    on("quantity", "change", () => this.arrange());
+    on("play", "click", () => this.play(!this.timer));
+    on("zoom", "input", (event) => this.look({ zoom: Number(event.target.value) }));
+    for (const role of ["left", "right", "divide"]) on(role, "input", () => this.wipe());
+    const panes = this.find("panes");
+    panes.addEventListener("pointermove", (event) => this.point(event));
+    panes.addEventListener("keydown", (event) => this.step(event));
+    panes.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
+    this.find("wiped").addEventListener("pointermove", (event) => {
+      if (!event.buttons && event.pointerType === "mouse") return;
+      const box = event.currentTarget.getBoundingClientRect();
+      this.find("divide").value = 100 * (event.clientX - box.left) / box.width;
+      this.wipe();
+    });
+  }
+
+  async show(number) {
+    this.root.dataset.ready = "no";
+    const scene = this.scenes[number];
+    const maps = await Promise.all(
+      scene.maps.map(async (map) => ({ ...map, values: await decoded(map, scene.width) }))
+    );
+    this.scene = scene;
+    this.find("scene").value = number;
+    const truth = maps.find((map) => map.source === "truth" && map.kind === "dolp");
+    const errors = maps.filter((map) => truth && map.kind === "dolp" && map !== truth).map((map) => ({
+      ...map, kind: "error",
+      values: map.values.map((value, i) => Math.abs(value - truth.values[i]) / FULL_ERROR),
+    }));
+    this.maps = [...maps, ...errors];
+    const of_methods = ["dolp", "aolp", "error"].filter((kind) => this.maps.some((map) => map.kind === kind && map.source !== "truth"));
+    const before = this.kinds?.[this.find("quantity").value];
+    this.kinds = of_methods;
+    option(this.find("quantity"), of_methods.map((kind) => TITLES[kind]), Math.max(0, of_methods.indexOf(before)));
+    this.find("quantity").parentElement.hidden = of_methods.length < 2;
+    const time = this.find("time");
+    time.max = scene.ms.length - 1;
+    time.value = Math.min(time.value, time.max);
+    for (const role of ["time", "play"]) this.find(role).disabled = scene.ms.length < 2;
+    this.cursor = null;
+    this.arrange();
+    this.root.dataset.ready = "yes";
+  }
+
+  /** Make a pane for events, S0, the truth, and the chosen quantity of each method. */
+  arrange() {
+    const quantity = this.kinds[this.find("quantity").value];
+    const scene = this.scene;
+    this.shown = this.maps.filter((map) => map.source === "truth" || ["events", "s0"].includes(map.kind) || map.kind === quantity);
+    const titled = (map) => map.kind === "events" ? "Events" : map.source === "truth" ? `True ${TITLES[map.kind]}` : map.source;
+    this.panes = this.shown.map((map) => {
+      const figure = document.createElement("figure");
+      const caption = document.createElement("figcaption");
+      const value = document.createElement("span");
+      const pane = document.createElement("div");
+      const canvas = document.createElement("canvas");
+      Object.assign(canvas, { width: scene.width, height: scene.height });
+      canvas.setAttribute("role", "img");
+      canvas.setAttribute("aria-label", `${titled(map)}${map.kind === "error" ? ": error of DoLP" : ""}, scene ${scene.name}`);
+      pane.className = "pane";
+      pane.append(canvas);
+      caption.append(titled(map), value);
+      figure.append(caption, pane);
+      return { map, figure, value, canvas, title: titled(map) };
+    });
+    this.find("panes").replaceChildren(...this.panes.map((pane) => pane.figure));
+    const names = this.panes.map((pane) => pane.title);
+    const truth = this.shown.findIndex((map) => map.source === "truth" && map.kind === quantity);
+    const first = this.shown.findIndex((map) => map.source !== "truth" && map.kind === quantity);
+    option(this.find("left"), names, Math.max(0, truth));
+    option(this.find("right"), names, first < 0 ? names.length - 1 : first);
+    this.find("wipe").hidden = names.length < 2;
+    this.legends();
+    this.draw();
+  }
+
+  legends() {
+    const kinds = [...new Set(this.shown.map((map) => map.kind))].filter((kind) => kind !== "s0");
+    const ends = { events: ["darker (OFF)", "brighter (ON)"], dolp: ["DoLP 0", "1"], error: ["error 0", `${FULL_ERROR}`] };
+    this.find("legend").replaceChildren(...kinds.map((kind) => {
+      const entry = document.createElement("span");
+      const canvas = document.createElement("canvas");
+      entry.append(...(kind === "aolp" ? ["AoLP ", canvas, " 0° lies to the right, 90° up"] : [ends[kind][0], canvas, ends[kind][1]]));
+      canvas.setAttribute("aria-hidden", "true");
+      kind === "aolp" ? this.wheel_legend(canvas) : this.bar(canvas, kind);
+      return entry;
+    }));
+  }
+
+  bar(canvas, kind) {
+    Object.assign(canvas, { width: 128, height: 1, className: "bar" });
+    this.paint(canvas, kind, Uint8Array.from({ length: 128 }, (_, i) => 2 * i + 1), 0);
+  }
+
+  /** AoLP by direction: opposite directions are one angle. */
+  wheel_legend(canvas) {
+    const size = 64, middle = (size - 1) / 2;
+    Object.assign(canvas, { width: size, height: size, className: "wheel" });
+    this.paint(canvas, "aolp", Uint8Array.from({ length: size * size }, (_, i) => {
+      const angle = Math.atan2(middle - Math.floor(i / size), i % size - middle) / Math.PI;
+      return Math.floor((angle + 2) * 256) % 256;
+    }), 0);
+  }
+
+  paint(canvas, kind, values, frame) {
+    const context = canvas.getContext("2d"), size = canvas.width * canvas.height, table = this.colours[kind];
+    const image = context.createImageData(canvas.width, canvas.height), top = table.length / 3;
+    for (let i = 0; i < size; i++) {
+      const entry = 3 * Math.min(top - 1, Math.floor(values[frame * size + i] / 256 * top));
+      image.data[4 * i] = table[entry];
+      image.data[4 * i + 1] = table[entry + 1];
+      image.data[4 * i + 2] = table[entry + 2];
+      image.data[4 * i + 3] = 255;
+    }
+    context.putImageData(image, 0, 0);
+  }
+
+  get frame() {
+    return Number(this.find("time").value);
+  }
+
+  draw() {
+    const ms = `${this.scene.ms[this.frame]} ms`;
+    this.find("ms").textContent = ms;
+    this.find("time").setAttribute("aria-valuetext", ms);
+    for (const pane of this.panes) this.paint(pane.canvas, pane.map.kind, pane.map.values, this.frame);
+    this.wipe();
+    this.read(false);
+  }
+
+  wipe() {
+    const [left, right] = ["left", "right"].map((role) => this.panes[this.find(role).value]);
+    const canvas = this.find("wiped"), edge = Math.round(this.find("divide").value / 100 * this.scene.width);
+    Object.assign(canvas, { width: this.scene.width, height: this.scene.height });
+    const context = canvas.getContext("2d");
+    context.drawImage(right.canvas, 0, 0);
+    if (edge > 0) context.drawImage(left.canvas, 0, 0, edge, canvas.height, 0, 0, edge, canvas.height);
+    this.find("wipe").style.setProperty("--edge", `${this.find("divide").value}%`);
+    this.find("divide").setAttribute("aria-valuetext", `${left.title} on ${this.find("divide").value} % of the width`);
+  }
+
+  play(start) {
+    clearInterval(this.timer);
+    const time = this.find("time"), button = this.find("play");
+    const next = () => { time.value = (this.frame + 1) % this.scene.ms.length; this.draw(); };
+    this.timer = start ? setInterval(next, 1000 / FRAMES_PER_SECOND) : undefined;
+    button.setAttribute("aria-pressed", String(start));
+    button.textContent = start ? "❚❚ Pause" : "▶ Play";
+  }
+
+  look(changes) {
+    const within = (value) => Math.min(100, Math.max(0, value));
+    Object.assign(this.view, changes);
+    this.view = { zoom: this.view.zoom, x: within(this.view.x), y: within(this.view.y) };
+    this.find("zoom").value = this.view.zoom;
+    for (const [name, unit] of [["zoom", ""], ["x", "%"], ["y", "%"]]) this.root.style.setProperty(`--${name}`, this.view[name] + unit);
+    this.mark();
+  }
+
+  wheel(event) {
+    if (!event.ctrlKey && !event.shiftKey) return; // the page scrolls
+    event.preventDefault();
+    this.look({ zoom: Math.min(8, Math.max(1, this.view.zoom * (event.deltaY + event.deltaX < 0 ? 1.25 : 0.8))) });
+  }
+
+  point(event) {
+    if (event.target.tagName !== "CANVAS") return;
+    const box = event.target.getBoundingClientRect(), { width, height } = this.scene;
+    if (event.buttons && this.view.zoom > 1) {
+      const room = 100 / (box.width * (1 - 1 / this.view.zoom)), tall = 100 / (box.height * (1 - 1 / this.view.zoom));
+      this.look({ x: this.view.x - event.movementX * room, y: this.view.y - event.movementY * tall });
+    }
+    const place = (offset, length, pixels) => Math.min(pixels - 1, Math.max(0, Math.floor(offset / length * pixels)));
+    this.cursor = [place(event.clientX - box.left, box.width, width), place(event.clientY - box.top, box.height, height)];
+    this.read(false);
+  }
+
+  step(event) {
+    const move = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+    if (!move) return;
+    event.preventDefault();
+    const { width, height } = this.scene, [x, y] = this.cursor ?? [width >> 1, height >> 1];
+    this.cursor = [(x + move[0] + width) % width, (y + move[1] + height) % height];
+    this.read(true);
+  }
+
+  /** Show the values at the cursor; `aloud` also writes them into the line that screen readers follow. */
+  read(aloud) {
+    this.mark();
+    if (!this.cursor) return;
+    const { width, height, rows } = this.scene, [x, y] = this.cursor;
+    const texts = this.panes.map(({ map, value, title }) => {
+      value.textContent = printed(map.kind, map.values[(this.frame * height + y) * width + x], map.scale);
+      return `${title} ${value.textContent}`;
+    });
+    const place = `Column ${Math.floor(x * rows / height)}, row ${Math.floor(y * rows / height)}`;
+    if (aloud) this.find("values").textContent = `${place}: ${texts.join(", ")}`;
+  }
+
+  mark() {
+    this.find("panes").classList.toggle("marked", Boolean(this.cursor));
+    if (!this.cursor) return;
+    const { zoom, x, y } = this.view, { width, height } = this.scene;
+    const shown = (origin, pixel, pixels) => `${origin + ((pixel + 0.5) / pixels * 100 - origin) * zoom}%`;
+    this.find("panes").style.setProperty("--left", shown(x, this.cursor[0], width));
+    this.find("panes").style.setProperty("--top", shown(y, this.cursor[1], height));
+  }
+}
+
+for (const root of document.querySelectorAll(".player")) {
+  const player = new Player(root);
+  for (const button of document.querySelectorAll("button[data-scene]"))
+    button.addEventListener("click", () => {
+      player.show(player.scenes.findIndex((scene) => scene.name === button.dataset.scene));
+      root.scrollIntoView({ block: "start" });
+      root.querySelector("select").focus({ preventScroll: true });
+    });
+}

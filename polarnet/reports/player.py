@@ -1,0 +1,137 @@
+"""The player of the pages: films of scenes as image strips inside the page, which player.js colours and plays.
+
+A strip stacks a map's frames as one grey WebP, so that the page knows values, not colours. AoLP is stored as cosine and
+sine of twice the angle, because a lossy picture of the angle itself would blur the jump from 180 to 0 degrees.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import cv2
+import matplotlib
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from polarnet.reports.artefacts import Panel
+from polarnet.reports.html import embedded_json, script, template
+from polarnet.reports.legend import Legend, with_structure
+from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, data_uri, event_full_scale, table_of
+from polarnet.storage.film import NO_EVENTS
+
+Kind = Literal["events", "s0", "dolp", "aolp"]
+
+MAX_SIDE = 320  # pixels of a map's longer side; larger maps are reduced
+MAX_FRAMES = 24  # with two maps a frame, MAX_SIDE * MAX_FRAMES stays below the 16,383 rows of a WebP
+QUALITY: Mapping[Kind, int] = {"events": 70, "s0": 75, "dolp": 80, "aolp": 60}
+TRUTH = "truth"
+
+COLOURS = {
+    "events": EVENT_TABLE,
+    "s0": table_of(matplotlib.colormaps["gray"]),
+    "dolp": DOLP_TABLE,
+    "aolp": table_of(matplotlib.colormaps["twilight"]),  # cyclic and perceptually uniform
+    "error": table_of(matplotlib.colormaps["magma"]),
+}
+
+
+class Map(NamedTuple):
+    """One quantity of a scene over its frames."""
+
+    source: str
+    """Label of what shows it: a method, the truth, the recording."""
+    kind: Kind
+    frames: UInt8[np.ndarray, "n h w"]
+    """Bytes in the steps of `polarnet.storage.film`."""
+
+
+class Film(NamedTuple):
+    """A scene of the player."""
+
+    name: str
+    t_us: Sequence[int]
+    maps: Sequence[Map]
+
+
+def panel_film(panel: Panel, legend: Legend, title: str = "") -> Film:
+    """The film of a benchmark's panel: events, truth, ours, and the other methods that are no constants."""
+    film = panel.film
+    maps = [Map("Events", "events", film["events"].numpy())]
+    maps += [Map(TRUTH, kind, film[f"truth_{kind}"].numpy()) for kind in ("s0", "aolp", "dolp")]
+    for method in sorted(with_structure(panel.dolp), key=lambda method: method != "ours"):
+        kinds: tuple[Kind, ...] = ("dolp", "aolp")
+        maps += [
+            Map(legend.label(method), kind, film[f"{kind}_{method}"].numpy())
+            for kind in kinds
+            if f"{kind}_{method}" in film
+        ]
+    return Film(f"{title}: {panel.sequence}" if title else panel.sequence, film["t_us"].tolist(), maps)
+
+
+def player_data(films: Iterable[Film]) -> dict[str, Any]:
+    """Content of the player's JSON: colour tables and scenes with their strips."""
+    return {
+        "colours": {name: table.tobytes().hex() for name, table in COLOURS.items()},
+        "scenes": [_scene(film) for film in films],
+    }
+
+
+def write_player(
+    path: Path,
+    title: str,
+    films: Sequence[Film],
+    facts: Mapping[str, str],
+    notes: Sequence[str] = (),
+    video: str | None = None,
+) -> Path:
+    """Write a page with the player, and below it `facts`; `video` names a file beside the page."""
+    player = embedded_json(player_data(films)) if films else None
+    page = template("viewer.html.jinja").render(
+        title=title, player_json=player, facts=facts, notes=notes, video=video, script=script
+    )
+    path.write_text(page, encoding="utf-8")
+    return path
+
+
+def _scene(film: Film) -> dict[str, Any]:
+    chosen = np.unique(np.linspace(0, len(film.t_us) - 1, min(MAX_FRAMES, len(film.t_us))).round().astype(int))
+    maps = [(one, _reduced(one.frames[chosen], one.kind)) for one in film.maps]
+    height, width = maps[0][1].shape[1:]
+    return {
+        "name": film.name,
+        "ms": [round(film.t_us[k] / 1000, 1) for k in chosen],
+        "height": height,
+        "width": width,
+        "rows": film.maps[0].frames.shape[1],  # of the sensor, for coordinates
+        "maps": [{"source": one.source, "kind": one.kind, **_strip(frames, one.kind)} for one, frames in maps],
+    }
+
+
+def _strip(frames: UInt8[np.ndarray, "n h w"], kind: Kind) -> dict[str, Any]:
+    """The strip's data URI and, for events, the count at its largest value."""
+    scale = 1.0
+    if kind == "events":
+        signed = frames.astype(np.float32) - NO_EVENTS
+        scale = event_full_scale(torch.from_numpy(signed))
+        frames = _bytes(127 * (signed / scale).clip(-1, 1) + NO_EVENTS)
+    if kind == "aolp":
+        doubled = frames.astype(np.float32) * (2 * np.pi / 256)
+        frames = np.concatenate([_bytes(127 * wave(doubled) + 128) for wave in (np.cos, np.sin)])
+    done, data = cv2.imencode(".webp", np.concatenate([*frames]), [cv2.IMWRITE_WEBP_QUALITY, QUALITY[kind]])
+    assert done, f"OpenCV could not encode a strip of {frames.shape}"
+    return {"scale": scale, "strip": data_uri(data.tobytes(), "webp")}
+
+
+def _reduced(frames: UInt8[np.ndarray, "n h w"], kind: Kind) -> UInt8[np.ndarray, "n h2 w2"]:
+    height, width = frames.shape[1:]
+    factor = MAX_SIDE / max(height, width)
+    if factor >= 1:
+        return frames
+    method = cv2.INTER_NEAREST if kind == "aolp" else cv2.INTER_AREA  # a mean of angles is none
+    size = (round(width * factor), round(height * factor))
+    return np.stack([cv2.resize(frame, size, interpolation=method) for frame in frames])
+
+
+def _bytes(values: np.ndarray) -> UInt8[np.ndarray, "..."]:
+    return values.round().astype(np.uint8)

@@ -1,0 +1,129 @@
+"""Films of everything that polarnet writes or reads: stores, folders of a simulation or recovery, recordings."""
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import zarr
+from torch import Tensor
+
+from polarnet.events.representations import polarity_sums
+from polarnet.events.stream import Events, slice_time
+from polarnet.recordings.recording import Recording, read_recording
+from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map
+from polarnet.storage.events import EventStore
+from polarnet.storage.film import angle_bytes, fraction_bytes, signed_bytes
+from polarnet.storage.frames import FrameStore, dequantise_angle, dequantise_fraction
+from polarnet.storage.parts import open_group
+from polarnet.storage.scenes import SceneStore
+
+MAX_FILMS = 12  # sequences of a store shown without a choice
+APPENDED: Mapping[str, Kind] = {"s0": "s0", "intensity": "s0", "dolp": "dolp", "aolp": "aolp"}
+"""Quantity of each array of recovered.zarr and truth.zarr."""
+
+
+def films_of(
+    path: Path, sequences: Sequence[str] = (), read: Callable[[Path], Recording] = read_recording
+) -> list[Film]:
+    """Films of a store, of a folder with stores, or of a camera's file, which `read` reads.
+
+    A folder gives the events, frames and recovery of a sequence in one film. Without `sequences`, the first `MAX_FILMS`
+    of each store are read. ValueError names the sequences there are for an unknown one; FileNotFoundError if there is
+    nothing to show.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: expected a store, a folder with stores or a recording; there is no such path")
+    stores = [path] if not path.is_dir() or _is_store(path) else sorted(filter(_is_store, path.glob("*.zarr")))
+    if not stores:
+        raise FileNotFoundError(f"{path}: expected a folder that holds stores (*.zarr), found none")
+    parts = [film for store in stores for film in _films(store, sequences, read)]
+    if not parts:
+        raise FileNotFoundError(f"{path}: its stores hold no frame and no event")
+    return _joined(parts)
+
+
+def _is_store(path: Path) -> bool:
+    return (path / "zarr.json").is_file()
+
+
+def _joined(parts: Sequence[Film]) -> list[Film]:
+    """One film for each name: maps of equal times and sizes together, others under the name of their store."""
+    films: dict[str, Film] = {}
+    for part in sorted(parts, key=lambda film: film.maps[0].kind == "events"):  # the truth sets the times
+        name, known = part.name, films.get(part.name)
+        if known is None:
+            films[name] = part
+        elif list(known.t_us) == list(part.t_us) and known.maps[0].frames.shape == part.maps[0].frames.shape:
+            films[name] = known._replace(maps=[*part.maps, *known.maps])
+        else:
+            films[f"{name}, {part.maps[0].kind}"] = part
+    return list(films.values())
+
+
+def _films(path: Path, sequences: Sequence[str], read: Callable[[Path], Recording]) -> Iterator[Film]:
+    if not path.is_dir():
+        yield _events_film(path.name, [read(path).events], None)
+        return
+    form = open_group(path).attrs.get("format")
+    if form == EventStore.FORMAT:
+        events, frames = EventStore.open(path), path.with_name("frames.zarr")
+        truth = FrameStore.open(frames) if _is_store(frames) else None
+        for name in _chosen(path, events.sequences, sequences):
+            times = truth.t_us(name).tolist() if truth is not None and name in truth.sequences else None
+            yield _events_film(name, events.read(name), times)
+    elif form == FrameStore.FORMAT:
+        store = FrameStore.open(path)
+        for name in _chosen(path, store.sequences, sequences):
+            truth_maps = _truth(store.intensity(name)[1:, ::2].sum(1), store.dolp(name)[1:], store.aolp(name)[1:])
+            yield Film(name, store.t_us(name).tolist()[1:], truth_maps)
+    elif form == SceneStore.FORMAT:
+        scenes = SceneStore.open(path)
+        for name in _chosen(path, list(scenes.scene_of), sequences):
+            scene = scenes.read(name)
+            yield Film(f"{name}: scene", [0], _truth(scene.s0[None], scene.dolp[None], scene.aolp[None]))
+    else:
+        yield _appended_film(path)
+
+
+def _chosen(path: Path, names: Sequence[str], sequences: Sequence[str]) -> list[str]:
+    if unknown := [name for name in sequences if name not in names]:
+        raise ValueError(f"{path}: expected sequences among {', '.join(names)}, got {', '.join(unknown)}")
+    return list(sequences) or list(names)[:MAX_FILMS]
+
+
+def _events_film(name: str, channels: Sequence[Events], times_us: Sequence[int] | None) -> Film:
+    """ON minus OFF events of the channels between the times; without times, in equal parts of the duration."""
+    if times_us is None:
+        full = [events.t for events in channels if len(events)]
+        start, stop = (min(int(t[0]) for t in full), max(int(t[-1]) for t in full) + 1) if full else (0, 1)
+        times_us = np.linspace(start, stop, MAX_FRAMES + 1).round().astype(int).tolist()
+    spans = list(itertools.pairwise(times_us))
+    sums = [torch.stack([polarity_sums(slice_time(events, *span)) for events in channels]).sum(0) for span in spans]
+    return Film(name, [stop for _, stop in spans], [Map("Events", "events", signed_bytes(torch.stack(sums)).numpy())])
+
+
+def _truth(s0: Tensor, dolp: Tensor, aolp: Tensor) -> list[Map]:
+    return _maps("truth", {"s0": fraction_bytes(s0), "dolp": fraction_bytes(dolp), "aolp": angle_bytes(aolp)})
+
+
+def _appended_film(path: Path) -> Film:
+    """A recovery or the truth of a simulation, from its growing arrays: frames spread evenly over them."""
+    group = zarr.open_group(path, mode="r")
+    arrays: dict[str, Any] = {name: group[name] for name in ("t_us", *APPENDED) if name in group}
+    if "t_us" not in arrays or len(arrays) < 2:
+        raise ValueError(f"{path}: expected arrays t_us and dolp, or a store of polarnet; got {sorted(group.keys())}")
+    places = np.unique(np.linspace(0, len(arrays["t_us"]) - 1, MAX_FRAMES).round().astype(int))
+    t_us = arrays.pop("t_us")[:][places].tolist()
+    frames = {APPENDED[name]: np.stack([array[int(k)] for k in places]) for name, array in arrays.items()}
+    read = {
+        kind: angle_bytes(dequantise_angle(steps)) if kind == "aolp" else fraction_bytes(dequantise_fraction(steps))
+        for kind, steps in frames.items()
+    }
+    return Film(path.parent.name, t_us, _maps("truth" if path.stem == "truth" else path.stem, read))
+
+
+def _maps(source: str, values: Mapping[Kind, Tensor]) -> list[Map]:
+    return [Map(source, kind, frames.numpy()) for kind, frames in values.items()]

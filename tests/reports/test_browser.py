@@ -1,0 +1,132 @@
+"""The pages in headless Chromium: they work, show everything, and ask for nothing outside."""
+
+import pytest
+
+from polarnet.reports.page import write_report
+from polarnet.reports.player import write_player
+from polarnet.reports.provenance import Run
+from polarnet.reports.viewing import films_of
+from studies.browser import axe_serious, chromium_path, cut_off, opened, settle, wear
+
+pytest.importorskip("playwright", reason="playwright is not installed: pip install 'polarnet[dev]'")
+if chromium_path() is None:
+    pytest.skip("no Chromium was found: install Debian's chromium", allow_module_level=True)
+
+RUN = Run("dvc repro", {"seed": 1, "loss": {"mse": 1.0}}, {"seed": "1", "commit": "abc"})
+LOOKS = [(width, scheme) for width in (400, 800, 1400) for scheme in ("light", "dark")]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium_path())
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def files(paths, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pages")
+    films = films_of(paths.frames)
+    return {
+        "report": write_report(paths, ["e2v"], RUN, folder),
+        "viewer": write_player(folder / "view.html", "frames.zarr", films, {"command": "polarnet view frames.zarr"}),
+    }
+
+
+def picture(page, role):
+    return page.evaluate(f"document.querySelector('[data-role={role}] canvas, canvas[data-role={role}]').toDataURL()")
+
+
+@pytest.mark.parametrize("name", ["report", "viewer"])
+def test_the_page_works_alone_and_cuts_nothing_off_on_a_phone_or_a_screen_in_light_or_dark(browser, files, name):
+    with opened(browser, files[name], 1400, "light") as (page, problems):
+        for width, scheme in LOOKS:
+            wear(page, width, scheme)
+            assert cut_off(page) == [], (width, scheme)
+        assert problems == []
+
+
+@pytest.mark.parametrize("name", ["report", "viewer"])
+def test_axe_finds_no_serious_fault(browser, files, name):
+    pytest.importorskip("axe_playwright_python", reason="pip install axe-playwright-python")
+    with opened(browser, files[name], 800, "light") as (page, _):
+        assert axe_serious(page) == []
+        wear(page, 400, "dark")
+        assert axe_serious(page) == []
+
+
+def test_all_images_load_and_all_charts_are_drawn(browser, files):
+    with opened(browser, files["report"], 1400, "light") as (page, _):
+        assert page.evaluate("[...document.images].length") > 3
+        assert page.evaluate("[...document.images].every((image) => image.complete && image.naturalWidth > 0)")
+        assert page.evaluate("[...document.querySelectorAll('[data-chart]')].every((c) => c.querySelector('svg'))")
+
+
+def test_the_time_slider_changes_the_picture_and_its_time(browser, files):
+    with opened(browser, files["viewer"], 800, "light") as (page, _):
+        before, time = picture(page, "panes"), page.inner_text("[data-role=ms]")
+        page.locator("[data-role=time]").focus()
+        page.keyboard.press("ArrowRight")
+        assert picture(page, "panes") != before
+        assert page.inner_text("[data-role=ms]") != time
+
+
+def test_the_wipe_shows_one_picture_at_each_end_and_both_between(browser, files):
+    with opened(browser, files["report"], 800, "light") as (page, _):
+        pictures = []
+        for place in (0, 50, 100):
+            page.locator("[data-role=divide]").fill(str(place))
+            pictures.append(picture(page, "wiped"))
+        panes = page.evaluate("[...document.querySelectorAll('.panes canvas')].map((c) => c.toDataURL())")
+        left, right = (int(page.input_value(f"[data-role={side}]")) for side in ("left", "right"))
+        assert pictures[0] == panes[right]
+        assert pictures[2] == panes[left]
+        assert len(set(pictures)) == 3
+
+
+def test_play_moves_on_and_pause_stops(browser, files):
+    with opened(browser, files["viewer"], 800, "light") as (page, _):
+        page.click("[data-role=play]")
+        page.wait_for_function("document.querySelector('[data-role=time]').value !== '0'")
+        page.click("[data-role=play]")
+        time = page.input_value("[data-role=time]")
+        page.wait_for_timeout(400)
+        assert page.input_value("[data-role=time]") == time
+
+
+def test_the_error_of_a_constant_tenth_less_is_read_at_the_cursor(browser, files):
+    """`ours` of the fixture is .9 of the truth, so its error is a tenth of the true DoLP beside it."""
+    with opened(browser, files["report"], 1400, "light") as (page, _):
+        page.select_option("[data-role=quantity]", label="error of DoLP")
+        page.locator("[data-role=panes]").focus()
+        page.keyboard.press("ArrowDown")
+        values = {
+            caption.split("\n")[0]: caption.split("\n")[-1]
+            for caption in page.locator(".panes figcaption").all_inner_texts()
+        }
+        ours = next(value for title, value in values.items() if title.startswith("ours"))
+        assert float(ours) == pytest.approx(0.1 * float(values["True DoLP"]), abs=0.03)
+        assert "True DoLP" in page.inner_text("[data-role=values]")
+
+
+def test_zoom_is_shared_by_all_pictures(browser, files):
+    with opened(browser, files["report"], 1400, "light") as (page, _):
+        page.locator("[data-role=zoom]").fill("3")
+        transforms = page.evaluate(
+            "[...document.querySelectorAll('.panes canvas')].map((c) => getComputedStyle(c).transform)"
+        )
+        assert len(transforms) > 3
+        assert {transform.split(",")[0] for transform in transforms} == {"matrix(3"}
+
+
+def test_a_button_beside_a_scene_opens_it_in_the_player(browser, files):
+    with opened(browser, files["report"], 1400, "light") as (page, _):
+        button = page.locator("button[data-scene]").last
+        button.click()
+        settle(page)
+        number = int(page.input_value("[data-role=scene]"))
+        names = page.locator("[data-role=scene] option").all_inner_texts()
+        assert names[number] == button.get_attribute("data-scene")
