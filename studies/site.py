@@ -81,9 +81,9 @@ def _rows(commented: Any, keys: Mapping[str, Any], part: Mapping[str, Any], sche
         if isinstance(value, Mapping) and "properties" in kind:
             yield from _rows(value, value, kind, schema, f"{prefix}{key}.")
             continue
-        shown = "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
-        shown = "a mapping" if isinstance(value, Mapping) else f"`{shown}`"
-        yield f"`{prefix}{key}`", shown, _type(kind), _comment(commented, key).replace("|", "\\|")
+        text = "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+        text = "a mapping" if isinstance(value, Mapping) else f"`{text}`"
+        yield f"`{prefix}{key}`", text, _type(kind), _comment(commented, key).replace("|", "\\|")
 
 
 def _comment(commented: Any, key: str) -> str:

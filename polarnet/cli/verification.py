@@ -1,4 +1,4 @@
-"""What `polarnet verify` checks: stores, sealed folders, checkpoints and running checkpoints, alone or in a folder."""
+"""Checks of `polarnet verify`: stores, sealed folders, checkpoints and running checkpoints, alone or in a folder."""
 
 import os
 from collections.abc import Callable, Iterator
