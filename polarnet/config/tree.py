@@ -4,6 +4,7 @@ import dataclasses
 import fnmatch
 import functools
 import logging
+import math
 import os
 import re
 import sys
@@ -16,7 +17,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from ruamel.yaml import YAML
-from ruamel.yaml.events import AliasEvent
+from ruamel.yaml.nodes import Node
 
 from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.score import BenchmarkConfig
@@ -49,6 +50,7 @@ from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
+MAX_VALUES = 10_000  # of params.yaml; it has some hundred
 EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # subfolder of the project in which DVC runs queued experiments
 DOLP_TRAINING = "ours"
 """Training of the DoLP network, in data/train beside the baselines."""
@@ -284,7 +286,7 @@ def check_overrides(root: Path, overrides: list[str], presets: Path | None = Non
     The groups are `experiment`, `sensor`, `polarizers` and `ablation`. Hydra refuses both as well, but this message
     lists the available keys and choices.
     """
-    _refuse_aliases(root / "params.yaml")
+    _refuse_many_values(root / "params.yaml")
     groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
     for override in overrides:
         key, _, value = override.partition("=")
@@ -295,11 +297,21 @@ def check_overrides(root: Path, overrides: list[str], presets: Path | None = Non
             raise ValueError(refusal)
 
 
-def _refuse_aliases(file: Path) -> None:
-    """ValueError for an alias, of which a short YAML file can make billions of values."""
-    for event in YAML(typ="safe").parse(file.read_text(encoding="utf-8")):
-        if isinstance(event, AliasEvent):
-            raise ValueError(f"{file}: expected no YAML aliases, got *{event.anchor}; write the value out")
+def _refuse_many_values(file: Path) -> None:
+    """ValueError for aliases that make more than `MAX_VALUES` values of a short YAML file."""
+    sizes: dict[int, float] = {}
+
+    def size(node: Node) -> float:
+        if id(node) not in sizes:
+            sizes[id(node)] = math.inf  # for an alias of a node inside itself
+            items = node.value if isinstance(node.value, list) else []
+            parts = (part for item in items for part in (item if isinstance(item, tuple) else (item,)))
+            sizes[id(node)] = 1 + sum(map(size, parts))
+        return sizes[id(node)]
+
+    root = YAML(typ="safe", pure=True).compose(file.read_text(encoding="utf-8"))
+    if root is not None and size(root) > MAX_VALUES:
+        raise ValueError(f"{file}: expected at most {MAX_VALUES} values, its aliases make {size(root):g}")
 
 
 def hydra_stage(main: Stage) -> Callable[[], None]:

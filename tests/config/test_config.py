@@ -1,6 +1,7 @@
 """params.yaml and conf/: what is accepted, what is refused, and with which words."""
 
 import dataclasses
+import itertools
 import functools
 import importlib.metadata
 import os
@@ -391,7 +392,10 @@ def test_the_one_deviation_of_earlier_versions_is_refused_with_the_two_of_today(
         load(project, ["emulate.contrast_threshold_sigma=0.05"])
 
 
-def test_an_alias_bomb_is_refused_at_once(project_root, tmp_path):
-    (tmp_path / "params.yaml").write_text("a: &a [1, 1]\nb: &b [*a, *a]\n")
-    with pytest.raises(ValueError, match=r"params\.yaml: expected no YAML aliases, got \*a"):
+@pytest.mark.parametrize("last", ["[*z, *z]", "&loop [*loop]"])
+def test_an_alias_bomb_is_refused_at_once(tmp_path, last):
+    names = "abcdefghijklmnopqrstuvwxyz"
+    lines = ["a: &a [1, 1]", *(f"{new}: &{new} [*{old}, *{old}]" for old, new in itertools.pairwise(names))]
+    (tmp_path / "params.yaml").write_text("\n".join([*lines, f"last: {last}\n"]))
+    with pytest.raises(ValueError, match=r"params\.yaml: expected at most 10000 values, its aliases make"):
         check_overrides(tmp_path, [])
