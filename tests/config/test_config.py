@@ -1,9 +1,9 @@
 """params.yaml and conf/: what is accepted, what is refused, and with which words."""
 
 import dataclasses
-import itertools
 import functools
 import importlib.metadata
+import itertools
 import os
 import re
 import shutil
