@@ -132,8 +132,8 @@ class RecoveryWriter:
         self._wait(MAX_QUEUED if usable_cores() > FEW_CORES else 0)
         self.frames += 1
 
-    def write_page(self, title: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:
-        """Write index.html and recovered.png; call it after the `with` block."""
+    def write_page(self, source: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:
+        """Write index.html about the recovery from `source`, and recovered.png; call it after the `with` block."""
         pictures = self._sample.pictures
         if pictures:
             margin = ((GAP, GAP), (GAP, GAP), (0, 0))
@@ -141,7 +141,8 @@ class RecoveryWriter:
             sheet = [np.pad(pictures[k].pixels, margin, constant_values=255) for k in np.unique(places)]
             (self.folder / "recovered.png").write_bytes(encode_png(np.concatenate(sheet)))
         video = VIDEO if "mp4" in self.outputs and self.frames else None
-        films = [_film(title, pictures)] if pictures else []
+        films = [_film(source, pictures)] if pictures else []
+        title = f"{'Intensity' if self._plain else 'DoLP'} from events: {source}"
         return write_player(self.folder / "index.html", title, films, facts, notes, video)
 
     def _wait(self, most: int) -> None:
@@ -253,12 +254,12 @@ def _byte_maps(window: EventWindow, prediction: Prediction) -> dict[Kind, UInt8[
     return maps if prediction.aolp is None else maps | {"aolp": angle_bytes(prediction.aolp)}
 
 
-def _film(title: str, pictures: Sequence[Picture]) -> Film:
+def _film(source: str, pictures: Sequence[Picture]) -> Film:
     """The film of a recovery for the page's player."""
     maps = [
         Map("recovered", kind, torch.stack([one.maps[kind] for one in pictures]).numpy()) for kind in pictures[0].maps
     ]
-    return Film(title, [one.t_us for one in pictures], maps)
+    return Film(source, [one.t_us for one in pictures], maps)
 
 
 def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:

@@ -250,7 +250,7 @@ def test_a_method_that_reconstructs_intensity_gives_the_video_of_a_camera_withou
     group = zarr.open_group(tmp_path / "out" / "recovered.zarr", mode="r")
     assert set(group.array_keys()) == {"t_us", "intensity"}
     assert group["intensity"].shape == (3, HEIGHT, WIDTH)
-    assert "camera.txt" in (tmp_path / "out" / "index.html").read_text()
+    assert "Intensity from events: camera.txt" in (tmp_path / "out" / "index.html").read_text()
     four = [*[str(file)] * 4, "--angles", "0", "45", "90", "135"]  # the same light behind all
     assert main(["recover", *four, "--method", method, "--out", str(tmp_path / "four"), *weights]) == 0
     dolp = zarr.open_group(tmp_path / "four" / "recovered.zarr", mode="r")["dolp"][:]
