@@ -299,9 +299,9 @@ def check_overrides(root: Path, overrides: list[str], presets: Path | None = Non
 
 def _refuse_many_values(file: Path) -> None:
     """ValueError for aliases that make more than `MAX_VALUES` values of a short YAML file."""
-    sizes: dict[int, float] = {}
+    sizes: dict[int, int | float] = {}
 
-    def size(node: Node) -> float:
+    def size(node: Node) -> int | float:
         if id(node) not in sizes:
             sizes[id(node)] = math.inf  # for an alias of a node inside itself
             items = node.value if isinstance(node.value, list) else []
