@@ -5,12 +5,13 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help setup repro test lint smoke clean
+.PHONY: help setup repro test lint docs smoke clean
 
 help:
 	@echo "make repro   set up and run the whole pipeline; the page is data/report/index.html"
 	@echo "make test    set up and run the tests"
 	@echo "make lint    ruff, mypy, import-linter, tables up to date"
+	@echo "make docs    the documentation site, in outputs/site"
 	@echo "make smoke   the pipeline at CI size, in outputs/run/smoke"
 	@echo "make clean   remove the virtual environment and caches (data/ stays)"
 
@@ -34,6 +35,9 @@ lint: setup
 	mypy
 	lint-imports
 	python -m studies.docs --check
+
+docs: setup
+	NO_MKDOCS_2_WARNING=1 mkdocs build
 
 smoke: setup
 	polarnet run experiment=smoke

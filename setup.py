@@ -1,4 +1,4 @@
-"""Puts the settings into the wheel: a copy of params.yaml and conf/. Everything else stands in pyproject.toml."""
+"""Puts the settings and the pipeline into the wheel, as copies. Everything else stands in pyproject.toml."""
 
 import shutil
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from setuptools import setup
 from setuptools.command.build_py import build_py
 
-SETTINGS = ("params.yaml", "conf")
+SETTINGS = ("params.yaml", "dvc.yaml", "conf/**/*.yaml", "stages/*.py", "data/*/README.md")
 INSTALLED = Path("polarnet", "config", "settings")  # polarnet.runtime.files.shipped_settings reads it
 
 
@@ -20,11 +20,10 @@ class BuildWithSettings(build_py):
             return
         folder = Path(self.build_lib) / INSTALLED
         shutil.rmtree(folder, ignore_errors=True)
-        for name in SETTINGS:
-            for source in sorted(path for path in (Path(name), *Path(name).rglob("*.yaml")) if path.is_file()):
-                target = folder / source
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(source, target)
+        for source in (path for pattern in SETTINGS for path in sorted(Path().glob(pattern))):
+            target = folder / source
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, target)
 
 
 setup(cmdclass={"build_py": BuildWithSettings})

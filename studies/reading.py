@@ -21,7 +21,7 @@ from studies.measure import arguments_of, command_line, machine_record, write_se
 
 MAX_WORDS = 40
 GENERATED = re.compile(r"<!-- results:.*?<!-- /results:[\w-]+ -->", re.DOTALL)
-SENTENCE_END = re.compile(r"(?<=[.!?])[)\"']*\s+(?=[A-Z\"'(`])")
+SENTENCE_END = re.compile(r"(?<=[.!?])[)\"']*\s+(?=[A-Z\"'(`]|polarnet\b|v2e\b)")
 ABBREVIATION = re.compile(r"\b(?:e\.g|i\.e|vs|Eq|Eqs|Fig|Figs|Sec|Ref|et al|approx|No|resp)\.$")
 WORD = re.compile(r"\S*\w\S*")
 

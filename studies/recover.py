@@ -42,7 +42,7 @@ from polarnet.networks.registry import NETWORKS
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import write_store
 from polarnet.recordings.live import LiveLines, Piece
-from polarnet.recovery.recover import Input, Summary, frames_of, recover
+from polarnet.recovery.stream import Input, Summary, frames_of, recover
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import precision_on, tune
 from polarnet.simulation import simulate

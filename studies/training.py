@@ -37,7 +37,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from polarnet.config.tree import load
 from polarnet.events.representations import REPRESENTATIONS, channels_of
 from polarnet.networks.registry import NETWORKS
-from polarnet.recovery.recover import PIXELS_AT_ONCE
+from polarnet.recovery.stream import PIXELS_AT_ONCE
 from polarnet.runtime.machine import configure, device_of, limit_threads, precision_on, usable_cores
 from polarnet.stokes import Prediction
 from polarnet.training.loop import autocast

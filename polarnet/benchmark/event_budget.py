@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
-from tqdm import tqdm
 
 from polarnet.benchmark.between_windows import frames_between
 from polarnet.benchmark.resimulate import sequence_at
@@ -30,6 +29,7 @@ from polarnet.events.streaming import EventWindow
 from polarnet.methods import METHODS
 from polarnet.methods.between import BetweenConfig
 from polarnet.metrics.similarity import correlation, mse, psnr
+from polarnet.runtime.progress import ProgressBar
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
 
@@ -53,7 +53,7 @@ def since_start(sequences: Iterable[TestSequence], methods: Sequence[str], conte
     """
     rows: dict[int, list[FrameScore]] = {}
     rates: dict[int, list[float]] = {}
-    for sequence in tqdm(list(sequences), "events since the start", unit="sequence"):
+    for sequence in ProgressBar(list(sequences), "events since the start", unit="sequence"):
         predictions = predictions_of(methods, sequence, context)
         per_pixel = events_per_pixel(sequence.events, sequence.t_us[1:]).tolist()
         for row in score_sequence(sequence, predictions, 0, None, context.device):
@@ -88,7 +88,7 @@ def by_window_length(
     The truth is rendered at the end of each window. ValueError if no window of some length ends after `settle_us`.
     """
     table: dict[str, list[dict]] = {method: [] for method in methods}
-    for length_us in tqdm(lengths_us, "window length", unit="length"):
+    for length_us in ProgressBar(lengths_us, "window length", unit="length"):
         rows: list[FrameScore] = []
         per_window: list[float] = []
         for sequence in sequences:
@@ -181,9 +181,9 @@ def by_sliding_window(
     table = []
     tests = [
         sequence_at(scenes, name, events.read(name), torch.tensor([times[0] - spacing_us, *times]))
-        for name in tqdm(sequences, "truth", unit="sequence")
+        for name in ProgressBar(sequences, "truth", unit="sequence")
     ]
-    for per_pixel in tqdm(EVENTS_PER_PIXEL, "overlapping windows", unit="size"):
+    for per_pixel in ProgressBar(EVENTS_PER_PIXEL, "overlapping windows", unit="size"):
         for carry in (False, True):
             of_sequences = [_sliding_scores(one, per_pixel, times, carry, method, context) for one in tests]
             means = {name: float(np.mean([scores[name] for scores in of_sequences])) for name in of_sequences[0]}
@@ -206,7 +206,7 @@ def between_windows(
     times = list(range(span_us[0], span_us[1] + 1, spacing_us))
     recoverer = opened(METHODS[method], context)
     of_sequences = []
-    for name in tqdm(sequences, "frames between windows", unit="sequence"):
+    for name in ProgressBar(sequences, "frames between windows", unit="sequence"):
         channels = events.read(name)
         run = sequence_at(scenes, name, channels, torch.arange(0, span_us[1] + 1, window_us))
         truth = sequence_at(scenes, name, channels, torch.tensor([times[0] - spacing_us, *times]))

@@ -18,6 +18,7 @@ import torch
 from polarnet.benchmark.run import Benchmark, Panel
 from polarnet.benchmark.score import Cost, FrameScore
 from polarnet.metrics.reliability import Reliability
+from polarnet.runtime.files import check_seal, seal
 
 MADE_BY = "run `dvc repro`, or `python -m stages.benchmark` for all rows"
 
@@ -47,12 +48,14 @@ def write_row(folder: Path, row: str, record: RowRecord, sets: Mapping[str, Benc
         for panel in benchmark.panels:
             write_panel(folder / name / "panels", panel.of_row(row))
     (folder / "row.json").write_text(json.dumps(record._asdict(), indent=2) + "\n")
+    seal(folder)
 
 
 def read_record(folder: Path) -> RowRecord:
-    """Content of row.json; FileNotFoundError if the row was not run."""
+    """Content of row.json; FileNotFoundError if the row was not run, ValueError if a file of the folder has changed."""
     if not (folder / "row.json").exists():
         raise FileNotFoundError(f"{folder / 'row.json'} is missing: row {folder.name} was not run; {MADE_BY}")
+    check_seal(folder)
     return RowRecord(**json.loads((folder / "row.json").read_text()))
 
 

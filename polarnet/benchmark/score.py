@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from pydantic import NonNegativeInt, PositiveInt
+from pydantic import Field, NonNegativeInt
 from torch import Tensor
 
 from polarnet.benchmark.rows import ROWS
@@ -58,7 +58,7 @@ class BenchmarkConfig:
     """Whether to compute LPIPS."""
     lpips_backbone: Annotated[str, one_of(BACKBONES)]
     """Backbone of LPIPS, always in fp32; the paper uses vgg."""
-    bootstrap_samples: PositiveInt
+    bootstrap_samples: Annotated[int, Field(gt=0, le=1_000_000)]
     panel_scenes: NonNegativeInt
     """Number of scenes shown as panels."""
 

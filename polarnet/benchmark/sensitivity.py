@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from polarnet.benchmark.resimulate import resimulated
 from polarnet.benchmark.rows import Context, predictions_of
 from polarnet.benchmark.score import FrameScore, mean_scores, score_sequence
+from polarnet.runtime.progress import ProgressBar
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
@@ -78,7 +78,7 @@ def sensitivity(
     """
     table: dict[str, list[dict[str, Any]]] = {}
     points = [(setting, value) for setting, values in settings.items() for value in values]
-    for setting, value in tqdm(points, "sensitivity", unit="setting"):
+    for setting, value in ProgressBar(points, "sensitivity", unit="setting"):
         rows: list[FrameScore] = []
         rates: list[float] = []
         left_out: list[str] = []

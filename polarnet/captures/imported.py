@@ -21,7 +21,7 @@ from polarnet.captures.dot import (
 )
 from polarnet.events.stream import Events
 from polarnet.recordings.arrangements import shifted
-from polarnet.runtime.files import sha256
+from polarnet.runtime.files import check_seal, seal, sha256
 from polarnet.storage.events import EventStore
 
 STATUS_FILE = "status.json"
@@ -67,13 +67,18 @@ def import_targets(root: Path, out: Path, config: RecordingsConfig) -> list[str]
             np.savez(folder / f"{capture}_times.npz", t_us=pictures.t_us, region=pictures.region)
         content = {"origin_us": origins, "given_us": given_starts(root / name)}
         (folder / "clocks.json").write_text(json.dumps(content, indent=2) + "\n")
+        seal(folder)
     store.finish()
     return names
 
 
 def open_target(imported: Path, name: str) -> Target:
-    """Open an imported target, its events by the clocks of their files; pictures are memory-mapped."""
+    """Open an imported target, its events by the clocks of their files; pictures are memory-mapped.
+
+    ValueError if a file has changed since the import.
+    """
     folder = imported / name
+    check_seal(folder)
     clocks = json.loads((folder / "clocks.json").read_text())
     channels = EventStore.open(imported / "events.zarr").read(name)
     events = {

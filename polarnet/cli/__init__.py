@@ -5,23 +5,22 @@ import sys
 from collections.abc import Sequence
 
 from polarnet import __version__
-from polarnet.cli import benchmark, convert, demo, networks, project, recordings, sensors, simulate, stores
-from polarnet.runtime.environment import let_threads_sleep
-
-INTERRUPTED = 130  # exit status of shells after Ctrl-C
+from polarnet.cli import benchmark, convert, demo, networks, new, project, recordings, sensors, simulate, stores
+from polarnet.runtime.environment import INTERRUPTED, STOPPED, let_threads_sleep, silence_bindings
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; the exit status."""
     let_threads_sleep()
+    silence_bindings()
     options = _options(arguments)
     try:
         return options.run(options)
-    except (ValueError, FileNotFoundError, RuntimeError) as error:
-        print(f"polarnet {options.command}: {error}", file=sys.stderr)
+    except (ValueError, OSError, RuntimeError, MemoryError) as error:
+        print(f"polarnet {options.command}: {error or type(error).__name__}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print(f"polarnet {options.command}: stopped", file=sys.stderr)
+        print(f"polarnet {options.command}: {STOPPED}", file=sys.stderr)
         return INTERRUPTED
 
 
@@ -44,6 +43,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"polarnet {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for subject in (demo, project, stores, simulate, recordings, convert, sensors, networks, benchmark):
+    for subject in (demo, project, new, stores, simulate, recordings, convert, sensors, networks, benchmark):
         subject.add_to(commands)
     return parser

@@ -13,6 +13,18 @@ if TYPE_CHECKING:
     from polarnet.config.tree import Config
     from polarnet.recordings.noise import Cleaning
 
+DESCRIPTION = """\
+--scenes simulates event sequences from the pictures of a folder, runs every method whose weights are available,
+prints the table and writes it with a page; it trains nothing. --recordings does the same on recordings of a camera
+with a polarizer mosaic that hold frames. --event-budget and --sensitivity study the pipeline's own test sequences.
+params.yaml sets sizes, motion and sensor."""
+
+EXAMPLES = """\
+examples:
+  polarnet benchmark --scenes photographs/ --limit 10 --methods cf,highpass,ours
+  polarnet benchmark --recordings pdavis/ --hot-pixels found
+  polarnet benchmark --event-budget --limit 4"""
+
 PDAVIS = "90 45 / 135 0"
 
 
@@ -21,10 +33,9 @@ def add_to(commands: Commands) -> None:
     benchmark = commands.add_parser(
         "benchmark",
         help="score every method on your own scenes or recordings, or study event budget and sensitivity",
-        description="--scenes simulates event sequences from the pictures of a folder, runs every method whose weights "
-        "are available, prints the table and writes it with a page; it trains nothing. --recordings does the same "
-        "on recordings of a camera with a polarizer mosaic that hold frames. --event-budget and --sensitivity study "
-        "the pipeline's own test sequences. params.yaml sets sizes, motion and sensor.",
+        description=DESCRIPTION,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     asked = benchmark.add_mutually_exclusive_group(required=True)
     asked.add_argument(
@@ -61,7 +72,9 @@ def add_to(commands: Commands) -> None:
     benchmark.add_argument(
         "--methods", help="methods, separated by commas (default: benchmark.methods; studies have a list of their own)"
     )
-    benchmark.add_argument("--limit", type=int, metavar="N", help="use only the first N test sequences in a study")
+    benchmark.add_argument(
+        "--limit", type=int, metavar="N", help="use only N pictures of --scenes, or N test sequences"
+    )
     benchmark.add_argument("overrides", nargs="*", help="values that replace those of params.yaml: seed=2")
     benchmark.set_defaults(run=_benchmark)
 
@@ -71,10 +84,10 @@ def _benchmark(options: argparse.Namespace) -> int:
     from polarnet.runtime.machine import configure, usable_cores
 
     own = options.scenes or options.recordings
-    if own and options.limit is not None:
-        raise ValueError(
-            "--limit applies to --event-budget and --sensitivity only; a folder of your own is scored as a whole"
-        )
+    if options.recordings and options.limit is not None:
+        raise ValueError("--limit does not apply to --recordings; leave it out")
+    if options.limit is not None and options.limit < 1:
+        raise ValueError(f"--limit: expected at least 1, got {options.limit}")
     if not options.recordings and (options.mosaic or options.hot_pixels or options.background):
         raise ValueError("--mosaic, --hot-pixels and --background apply to --recordings only; leave them out")
     settings = settings_root() if own else project_root()  # a study needs the pipeline's test sequences
@@ -102,11 +115,12 @@ def _own_folder(
     from polarnet.reports.tables import as_plain
     from polarnet.stokes import parse_mosaic
 
-    kind = "--scenes" if options.scenes else "--recordings"
-    command = f"polarnet benchmark {kind} {options.scenes or options.recordings}"
-    with run_folder(out, f"benchmark {kind}") as folder:
+    source = "--scenes" if options.scenes else "--recordings"
+    command = f"polarnet benchmark {source} {options.scenes or options.recordings}"
+    with run_folder(out, f"benchmark {source}") as folder:
         if options.scenes:
-            notes = benchmark_folder(config, root, options.kind, folder, out / WORK, weights, command)
+            kind, limit = options.kind, options.limit
+            notes = benchmark_folder(config, root, kind, folder, out / WORK, weights, command, limit)
         else:
             mosaic = parse_mosaic(options.mosaic or PDAVIS)
             notes = benchmark_recordings(config, root, mosaic, cleaning, folder, out / WORK, weights, command)

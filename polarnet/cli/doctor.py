@@ -15,6 +15,10 @@ from polarnet.config.tree import load
 from polarnet.methods import METHODS
 from polarnet.metrics.lpips import BACKBONES
 from polarnet.metrics.lpips_weights import local_source
+from polarnet.networks.checkpoint import load_checkpoint
+from polarnet.networks.weights import shipped_weights
+from polarnet.runtime.extras import EXTRAS, installation, missing, requirements
+from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import bf16_units, usable_cores
 
 PACKAGES = ("torch", "numpy", "numba", "zarr", "OpenImageIO", "opencv-contrib-python-headless", "scikit-image",
@@ -22,7 +26,7 @@ PACKAGES = ("torch", "numpy", "numba", "zarr", "OpenImageIO", "opencv-contrib-py
 
 
 def findings() -> Iterator[str]:
-    """Readable lines on versions, device, threads, bf16 and AMX, LPIPS weights, memory and free disk space."""
+    """Readable lines on versions, device, bf16 and AMX, weights, extras, memory and free disk space."""
     yield f"polarnet   {_version('polarnet')}"
     yield f"system     Python {platform.python_version()}, {platform.platform()}"
     yield "packages   " + ", ".join(f"{name} {_version(name)}" for name in PACKAGES)
@@ -31,6 +35,9 @@ def findings() -> Iterator[str]:
     yield f"bf16       {_bf16()}"
     for backbone in BACKBONES:
         yield f"LPIPS      {_lpips(backbone)}"
+    yield f"weights    {_shipped()}"
+    for extra, task in EXTRAS.items():
+        yield f"extra      {_extra(extra, task)}"
     memory = psutil.virtual_memory()
     yield f"memory     {memory.available / 2**30:.1f} of {memory.total / 2**30:.1f} GiB free"
     yield f"disk       {shutil.disk_usage('.').free / 2**30:.1f} GiB free here"
@@ -59,6 +66,22 @@ def _lpips(backbone: str) -> str:
         return f"{backbone}: {local_source(backbone, None)}"
     except ValueError as error:
         return str(error)
+
+
+def _shipped() -> str:
+    """The checkpoint that comes with the package, and its network."""
+    try:
+        file = shipped_weights()
+    except FileNotFoundError as error:
+        return str(error)
+    return f"{file} (network {load_checkpoint(file)[1]['network']}, sha256 {sha256(file)[:12]})"
+
+
+def _extra(extra: str, task: str) -> str:
+    if not requirements(extra):
+        return f"{extra} ({task}): not known to this installation; {installation(extra)}"
+    absent = missing(extra)
+    return f"{extra} ({task}): " + (f"{', '.join(absent)} missing; {installation(extra)}" if absent else "installed")
 
 
 def _version(package: str) -> str:

@@ -50,12 +50,20 @@ class Inputs(NamedTuple):
 
 
 def benchmark_folder(
-    config: Config, root: Path, kind: str, out: Path, work: Path, weights: Path | None, command: str
+    config: Config,
+    root: Path,
+    kind: str,
+    out: Path,
+    work: Path,
+    weights: Path | None,
+    command: str,
+    limit: int | None = None,
 ) -> list[str]:
     """Run the benchmark on a folder of photographs or measured scenes, without training; return the notes.
 
     `out` receives metrics.json, cost.json, details.json, frames.csv, panels and index.html. `work` receives the
-    pictures, scenes and events, so a stopped run resumes and a second run only runs the methods. Methods without
+    pictures, scenes and events, so a stopped run resumes and a second run only runs the methods. `limit` is the
+    maximum number of pictures. Methods without
     weights are left out and unusable files are skipped; `notes` lists both. Size, duration and sensor are printed
     first, with a warning if a network was trained with others. `weights` is a checkpoint of the DoLP network; None
     uses the shipped one. Raises ValueError if the folder has no usable file, or if the weights for an LPIPS column are
@@ -65,7 +73,7 @@ def benchmark_folder(
     used = configured(config.synthesize, config.emulate)
     conditions = announced(used, metadata_used(inputs.methods, inputs.context), SET_THEM)
     try:
-        make_folder_set(root, kind, work, config.recipe, config.mapper)
+        make_folder_set(root, kind, work, config.recipe, config.mapper, limit)
     except ValueError as error:
         raise ValueError(f"--scenes {root}: no scene to score. {error}") from error
     notes = [*_skipped(config, work), *(_left_out(row, reason) for row, reason in inputs.left_out.items())]

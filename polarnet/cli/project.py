@@ -18,7 +18,7 @@ CODE = ("polarnet/", "stages/")
 
 def add_to(commands: Commands) -> None:
     """Add the commands doctor, preset, run and stages."""
-    doctor = commands.add_parser("doctor", help="report versions, device, bf16 support, LPIPS weights, memory and disk")
+    doctor = commands.add_parser("doctor", help="report versions, device, weights, extras, memory and disk")
     doctor.add_argument(
         "--weights",
         type=Path,

@@ -1,10 +1,11 @@
 """Commands for recordings: inspect, recover DoLP, replay."""
 
 import argparse
+import contextlib
 import functools
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.parsers import (
@@ -19,20 +20,50 @@ from polarnet.cli.parsers import (
 )
 from polarnet.cli.project import settings_root
 
+if TYPE_CHECKING:
+    from polarnet.storage.true_frames import TrueFrames
+
 CLEANING_OPTIONS = ("hot_pixels", "background")
 """Options that remove noise before recovery."""
+
+RECONSTRUCT = "highpass"
+"""Method whose intensities are the S0 of the video."""
+
+BESIDE = ""
+"""Value of --truth without a path."""
 
 NETWORK_WINDOW = "33.333ms"
 
 OPTIONS_BY_INPUT = {
-    "--live": {"mosaic", "rate", *CLEANING_OPTIONS},
-    "four files": {"angles", "size", "rate", *CLEANING_OPTIONS, *READING_OPTIONS},
-    "one file with --mosaic": {"mosaic", "size", "rate", *CLEANING_OPTIONS, *READING_OPTIONS},
+    "--live": {"mosaic", "rate", "rerun", *CLEANING_OPTIONS},
+    "four files": {"angles", "size", "rate", "rerun", *CLEANING_OPTIONS, *READING_OPTIONS},
+    "one file with --mosaic": {"mosaic", "size", "rate", "rerun", *CLEANING_OPTIONS, *READING_OPTIONS},
     "one file with --rotating or --triggers": {"rotating", "triggers", "start_angle", "size", *READING_OPTIONS},
-    "one file without polarizers": {"size", *CLEANING_OPTIONS, *READING_OPTIONS},
-    "an event store or a folder": {"sequence", "size", "rate", *CLEANING_OPTIONS},
+    "one file without polarizers": {"size", "rerun", *CLEANING_OPTIONS, *READING_OPTIONS},
+    "an event store or a folder": {"sequence", "truth", "size", "rate", "rerun", *CLEANING_OPTIONS},
 }
 """Options of `polarnet recover` that apply to each kind of input."""
+
+
+RECOVER_DESCRIPTION = """\
+Writes frames, pictures, a video and a page. INPUT is one of:
+  four files, one for each polarizer, with --angles
+  one file of a camera with polarizers on its pixels, with --mosaic
+  one file of a camera behind a rotating polarizer, with --rotating or --triggers
+  an event store, or a folder that `polarnet export` or `polarnet simulate --format hdf5` wrote
+  a folder of division-of-time captures
+  with --live, a growing file or standard input (-) with lines `t x y p angle`, or a camera with --mosaic:
+  dv://HOST:PORT of a program that streams its events, or dv://camera
+With a --method that reconstructs intensity, any other file of a camera gives plain intensity."""
+
+RECOVER_EXAMPLES = """\
+examples:
+  polarnet recover recording.aedat4 --mosaic "90 45 / 135 0"
+  polarnet recover 0.raw 45.raw 90.raw 135.raw --angles 0 45 90 135 --hot-pixels found
+  polarnet recover outputs/simulate/lake/events.zarr --truth
+  polarnet recover data/events.zarr --sequence lake-0 --rate 2000 --write mp4
+  polarnet recover camera.raw --rotating 15
+  polarnet recover dv://camera --live --mosaic "90 45 / 135 0\""""
 
 
 def add_to(commands: Commands) -> None:
@@ -53,7 +84,8 @@ def _add_inspection(commands: Commands) -> None:
     add_reading(inspect)
     inspect.add_argument("--part", metavar="SEQUENCE/ANGLE", help="sequence and channel of an event store: NAME/45")
     add_hot_pixel_factor(inspect)
-    inspect.add_argument("--picture", type=Path, help="PNG of the busiest moment (default: outputs/inspect/FILE.png)")
+    inspect.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the PNG (default: outputs/inspect)")
+    inspect.add_argument("--picture", type=Path, help="PNG of the busiest moment (default: OUT/FILE.png)")
     inspect.add_argument(
         "--hot-pixels", type=Path, metavar="PNG", help="PNG of the number of events of each pixel (default: not drawn)"
     )
@@ -64,12 +96,9 @@ def _add_recovery(commands: Commands) -> None:
     recover = commands.add_parser(
         "recover",
         help="recover DoLP and AoLP from recordings or from a running camera",
-        description="Writes frames, pictures, a video and a page. With a --method that reconstructs intensity, any "
-        "other file of a camera gives plain intensity. INPUT is one of: four files, one for each polarizer, "
-        "with --angles; one file of a camera with polarizers on its pixels, with --mosaic; one file of a "
-        "camera behind a rotating polarizer, with --rotating or --triggers; an event store; a folder of "
-        "division-of-time captures; with --live, a growing file or standard input (-) with lines `t x y p angle`, or a "
-        "camera with --mosaic: dv://HOST:PORT of a program that streams its events, or dv://camera.",
+        description=RECOVER_DESCRIPTION,
+        epilog=RECOVER_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     _add_input(recover)
     add_cleaning(recover)
@@ -100,7 +129,12 @@ def _add_input(recover: argparse.ArgumentParser) -> None:
     recover.add_argument(
         "--start-angle", type=float, metavar="DEG", help="its angle at time 0, or at the first trigger (default: 0)"
     )
-    recover.add_argument("--sequence", metavar="NAME", help="sequence of an event store with several")
+    recover.add_argument("--sequence", metavar="NAME", help="sequence of an event store or folder with several")
+    recover.add_argument(
+        "--truth", nargs="?", const=BESIDE, metavar="FRAMES",
+        help="score the frames against the true frames of an event store: frames.zarr or truth.zarr (default: those "
+        "beside the store)",
+    )  # fmt: skip
     recover.add_argument("--live", action="store_true", help="recover while events arrive, and print the latency")
     recover.add_argument(
         "--idle",
@@ -162,6 +196,10 @@ def _add_output(recover: argparse.ArgumentParser) -> None:
         "--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), help="file types to write (default: zarr png mp4)"
     )
     recover.add_argument(
+        "--rerun", type=Path, metavar="FILE|viewer",
+        help="also log events, frames, expected errors and timings for Rerun: into FILE.rrd, or to the running viewer",
+    )  # fmt: skip
+    recover.add_argument(
         "--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)"
     )
 
@@ -187,7 +225,8 @@ def _inspect(options: argparse.Namespace) -> int:
     inspection = inspect_recording(recording, options.hot_pixel_factor)
     for finding in findings(inspection):
         print(finding)
-    path = options.picture or Path("outputs") / "inspect" / f"{options.file.name}.png"
+    folder = options.out or Path("outputs") / "inspect"
+    path = options.picture or folder / f"{options.file.name}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(recording_picture(inspection))
     print(f"picture     {path}")
@@ -203,12 +242,15 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.config.pipeline import setup_of
     from polarnet.config.tree import load
     from polarnet.events.streaming import WindowRule, parse_window
+    from polarnet.methods import METHODS
     from polarnet.recordings.noise import Cleaner
     from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recordings.recording import read_recording
     from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
-    from polarnet.recovery.recover import Arrangement, facts_of, frames_of, open_files, open_live, open_method, recover
+    from polarnet.recovery.stream import Arrangement, facts_of, frames_of, open_files, open_live, open_method, recover
+    from polarnet.recovery.watching import TruthScores, logged
     from polarnet.recovery.writer import RecoveryWriter
+    from polarnet.reports.rerun_log import RerunLog
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
     refuse_unused_options(options)
@@ -234,6 +276,7 @@ def _recover(options: argparse.Namespace) -> int:
         check_rate(options.rate, rule, recoverer)
         rate = Rate(options.rate, config().between.with_thresholds(options.thresholds))
         frames = functools.partial(frames_at_rate, rate=rate)
+    truth = _truth_of(options)
     name = "live" if options.live else Path(options.input[0]).stem
     out = options.out or Path("outputs") / "recover" / name
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
@@ -253,8 +296,19 @@ def _recover(options: argparse.Namespace) -> int:
         check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
         if source.channels == len(POLARIZER_ANGLES_DEG):
             source = source._replace(pieces=check.watch(source.pieces))
-        writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
-        summary = recover(source, rule, recoverer, writer, frames)
+        kinds = options.write or ("zarr", "png", "mp4")
+        drawn = "mp4" in kinds and source.channels == len(POLARIZER_ANGLES_DEG) and truth is None
+        reconstruct = METHODS[RECONSTRUCT].open(setup_of(config(), METHODS[RECONSTRUCT])) if drawn else None
+        writer = RecoveryWriter(folder, kinds, options.video_rate, reconstruct, truth)
+        scores = TruthScores(truth) if truth else None
+        if scores:
+            run, watch = frames, scores.watch
+            frames = lambda *inputs: watch(run(*inputs))  # noqa: E731
+        with contextlib.ExitStack() as stack:
+            if options.rerun:
+                log, inner = stack.enter_context(RerunLog(options.rerun, source.name)), frames
+                frames = lambda *inputs: logged(log, inner(*inputs), options.live)  # noqa: E731
+            summary = recover(source, rule, recoverer, writer, frames)
         left_out = {kind: count for kind, count in lines.counts.items() if count} if lines else {}
         notes = check.findings() if source.channels > 1 else []
         notes += [f"Unusable lines were left out: {left_out}."] if left_out else []
@@ -264,6 +318,8 @@ def _recover(options: argparse.Namespace) -> int:
             facts["rate"] = f"{options.rate:g} frames a second, carried on by the events from window to window"
         if source.channels > 1:
             facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
+        if scores:
+            facts["scores"] = scores.sentence(config().benchmark.warmup_windows)
         if any(getattr(options, option) for option in CLEANING_OPTIONS):
             facts["removed"] = cleaner.sentence()
         page = writer.write_page(source.name, facts, notes)
@@ -273,6 +329,23 @@ def _recover(options: argparse.Namespace) -> int:
         print(f"polarnet recover: warning: {note}", file=sys.stderr)
     print(f"page        {out / page.name}")
     return 0
+
+
+def _truth_of(options: argparse.Namespace) -> "TrueFrames | None":
+    """True frames of option --truth; ValueError if the input is not a store with them."""
+    from polarnet.recordings.recording import detect_format
+    from polarnet.storage.events import EventStore
+    from polarnet.storage.true_frames import open_truth, truth_beside
+
+    if options.truth is None:
+        return None
+    path = options.input[0]
+    if options.size or detect_format(Path(path)) != "store":
+        raise ValueError("--truth: expected an event store in its own size; leave out --truth or --size")
+    truth = truth_beside(path) if options.truth == BESIDE else options.truth
+    if truth is None:
+        raise ValueError(f"--truth: expected frames.zarr or truth.zarr beside {path}, there is none; name them")
+    return open_truth(truth, options.sequence or EventStore.open(path).sequences[0])
 
 
 def _reconstructs(method: str | None) -> bool:
@@ -287,8 +360,8 @@ def _recover_rotating(options: argparse.Namespace) -> int:
     from polarnet.methods.half_turns import half_turns_recoverer
     from polarnet.methods.rotating_polarizer import rotating_recoverer
     from polarnet.recordings.recording import read_recording
-    from polarnet.recovery.recover import facts_of, recover
     from polarnet.recovery.rotating import half_turn_rule, open_rotating, rotation_of
+    from polarnet.recovery.stream import facts_of, recover
     from polarnet.recovery.writer import RecoveryWriter
 
     if options.method not in (None, "rotating_polarizer") or options.weights or options.thresholds:
@@ -358,7 +431,7 @@ def refuse_unused_options(options: argparse.Namespace) -> None:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    from polarnet.recovery.recover import replay
+    from polarnet.recovery.stream import replay
     from polarnet.storage.events import EventStore
 
     def write(data: bytes) -> None:

@@ -101,6 +101,7 @@ def _simulate(options: argparse.Namespace) -> int:
     from polarnet.pictures.clips import ClipOptions, open_clip
     from polarnet.runtime.machine import configure
     from polarnet.stokes import parse_mosaic
+    from polarnet.storage.exchange import h5py_module
 
     inputs = [Path(word).resolve() for word in options.words if "=" not in word or Path(word).exists()]
     overrides = [word for word in options.words if "=" in word and not Path(word).exists()]
@@ -108,6 +109,8 @@ def _simulate(options: argparse.Namespace) -> int:
     formats = list(dict.fromkeys(word for word in options.format if "=" not in word))
     if unknown := [form for form in formats if form not in FORMATS]:
         raise ValueError(f"--format: expected some of {', '.join(FORMATS)}, got {', '.join(unknown)}")
+    if "hdf5" in formats:
+        h5py_module()  # where it is missing, say so before the simulation
     if not inputs:
         raise ValueError(f"expected an input before {overrides[0]}; name a picture, a video or a folder of frames")
     for name, value in (("--fps", options.fps), ("--video-rate", options.video_rate)):

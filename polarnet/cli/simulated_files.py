@@ -6,36 +6,33 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
-import zarr
 from jaxtyping import Float32
 from torch import Tensor
-from tqdm import tqdm
 
 from polarnet import stokes
 from polarnet.events.mosaic import join_mosaic
-from polarnet.events.stream import Events, slice_time
+from polarnet.events.stream import Events
 from polarnet.reports.maps import encode_png
-from polarnet.reports.preview import Preview
-from polarnet.reports.videos import open_video
+from polarnet.reports.preview import write_true_video
+from polarnet.runtime.progress import ProgressBar
 from polarnet.simulation.moving_sensor import leave_sensors
 from polarnet.simulation.video import Drawn, Piece
-from polarnet.storage.appended import FRAMES_PER_CHUNK, AppendedFrames
+from polarnet.storage.appended import AppendedFrames
 from polarnet.storage.events import MAX_DURATION_US, EventStore
 from polarnet.storage.exchange import FORMS, label_file
 from polarnet.storage.frames import (
     CONVENTIONS,
-    dequantise_fraction,
     quantise_angle,
     quantise_fraction,
 )
 from polarnet.storage.spool import EventSpool
+from polarnet.storage.true_frames import APPENDED, open_truth
 
 STORE = "store"
 FORMATS = (STORE, *FORMS)
 LABEL_FORMATS = tuple(form for form in FORMATS if form != "evt3")  # those that hold the label of an event
-EVENTS, TRUTH, VIDEO, PICTURE, SPOOL = "events.zarr", "truth.zarr", "preview.mp4", "preview.png", "spool"
+EVENTS, TRUTH, VIDEO, PICTURE, SPOOL = "events.zarr", APPENDED, "preview.mp4", "preview.png", "spool"
 TRUTH_CONVENTIONS = {
     "t_us": CONVENTIONS["t_us"],
     "s0": "S0 = I0 + I90: value / 65535",
@@ -94,7 +91,7 @@ def write_simulation(
     truth = AppendedFrames(folder / TRUTH, TRUTH_CONVENTIONS)
     duration_us, frames, polarized = 0, 0, False
     with EventSpool(folder / SPOOL, outputs.labels) as spool:
-        with tqdm(total=total, desc="simulate", unit="frame") as bar:
+        with ProgressBar(total=total, desc="simulate", unit="frame") as bar:
             for piece in pieces:
                 duration_us = piece.stop_us
                 if duration_us > MAX_DURATION_US:
@@ -142,7 +139,7 @@ def _write_events(
     polarizers = drawn.camera.polarizers
     others = [form for form in FORMS if form in outputs.formats]
     files = []
-    with tqdm(total=len(outputs.formats), desc="write", unit="format") as bar:
+    with ProgressBar(total=len(outputs.formats), desc="write", unit="format") as bar:
         if STORE in outputs.formats:
             size = channels[0].height, channels[0].width
             store = EventStore.create(folder / EVENTS, [name], *size, attributes, labelled=outputs.labels)
@@ -168,27 +165,7 @@ def _write_events(
 
 def _write_preview(folder: Path, channels: Sequence[Events], rate_hz: float, gamma: float) -> list[str]:
     """Write a video with one picture for the events between two true frames, and its busiest picture."""
-    truth = {name: zarr.open_array(folder / TRUTH / name, mode="r") for name in ("t_us", "s0", "dolp")}
-    t_us = np.asarray(truth["t_us"][:])
-    preview = Preview(channels[0].height, channels[0].width, gamma)
-    video, busiest, most = None, None, -1
-    try:
-        for k in tqdm(range(1, len(t_us)), desc="preview", unit="picture"):
-            if k == 1 or k % FRAMES_PER_CHUNK == 0:
-                first = k - k % FRAMES_PER_CHUNK
-                chunk = slice(first, first + FRAMES_PER_CHUNK)
-                s0, dolp = (dequantise_fraction(np.asarray(truth[name][chunk])) for name in ("s0", "dolp"))
-            span = int(t_us[k - 1]), int(t_us[k])
-            window = [slice_time(events, *span) for events in channels]
-            picture = preview.picture(window, s0[k - first], dolp[k - first], span)
-            if sum(map(len, window)) > most:
-                busiest, most = picture, sum(map(len, window))
-            if video is None:
-                video = open_video(folder / VIDEO, rate_hz, picture.shape, "give --no-preview")
-            video.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-    finally:
-        if video is not None:
-            video.release()
+    busiest = write_true_video(folder / VIDEO, channels, open_truth(folder / TRUTH, ""), rate_hz, gamma)
     if busiest is None:
         return []
     (folder / PICTURE).write_bytes(encode_png(busiest))

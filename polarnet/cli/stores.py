@@ -1,16 +1,20 @@
-"""Commands for stores: view, verify, export, labels."""
+"""Commands for stores: view, list, verify, export, video, labels."""
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from polarnet.cli.outputs import run_folder
 from polarnet.cli.parsers import Commands, add_hot_pixel_factor, add_reading, add_stored_sequence, reading_of
+
+if TYPE_CHECKING:
+    from polarnet.storage.parts import Store
 
 PICTURE_US = 33_333
 
 
 def add_to(commands: Commands) -> None:
-    """Add the commands view, verify, export and labels."""
+    """Add the commands view, list, verify, export, video and labels."""
     view = commands.add_parser(
         "view",
         help="look at a store, a recording or a recovery in a page that plays it",
@@ -20,12 +24,24 @@ def add_to(commands: Commands) -> None:
     view.add_argument("path", type=Path, help="store, folder with stores (of simulate or recover), or a camera's file")
     view.add_argument("--sequence", nargs="+", default=[], metavar="NAME", help="sequences (default: the first twelve)")
     view.add_argument("--out", type=Path, help="page (default: outputs/view/NAME.html)")
+    view.add_argument(
+        "--rerun",
+        type=Path,
+        metavar="FILE|viewer",
+        help="log an event store for Rerun instead of a page",
+    )
     view.add_argument("--no-browser", action="store_true", help="write the page without opening it")
     add_reading(view)
     view.set_defaults(run=_view)
 
-    verify = commands.add_parser("verify", help="check every byte of a store of events, frames or scenes")
-    verify.add_argument("store", help="store: folder or fsspec URL")
+    listing = commands.add_parser("list", help="name the sequences of a store of events, frames or scenes")
+    listing.add_argument("store", help="store: folder or fsspec URL")
+    listing.set_defaults(run=_list)
+
+    verify = commands.add_parser("verify", help="check every byte of a store, a checkpoint or a data folder")
+    verify.add_argument(
+        "store", help="store (folder or fsspec URL), checkpoint (.safetensors), running.pt or data folder"
+    )
     verify.set_defaults(run=_verify)
 
     export = commands.add_parser("export", help="export an event store to files for other tools")
@@ -37,7 +53,29 @@ def add_to(commands: Commands) -> None:
         default="hdf5",
         help="HDF5 in DSEC's layout, text lines t x y p, or Prophesee's EVT3 (default: hdf5)",
     )
+    export.add_argument("--sequence", nargs="+", metavar="NAME", help="sequences to export (default: all)")
     export.set_defaults(run=_export)
+
+    video = commands.add_parser(
+        "video",
+        help="draw a stored sequence and its truth as a video that browsers play",
+        description="Draws the events behind each polarizer, red and blue, beside the true S0, DoLP, AoLP and "
+        "polarization (hue, saturation and value), one picture a true frame, as H.264 in MP4. `polarnet recover` "
+        "draws predictions.",
+        epilog="examples:\n  polarnet video outputs/simulate/lake/events.zarr\n"
+        "  polarnet video data/events.zarr lake-0 --out lake.mp4",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    video.add_argument("store", help="event store: folder or fsspec URL")
+    video.add_argument("sequence", nargs="?", help="name of the sequence (default: the only one)")
+    video.add_argument(
+        "--truth", metavar="FRAMES", help="frames.zarr or truth.zarr with its true frames (default: beside the store)"
+    )
+    video.add_argument("--out", type=Path, metavar="FILE", help="MP4 to write (default: outputs/video/SEQUENCE.mp4)")
+    video.add_argument(
+        "--video-rate", type=float, default=30.0, metavar="HZ", help="pictures a second of the video (default: 30)"
+    )
+    video.set_defaults(run=_video)
 
     labels = commands.add_parser(
         "labels",
@@ -63,6 +101,12 @@ def _view(options: argparse.Namespace) -> int:
     from polarnet.reports.player import write_player
     from polarnet.reports.viewing import films_of
 
+    if options.rerun:
+        from polarnet.reports.rerun_log import log_sequence
+
+        log_sequence(options.path, options.sequence[0] if options.sequence else None, options.rerun)
+        print(f"rerun {options.rerun}")
+        return 0
     films = films_of(options.path, options.sequence, functools.partial(read_recording, **reading_of(options)))
     path = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -73,21 +117,71 @@ def _view(options: argparse.Namespace) -> int:
     return 0
 
 
-def _verify(options: argparse.Namespace) -> int:
+def _kind_of(path: str) -> "type[Store]":
+    """Class of the store at a path; ValueError for other content."""
     from polarnet.storage.events import EventStore
     from polarnet.storage.frames import FrameStore
     from polarnet.storage.parts import open_group
     from polarnet.storage.scenes import SceneStore
 
     stores = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}
-    form = open_group(options.store).attrs.get("format")
+    form = open_group(path).attrs.get("format")
     if form not in stores:
-        raise ValueError(f"{options.store}: expected a store of format {', '.join(stores)}, got {form!r}")
-    problems = stores[form].verify(options.store)
+        raise ValueError(f"{path}: expected a store of format {', '.join(stores)}, got {form!r}")
+    return stores[form]
+
+
+def _list(options: argparse.Namespace) -> int:
+    from polarnet.storage.events import EventStore
+    from polarnet.storage.frames import SplitStore
+
+    store = _kind_of(options.store).open(options.store)
+    width = max(map(len, store.sequences), default=0)
+    for name in store.sequences:
+        facts = ""
+        if isinstance(store, EventStore):
+            facts = f"{store.duration_us(name) * 1e-6:8.3f} s  {sum(store.count(name)):12,d} events"
+        elif isinstance(store, SplitStore):
+            facts = store.splits[name]
+        print(f"{name:{width}s}  {facts}")
+    return 0
+
+
+def _video(options: argparse.Namespace) -> int:
+    from polarnet.reports.preview import write_true_video
+    from polarnet.storage.events import EventStore
+    from polarnet.storage.parts import unknown_sequence
+    from polarnet.storage.true_frames import open_truth, truth_beside
+
+    store = EventStore.open(options.store)
+    name = store.sequences[0] if options.sequence is None and len(store.sequences) == 1 else options.sequence
+    if name not in store.sequences:
+        raise ValueError(f"{options.store}: {unknown_sequence(name, store.sequences)}")
+    truth = options.truth or truth_beside(options.store)
+    if truth is None:
+        raise ValueError(
+            f"{options.store}: expected frames.zarr or truth.zarr beside it, there is none; name the true frames with "
+            f"--truth, or draw predictions with `polarnet recover {options.store}`"
+        )
+    out = options.out or Path("outputs") / "video" / f"{name}.mp4"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_true_video(out, store.read(name), open_truth(truth, name), options.video_rate)
+    print(f"video {out}")
+    return 0
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from polarnet.cli.verification import verified
+
+    results = list(verified(options.store))
+    if not results:
+        raise ValueError(f"{options.store}: expected a store, a checkpoint or a folder that holds some, found none")
+    problems = [problem for _, found in results for problem in found]
     for problem in problems:
         print(problem)
-    if not problems:
-        print(f"{options.store}: every sequence is intact")
+    for name, found in results:
+        if not found:
+            print(f"{name}: intact")
     return 1 if problems else 0
 
 
@@ -97,7 +191,7 @@ def _export(options: argparse.Namespace) -> int:
 
     store = EventStore.open(options.store)
     with run_folder(options.folder, "export") as folder:
-        export_store(store, folder, options.format)
+        export_store(store, folder, options.format, options.sequence)
     print(f"{options.store} -> {options.folder}")
     return 0
 

@@ -4,6 +4,7 @@ import dataclasses
 import fnmatch
 import functools
 import logging
+import math
 import os
 import re
 import sys
@@ -15,6 +16,8 @@ from typing import Annotated, Any, TypeVar
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from ruamel.yaml import YAML
+from ruamel.yaml.nodes import Node
 
 from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.score import BenchmarkConfig
@@ -30,6 +33,7 @@ from polarnet.metrics.lpips_weights import LpipsConfig, local_source
 from polarnet.networks.registry import NETWORKS, NetworkConfig
 from polarnet.pictures.ingest import IngestConfig
 from polarnet.runtime.cluster import pmap
+from polarnet.runtime.environment import INTERRUPTED, STOPPED
 from polarnet.runtime.machine import RuntimeConfig, configure, threads_of
 from polarnet.runtime.sections import one_of, section, unknown_key
 from polarnet.simulation.camera import Camera
@@ -46,6 +50,7 @@ from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
+MAX_VALUES = 10_000  # of params.yaml; it has some hundred
 EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # subfolder of the project in which DVC runs queued experiments
 DOLP_TRAINING = "ours"
 """Training of the DoLP network, in data/train beside the baselines."""
@@ -281,6 +286,7 @@ def check_overrides(root: Path, overrides: list[str], presets: Path | None = Non
     The groups are `experiment`, `sensor`, `polarizers` and `ablation`. Hydra refuses both as well, but this message
     lists the available keys and choices.
     """
+    _refuse_many_values(root / "params.yaml")
     groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
     for override in overrides:
         key, _, value = override.partition("=")
@@ -289,6 +295,23 @@ def check_overrides(root: Path, overrides: list[str], presets: Path | None = Non
             _check_choices([root, presets] if presets else [root], key, value)
         elif not key.startswith(("hydra.", "hydra/")) and (refusal := unknown_key(Config, key.split("."))):
             raise ValueError(refusal)
+
+
+def _refuse_many_values(file: Path) -> None:
+    """ValueError for aliases that make more than `MAX_VALUES` values of a short YAML file."""
+    sizes: dict[int, int | float] = {}
+
+    def size(node: Node) -> int | float:
+        if id(node) not in sizes:
+            sizes[id(node)] = math.inf  # for an alias of a node inside itself
+            items = node.value if isinstance(node.value, list) else []
+            parts = (part for item in items for part in (item if isinstance(item, tuple) else (item,)))
+            sizes[id(node)] = 1 + sum(map(size, parts))
+        return sizes[id(node)]
+
+    root = YAML(typ="safe", pure=True).compose(file.read_text(encoding="utf-8"))
+    if root is not None and size(root) > MAX_VALUES:
+        raise ValueError(f"{file}: expected at most {MAX_VALUES} values, its aliases make {size(root):g}")
 
 
 def hydra_stage(main: Stage) -> Callable[[], None]:
@@ -324,7 +347,11 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         overrides = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
         or_exit(lambda: check_overrides(root, overrides))
         logging.captureWarnings(True)
-        run()
+        try:
+            run()
+        except KeyboardInterrupt:
+            print(f"stages.{_file_of(main).stem}: {STOPPED}", file=sys.stderr)
+            raise SystemExit(INTERRUPTED) from None
 
     return command_line
 

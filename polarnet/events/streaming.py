@@ -13,6 +13,8 @@ import torch
 from polarnet.events.stream import Events, concatenate, slice_count
 
 SHORTEST_STEP_US = 100
+MAX_PAUSE_US = 3_600_000_000
+"""Longest time without an event; a longer one is a damaged time stamp, and would give windows without end."""
 TRAINED_WINDOW_US = 33_333
 """Window length in the training of the networks, 1/30 s."""
 
@@ -81,15 +83,17 @@ class WindowCutter:
         self._held = [Events.empty(height, width)] * channels
         self._next_us = rule.length_us if rule.length_us is not None else rule.step_us
         self._start_us = 0
+        self._until_us = 0
 
     def add(self, channels: Sequence[Events], until_us: int) -> Iterator[EventWindow]:
         """Add new events; yields the windows that are complete once every event before `until_us` has arrived.
 
         ValueError unless there are as many channels as before, of the same size, with no event earlier than those
-        already added.
+        already added, or after more than `MAX_PAUSE_US` without events.
         """
         if len(channels) != len(self._held):
             raise ValueError(f"expected the events of {len(self._held)} channels, got {len(channels)} channels")
+        self._check_pauses(channels, until_us)
         self._held = [concatenate([held, new]) for held, new in zip(self._held, channels, strict=True)]
         if self.rule.length_us is not None:
             return self._by_time(self.rule.length_us, until_us)
@@ -97,6 +101,19 @@ class WindowCutter:
         if self.rule.step_us is not None:
             return self._last_events(self.rule.events, self.rule.step_us, until_us)
         return self._by_number(self.rule.events, until_us)
+
+    def _check_pauses(self, channels: Sequence[Events], until_us: int) -> None:
+        start_us, self._until_us = self._until_us, until_us
+        if until_us - start_us <= MAX_PAUSE_US:
+            return
+        times = torch.cat([torch.tensor([start_us, until_us]), *(one.t for one in channels)]).sort().values
+        pauses = times.diff()
+        if int(pauses.max()) > MAX_PAUSE_US:
+            before = int(pauses.argmax())
+            raise ValueError(
+                f"expected events without a pause longer than {MAX_PAUSE_US // 1_000_000} s, got none between "
+                f"{int(times[before])} and {int(times[before + 1])} us: a damaged time stamp? cut the recording there"
+            )
 
     def _by_time(self, length_us: int, until_us: int) -> Iterator[EventWindow]:
         assert self._next_us is not None

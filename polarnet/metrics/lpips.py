@@ -195,7 +195,12 @@ class Lpips(nn.Module):
 def stored_record(folder: Path | str, purpose: Purpose) -> Mapping[str, str | None]:
     """Backbone, sha256 and source of a purpose's weights in the folder of stage `weights`; all None without weights."""
     file = Path(folder) / f"{purpose}.json"
-    return json.loads(file.read_text()) if file.is_file() else NO_RECORD
+    if not file.is_file():
+        return NO_RECORD
+    try:
+        return {name: json.loads(file.read_bytes())[name] for name in NO_RECORD}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file} is not what stage `weights` wrote ({error}); run the stage again") from None
 
 
 def is_stored(folder: Path | str, purpose: Purpose, backbone: str) -> bool:

@@ -15,7 +15,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from polarnet.networks.registry import NETWORKS
-from polarnet.runtime.files import replaced, sha256
+from polarnet.runtime.files import check_seal, replaced, sha256
 
 FORMAT = "polarnet-checkpoint-1"
 
@@ -42,6 +42,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], di
     for file in (path, path.with_suffix(".json")):
         if not file.exists():
             raise FileNotFoundError(f"{file} is missing; a checkpoint is NAME.safetensors and NAME.json together")
+    check_seal(path.parent, [path.name, path.with_suffix(".json").name])
     try:
         metadata = json.loads(path.with_suffix(".json").read_text())
     except ValueError as error:

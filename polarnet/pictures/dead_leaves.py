@@ -58,7 +58,8 @@ def dead_leaves(generator: np.random.Generator, height: int, width: int) -> Floa
     _paint(picture, uncovered, leaves, _noise_tile(generator))
     picture += uncovered[..., None] * generator.uniform(0.1, 0.9, 3).astype(np.float32)
     blur = generator.uniform(0.3, 0.8)  # of a lens; without it every edge is one pixel wide
-    return np.clip(cv2.GaussianBlur(picture, (0, 0), blur), 0, 1).astype(np.float32)
+    blurred = cv2.GaussianBlur(picture.astype(np.float64), (0, 0), blur)  # in float32 it depends on the processor
+    return np.clip(blurred, 0, 1).astype(np.float32)
 
 
 def _draw_leaves(generator: np.random.Generator, height: int, width: int) -> np.ndarray:

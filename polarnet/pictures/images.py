@@ -16,6 +16,7 @@ from torch import Tensor
 from polarnet.pictures.icc import srgb_from_profile
 from polarnet.runtime.files import sha256
 
+MAX_PIXELS = 2**28  # of a picture; as float32 RGB it takes 3 GiB
 SRGB = "srgb_rec709_scene"  # OpenImageIO's name
 TAKEN_AS_SRGB = {"", SRGB, "g22_rec709_scene"}  # a PNG that says gamma 1/2.2 is how older programs wrote sRGB
 LINEAR_FORMATS = {"openexr", "hdr"}  # hold linear light unless they say otherwise
@@ -91,6 +92,8 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
     pixels, spec, file_format = _read(Path(path))
     profile = spec.get("ICCProfile")
     linear = file_format in LINEAR_FORMATS
+    if profile is None and file_format == "png" and _names_profile(Path(path)):
+        raise UnreadablePicture("the embedded colour profile is damaged; save the file again, with or without one")
     return Picture(
         pixels=np.ascontiguousarray(pixels[..., _rgb_channels(spec.channelnames, spec.alpha_channel)]),
         profile=None if profile is None else np.asarray(profile, dtype=np.uint8).tobytes(),
@@ -186,6 +189,8 @@ def read_rgb(path: str | os.PathLike[str]) -> Float[Tensor, "3 h w"]:
 def _read(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
     """Upright pixels of all channels, OpenImageIO's description of them, and the name of the format."""
     _refuse_by_extension(path)
+    if not is_unicode(path):
+        raise UnreadablePicture("cannot be read: the name of the file is not UTF-8; rename it")
     as_stored = oiio.ImageSpec()
     as_stored["oiio:UnassociatedAlpha"] = 1  # otherwise the reader multiplies the colours by alpha
     file = oiio.ImageInput.open(str(path), as_stored)
@@ -193,6 +198,10 @@ def _read(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
         raise UnreadablePicture(f"cannot be read: {_first_line(oiio.geterror(), path)}")
     try:
         spec = file.spec()
+        if spec.width * spec.height > MAX_PIXELS:
+            raise UnreadablePicture(
+                f"expected at most {MAX_PIXELS:,} pixels, got {spec.width}x{spec.height}; shrink it"
+            )
         pixels = file.read_image(0, 0, 0, spec.nchannels, "unknown")
         problem = file.geterror()
     finally:
@@ -200,6 +209,21 @@ def _read(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
     if pixels is None or problem:
         raise UnreadablePicture(f"cannot be read: {_first_line(problem, path)}")
     return upright(_plain(pixels), spec.get_int_attribute("Orientation", 1)), spec, file.format_name()
+
+
+def is_unicode(path: Path) -> bool:
+    """Whether a path can be written as UTF-8, which a name of arbitrary bytes cannot."""
+    try:
+        str(path).encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _names_profile(png: Path) -> bool:
+    """Whether a PNG has a colour profile before its pixels; OpenImageIO ignores a damaged one."""
+    with png.open("rb") as file:
+        return b"iCCP" in file.read(2**20).partition(b"IDAT")[0]
 
 
 def _refuse_by_extension(path: Path) -> None:

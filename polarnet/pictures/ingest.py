@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import numpy as np
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt
 
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.dead_leaves import dead_leaves
@@ -61,11 +61,11 @@ class IngestConfig:
     """Folder of the sources folder and polarization, searched recursively."""
     limit: PositiveInt | None
     """At most this many pictures of the folder, chosen by content hash."""
-    dead_leaves: NonNegativeInt
+    dead_leaves: Annotated[int, Field(ge=0, le=1_000_000)]
     """Generated pictures beside the builtin photographs."""
-    height: Annotated[int, Field(ge=16)]
+    height: Annotated[int, Field(ge=16, le=16_384)]
     """Pixels of every picture after the centre crop."""
-    width: Annotated[int, Field(ge=16)]
+    width: Annotated[int, Field(ge=16, le=16_384)]
     max_upscale: Annotated[float, Field(ge=1)]
     """A picture that would have to be enlarged more is too small."""
     val_fraction: Annotated[float, Field(ge=0, le=1)]
@@ -165,11 +165,16 @@ def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int]:
             files=group,
             kind=kind,
             stem=group[0].stem if len(group) == 1 else group[0].stem.rpartition("_")[0],
-            origin=", ".join(path.relative_to(root).as_posix() for path in group),
+            origin=", ".join(_printable(path.relative_to(root).as_posix()) for path in group),
         )
         for group in groups
     ]
     return sources, len(files) - len(pictures)
+
+
+def _printable(name: str) -> str:
+    """A file name in which bytes that are not UTF-8 are escaped."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def _extensions(kind: str) -> frozenset[str]:

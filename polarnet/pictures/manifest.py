@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from polarnet.runtime.files import check_seal, seal
+
 MANIFEST = "manifest.json"
 SPLITS = ("train", "val", "test")
 REASONS_SHOWN = 5
@@ -100,20 +102,22 @@ def split_by_content(hashes: Sequence[str], val_fraction: float, test_fraction: 
 
 
 def write_manifest(manifest: Manifest, folder: Path) -> None:
-    """Write `folder`/manifest.json, the same bytes for the same manifest."""
+    """Write `folder`/manifest.json, the same bytes for the same manifest, and seal the folder."""
     content = {
         "pictures": [asdict(entry) for entry in manifest.pictures],
         "skipped": [asdict(skipped) for skipped in manifest.skipped],
         "counts": manifest.counts,
     }
     (folder / MANIFEST).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    seal(folder)
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a folder that `ingest` wrote; FileNotFoundError or ValueError if there is none."""
+    """The manifest of a folder that `ingest` wrote; FileNotFoundError without one, ValueError for changed files."""
     path = folder / MANIFEST
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no manifest; run the stage ingest first (dvc repro ingest)")
+    check_seal(folder)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         return Manifest(

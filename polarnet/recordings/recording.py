@@ -1,5 +1,6 @@
 """Read event-camera files: whole with `read_recording`, in chunks of constant memory with `open_recording`."""
 
+import logging
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -13,10 +14,12 @@ import torch
 from polarnet.events.stream import MAX_SIDE, Events, concatenate
 from polarnet.recordings.formats import aedat2, celex5_bin, celex5_csv, faery, hdf5, prophesee, rosbag, store, text
 from polarnet.recordings.formats.lines import HEAD_BYTES
-from polarnet.recordings.repair import repaired
-from polarnet.recordings.source import Block, CameraFrames, Choices, RecordingError, Source
+from polarnet.recordings.repair import HARMLESS, repaired
+from polarnet.recordings.source import REPAIRS, Block, CameraFrames, Choices, RecordingError, Source
 
 CHUNK_EVENTS = 2**20
+
+logger = logging.getLogger(__name__)
 
 
 class Format(NamedTuple):
@@ -128,9 +131,12 @@ def read_recording(
     part: str | None = None,
     clock_mhz: float | int | None = None,
 ) -> Recording:
-    """Read a whole file, with the arguments and errors of `open_recording`."""
+    """Read a whole file, with the arguments and errors of `open_recording`; logs a warning for each kind of damage."""
     reader = open_recording(path, format, height=height, width=width, part=part, clock_mhz=clock_mhz)
     chunks = list(reader)
+    for kind, count in reader.repairs.items():
+        if count and kind not in HARMLESS:
+            logger.warning("%s: %d %s", Path(path).name, count, REPAIRS[kind])
     events = concatenate(chunks) if chunks else Events.empty(reader.height, reader.width)
     return Recording(events, reader.format, {kind: count for kind, count in reader.repairs.items() if count})
 

@@ -12,6 +12,8 @@ from polarnet.events.stream import MAX_SIDE
 
 BLOCK_EVENTS = 2**18  # events that a format decodes at a time; chunks handed to a user are cut anew
 
+MAX_PIXELS = 2**24  # of a sensor; the largest event cameras have 1.3 million
+
 WRAP_US = 2**32  # range of 32-bit time stamps
 
 REPAIRS = {
@@ -126,4 +128,6 @@ def sensor_size(path: Path, choices: Choices, height: int | None = None, width: 
         raise RecordingError(f"{path.name}: the file does not say how large the sensor is; give height and width")
     if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
         raise RecordingError(f"{path.name}: expected a sensor with sides of 1 to {MAX_SIDE} px, got {height}x{width}")
+    if height * width > MAX_PIXELS:
+        raise RecordingError(f"{path.name}: expected a sensor of at most {MAX_PIXELS:,} pixels, got {height}x{width}")
     return height, width

@@ -13,7 +13,7 @@ from polarnet.methods.between import Between, BetweenConfig, anchored, carried
 from polarnet.methods.method import Recoverer, each_map
 from polarnet.methods.overlap import advance, begin, warm_up
 from polarnet.recordings.live import Piece
-from polarnet.recovery.recover import PIXELS_AT_ONCE, Frame, Input, runs_of
+from polarnet.recovery.stream import PIXELS_AT_ONCE, Frame, Input, runs_of
 
 
 class Rate(NamedTuple):

@@ -14,7 +14,7 @@ from polarnet.recordings.formats import hdf5
 from polarnet.recordings.live import Piece
 from polarnet.recordings.recording import Recording
 from polarnet.recordings.source import RecordingError
-from polarnet.recovery.recover import Input
+from polarnet.recovery.stream import Input
 
 EMPTY_CHANNELS = 3  # windows have four channels; the one camera is the first
 

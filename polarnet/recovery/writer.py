@@ -1,10 +1,11 @@
 """Write the results of `polarnet recover`: numbers (Zarr, EXR), pictures (PNG), a video, and a page.
 
 A picture shows DoLP, AoLP and the events of the window side by side; of a camera without polarizers, the intensity and
-the events. Everything is written as frames arrive, in
-constant memory.
+the events. The video's pictures are labelled and also show polarization with the reconstructed S0. Everything is
+written as frames arrive, in constant memory.
 """
 
+import shutil
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -12,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import OpenImageIO as oiio
 import torch
@@ -20,7 +20,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from polarnet.events.streaming import EventWindow
+from polarnet.methods.method import Recoverer, State
 from polarnet.reports.maps import (
+    angle_image,
     dolp_image,
     encode_png,
     event_full_scale,
@@ -29,14 +31,17 @@ from polarnet.reports.maps import (
     polarization_hsv,
 )
 from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map, write_player
-from polarnet.reports.videos import open_video, with_even_sides
+from polarnet.reports.preview import Panel, Sheet, foot_of
+from polarnet.reports.videos import VideoWriter, with_even_sides
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
 from polarnet.storage.appended import AppendedFrames
 from polarnet.storage.film import angle_bytes, fraction_bytes, signed_bytes
+from polarnet.storage.true_frames import TrueFrames
 
 VIDEO = "recovered.mp4"
 PNG_STORED, NO_FILTER = 0, 8  # no compression, libpng's PNG_FILTER_NONE: larger files, but fast to write
+MIN_FREE_BYTES = 2**26  # of the disk, which the last frames, the video's index and the page need
 MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, the network needs all cores: a concurrent writing thread delays every operation
 SHEET_PICTURES = 3  # of recovered.png
@@ -79,17 +84,28 @@ class RecoveryWriter:
 
     `outputs` is a subset of zarr, png, exr and mp4. The folder gets recovered.zarr, png/*.png, exr/*.exr and
     recovered.mp4 (`video_rate_hz` frames a second, whatever the time between them). `write_page` adds index.html and
-    recovered.png.
+    recovered.png. `reconstruct` is a method that reconstructs intensity, for the S0 of the video; without it the
+    video shows polarization at full value. `truth` is shown in the video beside each frame.
     """
 
-    def __init__(self, folder: Path, outputs: Collection[str], video_rate_hz: float):
-        self.folder, self.outputs, self.video_rate_hz = folder, outputs, video_rate_hz
+    def __init__(
+        self,
+        folder: Path,
+        outputs: Collection[str],
+        video_rate_hz: float,
+        reconstruct: Recoverer | None = None,
+        truth: TrueFrames | None = None,
+    ):
+        self.folder, self.outputs = folder, outputs
+        self._reconstruct, self._truth = reconstruct, truth
+        self._reconstructed: State = None
         self.frames = 0
         self._plain = False
         self._sample = _Sample([])
         self._scale: float | None = None
+        self._sheet: Sheet | None = None
         self._arrays = AppendedFrames(folder / "recovered.zarr", ZARR_CONVENTIONS)
-        self._video: cv2.VideoWriter | None = None
+        self._video = VideoWriter(folder / VIDEO, video_rate_hz)
         # A second thread that computes on several cores would put those of the network to sleep between operations.
         self._thread = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,))
         self._waiting: deque[Future] = deque()
@@ -104,11 +120,10 @@ class RecoveryWriter:
     def __exit__(self, *problem: object) -> None:
         try:
             self._wait(0)
-            self._arrays.flush()
         finally:
             self._thread.shutdown(cancel_futures=True)
-            if self._video is not None:
-                self._video.release()
+            self._arrays.flush()  # after an error, too: the frames up to it are whole
+            self._video.close()
 
     def add(self, window: EventWindow, prediction: Prediction) -> None:
         """Add a frame on the CPU; returns before it is written, unless the queue is long or cores are few."""
@@ -117,16 +132,17 @@ class RecoveryWriter:
         self._wait(MAX_QUEUED if usable_cores() > FEW_CORES else 0)
         self.frames += 1
 
-    def write_page(self, title: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:
-        """Write index.html and recovered.png; call it after the `with` block."""
+    def write_page(self, source: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:
+        """Write index.html about the recovery from `source`, and recovered.png; call it after the `with` block."""
         pictures = self._sample.pictures
         if pictures:
             margin = ((GAP, GAP), (GAP, GAP), (0, 0))
             places = np.linspace(0, len(pictures) - 1, SHEET_PICTURES + 2).round().astype(int)[1:-1]
             sheet = [np.pad(pictures[k].pixels, margin, constant_values=255) for k in np.unique(places)]
             (self.folder / "recovered.png").write_bytes(encode_png(np.concatenate(sheet)))
-        video = VIDEO if self._video is not None else None
-        films = [_film(title, pictures)] if pictures else []
+        video = VIDEO if "mp4" in self.outputs and self.frames else None
+        films = [_film(source, pictures)] if pictures else []
+        title = f"{'Intensity' if self._plain else 'DoLP'} from events: {source}"
         return write_player(self.folder / "index.html", title, films, facts, notes, video)
 
     def _wait(self, most: int) -> None:
@@ -134,22 +150,54 @@ class RecoveryWriter:
             self._waiting.popleft().result()
 
     def _write(self, number: int, window: EventWindow, prediction: Prediction) -> None:
+        if shutil.disk_usage(self.folder).free < MIN_FREE_BYTES:
+            raise OSError(f"{self.folder}: the disk is full; all {number} frames up to here are whole")
         if "zarr" in self.outputs:
             self._add_to_zarr(window, prediction)
         if "exr" in self.outputs:
             _write_exr(self.folder / "exr" / f"{number:06d}.exr", prediction)
-        drawn = {"png", "mp4"} & set(self.outputs)
-        if not drawn and number % self._sample.every:
+        if "mp4" in self.outputs:
+            self._video.add(self._labelled(window, prediction))
+        if "png" not in self.outputs and number % self._sample.every:
             return
         picture = self._picture(window, prediction)
         self._sample.offer(number, Picture(window.stop_us, picture, _byte_maps(window, prediction)))
         if "png" in self.outputs:
             _write_png(self.folder / "png" / f"{number:06d}.png", picture)
-        if "mp4" in self.outputs:
-            if self._video is None:
-                path = self.folder / VIDEO
-                self._video = open_video(path, self.video_rate_hz, picture.shape, "leave mp4 out of --write")
-            self._video.write(np.ascontiguousarray(picture[..., ::-1]))
+
+    def _labelled(self, window: EventWindow, prediction: Prediction) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture of the video: events and DoLP above polarization and AoLP, with their truth where it is known."""
+        if self._sheet is None:
+            self._sheet = Sheet(*prediction.dolp.shape)
+        (events,) = self._sheet.events(signed_events(window)[None])
+        above, below = [Panel("events", events)], []
+        plain = plain_intensity(prediction)
+        if plain is None:
+            above.append(Panel("DoLP", dolp_image(prediction.dolp)))
+        else:
+            above.append(Panel("intensity", intensity_image(plain)))
+        true = None if self._truth is None else self._truth.at(window.stop_us)
+        if prediction.aolp is not None:
+            s0, kind = (true.s0, "true") if true else (self._s0(window, prediction), "reconstructed")
+            if s0 is not None:
+                light = polarization_hsv(s0, prediction.dolp, prediction.aolp)
+                below.append(Panel(f"polarization, {kind} S0", light))
+            below.append(Panel("AoLP (hue), DoLP (saturation)", angle_image(prediction.dolp, prediction.aolp)))
+        if true:
+            above.append(Panel("true DoLP", dolp_image(true.dolp)))
+            below.append(Panel("true AoLP (hue), DoLP (saturation)", angle_image(true.dolp, true.aolp)))
+        foot = foot_of((window.start_us, window.stop_us), sum(map(len, window.channels)))
+        return self._sheet.picture([above, below], foot)
+
+    def _s0(self, window: EventWindow, prediction: Prediction) -> Float[Tensor, "h w"] | None:
+        """Mean of the reconstructed intensities, in [0, 1]; None if no method reconstructs them."""
+        intensities = prediction.intensities
+        if intensities is None and self._reconstruct is not None:
+            if self._reconstructed is None:
+                self._reconstructed = self._reconstruct.start(*prediction.dolp.shape)
+            self._reconstructed, own = self._reconstruct.step(self._reconstructed, [window])
+            intensities = None if own.intensities is None else own.intensities[0]
+        return None if intensities is None else intensities.mean(0).float()
 
     def _picture(self, window: EventWindow, prediction: Prediction) -> UInt8[np.ndarray, "h w 3"]:
         events = signed_events(window)
@@ -158,7 +206,7 @@ class RecoveryWriter:
         plain = plain_intensity(prediction)
         maps = [dolp_image(prediction.dolp) if plain is None else intensity_image(plain)]
         if prediction.aolp is not None:
-            maps.append(polarization_hsv(torch.ones_like(prediction.dolp), prediction.dolp, prediction.aolp))
+            maps.append(angle_image(prediction.dolp, prediction.aolp))
         maps.append(event_image(events, self._scale))
         gap = np.full((maps[0].shape[0], GAP, 3), 255, np.uint8)
         return with_even_sides(np.concatenate([part for one in maps for part in (one, gap)][:-1], axis=1))
@@ -206,12 +254,12 @@ def _byte_maps(window: EventWindow, prediction: Prediction) -> dict[Kind, UInt8[
     return maps if prediction.aolp is None else maps | {"aolp": angle_bytes(prediction.aolp)}
 
 
-def _film(title: str, pictures: Sequence[Picture]) -> Film:
+def _film(source: str, pictures: Sequence[Picture]) -> Film:
     """The film of a recovery for the page's player."""
     maps = [
         Map("recovered", kind, torch.stack([one.maps[kind] for one in pictures]).numpy()) for kind in pictures[0].maps
     ]
-    return Film(title, [one.t_us for one in pictures], maps)
+    return Film(source, [one.t_us for one in pictures], maps)
 
 
 def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:

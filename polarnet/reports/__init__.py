@@ -1,1 +1,14 @@
 """Output for readers: figures, tables and pages."""
+
+from typing import TYPE_CHECKING
+
+from polarnet.runtime.lazy import attach
+
+if TYPE_CHECKING:
+    from polarnet.reports.look import plot_events as plot_events
+    from polarnet.reports.look import plot_frame as plot_frame
+    from polarnet.reports.look import plot_prediction as plot_prediction
+    from polarnet.reports.preview import write_true_video as write_true_video
+    from polarnet.reports.videos import VideoWriter as VideoWriter
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

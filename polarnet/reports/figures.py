@@ -3,6 +3,7 @@
 Figures are returned, not shown; `polarnet.reports.maps.png` encodes them.
 """
 
+import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +23,8 @@ from polarnet.metrics.similarity import mse, psnr
 from polarnet.reports.artefacts import Panel
 from polarnet.reports.legend import GENERAL, Legend, with_structure
 from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image, hue_wheel
+
+HEADING_LETTERS = 19  # of a line above a picture
 
 
 @dataclass(frozen=True)
@@ -52,9 +55,11 @@ def comparison_figure(
     if not panels:
         raise ValueError("a comparison needs at least one panel, got none")
     methods = with_structure(methods)
-    headings = ["events, 0°", "true DoLP", *map(legend.label, methods)]
+    labels = ["events, 0°", "true DoLP", *map(legend.label, methods)]
+    headings = [textwrap.fill(label, HEADING_LETTERS) for label in labels]
+    lines = max(1 + heading.count("\n") for heading in headings)
     with matplotlib.rc_context(chart_style(theme)):
-        figure, grid = tile_grid(len(panels), len(headings), panels[0].truth_dolp.shape, theme)
+        figure, grid = tile_grid(len(panels), len(headings), panels[0].truth_dolp.shape, theme, heading_lines=lines)
         for panel, row in zip(panels, grid, strict=True):
             full_scale = event_full_scale(panel.events)
             tiles = [(event_image(panel.events[0], full_scale), ""), (dolp_image(panel.truth_dolp), "")]
@@ -69,10 +74,10 @@ def comparison_figure(
 
 
 def tile_grid(
-    rows: int, columns: int, shape: Sequence[int], theme: Theme, bar_row: int = 0
+    rows: int, columns: int, shape: Sequence[int], theme: Theme, bar_row: int = 0, heading_lines: int = 1
 ) -> tuple[Figure, np.ndarray]:
     """A figure and its axes for pictures of `shape`, with a colour bar of DoLP beside row `bar_row`."""
-    tile, gap, left, right, top, below = 1.35, 0.06, 0.22, 0.5, 0.26, 0.2  # inches
+    tile, gap, left, right, top, below = 1.35, 0.06, 0.22, 0.5, 0.12 + 0.14 * heading_lines, 0.2  # inches
     tile_height = tile * shape[0] / shape[1]
     width, height = left + columns * (tile + gap) + right, top + rows * (tile_height + below)
     figure = Figure(figsize=(width, height), facecolor=theme.face)

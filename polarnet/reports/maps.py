@@ -64,6 +64,11 @@ def polarization_hsv(
     return _bytes(cv2.cvtColor(hsv.astype(np.float32), cv2.COLOR_HSV2RGB))
 
 
+def angle_image(dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """AoLP (radians) as hue and DoLP as saturation at full value, so that an angle without meaning is pale."""
+    return polarization_hsv(torch.ones_like(dolp), dolp, aolp)
+
+
 def paper_map(dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """The map of the paper's Fig. 3: hue is AoLP (radians), saturation 1, value DoLP."""
     return polarization_hsv(dolp, torch.ones_like(dolp), aolp)

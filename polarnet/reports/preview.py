@@ -1,7 +1,9 @@
-"""Pictures of a simulation: the events of each channel between two true frames, beside S0 and DoLP."""
+"""Labelled pictures of a sequence, side by side: events, DoLP, AoLP, S0 and polarization as hue, saturation, value."""
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -12,10 +14,20 @@ from matplotlib.ft2font import FT2Font
 from torch import Tensor
 
 from polarnet.events.representations import polarity_sums
-from polarnet.events.stream import Events
-from polarnet.reports.maps import DOLP_TABLE, dolp_image, event_full_scale, event_image, intensity_image
-from polarnet.reports.videos import with_even_sides
+from polarnet.events.stream import Events, slice_time
+from polarnet.reports.maps import (
+    DOLP_TABLE,
+    angle_image,
+    dolp_image,
+    event_full_scale,
+    event_image,
+    intensity_image,
+    polarization_hsv,
+)
+from polarnet.reports.videos import VideoWriter, with_even_sides
+from polarnet.runtime.progress import ProgressBar
 from polarnet.stokes import POLARIZER_ANGLES_DEG
+from polarnet.storage.true_frames import TrueFrame, TrueFrames
 
 MIN_PANEL, MAX_PANEL = 240, 640  # pixels of a panel's longer side: small sensors are enlarged, large ones reduced
 GAP, MARGIN = 8, 12
@@ -26,42 +38,59 @@ TEXT_COLOUR = np.array([31, 35, 40], np.float32)
 SCALE_INERTIA = 0.9  # share of the previous picture's full scale of events, which prevents flicker
 
 
-class Preview:
-    """Draws consecutive pictures of one simulation; keeps the scale of their events."""
+class Panel(NamedTuple):
+    """One captioned map of a sheet."""
 
-    def __init__(self, height: int, width: int, gamma: float):
-        """Pictures of channels of this size, S0 raised to 1 / `gamma`: 1 for code values, 2.2 for linear light."""
+    caption: str
+    pixels: UInt8[np.ndarray, "h w 3"]
+
+
+class Sheet:
+    """Draws the labelled pictures of one sequence; keeps the scale of their events from picture to picture."""
+
+    def __init__(self, height: int, width: int):
+        """Pictures of maps of this size; small maps are enlarged, large ones reduced."""
         longer = max(height, width)
         zoom = -(-MIN_PANEL // longer) if longer < MIN_PANEL else min(1.0, MAX_PANEL / longer)
         self._size = round(height * zoom), round(width * zoom)
-        self._gamma = gamma
         self._scale: float | None = None
 
-    def picture(
-        self, channels: Sequence[Events], s0: Float[Tensor, "h w"], dolp: Float[Tensor, "h w"], span_us: tuple[int, int]
-    ) -> UInt8[np.ndarray, "h2 w2 3"]:
-        """The events of `span_us` (start and end), and S0 and DoLP at its end."""
-        events = torch.stack([polarity_sums(channel) for channel in channels])
-        present = event_full_scale(events)
+    def events(self, sums: Float[Tensor, "n h w"]) -> list[UInt8[np.ndarray, "h w 3"]]:
+        """Maps of ON minus OFF events, coloured on one scale."""
+        present = event_full_scale(sums)
         self._scale = present if self._scale is None else SCALE_INERTIA * self._scale + (1 - SCALE_INERTIA) * present
-        maps = [event_image(image, self._scale) for image in events]
-        captions = [f"events, {angle}°" for angle in POLARIZER_ANGLES_DEG]
-        bright = intensity_image(s0.clamp(0, 1) ** (1 / self._gamma))
-        rows = [
-            self._row([*maps[:2], bright], [*captions[:2], "true S0"]),
-            self._row([*maps[2:], dolp_image(dolp)], [*captions[2:], "true DoLP"]),
-        ]
-        width = rows[0].shape[1]
-        start, stop = (time / 1000 for time in span_us)
-        count = sum(map(len, channels))
-        foot = self._foot(width, f"{start:.1f} to {stop:.1f} ms    {count:,} events    ON red, OFF blue")
-        sheet = np.concatenate([rows[0], _white(GAP, width), rows[1], foot])
+        return [event_image(image, self._scale) for image in sums]
+
+    def picture(self, rows: Sequence[Sequence[Panel]], foot: str) -> UInt8[np.ndarray, "h2 w2 3"]:
+        """Rows of panels above a line of text and the colour bar of DoLP, with even sides."""
+        drawn = [self._row(row) for row in rows if row]
+        width = max(row.shape[1] for row in drawn)
+        parts = [_widened(part, width) for row in drawn for part in (row, _white(GAP, width))]
+        sheet = np.concatenate([*parts[:-1], self._foot(width, foot)])
         return with_even_sides(np.pad(sheet, ((GAP, GAP), (MARGIN, MARGIN), (0, 0)), constant_values=255))
 
-    def _row(self, maps: Iterable[np.ndarray], captions: Iterable[str]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    def truth(
+        self, channels: Sequence[Events], truth: TrueFrame, span_us: tuple[int, int], gamma: float = 1.0
+    ) -> UInt8[np.ndarray, "h2 w2 3"]:
+        """The events of `span_us` (start and end) behind each polarizer, and the truth at its end.
+
+        S0 is raised to 1 / `gamma`: 1 for code values, 2.2 for linear light.
+        """
+        maps = self.events(torch.stack([polarity_sums(channel) for channel in channels]))
+        events = [Panel(f"events, {angle}°", one) for angle, one in zip(POLARIZER_ANGLES_DEG, maps, strict=True)]
+        bright = truth.s0.clamp(0, 1) ** (1 / gamma)
+        pale = Panel("true AoLP (hue), DoLP (saturation)", angle_image(truth.dolp, truth.aolp))
+        light = Panel("true polarization and S0", polarization_hsv(bright, truth.dolp, truth.aolp))
+        rows = [
+            [*events[:2], Panel("true S0", intensity_image(bright)), Panel("true DoLP", dolp_image(truth.dolp))],
+            [*events[2:], light, pale],
+        ]
+        return self.picture(rows, foot_of(span_us, sum(map(len, channels))))
+
+    def _row(self, panels: Sequence[Panel]) -> UInt8[np.ndarray, "h2 w2 3"]:
         height, width = self._size
         parts = []
-        for image, caption in zip(maps, captions, strict=True):
+        for caption, image in panels:
             enlarged = height > image.shape[0]
             method = cv2.INTER_NEAREST if enlarged else cv2.INTER_AREA
             panel = image if image.shape[:2] == self._size else cv2.resize(image, (width, height), interpolation=method)
@@ -87,8 +116,42 @@ class Preview:
         return foot
 
 
+def true_pictures(
+    channels: Sequence[Events], truth: TrueFrames, gamma: float = 1.0
+) -> Iterator[tuple[UInt8[np.ndarray, "h w 3"], int]]:
+    """A picture (`Sheet.truth`) for the events between each two true frames, and their number, with progress."""
+    sheet = Sheet(channels[0].height, channels[0].width)
+    for k in ProgressBar(range(1, len(truth)), "video", unit="picture"):
+        span = int(truth.t_us[k - 1]), int(truth.t_us[k])
+        window = [slice_time(events, *span) for events in channels]
+        yield sheet.truth(window, truth[k], span, gamma), sum(map(len, window))
+
+
+def write_true_video(
+    path: Path, channels: Sequence[Events], truth: TrueFrames, rate_hz: float = 30.0, gamma: float = 1.0
+) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Write the pictures of `true_pictures` as a video; returns the one with most events, None if there is none."""
+    busiest, most = None, -1
+    with VideoWriter(path, rate_hz) as video:
+        for picture, count in true_pictures(channels, truth, gamma):
+            video.add(picture)
+            if count > most:
+                busiest, most = picture, count
+    return busiest
+
+
+def foot_of(span_us: tuple[int, int], count: int) -> str:
+    """Line of text below a picture: the time span of its events, their number, and their colours."""
+    start, stop = (time / 1000 for time in span_us)
+    return f"{start:.1f} to {stop:.1f} ms    {count:,} events    ON red, OFF blue"
+
+
 def _white(height: int, width: int) -> UInt8[np.ndarray, "height width 3"]:
     return np.full((height, width, 3), 255, np.uint8)
+
+
+def _widened(part: UInt8[np.ndarray, "h w 3"], width: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+    return np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=255)
 
 
 def _write(picture: UInt8[np.ndarray, "h w 3"], text: str, left: int) -> None:

@@ -2,15 +2,15 @@
 
 import functools
 import multiprocessing
+import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
-from tqdm import tqdm
-
 from polarnet.runtime.extras import installation
 from polarnet.runtime.machine import end_with_parent, limit_threads, tune, usable_cores
+from polarnet.runtime.progress import ProgressBar as Bar
 
 ATTEMPTS = 4  # Dask's own limit for a task whose workers die (allowed-failures 3)
 
@@ -33,7 +33,7 @@ def pmap(
     unfinished items after workers have died `ATTEMPTS` times without one result. An exception raised by `function` ends
     the map and propagates unchanged.
     """
-    with tqdm(total=len(items), desc=label, unit="", disable=None if len(items) > 1 else True) as bar:
+    with Bar(total=len(items), desc=label, unit="", disable=None if len(items) > 1 else True) as bar:
         if address is not None:
             return _over_dask(function, items, address, bar)
         if workers > 1 and len(items) > 1:
@@ -46,7 +46,7 @@ def pmap(
 
 
 def _over_processes(
-    function: Callable[[Item], Result], items: Sequence[Item], workers: int, bar: tqdm, label: str
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int, bar: Bar, label: str
 ) -> list[Result]:
     results: dict[int, Result] = {}
     deaths = 0
@@ -67,13 +67,18 @@ def _over_processes(
 
 
 def _start_worker(threads: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a worker without a traceback
     end_with_parent()
     limit_threads(threads)
     tune()
 
 
 def _collect(
-    function: Callable[[Item], Result], items: Sequence[Item], workers: int, results: dict[int, Result], bar: tqdm
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    workers: int,
+    results: dict[int, Result],
+    bar: Bar,
 ) -> None:
     """Add the missing entries of `results`, until all are there or the pool breaks."""
     spawn = multiprocessing.get_context("spawn")  # forking a process with running OpenMP threads can hang
@@ -89,7 +94,7 @@ def _collect(
             raise
 
 
-def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], address: str, bar: tqdm) -> list[Result]:
+def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], address: str, bar: Bar) -> list[Result]:
     try:
         from distributed import Client
         from distributed import as_completed as dask_as_completed

@@ -1,6 +1,12 @@
-"""Environment variables of polarnet's programs; a user's own program keeps its own."""
+"""Manners of polarnet's programs: environment, Ctrl-C and quiet libraries; a user's own program keeps its own."""
 
+import atexit
 import os
+import sys
+from types import TracebackType
+
+INTERRUPTED = 130  # exit status of shells after Ctrl-C
+STOPPED = "stopped; finished work is kept, and the same command again continues from it"
 
 
 def let_threads_sleep() -> None:
@@ -12,3 +18,20 @@ def let_threads_sleep() -> None:
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # turns of a loop
+
+
+def announce_interrupts() -> None:
+    """Let Ctrl-C end this program with the one line `STOPPED` instead of a traceback, even during its imports."""
+
+    def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if issubclass(kind, KeyboardInterrupt):
+            print(STOPPED, file=sys.stderr)
+        else:
+            sys.__excepthook__(kind, error, trace)
+
+    sys.excepthook = hook
+
+
+def silence_bindings() -> None:
+    """Drop what C++ libraries print once Python has ended: nanobind's lists of leaks, which no setting turns off."""
+    atexit.register(lambda: os.dup2(os.open(os.devnull, os.O_WRONLY), 2))  # registered first, so it runs last

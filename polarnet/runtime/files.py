@@ -1,11 +1,17 @@
 """The hash of contents, files that are written whole or not at all, and the settings that came with the package."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from filelock import FileLock, Timeout
+
+PACKAGE = Path(__file__).parents[1]
+INSTALLED = PACKAGE / "config" / "settings"
+SUMS = "SHA256SUMS"
+"""File with the checksums of a folder, in the format of `sha256sum --check`."""
+REMAKE = "run the stage that makes it again, or copy the folder again from where it is whole"
 
 
 def sha256(*parts: bytes | memoryview | Path) -> str:
@@ -22,9 +28,12 @@ def sha256(*parts: bytes | memoryview | Path) -> str:
 
 def shipped_settings() -> Path:
     """Folder of params.yaml and conf/ beside the code: the copy that setup.py puts into a wheel, or the source tree."""
-    package = Path(__file__).parents[1]
-    installed = package / "config" / "settings"
-    return installed if installed.is_dir() else package.parent
+    return PACKAGE.parent if in_source_tree() else INSTALLED
+
+
+def in_source_tree() -> bool:
+    """Whether the code lies in a clone, and not in a wheel, which has a copy of the settings."""
+    return not INSTALLED.is_dir()
 
 
 @contextmanager
@@ -39,6 +48,39 @@ def replaced(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def seal(folder: Path) -> None:
+    """Write the checksum of every file below a finished folder into its `SUMS`."""
+    files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    lines = [f"{sha256(folder / name)}  {name}\n" for name in files if name != SUMS]
+    with replaced(folder / SUMS) as temporary:
+        temporary.write_text("".join(lines), encoding="utf-8")
+
+
+def changed_files(folder: Path, names: Collection[str] | None = None) -> list[str]:
+    """A message for each file (of `names`; None: all) that is not as it was when `folder` was sealed.
+
+    A folder without `SUMS` gives no message.
+    """
+    if not (folder / SUMS).is_file():
+        return []
+    problems = []
+    for line in (folder / SUMS).read_text(encoding="utf-8", errors="replace").splitlines():
+        digest, _, name = line.partition("  ")
+        if names is None or name in names:
+            path = folder / name
+            if not name or not path.is_file():
+                problems.append(f"{path} is missing, but {folder / SUMS} lists it; {REMAKE}")
+            elif sha256(path) != digest:
+                problems.append(f"{path} is not the file that {folder / SUMS} describes; {REMAKE}")
+    return problems
+
+
+def check_seal(folder: Path, names: Collection[str] | None = None) -> None:
+    """ValueError for the first of `changed_files`."""
+    for problem in changed_files(folder, names):
+        raise ValueError(problem)
 
 
 @contextmanager

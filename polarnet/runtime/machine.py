@@ -8,12 +8,12 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import numba
 import numpy as np
 import torch
-from pydantic import NonNegativeInt, PositiveInt
+from pydantic import Field, PositiveInt
 
 from polarnet.runtime.sections import section
 
@@ -32,9 +32,9 @@ class RuntimeConfig:
 
     device: str
     """auto (CUDA where there is one), cpu, cuda or cuda:N."""
-    threads: NonNegativeInt
+    threads: Annotated[int, Field(ge=0, le=4096)]
     """Threads of torch and numba in each process; 0: one per core."""
-    workers: PositiveInt
+    workers: Annotated[int, Field(gt=0, le=4096)]
     """Number of processes that share the sequences."""
     devices: PositiveInt
     """Number of processes on this machine that share a training, each on its own GPU, or all on the processor."""

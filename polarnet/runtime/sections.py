@@ -22,6 +22,8 @@ EXPECTED = {
     "choice": "one of {choices}",
 }
 """Expected values by pydantic's type of error; other types have a message of pydantic's own."""
+MAX_NUMBER = 1e10
+"""Larger values than this are mistakes in any section; keys with a meaningful limit have their own."""
 CLOSE = 0.85  # similarity of names, 1 for equal ones, from which a mistyped key is likely
 
 Section = TypeVar("Section")
@@ -39,6 +41,8 @@ def section(config_class: type[Section]) -> type[Section]:
 
     @functools.wraps(validate)
     def init(self: Any, *args: Any, **values: Any) -> None:
+        if refusal := _absurd_number(values):
+            raise ValueError(refusal)
         try:
             validate(self, *args, **values)
         except ValidationError as error:  # pydantic has no hook that words a whole error anew
@@ -46,6 +50,18 @@ def section(config_class: type[Section]) -> type[Section]:
 
     checked.__init__ = init
     return checked
+
+
+def _absurd_number(value: Any, key: str = "") -> str | None:
+    """The reason why a number anywhere in a value is none that a setting can have; None if there is none."""
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for name, inner in items:
+        inside = f"{key}[{name}]" if isinstance(value, list) else f"{key}.{name}".removeprefix(".")
+        if refusal := _absurd_number(inner, inside):
+            return refusal
+    if isinstance(value, int | float) and not abs(value) <= MAX_NUMBER:  # NaN compares as False
+        return f"{key}: expected a number from {-MAX_NUMBER:g} to {MAX_NUMBER:g}, got {value!r}"
+    return None
 
 
 def one_of(choices: Collection[str]) -> AfterValidator:

@@ -4,41 +4,30 @@
 alone loads none.
 """
 
-from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING
 
-MODULE_OF = {
-    "BUILTIN_PHOTOS": "polarnet.pictures.builtin",
-    "Camera": "polarnet.simulation.camera",
-    "EmulatorConfig": "polarnet.simulation.emulator",
-    "MOTIONS": "polarnet.simulation.presets",
-    "SynthesizeConfig": "polarnet.simulation.motion",
-    "POLARIZERS": "polarnet.simulation.presets",
-    "PolarizationScene": "polarnet.simulation.scene",
-    "SENSORS": "polarnet.simulation.presets",
-    "SensorState": "polarnet.simulation.emulator",
-    "Simulation": "polarnet.simulation.sequence",
-    "Trajectory": "polarnet.simulation.motion",
-    "emulate": "polarnet.simulation.emulator",
-    "random_trajectory": "polarnet.simulation.motion",
-    "read_rgb": "polarnet.pictures.images",
-    "scene_from_intensities": "polarnet.simulation.scene",
-    "scene_from_polarization": "polarnet.simulation.scene",
-    "scene_from_rgb": "polarnet.simulation.scene",
-    "simulate": "polarnet.simulation.sequence",
-    "simulate_video": "polarnet.simulation.video",
-    "emulate_motion": "polarnet.simulation.moving_sensor",
-}
-"""Module of each public name."""
+from polarnet.runtime.lazy import attach
 
-__all__ = list(MODULE_OF)
+if TYPE_CHECKING:
+    from polarnet.pictures.builtin import BUILTIN_PHOTOS as BUILTIN_PHOTOS
+    from polarnet.pictures.images import read_rgb as read_rgb
+    from polarnet.simulation.camera import Camera as Camera
+    from polarnet.simulation.emulator import EmulatorConfig as EmulatorConfig
+    from polarnet.simulation.emulator import SensorState as SensorState
+    from polarnet.simulation.emulator import emulate as emulate
+    from polarnet.simulation.motion import SynthesizeConfig as SynthesizeConfig
+    from polarnet.simulation.motion import Trajectory as Trajectory
+    from polarnet.simulation.motion import random_trajectory as random_trajectory
+    from polarnet.simulation.moving_sensor import emulate_motion as emulate_motion
+    from polarnet.simulation.presets import MOTIONS as MOTIONS
+    from polarnet.simulation.presets import POLARIZERS as POLARIZERS
+    from polarnet.simulation.presets import SENSORS as SENSORS
+    from polarnet.simulation.scene import PolarizationScene as PolarizationScene
+    from polarnet.simulation.scene import scene_from_intensities as scene_from_intensities
+    from polarnet.simulation.scene import scene_from_polarization as scene_from_polarization
+    from polarnet.simulation.scene import scene_from_rgb as scene_from_rgb
+    from polarnet.simulation.sequence import Simulation as Simulation
+    from polarnet.simulation.sequence import simulate as simulate
+    from polarnet.simulation.video import simulate_video as simulate_video
 
-
-def __getattr__(name: str) -> Any:
-    if name not in MODULE_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(MODULE_OF[name]), name)
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *MODULE_OF])
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field
 from torch import Tensor
 
 from polarnet.runtime.sections import section
@@ -24,22 +24,23 @@ TURN_SHARE = 0.2  # share of the allowed speed and acceleration that roll may us
 TURN_RATE_MAX = 2 * math.pi  # radians per second, maximum rate of the sines of roll and zoom
 FASTEST_OVER_SLOWEST = 3.0  # factor by which the sensor may turn back faster than the scene's border requires
 ATTEMPTS = 64
+MAX_SPEED_PX_S = 1e6
 
 
 @section
 class SynthesizeConfig:
     """Section `synthesize` of params.yaml. Speeds are in scene pixels and hold for every sensor pixel."""
 
-    sequences_per_picture: PositiveInt
-    duration_s: PositiveFloat
-    frame_rate_hz: PositiveFloat
+    sequences_per_picture: Annotated[int, Field(gt=0, le=10_000)]
+    duration_s: Annotated[float, Field(gt=0, le=3600)]
+    frame_rate_hz: Annotated[float, Field(gt=0, le=100_000)]
     """Rate of the ground-truth frames; the windows of events between frames are the network's inputs."""
-    sensor_height: Annotated[int, Field(ge=2)]
-    sensor_width: Annotated[int, Field(ge=2)]
-    speed_min_px_s: PositiveFloat
+    sensor_height: Annotated[int, Field(ge=2, le=4096)]
+    sensor_width: Annotated[int, Field(ge=2, le=4096)]
+    speed_min_px_s: Annotated[float, Field(gt=0, le=MAX_SPEED_PX_S)]
     """The peak speed of a sequence is drawn between this and speed_max_px_s."""
-    speed_max_px_s: PositiveFloat
-    acceleration_max_px_s2: PositiveFloat
+    speed_max_px_s: Annotated[float, Field(gt=0, le=MAX_SPEED_PX_S)]
+    acceleration_max_px_s2: Annotated[float, Field(gt=0, le=1e9)]
     rotation_max_deg: Annotated[float, Field(ge=0, le=90)]
     zoom_max: Annotated[float, Field(ge=1, le=16)]
 

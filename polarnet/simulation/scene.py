@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
@@ -21,6 +20,8 @@ from polarnet.runtime.arrays import (
     fractions,
 )
 from polarnet.stokes import stokes_from_intensities, stokes_from_polarization
+
+EPSILON = np.finfo(np.float32).eps  # keeps grey and black from dividing by 0
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,14 @@ def scene_from_intensities(intensities: Float[Array, "4 h w"]) -> PolarizationSc
 
 
 def _hsv(rgb: Float[Tensor, "3 h w"]) -> Float32[Tensor, "3 h w"]:
-    """Hue in degrees, saturation and value in [0, 1]."""
-    pixels = np.ascontiguousarray(rgb.permute(1, 2, 0).numpy(), dtype=np.float32)
-    return torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_RGB2HSV)).permute(2, 0, 1)
+    """Hue in degrees, saturation and value in [0, 1]: those of OpenCV on processors with FMA, on any processor."""
+    red, green, blue = pixels = rgb.numpy().astype(np.float32)
+    value = pixels.max(axis=0)
+    chroma = value - pixels.min(axis=0)
+    saturation = chroma / (value + EPSILON)
+    degrees = (np.float32(60) / (chroma + EPSILON)).astype(np.float64)
+    # each difference is rounded to float32, their sums with the offsets only at the end, as FMA does
+    from_red = (green - blue) * degrees
+    from_green, from_blue = (blue - red) * degrees + 120, (red - green) * degrees + 240
+    hue = np.select([value == red, value == green], [from_red + 360 * (from_red < 0), from_green], from_blue)
+    return torch.from_numpy(np.stack([hue.astype(np.float32), saturation, value]))

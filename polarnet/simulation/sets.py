@@ -6,6 +6,7 @@ A set is a folder with images, scenes.zarr, frames.zarr and events.zarr, made by
 import dataclasses
 import functools
 import json
+import logging
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
@@ -18,7 +19,7 @@ from polarnet.pictures.images import picture_extensions
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.pictures.polarimetry import group_by_measurement
-from polarnet.runtime.files import sha256
+from polarnet.runtime.files import changed_files, seal, sha256
 from polarnet.runtime.sections import section
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.dataset import emulate_scenes
@@ -26,6 +27,8 @@ from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.truth import synthesize
 
 MADE = "made.json"
+
+logger = logging.getLogger(__name__)
 
 MakeMapper = Callable[[str], Callable[..., Iterable[Any]]]
 """`polarnet.runtime.cluster.pmap` with its workers bound, for a label; or one that gives the built-in `map`."""
@@ -72,9 +75,12 @@ def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Re
     return _make(folder, recipe, mapper, functools.partial(_hold_out, images), _content(images))
 
 
-def make_folder_set(root: Path, kind: str, folder: Path, recipe: Recipe, mapper: MakeMapper) -> bool:
+def make_folder_set(
+    root: Path, kind: str, folder: Path, recipe: Recipe, mapper: MakeMapper, limit: int | None = None
+) -> bool:
     """Every photograph or measured scene under `root`, all in the test split. False if the folder is complete already.
 
+    With a `limit`, only so many pictures, in the order of the hashes of their content.
     `kind` is photographs, polarization, or auto, which looks at the files. Raises ValueError if
     no picture can be used.
     """
@@ -83,7 +89,7 @@ def make_folder_set(root: Path, kind: str, folder: Path, recipe: Recipe, mapper:
         raise ValueError(f"{root}: expected a folder of photographs or of measured polarization, got {actual}")
     source = "polarization" if (kind if kind != "auto" else kind_of(root)) == "polarization" else "folder"
     chosen = dataclasses.replace(
-        recipe.ingest, source=source, root=str(root), limit=None, val_fraction=0.0, test_fraction=1.0
+        recipe.ingest, source=source, root=str(root), limit=limit, val_fraction=0.0, test_fraction=1.0
     )
     recipe = dataclasses.replace(recipe, ingest=chosen)
     return _make(folder, recipe, mapper, lambda to: ingest(chosen, recipe.seed, to, mapper("ingest")), _content(root))
@@ -105,17 +111,21 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
     """Fill `folder`, resuming a stopped run with the same settings, seed and source pictures.
 
     `fill` writes the pictures into a folder, and `source` is the hash of those that it reads. A folder made with others
-    is emptied first. The code is not compared: DVC does that for the pipeline's sets.
+    is emptied first, and so is, with a warning, one whose files have changed since. The code is not
+    compared: DVC does that for the pipeline's sets.
     """
     sections = {"ingest": asdict(recipe.ingest), "motion": asdict(recipe.motion), **recipe.camera.sections}
     settings = sections | {"seed": recipe.seed, "source": source, "labels": recipe.labels}
     key = sha256(json.dumps(settings, sort_keys=True).encode())
     note = folder / MADE
     if note.exists():
-        known = json.loads(note.read_text())
-        if known == {"key": key, "complete": True}:
+        progress = _progress(note)
+        changed = changed_files(folder) if progress.get("complete") else []
+        for problem in changed:
+            logger.warning("%s; making the set again", problem.partition(";")[0])
+        if progress == {"key": key, "complete": True} and not changed:
             return False
-        if known.get("key") != key:
+        if progress.get("key") != key or changed:
             shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
     note.write_text(json.dumps({"key": key, "complete": False}))
@@ -128,7 +138,16 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
     if not events.exists():
         emulate_scenes(scenes, events, recipe.camera, recipe.seed, mapper("emulate"), recipe.threads, recipe.labels)
     note.write_text(json.dumps({"key": key, "complete": True}))
+    seal(folder)
     return True
+
+
+def _progress(note: Path) -> dict[str, Any]:
+    """Settings' hash and completeness of a folder; empty for a damaged note."""
+    try:
+        return dict(json.loads(note.read_bytes()))
+    except (TypeError, ValueError):
+        return {}
 
 
 def _content(folder: Path) -> str:

@@ -5,7 +5,7 @@
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, no_type_check
 
@@ -15,6 +15,7 @@ import numpy as np
 from polarnet.events.labels import LABELS
 from polarnet.events.stream import Events, slice_count
 from polarnet.runtime.extras import installation
+from polarnet.runtime.progress import ProgressBar
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore, first_at_millisecond
 
@@ -129,17 +130,23 @@ FORMS: dict[str, tuple[str, Callable[[Path, Events, int], None]]] = {
 """Suffix and writer of each file format."""
 
 
-def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -> None:
+EXPORT_INDEX = "store.json"
+
+
+def export_store(
+    store: EventStore, folder: str | os.PathLike[str], form: str, sequences: Sequence[str] | None = None
+) -> None:
     """Write FOLDER/SEQUENCE/polarizer_{000,045,090,135}.{h5,txt,raw} for every sequence, then FOLDER/store.json.
 
-    `form` is hdf5, text or evt3. store.json holds the data that these files cannot: durations, sizes, attributes, and
-    the names of the labels in a labelled store.
+    `sequences` are those to write; None: all. `form` is hdf5, text or evt3. store.json holds the data that these files
+    cannot: durations, sizes, attributes, and the names of the labels in a labelled store.
     """
     folder = Path(folder)
     if form not in FORMS:
         raise ValueError(f"expected a form of {', '.join(FORMS)}, got {form!r}")
     suffix, write = FORMS[form]
-    for sequence in store.sequences:
+    chosen = store.sequences if sequences is None else sequences
+    for sequence in ProgressBar(chosen, "export", unit="sequence"):
         if Path(sequence).name != sequence:
             raise ValueError(f"{store.path}: {sequence!r} cannot be the name of a folder")
         duration_us = store.duration_us(sequence)
@@ -152,11 +159,11 @@ def export_store(store: EventStore, folder: str | os.PathLike[str], form: str) -
         "width": store.width,
         "polarizer_angles_deg": POLARIZER_ANGLES_DEG,
         "sequences_per_part": store.sequences_per_part,
-        "duration_us": {sequence: store.duration_us(sequence) for sequence in store.sequences},
+        "duration_us": {sequence: store.duration_us(sequence) for sequence in chosen},
         "attributes": store.attributes,
         **({"labels": LABELS} if store.labelled else {}),
     }
-    (folder / "store.json").write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
+    (folder / EXPORT_INDEX).write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
 
 
 def h5py_module() -> Any:

@@ -15,6 +15,7 @@ the parts.
 """
 
 import contextlib
+import errno
 import functools
 import hashlib
 import json
@@ -42,7 +43,9 @@ from polarnet.runtime.sections import section
 
 COMPRESSION_LEVEL = 1  # for zstd; higher levels cost 10-100 times the time for 6 % fewer bytes
 DIGEST_LENGTH = 64  # characters of a SHA-256
+SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN)
 MAX_OPEN_PARTS = 64  # an open part has a file descriptor and about 2 MB of directory
+MAX_LISTED = 8  # names of sequences in a message
 REPAIR = "write this store again, or copy it again from where it is whole"
 
 Header = dict[str, Any]
@@ -240,6 +243,7 @@ class Store:
                 group, _ = self._opened(os.getpid(), part)
                 records: Any = group.attrs["sequences"]
             except Exception as error:  # Zarr raises many kinds of exceptions
+                _raise_shortage(error, self.path)
                 raise ValueError(f"{self.path}: {sequence}, {part}.zip is unreadable: {error}; {REPAIR}") from error
             self._records[part] = records
         return self._records[part][sequence]
@@ -257,6 +261,7 @@ class Store:
             if len(values) != max(0, rows.stop - rows.start):
                 raise ValueError(f"expected rows {rows.start} to {rows.stop}, got {len(values)} of them")
         except Exception as error:  # each codec raises its own exceptions
+            _raise_shortage(error, self.path)
             raise ValueError(
                 f"{self.path}: {sequence}, column {name} is unreadable: {part}.zip: {error}; {REPAIR}"
             ) from error
@@ -301,7 +306,7 @@ class Store:
 
     def _part(self, sequence: str) -> str:
         if sequence not in self._part_of:
-            raise ValueError(f"{self.path}: there is no {sequence!r} among its {len(self.sequences)} sequences")
+            raise ValueError(f"{self.path}: {unknown_sequence(sequence, self.sequences)}")
         return self._part_of[sequence]
 
     def _is_whole(self, part: str) -> bool:
@@ -389,6 +394,14 @@ class _WholeStore(WrapperStore[Any]):
         return content
 
 
+def unknown_sequence(sequence: str | None, sequences: list[str]) -> str:
+    """Message about a sequence that a store does not have: it lists those that the store has."""
+    listed = ", ".join(sequences[:MAX_LISTED])
+    if len(sequences) > MAX_LISTED:
+        listed += f", ... (`polarnet list` names all {len(sequences)})"
+    return f"expected a sequence of {listed}; got {sequence!r}"
+
+
 def open_group(path: str | os.PathLike[str]) -> zarr.Group:
     """Open the Zarr group in a local folder, a zip or at an fsspec URL; FileNotFoundError if there is none."""
     name = os.fspath(path)
@@ -409,7 +422,18 @@ def open_group(path: str | os.PathLike[str]) -> zarr.Group:
     except ImportError:  # a package for reading URLs is missing
         raise
     except Exception as error:  # Zarr raises many kinds of exceptions for a damaged zarr.json
+        _raise_shortage(error, name)
         raise ValueError(f"{name} is unreadable: {error}; {REPAIR}") from error
+
+
+def _raise_shortage(error: Exception, path: str) -> None:
+    """RuntimeError if reading failed for want of memory, threads or file descriptors, not because of the file."""
+    short = isinstance(error, MemoryError) or getattr(error, "errno", None) in SHORTAGES
+    if short or "can't start new thread" in str(error):
+        raise RuntimeError(
+            f"{path} was not read, because the system gave no more memory, threads or file descriptors "
+            f"({error or 'out of memory'}); lower runtime.workers, or raise the limits (ulimit -n, -u, -v)"
+        ) from error
 
 
 def _create_array(group: zarr.Group, name: str, column: Column) -> zarr.Array:

@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from polarnet.runtime.files import check_seal
+
 HISTORY = "history.csv"
 
 Row = Mapping[str, Any]
@@ -25,7 +27,8 @@ def write_history(folder: Path, rows: Sequence[Row]) -> None:
 
 
 def read_history(folder: Path) -> list[Row]:
-    """Read what `write_history` wrote, to the last digit; ValueError for a file without epochs."""
+    """Read what `write_history` wrote, to the last digit; ValueError for a changed file or one without epochs."""
+    check_seal(folder, [HISTORY])
     with (folder / HISTORY).open(newline="") as file:
         lines = list(csv.DictReader(file))
     if not lines:

@@ -38,14 +38,14 @@ class LoopConfig(ViewConfig):
 
     data: Annotated[str, one_of(("store", "fly"))]
     """store: read events from the store on disk; fly: emulate the same events in memory, from the scenes, on demand."""
-    epochs: PositiveInt
-    batch_size: PositiveInt
+    epochs: Annotated[int, Field(gt=0, le=100_000)]
+    batch_size: Annotated[int, Field(gt=0, le=10_000)]
     """Number of visits to sequences in one batch."""
     accumulate: PositiveInt
     """Number of parts that a batch is split into to save memory. The steps stay the same up to rounding."""
     bptt_windows: PositiveInt
     """Windows per optimizer step. The recurrent state passes from step to step, gradients do not."""
-    learning_rate: PositiveFloat
+    learning_rate: Annotated[float, Field(gt=0, le=1)]
     """Peak learning rate."""
     schedule: Annotated[str, one_of(("constant", "cosine"))]
     """cosine: decay from the peak rate to 0 over the training."""

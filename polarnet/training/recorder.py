@@ -17,10 +17,10 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from polarnet.networks.checkpoint import save_checkpoint
-from polarnet.runtime.files import claimed, replaced, sha256
+from polarnet.runtime.files import claimed, replaced, seal, sha256
+from polarnet.runtime.progress import ProgressBar
 from polarnet.training.history import Row, best_row, write_history
 from polarnet.training.parallel import place
 from polarnet.training.sequences import Batch
@@ -93,11 +93,11 @@ class Recorder:
         file = self.running / "running.pt"
         if not file.exists():
             return Progress()
-        content = _read(file)
+        content = read_running(file)
         network.load_state_dict(content["network"])
         optimizer.load_state_dict(content["optimizer"])
         progress = Progress(**content["progress"])
-        tqdm.write(f"resuming in epoch {progress.epoch + 1}, from {file}")
+        ProgressBar.write(f"resuming in epoch {progress.epoch + 1}, from {file}")
         if self.writes and progress.history and not progress.visits:
             self._write(progress, network)  # __init__ emptied `out`, so the last epoch's files are written again
         return progress
@@ -120,7 +120,7 @@ class Recorder:
 
     def show(self, batches: Iterable[Batch], progress: Progress, visits: int, epochs: int) -> Iterator[Batch]:
         """Yield the batches and show a progress bar that counts visits to sequences."""
-        with tqdm(
+        with ProgressBar(
             total=visits, initial=progress.visits, desc=f"epoch {progress.epoch + 1}/{epochs}", unit="visit",
             disable=not self.writes,
         ) as bar:  # fmt: skip
@@ -134,7 +134,7 @@ class Recorder:
         progress.end_epoch(network.state_dict(), scores)
         if not self.writes:
             return
-        tqdm.write("  validation: " + "  ".join(f"{name} {value:.4f}" for name, value in scores.items()))
+        ProgressBar.write("  validation: " + "  ".join(f"{name} {value:.4f}" for name, value in scores.items()))
         self._write(progress, network)
 
     def calibrated(self, progress: Progress, network: nn.Module, expected_errors: Mapping[str, int | float]) -> None:
@@ -142,6 +142,7 @@ class Recorder:
         result = _result(best_row(progress.history))
         metadata = {**self.metadata, **result, "expected_errors": dict(expected_errors)}
         save_checkpoint(self.out / "best.safetensors", network.state_dict(), metadata)
+        seal(self.out)
 
     def finish(self) -> None:
         """Delete the running checkpoint, because the training is complete."""
@@ -155,10 +156,14 @@ class Recorder:
         save_checkpoint(self.out / "last.safetensors", network.state_dict(), {**self.metadata, **_result(last)})
         save_checkpoint(self.out / "best.safetensors", progress.best, {**self.metadata, **_result(best)})
         write_history(self.out, progress.history)
+        seal(self.out)
 
 
-def _read(file: Path) -> dict[str, Any]:
-    """A running checkpoint whose bytes all have the checksums in its zip, which torch does not compare."""
+def read_running(file: Path) -> dict[str, Any]:
+    """A running checkpoint whose bytes all have the checksums in its zip, which torch does not compare.
+
+    ValueError if the file is damaged.
+    """
     try:
         with zipfile.ZipFile(file) as entries:
             damaged = entries.testzip()

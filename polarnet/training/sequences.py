@@ -76,7 +76,7 @@ def apply_view(sequence: WindowSequence, view: View) -> WindowSequence:
 class ViewConfig:
     """Augmentation settings; keys of `train`, `baselines.e2v` and `baselines.e2p` in params.yaml."""
 
-    visits: PositiveInt
+    visits: Annotated[int, Field(gt=0, le=10_000)]
     """Visits to each sequence per epoch, each with a new random view."""
     windows: PositiveInt | None
     """Consecutive windows per visit, starting at a random window; null: all windows."""

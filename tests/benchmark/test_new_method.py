@@ -15,7 +15,7 @@ from polarnet.benchmark.score import BenchmarkConfig
 from polarnet.events.streaming import WindowRule
 from polarnet.methods import METHODS
 from polarnet.recordings.live import Piece
-from polarnet.recovery.recover import Input, frames_of
+from polarnet.recovery.stream import Input, frames_of
 from polarnet.reports.tables import score_table
 
 pytestmark = pytest.mark.usefixtures("brief_costs")

@@ -81,4 +81,4 @@ def test_a_row_written_anew_keeps_nothing_of_an_earlier_run(five_scenes, context
     benchmark = run_benchmark(five_scenes, context, config, None)
     write_row(tmp_path / "cf", "cf", RowRecord(None, {}), {"simulated": benchmark, "measured": benchmark})
     written(tmp_path, benchmark, ["cf"])
-    assert sorted(path.name for path in (tmp_path / "cf").iterdir()) == ["row.json", "simulated"]
+    assert sorted(path.name for path in (tmp_path / "cf").iterdir()) == ["SHA256SUMS", "row.json", "simulated"]

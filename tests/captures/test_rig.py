@@ -22,7 +22,7 @@ from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.recordings.recording import read_recording
-from polarnet.recovery.recover import Arrangement, open_files
+from polarnet.recovery.stream import Arrangement, open_files
 from polarnet.reports.recordings import draw_calibration
 from polarnet.simulation.scene import scene_from_rgb
 from polarnet.storage.frames import FrameStore

@@ -113,14 +113,16 @@ def test_nothing_usable_says_what_was_expected(project_root, tmp_path, monkeypat
     assert "expected a folder of photographs or of measured polarization" in capsys.readouterr().err
 
 
-def test_methods_may_be_chosen_and_a_limit_is_refused(photographs, project_root, tmp_path, monkeypatch, capsys):
+def test_methods_and_the_number_of_pictures_may_be_chosen(photographs, project_root, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     assert run(project_root, monkeypatch, photographs, out, "--methods", "cf,cf+gain") == 0
     assert set(json.loads((out / "metrics.json").read_text())) == {"cf", "cf+gain"}
     assert run(project_root, monkeypatch, photographs, out, "--methods", "magic") == 1
     assert "magic" in capsys.readouterr().err
-    assert run(project_root, monkeypatch, photographs, out, "--limit", "1") == 1
-    assert "--limit applies to --event-budget and --sensitivity only" in capsys.readouterr().err
+    assert run(project_root, monkeypatch, photographs, out, "--methods", "cf", "--limit", "1") == 0
+    assert len(json.loads((out / "details.json").read_text())["scenes"]) == 1
+    assert run(project_root, monkeypatch, photographs, out, "--limit", "0") == 1
+    assert "--limit: expected at least 1, got 0" in capsys.readouterr().err
 
 
 def test_weights_that_are_not_there_are_named(photographs, project_root, tmp_path, monkeypatch, capsys):

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import importlib.metadata
+import itertools
 import os
 import re
 import shutil
@@ -389,3 +390,12 @@ def test_the_one_deviation_of_earlier_versions_is_refused_with_the_two_of_today(
         match=r"contrast_threshold_sigma is not a setting; .*did you mean contrast_threshold_sigma_on or contrast_",
     ):
         load(project, ["emulate.contrast_threshold_sigma=0.05"])
+
+
+@pytest.mark.parametrize("last", ["[*z, *z]", "&loop [*loop]"])
+def test_an_alias_bomb_is_refused_at_once(tmp_path, last):
+    names = "abcdefghijklmnopqrstuvwxyz"
+    lines = ["a: &a [1, 1]", *(f"{new}: &{new} [*{old}, *{old}]" for old, new in itertools.pairwise(names))]
+    (tmp_path / "params.yaml").write_text("\n".join([*lines, f"last: {last}\n"]))
+    with pytest.raises(ValueError, match=r"params\.yaml: expected at most 10000 values, its aliases make"):
+        check_overrides(tmp_path, [])

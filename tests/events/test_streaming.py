@@ -101,3 +101,15 @@ def test_an_event_at_a_windows_end_belongs_to_the_next_window_in_batches_and_str
     expected = [[0, 400, 999], [1000, 1500], [2000]]
     assert [window.t.tolist() for window in batch] == expected
     assert [window.channels[0].t.tolist() for window in streamed] == expected
+
+
+def test_a_time_stamp_far_in_the_future_is_refused_and_a_long_recording_is_not():
+    def event(t_us: list[int]) -> Events:
+        ones = torch.ones(len(t_us))
+        return Events(torch.tensor(t_us), ones.short(), ones.short(), ones.to(torch.int8), 4, 4)
+
+    hour_us = 3_600_000_000
+    cutter = WindowCutter(WindowRule(hour_us // 2, None, None), 4, 4, channels=1)
+    assert len(list(cutter.add([event([hour_us, 2 * hour_us])], 2 * hour_us))) == 4
+    with pytest.raises(ValueError, match=r"got none between 7200000000 and 10000000000000 us: a damaged time stamp"):
+        cutter.add([event([10**13])], 10**13 + 1)

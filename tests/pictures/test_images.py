@@ -1,10 +1,13 @@
 """Reading pictures: every kind of file is made here, by another program than the one that reads it."""
 
 import io
+import os
 import struct
+import zlib
 from importlib import resources
 from pathlib import Path
 
+import cv2
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -318,3 +321,25 @@ def test_a_path_may_be_text(tmp_path, rgb8):
     assert np.array_equal(read_picture(str(tmp_path / "b.png")).pixels, rgb8)
     with pytest.raises(UnreadablePicture, match=r'Could not open file "missing.jpg"'):
         read_rgb("missing.jpg")
+
+
+def test_a_png_whose_profile_is_damaged_is_refused(tmp_path):
+    profile = struct.pack(">I4s", 12, b"iCCP") + b"x\0\0not a zlib"[:12]
+    _, encoded = cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))
+    content = encoded.tobytes()
+    chunk = profile + struct.pack(">I", zlib.crc32(profile[4:]))
+    (tmp_path / "a.png").write_bytes(content[:33] + chunk + content[33:])
+    with pytest.raises(UnreadablePicture, match="profile"):
+        read_picture(tmp_path / "a.png")
+
+
+def test_a_picture_of_billions_of_pixels_and_a_name_of_bytes_are_refused(tmp_path, monkeypatch):
+    _, encoded = cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))
+    (tmp_path / "a.png").write_bytes(encoded.tobytes())
+    name = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.png"))
+    name.write_bytes(encoded.tobytes())
+    with pytest.raises(UnreadablePicture, match="the name of the file is not UTF-8"):
+        read_picture(name)
+    monkeypatch.setattr("polarnet.pictures.images.MAX_PIXELS", 63)
+    with pytest.raises(UnreadablePicture, match="expected at most 63 pixels, got 8x8"):
+        read_picture(tmp_path / "a.png")

@@ -122,7 +122,7 @@ def test_the_manifest_says_everything_and_reads_back(mixed_folder, tmp_path):
     assert (entry["bits"], entry["height"], entry["width"]) == (16, 100, 150)
     assert (entry["source_height"], entry["source_width"]) == (110, 160)
     assert sorted(path.name for path in (tmp_path / "images").iterdir()) == sorted(
-        [entry["file"] for entry in content["pictures"]] + ["manifest.json"]
+        [entry["file"] for entry in content["pictures"]] + ["manifest.json", "SHA256SUMS"]
     )
 
 

@@ -10,7 +10,7 @@ from polarnet.methods.between import BetweenConfig
 from polarnet.methods.method import Recoverer
 from polarnet.recordings.live import Piece
 from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
-from polarnet.recovery.recover import Input, frames_of
+from polarnet.recovery.stream import Input, frames_of
 from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore
 

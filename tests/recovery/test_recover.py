@@ -19,8 +19,8 @@ from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines
 from polarnet.recordings.recording import read_recording
-from polarnet.recovery import recover as recovery
-from polarnet.recovery.recover import Arrangement, frames_of, open_files, open_method, replay
+from polarnet.recovery import stream as recovery
+from polarnet.recovery.stream import Arrangement, frames_of, open_files, open_method, replay
 from polarnet.runtime import machine as runtime
 from polarnet.storage.events import EventStore
 
@@ -212,7 +212,7 @@ def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channel
 
 
 @pytest.mark.parametrize(("arguments", "reason"), [
-    ((), "say --sequence, one of lake, road; got None"),
+    ((), "--sequence: expected a sequence of lake, road; got None"),
     (("--sequence", "lake", "--method", "oracle_mean"), "expected a method of cf"),
     (("--sequence", "lake", "--method", "e2vid_published"), "no weights are given"),
     (("--sequence", "lake", "--method", "cf", "--window", "1s"),

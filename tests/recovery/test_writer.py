@@ -1,3 +1,5 @@
+import shutil
+
 import cv2
 import numpy as np
 import OpenImageIO as oiio
@@ -59,7 +61,7 @@ def test_exr_holds_the_floats_and_names_them(written):
     assert pixels == pytest.approx({"DoLP": 0.175, "AoLP": 0.35, "log_variance": -0.175}, abs=1e-3)
 
 
-def test_pictures_and_video_show_three_maps_side_by_side(written):
+def test_pictures_show_three_maps_side_by_side_and_the_video_labels_them(written):
     picture = cv2.imread(str(written / "png" / "000039.png"))
     assert picture.shape == (16, 72, 3)  # 3 * 21 + 2 * 4, brought to even sides
     assert len(list((written / "png").iterdir())) == FRAMES
@@ -67,7 +69,7 @@ def test_pictures_and_video_show_three_maps_side_by_side(written):
     while video.read()[0]:
         count += 1
     assert count == FRAMES
-    assert video.get(cv2.CAP_PROP_FRAME_WIDTH) == 72
+    assert video.get(cv2.CAP_PROP_FRAME_WIDTH) == 536  # 2 enlarged panels of 252, a gap of 8, margins of 12
 
 
 def test_the_page_needs_no_network_and_escapes_names(written):
@@ -76,7 +78,7 @@ def test_the_page_needs_no_network_and_escapes_names(written):
     assert "one note" in page
     assert page.count("data:image/webp") == 3  # strips of events, DoLP and AoLP
     assert 'src="http' not in page
-    assert '<a href="recovered.mp4">' in page
+    assert '<video src="recovered.mp4" controls' in page
     assert (written / "recovered.png").exists()
 
 
@@ -99,3 +101,19 @@ def test_a_failure_while_writing_reaches_whoever_recovers(tmp_path, cores):
 def test_events_of_all_polarizers_add_up():
     assert signed_events(window(2))[3, 2] == 4
     assert signed_events(window(2)).sum() == 4
+
+
+def test_a_full_disk_stops_at_a_whole_frame_and_says_so(tmp_path, cores, monkeypatch):
+    free = iter([2**30] * 3 + [2**20] * FRAMES)
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(recovery.shutil, "disk_usage", lambda _: usage._replace(free=next(free)))
+
+    def write() -> None:
+        with RecoveryWriter(tmp_path, ("zarr", "png"), 30.0) as writer:
+            for k in range(FRAMES):
+                writer.add(window(k), frame(k))
+
+    with pytest.raises(OSError, match=r"the disk is full; all 3 frames"):
+        write()
+    assert [cv2.imread(str(path)).shape for path in sorted((tmp_path / "png").iterdir())] == [(16, 72, 3)] * 3
+    assert zarr.open_group(tmp_path / "recovered.zarr", mode="r")["t_us"].shape == (3,)

@@ -73,3 +73,20 @@ def test_a_replaced_value_is_checked_too():
 def test_an_unknown_key_comes_with_the_keys_to_choose_from():
     assert unknown_key(Camera, ["lenses", "tele", "focal_mm"]) is None
     assert unknown_key(Camera, ["leak", "x"]) == "leak.x is not a setting; leak is a value, not a section"
+
+
+@pytest.mark.parametrize("number", [1e30, -(10**12), float("nan")])
+def test_numbers_that_no_setting_can_have_are_refused_wherever_they_are(number):
+    @section
+    class Inner:
+        text: str
+        numbers: list[float]
+
+    @section
+    class Outer:
+        inner: Inner
+
+    with pytest.raises(ValueError, match=r"inner\.numbers\[1\]: expected a number from -1e\+10 to 1e\+10, got"):
+        Outer(inner={"text": "a", "numbers": [1.0, number]})
+    with pytest.raises(ValueError, match=r"inner\.text: expected a number from"):
+        Outer(inner={"text": number, "numbers": []})

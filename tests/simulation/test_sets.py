@@ -7,6 +7,7 @@ from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import write_png
 from polarnet.pictures.manifest import Manifest, ManifestEntry, write_manifest
+from polarnet.runtime.files import seal
 from polarnet.runtime.machine import generator_for
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.sets import MADE, Recipe, SetsConfig, kind_of, make_complex_motion, make_folder_set
@@ -82,6 +83,7 @@ def test_a_set_is_made_once_and_again_only_when_its_recipe_changes(images, tmp_p
     assert not make_complex_motion(images, folder, harder(), recipe, plain)
     assert make_complex_motion(images, folder, harder(zoom_max=1.1), recipe, plain)
     write_png(images / "held-out.png", np.full((100, 150, 3), 0.5, dtype=np.float32), bits=8)
+    seal(images)
     assert make_complex_motion(images, folder, harder(zoom_max=1.1), recipe, plain)
 
 
@@ -93,6 +95,17 @@ def test_a_set_that_was_interrupted_goes_on(images, tmp_path, recipe):
     before = (folder / "frames.zarr" / "zarr.json").stat().st_mtime_ns
     assert make_complex_motion(images, folder, harder(), recipe, plain)
     assert (folder / "frames.zarr" / "zarr.json").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("file", ["images/held-out.png", "frames.zarr/part-00000.zip", MADE])
+def test_a_set_with_a_damaged_file_is_made_again(images, tmp_path, recipe, caplog, file):
+    folder = tmp_path / "complex_motion"
+    make_complex_motion(images, folder, harder(), recipe, plain)
+    whole = (folder / file).read_bytes()
+    (folder / file).write_bytes(whole[:20] + bytes([whole[20] ^ 1]) + whole[21:])
+    assert make_complex_motion(images, folder, harder(), recipe, plain)
+    assert (folder / file).read_bytes() == whole
+    assert file == MADE or f"{folder / file} is not the file that" in caplog.text
 
 
 def test_every_picture_of_a_folder_is_for_testing(tmp_path, recipe):

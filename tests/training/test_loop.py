@@ -13,6 +13,7 @@ import torch
 from polarnet.networks.checkpoint import load_checkpoint, load_network
 from polarnet.networks.dolp_unet import DolpUNetConfig
 from polarnet.networks.e2vid import E2vid
+from polarnet.runtime.files import SUMS
 from polarnet.runtime.machine import precision_on
 from polarnet.storage.events import EventStore
 from polarnet.training.dolp import dolp_task
@@ -74,7 +75,7 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
 def test_a_training_leaves_best_and_last_checkpoint_and_history(stores, tmp_path):
     out = run(small_task(), stores, tmp_path)
     files = bytes_of(out)
-    assert files.keys() == {"best.safetensors", "best.json", "last.safetensors", "last.json", "history.csv"}
+    assert files.keys() == {"best.safetensors", "best.json", "last.safetensors", "last.json", "history.csv", SUMS}
     history = read_history(out)
     assert [row["epoch"] for row in history] == [0, 1]
     _, metadata = load_network(out / "best.safetensors")

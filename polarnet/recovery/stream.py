@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from torch import Tensor
-from tqdm import tqdm
 
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
 from polarnet.captures.imported import import_targets
@@ -33,8 +32,11 @@ from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.recording import Recording, detect_format
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import RuntimeConfig, device_of, precision_on, tune
-from polarnet.stokes import Mosaic, Prediction
+from polarnet.runtime.progress import ProgressBar
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, Prediction
 from polarnet.storage.events import EventStore
+from polarnet.storage.exchange import EXPORT_INDEX
+from polarnet.storage.parts import unknown_sequence
 
 STANDARD_INPUT = "-"
 PIXELS_AT_ONCE = 4 * 120 * 180  # total over the windows of one batch; bounds the memory of a network
@@ -113,7 +115,8 @@ def open_files(
     `clean` removes noise before the reduction.
 
     Four files hold one channel each, in the order of `arrangement.angles`, and are read by `read`. A single path is a
-    recording of a camera with a mosaic, an event store, or a folder of division-of-time captures. Captures are
+    recording of a camera with a mosaic, an event store, a folder that `polarnet export` wrote, or a folder of
+    division-of-time captures. Captures are
     calibrated in `work` with the settings that `captures` returns. With `plain`, any other file is one channel, of a
     camera without polarizers. A ValueError or FileNotFoundError says what is
     missing.
@@ -153,6 +156,8 @@ def _channels(
         return read_mosaic(path, arrangement.mosaic, read)
     if path.is_dir() and any(path.glob(f"{EVENT_CAPTURES[0]}.*")):
         return _captures(path, work, captures())
+    if path.is_dir() and (exported := _exported(path, arrangement.sequence)):
+        return read_four(exported, dict.fromkeys(exported, 0), read)  # their times count from the start of the sequence
     if detect_format(path) == "store":
         return _sequence(EventStore.open(path), path, arrangement.sequence)
     if plain:
@@ -164,12 +169,30 @@ def _channels(
     )
 
 
+def _exported(folder: Path, sequence: str | None) -> dict[int, Path]:
+    """File by angle in a folder of `polarnet export`, of one of its sequences, or of `polarnet simulate`; else none."""
+    if (folder / EXPORT_INDEX).is_file():
+        names = sorted(path.name for path in folder.iterdir() if path.is_dir())
+        name = names[0] if sequence is None and len(names) == 1 else sequence
+        if name not in names:
+            raise ValueError(f"{folder.name}: --sequence: {unknown_sequence(name, names)}")
+        folder = folder / name
+    files = {angle: sorted(folder.glob(f"polarizer_{angle:03d}.*")) for angle in POLARIZER_ANGLES_DEG}
+    if not all(files.values()):
+        return {}
+    if several := next((paths for paths in files.values() if len(paths) > 1), None):
+        raise ValueError(
+            f"{folder}: expected one file for each polarizer, got {', '.join(path.name for path in several)}; "
+            f"name the four files, with --angles 0 45 90 135"
+        )
+    return {angle: path for angle, (path,) in files.items()}
+
+
 def _sequence(store: EventStore, path: Path, sequence: str | None) -> Sequence[Events]:
     if sequence is None and len(store.sequences) == 1:
         (sequence,) = store.sequences
     if sequence not in store.sequences:
-        names = ", ".join(store.sequences[:8]) + (", ..." if len(store.sequences) > 8 else "")
-        raise ValueError(f"{path.name}: say --sequence, one of {names}; got {sequence!r}")
+        raise ValueError(f"{path.name}: --sequence: {unknown_sequence(sequence, store.sequences)}")
     return store.read(sequence)
 
 
@@ -296,7 +319,9 @@ def recover(
     last_us, started = 0, time.perf_counter()
     with (
         writer,
-        tqdm(total=source.duration_us, desc="recover", unit_scale=1e-6, bar_format=LIVE_BAR if live else BAR) as bar,
+        ProgressBar(
+            total=source.duration_us, desc="recover", unit_scale=1e-6, bar_format=LIVE_BAR if live else BAR
+        ) as bar,
     ):
         for frame in frames(source, rule, recoverer):
             writer.add(frame.window, frame.prediction)

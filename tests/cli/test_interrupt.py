@@ -1,0 +1,41 @@
+"""Ctrl-C ends a command with one line, status 130 and work that a rerun continues."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+from skimage import data, io
+
+
+def interrupted(command, folder, ready, project_root):
+    """Exit status and standard error of a command that gets SIGINT once `ready()` is true."""
+    environment = os.environ | {"PYTHONPATH": str(project_root)}
+    with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+                          env=environment, start_new_session=True) as process:  # fmt: skip
+        while not ready():
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.02)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it, to all processes of the command
+        _, error = process.communicate(timeout=60)
+    return process.returncode, error
+
+
+def test_a_benchmark_stops_in_one_line_and_a_rerun_continues(tmp_path, project_root):
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    for name in ("coffee", "astronaut", "rocket"):
+        io.imsave(photographs / f"{name}.png", getattr(data, name)()[:200, :300], check_contrast=False)
+    work = tmp_path / "out" / "work"
+    command = [sys.executable, "-m", "polarnet.cli", "benchmark", "--scenes", "photographs", "--out", "out",
+               "--methods", "cf", "benchmark.lpips=false", "runtime.workers=2"]  # fmt: skip
+    status, error = interrupted(command, tmp_path, (work / "images" / "manifest.json").exists, project_root)
+    assert status == 130
+    assert "Traceback" not in error
+    assert error.rstrip().endswith(
+        "polarnet benchmark: stopped; finished work is kept, and the same command again continues from it"
+    )
+    before = (work / "images" / "manifest.json").stat().st_mtime_ns
+    assert subprocess.run(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(project_root)}).returncode == 0
+    assert (work / "images" / "manifest.json").stat().st_mtime_ns == before

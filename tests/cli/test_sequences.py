@@ -1,0 +1,59 @@
+"""Commands on stored sequences: list, video, export of some, and recovery with truth."""
+
+import av
+import numpy as np
+import pytest
+import zarr
+
+from polarnet.cli import main
+
+
+def test_list_names_sequences_with_events_and_splits(simulated, capsys):
+    assert main(["list", str(simulated.events)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["a-0", "b-0", "c-0", "d-0"]
+    assert all("0.200 s" in line and line.endswith(" events") for line in lines)
+    assert main(["list", str(simulated.frames)]) == 0
+    assert [line.split()[1] for line in capsys.readouterr().out.splitlines()] == ["train", "train", "train", "val"]
+
+
+def test_video_shows_a_picture_for_each_true_frame_after_the_first(simulated, tmp_path, capsys):
+    assert main(["video", str(simulated.events), "b-0", "--out", str(tmp_path / "b.mp4")]) == 0
+    with av.open(str(tmp_path / "b.mp4")) as file:
+        assert len([*file.decode(video=0)]) == len(zarr_times(simulated)) - 1
+    assert main(["video", str(simulated.events), "e-0"]) == 1
+    assert "expected a sequence of a-0, b-0, c-0, d-0; got 'e-0'" in capsys.readouterr().err
+
+
+def zarr_times(simulated):
+    from polarnet.storage.frames import FrameStore
+
+    return FrameStore.open(simulated.frames).t_us("b-0")
+
+
+def test_an_exported_sequence_gives_the_frames_of_the_store(simulated, tmp_path):
+    pytest.importorskip("h5py")
+    assert main(["export", str(simulated.events), str(tmp_path / "files"), "--sequence", "b-0"]) == 0
+    assert sorted(path.name for path in (tmp_path / "files").iterdir()) == ["b-0", "run.json", "store.json"]
+    options = ["--write", "zarr", "--method", "highpass", "--sequence", "b-0"]
+    for source, out in ((simulated.events, "a"), (tmp_path / "files", "b"), (tmp_path / "files" / "b-0", "c")):
+        chosen = options[:-2] if out == "c" else options
+        assert main(["recover", str(source), "--out", str(tmp_path / out), *chosen]) == 0
+    first, second, third = (zarr.open_group(tmp_path / name / "recovered.zarr", mode="r") for name in "abc")
+    count = min(second["dolp"].shape[0], first["dolp"].shape[0])
+    assert count >= 5
+    np.testing.assert_array_equal(first["dolp"][:count], second["dolp"][:count])
+    np.testing.assert_array_equal(second["dolp"][:], third["dolp"][:])
+
+
+def test_truth_scores_a_recovery_and_reaches_its_video(simulated, tmp_path, capsys):
+    command = ["recover", str(simulated.events), "--sequence", "b-0", "--method", "highpass", "--truth",
+               "--write", "mp4", "--out", str(tmp_path / "out")]  # fmt: skip
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert "scores      MSE 0." in printed
+    assert "AoLP error" in printed
+    with av.open(str(tmp_path / "out" / "recovered.mp4")) as file:
+        assert next(file.decode(video=0)).width > 700  # three columns of panels
+    assert main([*command[:-2], "--size", "9", "12"]) == 1
+    assert "--truth: expected an event store in its own size" in capsys.readouterr().err

@@ -1,0 +1,88 @@
+"""Videos that browsers play, whole or after a kill."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+
+import av
+import numpy as np
+import pytest
+
+from polarnet.reports.videos import VideoWriter
+
+CHROMIUM = shutil.which("chromium")
+
+
+def grey(level, height=64, width=96):
+    return np.full((height, width, 3), level, np.uint8)
+
+
+def levels(path):
+    with av.open(str(path)) as file:
+        return [frame.to_ndarray(format="rgb24").mean() for frame in file.decode(video=0)]
+
+
+def test_pictures_come_back_at_their_rate_with_even_sides(tmp_path):
+    with VideoWriter(tmp_path / "a.mp4", 25.0) as video:
+        for level in range(0, 250, 10):
+            video.add(grey(level, 63, 95))
+    np.testing.assert_allclose(levels(tmp_path / "a.mp4"), range(0, 250, 10), atol=2)
+    with av.open(str(tmp_path / "a.mp4")) as file:
+        stream = file.streams.video[0]
+        assert (stream.codec.canonical_name, stream.pix_fmt) == ("h264", "yuv420p")
+        assert (stream.height, stream.width, float(stream.average_rate), stream.frames) == (64, 96, 25.0, 25)
+        assert file.duration == pytest.approx(1e6)  # a finished file states its duration
+
+
+def test_a_picture_of_another_size_is_refused(tmp_path):
+    with VideoWriter(tmp_path / "a.mp4", 25.0) as video:
+        video.add(grey(1))
+        with pytest.raises(ValueError, match="expected pictures of 64 x 96 px, got 32 x 96"):
+            video.add(grey(1, 32))
+
+
+def test_without_pictures_there_is_no_file(tmp_path):
+    with VideoWriter(tmp_path / "a.mp4", 25.0):
+        pass
+    assert not (tmp_path / "a.mp4").exists()
+
+
+def test_after_a_kill_the_complete_fragments_play(tmp_path):
+    script = """
+import sys, time, numpy as np
+from pathlib import Path
+from polarnet.reports.videos import VideoWriter
+video = VideoWriter(Path(sys.argv[1]), 10.0)
+for level in range(100):
+    video.add(np.full((64, 96, 3), level, np.uint8))
+print("written", flush=True)
+time.sleep(60)
+"""
+    command = [sys.executable, "-c", script, str(tmp_path / "a.mp4")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        os.kill(process.pid, signal.SIGKILL)
+    played = levels(tmp_path / "a.mp4")
+    assert 40 <= len(played) < 100  # the encoder and the last fragment, of 2 s, are lost
+    np.testing.assert_allclose(played, range(len(played)), atol=2)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+def test_chromium_plays_it(tmp_path):
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with VideoWriter(tmp_path / "a.mp4", 30.0) as video:
+        for level in range(0, 250, 5):
+            video.add(grey(level))
+    (tmp_path / "a.html").write_text('<video src="a.mp4" muted></video>')
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page()
+        page.goto((tmp_path / "a.html").as_uri())
+        played = page.evaluate(
+            "async () => { const v = document.querySelector('video'); await v.play();"
+            " await new Promise(done => v.onended = done); return [v.error, v.duration, v.videoWidth, v.videoHeight]; }"
+        )
+        browser.close()
+    assert played == [None, pytest.approx(50 / 30, abs=0.05), 96, 64]
