@@ -16,7 +16,6 @@ from polarnet.cli.project import hydra_runs
 from polarnet.config.tree import load
 from polarnet.metrics.lpips import PURPOSES
 from polarnet.pictures.dead_leaves import dead_leaves
-from polarnet.pictures.images import write_png
 from polarnet.simulation.scene import scene_from_rgb
 from studies.simulated_rig import RigConfig, write_rig
 
@@ -30,8 +29,6 @@ TINY = [
     "synthesize.sensor_width=60",
     "networks.polarnet.channels=[8,8,8]",
     "networks.polarnet.reach=4",
-    "networks.paper.channels=[4,8,8]",
-    "networks.paper.swin_heads=[2,2]",
     "train.epochs=1",
     "train.visits=1",
     "train.windows=3",
@@ -148,12 +145,8 @@ RIG_SIZE = {"sensor": [96, 160], "region": [24, 2], "negative_events": 24, "crop
 
 @pytest.fixture(scope="module")
 def paper(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The data folder after experiment=paper on a folder of four pictures and one target of a simulated rig."""
+    """The data folder after experiment=paper on the eight built-in photographs and one target of a simulated rig."""
     folder = tmp_path_factory.mktemp("paper")
-    (folder / "photographs").mkdir()
-    for number in range(4):
-        leaves = dead_leaves(np.random.default_rng(10 + number), 120, 180)
-        write_png(folder / "photographs" / f"{number}.png", leaves, bits=8)
     config = load(project_root, ["experiment=paper"])
     captures, picture = (
         dataclasses.replace(config.recordings, **RIG_SIZE),
@@ -164,7 +157,7 @@ def paper(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_rig(folder / "targets" / "one", scene, RIG, captures, emulator, seed=1)
     size = [f"recordings.{key}={value}".replace(" ", "") for key, value in RIG_SIZE.items()]
     overrides = [
-        "experiment=paper", f"ingest.root={folder / 'photographs'}", "ingest.dead_leaves=0", "ingest.test_fraction=0.2",
+        "experiment=paper", "ingest.source=builtin", "ingest.dead_leaves=0", "ingest.test_fraction=0.2",
         "synthesize.sensor_height=24", "synthesize.sensor_width=32",
         "benchmark.methods=[zeros,cf,e2v,ours]", "recordings.enabled=true", f"recordings.root={folder / 'targets'}",
         *size,
@@ -175,7 +168,7 @@ def paper(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_paper_experiment_goes_through_every_stage_at_reduced_sizes(paper):
-    assert json.loads((paper / "images" / "manifest.json").read_text())["counts"]["train"] == 2  # of 4 pictures
+    assert json.loads((paper / "images" / "manifest.json").read_text())["counts"]["train"] == 4  # of 8 photographs
     networks = {name: json.loads((paper / "train" / name / "best.json").read_text()) for name in ("ours", "e2v")}
     assert {name: one["network"] for name, one in networks.items()} == {"ours": "paper", "e2v": "e2vid"}
     assert networks["ours"]["config"]["input_mixing"] == "polarizers"
