@@ -114,6 +114,8 @@ def test_panels_show_one_window_of_different_scenes_and_every_method(five_scenes
     with np.load(folder / "panels" / "a1.npz") as panel:
         assert set(panel.files) == {
             *("window", "t_us", "events", "truth_dolp", "truth_aolp", "truth_s0", "dolp_zeros", "dolp_cf", "aolp_cf"),
+            *("film_t_us", "film_events", "film_truth_dolp", "film_truth_aolp", "film_truth_s0"),
+            *("film_dolp_zeros", "film_dolp_cf", "film_aolp_cf"),
         }
         assert panel["events"].shape == (4, 18, 20)
         assert panel["dolp_cf"].dtype == np.float32

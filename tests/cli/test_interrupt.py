@@ -9,11 +9,16 @@ import time
 from skimage import data, io
 
 
+def heed_interrupts() -> None:
+    """Undo what a shell sets for commands in its background."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def interrupted(command, folder, ready, project_root):
     """Exit status and standard error of a command that gets SIGINT once `ready()` is true."""
     environment = os.environ | {"PYTHONPATH": str(project_root)}
     with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-                          env=environment, start_new_session=True) as process:  # fmt: skip
+                          env=environment, start_new_session=True, preexec_fn=heed_interrupts) as process:  # fmt: skip
         while not ready():
             assert process.poll() is None, process.communicate()
             time.sleep(0.02)

@@ -247,7 +247,9 @@ def test_interrupted_or_failed_runs_leave_an_earlier_run_and_nothing_else(tmp_pa
 
     monkeypatch.setattr(simulated_files, "leave_sensors", interrupted)
     assert main([*command, "seed=2"]) == 130
-    assert capsys.readouterr().err.endswith("polarnet simulate: stopped\n")
+    assert capsys.readouterr().err.endswith(
+        "polarnet simulate: stopped; finished work is kept, and the same command again continues from it\n"
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "walk.mp4"]
     assert_equal(stored(), before)
     monkeypatch.undo()

@@ -32,8 +32,9 @@ def test_real_targets_are_a_set_while_they_are_switched_on(project_root, tmp_pat
 def test_a_row_without_weights_is_recorded_without_opening_a_test_set(project_root, tmp_path):
     config = load(project_root, [f"paths.data={tmp_path}"])
     pipeline.run_rows(config, ["e2p"])
-    (file,) = (tmp_path / "benchmark" / "rows" / "e2p").iterdir()
-    assert "best.safetensors is not there" in file.read_text()
+    row = tmp_path / "benchmark" / "rows" / "e2p"
+    assert {file.name for file in row.iterdir()} == {"row.json", "SHA256SUMS"}
+    assert "best.safetensors is not there" in (row / "row.json").read_text()
     with pytest.raises(ValueError, match="expected at least one row that can run, got none"):
         tables.collect_rows(load(project_root, [f"paths.data={tmp_path}", "benchmark.methods=[e2p]"]))
 

@@ -151,7 +151,8 @@ def write_sample(form: str, path: Path, events: Events) -> None:
 def ending(path: Path, form: str | None, chunk_events: int, **size: int) -> str:
     """One of ENDINGS. Whatever else a reader does (another error, events out of order, an unnamed file) is raised."""
     try:
-        reader = open_recording(path, form, part="lake/135", chunk_events=chunk_events, **size)
+        part = "lake/135" if path.is_dir() else None  # of an event store
+        reader = open_recording(path, form, part=part, chunk_events=chunk_events, **size)
         before = None
         for events in reader:
             validate(events)

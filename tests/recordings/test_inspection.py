@@ -92,5 +92,5 @@ def test_inspect_of_a_mode_without_polarity_says_what_to_do(tmp_path, capsys):
 
 def test_a_sensor_larger_than_any_is_refused(tmp_path):
     (tmp_path / "e.txt").write_text("32767 32767\n1 2 3 1\n")
-    with pytest.raises(RecordingError, match="no event camera has 32767 x 32767 px"):
+    with pytest.raises(RecordingError, match="expected a sensor of at most 16,777,216 pixels, got 32767x32767"):
         inspect_recording(open_recording(tmp_path / "e.txt"), FACTOR)

@@ -78,7 +78,7 @@ def test_another_seed_gives_other_events(simulated, source):
 
 
 def test_an_unknown_sequence_and_an_empty_memory_are_refused(simulated, source):
-    with pytest.raises(ValueError, match="there is no 'lake' among its 4 sequences"):
+    with pytest.raises(ValueError, match="expected a sequence of a-0, b-0, c-0, d-0; got 'lake'"):
         source.read("lake")
     with pytest.raises(ValueError, match="at least one sequence to keep"):
         EmulatedEvents(SceneStore.open(simulated.scenes), simulated.camera, simulated.seed, capacity=0)

@@ -207,7 +207,7 @@ def test_events_that_break_the_format_are_refused_before_anything_is_written(mak
         write(good, 0)
     with pytest.raises(ValueError, match="each of 4 polarizers, got 1"):
         store.write("a", [good], 1000)
-    with pytest.raises(ValueError, match="there is no 'b'"):
+    with pytest.raises(ValueError, match="expected a sequence of a; got 'b'"):
         store.write("b", [good] * 4, 1000)
     assert store.missing() == ["a"]
 

@@ -128,7 +128,7 @@ def test_what_cannot_be_a_scene_is_refused(tmp_path):
         store.write("leaves-0", SCENES["leaves"], torch.tensor([0.0, math.nan, 0.0], dtype=torch.float64), 1000)
     with pytest.raises(ValueError, match="duration above 0"):
         store.write("leaves-0", SCENES["leaves"], STILL, 0)
-    with pytest.raises(ValueError, match="there is no 'tea'"):
+    with pytest.raises(ValueError, match="expected a sequence of coffee-0, coffee-1, leaves-0; got 'tea'"):
         store.write("tea", SCENES["leaves"], STILL, 1)
 
 
