@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from polarnet.cli.own_scenes import benchmark_recordings
 from polarnet.config.tree import Config, load
@@ -109,7 +110,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         results, out = measured(config, Path(folder), photographs)
         if arguments.picture:
-            (ROOT / "docs" / "pictures" / "recorded.png").write_bytes((out / "comparison.png").read_bytes())
+            with Image.open(out / "comparison.png") as picture:
+                picture.reduce(2).quantize().save(ROOT / "docs" / "pictures" / "recorded.png", optimize=True)
     print(json.dumps({row: scores["psnr"] for row, scores in results["scores"].items()}, indent=2))
     print(results["reader_errors"], {"formats_read": len(FORMATS)}, figures_of(results["scores"]))
     if arguments.write:

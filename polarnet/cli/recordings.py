@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import functools
 import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,12 @@ from polarnet.cli.parsers import (
 from polarnet.cli.project import settings_root
 
 if TYPE_CHECKING:
+    from polarnet.captures.dot import RecordingsConfig
+    from polarnet.recordings.live import LiveLines
+    from polarnet.recordings.live_camera import LiveCamera
+    from polarnet.recordings.noise import Cleaner
+    from polarnet.recovery.stream import Input
+    from polarnet.stokes import Mosaic
     from polarnet.storage.true_frames import TrueFrames
 
 CLEANING_OPTIONS = ("hot_pixels", "background")
@@ -245,9 +252,8 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.methods import METHODS
     from polarnet.recordings.noise import Cleaner
     from polarnet.recordings.polarizers import ChannelCheck
-    from polarnet.recordings.recording import read_recording
     from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
-    from polarnet.recovery.stream import Arrangement, facts_of, frames_of, open_files, open_live, open_method, recover
+    from polarnet.recovery.stream import facts_of, frames_of, open_method, recover
     from polarnet.recovery.watching import TruthScores, logged
     from polarnet.recovery.writer import RecoveryWriter
     from polarnet.reports.rerun_log import RerunLog
@@ -280,19 +286,11 @@ def _recover(options: argparse.Namespace) -> int:
     name = "live" if options.live else Path(options.input[0]).stem
     out = options.out or Path("outputs") / "recover" / name
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
-    cleaner, lines = Cleaner(cleaning, mosaic), None
+    cleaner = Cleaner(cleaning, mosaic)
     with run_folder(out, "recover") as folder:
         if options.live:
             print(f"writing frames to {folder}; the folder becomes {out} at the end", file=sys.stderr)
-            source, lines = open_live(options.input[0], mosaic, options.idle)
-            source = source._replace(pieces=cleaner.live(source.pieces))
-        else:
-            read = functools.partial(read_recording, **reading_of(options))
-            arrangement = Arrangement(options.angles, mosaic, options.sequence)
-            size = (options.size[0], options.size[1]) if options.size else None
-            files, captures = [Path(path) for path in options.input], lambda: config().recordings
-            plain = _reconstructs(options.method)
-            source = open_files(files, arrangement, read, size, folder / WORK, captures, plain, cleaner)
+        source, lines = _input(options, mosaic, cleaner, folder / WORK, lambda: config().recordings)
         check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
         if source.channels == len(POLARIZER_ANGLES_DEG):
             source = source._replace(pieces=check.watch(source.pieces))
@@ -312,23 +310,48 @@ def _recover(options: argparse.Namespace) -> int:
         left_out = {kind: count for kind, count in lines.counts.items() if count} if lines else {}
         notes = check.findings() if source.channels > 1 else []
         notes += [f"Unusable lines were left out: {left_out}."] if left_out else []
-        counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)
         facts = facts_of(source, rule, words, summary)
         if options.rate is not None:
             facts["rate"] = f"{options.rate:g} frames a second, carried on by the events from window to window"
         if source.channels > 1:
+            counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)
             facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
         if scores:
             facts["scores"] = scores.sentence(config().benchmark.warmup_windows)
         if any(getattr(options, option) for option in CLEANING_OPTIONS):
             facts["removed"] = cleaner.sentence()
         page = writer.write_page(source.name, facts, notes)
+    _print_run(facts, notes, out / page.name)
+    return 0
+
+
+def _input(
+    options: argparse.Namespace,
+    mosaic: "Mosaic | None",
+    cleaner: "Cleaner",
+    work: Path,
+    captures: "Callable[[], RecordingsConfig]",
+) -> "tuple[Input, LiveLines | LiveCamera | None]":
+    """The cleaned events that the options name, and what counts the lines of live input."""
+    from polarnet.recordings.recording import read_recording
+    from polarnet.recovery.stream import Arrangement, open_files, open_live
+
+    if options.live:
+        source, lines = open_live(options.input[0], mosaic, options.idle)
+        return source._replace(pieces=cleaner.live(source.pieces)), lines
+    read = functools.partial(read_recording, **reading_of(options))
+    arrangement = Arrangement(options.angles, mosaic, options.sequence)
+    size = (options.size[0], options.size[1]) if options.size else None
+    files, plain = [Path(path) for path in options.input], _reconstructs(options.method)
+    return open_files(files, arrangement, read, size, work, captures, plain, cleaner), None
+
+
+def _print_run(facts: Mapping[str, str], notes: Sequence[str], page: Path) -> None:
     for key, value in facts.items():
         print(f"{key:11s} {value}")
     for note in notes:
         print(f"polarnet recover: warning: {note}", file=sys.stderr)
-    print(f"page        {out / page.name}")
-    return 0
+    print(f"page        {page}")
 
 
 def _truth_of(options: argparse.Namespace) -> "TrueFrames | None":
@@ -389,9 +412,7 @@ def _recover_rotating(options: argparse.Namespace) -> int:
         words += f"{rotation.rate_hz:g} turns/s"
         facts = facts_of(source, rule, words, summary)
         page = writer.write_page(source.name, facts, [])
-    for key, value in facts.items():
-        print(f"{key:11s} {value}")
-    print(f"page        {out / page.name}")
+    _print_run(facts, [], out / page.name)
     return 0
 
 

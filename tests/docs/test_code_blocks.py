@@ -131,8 +131,10 @@ def folder(tmp_path_factory):
 def test_the_python_of_a_page_runs_from_top_to_bottom(page, folder, monkeypatch):
     monkeypatch.chdir(folder)
     names: dict = {"__name__": "documentation"}
-    for number, block in enumerate(b for b in blocks("python") if b.page == page):
+    own = [block for block in blocks("python") if block.page == page]
+    for number, block in enumerate(own):
         exec(compile(block.text, f"{page.name}, block {number}", "exec"), names)
+    assert len(names) > 2, "no block of the page imports or computes anything"
 
 
 @pytest.mark.parametrize(("page", "test"), TESTED_ELSEWHERE.items())

@@ -64,7 +64,7 @@ def test_workers_end_with_the_process_that_started_them(tmp_path):
     main = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], env={**os.environ, "PYTHONPATH": paths})
     until(lambda: len(list(tmp_path.iterdir())) == 2)
     main.kill()
-    main.wait()
+    assert main.wait() == -signal.SIGKILL
     until(lambda: not any(Path("/proc", note.name).exists() for note in tmp_path.iterdir()))
 
 
