@@ -15,6 +15,11 @@ PICTURE_US = 33_333
 
 def add_to(commands: Commands) -> None:
     """Add the commands view, list, verify, export, video and labels."""
+    for add in (_add_view, _add_list, _add_verify, _add_export, _add_video, _add_labels):
+        add(commands)
+
+
+def _add_view(commands: Commands) -> None:
     view = commands.add_parser(
         "view",
         help="look at a store, a recording or a recovery in a page that plays it",
@@ -34,16 +39,22 @@ def add_to(commands: Commands) -> None:
     add_reading(view)
     view.set_defaults(run=_view)
 
+
+def _add_list(commands: Commands) -> None:
     listing = commands.add_parser("list", help="name the sequences of a store of events, frames or scenes")
     listing.add_argument("store", help="store: folder or fsspec URL")
     listing.set_defaults(run=_list)
 
+
+def _add_verify(commands: Commands) -> None:
     verify = commands.add_parser("verify", help="check every byte of a store, a checkpoint or a data folder")
     verify.add_argument(
         "store", help="store (folder or fsspec URL), checkpoint (.safetensors), running.pt or data folder"
     )
     verify.set_defaults(run=_verify)
 
+
+def _add_export(commands: Commands) -> None:
     export = commands.add_parser("export", help="export an event store to files for other tools")
     export.add_argument("store", help="event store: folder or fsspec URL")
     export.add_argument("folder", type=Path, help="output folder; one file for each sequence and channel")
@@ -56,6 +67,8 @@ def add_to(commands: Commands) -> None:
     export.add_argument("--sequence", nargs="+", metavar="NAME", help="sequences to export (default: all)")
     export.set_defaults(run=_export)
 
+
+def _add_video(commands: Commands) -> None:
     video = commands.add_parser(
         "video",
         help="draw a stored sequence and its truth as a video that browsers play",
@@ -77,6 +90,8 @@ def add_to(commands: Commands) -> None:
     )
     video.set_defaults(run=_video)
 
+
+def _add_labels(commands: Commands) -> None:
     labels = commands.add_parser(
         "labels",
         help="count and draw a stored sequence's events by cause, and score the removal of hot pixels",
