@@ -51,6 +51,11 @@ def test_the_first_table_has_the_seven_scores_at_most_and_the_best_is_marked(pag
     assert 'class="best"' in ours
 
 
+def test_the_papers_own_table_stands_on_the_page(page):
+    assert "15.56" in page
+    assert "27.48" in page
+
+
 def test_every_picture_says_what_it_shows(page):
     html = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)  # the plotting library writes tags too
     tags = re.findall(r"<img[^>]*>", html)
