@@ -121,7 +121,7 @@ def s3_server() -> Iterator[str]:
 
 
 def queue(clone: Path) -> dict[str, Any]:
-    """Run experiments with two workers of `dvc queue`: how many succeed, what they execute, and what they leave alone."""
+    """Run experiments with two workers of `dvc queue`: successes, executed stages and whether params.yaml stays."""
     params = (clone / "params.yaml").read_bytes()
     names = [f"queued{k}" for k in range(len(QUEUED))]
     for name, override in zip(names, QUEUED, strict=True):
