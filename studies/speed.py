@@ -135,7 +135,7 @@ def _points(sweep: Path) -> list[Any]:
 def search(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Trials of an Optuna search, how many were stopped, how many a second start runs, and the best point."""
     words = [*SHORT, "train.epochs=2", SWEEP_ROWS, *SEARCH, f"paths.resume={folder / 'resume'}"]
-    asked = ["--trials", str(TRIALS), "--jobs", "2", "--out", folder / "search"]
+    asked = ["--trials", str(TRIALS), "--jobs", "2", "--out", str(folder / "search")]
     started = time.monotonic()
     stage("search", options, *words, *asked)
     minutes = round((time.monotonic() - started) / 60, 2)
