@@ -3,7 +3,8 @@
 python -m studies.clones [push] [queue] [--write]
 
 `push` sends the artefacts to a folder and to an S3-compatible server on loopback, and pulls them into another clone.
-`queue` runs two experiments with two workers. Both write to docs/results/sweeps.json and need the extra `remote`.
+It needs `pip install dvc-s3 'moto[server]'`. `queue` runs two experiments with two workers. Both write to
+docs/results/sweeps.json.
 """
 
 import argparse
