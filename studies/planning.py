@@ -8,12 +8,12 @@ from studies.tables import Block, Results, Row
 
 PICTURES = (10**3, 10**4, 10**6)
 MIB_PER_GB = 1e9 / 2**20
-HEADINGS = {"cost": "{cost}", **{f"{pictures:,} pictures": f"{{n{pictures}:,.2f}}" for pictures in PICTURES}}
+HEADINGS = {"cost": "{cost}", **{f"{pictures:,} pictures": f"{{n{pictures}:,g}}" for pictures in PICTURES}}
 
 
 def multiplied(costs: Mapping[str, float]) -> list[Row]:
-    """A row for each cost of one picture, with a column for each number of pictures."""
-    return [{"cost": name, **{f"n{n}": n * cost for n in PICTURES}} for name, cost in costs.items()]
+    """A row for each cost of one picture, with a column for each number of pictures, to three digits."""
+    return [{"cost": name, **{f"n{n}": float(f"{n * cost:.3g}") for n in PICTURES}} for name, cost in costs.items()]
 
 
 def simulation_rows(results: Results) -> list[Row]:

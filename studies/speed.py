@@ -31,7 +31,7 @@ LAUNCHERS = {
     "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
     "submitit_local": ["hydra/launcher=submitit_local", "hydra.launcher.timeout_min=60"],
 }
-SHORT = ["network=paper", "train.windows=2", "train.bptt_windows=2", "runtime.threads=1"]
+SHORT = ["network=paper", "train.windows=2", "train.bptt_windows=2", "train.crop=[40,60]", "runtime.threads=1"]
 SWEEP = [*SHORT, "loss.mse=1.0,10.0", "loss.ssim=0.0,1.0", "loss.lpips=0.0,1.0"]
 SWEEP_ROWS = "benchmark.methods=[zeros,ours]"
 KILLED_AFTER = 4
@@ -114,11 +114,10 @@ def _dask_points(options: argparse.Namespace, sweep: Path) -> None:
     """Run the sweep's points as tasks of two Dask workers on loopback, and write its table."""
     from distributed import LocalCluster
 
-    swept = [one for one in SWEEP if "," in one]
+    swept = SWEEP[len(SHORT) :]
     values = [[f"{key}={value}" for value in given.split(",")] for key, given in (one.split("=") for one in swept)]
-    fixed = [one for one in SWEEP if one not in swept]
     points = [
-        words_of("trial", options, *fixed, *point, SWEEP_ROWS, f"hydra.run.dir={sweep / str(k)}", _folders(sweep)[1])
+        words_of("trial", options, *SHORT, *point, SWEEP_ROWS, f"hydra.run.dir={sweep / str(k)}", _folders(sweep)[1])
         for k, point in enumerate(itertools.product(*values))
     ]
     run = functools.partial(subprocess.run, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
