@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -79,17 +80,25 @@ def launchers(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
     The sweep of the basic launcher is killed half-way and continued. Dask runs each point as a task of its own.
     """
-    lost = _killed_half_way(options, folder / "basic")
-    for name, chosen in LAUNCHERS.items():
-        stage("trial", options, *chosen, *SWEEP, SWEEP_ROWS, *_folders(folder / name), "--multirun")
-    _dask_points(options, folder / "dask")
-    scores = {name: _points(folder / name) for name in (*LAUNCHERS, "dask")}
+
+    def sweep(name: str) -> int:
+        lost = _killed_half_way(options, folder / name) if name == "basic" else lambda: 0
+        if name == "dask":
+            _dask_points(options, folder / name)
+        else:
+            stage("trial", options, *LAUNCHERS[name], *SWEEP, SWEEP_ROWS, *_folders(folder / name), "--multirun")
+        return lost()
+
+    names = [*LAUNCHERS, "dask"]
+    with ThreadPoolExecutor(2) as pool:  # two sweeps at a time
+        lost = sum(pool.map(sweep, names))
+    scores = {name: _points(folder / name) for name in names}
     return {
         "launchers_equal": all(one == scores["basic"] for one in scores.values()),
-        "resumed_trials_lost": lost(),
+        "resumed_trials_lost": lost,
         "killed_after": KILLED_AFTER,
         "points": len(scores["basic"]),
-        "launchers": [*scores],
+        "launchers": names,
     }
 
 
