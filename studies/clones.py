@@ -1,10 +1,10 @@
 """Check DVC's remotes and its queue in fresh clones of the committed project, at smoke size.
 
-python -m studies.clones [push] [queue] [--write]
+python -m studies.clones [push] [queue] [--target STAGE] [--write]
 
 `push` sends the artefacts to a folder and to an S3-compatible server on loopback, and pulls them into another clone.
 It needs `pip install dvc-s3 'moto[server]'`. `queue` runs two experiments with two workers. Both write to
-docs/results/sweeps.json.
+docs/results/sweeps.json. `--target` limits the pipeline to a stage and those before it.
 """
 
 import argparse
@@ -20,9 +20,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from studies.measure import ROOT, STAGE_STARTS, arguments_of, command_line, machine_record, write_section
 
-QUEUED = ("loss.mse=1.0", "loss.mse=5.0")
+QUEUED = ("synthesize.speed_max_px_s=120.0", "synthesize.speed_max_px_s=140.0")
 POLL_S = 5
 BUCKET = "artefacts"
 
@@ -50,23 +52,23 @@ def executed(output: str) -> list[str]:
     return list(dict.fromkeys(STAGE_STARTS.findall(output)))
 
 
-def reproduced(folder: Path) -> Path:
-    """A clone whose pipeline ran at smoke size and whose lock is committed."""
+def reproduced(folder: Path, target: list[str]) -> Path:
+    """A clone whose pipeline ran at smoke size, up to `target` if any, and whose lock is committed."""
     clone = folder / "first"
     run(folder, "git", "clone", "--quiet", ROOT, clone)
     run(clone, "-m", "polarnet.cli", "preset", "smoke")
-    dvc(clone, "repro")
+    dvc(clone, "repro", *target)
     run(clone, "git", "-c", "user.name=study", "-c", "user.email=study@localhost", "commit", "-qam", "smoke size")
     return clone
 
 
-def push(clone: Path) -> dict[str, Any]:
+def push(clone: Path, target: list[str]) -> dict[str, Any]:
     """Files and bytes of each remote, and the number of stages that another clone executes after `dvc pull`."""
     remotes = {"folder": clone.parent / "remote"}
     with s3_server() as url:
         figures = {
-            "folder": _through(clone, "folder", remotes["folder"]),
-            "s3": _through(clone, "s3", f"s3://{BUCKET}", url),
+            "folder": _through(clone, target, "folder", remotes["folder"]),
+            "s3": _through(clone, target, "s3", f"s3://{BUCKET}", url),
         }
     files = [path for path in remotes["folder"].rglob("*") if path.is_file()]
     return {
@@ -78,7 +80,7 @@ def push(clone: Path) -> dict[str, Any]:
     }
 
 
-def _through(clone: Path, name: str, url: str | Path, endpoint: str | None = None) -> dict[str, Any]:
+def _through(clone: Path, target: list[str], name: str, url: str | Path, endpoint: str | None = None) -> dict[str, Any]:
     """Push from `clone` to a new remote and pull into a new clone; seconds, executed stages, and digest of its data."""
     other = clone.parent / f"from_{name}"
     run(clone.parent, "git", "clone", "--quiet", clone, other)
@@ -87,11 +89,11 @@ def _through(clone: Path, name: str, url: str | Path, endpoint: str | None = Non
         if endpoint:
             dvc(one, "remote", "modify", "--local", name, "endpointurl", endpoint)
     started = time.monotonic()
-    dvc(clone, "push")
+    dvc(clone, "push", *target)
     pushed = time.monotonic()
-    dvc(other, "pull")
+    dvc(other, "pull", *target)
     seconds = {"push_seconds": round(pushed - started, 1), "pull_seconds": round(time.monotonic() - pushed, 1)}
-    return {**seconds, "executed": executed(dvc(other, "repro")), "sha256": _digest(other)}
+    return {**seconds, "executed": executed(dvc(other, "repro", *target)), "sha256": _digest(other)}
 
 
 def _digest(clone: Path) -> str:
@@ -121,12 +123,12 @@ def s3_server() -> Iterator[str]:
         server.stop()
 
 
-def queue(clone: Path) -> dict[str, Any]:
+def queue(clone: Path, target: list[str]) -> dict[str, Any]:
     """Run experiments with two workers of `dvc queue`: successes, executed stages and whether params.yaml stays."""
     params = (clone / "params.yaml").read_bytes()
     names = [f"queued{k}" for k in range(len(QUEUED))]
     for name, override in zip(names, QUEUED, strict=True):
-        dvc(clone, "exp", "run", "--queue", "--name", name, "-S", override)
+        dvc(clone, "exp", "run", "--queue", "--name", name, "-S", override, *target)
     os.environ["OMP_NUM_THREADS"] = "1"  # each worker has one core
     started = time.monotonic()
     dvc(clone, "queue", "start", "-j", "2")
@@ -137,14 +139,15 @@ def queue(clone: Path) -> dict[str, Any]:
     seconds = round(time.monotonic() - started)
     dvc(clone, "queue", "stop")
     ran = [executed(dvc(clone, "queue", "logs", name)) for name in names]
-    scores = [run(clone, "git", "show", f"{name}:data/benchmark/metrics.json") for name in experiments(clone, names)]
+    locks = [yaml.safe_load(run(clone, "git", "show", f"{name}:dvc.lock")) for name in experiments(clone, names)]
+    scenes = {lock["stages"]["synthesize"]["outs"][1]["md5"] for lock in locks}
     return {
         "experiments": len(QUEUED),
         "succeeded": status.count("Success"),
         "together": together,
         "seconds": seconds,
         "executed": sorted(set().union(*ran)),
-        "scores_differ": len(set(scores)) == len(QUEUED),
+        "scenes_differ": len(scenes) == len(QUEUED),
         "params_unchanged": (clone / "params.yaml").read_bytes() == params,
     }
 
@@ -162,12 +165,13 @@ def main() -> None:
     """Run the studies in one clone, print and perhaps write."""
     parser = command_line(__doc__, "docs/results/sweeps.json")
     parser.add_argument("studies", nargs="+", choices=tuple(STUDIES))
+    parser.add_argument("--target", nargs=1, default=[], metavar="STAGE", help="last stage that runs; default: all")
     options: argparse.Namespace = arguments_of(parser)
     record = machine_record(ROOT)
     with tempfile.TemporaryDirectory() as folder:
-        clone = reproduced(Path(folder))
+        clone = reproduced(Path(folder), options.target)
         for name in options.studies:
-            figures = STUDIES[name](clone)
+            figures = STUDIES[name](clone, options.target) | {"target": "".join(options.target) or "all"}
             print(json.dumps({name: figures}, indent=2), flush=True)
             if options.write:
                 print(f"wrote {write_section(ROOT, 'sweeps', name, figures, record)}")
