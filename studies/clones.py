@@ -89,9 +89,9 @@ def _through(clone: Path, target: list[str], name: str, url: str | Path, endpoin
         if endpoint:
             dvc(one, "remote", "modify", "--local", name, "endpointurl", endpoint)
     started = time.monotonic()
-    dvc(clone, "push", *target)
+    dvc(clone, "push", "--with-deps", *target)
     pushed = time.monotonic()
-    dvc(other, "pull", *target)
+    dvc(other, "pull", "--with-deps", *target)
     seconds = {"push_seconds": round(pushed - started, 1), "pull_seconds": round(time.monotonic() - pushed, 1)}
     return {**seconds, "executed": executed(dvc(other, "repro", *target)), "sha256": _digest(other)}
 
