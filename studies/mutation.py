@@ -3,43 +3,37 @@
 python -m studies.mutation [--module MODULE ...] [--mutants N] [--workers N] [--seed N] [--write]
 
 A mutant is one module with one change: another operator or comparison, a number plus or minus 1, a negated condition,
-or None returned. Each mutant runs in a process of its own, a copy of one that has imported polarnet: the functions and
-constants of the module are replaced, then the tests of `TESTS` run. The mutant is killed if a test fails or if the
-tests exceed `LIMIT_S`. The mutants of a module are drawn with the seed. Annotations, decorators and error messages are
-not mutated. Pixel models run uncompiled.
+or None returned. Each mutant is imported in a process of its own, which runs the tests of `TESTS` that concern the
+module. The mutant is killed if a test fails or if the tests exceed `LIMIT_S`. The mutants of a module are drawn with
+the seed. Annotations, decorators and error messages are not mutated. Pixel models run uncompiled.
 
 The score is the fraction of killed mutants. Mutants that compute the same as the code, listed with the reason in
 `EQUIVALENT`, count as survivors in it. --write updates section `mutation` of docs/results/reliability.json.
 """
 
 import ast
-import gc
-import inspect
+import importlib.machinery
 import json
 import multiprocessing
 import os
 import random
-import resource
-import signal
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import FunctionType
 from typing import Any, NamedTuple
 
-import numba
-import pytest
-
-from studies.measure import arguments_of, command_line, machine_record, write_section
-
 ROOT = Path(__file__).resolve().parents[1]
-LIMIT_S = 30  # processor time, so that other programs do not turn a survivor into a kill
+LIMIT_S = 60.0
 UNCOMPILED = tuple(
     f"polarnet.simulation.pixels.{name}" for name in ("physics", "light", "exact", "v2e", "esim", "voltmeter")
 )
 """Modules whose kernels run as Python, so that a mutant of one of them needs no compilation."""
+PRELOADED = (
+    "torch", "numpy", "numba", "scipy.stats", "cv2", "zarr", "hydra", "omegaconf", "pydantic.dataclasses", "beartype",
+    "jaxtyping", "hypothesis", "pytest", "matplotlib.figure", "ruamel.yaml", "skimage.metrics", "torchmetrics",
+)  # fmt: skip
 ONE_PIXEL = (
     "test_pixel_physics or test_light or log_ramp or low_pass or delayed or response_is_linear or follows_a_step "
     "or v2e_does_not"
@@ -161,117 +155,75 @@ def mutants_of(module: str, number: int, seed: int) -> list[Mutant]:
     return mutants
 
 
-def _functions(namespace: Mapping[str, Any]) -> Iterator[FunctionType]:
-    """Functions of a module or class, in the order of their definition, methods included."""
-    for value in namespace.values():
-        value = inspect.unwrap(getattr(value, "fget", getattr(value, "__func__", value)))
-        if isinstance(value, FunctionType):
-            yield value
-        elif inspect.isclass(value) and value.__module__ == namespace.get("__name__"):
-            yield from _functions(vars(value))
+def _test(mutant: Mutant) -> None:
+    """Run the tests of a mutant in this process; its status is that of pytest."""
+    import numba
+    import pytest
 
-
-def _apply(mutant: Mutant) -> None:
-    """Give the imported module the code and the constants of the mutant; the other modules see it too."""
-    name = mutant.module.removesuffix(".py").replace("/", ".")
-    module = sys.modules[name]
-    changed = {"__name__": name, "__file__": module.__file__}
-    exec(compile(mutant.source, str(ROOT / mutant.module), "exec"), changed)
-    functions = {each.__qualname__: each for each in _functions(changed) if each.__module__ == name}
-    for function in _functions(vars(module)):
-        if function.__module__ == name and function.__qualname__ in functions:
-            other = functions[function.__qualname__]
-            function.__code__, function.__defaults__ = other.__code__, other.__defaults__
-    for key, value in changed.items():
-        if not key.startswith("__") and not callable(value) and not inspect.ismodule(value):
-            setattr(module, key, value)
-
-
-def _silent() -> None:
     output = os.open(os.devnull, os.O_WRONLY)
     for standard in (1, 2):
         os.dup2(output, standard)
+    os.chdir(ROOT)
+    if mutant.module.startswith("polarnet/simulation/pixels/"):
+        njit = numba.njit
 
+        def uncompiled(*kernels: Any, **options: Any) -> Any:
+            return (
+                njit(*kernels, **options)
+                if kernels
+                else lambda k: k if k.__module__ in UNCOMPILED else njit(**options)(k)
+            )
 
-def _test(mutant: Mutant) -> None:
-    """Run the tests of a mutant in this process; its status is that of pytest."""
-    resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S + 1))
-    _silent()
-    try:
-        _apply(mutant)
-    except Exception:  # a mutant that cannot be imported
-        sys.exit(1)
-    for name in [name for name in sys.modules if name.startswith("test_")]:
-        del sys.modules[name]  # they may hold constants of the module
-    sys.exit(pytest.main([*OPTIONS, "-x", *TESTS[mutant.module]]))
+        numba.njit = uncompiled
+    file, loader = str(ROOT / mutant.module), importlib.machinery.SourceFileLoader
+    get_data, path_stats = loader.get_data, loader.path_stats
 
+    def without_bytecode(self: Any, path: str) -> Any:
+        if path == file:
+            raise OSError("the mutant has no bytecode file")
+        return path_stats(self, path)
 
-def _preload(modules: list[str], uncompiled: bool) -> None:
-    """Import polarnet and the tests of these modules, so that each mutant's process has them."""
-    for name in [name for name in sys.modules if name.partition(".")[0] == "polarnet" or name.startswith("test_")]:
-        del sys.modules[name]
-    njit = numba.njit
-
-    def python(*kernels: Any, **options: Any) -> Any:
-        return (
-            njit(*kernels, **options) if kernels else lambda k: k if k.__module__ in UNCOMPILED else njit(**options)(k)
-        )
-
-    if uncompiled:
-        numba.njit = python
-    files = {each for module in modules for each in TESTS[module] if each.startswith("tests/")}
-    pytest.main([*OPTIONS, "--collect-only", "-qqq", *sorted(files)])
-    gc.freeze()  # the copies need not search what was imported
+    loader.path_stats = without_bytecode  # type: ignore[method-assign]
+    loader.get_data = lambda self, path: mutant.source.encode() if path == file else get_data(self, path)  # type: ignore
+    for name in [name for name in sys.modules if name.partition(".")[0] == "polarnet"]:
+        del sys.modules[name]  # pytest's type checks hook into modules that are not yet imported
+    sys.path[:0] = [str(ROOT)]
+    options = ["-x", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
+    sys.exit(pytest.main([*options, *TESTS[mutant.module]]))
 
 
 def outcome(mutant: Mutant) -> str:
     """`survived`, `killed` or `timeout` of a mutant, from a process of its own."""
     process = CONTEXT.Process(target=_test, args=(mutant,))
     process.start()
-    process.join()
-    if process.exitcode == -signal.SIGXCPU:
+    process.join(LIMIT_S)
+    if process.is_alive():
+        process.kill()
+        process.join()
         return "timeout"
     return "killed" if process.exitcode else "survived"
 
 
-OPTIONS = (
-    "-o",
-    "addopts=",
-    "-p",
-    "no:cacheprovider",
-    "-p",
-    "no:jaxtyping",
-    "-p",
-    "no:xdist",
-    "-p",
-    "no:unraisableexception",
-    "--hypothesis-seed=0",
-)
-CONTEXT = multiprocessing.get_context("fork")
+CONTEXT = multiprocessing.get_context("forkserver")
 
 
 def measure(modules: list[str], number: int, seed: int, workers: int) -> dict[str, Any]:
     """Counts of each module, the survivors, and the score; RuntimeError if the tests fail without a mutation."""
-    mutants, outcomes = [], []
-    for uncompiled in (False, True):
-        group = [module for module in modules if ("/pixels/" in module) == uncompiled]
-        if not group:
-            continue
-        _preload(group, uncompiled)
-        drawn = [mutant for module in group for mutant in mutants_of(module, number, seed)]
-        unchanged = [Mutant(module, (ROOT / module).read_text(), "", "") for module in group]
-        with ThreadPoolExecutor(workers) as pool:
-            failed = [
-                one.module
-                for one, how in zip(unchanged, pool.map(outcome, unchanged), strict=True)
-                if how != "survived"
-            ]
-            if failed:
-                raise RuntimeError(f"expected tests that pass without a mutation within {LIMIT_S} s, not so: {failed}")
-            for mutant, how in zip(drawn, pool.map(outcome, drawn), strict=True):
-                mutants.append(mutant)
-                outcomes.append(how)
-                print(f"{how:8} {mutant.name}", flush=True)
+    CONTEXT.set_forkserver_preload([*PRELOADED])
+    os.environ["OMP_NUM_THREADS"] = "1"
+    mutants = [mutant for module in modules for mutant in mutants_of(module, number, seed)]
+    unchanged = [Mutant(module, (ROOT / module).read_text(), "", "") for module in modules]
+    with ThreadPoolExecutor(workers) as pool:
+        if failed := [
+            each.module for each, how in zip(unchanged, pool.map(outcome, unchanged), strict=True) if how != "survived"
+        ]:
+            raise RuntimeError(
+                f"expected tests that pass without a mutation, got failures or {LIMIT_S:g} s for {failed}"
+            )
+        outcomes = []
+        for mutant, how in zip(mutants, pool.map(outcome, mutants), strict=True):
+            outcomes.append(how)
+            print(f"{how:8} {mutant.name}", flush=True)
     counts = {module: Counter[str]() for module in modules}
     for mutant, how in zip(mutants, outcomes, strict=True):
         counts[mutant.module].update(["mutants", how])
@@ -288,6 +240,8 @@ def measure(modules: list[str], number: int, seed: int, workers: int) -> dict[st
 
 def main() -> None:
     """The command line."""
+    from studies.measure import arguments_of, command_line, machine_record, write_section  # imports polarnet
+
     parser = command_line(__doc__, "docs/results/reliability.json")
     parser.add_argument("--module", nargs="+", choices=tuple(TESTS), default=[*TESTS], metavar="MODULE")
     parser.add_argument("--mutants", type=int, default=60, help="largest number for each module")
