@@ -7,14 +7,17 @@ the output of `polarnet benchmark --scenes`, or data/benchmark.
   every part of the page open.
 - `axe_serious`: serious and critical accessibility faults that axe-core finds, in light and dark.
 - `page_mb_50_scenes`, `open_seconds_50_scenes`: size of a page with 50 scenes, and the median time until its player
-  shows the first. The scenes of FOLDER repeat under other names: it is a measurement of the page, not of
-  50 different scenes.
+  shows the first. `page_frames_a_scene` is the number of frames of each. The scenes of FOLDER repeat under other names:
+  it is a measurement of the page, not of 50 different scenes.
+- `dolp_error_of_player`: mean and largest difference between the DoLP of its strips (WebP) and the DoLP before
+  compression.
 
 `--write` puts the figures into docs/results/report.json. Other commands add their own keys there.
 """
 
 import argparse
 import json
+import re
 import shutil
 import statistics
 import tempfile
@@ -75,6 +78,16 @@ def repeated(benchmark: Path, folder: Path) -> Path:
     return write_set_page(folder, f"{SCENES} scenes", "python -m studies.report", [])
 
 
+def strips(page: Path) -> dict[str, Any]:
+    """Frames of a scene in the page's player, and the error of the DoLP that its strips hold."""
+    found = re.search(r'data-role="data">(.*?)</script>', page.read_text(encoding="utf-8"))
+    assert found, f"{page} has no player"
+    scenes = json.loads(found[1])["scenes"]
+    means, largest = zip(*(one["error"] for scene in scenes for one in scene["maps"] if "error" in one), strict=True)
+    error = {"mean": round(statistics.fmean(means), 4), "max": round(max(largest), 3)}
+    return {"page_frames_a_scene": min(len(scene["ms"]) for scene in scenes), "dolp_error_of_player": error}
+
+
 def opening_seconds(browser: Any, file: Path) -> float:
     """Median time from opening a page until the player shows a scene."""
     times = []
@@ -97,6 +110,7 @@ def measured(arguments: argparse.Namespace) -> dict[str, Any]:
         figures: dict[str, Any] = dict(faults(browser, arguments.page.resolve()))
         page = repeated(arguments.benchmark, Path(work) / "repeated")
         figures["page_mb_50_scenes"] = round(page.stat().st_size / 1e6, 2)
+        figures |= strips(page)
         figures["open_seconds_50_scenes"] = round(opening_seconds(browser, page), 2)
         browser.close()
     return figures

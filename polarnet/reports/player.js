@@ -98,6 +98,9 @@ class Player {
     this.kinds = of_methods;
     option(this.find("quantity"), of_methods.map((kind) => TITLES[kind]), Math.max(0, of_methods.indexOf(before)));
     this.find("quantity").parentElement.hidden = of_methods.length < 2;
+    const stored = maps.filter((map) => map.error).map((map) => map.error);
+    const mean = stored.reduce((sum, [one]) => sum + one, 0) / stored.length, most = Math.max(...stored.map((one) => one[1]));
+    this.find("accuracy").textContent = stored.length ? `The pictures are compressed: DoLP at the cursor is off by ${mean.toFixed(3)} on average, by ${most.toFixed(2)} at most.` : "";
     const time = this.find("time");
     time.max = scene.ms.length - 1;
     time.value = Math.min(time.value, time.max);

@@ -24,8 +24,8 @@ Kind = Literal["events", "s0", "dolp", "aolp"]
 
 MAX_SIDE = 320  # pixels of a map's longer side; larger maps are reduced
 MAX_FRAMES = 24  # with two maps a frame, MAX_SIDE * MAX_FRAMES stays below the 16,383 rows of a WebP
-MAX_PAGE_FRAMES = 200  # over all scenes: a page of 50 scenes has 4 frames of each and stays below 30 MB
-QUALITY: Mapping[Kind, int] = {"events": 50, "s0": 60, "dolp": 55, "aolp": 25}
+MAX_STRIP_BYTES = 28_000_000  # of all strips: a page with charts and tables stays below 30 MB
+QUALITY: Mapping[Kind, int] = {"events": 50, "s0": 60, "dolp": 55, "aolp": 20}
 TRUTH = "truth"
 
 COLOURS = {
@@ -73,7 +73,8 @@ def panel_film(panel: Panel, legend: Legend, title: str = "") -> Film:
 
 def player_data(films: Sequence[Film]) -> dict[str, Any]:
     """Content of the player's JSON: colour tables and scenes with their strips."""
-    frames = min(MAX_FRAMES, max(1, MAX_PAGE_FRAMES // max(1, len(films))))
+    size_of_two = sum(len(one["strip"]) for film in films for one in _scene(film, 2)["maps"])
+    frames = min(MAX_FRAMES, max(1, 2 * MAX_STRIP_BYTES // max(1, size_of_two)))
     return {
         "colours": {name: table.tobytes().hex() for name, table in COLOURS.items()},
         "scenes": [_scene(film, frames) for film in films],
@@ -112,18 +113,22 @@ def _scene(film: Film, frames: int) -> dict[str, Any]:
 
 
 def _strip(frames: UInt8[np.ndarray, "n h w"], kind: Kind) -> dict[str, Any]:
-    """The strip's data URI and, for events, the count at its largest value."""
-    scale = 1.0
+    """The strip's data URI; the count at the largest value of events; mean and largest error of the strip's DoLP."""
+    about: dict[str, Any] = {}
     if kind == "events":
         signed = frames.astype(np.float32) - NO_EVENTS
-        scale = event_full_scale(torch.from_numpy(signed))
-        frames = _bytes(127 * (signed / scale).clip(-1, 1) + NO_EVENTS)
+        about["scale"] = event_full_scale(torch.from_numpy(signed))
+        frames = _bytes(127 * (signed / about["scale"]).clip(-1, 1) + NO_EVENTS)
     if kind == "aolp":
         doubled = frames.astype(np.float32) * (2 * np.pi / 256)
         frames = np.concatenate([_bytes(127 * wave(doubled) + 128) for wave in (np.cos, np.sin)])
-    done, data = cv2.imencode(".webp", np.concatenate([*frames]), [cv2.IMWRITE_WEBP_QUALITY, QUALITY[kind]])
+    rows = np.concatenate([*frames])
+    done, data = cv2.imencode(".webp", rows, [cv2.IMWRITE_WEBP_QUALITY, QUALITY[kind]])
     assert done, f"OpenCV could not encode a strip of {frames.shape}"
-    return {"scale": scale, "strip": data_uri(data.tobytes(), "webp")}
+    if kind == "dolp":
+        error = cv2.absdiff(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), rows) / 255
+        about["error"] = [round(float(error.mean()), 4), round(float(error.max()), 4)]
+    return {**about, "strip": data_uri(data.tobytes(), "webp")}
 
 
 def _reduced(frames: UInt8[np.ndarray, "n h w"], kind: Kind) -> UInt8[np.ndarray, "n h2 w2"]:

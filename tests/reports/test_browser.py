@@ -119,9 +119,11 @@ def test_the_player_shows_the_papers_map_of_aolp_and_dolp(browser, files):
         page.locator("[data-role=panes]").focus()
         page.keyboard.press("ArrowDown")
         dolp, pixel = page.evaluate("""() => {
-          const pane = [...document.querySelectorAll('.panes figure')].find((one) => one.innerText.includes('°') && !one.innerText.startsWith('True'));
-          const canvas = pane.querySelector('canvas'), [x, y] = [canvas.width >> 1, (canvas.height >> 1) + 1];
-          return [parseFloat(pane.querySelector('span').textContent), [...canvas.getContext('2d').getImageData(x, y, 1, 1).data]];
+          const shown = [...document.querySelectorAll('.panes figure')].filter((one) => one.innerText.includes('°'));
+          const pane = shown.find((one) => !one.innerText.startsWith('True')), canvas = pane.querySelector('canvas');
+          const context = canvas.getContext('2d'), [x, y] = [canvas.width >> 1, (canvas.height >> 1) + 1];
+          const dolp = parseFloat(pane.querySelector('span').textContent);
+          return [dolp, [...context.getImageData(x, y, 1, 1).data]];
         }""")
         assert min(pixel[:3]) == 0
         assert max(pixel[:3]) / 255 == pytest.approx(dolp, abs=0.01)

@@ -3,9 +3,11 @@ import json
 import re
 import shutil
 
+import numpy as np
 import pytest
 
 from polarnet.reports.page import write_report
+from polarnet.reports.player import Film, Map, player_data
 from polarnet.reports.provenance import Run
 
 RUN = Run(
@@ -154,3 +156,23 @@ def test_a_further_test_set_has_its_table_and_its_pictures(paths, tmp_path):
     assert "Scenes whose polarization a camera measured" in page
     assert 'data-chart="sets"' in page  # the heat map
     assert "10.40" in page  # GFLOP of ours
+
+
+def test_the_strips_of_a_page_with_many_scenes_stay_within_their_bytes(monkeypatch):
+    frames = np.random.default_rng(1).integers(0, 256, (12, 24, 36), dtype=np.uint8)
+    films = [Film(f"scene {k}", range(12), [Map("truth", "dolp", frames)]) for k in range(3)]
+    alone = player_data(films)
+    assert {len(scene["ms"]) for scene in alone["scenes"]} == {12}
+    size = sum(len(one["strip"]) for scene in alone["scenes"] for one in scene["maps"])
+    monkeypatch.setattr("polarnet.reports.player.MAX_STRIP_BYTES", size // 2)
+    assert {len(scene["ms"]) for scene in player_data(films)["scenes"]} <= {4, 5, 6}
+
+
+def test_a_strip_states_the_error_of_its_dolp():
+    """A constant is compressed to within a step of 219, the range of brightness in a WebP."""
+    flat = Film("flat", [0], [Map("truth", "dolp", np.full((1, 24, 36), 128, np.uint8))])
+    mean, most = player_data([flat])["scenes"][0]["maps"][0]["error"]
+    assert mean <= most <= 1 / 219
+    noise = np.random.default_rng(1).integers(0, 256, (1, 24, 36), dtype=np.uint8)
+    mean, most = player_data([Film("noise", [0], [Map("truth", "dolp", noise)])])["scenes"][0]["maps"][0]["error"]
+    assert 0.01 < mean < most
