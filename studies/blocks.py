@@ -159,6 +159,16 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
         ", emulate {paper_set[stage_minutes][emulate]:.1f}) with at most {paper_set[peak_mib]:,} MiB of memory. "
         "{origin}",
     ),
+    "remotes": Block(
+        "sweeps", "push", "studies.clones push --write",
+        caption="At smoke size, with stages: {push[target]}. The remote holds {push[files]:,.0f} files of together "
+        "{push[bytes]:,.0f} bytes; in the other clone `dvc repro` executes {push[repro_executes]:.0f} stages. {origin}",
+    ),
+    "search": Block(
+        "sweeps", "search", "studies.speed search --data FOLDER --write",
+        caption="A search of {search[trials]:,.0f} trials at smoke size: {search[stopped]:.0f} were stopped after an "
+        "epoch. Best validation MSE: {search[best][validation_mse]:.4f}. {origin}",
+    ),
     "readers": Block(
         "recordings", "readers", "studies.recordings", _reader_rows, _reader_columns,
         "Columns: millions of events a second, then the memory of polarnet's reader by number of events. {origin}",

@@ -185,7 +185,7 @@ def s3(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
     from polarnet.storage.events import EventStore
 
-    server = ThreadedMotoServer(port=0)
+    server = ThreadedMotoServer("127.0.0.1", port=0)
     server.start()
     try:
         host, port = server.get_host_and_port()
