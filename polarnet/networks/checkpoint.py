@@ -50,7 +50,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], di
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
         raise ValueError(f"{path.with_suffix('.json')}: expected a {FORMAT}, which it does not say it is")
     content = path.read_bytes()
-    if sha256(content) != metadata["sha256"]:
+    if sha256(content) != metadata.get("sha256"):
         raise ValueError(f"{path} is not the file that {path.stem}.json describes; copy or train the pair again")
     try:
         return load(content), metadata

@@ -156,7 +156,15 @@ class Store:
             raise ValueError(f"{path}: the store was never finished; run the stage that writes it again")
         if not _is_signed(header):
             raise ValueError(f"{path}: the attributes in zarr.json are not what was written; {REPAIR}")
-        return cls(os.fspath(path), header)
+        try:
+            store = cls(os.fspath(path), header)
+            if not store.columns or set(store.digests) != set(store.parts):
+                raise ValueError("expected a digest of every part")
+        except (AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+            raise ValueError(
+                f"{path}: the attributes in zarr.json are not those of a store: {error}; {REPAIR}"
+            ) from error
+        return store
 
     def missing(self) -> list[str]:
         """Sequences of the parts that are not written yet, in the store's order."""
@@ -221,7 +229,8 @@ class Store:
         if part not in self._records:
             try:
                 group, _ = self._opened(os.getpid(), part)
-                records: Any = group.attrs["sequences"]
+                written: Any = group.attrs["sequences"]
+                records = {name: dict(written[name]) for name in self.parts[part]}
             except Exception as error:  # Zarr raises many kinds of exceptions
                 raise_shortage(error, self.path)
                 raise ValueError(f"{self.path}: {sequence}, {part}.zip is unreadable: {error}; {REPAIR}") from error
@@ -230,10 +239,10 @@ class Store:
 
     def read_column(self, name: str, sequence: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows `start` to `stop` (None: to the end) of a sequence; ValueError that names what cannot be read."""
-        first, end = self.record(sequence)[self.columns[name].axis]
-        part = self._part(sequence)
-        rows = slice(first + start, end if stop is None else min(first + stop, end))
+        part, record = self._part(sequence), self.record(sequence)
         try:
+            first, end = record[self.columns[name].axis]
+            rows = slice(first + start, end if stop is None else min(first + stop, end))
             group, arrays = self._opened(os.getpid(), part)
             if name not in arrays:
                 arrays[name] = group[name]

@@ -115,3 +115,12 @@ def test_a_path_may_be_text(saved):
     assert load_checkpoint(copy)[0].keys() == network.state_dict().keys()
     with pytest.raises(FileNotFoundError, match=r"x\.safetensors is missing"):
         load_network("x.safetensors")
+
+
+def test_a_record_without_the_hash_is_refused(saved):
+    path, _ = saved
+    record = json.loads(path.with_suffix(".json").read_text())
+    del record["sha256"]
+    path.with_suffix(".json").write_text(json.dumps(record))
+    with pytest.raises(ValueError, match=r"n\.safetensors is not the file that n\.json describes"):
+        load_checkpoint(path)

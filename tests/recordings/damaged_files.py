@@ -67,14 +67,18 @@ class Sample:
         self.path = folder / f"sample.{'bag' if form == 'rosbag' else form}"
         write_sample(form, self.path, events)
         self._files = sorted(path for path in [self.path, *self.path.rglob("*")] if path.is_file())
-        self._sound = [file.read_bytes() for file in self._files]
+        self.sound = [file.read_bytes() for file in self._files]
 
     def ending(self, damage: Sequence[tuple[str, int, Any]], number: int, says_format: bool, chunk_events: int) -> str:
         """Damage file `number`, counted round, read the recording, and put the file right again."""
         number %= len(self._files)
-        self._files[number].write_bytes(damaged(self._sound[number], damage))
+        return self.ending_of(damaged(self.sound[number], damage), number, says_format, chunk_events)
+
+    def ending_of(self, content: bytes, number: int, says_format: bool, chunk_events: int) -> str:
+        """The ending with other content of file `number`, which is put right again."""
+        self._files[number].write_bytes(content)
         outcome = ending(self.path, self.form if says_format else None, chunk_events, **self._size)
-        self._files[number].write_bytes(self._sound[number])
+        self._files[number].write_bytes(self.sound[number])
         return outcome
 
 

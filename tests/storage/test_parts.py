@@ -434,3 +434,20 @@ def test_a_damaged_header_is_unreadable_by_name(tmp_path, content):
     (tmp_path / "store.zarr" / "zarr.json").write_text(content)
     with pytest.raises(ValueError, match=r"store\.zarr is unreadable"):
         open_group(tmp_path / "store.zarr")
+
+
+@pytest.mark.parametrize("value", [{"a": 1}, 0, 1.5, "2", None])
+def test_a_header_with_a_valid_checksum_and_absurd_values_is_refused(copy, value):
+    content = json.loads((copy / "zarr.json").read_text())
+    header = {key: entry for key, entry in content["attributes"].items() if key != "checksum"}
+    signed = parts_module._signed({**header, "sequences_per_part": value})
+    (copy / "zarr.json").write_text(json.dumps({**content, "attributes": signed}))
+    with pytest.raises(ValueError, match=r"copy\.zarr: the attributes in zarr\.json are not those of a store"):
+        Numbers.open(copy)
+
+
+def test_a_part_that_lacks_a_sequence_of_the_header_is_refused(copy):
+    store = Numbers.open(copy)
+    store.parts["part-00002"] = ["s4", "s5"]
+    with pytest.raises(ValueError, match=r"part-00002\.zip is unreadable: 's5'"):
+        store.record("s4")
