@@ -5,7 +5,8 @@ from pathlib import Path
 
 from polarnet.config.experiments import preset_values
 from polarnet.reports.legend import LABELS, legend_of
-from polarnet.reports.tables import COLUMNS, COSTS, as_markdown, paired_lines, score_table, standing
+from polarnet.reports.tables import COLUMNS, COSTS, as_markdown, score_table
+from studies.comparisons import paired_lines, standing
 from studies.network_blocks import NETWORK_BLOCKS
 from studies.noise import NOISE_BLOCK
 from studies.paper import duration_rows, table_rows

@@ -6,10 +6,13 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from polarnet.reports.figures import Theme, chart_style, draw_reliability
+from polarnet.reports.figures import Theme, chart_style
 from polarnet.reports.tables import SET_TITLES
 
 SWEEP_SCORES = {
@@ -19,6 +22,9 @@ SWEEP_SCORES = {
     "lpips": ("LPIPS ↓", -1, 3),
 }
 """Heading, 1 if higher is better and -1 if lower is, decimals."""
+
+ReliabilityCurve = Sequence[tuple[float, float, int]]
+"""Predicted squared error, measured squared error and number of pixels of each bin."""
 
 
 def expected_errors_figure(seeds: Mapping[str, Mapping[str, Any]], theme: Theme) -> Figure:
@@ -35,9 +41,31 @@ def expected_errors_figure(seeds: Mapping[str, Mapping[str, Any]], theme: Theme)
                 (f"seed {seed}", colour, results["sets"][name]["curve"])
                 for (seed, results), colour in zip(seeds.items(), itertools.cycle(colours), strict=False)
             ]
-            draw_reliability(axes, lines, theme)
+            _draw_reliability(axes, lines, theme)
             axes.set_title(SET_TITLES[name], loc="left", fontsize=9)
     return figure
+
+
+def _draw_reliability(axes: Axes, lines: Sequence[tuple[str, str, ReliabilityCurve]], theme: Theme) -> None:
+    """Draw measured against predicted squared error, and the diagonal; a line has label, colour and curve."""
+    ends = [value for _, _, curve in lines for predicted, measured, _ in curve for value in (predicted, measured)]
+    diagonal = [min(value for value in ends if value > 0), max(ends)]
+    axes.plot(diagonal, diagonal, color=theme.quiet, linewidth=0.8)
+    for label, colour, curve in lines:
+        predicted, measured, pixels = (np.array(column) for column in zip(*curve, strict=True))
+        axes.plot(predicted, measured, color=colour, label=label)
+        axes.scatter(predicted, measured, s=4 + 60 * pixels / pixels.sum(), color=colour, linewidths=0, zorder=3)
+    axes.set(xscale="log", yscale="log", xlabel="predicted squared error", ylabel="measured squared error")
+    _plain_log_ticks(axes.xaxis)
+    _plain_log_ticks(axes.yaxis)
+    axes.legend(frameon=False)
+
+
+def _plain_log_ticks(axis: Axis) -> None:
+    """Label 1, 2 and 5 of each decade in plain notation: 0.05, not 5 x 10^-2."""
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_locator(NullLocator())
 
 
 def loss_sweep_figure(points: Sequence[Mapping[str, Any]], theme: Theme) -> Figure:

@@ -149,7 +149,7 @@ def _kind_of(path: str) -> "type[Store]":
     """Class of the store at a path; ValueError for other content."""
     from polarnet.storage.events import EventStore
     from polarnet.storage.frames import FrameStore
-    from polarnet.storage.parts import open_group
+    from polarnet.storage.groups import open_group
     from polarnet.storage.scenes import SceneStore
 
     stores = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}

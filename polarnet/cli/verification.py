@@ -8,7 +8,7 @@ from polarnet.networks.checkpoint import load_checkpoint
 from polarnet.runtime.files import SUMS, changed_files
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
-from polarnet.storage.parts import open_group
+from polarnet.storage.groups import open_group
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.recorder import read_running
 

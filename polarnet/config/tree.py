@@ -1,28 +1,24 @@
 """The typed configuration of every stage, read from params.yaml and conf/ and checked before anything runs."""
 
 import dataclasses
-import fnmatch
 import functools
 import logging
-import math
 import os
-import re
 import sys
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path, PurePath
 from typing import Annotated, Any, TypeVar
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from ruamel.yaml import YAML
-from ruamel.yaml.nodes import Node
 
 from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.score import BenchmarkConfig
 from polarnet.captures.dot import RecordingsConfig
-from polarnet.config.experiments import preset_names, preset_values
+from polarnet.config.experiments import preset_values
+from polarnet.config.overrides import check_overrides
 from polarnet.methods import METHODS, module_of, trained_rows
 from polarnet.methods.between import BetweenConfig
 from polarnet.methods.postprocessing import PostprocessingConfig
@@ -35,7 +31,7 @@ from polarnet.pictures.ingest import IngestConfig
 from polarnet.runtime.cluster import pmap
 from polarnet.runtime.environment import INTERRUPTED, STOPPED
 from polarnet.runtime.machine import RuntimeConfig, configure, threads_of
-from polarnet.runtime.sections import one_of, section, unknown_key
+from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
@@ -50,11 +46,9 @@ from polarnet.training.loop import TrainConfig
 from polarnet.training.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
-MAX_VALUES = 10_000  # of params.yaml; it has some hundred
 EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # subfolder of the project in which DVC runs queued experiments
 DOLP_TRAINING = "ours"
 """Training of the DoLP network, in data/train beside the baselines."""
-CHOICES = re.compile(r"(?:glob\()?([^()=]*)\)?")
 
 Stage = Callable[["Config"], None]
 T = TypeVar("T")
@@ -270,7 +264,7 @@ def load(root: Path, overrides: list[str] | None = None, presets: Path | None = 
     ValueError for an unknown key, an invalid value, or an ablation that changes nothing.
     """
     overrides = overrides or []
-    check_overrides(root, overrides, presets)
+    check_overrides(Config, root, overrides, presets)
     os.environ[ROOT_VARIABLE] = str(root)
     if presets and presets != root and (presets / "conf").is_dir():
         overrides = [*overrides, f"hydra.searchpath=['file://{root}','file://{presets / 'conf'}']"]
@@ -278,40 +272,6 @@ def load(root: Path, overrides: list[str] | None = None, presets: Path | None = 
         config = typed(hydra.compose("config", overrides=overrides))
         _check_ablation(root, config, overrides)
     return config
-
-
-def check_overrides(root: Path, overrides: list[str], presets: Path | None = None) -> None:
-    """Raise ValueError for an override of a key that is not a setting, or of a group that has no such choice.
-
-    The groups are `experiment`, `sensor`, `polarizers` and `ablation`. Hydra refuses both as well, but this message
-    lists the available keys and choices.
-    """
-    _refuse_many_values(root / "params.yaml")
-    groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
-    for override in overrides:
-        key, _, value = override.partition("=")
-        key = key.lstrip("+~").split("@")[0]
-        if key in groups:
-            _check_choices([root, presets] if presets else [root], key, value)
-        elif not key.startswith(("hydra.", "hydra/")) and (refusal := unknown_key(Config, key.split("."))):
-            raise ValueError(refusal)
-
-
-def _refuse_many_values(file: Path) -> None:
-    """ValueError for aliases that make more than `MAX_VALUES` values of a short YAML file."""
-    sizes: dict[int, int | float] = {}
-
-    def size(node: Node) -> int | float:
-        if id(node) not in sizes:
-            sizes[id(node)] = math.inf  # for an alias of a node inside itself
-            items = node.value if isinstance(node.value, list) else []
-            parts = (part for item in items for part in (item if isinstance(item, tuple) else (item,)))
-            sizes[id(node)] = 1 + sum(map(size, parts))
-        return sizes[id(node)]
-
-    root = YAML(typ="safe", pure=True).compose(file.read_text(encoding="utf-8"))
-    if root is not None and size(root) > MAX_VALUES:
-        raise ValueError(f"{file}: expected at most {MAX_VALUES} values, its aliases make {size(root):g}")
 
 
 def hydra_stage(main: Stage) -> Callable[[], None]:
@@ -345,7 +305,7 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
     def command_line() -> None:
         os.environ[ROOT_VARIABLE] = str(root)
         overrides = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
-        or_exit(lambda: check_overrides(root, overrides))
+        or_exit(lambda: check_overrides(Config, root, overrides))
         logging.captureWarnings(True)
         try:
             run()
@@ -412,18 +372,6 @@ def _check_lpips(config: Config) -> None:
 
     for purpose in PURPOSES:
         with_lpips(config, purpose, functools.partial(look, purpose))
-
-
-def _check_choices(roots: Sequence[Path], group: str, value: str) -> None:
-    """Raise ValueError if a name or pattern for `group`, alone, in a list or in glob(...), matches no file.
-
-    Other Hydra syntax, such as choice(...), is left to Hydra to check.
-    """
-    known = sorted({name for root in roots for name in preset_names(root, group)})
-    plain = CHOICES.fullmatch(value)
-    for name in (word.strip("[]'\" ") for word in (plain[1].split(",") if plain else [])):
-        if not fnmatch.filter(["null", *known], name):
-            raise ValueError(f"{group}: there is no {name!r}; conf/{group} has {', '.join(known)}")
 
 
 def _check_ablation(root: Path, config: Config, overrides: list[str]) -> None:

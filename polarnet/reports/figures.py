@@ -1,4 +1,4 @@
-"""Figures drawn with matplotlib for use outside the page: comparison panels, reliability, the wheel of AoLP.
+"""Figures drawn with matplotlib for use outside the page: comparison panels, the wheel of AoLP.
 
 Figures are returned, not shown; `polarnet.reports.maps.png` encodes them.
 """
@@ -12,11 +12,9 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
-from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from torch import Tensor
 
 from polarnet.metrics.similarity import mse, psnr
@@ -40,9 +38,6 @@ class Theme:
 
 LIGHT = Theme(text="#1c2330", quiet="#667085", grid="#e4e7ec", face="#ffffff")
 DARK = Theme(text="#e6e9ef", quiet="#98a2b3", grid="#313947", face="#161b24")
-
-ReliabilityCurve = Sequence[tuple[float, float, int]]
-"""Predicted squared error, measured squared error and number of pixels of each bin."""
 
 
 def comparison_figure(
@@ -89,21 +84,6 @@ def tile_grid(
     bar = figure.add_axes((place.x1 + (gap + 0.04) / width, place.y0, 0.09 / width, place.height))
     _colour_bar(figure, bar, theme, "vertical", label_size=6.0)
     return figure, grid
-
-
-def draw_reliability(axes: Axes, lines: Sequence[tuple[str, str, ReliabilityCurve]], theme: Theme) -> None:
-    """Draw measured against predicted squared error, and the diagonal; a line has label, colour and curve."""
-    ends = [value for _, _, curve in lines for predicted, measured, _ in curve for value in (predicted, measured)]
-    diagonal = [min(value for value in ends if value > 0), max(ends)]
-    axes.plot(diagonal, diagonal, color=theme.quiet, linewidth=0.8)
-    for label, colour, curve in lines:
-        predicted, measured, pixels = (np.array(column) for column in zip(*curve, strict=True))
-        axes.plot(predicted, measured, color=colour, label=label)
-        axes.scatter(predicted, measured, s=4 + 60 * pixels / pixels.sum(), color=colour, linewidths=0, zorder=3)
-    axes.set(xscale="log", yscale="log", xlabel="predicted squared error", ylabel="measured squared error")
-    _plain_log_ticks(axes.xaxis)
-    _plain_log_ticks(axes.yaxis)
-    axes.legend(frameon=False)
 
 
 def score_line(recovered: Float[Tensor, "h w"], truth: Float[Tensor, "h w"]) -> str:
@@ -163,13 +143,6 @@ def _colour_bar(figure: Figure, axes: Axes, theme: Theme, orientation: str, labe
     bar = figure.colorbar(ScalarMappable(cmap=DOLP_COLOURS), cax=axes, orientation=orientation, ticks=[0, 0.5, 1])
     bar.ax.tick_params(labelsize=label_size, length=2, pad=2, colors=theme.quiet)
     bar.outline.set_visible(False)
-
-
-def _plain_log_ticks(axis: Axis) -> None:
-    """Label 1, 2 and 5 of each decade in plain notation: 0.05, not 5 x 10^-2."""
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axis.set_minor_locator(NullLocator())
 
 
 def _short(name: str) -> str:

@@ -19,7 +19,8 @@ from torch import Tensor
 from polarnet.events.labels import LABELS
 from polarnet.events.stream import MAX_SIDE, Events, slice_count, slice_time, validate
 from polarnet.stokes import POLARIZER_ANGLES_DEG
-from polarnet.storage.parts import Column, Columns, Store
+from polarnet.storage.groups import Column, Columns
+from polarnet.storage.parts import Store
 
 CHANNELS = len(POLARIZER_ANGLES_DEG)
 MAX_DURATION_US = 2**32 - 1  # 71 minutes: t is uint32

@@ -21,7 +21,8 @@ from polarnet.runtime.arrays import (
     mask_of,
     whole_numbers,
 )
-from polarnet.storage.parts import Column, Columns, Store
+from polarnet.storage.groups import Column, Columns
+from polarnet.storage.parts import Store
 
 SPLITS = ("train", "val", "test")
 FRACTION_STEPS = 2**16 - 1

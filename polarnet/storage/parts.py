@@ -15,7 +15,6 @@ the parts.
 """
 
 import contextlib
-import errno
 import functools
 import hashlib
 import json
@@ -26,7 +25,6 @@ import zipfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -35,20 +33,18 @@ import numpy as np
 import zarr
 from pydantic import PositiveInt
 from zarr.abc.buffer import Buffer
-from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
-from zarr.storage import FsspecStore, LocalStore, MemoryStore, WrapperStore, ZipStore
+from zarr.storage import MemoryStore
 
 from polarnet.runtime.files import claimed, sha256
 from polarnet.runtime.sections import section
+from polarnet.storage.groups import REPAIR, Columns, create_array, open_group, raise_shortage
 
-COMPRESSION_LEVEL = 1  # for zstd; higher levels cost 10-100 times the time for 6 % fewer bytes
 DIGEST_LENGTH = 64  # characters of a SHA-256
-SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN)
 MAX_OPEN_PARTS = 64  # an open part has a file descriptor and about 2 MB of directory
 MAX_LISTED = 8  # names of sequences in a message
-REPAIR = "write this store again, or copy it again from where it is whole"
 
 Header = dict[str, Any]
+S = TypeVar("S", bound="Store")
 
 
 @section
@@ -58,22 +54,6 @@ class StorageConfig:
     sequences_per_part: PositiveInt
     labels: bool
     """Store the cause of each simulated event."""
-
-
-@dataclass(frozen=True)
-class Column:
-    """One array of every part. A sequence has the same number of rows in all columns of an axis."""
-
-    axis: str
-    dtype: str
-    chunk: int
-    """Rows that are compressed together, the smallest unit of reading."""
-    shape: tuple[int, ...] = ()
-    """Shape of a row."""
-
-
-Columns = Mapping[str, Column]
-S = TypeVar("S", bound="Store")
 
 
 class Store:
@@ -252,7 +232,7 @@ class Store:
                 written: Any = group.attrs["sequences"]
                 records = {name: dict(written[name]) for name in self.parts[part]}
             except Exception as error:  # Zarr raises many kinds of exceptions
-                _raise_shortage(error, self.path)
+                raise_shortage(error, self.path)
                 raise ValueError(f"{self.path}: {sequence}, {part}.zip is unreadable: {error}; {REPAIR}") from error
             self._records[part] = records
         return self._records[part][sequence]
@@ -270,7 +250,7 @@ class Store:
             if len(values) != max(0, rows.stop - rows.start):
                 raise ValueError(f"expected rows {rows.start} to {rows.stop}, got {len(values)} of them")
         except Exception as error:  # each codec raises its own exceptions
-            _raise_shortage(error, self.path)
+            raise_shortage(error, self.path)
             raise ValueError(
                 f"{self.path}: {sequence}, column {name} is unreadable: {part}.zip: {error}; {REPAIR}"
             ) from error
@@ -350,7 +330,7 @@ class _Part:
         self._entries: dict[str, Buffer] = {}
         self._group = zarr.create_group(MemoryStore(self._entries))
         self._columns = columns
-        self._arrays = {name: _create_array(self._group, name, column) for name, column in columns.items()}
+        self._arrays = {name: create_array(self._group, name, column) for name, column in columns.items()}
 
     def append(self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
         """Write the chunks of a sequence and take its record."""
@@ -393,71 +373,12 @@ def _digests(part: Any) -> tuple[bytes, bytes]:
     return digest.hexdigest().encode(), end
 
 
-class _WholeStore(WrapperStore[Any]):
-    """A store that raises where a file of an array is missing or empty; Zarr itself would read fill values."""
-
-    async def get(self, key: str, *arguments: Any, **options: Any) -> Any:
-        content = await super().get(key, *arguments, **options)
-        if "/c/" in key and not content:
-            raise FileNotFoundError(f"there is no {key}, or nothing in it")
-        return content
-
-
 def unknown_sequence(sequence: str | None, sequences: list[str]) -> str:
     """Message about a sequence that a store does not have: it lists those that the store has."""
     listed = ", ".join(sequences[:MAX_LISTED])
     if len(sequences) > MAX_LISTED:
         listed += f", ... (`polarnet list` names all {len(sequences)})"
     return f"expected a sequence of {listed}; got {sequence!r}"
-
-
-def open_group(path: str | os.PathLike[str]) -> zarr.Group:
-    """Open the Zarr group in a local folder, a zip or at an fsspec URL; FileNotFoundError if there is none."""
-    name = os.fspath(path)
-    store: FsspecStore | ZipStore | LocalStore
-    try:
-        if "://" in name:
-            store = FsspecStore.from_url(name, read_only=True)
-        elif Path(name).is_file():
-            store = ZipStore(name, mode="r", read_only=True)
-        else:
-            store = LocalStore(name, read_only=True)
-        return zarr.open_group(_WholeStore(store), mode="r", zarr_format=3)
-    except FileNotFoundError:
-        unfinished = f" ({name}.tmp is unfinished)" if Path(f"{name}.tmp").exists() else ""
-        raise FileNotFoundError(
-            f"{name}: there is no Zarr v3 group{unfinished}; run the stage that writes it"
-        ) from None
-    except ImportError:  # a package for reading URLs is missing
-        raise
-    except Exception as error:  # Zarr raises many kinds of exceptions for a damaged zarr.json
-        _raise_shortage(error, name)
-        raise ValueError(f"{name} is unreadable: {error}; {REPAIR}") from error
-
-
-def _raise_shortage(error: Exception, path: str) -> None:
-    """RuntimeError if reading failed for want of memory, threads or file descriptors, not because of the file."""
-    short = isinstance(error, MemoryError) or getattr(error, "errno", None) in SHORTAGES
-    if short or "can't start new thread" in str(error):
-        raise RuntimeError(
-            f"{path} was not read, because the system gave no more memory, threads or file descriptors "
-            f"({error or 'out of memory'}); lower runtime.workers, or raise the limits (ulimit -n, -u, -v)"
-        ) from error
-
-
-def _create_array(group: zarr.Group, name: str, column: Column) -> zarr.Array:
-    dtype = np.dtype(column.dtype)
-    shuffle = BloscShuffle.bitshuffle if dtype.itemsize <= 2 else BloscShuffle.shuffle
-    blosc = BloscCodec(typesize=dtype.itemsize, cname="zstd", clevel=COMPRESSION_LEVEL, shuffle=shuffle)
-    return group.create_array(
-        name,
-        shape=(0, *column.shape),
-        chunks=(column.chunk, *column.shape),
-        dtype=dtype,
-        fill_value=0,
-        compressors=[blosc, Crc32cCodec()],
-        config={"write_empty_chunks": True},  # a missing chunk is a damaged one
-    )
 
 
 def _signed(header: Header) -> Header:

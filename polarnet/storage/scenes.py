@@ -22,7 +22,7 @@ from polarnet.storage.frames import (
     quantise_fraction,
     splits_of,
 )
-from polarnet.storage.parts import Column, Columns
+from polarnet.storage.groups import Column, Columns
 
 CHUNK = 2**18  # pixels
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from polarnet.storage.appended import FRAMES_PER_CHUNK
 from polarnet.storage.frames import FrameStore, dequantise_angle, dequantise_fraction, unpack_mask
-from polarnet.storage.parts import open_group
+from polarnet.storage.groups import open_group
 
 APPENDED = "truth.zarr"
 """Name of the frames that `polarnet simulate` writes beside its event store."""

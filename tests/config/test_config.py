@@ -15,7 +15,8 @@ import torch
 
 from polarnet.cli import main
 from polarnet.config.experiments import BASE, preset_names, preset_values, write_preset
-from polarnet.config.tree import Config, check_overrides, input_folder, load, with_lpips
+from polarnet.config.overrides import check_overrides
+from polarnet.config.tree import Config, input_folder, load, with_lpips
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 
 
@@ -72,9 +73,9 @@ def test_a_wrong_type_is_refused_with_its_key(project_root):
 
 def test_a_typo_on_the_command_line_is_refused_with_the_keys_there_are(project_root):
     with pytest.raises(ValueError, match=r"loss\.msee is not a setting; loss has lpips, mse, ssim"):
-        check_overrides(project_root, ["loss.msee=1.0"])
+        check_overrides(Config, project_root, ["loss.msee=1.0"])
     with pytest.raises(ValueError, match=r"seed\.x is not a setting; seed is a value, not a section"):
-        check_overrides(project_root, ["seed.x=1"])
+        check_overrides(Config, project_root, ["seed.x=1"])
 
 
 @pytest.mark.parametrize(
@@ -398,4 +399,4 @@ def test_an_alias_bomb_is_refused_at_once(tmp_path, last):
     lines = ["a: &a [1, 1]", *(f"{new}: &{new} [*{old}, *{old}]" for old, new in itertools.pairwise(names))]
     (tmp_path / "params.yaml").write_text("\n".join([*lines, f"last: {last}\n"]))
     with pytest.raises(ValueError, match=r"params\.yaml: expected at most 10000 values, its aliases make"):
-        check_overrides(tmp_path, [])
+        check_overrides(Config, tmp_path, [])

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 
 from polarnet.cli import _options, main
-from polarnet.config.tree import check_overrides
+from polarnet.config.overrides import check_overrides
+from polarnet.config.tree import Config
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -74,7 +75,7 @@ def test_a_command_of_the_documentation_is_accepted_by_its_parser(page, words, m
         assert importlib.util.find_spec(module) is not None
         if module.startswith("stages."):
             overrides = [word for word in rest if "=" in word and not word.startswith(("ablation=", "--"))]
-            check_overrides(ROOT, [_first_choice(word) for word in overrides])
+            check_overrides(Config, ROOT, [_first_choice(word) for word in overrides])
     elif program == "polarnet":
         _options(arguments)
     elif program == "dvc":
@@ -82,7 +83,7 @@ def test_a_command_of_the_documentation_is_accepted_by_its_parser(page, words, m
 
         parse_args(arguments)
         values = [value for flag, value in pairwise(arguments) if flag == "-S"]
-        check_overrides(ROOT, [value for value in values if not value.startswith("+")])
+        check_overrides(Config, ROOT, [value for value in values if not value.startswith("+")])
     elif program == "make":
         targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
         assert set(arguments) <= set(targets)

@@ -8,10 +8,8 @@ from polarnet.reports.tables import (
     PAPER_TABLE_2,
     as_markdown,
     as_plain,
-    paired_lines,
     paper_table,
     score_table,
-    standing,
 )
 
 SCORES = {
@@ -119,24 +117,6 @@ def test_paper_psnr_is_near_the_psnr_of_the_papers_mse():
             assert scores["psnr"] >= -10 * math.log10(scores["mse"]) - 0.01
 
 
-def test_standing_says_better_or_worse_with_the_difference():
-    lines = standing({"train_mean": {"mse": 0.05, "psnr": 13.0, "ssim": 0.5}, "ours": SCORES["ours"]})
-    assert lines == ["ours against training mean: MSE -0.0300 (better), PSNR +4.00 dB (better), SSIM -0.1000 (worse)."]
-
-
-def test_standing_without_ours_says_nothing():
-    assert standing({"cf": {"mse": 0.1}}) == []
-
-
 def test_what_rounds_to_zero_has_no_sign():
     assert COLUMNS["skill"].printed(-0.0001) == "0.000"
     assert COLUMNS["skill"].printed(-0.0006) == "-0.001"
-
-
-def test_pairs_are_said_in_the_order_of_the_table():
-    one = {"scenes": 10, "better": 9, "effect": 0.964, "p_holm": 0.0058}
-    lines = paired_lines({"e2v": {"mse": one}, "cf": {"mse": one}, "zeros": {"psnr": one}})
-    assert lines == [
-        "CF: ours is better in 9 of 10 scenes (effect +0.96, p = 0.0058).",
-        "E2V: ours is better in 9 of 10 scenes (effect +0.96, p = 0.0058).",
-    ]

@@ -24,7 +24,8 @@ from part_fixtures import entries_to_change
 from zarr.storage import ZipStore
 
 import polarnet.storage.parts as parts_module
-from polarnet.storage.parts import Column, StorageConfig, Store, open_group
+from polarnet.storage.groups import Column, open_group
+from polarnet.storage.parts import StorageConfig, Store
 
 NAMES = [f"s{i}" for i in range(5)]
 SEQUENCES_PER_PART = 2
