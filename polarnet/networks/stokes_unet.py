@@ -38,7 +38,7 @@ from polarnet.networks.threshold import Scale, scale_features
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
-STRIDE = 4  # stride of the largest recurrent layer; height and width are padded to multiples of it
+STRIDE = 4  # stride of the largest recurrent layer; height and width in blocks are padded to multiples of it
 IMAGES = 2  # input images per channel: sum of polarities and number of events (representation `event_counts`)
 PARTS = ("redundancy", "slopes", "sums", "recurrence", "panorama", "sensitivity", "scale")
 MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate
@@ -55,6 +55,9 @@ LOG_VARIANCE_OUTPUTS = slice(12, 16)  # outputs of the last layer that hold the 
 class StokesUNetConfig:
     """Section `networks.polarnet` of params.yaml."""
 
+    binning: PositiveInt
+    """Side in pixels of the blocks whose events are averaged before anything else. Time falls with its square; the
+    outputs are interpolated back to the sensor's size."""
     channels: list[PositiveInt]
     """Channels at 1/2, 1/4, 1/8, ... of the resolution; at least three numbers."""
     memories: list[Annotated[float, Field(ge=0, le=0.999)]]
@@ -148,6 +151,7 @@ class StokesUNet(nn.Module):
             raise ValueError(
                 f"network=polarnet takes {4 * IMAGES} images (representation event_counts), got {in_channels}"
             )
+        self.binning = config.binning
         self.memories, self.decays, self.scales = config.memories, config.decays, config.scales
         self.without = frozenset(config.without)
         self.reach, self.margin = config.reach, config.panorama_margin
@@ -206,7 +210,8 @@ class StokesUNet(nn.Module):
     ) -> tuple[Prediction, Float[Tensor, "n k h2 w2"], list[Tensor]]:
         """Same as `unroll`, with the `error_features` of the n = t * b padded images at half resolution."""
         t, b, _, height, width = inputs.shape
-        inputs = F.pad(inputs, (0, -width % STRIDE, 0, -height % STRIDE))  # the padding holds no events
+        side = STRIDE * self.binning
+        inputs = block_means(F.pad(inputs, (0, -width % side, 0, -height % side)), self.binning)  # no events in padding
         polarity, count = inputs.unflatten(2, (4, IMAGES)).unbind(3)
         equalised, sensitivity = self.equaliser(polarity, count, state[:SENSITIVITY_TENSORS] if state else [])
         if "sensitivity" not in self.without:
@@ -216,7 +221,8 @@ class StokesUNet(nn.Module):
         before_panorama, recurrent = others[:PANORAMA_TENSORS], others[PANORAMA_TENSORS:]
 
         keep = inputs.new_tensor(self.memories).view(-1, 1, 1, 1)
-        panorama, certain, next_panorama = self._panorama(polarity, (height, width), before_panorama)
+        seen = (math.ceil(height / self.binning), math.ceil(width / self.binning))
+        panorama, certain, next_panorama = self._panorama(polarity, seen, before_panorama)
         clues = scale_features(panorama, equalised.total.flatten(), equalised.mismatch.flatten())
         scale = torch.ones_like(certain) if "scale" in self.without else self.scale(clues)
         images, of_window = scale * self.step * panorama, scale.view(t, b, 1, 1, 1, 1)
@@ -242,11 +248,13 @@ class StokesUNet(nn.Module):
         features = torch.cat([y2, F.pixel_unshuffle(fine, 2).to(y2.dtype)], dim=1)
         added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(features)))), 2).float()
 
-        stokes, dolp = (fine + added[:, :3]).split([2, 1], dim=1)
+        maps = fine + added[:, :3]
+        features = error_features(candidates.dolp, weights[:, :-1], candidates.evidence, maps[:, 2:])
+        log_variance = LOG_VARIANCE + added[:, 3:] + F.interpolate(self.expected(features), scale_factor=2)
+        maps, features = self._enlarged(torch.cat([maps, log_variance], dim=1)), self._enlarged(features)
+        stokes, dolp, log_variance = maps[:, :2], maps[:, 2], maps[:, 3]
         aolp = torch.remainder(torch.atan2(stokes[:, 1], stokes[:, 0]) / 2, math.pi)
-        features = error_features(candidates.dolp, weights[:, :-1], candidates.evidence, dolp)
-        log_variance = LOG_VARIANCE + added[:, 3] + F.interpolate(self.expected(features), scale_factor=2)[:, 0]
-        maps = [dolp[:, 0], aolp, log_variance, stokes]
+        maps = [dolp, aolp, log_variance, stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
         state = [*sensitivity, steps[-1], moments, *(means[-1] for means in wide_steps), *next_panorama, *recurrent]
         return prediction, features, state
@@ -331,6 +339,10 @@ class StokesUNet(nn.Module):
         g4, first = self.gru_quarter(x4, streams, state[0] if state else None)
         y4, smaller = self.smaller(g4, streams, state[1:])
         return self.at_quarter(y4), [] if "recurrence" in self.without else [first, *smaller]
+
+    def _enlarged(self, maps: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h2 w2"]:
+        """Interpolate maps of blocks to the sensor's pixels."""
+        return maps if self.binning == 1 else F.interpolate(maps, scale_factor=self.binning, mode="bilinear")
 
     def _mixed(self, candidates: Candidates, weights: Float[Tensor, "n c1 h w"]) -> Float[Tensor, "n 3 h w"]:
         """Mix the candidates to s1, s2 and DoLP. The last weight belongs to the constant, which adds to DoLP only."""

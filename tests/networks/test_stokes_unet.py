@@ -10,6 +10,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from polarnet.config.tree import load
 from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.networks.redundancy import block_means
 from polarnet.networks.stokes_unet import PARTS, StokesUNet, averaged
 from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
 
@@ -65,6 +66,23 @@ def test_any_height_and_width_come_back_with_everything_predicted():
 
 
 @torch.no_grad()
+@torch.no_grad()
+def test_binning_sees_block_means_and_answers_at_every_pixel():
+    inputs = events(3, 2, 8, 24, 40)
+    coarse, features, _ = network(binning=1).unroll_with_features(block_means(inputs, 2))
+    fine, fine_features, _ = network(binning=2).unroll_with_features(inputs)
+    enlarged = F.interpolate(coarse.dolp.flatten(0, 1)[:, None], scale_factor=2, mode="bilinear")
+    torch.testing.assert_close(fine.dolp.flatten(0, 1)[:, None], enlarged)
+    assert fine.stokes.shape == (3, 2, 2, 24, 40)
+    assert fine_features.shape[-2:] == (12, 20) != features.shape[-2:]
+
+
+@torch.no_grad()
+def test_binning_takes_any_height_and_width():
+    prediction, _ = network(binning=2)(events(1, 8, 21, 35))
+    assert {tuple(field.shape[-2:]) for field in prediction if field is not None} == {(21, 35)}
+
+
 def test_windows_at_once_are_windows_one_by_one_with_the_state_carried():
     built, windows = network(), events(5, 2, 8, 18, 20)
     together, last = built.unroll(windows)
