@@ -11,6 +11,7 @@ from polarnet.reports.tables import COLUMNS, COSTS, as_markdown, paired_lines, s
 from studies.network_blocks import NETWORK_BLOCKS
 from studies.noise import NOISE_BLOCK
 from studies.paper import duration_rows, table_rows
+from studies.planning import PLANNING_BLOCKS
 from studies.recorded import RECORDED_BLOCK
 from studies.rotating import CURVES
 from studies.tables import Block, Columns, Results, Row, listed
@@ -130,7 +131,7 @@ def _sensor_fit(section: str, stimulus: str) -> Block:
     )  # fmt: skip
 
 
-BLOCKS = NETWORK_BLOCKS | {
+BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
     "pipeline-scores": Block(
         "pipeline", "metrics", "studies.measure",
         lambda results: _demo_table(results["metrics"], results.get("weights", {})),

@@ -6,10 +6,12 @@ import torch
 
 from polarnet.stokes import (
     POLARIZER_ANGLES_DEG,
+    analyzer,
     aolp,
     dolp,
     intensities_from_stokes,
     intensity_behind_polarizer,
+    parse_mosaic,
     stokes_from_intensities,
     stokes_from_polarization,
 )
@@ -98,3 +100,17 @@ def test_intensities_whose_differences_would_be_wrong_are_refused(unchecked_anno
 def test_planes_are_not_stretched_to_fit(unchecked_annotations):
     with pytest.raises(ValueError, match=r"one shape, got s0 \(2, 3\), dolp \(1, 3\), aolp \(2, 3\)"):
         stokes_from_polarization(torch.ones(2, 3), torch.ones(1, 3), torch.ones(2, 3))
+
+
+def test_a_mosaic_is_read_row_by_row_and_holds_every_angle_once():
+    assert parse_mosaic(" 90 45 / 135 0 ") == ((90, 45), (135, 0))
+    for text in ("90 45 / 135 135", "90 45 135 0", "0 45 / 90"):
+        with pytest.raises(ValueError, match="expected the angles 0, 45, 90 and 135"):
+            parse_mosaic(text)
+
+
+def test_an_analyzer_of_8_to_1_passes_what_malus_law_and_its_leak_add_up_to():
+    """Transmission 0.8 along and 0.1 across: half the sum of unpolarized light, and half the difference of S1 at 0."""
+    assert analyzer(0.0, 8.0, 0.8) == pytest.approx((0.45, 0.35, 0.0))
+    assert analyzer(math.pi / 4, 8.0, 0.8) == pytest.approx((0.45, 0.0, 0.35))
+    assert analyzer(math.pi / 2) == pytest.approx((0.5, -0.5, 0.0))

@@ -15,6 +15,7 @@ def add_to(commands: Commands) -> None:
         help="convert a recording to HDF5 (DSEC's layout), text or EVT3",
         description="Reads any recording that `polarnet inspect` reads, repairs it as reading does, and writes its "
         "events, or those of a time span. Times in OUT count from the start of the span.",
+        epilog="example: polarnet convert recording.aedat4 first.h5 --start 500ms --stop 2s",
     )
     convert.add_argument("file", type=Path, metavar="IN", help="file of a camera, a bag, or an event store with --part")
     convert.add_argument("out", type=Path, metavar="OUT", help="file to write")

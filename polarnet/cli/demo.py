@@ -18,6 +18,7 @@ def add_to(commands: Commands) -> None:
         description="Simulates a camera with four polarizers that moves over a photograph of scikit-image, and "
         "recovers DoLP and AoLP from its events with the shipped weights. Trains nothing and downloads nothing. "
         "`polarnet simulate` and `polarnet recover` do the two halves, on files of your own.",
+        epilog="example: polarnet demo --photograph coffee sensor=noisy",
     )
     demo.add_argument("--photograph", choices=PHOTOGRAPHS, default=PHOTOGRAPHS[0], help="default: astronaut")
     demo.add_argument("--out", type=Path, metavar="FOLDER", default=Path("outputs/demo"), help="default: outputs/demo")

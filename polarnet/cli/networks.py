@@ -14,6 +14,7 @@ def add_to(commands: Commands) -> None:
         description="The exported network takes the events of one window and a state, and returns DoLP and the new "
         "state; the file's metadata describes all inputs and outputs. The file is renamed to OUT.onnx once ONNX "
         "Runtime reproduces torch's outputs.",
+        epilog="example: polarnet onnx polarnet.onnx --height 260 --width 346",
     )
     onnx.add_argument("file", type=Path, metavar="OUT.onnx", help="file to write")
     onnx.add_argument(

@@ -18,7 +18,11 @@ CODE = ("polarnet/", "stages/")
 
 def add_to(commands: Commands) -> None:
     """Add the commands doctor, preset, run and stages."""
-    doctor = commands.add_parser("doctor", help="report versions, device, weights, extras, memory and disk")
+    doctor = commands.add_parser(
+        "doctor",
+        help="report versions, device, weights, extras, memory and disk",
+        epilog="example: polarnet doctor --weights best.safetensors",
+    )
     doctor.add_argument(
         "--weights",
         type=Path,
@@ -27,15 +31,27 @@ def add_to(commands: Commands) -> None:
     )
     doctor.set_defaults(run=_doctor)
 
-    preset = commands.add_parser("preset", help="write a named experiment or sensor into params.yaml, keeping comments")
+    preset = commands.add_parser(
+        "preset",
+        help="write a named experiment or sensor into params.yaml, keeping comments",
+        epilog="example: polarnet preset smoke",
+    )
     preset.add_argument("name", help="name of a file in conf/experiment or conf/sensor: demo, smoke, paper, noisy, ...")
     preset.set_defaults(run=_preset)
 
-    run = commands.add_parser("run", help="run all stages through Hydra alone, into outputs/run/NAME")
+    run = commands.add_parser(
+        "run",
+        help="run all stages through Hydra alone, into outputs/run/NAME",
+        epilog="example: polarnet run experiment=smoke seed=2",
+    )
     run.add_argument("overrides", nargs="*", help="overrides for Hydra: experiment=smoke seed=2 paths.data=FOLDER")
     run.set_defaults(run=_run)
 
-    stages = commands.add_parser("stages", help="list the stages in order, or those whose code is newer than dvc.lock")
+    stages = commands.add_parser(
+        "stages",
+        help="list the stages in order, or those whose code is newer than dvc.lock",
+        epilog="example: polarnet stages --unlocked",
+    )
     stages.add_argument(
         "--unlocked",
         action="store_true",

@@ -86,6 +86,7 @@ def _add_inspection(commands: Commands) -> None:
         help="summarise a camera's file and draw its busiest moment",
         description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
         "camera's file, with signs of a readout at its limit, and draws its busiest moment as a PNG.",
+        epilog="example: polarnet inspect recording.aedat4 --hot-pixels hot.png",
     )
     inspect.add_argument("file", type=Path, help="file of a camera, or an event store with --part")
     add_reading(inspect)
@@ -217,6 +218,7 @@ def _add_replay(commands: Commands) -> None:
         help="print a stored sequence as lines `t x y p angle`, at its own pace",
         description="Prints the events of a stored sequence at the pace of the recording. Pipe them into "
         "`polarnet recover - --live` to try live recovery without a camera.",
+        epilog="example: polarnet replay data/events.zarr lake-0 --speed 0.5",
     )
     add_stored_sequence(replay)
     replay.add_argument("--speed", type=float, default=1.0, help="speed relative to the recording (default: 1)")

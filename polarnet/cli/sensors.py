@@ -41,6 +41,8 @@ def add_to(commands: Commands) -> None:
         description="Estimates thresholds, their deviations, bandwidth, refractory period, leak, shot noise and hot "
         "pixels of a camera from its recordings; prints a table, writes conf/sensor/NAME.yaml, and draws a page that "
         "compares each recording with its simulated twin. docs/fit-sensor.md says what to record.",
+        epilog="example: polarnet fit-sensor --name lab --static dark.raw --static-light 0 --moving walk.raw --frames "
+        "frames/",
     )
     fit.add_argument("--name", required=True, help="name of the sensor: sensor=NAME uses it")
     fit.add_argument("--static", type=Path, metavar="FILE", help="recording under constant light")

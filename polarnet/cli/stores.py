@@ -41,13 +41,21 @@ def _add_view(commands: Commands) -> None:
 
 
 def _add_list(commands: Commands) -> None:
-    listing = commands.add_parser("list", help="name the sequences of a store of events, frames or scenes")
+    listing = commands.add_parser(
+        "list",
+        help="name the sequences of a store of events, frames or scenes",
+        epilog="example: polarnet list data/events.zarr",
+    )
     listing.add_argument("store", help="store: folder or fsspec URL")
     listing.set_defaults(run=_list)
 
 
 def _add_verify(commands: Commands) -> None:
-    verify = commands.add_parser("verify", help="check every byte of a store, a checkpoint or a data folder")
+    verify = commands.add_parser(
+        "verify",
+        help="check every byte of a store, a checkpoint or a data folder",
+        epilog="example: polarnet verify data/events.zarr",
+    )
     verify.add_argument(
         "store", help="store (folder or fsspec URL), checkpoint (.safetensors), running.pt or data folder"
     )
@@ -55,7 +63,11 @@ def _add_verify(commands: Commands) -> None:
 
 
 def _add_export(commands: Commands) -> None:
-    export = commands.add_parser("export", help="export an event store to files for other tools")
+    export = commands.add_parser(
+        "export",
+        help="export an event store to files for other tools",
+        epilog="example: polarnet export data/events.zarr exported --format evt3 --sequence lake-0",
+    )
     export.add_argument("store", help="event store: folder or fsspec URL")
     export.add_argument("folder", type=Path, help="output folder; one file for each sequence and channel")
     export.add_argument(
@@ -97,6 +109,7 @@ def _add_labels(commands: Commands) -> None:
         help="count and draw a stored sequence's events by cause, and score the removal of hot pixels",
         description="Needs an event store that was written with storage.labels=true. Score a denoiser of your own with "
         "polarnet.metrics.denoising.denoising_scores.",
+        epilog="example: polarnet labels data/events.zarr lake-0 --picture causes.png",
     )
     add_stored_sequence(labels)
     add_hot_pixel_factor(labels)

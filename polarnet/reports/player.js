@@ -1,7 +1,7 @@
 // Plays the films of a page: colours the grey strips, shares time, zoom and cursor among pictures, wipes between two.
 "use strict";
 
-const TITLES = { events: "Events", s0: "S0", dolp: "DoLP", aolp: "AoLP", error: "error of DoLP" };
+const TITLES = { events: "Events", s0: "S0", dolp: "DoLP", aolp: "AoLP", error: "error of DoLP", paper: "AoLP and DoLP (Fig. 3)" };
 const FRAMES_PER_SECOND = 6;
 const FULL_ERROR = 0.5; // DoLP at the end of the colours
 
@@ -29,6 +29,7 @@ async function decoded(map, width) {
 }
 
 function printed(kind, value, scale) {
+  if (kind === "paper") return `${printed("dolp", value & 255)} at ${printed("aolp", value >> 8)}`;
   if (kind === "events") return ((value - 128) / 127 * scale).toFixed(0);
   if (kind === "aolp") return `${(value / 256 * 180).toFixed(0)}°`;
   return (value / 255 * (kind === "error" ? FULL_ERROR : 1)).toFixed(2);
@@ -87,8 +88,12 @@ class Player {
       ...map, kind: "error",
       values: map.values.map((value, i) => Math.abs(value - truth.values[i]) / FULL_ERROR),
     }));
-    this.maps = [...maps, ...errors];
-    const of_methods = ["dolp", "aolp", "error"].filter((kind) => this.maps.some((map) => map.kind === kind && map.source !== "truth"));
+    const papers = maps.filter((map) => map.kind === "dolp").flatMap((map) => {
+      const angle = maps.find((other) => other.kind === "aolp" && other.source === map.source);
+      return angle ? [{ ...map, kind: "paper", values: Uint16Array.from(map.values, (value, i) => 256 * angle.values[i] + value) }] : [];
+    });
+    this.maps = [...maps, ...errors, ...papers];
+    const of_methods = ["dolp", "aolp", "error", "paper"].filter((kind) => this.maps.some((map) => map.kind === kind && map.source !== "truth"));
     const before = this.kinds?.[this.find("quantity").value];
     this.kinds = of_methods;
     option(this.find("quantity"), of_methods.map((kind) => TITLES[kind]), Math.max(0, of_methods.indexOf(before)));
@@ -106,7 +111,7 @@ class Player {
   arrange() {
     const quantity = this.kinds[this.find("quantity").value];
     const scene = this.scene;
-    this.shown = this.maps.filter((map) => map.source === "truth" || ["events", "s0"].includes(map.kind) || map.kind === quantity);
+    this.shown = this.maps.filter((map) => ["events", "s0", quantity].includes(map.kind) || (map.source === "truth" && map.kind !== "paper"));
     const titled = (map) => map.kind === "events" ? "Events" : map.source === "truth" ? `True ${TITLES[map.kind]}` : map.source;
     this.panes = this.shown.map((map) => {
       const figure = document.createElement("figure");
@@ -116,7 +121,7 @@ class Player {
       const canvas = document.createElement("canvas");
       Object.assign(canvas, { width: scene.width, height: scene.height });
       canvas.setAttribute("role", "img");
-      canvas.setAttribute("aria-label", `${titled(map)}${map.kind === "error" ? ": error of DoLP" : ""}, scene ${scene.name}`);
+      canvas.setAttribute("aria-label", `${titled(map)}${["error", "paper"].includes(map.kind) ? `: ${TITLES[map.kind]}` : ""}, scene ${scene.name}`);
       pane.className = "pane";
       pane.append(canvas);
       caption.append(titled(map), value);
@@ -140,9 +145,10 @@ class Player {
     this.find("legend").replaceChildren(...kinds.map((kind) => {
       const entry = document.createElement("span");
       const canvas = document.createElement("canvas");
-      entry.append(...(kind === "aolp" ? ["AoLP ", canvas, " 0° lies to the right, 90° up"] : [ends[kind][0], canvas, ends[kind][1]]));
+      const angles = kind === "paper" ? "hue: AoLP, brightness: DoLP; " : "";
+      entry.append(...(["aolp", "paper"].includes(kind) ? ["AoLP ", canvas, ` ${angles}0° lies to the right, 90° up`] : [ends[kind][0], canvas, ends[kind][1]]));
       canvas.setAttribute("aria-hidden", "true");
-      kind === "aolp" ? this.wheel_legend(canvas) : this.bar(canvas, kind);
+      ["aolp", "paper"].includes(kind) ? this.wheel_legend(canvas, kind) : this.bar(canvas, kind);
       return entry;
     }));
   }
@@ -152,24 +158,26 @@ class Player {
     this.paint(canvas, kind, Uint8Array.from({ length: 128 }, (_, i) => 2 * i + 1), 0);
   }
 
-  /** AoLP by direction: opposite directions are one angle. */
-  wheel_legend(canvas) {
+  /** AoLP by direction: opposite directions are one angle. The paper's map darkens with DoLP, here the radius. */
+  wheel_legend(canvas, kind) {
     const size = 64, middle = (size - 1) / 2;
     Object.assign(canvas, { width: size, height: size, className: "wheel" });
-    this.paint(canvas, "aolp", Uint8Array.from({ length: size * size }, (_, i) => {
-      const angle = Math.atan2(middle - Math.floor(i / size), i % size - middle) / Math.PI;
-      return Math.floor((angle + 2) * 256) % 256;
+    this.paint(canvas, kind, Uint16Array.from({ length: size * size }, (_, i) => {
+      const across = i % size - middle, up = middle - Math.floor(i / size);
+      const angle = Math.floor((Math.atan2(up, across) / Math.PI + 2) * 256) % 256;
+      return kind === "aolp" ? angle : 256 * angle + Math.min(255, Math.round(255 * Math.hypot(across, up) / middle));
     }), 0);
   }
 
+  /** Colour a byte a pixel; of the paper's map two, AoLP and DoLP: colours scale with DoLP, as S = 1 and V = DoLP. */
   paint(canvas, kind, values, frame) {
     const context = canvas.getContext("2d"), size = canvas.width * canvas.height, table = this.colours[kind];
     const image = context.createImageData(canvas.width, canvas.height), top = table.length / 3;
     for (let i = 0; i < size; i++) {
-      const entry = 3 * Math.min(top - 1, Math.floor(values[frame * size + i] / 256 * top));
-      image.data[4 * i] = table[entry];
-      image.data[4 * i + 1] = table[entry + 1];
-      image.data[4 * i + 2] = table[entry + 2];
+      const value = values[frame * size + i];
+      const entry = 3 * Math.min(top - 1, Math.floor((kind === "paper" ? value >> 8 : value) / 256 * top));
+      const bright = kind === "paper" ? (value & 255) / 255 : 1;
+      for (const k of [0, 1, 2]) image.data[4 * i + k] = bright * table[entry + k];
       image.data[4 * i + 3] = 255;
     }
     context.putImageData(image, 0, 0);

@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from polarnet.reports.artefacts import Panel
 from polarnet.reports.html import embedded_json, script, template
 from polarnet.reports.legend import Legend, with_structure
-from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, data_uri, event_full_scale, table_of
+from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, data_uri, event_full_scale, paper_map, table_of
 from polarnet.storage.film import NO_EVENTS
 
 Kind = Literal["events", "s0", "dolp", "aolp"]
@@ -34,6 +34,7 @@ COLOURS = {
     "dolp": DOLP_TABLE,
     "aolp": table_of(matplotlib.colormaps["twilight"]),  # cyclic and perceptually uniform
     "error": table_of(matplotlib.colormaps["magma"]),
+    "paper": paper_map(torch.ones(1, 256), torch.arange(256)[None] * (torch.pi / 256))[0],  # scaled with DoLP
 }
 
 

@@ -1,3 +1,5 @@
+import re
+import shlex
 import subprocess
 from pathlib import Path
 
@@ -6,7 +8,7 @@ import pytest
 import torch
 from part_fixtures import flip
 
-from polarnet.cli import main
+from polarnet.cli import _options, _parser, main
 from polarnet.cli.project import unlocked
 from polarnet.events.stream import Events
 from polarnet.storage.events import EventStore
@@ -28,6 +30,17 @@ def store(tmp_path):
     writer.write("lake", [one] * 4, 1000)
     writer.finish()
     return path
+
+
+COMMANDS = next(action.choices for action in _parser()._actions if action.dest == "command")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_of_a_command_ends_with_examples_that_it_understands(name):
+    examples = re.findall(rf"polarnet {name}\b[^&|\n]*", COMMANDS[name].epilog or "")
+    assert examples
+    for example in examples:
+        assert _options(shlex.split(example)[1:]).command == name
 
 
 def test_doctor_names_the_rows_that_can_use_a_file_of_weights(tmp_path, capsys):

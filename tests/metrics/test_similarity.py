@@ -269,3 +269,18 @@ def test_lpips_takes_numpy_and_refuses_bytes_and_a_truth_of_another_range(unchec
         ValueError, match=r"truth: expected images in \[0, 1\], got values up to 2\d\d.*; divide by 255"
     ):
         network(a, 255 * b)
+
+
+def test_a_frame_without_a_valid_pixel_has_no_correlation_whatever_the_leading_axes():
+    frames = torch.rand(2, 3, 4, 5, generator=torch.Generator().manual_seed(0))
+    valid = torch.ones(2, 3, 4, 5, dtype=torch.bool)
+    valid[1, 2] = False
+    assert correlation(frames, frames.flip(-1), valid).isnan().nonzero().tolist() == [[1, 2]]
+
+
+def test_a_slope_below_a_tenth_of_a_stored_step_per_pixel_is_no_edge_on_any_shape_of_frame():
+    """A tenth of a step is 1e-6: a ramp of 0.9e-6 a pixel is flat, and one of 1.1e-6 is not."""
+    for slope, agreement in ((0.9e-6, 0.0), (1.1e-6, 1.0)):
+        ramp = (slope * torch.arange(12, dtype=torch.float64)).expand(4, 12)
+        for frame in (ramp, ramp.T):
+            assert gradient_agreement(frame, frame).item() == pytest.approx(agreement)

@@ -112,6 +112,21 @@ def test_the_error_of_a_constant_tenth_less_is_read_at_the_cursor(browser, files
         assert "True DoLP" in page.inner_text("[data-role=values]")
 
 
+def test_the_player_shows_the_papers_map_of_aolp_and_dolp(browser, files):
+    """Fig. 3 has hue AoLP, saturation 1 and value DoLP: the darkest channel is 0 and the brightest is DoLP."""
+    with opened(browser, files["report"], 1400, "light") as (page, _):
+        page.select_option("[data-role=quantity]", label="AoLP and DoLP (Fig. 3)")
+        page.locator("[data-role=panes]").focus()
+        page.keyboard.press("ArrowDown")
+        dolp, pixel = page.evaluate("""() => {
+          const pane = [...document.querySelectorAll('.panes figure')].find((one) => one.innerText.includes('°') && !one.innerText.startsWith('True'));
+          const canvas = pane.querySelector('canvas'), [x, y] = [canvas.width >> 1, (canvas.height >> 1) + 1];
+          return [parseFloat(pane.querySelector('span').textContent), [...canvas.getContext('2d').getImageData(x, y, 1, 1).data]];
+        }""")
+        assert min(pixel[:3]) == 0
+        assert max(pixel[:3]) / 255 == pytest.approx(dolp, abs=0.01)
+
+
 def test_zoom_is_shared_by_all_pictures(browser, files):
     with opened(browser, files["report"], 1400, "light") as (page, _):
         page.locator("[data-role=zoom]").fill("3")

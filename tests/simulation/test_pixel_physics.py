@@ -1,0 +1,97 @@
+"""Light on a pixel and the constants of its noise, worked out by hand."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from polarnet.simulation.pixels.light import Light, intensity_rows, light_of_frames, linlog_8bit, linlog_as_v2e, ln
+from polarnet.simulation.pixels.physics import (
+    leak_factor_map,
+    physics_of,
+    shot_noise_fraction,
+    threshold_maps,
+)
+from polarnet.simulation.presets import SENSORS
+
+PIXELS, KEY = 400, np.uint64(7)
+
+
+def rows_of(light: Light, frame: int, row: int, width: int, rows: int) -> list[list[float]]:
+    dn = np.empty(rows * width, np.float32)
+    intensity_rows(light, frame, row, width, dn)
+    return dn.reshape(rows, width).tolist()
+
+
+def test_a_sensor_between_four_scene_pixels_sees_each_by_its_share():
+    """A quarter of a pixel down and half a pixel right of row 1, column 0 of a scene of 10 row + column."""
+    scene = (10 * np.arange(5.0)[:, None] + np.arange(6.0)).astype(np.float32)[None]
+    light = Light(scene, np.array([0.0, 1.25]), np.array([0.0, 0.5]))
+    assert rows_of(light, 0, 0, 2, 2) == [[0, 1], [10, 11]]
+    assert rows_of(light, 1, 0, 3, 2) == [[13, 14, 15], [23, 24, 25]]
+    assert rows_of(light, 1, 1, 2, 1) == [[23, 24]]
+
+
+def test_scene_pixels_are_mixed_by_area_even_where_they_do_not_lie_on_a_plane():
+    """(1 - 1/4)(1 - 1/2) 8 + (1 - 1/4) 1/2 16 + 1/4 (1 - 1/2) 32 + 1/4 1/2 80 = 3 + 6 + 4 + 10."""
+    scene = np.array([[[8, 16], [32, 80]]], np.float32)
+    assert rows_of(Light(scene, np.array([0.25]), np.array([0.5])), 0, 0, 1, 1) == [[23]]
+
+
+def test_a_clip_shows_the_rows_of_its_frames():
+    clip = np.arange(24, dtype=np.uint8).reshape(2, 3, 4)
+    assert rows_of(light_of_frames(clip), 1, 1, 4, 2) == clip[1, 1:].tolist()
+
+
+def test_8_bit_light_is_rounded_before_the_response():
+    dn, response = np.array([0.4, 10.5, 20.0, 99.7, 255.0], np.float32), np.empty(5, np.float32)
+    linlog_8bit(dn, response)
+    assert dn.tolist() == [0, 11, 20, 100, 255]
+    expected = [0, 11 * math.log(20) / 20, math.log(20), math.log(100), math.log(255)]
+    assert response.tolist() == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_response_of_v2e_is_linear_below_20_dn_and_a_logarithm_above():
+    dn, response = np.array([0, 5, 20, 20.5, 200], np.float32), np.empty(5, np.float32)
+    linlog_as_v2e(dn, response)
+    expected = [0, math.log(20) / 4, math.log(20), math.log(20.5), math.log(200)]
+    assert response.tolist() == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("x", [1e-30, 0.7, 0.71, 1.0, 1.41, 1.42, 3.0, 255.0, 1e30])
+def test_the_natural_logarithm_is_right_to_float32(x):
+    assert ln(np.float32(x)) == pytest.approx(math.log(float(np.float32(x))), rel=2e-7, abs=1e-7)
+
+
+def test_shot_noise_is_95_hundredths_in_the_dark_and_a_quarter_at_full_light():
+    assert shot_noise_fraction(0.0) == pytest.approx(1 - 0.75 * 20 / 275)
+    assert shot_noise_fraction(255.0) == pytest.approx(0.25)
+
+
+def test_microseconds_of_refractoriness_become_seconds():
+    config = dataclasses.replace(SENSORS["default"], refractory_period_us=500.0)
+    assert physics_of(config).refractory_s == pytest.approx(0.0005)
+
+
+def test_thresholds_are_nominal_without_mismatch_and_never_below_a_hundredth():
+    nominal = physics_of(SENSORS["default"])._replace(
+        threshold_on=0.3, threshold_off=0.2, threshold_sigma_on=0.0, threshold_sigma_off=0.1, threshold_correlation=0.0
+    )
+    on, off = threshold_maps(nominal, PIXELS, KEY, 0)
+    assert np.unique(on).tolist() == [np.float32(0.3)]
+    assert off.min() == np.float32(0.01)
+    assert off.mean() == pytest.approx(0.2, abs=0.015)  # three standard errors
+    assert off.std() == pytest.approx(0.1, abs=0.012)
+    together = nominal._replace(threshold_sigma_on=0.03, threshold_sigma_off=0.03, threshold_correlation=0.6)
+    on, off = threshold_maps(together, PIXELS, KEY, 0)
+    assert np.corrcoef(on, off)[0, 1] == pytest.approx(0.6, abs=0.1)
+    assert off.std() == pytest.approx(0.03, rel=0.12)
+
+
+def test_leak_rates_spread_by_a_tenth_of_a_decade_around_the_nominal_one():
+    physics = physics_of(SENSORS["default"])._replace(noise_rate_cov_decades=0.1)
+    decades = np.log10(leak_factor_map(physics, PIXELS, KEY, 0))
+    assert decades.mean() == pytest.approx(0, abs=0.015)
+    assert decades.std() == pytest.approx(0.1, rel=0.12)
+    assert leak_factor_map(physics._replace(noise_rate_cov_decades=0.0), 3, KEY, 0).tolist() == [1, 1, 1]
