@@ -1,6 +1,8 @@
 """The result blocks of README.md and docs/*.md: which file each one shows, its rows, columns and caption."""
 
+import functools
 from collections.abc import Callable, Iterator
+from operator import getitem
 from pathlib import Path
 
 from polarnet.config.experiments import preset_values
@@ -57,6 +59,11 @@ def _recover_rows(results: Results) -> Iterator[Row]:
     for name, one in results["recover"]["methods"].items():
         label = "network `{network}`, {precision}".format_map(results["recover"]) if name == "network" else f"`{name}`"
         yield {"label": label, **one}
+
+
+def _endings_by_kind(*path: str) -> Callable[[Results], list[Row]]:
+    """Rows of the counts that lie at `path` in a file, one of each kind."""
+    return lambda results: [{"name": k, **one} for k, one in sorted(functools.reduce(getitem, path, results).items())]
 
 
 def _benchmark_lines(name: str) -> Callable[[Results], list[str]]:
@@ -227,6 +234,22 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
     "rotating-curves": Block(
         "camera", "rotating", "studies.rotating --write", _rotating_curve_rows,
         {"setting": "{label}", "error": "{about}", "value: error": "{errors}"}, caption="",
+    ),
+    "faults": Block(
+        "reliability", "artefacts", "studies.faults --write", _endings_by_kind("artefacts", "artefacts"),
+        {
+            "artefact": "{name}", "refused": "{refused:,}", "harmless": "{harmless:,}", "refused without a name":
+            "{unnamed:,}", "traceback": "{traceback:,}", "used silently": "{silent:,}", "lost": "{lost:,}",
+        },
+        "{artefacts[faults_injected]:,} faults. {origin}",
+    ),
+    "fuzz-inputs": Block(
+        "reliability", "fuzz", "studies.fuzz --write", _endings_by_kind("fuzz"),
+        {
+            "input": "{name}", "read": "{read:,}", "refused": "{refused:,}", "traceback": "{traceback:,}",
+            "crash": "{crash:,}", "hang": "{hang:,}", "memory": "{memory:,}",
+        },
+        "{fuzz_cases:,} cases. {origin}",
     ),
     "house": Block(
         "house", "house", "studies.house --write",

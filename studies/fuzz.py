@@ -309,6 +309,7 @@ def worker(counts: Any, state: Any, until: float, cases: int) -> None:
                     counts[place * len(ENDINGS) + ENDINGS.index(what)] += 1
                     if what in BAD:
                         print(f"{what}: {kind} {number}: {message[:1000]}", flush=True)
+        state[1] = math.inf  # the end of the process is no case
 
 
 def fuzz(minutes: float, cases: int) -> dict[str, dict[str, int]]:
