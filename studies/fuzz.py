@@ -22,7 +22,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -171,7 +171,7 @@ def read_yaml(file: Path) -> dict[Any, Any]:
     return {str(key): value for key, value in content.items()} if isinstance(content, dict) else {"content": content}
 
 
-def with_other_values(tree: dict[str, Any], generator: Generator) -> dict[str, Any]:
+def with_other_values(tree: Mapping[Any, Any], generator: Generator) -> dict[str, Any]:
     """A copy of a configuration in which one to three values at any depth are others, missing or renamed."""
     tree = dict(tree)
     for _ in range(int(generator.integers(1, 4))):
@@ -294,14 +294,14 @@ def worker(counts: Any, state: Any, until: float, cases: int) -> None:
     torch.set_num_threads(1)
     isolated.PATIENCE_S = 5
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as scratch:
-        made = []
+        calls = []
         for kind, make in KINDS.items():
             (folder := Path(scratch, kind)).mkdir()
-            made.append(make(folder))
+            calls.append(make(folder))
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libpng and others write lines about damage
         resource.setrlimit(resource.RLIMIT_AS, (2 * MAX_MIB << 20, 2 * MAX_MIB << 20))
         while time.time() < until and min(state[2:]) < cases:
-            for place, (kind, case) in enumerate(zip(KINDS, made, strict=True)):
+            for place, (kind, case) in enumerate(zip(KINDS, calls, strict=True)):
                 stop = min(until, time.time() + SLICE_S)
                 while (start := time.time()) < stop and (number := int(state[2 + place])) < cases:
                     state[0], state[1], state[2 + place] = place, start, number + PROCESSES
@@ -348,7 +348,7 @@ def main() -> None:
     """The command line."""
     parser = command_line(__doc__, "docs/results/reliability.json")
     parser.add_argument("--minutes", type=float, default=60)
-    parser.add_argument("--cases", type=int, default=10**6, help="of each kind")
+    parser.add_argument("--cases", type=int, default=10**6, help="largest number of cases of each kind")
     arguments = arguments_of(parser)
     record = machine_record(ROOT)
     kinds = fuzz(arguments.minutes, arguments.cases)

@@ -80,9 +80,9 @@ def repeated(benchmark: Path, folder: Path) -> Path:
 
 def strips(page: Path) -> dict[str, Any]:
     """Frames of a scene in the page's player, and the error of the DoLP that its strips hold."""
-    found = re.search(r'data-role="data">(.*?)</script>', page.read_text(encoding="utf-8"))
-    assert found, f"{page} has no player"
-    scenes = json.loads(found[1])["scenes"]
+    player = re.search(r'data-role="data">(.*?)</script>', page.read_text(encoding="utf-8"))
+    assert player, f"{page} has no player"
+    scenes = json.loads(player[1])["scenes"]
     means, largest = zip(*(one["error"] for scene in scenes for one in scene["maps"] if "error" in one), strict=True)
     error = {"mean": round(statistics.fmean(means), 4), "max": round(max(largest), 3)}
     return {"page_frames_a_scene": min(len(scene["ms"]) for scene in scenes), "dolp_error_of_player": error}

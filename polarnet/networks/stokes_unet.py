@@ -221,8 +221,8 @@ class StokesUNet(nn.Module):
         before_panorama, recurrent = others[:PANORAMA_TENSORS], others[PANORAMA_TENSORS:]
 
         keep = inputs.new_tensor(self.memories).view(-1, 1, 1, 1)
-        seen = (math.ceil(height / self.binning), math.ceil(width / self.binning))
-        panorama, certain, next_panorama = self._panorama(polarity, seen, before_panorama)
+        sensor = (math.ceil(height / self.binning), math.ceil(width / self.binning))
+        panorama, certain, next_panorama = self._panorama(polarity, sensor, before_panorama)
         clues = scale_features(panorama, equalised.total.flatten(), equalised.mismatch.flatten())
         scale = torch.ones_like(certain) if "scale" in self.without else self.scale(clues)
         images, of_window = scale * self.step * panorama, scale.view(t, b, 1, 1, 1, 1)
@@ -248,16 +248,16 @@ class StokesUNet(nn.Module):
         features = torch.cat([y2, F.pixel_unshuffle(fine, 2).to(y2.dtype)], dim=1)
         added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(features)))), 2).float()
 
-        maps = fine + added[:, :3]
-        features = error_features(candidates.dolp, weights[:, :-1], candidates.evidence, maps[:, 2:])
+        recovered = fine + added[:, :3]
+        features = error_features(candidates.dolp, weights[:, :-1], candidates.evidence, recovered[:, 2:])
         log_variance = LOG_VARIANCE + added[:, 3:] + F.interpolate(self.expected(features), scale_factor=2)
-        maps, features = self._enlarged(torch.cat([maps, log_variance], dim=1)), self._enlarged(features)
-        stokes, dolp, log_variance = maps[:, :2], maps[:, 2], maps[:, 3]
+        enlarged = self._enlarged(torch.cat([recovered, log_variance], dim=1))
+        stokes, dolp, log_variance = enlarged[:, :2], enlarged[:, 2], enlarged[:, 3]
         aolp = torch.remainder(torch.atan2(stokes[:, 1], stokes[:, 0]) / 2, math.pi)
         maps = [dolp, aolp, log_variance, stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
         state = [*sensitivity, steps[-1], moments, *(means[-1] for means in wide_steps), *next_panorama, *recurrent]
-        return prediction, features, state
+        return prediction, self._enlarged(features), state
 
     @torch.no_grad()
     def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:

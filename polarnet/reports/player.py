@@ -126,7 +126,9 @@ def _strip(frames: UInt8[np.ndarray, "n h w"], kind: Kind) -> dict[str, Any]:
     done, data = cv2.imencode(".webp", rows, [cv2.IMWRITE_WEBP_QUALITY, QUALITY[kind]])
     assert done, f"OpenCV could not encode a strip of {frames.shape}"
     if kind == "dolp":
-        error = cv2.absdiff(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), rows) / 255
+        decoded = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+        assert decoded is not None, "OpenCV could not decode its own strip"
+        error = cv2.absdiff(decoded, rows) / 255
         about["error"] = [round(float(error.mean()), 4), round(float(error.max()), 4)]
     return {**about, "strip": data_uri(data.tobytes(), "webp")}
 

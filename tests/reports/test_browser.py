@@ -119,8 +119,8 @@ def test_the_player_shows_the_papers_map_of_aolp_and_dolp(browser, files):
         page.locator("[data-role=panes]").focus()
         page.keyboard.press("ArrowDown")
         dolp, pixel = page.evaluate("""() => {
-          const shown = [...document.querySelectorAll('.panes figure')].filter((one) => one.innerText.includes('°'));
-          const pane = shown.find((one) => !one.innerText.startsWith('True')), canvas = pane.querySelector('canvas');
+          const figures = [...document.querySelectorAll('.panes figure')].filter((one) => one.innerText.includes('°'));
+          const pane = figures.find((one) => !one.innerText.startsWith('True')), canvas = pane.querySelector('canvas');
           const context = canvas.getContext('2d'), [x, y] = [canvas.width >> 1, (canvas.height >> 1) + 1];
           const dolp = parseFloat(pane.querySelector('span').textContent);
           return [dolp, [...context.getImageData(x, y, 1, 1).data]];
