@@ -1,6 +1,7 @@
-"""Figures of the expected errors and of the sweep over the weights of the loss."""
+"""Figures of expected errors, of scores under other conditions, and of the sweep over the weights of the loss."""
 
 import itertools
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -108,4 +109,31 @@ def loss_sweep_figure(points: Sequence[Mapping[str, Any]], theme: Theme) -> Figu
             row[0].set_ylabel("loss.ssim")
         for axes in figure.axes[-len(mse) :]:
             axes.set_xlabel("loss.lpips")
+    return figure
+
+
+def robustness_figure(tables: Mapping[str, Mapping[str, Any]], theme: Theme) -> Figure:
+    """MSE relative to the oracle mean's: a row for each condition, a column for each row of most conditions' tables.
+
+    `tables` are those of a split in docs/results/robustness.json. Darker is better.
+    """
+    uses = Counter(row for one in tables.values() for row in one["rows"])
+    methods = [name for name, number in uses.items() if name != "oracle_mean" and 2 * number > len(tables)]
+    ratios = [[one["rows"].get(m, {}).get("mse_over_oracle_mean", np.nan) for m in methods] for one in tables.values()]
+    image = np.log(np.array(ratios, float))
+    low, high = np.nanmin(image), np.nanpercentile(image, 90)
+    with matplotlib.rc_context(chart_style(theme)):
+        size = (2.6 + 0.75 * len(methods), 1.2 + 0.24 * len(tables))
+        figure = Figure(figsize=size, layout="constrained", facecolor="none")
+        axes = figure.subplots()
+        axes.imshow(image, cmap="cividis", vmin=low, vmax=high, aspect="auto")
+        for (row, column), value in np.ndenumerate(image):
+            if np.isfinite(value):
+                ink = "black" if value > (low + high) / 2 else "white"
+                axes.text(column, row, f"{np.exp(value):.2f}", ha="center", va="center", fontsize=7, color=ink)
+        axes.grid(False)
+        axes.set_xticks(range(len(methods)), [name.replace("+", "\n+").replace(", ", ",\n") for name in methods])
+        axes.set_yticks(range(len(tables)), [f"{name} ({one['scenes']})" for name, one in tables.items()])
+        axes.xaxis.tick_top()
+        axes.tick_params(length=0, labelsize=7)
     return figure

@@ -25,13 +25,9 @@ network trained on them (`ingest.root`) has seen no photograph of --split val an
 """
 
 import argparse
-import csv
-import dataclasses
 import functools
 import json
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -44,23 +40,22 @@ from polarnet.benchmark.resimulate import resimulated
 from polarnet.benchmark.rows import Context, available, predictions_of
 from polarnet.benchmark.score import FrameScore, scene_means, score_sequence, scored_windows
 from polarnet.config.pipeline import context_of
-from polarnet.config.tree import Config, load
+from polarnet.config.tree import Config
 from polarnet.metrics.reliability import Reliability, reliability
 from polarnet.networks.checkpoint import load_network
 from polarnet.networks.weights import shipped_weights
-from polarnet.pictures.images import read_rgb
-from polarnet.pictures.manifest import MANIFEST, ManifestEntry, read_manifest, write_manifest
-from polarnet.pictures.polarimetry import read_intensities
+from polarnet.reports.figures import LIGHT
+from polarnet.reports.maps import png
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import configure
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.motion import SynthesizeConfig
-from polarnet.simulation.scene import polarization_from_rgb
-from polarnet.simulation.truth import synthesize
-from polarnet.stokes import Prediction, dolp, stokes_from_intensities
+from polarnet.stokes import Prediction
 from polarnet.storage.scenes import SceneStore
+from studies.figures import robustness_figure
 from studies.measure import arguments_of, command_line, machine_record, write_section
 from studies.rate import ENDS, EVENTS_PER_PIXEL, FRAME_RATE_HZ, OURS, RATE_HZ, RATED, ms_per_frame, rated_scores
+from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SENSORS: dict[str, tuple[str, ...]] = {
@@ -115,87 +110,6 @@ class Scores(NamedTuple):
     def __add__(self, other: "Scores") -> "Scores":  # type: ignore[override]
         sums = {name: one + other.reliability[name] for name, one in self.reliability.items()}
         return Scores(self.rows + other.rows, self.dolp | other.dolp, sums)
-
-
-def settings(*overrides: str) -> Config:
-    """The configuration of a condition."""
-    return load(ROOT, ["experiment=photographs", *overrides])
-
-
-def ingested(root: Path, folder: Path, *overrides: str) -> Path:
-    """Folder of the pictures of `root`, made by stage ingest if missing."""
-    if not (folder / "images" / MANIFEST).exists():
-        common = ("experiment=photographs", f"ingest.root={root}", f"paths.data={folder}", *overrides)
-        subprocess.run([sys.executable, "-m", "stages.ingest", *common], cwd=ROOT, check=True)
-    return folder / "images"
-
-
-def sources_of(folder: Path, work: Path) -> dict[str, Path]:
-    """A folder of each source of measured scenes: links by the repo column of manifest.csv, or the folder itself."""
-    manifest = folder / "manifest.csv"
-    if not manifest.exists():
-        return {folder.name: folder}
-    sources: dict[str, Path] = {}
-    with manifest.open(newline="") as file:
-        for row in csv.DictReader(file):
-            name = row["repo"].rpartition("/")[2]
-            sources[name] = work / "sources" / name
-            sources[name].mkdir(parents=True, exist_ok=True)
-            if not (link := sources[name] / row["file"]).exists():
-                link.symlink_to(folder / row["file"])
-    return sources
-
-
-def link_training(roots: Mapping[str, Path], images: Mapping[str, Path], folder: Path) -> int:
-    """Fill a folder with links to the training photographs of all roots, and return their number."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, root in roots.items():
-        for entry in read_manifest(images[name]).pictures:
-            link = folder / f"{name}_{entry.origin.replace('/', '_')}"
-            if entry.split == "train" and not link.is_symlink():
-                link.symlink_to(root / entry.origin)
-    return len(list(folder.iterdir()))
-
-
-def part_of(images: Path, folder: Path, split: str, limit: int | None) -> Path:
-    """Folder with links to the pictures of a split and their manifest."""
-    folder = folder / f"{split}_{limit or 'all'}"
-    if not (folder / MANIFEST).exists():
-        manifest = read_manifest(images)
-        pictures = tuple(entry for entry in manifest.pictures if entry.split == split)[:limit]
-        folder.mkdir(parents=True, exist_ok=True)
-        for entry in pictures:
-            (folder / entry.file).symlink_to(images / entry.file)
-        write_manifest(dataclasses.replace(manifest, pictures=pictures, skipped=()), folder)
-    return folder
-
-
-def scenes_of(images: Path, config: Config) -> SceneStore:
-    """Scenes and motions of the pictures, made beside them if missing."""
-    size, layout = config.storage.sequences_per_part, config.polarizers.layout
-    made_with = json.dumps([dataclasses.asdict(config.synthesize), layout, config.seed]).encode()
-    folder = images.with_name(f"{images.name}_{sha256(made_with)[:12]}")
-    if not (folder / "frames.zarr").exists():
-        folder.mkdir(exist_ok=True)
-        synthesize(
-            images, folder / "scenes.zarr", folder / "frames.zarr", config.synthesize, config.seed,
-            config.mapper("scenes"), size, layout=layout,
-        )  # fmt: skip
-    return SceneStore.open(folder / "scenes.zarr")
-
-
-def mean_dolp(images: Path, split: str) -> list[float]:
-    """Mean DoLP of each picture of a split."""
-
-    def of_picture(entry: ManifestEntry) -> float:
-        path = images / entry.file
-        if entry.source == "polarization":
-            intensities, valid = read_intensities(path)
-            degree = dolp(stokes_from_intensities(torch.as_tensor(intensities))).clamp(0, 1)
-            return float(degree[torch.as_tensor(valid)].mean())
-        return float(polarization_from_rgb(read_rgb(path))[1].mean())
-
-    return [of_picture(entry) for entry in read_manifest(images).pictures if entry.split == split]
 
 
 def scored_sequence(
@@ -461,6 +375,8 @@ def main() -> None:
     (arguments.work / f"robustness_{arguments.split}.json").write_text(json.dumps(section, indent=2) + "\n")
     if arguments.write:
         print(write_section(ROOT, "robustness", arguments.split, section, record, figures))
+        picture = ROOT / "docs" / "pictures" / f"robustness_{arguments.split}.png"
+        picture.write_bytes(png(robustness_figure(tables, LIGHT)))
 
 
 if __name__ == "__main__":

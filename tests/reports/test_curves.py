@@ -6,7 +6,7 @@ import pytest
 from polarnet.reports.curves import event_budget_figure, sensitivity_figure
 from polarnet.reports.figures import DARK, LIGHT
 from polarnet.reports.maps import png
-from studies.figures import expected_errors_figure, loss_sweep_figure
+from studies.figures import expected_errors_figure, loss_sweep_figure, robustness_figure
 
 
 def scores(value):
@@ -32,6 +32,15 @@ EXPECTED = {
     for seed in ("1", "2")
 }
 
+CONDITIONS = {
+    name: {"scenes": 3, "rows": {"oracle_mean": {"mse_over_oracle_mean": 1.0}, **rows}}
+    for name, rows in {
+        "photographs": {"zeros": {"mse_over_oracle_mean": 5.5}, "ours": {"mse_over_oracle_mean": 0.75}},
+        "measured": {"zeros": {"mse_over_oracle_mean": 7.0}, "ours": {"mse_over_oracle_mean": 1.84}},
+        "time": {"ours": {"mse_over_oracle_mean": 0.9}, "held": {"mse_over_oracle_mean": 0.98}},
+    }.items()
+}
+
 
 @pytest.mark.parametrize("theme", [LIGHT, DARK])
 def test_the_figures_are_drawn_the_same_each_time(theme):
@@ -39,6 +48,7 @@ def test_the_figures_are_drawn_the_same_each_time(theme):
         (event_budget_figure, BUDGET),
         (sensitivity_figure, SETTINGS),
         (expected_errors_figure, EXPECTED),
+        (robustness_figure, CONDITIONS),
     ):
         content = png(draw(results, theme))
         assert content == png(draw(results, theme))
@@ -70,6 +80,13 @@ def test_expected_errors_are_drawn_for_each_set_and_seed_beside_the_diagonal():
         assert list(diagonal.get_xdata()) == list(diagonal.get_ydata()) == [0.01, 0.1]
         assert [line.get_label() for line in seeds] == ["seed 1", "seed 2"]
         assert list(seeds[0].get_ydata()) == [0.02, 0.1]
+
+
+def test_conditions_are_rows_and_a_row_of_few_conditions_has_no_column():
+    (axes,) = robustness_figure(CONDITIONS, LIGHT).axes
+    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["photographs (3)", "measured (3)", "time (3)"]
+    assert [tick.get_text() for tick in axes.get_xticklabels()] == ["zeros", "ours"]
+    assert [text.get_text() for text in axes.texts] == ["5.50", "0.75", "7.00", "1.84", "0.90"]
 
 
 def swept(mse, ssim, lpips, value):

@@ -8,7 +8,8 @@ from polarnet.config.pipeline import context_of
 from polarnet.networks.weights import shipped_weights
 from polarnet.storage.scenes import SceneStore
 from studies.rate import rated_scores
-from studies.robustness import SENSORS, Scores, headlines, settings, sources_of, table_of
+from studies.robustness import SENSORS, Scores, headlines, table_of
+from studies.scored_pictures import settings, sources_of
 
 ERRORS = {"pale": 0.001, "middle": 0.01, "strong": 0.1}
 DOLP = {"pale": 0.03, "middle": 0.1, "strong": 0.5}
