@@ -224,6 +224,8 @@ def test_figures_are_kept_where_the_tests_fail(tmp_path):
     assert record["metrics"] == {"ours": {"mse": 0.1, "params": 7}}
     assert record["lpips"] == {"backbone": "alex"}
     assert "test_minutes" not in record
+    speed = json.loads((root / "docs" / "results" / "speed.json").read_text())
+    assert speed["repro_minutes"] == record["repro_minutes"]
     assert (root / "dvc.lock").read_text() == "stages\n"
     (root / "Makefile").write_text("setup:\n\t@true\ntest:\n\t@true\n")
     with pytest.raises(RuntimeError, match="uncommitted changes"):
