@@ -352,8 +352,10 @@ def main() -> None:
     arguments = arguments_of(parser)
     record = machine_record(ROOT)
     kinds = fuzz(arguments.minutes, arguments.cases)
-    crashes = {kind: sum(endings[what] for what in BAD) for kind, endings in kinds.items()}
-    headlines = {"fuzz_cases": sum(sum(endings.values()) for endings in kinds.values()), "fuzz_crashes": crashes}
+    headlines = {
+        "fuzz_cases": sum(sum(endings.values()) for endings in kinds.values()),
+        "fuzz_crashes": sum(endings[what] for endings in kinds.values() for what in BAD),
+    }
     print(json.dumps({**headlines, "kinds": kinds}, indent=2))
     if arguments.write:
         print(write_section(ROOT, "reliability", "fuzz", kinds, record, headlines))
