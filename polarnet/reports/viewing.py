@@ -115,7 +115,7 @@ def _appended_film(path: Path) -> Film:
     arrays: dict[str, Any] = {name: group[name] for name in ("t_us", *APPENDED) if name in group}
     if "t_us" not in arrays or len(arrays) < 2:
         raise ValueError(f"{path}: expected arrays t_us and dolp, or a store of polarnet; got {sorted(group.keys())}")
-    places = np.unique(np.linspace(0, len(arrays["t_us"]) - 1, MAX_FRAMES).round().astype(int))
+    places = np.unique(np.linspace(0, arrays["t_us"].shape[0] - 1, MAX_FRAMES).round().astype(int))
     t_us = arrays.pop("t_us")[:][places].tolist()
     frames = {APPENDED[name]: np.stack([array[int(k)] for k in places]) for name, array in arrays.items()}
     read = {

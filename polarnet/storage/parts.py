@@ -149,7 +149,7 @@ class Store:
             raise ValueError(f"{path}: expected a store of format {cls.FORMAT!r}, got {header.get('format')!r}")
         if header.get("version") != cls.VERSION:
             raise ValueError(
-                f"{path}: expected version {cls.VERSION} of {cls.FORMAT}, got version {header.get('version')} of "
+                f"{path}: expected version {cls.VERSION} of {cls.FORMAT}, got version {header.get('version')!r} of "
                 "another polarnet; run `dvc repro`, which writes it again"
             )
         if header.get("complete") is not True:

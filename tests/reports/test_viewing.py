@@ -1,4 +1,6 @@
+import numpy as np
 import pytest
+import zarr
 
 from polarnet.cli import main
 from polarnet.reports.viewing import films_of
@@ -8,6 +10,16 @@ def test_a_folder_gives_events_and_truth_of_a_sequence_in_one_film(paths):
     films = {film.name: film for film in films_of(paths.events.parent)}
     assert {one.kind for one in films["tree-00"].maps} == {"events", "s0", "dolp", "aolp"}
     assert {one.kind for one in films["tree-00: scene"].maps} == {"s0", "dolp", "aolp"}
+
+
+def test_a_recovery_is_a_film_of_its_dolp_and_aolp(tmp_path):
+    group = zarr.open_group(tmp_path / "night" / "recovered.zarr", mode="w")
+    group["t_us"] = np.array([33_000, 66_000])
+    for name in ("dolp", "aolp"):
+        group[name] = np.full((2, 4, 6), 65535 // 2, np.uint16)
+    (film,) = films_of(tmp_path / "night")
+    assert film.t_us == [33_000, 66_000]
+    assert {one.kind for one in film.maps} == {"dolp", "aolp"}
 
 
 def test_an_unknown_sequence_is_refused_with_the_names_there_are(paths):

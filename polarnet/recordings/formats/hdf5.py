@@ -160,6 +160,10 @@ def open_metavision(path: Path, choices: Choices) -> Source:
     The attribute geometry is "WIDTHxHEIGHT". Its own compression, ECF, needs Prophesee's HDF5 plugin.
     """
     description = _described(path)
+    if METAVISION not in description["tables"]:
+        raise RecordingError(
+            f"{path.name}: expected a table {METAVISION}, got {', '.join(description['tables']) or 'none'}"
+        )
     (length, *_), kind = description["tables"][METAVISION]
     if kind != "V":
         raise RecordingError(f"{path.name}: expected records of x, y, p, t in {METAVISION}, got type {kind!r}")

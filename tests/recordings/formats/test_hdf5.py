@@ -156,6 +156,8 @@ def test_prophesees_table_has_records_of_x_y_p_t_and_its_geometry(tmp_path):
     other = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2")])
     with pytest.raises(RecordingError, match="expected x, y, p, t in CD/events, there is no t"):
         read_recording(write_metavision(tmp_path / "g.hdf5", [(1, 2, 1)], dtype=other))
+    with pytest.raises(RecordingError, match="expected a table CD/events, got events/t, events/x, events/y, events/p"):
+        read_recording(write_dsec(tmp_path / "h.h5"), "metavision")
 
 
 def test_prophesees_own_compression_names_the_plugin_that_it_needs(tmp_path):
