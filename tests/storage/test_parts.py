@@ -451,3 +451,12 @@ def test_a_part_that_lacks_a_sequence_of_the_header_is_refused(copy):
     store.parts["part-00002"] = ["s4", "s5"]
     with pytest.raises(ValueError, match=r"part-00002\.zip is unreadable: 's5'"):
         store.record("s4")
+
+
+def test_a_version_with_a_line_break_is_refused_in_one_line(copy):
+    content = json.loads((copy / "zarr.json").read_text())
+    content["attributes"]["version"] = "a\nb"
+    (copy / "zarr.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"expected version .* got version 'a\\nb'") as refused:
+        Numbers.open(copy)
+    assert "\n" not in str(refused.value)
