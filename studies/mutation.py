@@ -38,7 +38,7 @@ PRELOADED = (
 )  # fmt: skip
 ONE_PIXEL = (
     "test_pixel_physics or test_light or log_ramp or low_pass or delayed or response_is_linear or follows_a_step "
-    "or v2e_does_not"
+    "or v2e_does_not or leak_of or shot_noise_of"
 )
 """Tests of the pixel models that take little time without compilation."""
 TESTS: Mapping[str, tuple[str, ...]] = {

@@ -64,7 +64,7 @@ def test_the_response_of_v2e_is_linear_below_20_dn_and_a_logarithm_above():
 def test_the_response_of_v2e_is_rounded_to_eight_decimals():
     dn, response = np.linspace(0.01, 255, 5000, dtype=np.float32), np.empty(5000, np.float32)
     linlog_as_v2e(dn, response)
-    exact = np.where(dn <= 20, dn * (math.log(20) / 20), np.log(np.float64(dn)))
+    exact = np.where(dn <= 20, np.float64(dn) * (math.log(20) / 20), np.log(np.float64(dn)))
     assert response.tolist() == exact.round(8).astype(np.float32).tolist()
 
 
