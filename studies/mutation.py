@@ -75,15 +75,39 @@ TESTS: Mapping[str, tuple[str, ...]] = {
 }
 """Tests that concern a module."""
 EQUIVALENT: Mapping[str, str] = {
-    "polarnet/stokes.py: folded = torch.where(angle < 0, angle + math.pi, angle) -> "
-    "folded = torch.where(angle <= 0, angle + math.pi, angle)": "0 becomes pi, which the next line makes 0",
-    "polarnet/metrics/similarity.py: return torch.where(varies, covariance / torch.where(varies, variance, 1.0)"
-    ".sqrt(), constant).to(dtype) -> return torch.where(varies, covariance / torch.where(varies, variance, 2.0)"
-    ".sqrt(), constant).to(dtype)": "the quotient is not used where the frame is constant",
-    "polarnet/metrics/reliability.py: here = (self.pixels > 0) & (self.measured > 0) -> "
-    "here = (self.pixels > -1) & (self.measured > 0)": "a bin without pixels has no measured error",
-    "polarnet/metrics/reliability.py: here = (self.pixels > 0) & (self.measured > 0) -> "
-    "here = (self.pixels >= 0) & (self.measured > 0)": "a bin without pixels has no measured error",
+    "polarnet/stokes.py: folded = torch.where(angle < 0, angle + math.pi, angle) -> folded = "
+    "torch.where(angle <= 0, angle + math.pi, angle)": "0 becomes pi, which the next line makes 0",
+    "polarnet/metrics/similarity.py: return torch.where(varies, covariance / torch.where(varies, "
+    "variance, 1.0).sqrt(), constant).to(dtype) -> return torch.where(varies, covariance / "
+    "torch.where(varies, variance, "
+    "2.0).sqrt(), constant).to(dtype)": "the quotient is not used where the frame is constant",
+    "polarnet/metrics/reliability.py: here = (self.pixels > 0) & (self.measured > 0) -> here = "
+    "(self.pixels > -1) & (self.measured > 0)": "a bin without pixels has no measured error",
+    "polarnet/metrics/reliability.py: here = (self.pixels > 0) & (self.measured > 0) -> here = "
+    "(self.pixels >= 0) & (self.measured > 0)": "a bin without pixels has no measured error",
+    "polarnet/simulation/polarizers.py: pixels = "
+    "channels[0].size -> pixels = channels[-1].size": "all sensors have the same size",
+    "polarnet/simulation/pixels/physics.py: if "
+    "sigma == 0: -> if sigma == -1:": "a deviation of 0 gives the same map without the shortcut",
+    "polarnet/simulation/rendering.py: inner = (nearest > 0) & (nearest < len(even) - 1) -> inner = "
+    "(nearest > 0) & (nearest < len(even) + 1)": "the last frame gets the end of the sequence anyway",
+    "polarnet/simulation/rendering.py: for place in (pose.x - (width - 1) / 2, pose.y - (height - 1) / "
+    "2): -> for place in (pose.x - (width - 1) / "
+    "2, pose.y + "
+    "(height - 1) / 2):": "the place moves by whole pixels, and so do the rows that it crosses",
+    "polarnet/simulation/rendering.py: return slice(math.floor(first.min()), min(math.floor(first.max()) "
+    "+ size + 1, limit)) -> return slice(math.floor(first.min()), min(math.floor(first.max()) + size + "
+    "2, limit))": "the light has a row more, which no pixel sees",
+    "polarnet/simulation/pixels/physics.py: if cov_decades "
+    "== 0: -> if cov_decades == -1:": "a spread of 0 gives the same map without the shortcut",
+    "polarnet/simulation/pixels/exact.py: beyond = (max(change, final) >= active.threshold_on[a]) | "
+    "(min(change, final) <= -active.threshold_off[a]) -> beyond = (max(change, final) >= "
+    "active.threshold_on[a]) | (min(change, "
+    "final) > -active.threshold_off[a])": "a further round finds no crossing",
+    "polarnet/events/windows.py: height, width = per_channel[0].shape[-2:] -> height, width = "
+    "per_channel[-1].shape[-2:]": "all channels have the same size",
+    "polarnet/events/streaming.py: if until_us - start_us <= MAX_PAUSE_US: -> if until_us + start_us <= "
+    "MAX_PAUSE_US:": "the check that the shortcut leaves out gives the same answer",
 }
 """Mutants that compute the same as the code, as `Mutant.name` gives them, each with the reason."""
 
