@@ -57,8 +57,8 @@ def _reader_columns(results: Results) -> Columns:
 
 def _recover_rows(results: Results) -> Iterator[Row]:
     for name, one in results["recover"]["methods"].items():
-        label = "network `{network}`, {precision}".format_map(results["recover"]) if name == "network" else f"`{name}`"
-        yield {"label": label, **one}
+        network = "network `{network}`, {precision}".format_map(results["recover"])
+        yield {"label": name.replace("network", network) if "network" in name else f"`{name}`", **one}
 
 
 def _endings_by_kind(*path: str) -> Callable[[Results], list[Row]]:
