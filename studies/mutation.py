@@ -32,6 +32,11 @@ UNCOMPILED = tuple(
     f"polarnet.simulation.pixels.{name}" for name in ("physics", "light", "exact", "v2e", "esim", "voltmeter")
 )
 """Modules whose kernels run as Python, so that a mutant of one of them needs no compilation."""
+EXACT = str(ROOT / "polarnet/simulation/pixels/exact.py")
+UNSIGNED = """
+mixed, key_for = ((lambda *values, made=made: np.uint64(made(*values))) for made in (mixed, key_for))
+"""
+"""End of the uncompiled module `exact`: random bits stay unsigned on their way through Python."""
 PRELOADED = (
     "torch", "numpy", "numba", "scipy.stats", "cv2", "zarr", "hydra", "omegaconf", "pydantic.dataclasses", "beartype",
     "jaxtyping", "hypothesis", "pytest", "matplotlib.figure", "ruamel.yaml", "skimage.metrics", "torchmetrics",
@@ -204,13 +209,20 @@ def _test(mutant: Mutant) -> None:
     file, loader = str(ROOT / mutant.module), importlib.machinery.SourceFileLoader
     get_data, path_stats = loader.get_data, loader.path_stats
 
+    uncompiled_exact = mutant.module.startswith("polarnet/simulation/pixels/")
+
     def without_bytecode(self: Any, path: str) -> Any:
-        if path == file:
+        if path == file or (path == EXACT and uncompiled_exact):
             raise OSError("the mutant has no bytecode file")
         return path_stats(self, path)
 
     loader.path_stats = without_bytecode  # type: ignore[method-assign]
-    loader.get_data = lambda self, path: mutant.source.encode() if path == file else get_data(self, path)  # type: ignore
+
+    def changed(self: Any, path: str) -> bytes:
+        content = mutant.source.encode() if path == file else get_data(self, path)
+        return content + UNSIGNED.encode() if path == EXACT and uncompiled_exact else content
+
+    loader.get_data = changed  # type: ignore[method-assign]
     for name in [name for name in sys.modules if name.partition(".")[0] == "polarnet"]:
         del sys.modules[name]  # pytest's type checks hook into modules that are not yet imported
     sys.path[:0] = [str(ROOT)]
