@@ -29,7 +29,6 @@ import psutil
 import torch
 from skimage import data
 
-from polarnet.config.tree import load
 from polarnet.events.streaming import WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks.checkpoint import load_network

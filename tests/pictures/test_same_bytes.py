@@ -13,7 +13,7 @@ from skimage import data
 
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.simulation.scene import polarization_from_rgb
-from studies import same_bytes
+from studies import instruction_sets
 
 REFERENCE = "9869284915ce1dd18a56fc4ec597740599d363e501ed495aeb257b6b2cc06773"
 
@@ -29,20 +29,26 @@ def test_the_bytes_are_those_of_the_reference():
     assert hash_of_values() == REFERENCE
 
 
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="the settings are of x86-64")
-def test_the_bytes_are_the_same_on_a_processor_without_avx_and_fma(tmp_path):
-    setting = same_bytes.SETTINGS["everything without AVX and FMA"]
-    assert set(same_bytes.checked_levels(setting, str(tmp_path)).values()) == {"SSE"}
+@pytest.fixture
+def x86_64():
+    if platform.machine() != "x86_64":
+        pytest.skip("the settings are those of x86-64")
+
+
+def test_the_bytes_are_the_same_on_a_processor_without_avx_and_fma(tmp_path, x86_64):
+    setting = instruction_sets.SETTINGS["everything without AVX and FMA"]
+    assert set(instruction_sets.checked_levels(setting).values()) == {"SSE"}
     script = "import test_same_bytes; print(test_same_bytes.hash_of_values())"
-    variables = same_bytes.environment(setting, str(tmp_path))
+    variables = instruction_sets.environment(setting) | {"NUMBA_CACHE_DIR": str(tmp_path)}
     variables["PYTHONPATH"] += os.pathsep + os.path.dirname(__file__)
     done = subprocess.run([sys.executable, "-c", script], env=variables, stdout=subprocess.PIPE, text=True, check=True)
     assert done.stdout.strip() == REFERENCE
 
 
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="the settings are of x86-64")
-def test_a_setting_without_effect_is_noticed(tmp_path, monkeypatch):
-    old_names = {"NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX"}  # of numpy before 2.4
-    monkeypatch.setitem(same_bytes.VARIABLES["numpy"], "SSE", old_names)
-    with pytest.raises(RuntimeError, match="'numpy': 'SSE'.+has no effect"):
-        same_bytes.checked_levels({"numpy": "SSE"}, str(tmp_path))
+def test_a_setting_without_effect_is_noticed(monkeypatch, x86_64):
+    if instruction_sets.default_levels()["numpy"] == "SSE":
+        pytest.skip("this processor has no instructions that a setting could switch off")
+    old_names = {"NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3 AVX512F"}  # of numpy before 2.4
+    monkeypatch.setitem(instruction_sets.VARIABLES["numpy"], "SSE", old_names)
+    with pytest.raises(RuntimeError, match=r"expected the levels .'numpy': 'SSE'.+got .'numpy': 'AVX"):
+        instruction_sets.checked_levels({"numpy": "SSE"})
