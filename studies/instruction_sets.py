@@ -88,13 +88,14 @@ def environment(setting: Mapping[str, str]) -> dict[str, str]:
     return {**os.environ, **variables, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
 
 
-def levels(setting: Mapping[str, str]) -> dict[str, str]:
-    """The level that each library says it uses in a process under a setting."""
-    command = [sys.executable, "-c", "from studies.instruction_sets import print_levels; print_levels()"]
-    variables = {**environment(setting), "ONEDNN_VERBOSE": "1"}
+def levels(setting: Mapping[str, str], then: str = "") -> dict[str, str]:
+    """The level that each library says it uses in a process under a setting, which afterwards runs the code `then`."""
+    script = f"from studies.instruction_sets import print_levels; print_levels(); {then}"
+    command, variables = [sys.executable, "-c", script], {**environment(setting), "ONEDNN_VERBOSE": "1"}
     printed = subprocess.run(command, env=variables, stdout=subprocess.PIPE, text=True, check=True).stdout
     (isa,) = re.findall(r"cpu,isa:Intel (\S+)", printed)
-    found = {**json.loads(printed.splitlines()[-1]), "oneDNN": "SSE" if isa == "SSE4.1" else isa}
+    (found,) = (json.loads(line) for line in printed.splitlines() if line.startswith("{"))
+    found["oneDNN"] = "SSE" if isa == "SSE4.1" else isa
     return {library: found[library] if found[library] in LEVELS else "AVX-512" for library in VARIABLES}
 
 
@@ -104,9 +105,9 @@ def default_levels() -> dict[str, str]:
     return levels({})
 
 
-def checked_levels(setting: Mapping[str, str]) -> dict[str, str]:
+def checked_levels(setting: Mapping[str, str], then: str = "") -> dict[str, str]:
     """`levels` under a setting; RuntimeError if the setting does not restrict the libraries as it says."""
-    default, found = default_levels(), levels(setting)
+    default, found = default_levels(), levels(setting, then)
     expected = {one: min(level, setting.get(one, level), key=LEVELS.index) for one, level in default.items()}
     if found != expected:
         raise RuntimeError(f"expected the levels {expected} under the setting {dict(setting)}, got {found}")

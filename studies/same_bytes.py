@@ -2,38 +2,43 @@
 
 python -m studies.same_bytes [--write]
 
-The stages ingest, synthesize and emulate make a set of smoke size, once with the default settings, once under each of
-`studies.instruction_sets.SETTINGS`, and once with each of `WORKERS`. The files must be equal. --write puts the number
-of settings with equal files into docs/results/reliability.json.
+The functions of the stages ingest, synthesize and emulate make a set of smoke size, once with the default settings,
+once under each of `studies.instruction_sets.SETTINGS`, and once with each of `WORKERS`. The files must be equal.
+--write puts the number of settings with equal files into docs/results/reliability.json.
 """
 
 import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from polarnet.config.tree import load
+from polarnet.pictures.ingest import ingest
 from polarnet.runtime.files import sha256
+from polarnet.runtime.machine import configure, threads_of
+from polarnet.simulation.dataset import emulate_scenes
+from polarnet.simulation.truth import synthesize
 from studies.faults import STORES, digest
-from studies.instruction_sets import SETTINGS, checked_levels, environment
+from studies.instruction_sets import SETTINGS, checked_levels
 from studies.measure import arguments_of, command_line, machine_record, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
-STAGES = ("ingest", "synthesize", "emulate")
 ARTEFACTS = ("images", *STORES)
 WORKERS = (2, 5)
 SMALL = ("experiment=smoke", "storage.sequences_per_part=2")  # ten parts, so that five workers have work
 
 
-def make(setting: Mapping[str, str], workers: int, scratch: Path) -> Path:
-    """The folder of a set that the stages made under a setting."""
-    variables = environment(setting) | {"NUMBA_CACHE_DIR": str(scratch / "numba")}
-    for stage in STAGES:
-        words = [*SMALL, f"paths.data={scratch}", f"runtime.workers={workers}", f"hydra.run.dir={scratch / stage}"]
-        subprocess.run([sys.executable, "-m", f"stages.{stage}", *words], cwd=ROOT, env=variables, check=True)
-    return scratch
+def make(data: str, workers: int) -> None:
+    """Make a set in the folder `data`, as the stages ingest, synthesize and emulate do."""
+    config = load(ROOT, [*SMALL, f"paths.data={data}", f"runtime.workers={workers}"])
+    configure(config.runtime, config.seed)
+    paths, seed, per_part = config.paths, config.seed, config.storage.sequences_per_part
+    images, scenes, frames, events = (Path(path) for path in (paths.images, paths.scenes, paths.frames, paths.events))
+    ingest(config.ingest, seed, images, config.mapper("ingest"))
+    mapper, layout = config.mapper("synthesize"), config.polarizers.layout
+    synthesize(images, scenes, frames, config.synthesize, seed, mapper, per_part, config.variation, layout)
+    emulate_scenes(scenes, events, config.camera, seed, config.mapper("emulate"), threads_of(config.runtime))
 
 
 def hashes(data: Path) -> dict[str, dict[str, str]]:
@@ -68,8 +73,9 @@ def compared() -> dict[str, dict[str, Any]]:
     reference_bytes = ""
     for name, (setting, workers) in runs.items():
         with tempfile.TemporaryDirectory() as scratch:
-            used, data = checked_levels(setting), make(setting, workers, Path(scratch))
-            items, all_bytes = hashes(data), bytes_of(data)
+            script = f"from studies.same_bytes import make; make({scratch!r}, {workers})"
+            used = checked_levels(setting, script)
+            items, all_bytes = hashes(Path(scratch)), bytes_of(Path(scratch))
         reference, reference_bytes = reference or items, reference_bytes or all_bytes
         rows[name] = {"workers": workers, "levels": used, "equal": all_bytes == reference_bytes}
         for artefact, expected in reference.items():
