@@ -75,8 +75,9 @@ class Meter:
 
 
 def simulation(size: tuple[int, int], duration_s: float, seed: int) -> Simulation:
-    """A small sensor that moves over a photograph."""
-    motion = dataclasses.replace(MOTIONS["default"], sensor_height=size[0], sensor_width=size[1], duration_s=duration_s)
+    """A small sensor that moves slowly over a photograph."""
+    slow = dataclasses.replace(MOTIONS["default"], speed_min_px_s=5.0, speed_max_px_s=10.0)
+    motion = dataclasses.replace(slow, sensor_height=size[0], sensor_width=size[1], duration_s=duration_s)
     return simulate(SCENE, motion, SENSORS["default"], seed)
 
 
