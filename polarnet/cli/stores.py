@@ -2,13 +2,9 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from polarnet.cli.outputs import run_folder
 from polarnet.cli.parsers import Commands, add_hot_pixel_factor, add_reading, add_stored_sequence, reading_of
-
-if TYPE_CHECKING:
-    from polarnet.storage.parts import Store
 
 PICTURE_US = 33_333
 
@@ -30,10 +26,7 @@ def _add_view(commands: Commands) -> None:
     view.add_argument("--sequence", nargs="+", default=[], metavar="NAME", help="sequences (default: the first twelve)")
     view.add_argument("--out", type=Path, help="page (default: outputs/view/NAME.html)")
     view.add_argument(
-        "--rerun",
-        type=Path,
-        metavar="FILE|viewer",
-        help="log an event store for Rerun instead of a page",
+        "--rerun", type=Path, metavar="FILE|viewer", help="log an event store for Rerun instead of a page"
     )
     view.add_argument("--no-browser", action="store_true", help="write the page without opening it")
     add_reading(view)
@@ -145,25 +138,12 @@ def _view(options: argparse.Namespace) -> int:
     return 0
 
 
-def _kind_of(path: str) -> "type[Store]":
-    """Class of the store at a path; ValueError for other content."""
-    from polarnet.storage.events import EventStore
-    from polarnet.storage.frames import FrameStore
-    from polarnet.storage.groups import open_group
-    from polarnet.storage.scenes import SceneStore
-
-    stores = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}
-    form = open_group(path).attrs.get("format")
-    if form not in stores:
-        raise ValueError(f"{path}: expected a store of format {', '.join(stores)}, got {form!r}")
-    return stores[form]
-
-
 def _list(options: argparse.Namespace) -> int:
+    from polarnet.cli.verification import kind_of
     from polarnet.storage.events import EventStore
     from polarnet.storage.frames import SplitStore
 
-    store = _kind_of(options.store).open(options.store)
+    store = kind_of(options.store).open(options.store)
     width = max(map(len, store.sequences), default=0)
     for name in store.sequences:
         facts = ""
