@@ -54,7 +54,8 @@ def release(path: str, reader: int) -> None:
 def serve(tasks: dict[str, Any]) -> None:
     """Answer requests until the input ends."""
     requests, answers = sys.stdin.buffer, sys.stdout.buffer
-    tasks = {"release": release, "block": functools.partial(block, tasks.get("pieces")), **tasks}
+    if "pieces" in tasks:
+        tasks = {**tasks, "release": release, "block": functools.partial(block, tasks["pieces"])}
     reply: tuple[str, Any]
     while True:
         try:
