@@ -407,9 +407,10 @@ def _recover_rotating(options: argparse.Namespace) -> int:
     with run_folder(out, "recover") as folder:
         source, rotation = open_rotating(file, rotation, functools.partial(read_recording, **reading_of(options)), size)
         writer = RecoveryWriter(folder, options.write, options.video_rate)
-        recoverer = rotating_recoverer(config, rotation)
         if moving:
             recoverer = half_turns_recoverer(settings.methods.rotating_polarizer, rotation)
+        else:
+            recoverer = rotating_recoverer(config, rotation)
         fitted = "each half turn of" if moving else "the modulation by"
         words = f"fit to {fitted} a polarizer at {rotation.rate_hz:g} turns/s"
         facts = facts_of(source, rule, words, recover(source, rule, recoverer, writer))
