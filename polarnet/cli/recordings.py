@@ -190,6 +190,11 @@ def _add_method(recover: argparse.ArgumentParser) -> None:
         "`polarnet fit-sensor` measures them",
     )
     recover.add_argument(
+        "--binning", type=int, metavar="N",
+        help="show the network blocks of N x N pixels, averaged: with 2, it takes a third of the time "
+        "(default: as in its training)",
+    )  # fmt: skip
+    recover.add_argument(
         "--method", help="method of the benchmark instead of the network: cf, highpass, cf+gain, e2v, ..."
     )
     recover.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
@@ -276,7 +281,7 @@ def _recover(options: argparse.Namespace) -> int:
 
     rule = WindowRule(*parse_window(options.window or NETWORK_WINDOW), duration_us(options, "step", "0.1ms"))
     recoverer, words = open_method(
-        options.method, options.weights, options.device, options.precision, setup, options.thresholds
+        options.method, options.weights, options.device, options.precision, setup, options.thresholds, options.binning
     )
     rate = None
     if options.rate is not None:
@@ -391,11 +396,11 @@ def _recover_rotating(options: argparse.Namespace) -> int:
     from polarnet.recovery.stream import facts_of, recover
     from polarnet.recovery.writer import RecoveryWriter
 
-    if options.method not in (None, "rotating_polarizer") or options.weights or options.thresholds:
+    if options.method not in (None, "rotating_polarizer") or options.weights or options.thresholds or options.binning:
         raise ValueError(
-            "--rotating: expected no --method but rotating_polarizer (for moving scenes), no --weights and no "
-            "--thresholds, because a fit without network recovers DoLP with the thresholds of section modulation; "
-            "leave it out"
+            "--rotating: expected no --method but rotating_polarizer (for moving scenes), no --weights, "
+            "--thresholds or --binning, because a fit without network recovers DoLP with the thresholds of section "
+            "modulation; leave it out"
         )
     settings = load(settings_root())
     config, moving = settings.modulation, options.method is not None
