@@ -1,4 +1,4 @@
-"""Commands for recordings: inspect, recover DoLP, replay."""
+"""Commands for recordings: inspect, recover DoLP."""
 
 import argparse
 import contextlib
@@ -15,7 +15,6 @@ from polarnet.cli.parsers import (
     add_cleaning,
     add_hot_pixel_factor,
     add_reading,
-    add_stored_sequence,
     cleaning_of,
     duration_us,
     reading_of,
@@ -77,10 +76,9 @@ examples:
 
 
 def add_to(commands: Commands) -> None:
-    """Add the commands inspect, recover and replay."""
+    """Add the commands inspect and recover."""
     _add_inspection(commands)
     _add_recovery(commands)
-    _add_replay(commands)
 
 
 def _add_inspection(commands: Commands) -> None:
@@ -219,19 +217,6 @@ def _add_output(recover: argparse.ArgumentParser) -> None:
     recover.add_argument(
         "--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)"
     )
-
-
-def _add_replay(commands: Commands) -> None:
-    replay = commands.add_parser(
-        "replay",
-        help="print a stored sequence as lines `t x y p angle`, at its own pace",
-        description="Prints the events of a stored sequence at the pace of the recording. Pipe them into "
-        "`polarnet recover - --live` to try live recovery without a camera.",
-        epilog="example: polarnet replay data/events.zarr lake-0 --speed 0.5",
-    )
-    add_stored_sequence(replay)
-    replay.add_argument("--speed", type=float, default=1.0, help="speed relative to the recording (default: 1)")
-    replay.set_defaults(run=_replay)
 
 
 def _inspect(options: argparse.Namespace) -> int:
@@ -446,15 +431,3 @@ def refuse_unused_options(options: argparse.Namespace) -> None:
     given = [f"--{name.replace('_', '-')}" for name in sorted(unused) if getattr(options, name) is not None]
     if given:
         raise ValueError(f"{kind}: expected no {', '.join(given)}, which does not apply to this input; leave it out")
-
-
-def _replay(options: argparse.Namespace) -> int:
-    from polarnet.recovery.stream import replay
-    from polarnet.storage.events import EventStore
-
-    def write(data: bytes) -> None:
-        sys.stdout.buffer.write(data)
-        sys.stdout.buffer.flush()
-
-    replay(EventStore.open(options.store), options.sequence, options.speed, write)
-    return 0

@@ -1,6 +1,7 @@
-"""Commands for stores: view, list, verify, export, video, labels."""
+"""Commands for stores: view, list, verify, export, video, labels, replay."""
 
 import argparse
+import sys
 from pathlib import Path
 
 from polarnet.cli.outputs import run_folder
@@ -10,8 +11,8 @@ PICTURE_US = 33_333
 
 
 def add_to(commands: Commands) -> None:
-    """Add the commands view, list, verify, export, video and labels."""
-    for add in (_add_view, _add_list, _add_verify, _add_export, _add_video, _add_labels):
+    """Add the commands view, list, verify, export, video, labels and replay."""
+    for add in (_add_view, _add_list, _add_verify, _add_export, _add_video, _add_labels, _add_replay):
         add(commands)
 
 
@@ -112,6 +113,19 @@ def _add_labels(commands: Commands) -> None:
         help="PNG of 33 ms in the middle of the sequence, coloured by cause (default: not drawn)",
     )
     labels.set_defaults(run=_labels)
+
+
+def _add_replay(commands: Commands) -> None:
+    replay = commands.add_parser(
+        "replay",
+        help="print a stored sequence as lines `t x y p angle`, at its own pace",
+        description="Prints the events of a stored sequence at the pace of the recording. Pipe them into "
+        "`polarnet recover - --live` to try live recovery without a camera.",
+        epilog="example: polarnet replay data/events.zarr lake-0 --speed 0.5",
+    )
+    add_stored_sequence(replay)
+    replay.add_argument("--speed", type=float, default=1.0, help="speed relative to the recording (default: 1)")
+    replay.set_defaults(run=_replay)
 
 
 def _view(options: argparse.Namespace) -> int:
@@ -230,4 +244,16 @@ def _labels(options: argparse.Namespace) -> int:
         middle_us = store.duration_us(options.sequence) // 2
         draw_labels(store.read(options.sequence, middle_us, middle_us + PICTURE_US), options.picture)
         print(f"picture {options.picture}")
+    return 0
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from polarnet.recovery.stream import replay
+    from polarnet.storage.events import EventStore
+
+    def write(data: bytes) -> None:
+        sys.stdout.buffer.write(data)
+        sys.stdout.buffer.flush()
+
+    replay(EventStore.open(options.store), options.sequence, options.speed, write)
     return 0
