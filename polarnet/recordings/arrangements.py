@@ -47,9 +47,7 @@ def read_four(
 
 
 def read_mosaic(
-    path: str | os.PathLike[str],
-    mosaic: Mosaic,
-    read: Callable[[Path], Recording] = read_recording,
+    path: str | os.PathLike[str], mosaic: Mosaic, read: Callable[[Path], Recording] = read_recording
 ) -> list[Events]:
     """The four channels of one file of a camera with a mosaic; time starts with its first event."""
     return _from_first_event(split_mosaic(read(Path(path)).events, mosaic))
