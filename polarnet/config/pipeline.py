@@ -33,7 +33,7 @@ def context_of(config: Config, train_mean: float | None, weights: Path | None = 
 
 def setup_of(config: Config, method: Method, weights: Path | None = None) -> Setup:
     """Inputs of a method, with `weights`, else the weights in its section, else those of its training stage."""
-    section = getattr(config.methods, method.section)
+    section = getattr(config.methods, method.section, None)  # a method without settings has no section
     if weights is None and method.weights is not None:
         if section.weights:
             weights = Path(section.weights)
