@@ -43,6 +43,13 @@ def test_the_site_builds_without_warnings_and_loads_nothing_from_other_hosts(sit
 
 
 @pytest.mark.site
+def test_examples_of_docstrings_are_code_on_the_pages_of_the_reference(site):
+    page = (site / "api" / "metrics.html").read_text()
+    assert page.count('class="language-pycon highlight"') == 5
+    assert "<blockquote>" not in page
+
+
+@pytest.mark.site
 def test_search_and_the_player_of_the_home_page_work_in_a_folder_without_a_server(site):
     playwright = pytest.importorskip("playwright.sync_api", reason="pip install 'polarnet[dev]'")
     if chromium_path() is None:
