@@ -45,7 +45,7 @@ def test_the_site_builds_without_warnings_and_loads_nothing_from_other_hosts(sit
 @pytest.mark.site
 def test_examples_of_docstrings_are_code_on_the_pages_of_the_reference(site):
     page = (site / "api" / "metrics.html").read_text()
-    assert page.count('class="language-pycon highlight"') == 5
+    assert page.count('<div class="highlight">') == 5
     assert "<blockquote>" not in page
 
 
@@ -65,5 +65,5 @@ def test_search_and_the_player_of_the_home_page_work_in_a_folder_without_a_serve
         page.locator("input[name=query]").press_sequentially("Malus")
         assert "Malus" in page.locator(".md-search-result__item").first.inner_text()
         page.keyboard.press("Escape")
-        page.frame_locator("iframe").locator(".player[data-ready=yes]").wait_for()
+        page.frame_locator("iframe[title]").locator(".player[data-ready=yes]").wait_for()
         assert problems == []
