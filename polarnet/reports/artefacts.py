@@ -257,10 +257,8 @@ def event_budget(file: Path, events: EventStore) -> list[BudgetPoint]:
     bins: dict[tuple[str, int], list[tuple[float, float]]] = {}
     for method, frame, mse in scores:
         bins.setdefault((method, bisect(BIN_EDGES, counts[frame])), []).append((counts[frame], float(mse)))
-    return [
-        BudgetPoint(method, *np.mean(bins[method, k], axis=0).tolist(), len(bins[method, k]))
-        for method, k in sorted(bins)
-    ]
+    means = {key: np.mean(pairs, axis=0).tolist() for key, pairs in sorted(bins.items())}
+    return [BudgetPoint(key[0], count, mse, len(bins[key])) for key, (count, mse) in means.items()]
 
 
 def _overview(panels: Sequence[Panel], scenes: SceneStore, frames: FrameStore, events: EventStore) -> Overview | None:
