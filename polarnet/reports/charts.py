@@ -167,7 +167,8 @@ def budget_chart(points: Sequence[BudgetPoint], legend: Legend) -> Spec:
     methods = in_order(dict.fromkeys(point.method for point in points))
     values = [{**one._asdict(), "method": legend.label(one.method)} for one in points if one.events_per_pixel > 0]
     scale = alt.Scale(domain=[*map(legend.label, methods)], range=[*map(legend.colour, methods)])
-    x = alt.X("events_per_pixel:Q", title="events per pixel since the start", scale=alt.Scale(type="log"))
+    scale_x = alt.Scale(type="log", nice=False, padding=10)
+    x = alt.X("events_per_pixel:Q", title="events per pixel since the start", scale=scale_x)
     y = alt.Y("mse:Q", title="MSE", axis=alt.Axis(tickCount=5, format="~g"))
     lines = alt.Chart(alt.Data(values=values)).mark_line(point=True)
     tooltip = ["method:N", "events_per_pixel:Q", "mse:Q", "frames:Q"]
