@@ -118,7 +118,8 @@ def leak_factor_map(physics: Physics, pixels: int, key: np.uint64, channel: int)
     if cov_decades == 0:
         return np.ones(pixels, np.float32)
     exponents = randomness.normal_map(key, randomness.NOISE_RATE, channel, pixels)
-    return np.float32(10) ** (np.float32(cov_decades) * exponents)
+    decades = (np.float32(cov_decades) * exponents).astype(np.float64)  # powers in float32 depend on the processor
+    return (10**decades).astype(np.float32)
 
 
 @inlined
