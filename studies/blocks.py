@@ -177,16 +177,6 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
         caption="A search of {search[trials]:,.0f} trials at smoke size: {search[stopped]:.0f} were stopped after an "
         "epoch. Best validation MSE: {search[best][validation_mse]:.4f}. {origin}",
     ),
-    "dask": Block(
-        "sweeps", "dask", "studies.speed dask --data FOLDER --write",
-        caption="Of {dask[files]} files, {dask[finished_before_rerun]} parts were finished before the rerun, which computed "
-        "{dask[computed_twice]} of them again. Bytes equal to those of one process: {dask[bytes_equal]}. {origin}",
-    ),
-    "s3": Block(
-        "sweeps", "s3", "studies.speed s3 --data FOLDER --write",
-        caption="{s3[files]} files of three stores, written by the stages to a server on loopback. Bytes equal to local "
-        "stores: {s3[bytes_equal]}; losses of the training equal: {s3[losses_equal]}. {origin}",
-    ),
     "ddp": Block(
         "sweeps", "ddp", "studies.speed ddp --data FOLDER --write",
         caption="Largest difference of a loss between two processes and one: {ddp[ddp_loss_difference]:.1e}, at smoke size "
