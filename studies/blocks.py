@@ -57,8 +57,8 @@ def _reader_columns(results: Results) -> Columns:
 
 def _recover_rows(results: Results) -> Iterator[Row]:
     for name, one in results["recover"]["methods"].items():
-        label = "network `{network}`, {precision}".format_map(results["recover"]) if name == "network" else f"`{name}`"
-        yield {"label": label, **one}
+        network = "network `{network}`, {precision}".format_map(results["recover"])
+        yield {"label": name.replace("network", network) if "network" in name else f"`{name}`", **one}
 
 
 def _endings_by_kind(*path: str) -> Callable[[Results], list[Row]]:
@@ -154,7 +154,9 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
     "recorded": RECORDED_BLOCK,
     "emulation": Block(
         "emulation", "paper_set", "studies.emulation",
-        lambda results: [{"name": name, **one} for name, one in results.items() if "seconds_1_thread" in str(one)],
+        lambda results: [
+            {"name": name, **results[name]} for name in ("v2e_default", "exact", "esim", "dvs_voltmeter")
+        ],
         {
             "model": "`{name}`", "seconds, 1 thread": "{seconds_1_thread:.3f}", "2 threads": "{seconds_2_threads:.3f}",
             "Mpixel updates / s": "{mpixel_updates_per_s:,.0f}", "Mevents / s": "{mevents_per_s:,.1f}",
@@ -282,6 +284,15 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
         },
         "Training of the network with its loss, VGG included, on two cores; without E2VID, validation and simulation. "
         "{origin}",
+    ),
+    "paper-small": Block(
+        "paper", "paper_small", "studies.paper --small DATA --write",
+        lambda results: [{"name": name, **scores} for name, scores in results["paper_small"].items()],
+        {
+            "row": "`{name}`", "MSE": "{mse:.4f}", "PSNR": "{psnr:.2f}", "SSIM": "{ssim:.3f}", "LPIPS": "{lpips:.3f}",
+            "correlation": "{corr:.3f}", "AoLP error": "{aolp_deg:.1f}°", "skill": "{skill:.3f}",
+        },
+        "`paper` is the network that experiment=paper_small trains, `ours` the shipped one. {origin}",
     ),
     "polarizer-presets": Block(
         "camera", "polarizer_presets", "studies.polarizer_presets",

@@ -131,7 +131,8 @@ def queue(clone: Path, target: list[str]) -> dict[str, Any]:
         dvc(clone, "exp", "run", "--queue", "--name", name, "-S", override, *target)
     os.environ["OMP_NUM_THREADS"] = "1"  # each worker has one core
     started = time.monotonic()
-    dvc(clone, "queue", "start", "-j", "2")
+    if "Started '2'" not in (answer := dvc(clone, "queue", "start", "-j", "2")):  # it succeeds without workers too
+        raise RuntimeError(f"dvc queue start: expected 2 workers, got {answer!r}; the workers need `dvc` in PATH")
     together = 0
     while "Queued" in (status := dvc(clone, "queue", "status")) or "Running" in status:
         together = max(together, status.count("Running"))

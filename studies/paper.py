@@ -1,8 +1,15 @@
-"""The paper row by row: the list docs/paper_rows.yaml, and the counts of its rows.
+"""The paper row by row, and its small experiment.
 
 python -m studies.paper [--write]
+python -m studies.paper --small DATA [--write]
+
+The first command counts the rows of docs/paper_rows.yaml. The second reads the scores of a finished run of
+experiment=paper_small in the folder DATA (`paths.data`), with the rows of the constants, of the filters, of E2VID
+(`e2v`), of the network that the run trained (`paper`) and of the shipped one (`ours`). Both write to
+docs/results/paper.json.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -95,13 +102,33 @@ def duration_rows(lpips: Results) -> list[Row]:
     return rows
 
 
+SMALL_SCORES = ("mse", "psnr", "ssim", "lpips", "corr", "aolp_deg", "skill")
+SMALL_ROWS = ("train_mean", "oracle_mean", "cf", "e2v", "paper", "ours")
+
+
+def small_scores(data: Path) -> dict[str, dict[str, Any]]:
+    """Scores of the rows of experiment=paper_small; ValueError names the rows that the run lacks."""
+    metrics = json.loads((data / "benchmark" / "metrics.json").read_text())
+    if missing := [row for row in SMALL_ROWS if row not in metrics]:
+        raise ValueError(f"{data}: expected the rows {', '.join(SMALL_ROWS)}; {', '.join(missing)} missing")
+    return {row: {score: scores[score] for score in SMALL_SCORES} for row, scores in metrics.items()}
+
+
 def _printed(value: Any) -> str:
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def main() -> None:
     """Print the counts; with --write also keep them in docs/results/paper.json."""
-    options = arguments_of(command_line(__doc__, "docs/results/paper.json"))
+    parser = command_line(__doc__, "docs/results/paper.json")
+    parser.add_argument("--small", type=Path, metavar="DATA", help="data folder of a run of experiment=paper_small")
+    options = arguments_of(parser)
+    if options.small:
+        scores = small_scores(options.small)
+        print(json.dumps(scores, indent=1))
+        if options.write:
+            print(f"wrote {write_section(ROOT, 'paper', 'paper_small', scores, machine_record(ROOT))}")
+        return
     counted = counts(read_rows(ROOT))
     print(", ".join(f"{name} {count}" for name, count in counted.items()))
     if options.write:

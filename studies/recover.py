@@ -6,9 +6,10 @@ M events a second. The events are recovered as the command does it: windows of 1
 video. `realtime_factor` is the length of the stream divided by the time of the run, writing included; above 1 the run
 is faster than the camera. `latency_ms` is the median time of a step for windows that arrive one by one, from events in
 memory to DoLP and AoLP in memory. Methods are the network and the high-pass filter with and without solved gains. The
-network is that of --weights, else the shipped one, else an untrained one of params.yaml, which costs the same. In the
-live measurement, another process sends the stream through a pipe at its own pace; its latency runs from the arrival of
-an event to the frame that contains it.
+network is that of --weights, else the shipped one, else an untrained one of params.yaml, which costs the same. It also
+recovers a stream of 260 x 346 pixels and as many events, with and without blocks of 2x2 pixels. In the live
+measurement, another process sends the stream through a pipe at its own pace; its latency runs from the arrival of an
+event to the frame that contains it.
 
 `--write` merges the figures into docs/results/recordings.json under `recover`. `--picture` copies the network's
 pictures of the stream, or those of the high-pass filter if the network is untrained.
@@ -55,20 +56,25 @@ WINDOWS = WindowRule(33_333, None, None)
 WRITTEN = ("zarr", "png", "mp4")
 UNTRAINED = ", untrained"
 FILTERS = ("highpass", "highpass+gain")
+SMALL, LARGE = (120, 180), (260, 346)
+ON_LARGE: dict[str, int | None] = {"network, 260x346": None, "network, 260x346, 2x2 blocks": 2}
+"""Binning of the network on the large sensor."""
 CPU = torch.device("cpu")
 
 
-def stream_of_events(config: Config, seconds: float) -> list[Events]:
-    """Four channels of 120 x 180 pixels, `seconds` long, at `RATE`."""
+def stream_of_events(config: Config, seconds: float, size: tuple[int, int]) -> list[Events]:
+    """Four channels of a sensor of this size, `seconds` long, at `RATE`."""
     picture = torch.from_numpy(data.coffee()).permute(2, 0, 1).float() / 255
-    motion = replace(config.synthesize, duration_s=seconds, sensor_height=120, sensor_width=180)
+    motion = replace(config.synthesize, duration_s=seconds, sensor_height=size[0], sensor_width=size[1])
     channels = simulate(picture, motion, config.emulate, seed=1).events
     stretch = sum(map(len, channels)) / (RATE * seconds)
     stretched = [replace(events, t=(events.t * stretch).long()) for events in channels]
     return [replace(e, **{c: getattr(e, c)[e.t < seconds * 1e6] for c in "txyp"}) for e in stretched]
 
 
-def network_of(config: Config, weights: Path | None, precision: str) -> tuple[Recoverer, str]:
+def network_of(
+    config: Config, weights: Path | None, precision: str, binning: int | None = None
+) -> tuple[Recoverer, str]:
     """The network to measure, and what it is."""
     try:
         weights = weights or shipped_weights()
@@ -77,9 +83,10 @@ def network_of(config: Config, weights: Path | None, precision: str) -> tuple[Re
         representation = config.train.representation or build.representation
         torch.manual_seed(config.seed)
         module = build(config.network_config, 4 * channels_of(REPRESENTATIONS[representation]))
-        return dolp_recoverer(module, {"representation": representation}, CPU, precision), config.network + UNTRAINED
+        metadata: Any = {"network": config.network, "representation": representation}
+        return dolp_recoverer(module, metadata, CPU, precision, binning=binning), config.network + UNTRAINED
     network, metadata = load_network(weights)
-    return dolp_recoverer(network, metadata, CPU, precision), metadata["network"]
+    return dolp_recoverer(network, metadata, CPU, precision, binning=binning), metadata["network"]
 
 
 def latency_ms(channels: Sequence[Events], recoverer: Recoverer) -> float:
@@ -131,7 +138,7 @@ def main() -> None:
     config = load(ROOT)
     tune()
     figures: dict[str, Any] = machine_record(ROOT)
-    channels = stream_of_events(config, arguments.seconds)
+    channels, large = (stream_of_events(config, arguments.seconds, size) for size in (SMALL, LARGE))
     precision = precision_on(CPU, arguments.precision)
     network, name = network_of(config, arguments.weights, precision)
     recoverers = {"network": network}
@@ -146,6 +153,11 @@ def main() -> None:
         for key, recoverer in recoverers.items():
             summary, pictures[key] = measured(channels, recoverer, folder / key)
             figures["methods"][key] = figures_of(summary, latency_ms(channels, recoverer))
+            print(key, asdict(summary), flush=True)
+        for key, binning in ON_LARGE.items():
+            network, _ = network_of(config, arguments.weights, precision, binning)
+            summary, _ = measured(large, network, folder / key)
+            figures["methods"][key] = figures_of(summary, latency_ms(large, network))
             print(key, asdict(summary), flush=True)
         write_store(folder / "events.zarr", {"stream": channels})
         for key in ("network", "highpass"):

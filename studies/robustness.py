@@ -10,10 +10,12 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
   for each repo; any other folder is one source.
 - `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS.
   `ours, thresholds given` is told the contrast thresholds of the sensor (`methods.ours.thresholds`).
+- `ours, 2x2 blocks`, under each condition, is the network on blocks of pixels (`methods.ours.binning=2`).
 - `time.5ms`: the same with windows of 5 ms.
 - `time.2000hz.photographs`, `time.2000hz.measured`: frames between windows (`polarnet recover --rate 2000`), on the
   pictures of the sensors and on all measured scenes, at 16 times between the ends of two windows (`studies.rate`).
-- `speed`: windows a second of the first weights on random events, and ms of a frame between windows, with --threads.
+- `speed`: windows a second of the first weights on random events, with and without blocks of 2x2 pixels, and ms of a
+  frame between windows, with --threads.
 
 Nothing is trained, except the constants: `train_mean` is the mean DoLP of the training photographs, and `constant_real`
 the mean DoLP of the measured scenes of all sources but the one that is scored. --split val is for choices and --split
@@ -41,13 +43,14 @@ from polarnet.benchmark.rows import Context, available, predictions_of
 from polarnet.benchmark.score import FrameScore, scene_means, score_sequence, scored_windows
 from polarnet.config.pipeline import context_of
 from polarnet.config.tree import Config
+from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.metrics.reliability import Reliability, reliability
 from polarnet.networks.checkpoint import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.reports.figures import LIGHT
 from polarnet.reports.maps import png
 from polarnet.runtime.files import sha256
-from polarnet.runtime.machine import configure
+from polarnet.runtime.machine import configure, precision_on
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.stokes import Prediction
@@ -89,7 +92,10 @@ TIMES: dict[str, tuple[str, ...]] = {"5ms": ("synthesize.frame_rate_hz=200",)}
 """Overrides that change the windows."""
 SIZES = ((120, 180), (260, 346), (480, 640))
 TIMED_WINDOWS, WARM_WINDOWS = 12, 4
+CPU = torch.device("cpu")
 CALIBRATED = "ours, thresholds given"
+BLOCKS = "ours, 2x2 blocks"
+BINNING = 2
 CONSTANT = "constant_real"
 METHODS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
 NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published+gain")
@@ -194,19 +200,21 @@ def table_of(scores: Scores) -> dict[str, Any]:
 
 
 @torch.inference_mode()
-def windows_per_s(weights: Path, height: int, width: int) -> float:
-    """Windows a second of the network on random events, one at a time as from a camera."""
-    network, _ = load_network(weights)
-    stream: Any = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+def windows_per_s(weights: Path, height: int, width: int, binning: int | None = None) -> float:
+    """Windows a second of the network on random events, one at a time as from a camera, as precise as `recover`."""
+    network, metadata = load_network(weights)
+    recoverer = dolp_recoverer(network, metadata, CPU, binning=binning)
+    stream: Any = recoverer.network
     generator = torch.Generator().manual_seed(0)
     count = torch.poisson(torch.full((1, 4, 1, height, width), EVENTS_PER_PIXEL), generator)
     sign = torch.randint(0, 2, count.shape, generator=generator) * 2 - 1
     windows = torch.cat([count * sign, count], dim=2).flatten(1, 2)
     state = None
-    for number in range(WARM_WINDOWS + TIMED_WINDOWS):
-        if number == WARM_WINDOWS:
-            start = time.perf_counter()
-        _, state = stream(windows, state)
+    with torch.autocast(CPU.type, torch.bfloat16, enabled=precision_on(CPU, "auto") == "bf16"):
+        for number in range(WARM_WINDOWS + TIMED_WINDOWS):
+            if number == WARM_WINDOWS:
+                start = time.perf_counter()
+            _, state = stream(windows, state)
     return TIMED_WINDOWS / (time.perf_counter() - start)
 
 
@@ -347,6 +355,9 @@ def main() -> None:
         for part, overrides in parts:
             config = settings(*common, *overrides)
             contexts = {row: context_of(config, train_mean, file) for row, file in arguments.weights.items()}
+            if not name.startswith(RATED):
+                binned = settings(*common, *overrides, f"methods.ours.binning={BINNING}")
+                contexts[BLOCKS] = context_of(binned, train_mean, first_weights)
             if name.startswith("sensors.") and not config.emulate.randomise:
                 thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
                 calibrated = settings(*common, *overrides, f"methods.ours.thresholds={thresholds}")
@@ -364,9 +375,13 @@ def main() -> None:
     row, weights = next(iter(arguments.weights.items()))
     figures = headlines(tables, row)
     if "speed" in wanted:
-        rates = {f"windows_per_s_{height}x{width}": windows_per_s(weights, height, width) for height, width in SIZES}
+        rates = {
+            f"windows_per_s_{height}x{width}{suffix}": windows_per_s(weights, height, width, binning)
+            for height, width in SIZES
+            for suffix, binning in (("", None), (f"_blocks_of_{BINNING}", BINNING))
+        }
         between = {f"ms_per_{RATE_HZ}hz_frame_{h}x{w}": ms_per_frame(h, w, config.between) for h, w in SIZES}
-        figures["speed"] = rates | between | {"threads": arguments.threads}
+        figures["speed"] = rates | between | {"threads": arguments.threads, "precision": precision_on(CPU, "auto")}
     print(json.dumps(figures, indent=1))
     section = {
         "split": arguments.split, "limit": arguments.limit, "sensor_limit": arguments.sensor_limit,

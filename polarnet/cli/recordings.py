@@ -187,6 +187,11 @@ def _add_method(recover: argparse.ArgumentParser) -> None:
         "`polarnet fit-sensor` measures them",
     )
     recover.add_argument(
+        "--binning", type=int, metavar="N",
+        help="show the network blocks of N x N pixels, averaged: with 2, it takes a third of the time "
+        "(default: as in its training)",
+    )  # fmt: skip
+    recover.add_argument(
         "--method", help="method of the benchmark instead of the network: cf, highpass, cf+gain, e2v, ..."
     )
     recover.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
@@ -278,6 +283,7 @@ def _recover(options: argparse.Namespace) -> int:
         options.precision,
         lambda method: setup_of(config(), method),
         options.thresholds,
+        options.binning,
     )
     frames: Any = frames_of
     if options.rate is not None:
@@ -389,11 +395,11 @@ def _recover_rotating(options: argparse.Namespace) -> int:
     from polarnet.recovery.stream import facts_of, recover
     from polarnet.recovery.writer import RecoveryWriter
 
-    if options.method not in (None, "rotating_polarizer") or options.weights or options.thresholds:
+    if options.method not in (None, "rotating_polarizer") or options.weights or options.thresholds or options.binning:
         raise ValueError(
-            "--rotating: expected no --method but rotating_polarizer (for moving scenes), no --weights and no "
-            "--thresholds, because a fit without network recovers DoLP with the thresholds of section modulation; "
-            "leave it out"
+            "--rotating: expected no --method but rotating_polarizer (for moving scenes), no --weights, "
+            "--thresholds or --binning, because a fit without network recovers DoLP with the thresholds of section "
+            "modulation; leave it out"
         )
     settings = load(settings_root())
     config, moving = settings.modulation, options.method is not None

@@ -16,7 +16,7 @@ from polarnet.methods.method import Recoverer, Setup, State, WeightsConfig, each
 from polarnet.methods.window_length import of_any_length
 from polarnet.networks.checkpoint import load_network, trained_window_us
 from polarnet.networks.registry import NETWORKS
-from polarnet.networks.stokes_unet import StokesUNet
+from polarnet.networks.stokes_unet import MOST_BINNING, Binning, StokesUNet
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
@@ -29,6 +29,8 @@ class DolpNetworkConfig(WeightsConfig):
 
     thresholds: Annotated[list[PositiveFloat], Field(min_length=2, max_length=2)] | None
     """Contrast thresholds of the camera, ON and OFF, in natural-log intensity; null: estimated from the events."""
+    binning: Binning | None
+    """Side in pixels of the blocks that the network sees (`networks.polarnet.binning`); null: as in its training."""
 
 
 def encoded(windows: Sequence[EventWindow], encode: Encode) -> Float[Tensor, "n c h w"]:
@@ -42,17 +44,21 @@ def dolp_recoverer(
     device: torch.device | str = "cpu",
     precision: str = "fp32",
     thresholds: Sequence[float] | None = None,
+    binning: int | None = None,
 ) -> Recoverer:
     """Wrap a network and the metadata of its checkpoint (`load_network`) as a method.
 
     `precision` is fp32 or bf16 (autocast). Windows may have any length (`polarnet.methods.window_length`).
-    `thresholds` are the camera's contrast thresholds, ON and OFF (`told`).
+    `thresholds` are the camera's contrast thresholds, ON and OFF (`told`), and `binning` is the side of the pixel
+    blocks that the network sees (default: that of its training).
     """
     place = torch.device(device)
     ready: Any = network.to(place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
     encode = REPRESENTATIONS[metadata["representation"]]
     if thresholds is not None:
         encode = told(ready, metadata, thresholds)
+    if binning is not None:
+        _bin(ready, metadata, binning)
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
         inputs = encoded(windows, encode)[:, None].to(place)
@@ -68,8 +74,8 @@ def dolp_recoverer(
 def open_dolp_network(setup: Setup) -> Recoverer:
     """Open the DoLP network from the checkpoint in the setup."""
     network, metadata = load_network(weights_file(setup))
-    thresholds = setup.config.thresholds if isinstance(setup.config, DolpNetworkConfig) else None
-    return dolp_recoverer(network, metadata, setup.device, setup.precision, thresholds)
+    options = (setup.config.thresholds, setup.config.binning) if isinstance(setup.config, DolpNetworkConfig) else ()
+    return dolp_recoverer(network, metadata, setup.device, setup.precision, *options)
 
 
 def told(network: nn.Module, metadata: Mapping[str, Any], thresholds: Sequence[float]) -> Encode:
@@ -80,11 +86,23 @@ def told(network: nn.Module, metadata: Mapping[str, Any], thresholds: Sequence[f
     """
     if min(thresholds) <= 0:
         raise ValueError(f"thresholds: expected numbers above 0 (ON, OFF), got {list(thresholds)}")
-    if not isinstance(network, StokesUNet):
-        raise ValueError(f"thresholds: expected network polarnet, got {metadata['network']}; leave the thresholds out")
     mean = math.sqrt(math.prod(thresholds))
-    network.scale.given = mean / network.step
+    unet = _stokes_unet(network, metadata, "thresholds")
+    unet.scale.given = mean / unet.step
     return weighted_counts([threshold / mean for threshold in thresholds])
+
+
+def _bin(network: nn.Module, metadata: Mapping[str, Any], side: int) -> None:
+    if not 1 <= side <= MOST_BINNING:
+        raise ValueError(f"binning: expected blocks with a side of 1 to {MOST_BINNING} px, got {side}")
+    _stokes_unet(network, metadata, "binning").binning = side
+
+
+def _stokes_unet(network: nn.Module, metadata: Mapping[str, Any], option: str) -> StokesUNet:
+    """The network, if it is the one that has this option."""
+    if not isinstance(network, StokesUNet):
+        raise ValueError(f"{option}: expected network polarnet, got {metadata['network']}; leave {option} out")
+    return network
 
 
 def weighted_counts(steps: Sequence[float]) -> Encode:

@@ -51,11 +51,15 @@ LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
 LOG_VARIANCE_OUTPUTS = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
 
 
+MOST_BINNING = 8
+Binning = Annotated[int, Field(ge=1, le=MOST_BINNING)]
+
+
 @section
 class StokesUNetConfig:
     """Section `networks.polarnet` of params.yaml."""
 
-    binning: PositiveInt
+    binning: Binning
     """Side in pixels of the blocks whose events are averaged before anything else. Time falls with its square; the
     outputs are interpolated back to the sensor's size."""
     channels: list[PositiveInt]

@@ -232,13 +232,15 @@ def open_method(
     precision: str,
     setup_of: Callable[[Method], Setup],
     thresholds: Sequence[float] | None = None,
+    binning: int | None = None,
 ) -> tuple[Recoverer, str]:
     """Open a method for `recover` and describe it in words.
 
     Without a `name` the method is the DoLP network with `weights`, else the shipped weights. Any other method runs
     with the settings of `setup_of`, and with `weights` if given. `precision` applies to networks: fp32, bf16,
     or auto, which selects bf16 if the device has units for it. `thresholds` are the camera's contrast thresholds, ON
-    and OFF, for the DoLP network. A ValueError or FileNotFoundError says what is missing.
+    and OFF, and `binning` is the side in pixels of the blocks that the network sees; both are for the DoLP network. A
+    ValueError or FileNotFoundError says what is missing.
     """
     tune()
     place = device_of(RuntimeConfig(device, threads=0, workers=1, devices=1, nodes=1, rendezvous=""))
@@ -249,7 +251,7 @@ def open_method(
             raise FileNotFoundError(f"--weights {file}: expected a checkpoint (NAME.safetensors), there is none")
         network, metadata = load_network(file)
         words = f"network {metadata['network']} ({precision}), {file}"
-        return dolp_recoverer(network, metadata, place, precision, thresholds), words
+        return dolp_recoverer(network, metadata, place, precision, thresholds, binning), words
     assert name is not None
     if name not in METHODS:
         raise ValueError(f"--method: expected a method of {', '.join(METHODS)}, got {name!r}")
@@ -258,8 +260,9 @@ def open_method(
         raise ValueError(
             f"--method {name}: expected the rotation of the polarizer too: --rotating HZ or --triggers FILE"
         )
-    if thresholds is not None:
-        raise ValueError(f"--thresholds is for the DoLP network, {name} does not use it")
+    for option, value in (("--thresholds", thresholds), ("--binning", binning)):
+        if value is not None:
+            raise ValueError(f"{option} is for the DoLP network, {name} does not use it")
     if weights is not None and method.weights is None:
         raise ValueError(f"--weights: {name} has no weights; leave it out")
     setup = dataclasses.replace(setup_of(method), device=place, precision=precision)

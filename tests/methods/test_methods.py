@@ -229,10 +229,30 @@ def test_a_network_that_is_told_the_thresholds_does_not_estimate_them(sequence, 
 
 
 def test_thresholds_need_a_network_that_has_a_use_for_them(stokes_unet):
-    with pytest.raises(ValueError, match="expected network polarnet, got paper; leave the thresholds out"):
+    with pytest.raises(ValueError, match="expected network polarnet, got paper; leave thresholds out"):
         told(torch.nn.Identity(), {"network": "paper"}, (0.1, 0.1))
     with pytest.raises(ValueError, match="expected numbers above 0"):
         told(stokes_unet, {"network": "polarnet"}, (0.1, 0.0))
+
+
+def test_binning_makes_the_network_see_blocks_of_pixels(sequence, stokes_unet, project_root):
+    coarse = StokesUNet(dataclasses.replace(load(project_root).networks.polarnet, binning=2))
+    coarse.load_state_dict(stokes_unet.state_dict())
+    metadata = {"network": "polarnet", "representation": "event_counts"}
+    told_at_use = recovered(dolp_recoverer(stokes_unet, metadata, binning=2), sequence.windows)
+    assert torch.equal(told_at_use.dolp, recovered(dolp_recoverer(coarse, metadata), sequence.windows).dolp)
+
+
+@pytest.mark.parametrize(
+    ("network", "side", "words"),
+    [
+        ("paper", 2, "expected network polarnet, got paper; leave binning out"),
+        ("polarnet", 9, "side of 1 to 8 px, got 9"),
+    ],
+)
+def test_binning_that_cannot_be_is_refused(network, side, words):
+    with pytest.raises(ValueError, match=words):
+        dolp_recoverer(torch.nn.Identity(), {"network": network, "representation": "event_counts"}, binning=side)
 
 
 def test_a_method_without_weights_says_what_to_do(make_setup, checkpoints, tmp_path):

@@ -346,9 +346,11 @@ def test_shipped_weights_are_a_checkpoint_or_say_what_to_do():
         assert isinstance(network, torch.nn.Module)
 
 
-def test_thresholds_are_refused_for_a_method_that_does_not_use_them():
-    with pytest.raises(ValueError, match="--thresholds is for the DoLP network, highpass does not use it"):
-        open_method("highpass", None, "cpu", "fp32", lambda method: None, thresholds=(0.1, 0.1))
+@pytest.mark.parametrize("option", [{"thresholds": (0.1, 0.1)}, {"binning": 2}])
+def test_options_of_the_network_are_refused_for_a_method_that_does_not_use_them(option):
+    (name,) = option
+    with pytest.raises(ValueError, match=f"--{name} is for the DoLP network, highpass does not use it"):
+        open_method("highpass", None, "cpu", "fp32", lambda method: None, **option)
 
 
 def test_the_shipped_network_takes_the_thresholds_of_the_camera():

@@ -1,6 +1,7 @@
 """Properties of every pixel model: hand-worked ramps, equal bytes for any split of the work, clear errors."""
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -140,6 +141,41 @@ def test_the_photoreceptor_of_exact_follows_a_step_exponentially_whatever_the_fr
     expected = math.log(2.55) * (1 - math.exp(-2 * math.pi * 10 * 0.02))
     assert filtered(1) == pytest.approx(expected, abs=2e-4)
     assert filtered(200) == pytest.approx(expected, abs=2e-4)
+
+
+@pytest.mark.parametrize("cutoff_hz", [0.5, 3.0, 40.0, 880.0])
+def test_the_photoreceptor_of_exact_follows_a_step_of_light_within_a_frame(cutoff_hz):
+    """Over a step, with a = bandwidth * duration, a rise of the response by r becomes r (1 - (1 - exp(-a)) / a)."""
+    frames = torch.tensor([100.0, 255.0]).view(2, 1, 1, 1)
+    config = of("exact", cutoff_hz=cutoff_hz, contrast_threshold_on=5.0, contrast_threshold_off=5.0)
+    _, state = emulate(frames, torch.tensor([0, 20_000]), config, key=1)
+    a = 2 * math.pi * cutoff_hz * 0.02 * (177.5 + 20) / 275
+    assert float(state.pixels[0].change[0]) == pytest.approx(math.log(2.55) * (1 + math.expm1(-a) / a), rel=1e-5)
+
+
+def test_leak_of_a_pixel_in_steady_light_fires_on_events_at_its_rate():
+    config = of("exact", leak_rate_hz=10.0, leak_jitter=0.0)
+    frames = torch.full((2, 1, 1, 3), 90.0)
+    (columns,), _ = emulate_columns(frames, torch.tensor([0, 350_000]), config, key=1, unrounded_times=True)
+    for x in range(3):  # each pixel starts with a leak of its own
+        times_us = columns.unrounded_us[columns.x == x]
+        assert times_us[0] < 1e5 < 2.5e5 < times_us[-1]
+        assert np.diff(times_us) == pytest.approx(1e5, abs=2)
+    assert set(columns.p.tolist()) == {1}
+
+
+@pytest.mark.parametrize(("dn", "fraction"), [(0.0, 1 - 0.75 * 20 / 275), (255.0, 0.25)])
+def test_shot_noise_of_a_pixel_in_steady_light_is_a_poisson_process_of_both_polarities(dn, fraction):
+    frames = torch.full((41, 1, 10, 10), dn)
+    config = of("exact", shot_noise_rate_hz=20.0)
+    (events,), _ = emulate(frames, 25_000 * torch.arange(41), config, key=1)
+    expected = 100 * 20 * fraction
+    assert len(events) == pytest.approx(expected, abs=4 * math.sqrt(expected))
+    assert int(events.p.sum()) == pytest.approx(0, abs=4 * math.sqrt(expected))
+    places = {*zip(events.y.tolist(), events.x.tolist(), strict=True)}
+    assert len(places) > 90
+    assert places <= {*itertools.product(range(10), range(10))}
+    assert int((events.t < 500_000).sum()) == pytest.approx(expected / 2, abs=4 * math.sqrt(expected / 2))
 
 
 @pytest.mark.parametrize("model", list(MODELS))

@@ -9,12 +9,12 @@ from skimage import data
 
 from polarnet.events.stream import validate
 from polarnet.simulation.emulator import emulate
-from polarnet.simulation.motion import HARMONICS, Sine, Trajectory, render
+from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory, render
 from polarnet.simulation.moving_sensor import emulate_motion, emulate_motion_steps, emulation_times_us
 from polarnet.simulation.pixels.light import intensity_rows
 from polarnet.simulation.polarizers import IDEAL, analyzers
 from polarnet.simulation.presets import SENSORS
-from polarnet.simulation.rendering import lights_of_drift, render_intensities
+from polarnet.simulation.rendering import check_inside, lights_of_drift, render_intensities, render_times_us
 from polarnet.simulation.scene import scene_from_rgb
 from polarnet.stokes import intensities_from_stokes
 
@@ -126,6 +126,14 @@ def test_exact_renders_as_often_but_when_pixels_meet():
     assert np.minimum(*off_grid).max() < 1e-3
 
 
+def test_the_second_frame_moves_to_a_crossing_nearby():
+    """4 sin(10 t) from 59.5 - 15.5 = 44 columns on: the next column is reached after 25 ms, frames are 20 ms apart."""
+    drift = Trajectory(59.5, 40.5, (Sine(4.0, 10.0, 0.0),), (STILL,), STILL, STILL, speed_px_s=40.0)
+    t_us = render_times_us(drift, 100_000, H, W, 50.0, regular=False)
+    crossing_us = 1e6 * np.arcsin(1 / 4) / 10
+    assert t_us.tolist()[:2] == pytest.approx([0, crossing_us], abs=10)
+
+
 @pytest.mark.parametrize("model", ["v2e", "exact"])
 def test_an_adaptive_rate_takes_steps_of_at_most_a_pixel(model):
     config = dataclasses.replace(CONFIG, model=model, render_rate_hz=None)
@@ -150,6 +158,14 @@ def test_a_sensor_that_leaves_the_scene_is_refused_with_its_place(scene):
     far = dataclasses.replace(trajectory(), x=100.0)
     with pytest.raises(ValueError, match=r"reaches rows .* of a scene of 80x120; use a trajectory made for this scene"):
         emulate_motion(scene, far, 200_000, H, W, CONFIG, key=5)
+
+
+def test_a_sensor_as_large_as_the_scene_fits_into_it(scene):
+    pose = Pose(np.array([59.5]), np.array([39.5]), np.zeros(1), np.ones(1))
+    check_inside(scene, pose, np.zeros(1, np.int64), 80, 120)
+    for x, y in ((59.6, 39.5), (59.4, 39.5), (59.5, 39.6), (59.5, 39.4)):
+        with pytest.raises(ValueError, match="at 7 us a sensor of 80x120 pixels reaches"):
+            check_inside(scene, pose._replace(x=np.array([x]), y=np.array([y])), np.array([7]), 80, 120)
 
 
 def test_exact_needs_few_frames_for_the_times_of_many(scene):

@@ -6,8 +6,10 @@ import math
 import numpy as np
 import pytest
 
+from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.light import Light, intensity_rows, light_of_frames, linlog_8bit, linlog_as_v2e, ln
 from polarnet.simulation.pixels.physics import (
+    DARK_SHOT_NOISE,
     leak_factor_map,
     physics_of,
     shot_noise_fraction,
@@ -59,13 +61,20 @@ def test_the_response_of_v2e_is_linear_below_20_dn_and_a_logarithm_above():
     assert response.tolist() == pytest.approx(expected, abs=1e-6)
 
 
+def test_the_response_of_v2e_is_rounded_to_eight_decimals():
+    dn, response = np.linspace(0.01, 255, 5000, dtype=np.float32), np.empty(5000, np.float32)
+    linlog_as_v2e(dn, response)
+    exact = np.where(dn <= 20, np.float64(dn) * (math.log(20) / 20), np.log(np.float64(dn)))
+    assert response.tolist() == exact.round(8).astype(np.float32).tolist()
+
+
 @pytest.mark.parametrize("x", [1e-30, 0.7, 0.71, 1.0, 1.41, 1.42, 3.0, 255.0, 1e30])
 def test_the_natural_logarithm_is_right_to_float32(x):
     assert ln(np.float32(x)) == pytest.approx(math.log(float(np.float32(x))), rel=2e-7, abs=1e-7)
 
 
 def test_shot_noise_is_95_hundredths_in_the_dark_and_a_quarter_at_full_light():
-    assert shot_noise_fraction(0.0) == pytest.approx(1 - 0.75 * 20 / 275)
+    assert shot_noise_fraction(0.0) == DARK_SHOT_NOISE == pytest.approx(1 - 0.75 * 20 / 275)
     assert shot_noise_fraction(255.0) == pytest.approx(0.25)
 
 
@@ -83,6 +92,8 @@ def test_thresholds_are_nominal_without_mismatch_and_never_below_a_hundredth():
     assert off.min() == np.float32(0.01)
     assert off.mean() == pytest.approx(0.2, abs=0.015)  # three standard errors
     assert off.std() == pytest.approx(0.1, abs=0.012)
+    (wide, _) = threshold_maps(nominal._replace(threshold_on=5.0, threshold_sigma_on=1.0), PIXELS, KEY, 0)
+    assert wide.std() == pytest.approx(1, rel=0.12)
     together = nominal._replace(threshold_sigma_on=0.03, threshold_sigma_off=0.03, threshold_correlation=0.6)
     on, off = threshold_maps(together, PIXELS, KEY, 0)
     assert np.corrcoef(on, off)[0, 1] == pytest.approx(0.6, abs=0.1)
@@ -91,7 +102,10 @@ def test_thresholds_are_nominal_without_mismatch_and_never_below_a_hundredth():
 
 def test_leak_rates_spread_by_a_tenth_of_a_decade_around_the_nominal_one():
     physics = physics_of(SENSORS["default"])._replace(noise_rate_cov_decades=0.1)
-    decades = np.log10(leak_factor_map(physics, PIXELS, KEY, 0))
-    assert decades.mean() == pytest.approx(0, abs=0.015)
-    assert decades.std() == pytest.approx(0.1, rel=0.12)
+    normal = randomness.normal_map(KEY, randomness.NOISE_RATE, 0, PIXELS)
+    assert normal.mean() == pytest.approx(0, abs=0.15)
+    assert normal.std() == pytest.approx(1, rel=0.12)
+    for decades in (0.1, 1.0):
+        factors = leak_factor_map(physics._replace(noise_rate_cov_decades=decades), PIXELS, KEY, 0)
+        assert factors == pytest.approx(10 ** (decades * normal), rel=1e-5)
     assert leak_factor_map(physics._replace(noise_rate_cov_decades=0.0), 3, KEY, 0).tolist() == [1, 1, 1]

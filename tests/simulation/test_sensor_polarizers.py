@@ -176,6 +176,22 @@ def test_micropolarizers_differ_between_pixels_as_much_as_stated():
     assert not np.array_equal(analyzer_maps(polarizers, 200, 300, key=8)[0], weights.astype(np.float32))
 
 
+def test_a_drawn_polarizer_never_lets_more_crossed_light_through_than_parallel_light():
+    polarizers = dataclasses.replace(DOFP, extinction_ratio=[1.5] * 4, extinction_spread=1.0)
+    (weights,) = analyzer_maps(polarizers, 20, 30, key=7).astype(np.float64)
+    turned = np.radians([[90, 45], [135, 0]])[np.arange(20)[:, None] % 2, np.arange(30) % 2]
+    polarized = weights[1] * np.cos(2 * turned) + weights[2] * np.sin(2 * turned)
+    assert polarized.min() == pytest.approx(0, abs=1e-6)
+    assert polarized.max() > 0.2
+
+
+@pytest.mark.parametrize("spread", ["extinction_spread", "angle_spread_deg", "transmission_spread"])
+def test_any_spread_makes_pixels_differ(spread):
+    assert FILM.uniform
+    assert not dataclasses.replace(FILM, **{spread: 0.1}).uniform
+    assert not DOFP.uniform
+
+
 def test_ideal_polarizers_give_the_same_light_alike_or_pixel_by_pixel():
     scene, pose = random_scene(), still(38.2, 30.7, roll_deg=20)
     alike = render_intensities(scene, pose, 20, 30, analyzers(IDEAL))[:, 0]
