@@ -181,8 +181,8 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
     ),
     "ddp": Block(
         "sweeps", "ddp", "studies.speed ddp --data FOLDER --write",
-        caption="Largest difference of a loss between two processes and one: {ddp[ddp_loss_difference]:.1e}, at smoke size "
-        "in float32. {origin}",
+        caption="Largest difference of a loss between two processes and one: {ddp[ddp_loss_difference]:.1e}, at "
+        "smoke size in float32. {origin}",
     ),
     "readers": Block(
         "recordings", "readers", "studies.recordings", _reader_rows, _reader_columns,

@@ -13,7 +13,6 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -297,14 +296,15 @@ def _timed(target: str, folder: Path) -> tuple[float, dict[str, float]]:
     Stages run in turn, and beside them those whose lines start with `BESIDE`.
     """
     started = time.monotonic()
-    seconds: Counter[str] = Counter()
+    seconds: dict[str, float] = {}
     running: dict[bool, tuple[str, float]] = {}
     latest: dict[bool, float] = {}
 
     def end(beside: bool, now: float) -> None:
         if beside in running:
             name, start = running.pop(beside)
-            seconds[name.partition("@")[0]] += now - start  # all rows and all trained baselines together
+            stage = name.partition("@")[0]  # all rows and all trained baselines together
+            seconds[stage] = seconds.get(stage, 0.0) + now - start
 
     with subprocess.Popen(
         ["make", target], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

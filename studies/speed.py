@@ -265,7 +265,8 @@ def ddp(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         words = [f"runtime.devices={processes}", "runtime.device=cpu", "runtime.threads=1", *DDP]
         stage("train", options, *words, *(f"paths.{name}={folder / str(processes)}" for name in ("train", "resume")))
         histories.append(read_history(folder / str(processes) / DOLP_TRAINING))
-    pairs = [(one[split]["total"], two[split]["total"]) for one, two in zip(*histories, strict=True) for split in SPLITS]
+    rows = list(zip(*histories, strict=True))
+    pairs = [(one[split]["total"], two[split]["total"]) for split in SPLITS for one, two in rows]
     return {
         "ddp_loss_difference": max(abs(one - two) for one, two in pairs),
         "losses": {"one_process": [one for one, _ in pairs], "two_processes": [two for _, two in pairs]},

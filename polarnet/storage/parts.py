@@ -134,7 +134,7 @@ class Store:
             store._claim.enter_context(claimed(Path(path)))
         if (known := _unsigned(store.path)) != header:
             if known is not None and is_url(path):
-                raise ValueError(f"{path}: expected nothing there, or this store unfinished, got another; delete that one")
+                raise ValueError(f"{path}: expected nothing there, or this store unfinished, got another; delete it")
             shutil.rmtree(store.path, ignore_errors=True)
         zarr.open_group(store.path, mode="a", zarr_format=3).attrs.put(_signed({**header, "complete": False}))
         return store
