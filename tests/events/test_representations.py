@@ -86,6 +86,7 @@ def test_grids_are_normalised_one_by_one():
 def test_normalising_survives_equal_entries_and_no_entries():
     assert normalise_nonzero(torch.full((1, 2, 2), 3.0)).abs().max() == 0
     assert normalise_nonzero(torch.zeros(1, 2, 2)).abs().max() == 0
+    assert normalise_nonzero(torch.tensor([[[0.0, 3.0], [0.0, 0.0]]])).abs().max() == 0
 
 
 def test_time_surface_shows_each_pixels_last_polarity_faded_by_its_age(make_events):
