@@ -106,7 +106,7 @@ def dolp(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
 def aolp(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
     """Angle of linear polarization in radians, [0, pi) (paper Eq. 3, over the whole circle); 0 if unpolarized."""
     _, s1, s2 = _planes("stokes", stokes, "... 3 height width").unbind(-3)
-    angle = torch.atan2(s2, s1) / 2
+    angle = (torch.atan2(s2.double(), s1.double()) / 2).to(s1.dtype)  # float32 would depend on the processor
     folded = torch.where(angle < 0, angle + math.pi, angle)
     return torch.where(folded >= math.pi, 0.0, folded)  # -1e-9 + pi rounds to pi
 

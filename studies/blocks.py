@@ -9,6 +9,7 @@ from polarnet.config.experiments import preset_values
 from polarnet.reports.legend import LABELS, legend_of
 from polarnet.reports.tables import COLUMNS, COSTS, as_markdown, score_table
 from studies.comparisons import paired_lines, standing
+from studies.instruction_sets import SETTINGS, VARIABLES
 from studies.network_blocks import NETWORK_BLOCKS
 from studies.noise import NOISE_BLOCK
 from studies.paper import duration_rows, table_rows
@@ -257,6 +258,26 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
             "crash": "{crash:,}", "hang": "{hang:,}", "memory": "{memory:,}",
         },
         "{fuzz_cases:,} cases. {origin}",
+    ),
+    "same-bytes": Block(
+        "reliability", "same_bytes", "studies.same_bytes --write",
+        lambda results: [{"name": name, **row} for name, row in results["same_bytes"].items()],
+        {
+            "setting": "{name}", "workers": "{workers}",
+            **{library: f"{{levels[{library}]}}" for library in VARIABLES},
+            **{name: f"{{{name}[different]}} of {{{name}[of]}}" for name in ("images", "scenes", "frames", "events")},
+        },
+        f"Settings with equal bytes: {{isa_settings_equal}} of {len(SETTINGS)}. {{origin}}",
+    ),
+    "soak": Block(
+        "reliability", "soak", "studies.soak --write",
+        lambda results: [{"name": name, **row} for name, row in results["soak"].items()],
+        {
+            "run": "{name}", "hours": "{hours:.2f}", "hours of the camera": "{camera_hours:.2f}",
+            "sequences": "{sequences:,}", "events": "{events:,}", "MiB after warm-up": "{memory_mib[start]:,.1f}",
+            "at the end": "{memory_mib[end]:,.1f}", "growth": "{growth_mib:+.1f}",
+            "descriptors after warm-up": "{descriptors[start]}", "then": "{descriptors[end]}",
+        },
     ),
     "house": Block(
         "house", "house", "studies.house --write",

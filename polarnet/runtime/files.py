@@ -1,6 +1,7 @@
 """The hash of contents, files that are written whole or not at all, and the settings that came with the package."""
 
 import hashlib
+import shutil
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -48,6 +49,16 @@ def replaced(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def check_room(folder: Path, needed: int, work: str) -> None:
+    """OSError if the disk of a folder, which need not exist yet, has less than `needed` bytes free."""
+    free = shutil.disk_usage(next(path for path in (folder, *folder.absolute().parents) if path.exists())).free
+    if needed > free:
+        raise OSError(
+            f"{folder}: {work} need about {needed / 2**20:,.1f} MiB, the disk has {free / 2**20:,.1f} MiB free; make "
+            "room or write to another disk, then run this again"
+        )
 
 
 def seal(folder: Path) -> None:

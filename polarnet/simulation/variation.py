@@ -93,4 +93,5 @@ def _graded(
         multiplier = math.exp(generator.uniform(math.log(low), math.log(high)))
     else:
         multiplier = generator.uniform(low, high)
-    return multiplier * values.clamp(0, 1) ** exponent
+    powers = values.clamp(0, 1).double() ** exponent  # float32 would depend on the processor
+    return (multiplier * powers).to(values.dtype)

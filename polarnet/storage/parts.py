@@ -36,7 +36,7 @@ from pydantic import PositiveInt
 from zarr.abc.buffer import Buffer
 from zarr.storage import MemoryStore
 
-from polarnet.runtime.files import claimed, sha256
+from polarnet.runtime.files import check_room, claimed, sha256
 from polarnet.runtime.sections import section
 from polarnet.storage.groups import REPAIR, Columns, create_array, is_url, open_group, raise_shortage
 
@@ -212,7 +212,8 @@ class Store:
         """Add the next sequence to its part, with its rows in some columns and its numbers; the last one completes it.
 
         The sequences of a part come in the store's order, from one process. A part begins anew with its first sequence.
-        ValueError for another order.
+        ValueError for another order. OSError after a part if the disk has no room for the missing parts, which are
+        expected to be as large as the mean of those that are there.
         """
         part, written = self._part(sequence), len(self.records_so_far(sequence))
         names = self.parts[part]
@@ -225,6 +226,9 @@ class Store:
         self._unfinished[part].append(sequence, columns, record)
         if sequence == names[-1]:
             self._unfinished.pop(part).finish()
+            sizes = [file.stat().st_size for file in Path(self.path).glob("part-*.zip")]
+            missing = len(self.parts) - len(sizes)
+            check_room(Path(self.path), missing * sum(sizes) // len(sizes), f"the {missing} missing parts")
 
     def records_so_far(self, sequence: str) -> dict[str, Header]:
         """Records of the sequences before `sequence` in its part, while this process writes it."""

@@ -13,6 +13,7 @@ from torch.nn.functional import avg_pool2d
 
 from polarnet.events.representations import REPRESENTATIONS
 from polarnet.metrics.similarity import correlation, mse, psnr
+from polarnet.runtime.files import check_room
 from polarnet.runtime.machine import precision_on
 from polarnet.runtime.sections import one_of, section
 from polarnet.storage.windows import WindowDataset
@@ -25,6 +26,7 @@ from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, l
 from polarnet.training.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
+COPIES_OF_WEIGHTS = 12  # on disk: best, last, and twice (old and new) the running checkpoint with best and two moments
 MAX_SCENES = 200  # sequences in the expected-error fit, spread evenly; more cost time and change it little
 MAX_BLOCKS = 10_000  # 2x2-pixel blocks per sequence in the expected-error fit; errors of neighbouring blocks are alike
 
@@ -78,8 +80,10 @@ def train(
     All random numbers derive from the seed, the epoch and the sequence's name. A resumed run therefore ends with the
     same weights as an uninterrupted one. The number of workers (processes that read ahead) does not change the weights
     either. All processes that share a training (polarnet.training.parallel) call this function; their number changes
-    the weights by rounding only.
+    the weights by rounding only. OSError if the disk has no room for the checkpoints.
     """
+    weights = sum(tensor.nbytes for tensor in task.network.state_dict().values())
+    check_room(recorder.running, COPIES_OF_WEIGHTS * weights, "the checkpoints")
     network = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = OPTIMIZERS[task.optimizer](network, config.learning_rate)
     progress = recorder.resume(network, optimizer)

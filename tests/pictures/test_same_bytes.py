@@ -2,25 +2,19 @@
 
 import hashlib
 import os
+import platform
 import subprocess
 import sys
 
 import numpy as np
+import pytest
 import torch
 from skimage import data
 
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.simulation.scene import polarization_from_rgb
+from studies import instruction_sets
 
-OLDER_PROCESSOR = {
-    "OPENCV_CPU_DISABLE": "AVX512-SKX,AVX2,FMA3",
-    "NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX",
-    "ATEN_CPU_CAPABILITY": "default",
-    "ONEDNN_MAX_CPU_ISA": "SSE41",
-    "NUMBA_CPU_NAME": "generic",
-    "NUMBA_CPU_FEATURES": "",
-}
-"""Settings that keep each library from the newer instructions of this processor."""
 REFERENCE = "9869284915ce1dd18a56fc4ec597740599d363e501ed495aeb257b6b2cc06773"
 
 
@@ -35,9 +29,26 @@ def test_the_bytes_are_those_of_the_reference():
     assert hash_of_values() == REFERENCE
 
 
-def test_the_bytes_are_the_same_on_an_older_processor(tmp_path):
+@pytest.fixture
+def x86_64():
+    if platform.machine() != "x86_64":
+        pytest.skip("the settings are those of x86-64")
+
+
+def test_the_bytes_are_the_same_on_a_processor_without_avx_and_fma(tmp_path, x86_64):
+    setting = instruction_sets.SETTINGS["everything without AVX and FMA"]
+    assert set(instruction_sets.checked_levels(setting).values()) == {"SSE"}
     script = "import test_same_bytes; print(test_same_bytes.hash_of_values())"
-    paths = os.pathsep.join([os.path.dirname(__file__), *sys.path])
-    settings = {**os.environ, **OLDER_PROCESSOR, "PYTHONPATH": paths, "NUMBA_CACHE_DIR": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", script], env=settings, stdout=subprocess.PIPE, text=True, check=True)
+    variables = instruction_sets.environment(setting) | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    variables["PYTHONPATH"] += os.pathsep + os.path.dirname(__file__)
+    done = subprocess.run([sys.executable, "-c", script], env=variables, stdout=subprocess.PIPE, text=True, check=True)
     assert done.stdout.strip() == REFERENCE
+
+
+def test_a_setting_without_effect_is_noticed(monkeypatch, x86_64):
+    if instruction_sets.default_levels()["numpy"] == "SSE":
+        pytest.skip("this processor has no instructions that a setting could switch off")
+    old_names = {"NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3 AVX512F"}  # of numpy before 2.4
+    monkeypatch.setitem(instruction_sets.VARIABLES["numpy"], "SSE", old_names)
+    with pytest.raises(RuntimeError, match=r"expected the levels .'numpy': 'SSE'.+got .'numpy': 'AVX"):
+        instruction_sets.checked_levels({"numpy": "SSE"})

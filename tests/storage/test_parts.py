@@ -147,6 +147,25 @@ def test_a_part_takes_its_sequences_in_order(tmp_path):
     assert store.missing() == NAMES
 
 
+def test_a_disk_without_room_for_the_missing_parts_ends_the_writing_and_a_larger_one_takes_them(
+    finished, tmp_path, monkeypatch
+):
+    usage, free = shutil.disk_usage(tmp_path), 0
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=free))
+    store = store_at(tmp_path / "store.zarr")
+    write(store, "s0")
+    with pytest.raises(
+        OSError, match=r"store.zarr.tmp: the 2 missing parts need about 0\.\d MiB, the disk has 0\.0 MiB"
+    ):
+        write(store, "s1")
+    assert store.missing() == ["s2", "s3", "s4"]
+    free = 2 * (finished / "part-00001.zip").stat().st_size
+    for name in store.missing():
+        write(store, name)
+    store.finish()
+    assert digest(tmp_path / "store.zarr") == digest(finished)
+
+
 def test_two_processes_that_write_one_part_leave_the_bytes_of_one(tmp_path, finished):
     one, two = store_at(tmp_path / "store.zarr"), store_at(tmp_path / "store.zarr")
     for name in NAMES:

@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,14 @@ def test_a_training_leaves_best_and_last_checkpoint_and_history(stores, tmp_path
 def test_equal_trainings_leave_equal_bytes(stores, tmp_path):
     first, second = (bytes_of(run(small_task(), stores, tmp_path / name)) for name in ("one", "two"))
     assert first == second
+
+
+def test_a_disk_without_room_for_the_checkpoints_is_refused_before_the_first_step(stores, tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=10_000))
+    with pytest.raises(OSError, match=r"resume.+: the checkpoints need about \d\.\d MiB, the disk has 0\.0 MiB free"):
+        run(small_task(), stores, tmp_path)
+    assert not (tmp_path / "resume").exists()
 
 
 def killed(task: Task, at: int, stores: tuple[Path, Path], folder: Path) -> None:

@@ -1,0 +1,58 @@
+"""Commands and stages need no network: they succeed where every connection fails."""
+
+import json
+import socket
+import subprocess
+import sys
+
+import pytest
+from test_simulate import SMALL
+
+APART = ["unshare", "--net", "--map-root-user"]
+"""Runs a command in a network namespace of its own, whose one interface is down."""
+SIZE = ["synthesize.sensor_height=60", "synthesize.sensor_width=90", "synthesize.duration_s=0.1"]
+REST = [word for word in SMALL if not word.startswith(("synthesize.", "ingest."))]
+CONNECT = "import socket, sys; socket.create_connection(('127.0.0.1', int(sys.argv[1])), timeout=5)"
+WORK = """
+import json, os, sys
+paths, words = map(json.loads, sys.argv[1:])
+sys.path[:0] = paths
+from polarnet.cli import main
+from preloaded import run_stage
+assert main(["demo", "--out", "demo", *words]) == 0
+for stage in ("ingest", "synthesize"):
+    pictures = ["ingest.height=120", "ingest.width=180", "ingest.dead_leaves=0"]
+    folders = [f"paths.data={os.getcwd()}/data", f"hydra.run.dir={os.getcwd()}/logs/{stage}"]
+    done = run_stage(paths[0], stage, [*words, *pictures, *folders])
+    assert done.returncode == 0, done.stdout
+"""
+
+
+@pytest.fixture
+def apart():
+    """The command; skips where the system gives no namespace."""
+    try:
+        subprocess.run([*APART, "true"], check=True, capture_output=True, text=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"no network namespace here: {getattr(error, 'stderr', None) or error}")
+    return APART
+
+
+def test_a_connection_succeeds_outside_the_namespace_and_fails_in_it(apart):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        command = [sys.executable, "-c", CONNECT, str(server.getsockname()[1])]
+        subprocess.run(command, check=True)
+        inside = subprocess.run([*apart, *command], capture_output=True, text=True)
+    assert inside.returncode == 1
+    assert "OSError: [Errno 101] Network is unreachable" in inside.stderr
+
+
+def test_simulation_recovery_with_the_shipped_weights_and_stages_succeed_without_a_network(
+    apart, project_root, tmp_path
+):
+    paths = [str(project_root), str(project_root / "tests"), *sys.path]
+    words = [json.dumps(paths), json.dumps([*SIZE, *REST])]
+    done = subprocess.run([*apart, sys.executable, "-c", WORK, *words], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert {"index.html", "recovered.mp4"} <= {path.name for path in (tmp_path / "demo" / "recovered").iterdir()}
+    assert (tmp_path / "data" / "frames.zarr" / "zarr.json").exists()
