@@ -226,9 +226,13 @@ class Store:
         self._unfinished[part].append(sequence, columns, record)
         if sequence == names[-1]:
             self._unfinished.pop(part).finish()
-            sizes = [file.stat().st_size for file in Path(self.path).glob("part-*.zip")]
-            missing = len(self.parts) - len(sizes)
-            check_room(Path(self.path), missing * sum(sizes) // len(sizes), f"the {missing} missing parts")
+            if not is_url(self.path):
+                self._check_room()
+
+    def _check_room(self) -> None:
+        sizes = [file.stat().st_size for file in Path(self.path).glob("part-*.zip")]
+        missing = len(self.parts) - len(sizes)
+        check_room(Path(self.path), missing * sum(sizes) // len(sizes), f"the {missing} missing parts")
 
     def records_so_far(self, sequence: str) -> dict[str, Header]:
         """Records of the sequences before `sequence` in its part, while this process writes it."""
