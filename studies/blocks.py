@@ -170,6 +170,16 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
         ", emulate {paper_set[stage_minutes][emulate]:.1f}) with at most {paper_set[peak_mib]:,} MiB of memory. "
         "{origin}",
     ),
+    "walk": Block(
+        "report", "walk", "studies.walk --write",
+        lambda results: [
+            {**one, "typed": "<br>".join(f"`{command}`" for command in one["commands"]), "total": sum(one["seconds"])}
+            for one in results["walk"].values()
+        ],
+        {"from nothing to": "{title}", "commands": "{typed}", "seconds": "{total:.0f}"},
+        "At most {new_user_commands} commands. The seconds contain the compilation of the simulation, but not the "
+        "download of the packages that polarnet needs. {origin}",
+    ),
     "remotes": Block(
         "sweeps", "push", "studies.clones push --write",
         caption="At smoke size, with stages: {push[target]}. The remote holds {push[files]:,.0f} files of together "

@@ -4,7 +4,6 @@ A block lies between `<!-- results:NAME -->` and `<!-- /results:NAME -->`; studi
 """
 
 import argparse
-import json
 import re
 import sys
 from pathlib import Path
@@ -36,8 +35,7 @@ def update_results_blocks(root: Path, check: bool) -> list[Path]:
 def block_text(name: str, results: Path) -> str:
     """Markdown of the block NAME; the command that measures it while its figures are missing."""
     block = BLOCKS[name]
-    file = results / f"{block.file}.json"
-    known = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    known = block.results(results)
     if block.section not in known:
         return f"Not measured yet; `python -m {block.module}` measures it."
     return block.text(known)

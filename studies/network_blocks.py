@@ -10,7 +10,6 @@ from polarnet.methods import METHODS
 from polarnet.reports.curves import PAPER_EVENTS_PER_PIXEL
 from polarnet.reports.legend import LABELS, in_order
 from polarnet.reports.tables import COLUMNS, ERROR_PARTS
-from studies.designs import DESIGNS
 from studies.measure import ABLATION_KEYS, ablation_about
 from studies.rate import ENDS, HELD, OURS, RATED
 from studies.scenes import CHOICES
@@ -55,8 +54,9 @@ def _headline_rows(results: Results) -> Iterator[Row]:
     for method, label in HEADLINE_LABELS.items():
         row: dict[str, Any] = {"label": label}
         for name in SETS:
-            chosen = method or best_reconstruction(tables[0][name])
-            scores = pooled(table[name][chosen] for table in tables if chosen in table[name])
+            untrained = results["benchmark"][name]  # has every method with published weights
+            chosen = method or best_reconstruction(untrained)
+            scores = pooled([table[name][chosen] for table in tables if chosen in table[name]] or [untrained[chosen]])
             row[name] = {key: fmean(scores[key]) for key in ("mse", "psnr")}
         yield row
 
@@ -64,6 +64,7 @@ def _headline_rows(results: Results) -> Iterator[Row]:
 HEADLINE_LABELS = {
     "oracle_mean": "mean DoLP of each frame, taken from the truth",
     "": "best intensity reconstruction",
+    "cista_tc": LABELS["cista_tc"],
     "paper": "the paper's network",
     "ours": "polarnet",
 }
@@ -84,10 +85,9 @@ def _headline_lines(results: Results) -> list[str]:
 
 def _network_rows(name: str) -> Callable[[Results], Iterator[Row]]:
     def rows(results: Results) -> Iterator[Row]:
-        seeds = seeds_of(results)
-        first = next(iter(seeds.values()))["rows"][name]
-        for row in ("oracle_mean", best_reconstruction(first)):
-            yield {"label": LABELS[row], **first[row]}
+        seeds, untrained = seeds_of(results), results["benchmark"][name]
+        for row in ("oracle_mean", best_reconstruction(untrained)):
+            yield {"label": LABELS[row], **untrained[row]}
         for row in ("paper", "ours"):
             scores = {number: seed["rows"][name][row] for number, seed in seeds.items()}
             yield from ({"label": f"{LABELS[row]}, seed {number}", **one} for number, one in scores.items())
@@ -122,12 +122,6 @@ def _ablation_rows(results: Results) -> list[Row]:
     order = sorted(rows, key=lambda name: (name != "nothing", -rows[name]["mse"]))
     names = {name: RENAMED_ABLATIONS.get(name, name) for name in order}
     return [{**rows[old], "name": name, "about": ablation_about(ROOT, name)} for old, name in names.items()]
-
-
-def _design_rows(results: Results) -> Iterator[Row]:
-    for row in results["rows"]["designs"]:
-        about = next(design.about for design in DESIGNS if row["commit"].startswith(design.commit))
-        yield {**row, **pooled(row["seeds"]), "about": about, "trainings": len(row["seeds"])}
 
 
 def _choice_rows(results: Results) -> Iterator[Row]:
@@ -250,13 +244,15 @@ NETWORK_BLOCKS = {
             heading: form for name, title in SETS.items()
             for heading, form in score_columns(("mse", "psnr"), f"{name}[{{}}]", f"{title}: ").items()
         },
-        caption="", lines=_headline_lines,
+        caption="", lines=_headline_lines, beside="benchmark",
     ),
     "networks-simulated": Block(
-        "network", "seed_1", "studies.study", _network_rows("simulated"), {"": "{label}"} | score_columns(), caption=""
+        "network", "seed_1", "studies.study", _network_rows("simulated"), {"": "{label}"} | score_columns(), caption="",
+        beside="benchmark",
     ),
     "networks-measured": Block(
-        "network", "seed_1", "studies.study", _network_rows("measured"), {"": "{label}"} | score_columns(), caption=""
+        "network", "seed_1", "studies.study", _network_rows("measured"), {"": "{label}"} | score_columns(), caption="",
+        beside="benchmark",
     ),
     "networks-compared": Block(
         "network", "seed_1", "studies.study", _compared_rows,
@@ -287,12 +283,6 @@ NETWORK_BLOCKS = {
         "scenes", "choices", "studies.scenes", _choice_rows,
         {"training scenes": "{about}", "trainings": "{trainings}"} | score_columns(), f"{SEVERAL} {{origin}}",
         _overrides("choices"),
-    ),
-    "designs": Block(
-        "designs", "rows", "studies.designs", _design_rows,
-        {"design": "{about}", "trainings": "{trainings}", "MSE relative to oracle mean ↓": "{mse_over_oracle_mean:.3f}"}
-        | score_columns() | {"measured MSE ↓": "{measured_mse:.4f}", "commit": "`{commit}`"},
-        SEVERAL,
     ),
     "event_budget": Block(
         "event_budget", "budget", "studies.study", _budget_rows, _budget_columns, lines=_budget_lines

@@ -1,35 +1,51 @@
 """Generated pages of the documentation site, a hook of mkdocs.yml: `make docs`.
 
 Parameters come from params.yaml and the schema of its sections, the Python reference from docstrings, and the page on
-contributing from CONTRIBUTING.md. Links to files outside docs/ lead to copies of them.
+contributing from CONTRIBUTING.md. The player of the home page shows a simulation of a few seconds. Links to files
+outside docs/ lead to copies of them.
 """
 
 import pkgutil
 import re
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 from pydantic import TypeAdapter
 from ruamel.yaml import YAML
+from torch import Tensor
 
 import polarnet
-from polarnet.config.tree import Config
+from polarnet.benchmark.sequences import TestSequence
+from polarnet.config.pipeline import setup_of
+from polarnet.config.tree import Config, load
+from polarnet.events.representations import polarity_sums
+from polarnet.methods import METHODS
+from polarnet.networks import shipped_weights
+from polarnet.pictures import BUILTIN_PHOTOS, read_rgb
+from polarnet.reports.player import TRUTH, Film, Map, write_player
+from polarnet.simulation import MOTIONS, SENSORS, simulate
+from polarnet.storage.film import angle_bytes, fraction_bytes, signed_bytes
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTSIDE = re.compile(r"\]\(\.\./([^)#]+)(#[^)]*)?\)")
 LIMITS = {"minimum": ">= {}", "exclusiveMinimum": "> {}", "maximum": "<= {}", "exclusiveMaximum": "< {}",
           "minItems": "at least {} values", "maxItems": "at most {} values"}  # fmt: skip
+PHOTOGRAPH = "astronaut"
+SHOWN = {"polarnet": ("ours", shipped_weights()), "high-pass": ("highpass", None)}
+"""Methods in the player of the home page, with their weights, by caption."""
 NOT_LIBRARY = ("cli", "config")
 """Folders of polarnet that are the command line and the configuration, which other pages describe."""
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages, and copies of the files outside docs/ that pages link to."""
-    for path, text in generated_pages().items():
+    for path, text in {**generated_pages(), "player.html": player_page()}.items():
         files.append(File.generated(config, path, content=text))
     linked = {name for page in files.documentation_pages() for name, _ in OUTSIDE.findall(page.content_string)}
     for name in sorted(linked):
@@ -47,6 +63,34 @@ def generated_pages() -> dict[str, str]:
     """Text of each generated page by its path."""
     contributing = (ROOT / "CONTRIBUTING.md").read_text().replace("](docs/", "](")
     return {"parameters.md": parameters_page(), "contributing.md": contributing, **api_pages()}
+
+
+def player_page() -> str:
+    """The player on a simulated sequence: events, truth, and the methods `SHOWN`; takes seconds."""
+    photo = next(one for one in BUILTIN_PHOTOS if one.path.stem == PHOTOGRAPH)
+    made = simulate(read_rgb(photo.path), MOTIONS["default"], SENSORS["default"], seed=1)
+    truth = made.dolp[1:], made.aolp[1:]
+    sequence = TestSequence(PHOTOGRAPH, PHOTOGRAPH, made.events, made.t_us, *truth, made.intensities[1:, ::2].sum(1))
+    windows, config, size = sequence.windows, load(ROOT), sequence.dolp.shape[1:]
+    counts = torch.stack([torch.stack([*map(polarity_sums, window.channels)]).sum(0) for window in windows])
+    maps = [Map("Events", "events", signed_bytes(counts).numpy())]
+    maps += [Map(TRUTH, "s0", fraction_bytes(sequence.s0).numpy()), *_polarization(TRUTH, *truth)]
+    for caption, (name, weights) in SHOWN.items():
+        method = METHODS[name].open(setup_of(config, METHODS[name], weights))
+        prediction = method.step(method.start(*size), windows)[1]
+        maps += _polarization(caption, prediction.dolp, prediction.aolp)
+    first = config.benchmark.warmup_windows  # before, few events have arrived
+    film = Film(PHOTOGRAPH, made.t_us[1 + first :].tolist(), [m._replace(frames=m.frames[first:]) for m in maps])
+    facts = {"photograph": f"{photo.file} of scikit-image by {photo.author}, {photo.licence}",
+             "sensor": f"{size[0]} x {size[1]} pixels behind four polarizers, simulated",
+             "by hand": f"polarnet demo --photograph {PHOTOGRAPH}"}  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        return write_player(Path(folder, "player.html"), "A simulated camera", [film], facts).read_text()
+
+
+def _polarization(source: str, dolp: Tensor, aolp: Tensor | None) -> list[Map]:
+    angles = [] if aolp is None else [Map(source, "aolp", angle_bytes(aolp).numpy())]
+    return [*angles, Map(source, "dolp", fraction_bytes(dolp).numpy())]
 
 
 def parameters_page() -> str:

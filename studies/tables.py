@@ -1,7 +1,9 @@
 """One writer for every table of docs/results: a format string for each column, and a caption."""
 
+import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
@@ -46,6 +48,16 @@ class Block:
     caption: str = "{origin}"
     """Format string over the file's entries; `{origin}` names machine, versions and commit of the measurement."""
     lines: Callable[[Results], Iterable[str]] = lambda results: ()
+    beside: str | None = None
+    """NAME of a second file, whose content the functions above get under that key."""
+
+    def results(self, folder: Path) -> dict[str, Any]:
+        """Content of the block's file in `folder`, with that of the second file; empty if it does not exist."""
+        file = folder / f"{self.file}.json"
+        known = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+        if self.beside:
+            known[self.beside] = json.loads((folder / f"{self.beside}.json").read_text(encoding="utf-8"))
+        return known
 
     def text(self, results: Results) -> str:
         """The block's Markdown for the content of its file."""

@@ -59,8 +59,10 @@ def pytest_collection() -> None:
     Large packages come before polarnet: the import hook of jaxtyping renames the bytecode files of whatever a module of
     polarnet imports first, so Python would compile those packages once more.
     """
-    from hypothesis import settings  # here and not above, because the controller of several workers needs none of this
+    import yaml  # here and not above, because the controller of several workers needs none of this
+    from hypothesis import settings
 
+    yaml.SafeLoader = yaml.CSafeLoader  # with which omegaconf reads params.yaml for every test that loads it
     for name, cases in FUZZ_CASES.items():
         settings.register_profile(name, max_examples=cases, deadline=None)
     settings.load_profile("ci" if os.environ.get("CI") else "local")

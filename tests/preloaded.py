@@ -4,12 +4,14 @@ Each stage still reads its command line and runs in a process of its own, withou
 """
 
 import multiprocessing
+import multiprocessing.forkserver
 import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 STAGES = sorted(path.stem for path in (Path(__file__).parents[1] / "stages").glob("[a-z]*.py"))
 FORKSERVER = multiprocessing.get_context("forkserver")
@@ -28,6 +30,14 @@ def run_stage(
         process.start()
         process.join()
         return subprocess.CompletedProcess([stage, *arguments], process.exitcode or 0, output.read())
+
+
+def fork_workers_too() -> None:
+    """Let the worker processes of a stage fork from the process that the stage was forked from; a `prepare`."""
+    from polarnet.runtime import cluster
+
+    multiprocessing.forkserver._forkserver.ensure_running = lambda: None  # it runs; Python would start another
+    cluster.multiprocessing = SimpleNamespace(get_context=lambda _: FORKSERVER)
 
 
 def _main(root: Path, stage: str, arguments: list[str], output: str, prepare: Callable[[], None] | None) -> None:

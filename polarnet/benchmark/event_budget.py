@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
 from polarnet.benchmark.between_windows import frames_between
@@ -26,6 +26,7 @@ from polarnet.benchmark.score import FrameScore, mean_scores, score_sequence
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import Events, slice_count, slice_time
 from polarnet.events.streaming import EventWindow
+from polarnet.events.windows import BIN_EDGES, events_per_pixel
 from polarnet.methods import METHODS
 from polarnet.methods.between import BetweenConfig
 from polarnet.metrics.similarity import correlation, mse, psnr
@@ -33,17 +34,9 @@ from polarnet.runtime.progress import ProgressBar
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
 
-BIN_EDGES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 13.0, 20.0, math.inf)
-"""Bin edges in events per pixel since the start; finer below 2, where the paper sees the change."""
 SHOWN = ("mse", "psnr", "ssim", "corr", "skill")
 EVENTS_PER_PIXEL = (0.25, 0.5, 1.0, 2.0)
 """Sizes of the overlapping windows, in events per pixel."""
-
-
-def events_per_pixel(events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Mean number of events per pixel before each time (t < time), averaged over the channels."""
-    counts = torch.stack([torch.searchsorted(e.t, t_us) for e in events]).double().mean(dim=0)
-    return (counts / (events[0].height * events[0].width)).float()
 
 
 def since_start(sequences: Iterable[TestSequence], methods: Sequence[str], context: Context) -> dict[str, list[dict]]:

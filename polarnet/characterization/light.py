@@ -109,10 +109,7 @@ def _read_frame(path: Path) -> Float[np.ndarray, "h w"]:
 
 
 def moving_responses(
-    light: MovingLight,
-    pixel: Int64[np.ndarray, " n"],
-    t_us: Float64[np.ndarray, " n"],
-    cutoff_hz: float,
+    light: MovingLight, pixel: Int64[np.ndarray, " n"], t_us: Float64[np.ndarray, " n"], cutoff_hz: float
 ) -> Float64[np.ndarray, " n"]:
     """Filtered response of each event's pixel at its time; NaN outside the frames' times.
 

@@ -63,9 +63,7 @@ def add_to(commands: Commands) -> None:
         "(default: auto)",
     )  # fmt: skip
     benchmark.add_argument(
-        "--mosaic",
-        metavar="'A B / C D'",
-        help="polarizers of 2x2 pixels of --recordings (default: 90 45 / 135 0)",
+        "--mosaic", metavar="'A B / C D'", help="polarizers of 2x2 pixels of --recordings (default: 90 45 / 135 0)"
     )
     add_cleaning(benchmark)
     benchmark.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/benchmark/NAME)")

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from polarnet.cli.parsers import Commands, add_reading, reading_of
+from polarnet.cli.parsers import Commands, add_reading, duration_us, reading_of
 
 SUFFIXES = {".h5": "hdf5", ".hdf5": "hdf5", ".txt": "text", ".raw": "evt3"}
 
@@ -29,7 +29,6 @@ def add_to(commands: Commands) -> None:
 
 def _convert(options: argparse.Namespace) -> int:
     from polarnet.events.stream import slice_time
-    from polarnet.events.streaming import parse_window
     from polarnet.recordings.arrangements import shifted
     from polarnet.recordings.recording import read_recording
     from polarnet.runtime.files import replaced
@@ -40,19 +39,12 @@ def _convert(options: argparse.Namespace) -> int:
         raise ValueError(f"{options.out}: expected a suffix of {', '.join(SUFFIXES)}, or --to FORMAT")
     if options.out.exists() and options.out.samefile(options.file):
         raise ValueError(f"{options.out}: expected another file than the one to convert; name another")
-    span = []
-    for name in ("start", "stop"):
-        text = getattr(options, name)
-        time_us, _ = parse_window(text) if text else (None, None)
-        if text and time_us is None:
-            raise ValueError(f"--{name}: expected a time such as 500ms, got {text}")
-        span.append(time_us)
-    start_us = span[0] or 0
+    start_us, stop_us = duration_us(options, "start", "500ms") or 0, duration_us(options, "stop", "500ms")
     recording = read_recording(options.file, part=options.part, **reading_of(options))
     events = recording.events
     origin_us = int(events.t[0]) if len(events) else 0
     last_us = int(events.t[-1]) if len(events) else 0
-    stop_us = last_us - origin_us + 1 if span[1] is None else span[1]
+    stop_us = last_us - origin_us + 1 if stop_us is None else stop_us
     if stop_us <= start_us:
         raise ValueError(f"expected --stop after --start, got {start_us} to {stop_us} us of {last_us - origin_us} us")
     part = shifted(slice_time(events, origin_us + start_us, origin_us + stop_us), origin_us + start_us)

@@ -45,18 +45,25 @@ def add_cleaning(command: argparse.ArgumentParser) -> None:
 
 def cleaning_of(options: argparse.Namespace) -> "Cleaning":
     """Noise to remove; ValueError for a background that is not a time."""
-    from polarnet.events.streaming import parse_window
     from polarnet.recordings.noise import FOUND, Cleaning
 
-    within_us, _ = parse_window(options.background) if options.background else (None, None)
-    if options.background and within_us is None:
-        raise ValueError(f"--background: expected a time such as 10ms, got {options.background}")
-    hot = options.hot_pixels
+    within_us, hot = duration_us(options, "background", "10ms"), options.hot_pixels
     if hot not in (None, FOUND):
         hot = str(Path(hot).resolve())
         if not Path(hot).is_file():
             raise FileNotFoundError(f"--hot-pixels {options.hot_pixels}: expected {FOUND} or a file, there is none")
     return Cleaning(hot, options.hot_pixel_factor, within_us)
+
+
+def duration_us(options: argparse.Namespace, name: str, example: str) -> int | None:
+    """Option --NAME as a time in microseconds; None if it is not given, ValueError for anything but a time."""
+    from polarnet.events.streaming import parse_window
+
+    text = getattr(options, name)
+    time_us, _ = parse_window(text) if text else (None, None)
+    if text and time_us is None:
+        raise ValueError(f"--{name}: expected a time such as {example}, got {text}")
+    return time_us
 
 
 def add_reading(command: argparse.ArgumentParser) -> None:

@@ -24,10 +24,7 @@ def add_to(commands: Commands) -> None:
         epilog="example: polarnet doctor --weights best.safetensors",
     )
     doctor.add_argument(
-        "--weights",
-        type=Path,
-        metavar="FILE",
-        help="check a file of weights, and name the rows that can use it",
+        "--weights", type=Path, metavar="FILE", help="check a file of weights, and name the rows that can use it"
     )
     doctor.set_defaults(run=_doctor)
 

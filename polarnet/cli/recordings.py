@@ -1,4 +1,4 @@
-"""Commands for recordings: inspect, recover DoLP, replay."""
+"""Commands for recordings: inspect, recover DoLP."""
 
 import argparse
 import contextlib
@@ -6,7 +6,7 @@ import functools
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.parsers import (
@@ -15,17 +15,19 @@ from polarnet.cli.parsers import (
     add_cleaning,
     add_hot_pixel_factor,
     add_reading,
-    add_stored_sequence,
     cleaning_of,
+    duration_us,
     reading_of,
 )
 from polarnet.cli.project import settings_root
 
 if TYPE_CHECKING:
     from polarnet.captures.dot import RecordingsConfig
+    from polarnet.methods.method import Method, Setup
     from polarnet.recordings.live import LiveLines
     from polarnet.recordings.live_camera import LiveCamera
     from polarnet.recordings.noise import Cleaner
+    from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recovery.stream import Input
     from polarnet.stokes import Mosaic
     from polarnet.storage.true_frames import TrueFrames
@@ -74,10 +76,9 @@ examples:
 
 
 def add_to(commands: Commands) -> None:
-    """Add the commands inspect, recover and replay."""
+    """Add the commands inspect and recover."""
     _add_inspection(commands)
     _add_recovery(commands)
-    _add_replay(commands)
 
 
 def _add_inspection(commands: Commands) -> None:
@@ -206,8 +207,9 @@ def _add_method(recover: argparse.ArgumentParser) -> None:
 def _add_output(recover: argparse.ArgumentParser) -> None:
     recover.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
     recover.add_argument(
-        "--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), help="file types to write (default: zarr png mp4)"
-    )
+        "--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), default=("zarr", "png", "mp4"),
+        help="file types to write (default: zarr png mp4)",
+    )  # fmt: skip
     recover.add_argument(
         "--rerun", type=Path, metavar="FILE|viewer",
         help="also log events, frames, expected errors and timings for Rerun: into FILE.rrd, or to the running viewer",
@@ -215,19 +217,6 @@ def _add_output(recover: argparse.ArgumentParser) -> None:
     recover.add_argument(
         "--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)"
     )
-
-
-def _add_replay(commands: Commands) -> None:
-    replay = commands.add_parser(
-        "replay",
-        help="print a stored sequence as lines `t x y p angle`, at its own pace",
-        description="Prints the events of a stored sequence at the pace of the recording. Pipe them into "
-        "`polarnet recover - --live` to try live recovery without a camera.",
-        epilog="example: polarnet replay data/events.zarr lake-0 --speed 0.5",
-    )
-    add_stored_sequence(replay)
-    replay.add_argument("--speed", type=float, default=1.0, help="speed relative to the recording (default: 1)")
-    replay.set_defaults(run=_replay)
 
 
 def _inspect(options: argparse.Namespace) -> int:
@@ -271,66 +260,64 @@ def _recover(options: argparse.Namespace) -> int:
     if options.rotating is not None or options.triggers is not None:
         return _recover_rotating(options)
     config = functools.cache(lambda: load(settings_root()))
-    length_us, events = parse_window(options.window or NETWORK_WINDOW)
-    step_us, step_events = parse_window(options.step) if options.step else (None, None)
-    if step_events is not None:
-        raise ValueError(f"--step: expected a time such as 0.1ms, got {options.step}")
-    rule = WindowRule(length_us, events, step_us)
+
+    def setup(method: "Method") -> "Setup":
+        return setup_of(config(), method)
+
+    rule = WindowRule(*parse_window(options.window or NETWORK_WINDOW), duration_us(options, "step", "0.1ms"))
     recoverer, words = open_method(
-        options.method,
-        options.weights,
-        options.device,
-        options.precision,
-        lambda method: setup_of(config(), method),
-        options.thresholds,
-        options.binning,
+        options.method, options.weights, options.device, options.precision, setup, options.thresholds, options.binning
     )
-    frames: Any = frames_of
+    rate = None
     if options.rate is not None:
         check_rate(options.rate, rule, recoverer)
         rate = Rate(options.rate, config().between.with_thresholds(options.thresholds))
-        frames = functools.partial(frames_at_rate, rate=rate)
     truth = _truth_of(options)
-    name = "live" if options.live else Path(options.input[0]).stem
-    out = options.out or Path("outputs") / "recover" / name
+    scores = TruthScores(truth) if truth else None
+    out = options.out or Path("outputs") / "recover" / ("live" if options.live else Path(options.input[0]).stem)
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     cleaner = Cleaner(cleaning, mosaic)
-    with run_folder(out, "recover") as folder:
+    with run_folder(out, "recover") as folder, contextlib.ExitStack() as stack:
         if options.live:
             print(f"writing frames to {folder}; the folder becomes {out} at the end", file=sys.stderr)
         source, lines = _input(options, mosaic, cleaner, folder / WORK, lambda: config().recordings)
-        check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
-        if source.channels == len(POLARIZER_ANGLES_DEG):
+        check, polarized = None, source.channels == len(POLARIZER_ANGLES_DEG)
+        if polarized:
+            check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
             source = source._replace(pieces=check.watch(source.pieces))
-        kinds = options.write or ("zarr", "png", "mp4")
-        drawn = "mp4" in kinds and source.channels == len(POLARIZER_ANGLES_DEG) and truth is None
-        reconstruct = METHODS[RECONSTRUCT].open(setup_of(config(), METHODS[RECONSTRUCT])) if drawn else None
-        writer = RecoveryWriter(folder, kinds, options.video_rate, reconstruct, truth)
-        scores = TruthScores(truth) if truth else None
+        drawn = polarized and "mp4" in options.write and truth is None
+        reconstruct = METHODS[RECONSTRUCT].open(setup(METHODS[RECONSTRUCT])) if drawn else None
+        writer = RecoveryWriter(folder, options.write, options.video_rate, reconstruct, truth)
+        frames = frames_at_rate(source, rule, recoverer, rate) if rate else frames_of(source, rule, recoverer)
         if scores:
-            run, watch = frames, scores.watch
-            frames = lambda *inputs: watch(run(*inputs))  # noqa: E731
-        with contextlib.ExitStack() as stack:
-            if options.rerun:
-                log, inner = stack.enter_context(RerunLog(options.rerun, source.name)), frames
-                frames = lambda *inputs: logged(log, inner(*inputs), options.live)  # noqa: E731
-            summary = recover(source, rule, recoverer, writer, frames)
-        left_out = {kind: count for kind, count in lines.counts.items() if count} if lines else {}
-        notes = check.findings() if source.channels > 1 else []
-        notes += [f"Unusable lines were left out: {left_out}."] if left_out else []
-        facts = facts_of(source, rule, words, summary)
-        if options.rate is not None:
-            facts["rate"] = f"{options.rate:g} frames a second, carried on by the events from window to window"
-        if source.channels > 1:
-            counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)
-            facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
+            frames = scores.watch(frames)
+        if options.rerun:
+            frames = logged(stack.enter_context(RerunLog(options.rerun, source.name)), frames, options.live)
+        facts = facts_of(source, rule, words, recover(source, rule, recoverer, writer, frames))
+        facts |= _further_facts(options.rate, check)
         if scores:
             facts["scores"] = scores.sentence(config().benchmark.warmup_windows)
         if any(getattr(options, option) for option in CLEANING_OPTIONS):
             facts["removed"] = cleaner.sentence()
+        notes = check.findings() if check else []
+        if left_out := {kind: count for kind, count in lines.counts.items() if count} if lines else {}:
+            notes.append(f"Unusable lines were left out: {left_out}.")
         page = writer.write_page(source.name, facts, notes)
     _print_run(facts, notes, out / page.name)
     return 0
+
+
+def _further_facts(rate_hz: float | None, check: "ChannelCheck | None") -> dict[str, str]:
+    """Facts about the rate of the frames and the events of each channel, where they apply."""
+    from polarnet.stokes import POLARIZER_ANGLES_DEG
+
+    facts = {}
+    if rate_hz is not None:
+        facts["rate"] = f"{rate_hz:g} frames a second, carried on by the events from window to window"
+    if check:
+        counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)
+        facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
+    return facts
 
 
 def _input(
@@ -349,9 +336,8 @@ def _input(
         return source._replace(pieces=cleaner.live(source.pieces)), lines
     read = functools.partial(read_recording, **reading_of(options))
     arrangement = Arrangement(options.angles, mosaic, options.sequence)
-    size = (options.size[0], options.size[1]) if options.size else None
-    files, plain = [Path(path) for path in options.input], _reconstructs(options.method)
-    return open_files(files, arrangement, read, size, work, captures, plain, cleaner), None
+    files, size = [Path(path) for path in options.input], options.size and tuple(options.size)
+    return open_files(files, arrangement, read, size, work, captures, _reconstructs(options.method), cleaner), None
 
 
 def _print_run(facts: Mapping[str, str], notes: Sequence[str], page: Path) -> None:
@@ -403,36 +389,24 @@ def _recover_rotating(options: argparse.Namespace) -> int:
         )
     settings = load(settings_root())
     config, moving = settings.modulation, options.method is not None
-    file, size = Path(options.input[0]), (options.size[0], options.size[1]) if options.size else None
+    file, size = Path(options.input[0]), options.size and tuple(options.size)
     rotation = rotation_of(options.rotating, options.triggers, options.start_angle or 0.0)
-    length_us, step_us = (_duration_us(options, name) for name in ("window", "step"))
+    length_us, step_us = (duration_us(options, name, "500ms") for name in ("window", "step"))
     rule = half_turn_rule(rotation, 0.5 if moving else config.window_turns, length_us, step_us)
     out = options.out or Path("outputs") / "recover" / file.stem
     with run_folder(out, "recover") as folder:
         source, rotation = open_rotating(file, rotation, functools.partial(read_recording, **reading_of(options)), size)
-        writer = RecoveryWriter(folder, options.write or ("zarr", "png", "mp4"), options.video_rate)
+        writer = RecoveryWriter(folder, options.write, options.video_rate)
         if moving:
             recoverer = half_turns_recoverer(settings.methods.rotating_polarizer, rotation)
         else:
             recoverer = rotating_recoverer(config, rotation)
-        summary = recover(source, rule, recoverer, writer)
-        words = f"fit to {'each half turn of' if moving else 'the modulation by'} a polarizer at "
-        words += f"{rotation.rate_hz:g} turns/s"
-        facts = facts_of(source, rule, words, summary)
+        fitted = "each half turn of" if moving else "the modulation by"
+        words = f"fit to {fitted} a polarizer at {rotation.rate_hz:g} turns/s"
+        facts = facts_of(source, rule, words, recover(source, rule, recoverer, writer))
         page = writer.write_page(source.name, facts, [])
     _print_run(facts, [], out / page.name)
     return 0
-
-
-def _duration_us(options: argparse.Namespace, name: str) -> int | None:
-    """Option --window or --step as a time; None if it is not given."""
-    from polarnet.events.streaming import parse_window
-
-    text = getattr(options, name)
-    duration_us, _ = parse_window(text) if text else (None, None)
-    if text and duration_us is None:
-        raise ValueError(f"--{name}: expected a time such as 500ms with a rotating polarizer, got {text}")
-    return duration_us
 
 
 def refuse_unused_options(options: argparse.Namespace) -> None:
@@ -457,15 +431,3 @@ def refuse_unused_options(options: argparse.Namespace) -> None:
     given = [f"--{name.replace('_', '-')}" for name in sorted(unused) if getattr(options, name) is not None]
     if given:
         raise ValueError(f"{kind}: expected no {', '.join(given)}, which does not apply to this input; leave it out")
-
-
-def _replay(options: argparse.Namespace) -> int:
-    from polarnet.recovery.stream import replay
-    from polarnet.storage.events import EventStore
-
-    def write(data: bytes) -> None:
-        sys.stdout.buffer.write(data)
-        sys.stdout.buffer.flush()
-
-    replay(EventStore.open(options.store), options.sequence, options.speed, write)
-    return 0

@@ -119,7 +119,7 @@ def _simulate(options: argparse.Namespace) -> int:
     if options.size and min(options.size) < 2:
         raise ValueError(f"--size: expected at least 2 rows and columns, got {options.size[0]} {options.size[1]}")
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
-    size = (options.size[0], options.size[1]) if options.size else None
+    size = options.size and tuple(options.size)
     clip = open_clip(inputs, ClipOptions(mosaic, options.angles, options.white, options.grey, size))
     refuse_unused_options(options, clip, len(inputs))
     times = None if clip.still else _times_of(options, clip, inputs[0])

@@ -21,11 +21,7 @@ from polarnet.simulation.video import Drawn, Piece
 from polarnet.storage.appended import AppendedFrames
 from polarnet.storage.events import MAX_DURATION_US, EventStore
 from polarnet.storage.exchange import FORMS, label_file
-from polarnet.storage.frames import (
-    CONVENTIONS,
-    quantise_angle,
-    quantise_fraction,
-)
+from polarnet.storage.frames import CONVENTIONS, quantise_angle, quantise_fraction
 from polarnet.storage.spool import EventSpool
 from polarnet.storage.true_frames import APPENDED, open_truth
 

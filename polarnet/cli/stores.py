@@ -1,21 +1,18 @@
-"""Commands for stores: view, list, verify, export, video, labels."""
+"""Commands for stores: view, list, verify, export, video, labels, replay."""
 
 import argparse
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from polarnet.cli.outputs import run_folder
 from polarnet.cli.parsers import Commands, add_hot_pixel_factor, add_reading, add_stored_sequence, reading_of
-
-if TYPE_CHECKING:
-    from polarnet.storage.parts import Store
 
 PICTURE_US = 33_333
 
 
 def add_to(commands: Commands) -> None:
-    """Add the commands view, list, verify, export, video and labels."""
-    for add in (_add_view, _add_list, _add_verify, _add_export, _add_video, _add_labels):
+    """Add the commands view, list, verify, export, video, labels and replay."""
+    for add in (_add_view, _add_list, _add_verify, _add_export, _add_video, _add_labels, _add_replay):
         add(commands)
 
 
@@ -30,10 +27,7 @@ def _add_view(commands: Commands) -> None:
     view.add_argument("--sequence", nargs="+", default=[], metavar="NAME", help="sequences (default: the first twelve)")
     view.add_argument("--out", type=Path, help="page (default: outputs/view/NAME.html)")
     view.add_argument(
-        "--rerun",
-        type=Path,
-        metavar="FILE|viewer",
-        help="log an event store for Rerun instead of a page",
+        "--rerun", type=Path, metavar="FILE|viewer", help="log an event store for Rerun instead of a page"
     )
     view.add_argument("--no-browser", action="store_true", help="write the page without opening it")
     add_reading(view)
@@ -121,6 +115,19 @@ def _add_labels(commands: Commands) -> None:
     labels.set_defaults(run=_labels)
 
 
+def _add_replay(commands: Commands) -> None:
+    replay = commands.add_parser(
+        "replay",
+        help="print a stored sequence as lines `t x y p angle`, at its own pace",
+        description="Prints the events of a stored sequence at the pace of the recording. Pipe them into "
+        "`polarnet recover - --live` to try live recovery without a camera.",
+        epilog="example: polarnet replay data/events.zarr lake-0 --speed 0.5",
+    )
+    add_stored_sequence(replay)
+    replay.add_argument("--speed", type=float, default=1.0, help="speed relative to the recording (default: 1)")
+    replay.set_defaults(run=_replay)
+
+
 def _view(options: argparse.Namespace) -> int:
     import functools
     import webbrowser
@@ -145,25 +152,12 @@ def _view(options: argparse.Namespace) -> int:
     return 0
 
 
-def _kind_of(path: str) -> "type[Store]":
-    """Class of the store at a path; ValueError for other content."""
-    from polarnet.storage.events import EventStore
-    from polarnet.storage.frames import FrameStore
-    from polarnet.storage.groups import open_group
-    from polarnet.storage.scenes import SceneStore
-
-    stores = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}
-    form = open_group(path).attrs.get("format")
-    if form not in stores:
-        raise ValueError(f"{path}: expected a store of format {', '.join(stores)}, got {form!r}")
-    return stores[form]
-
-
 def _list(options: argparse.Namespace) -> int:
+    from polarnet.cli.verification import kind_of
     from polarnet.storage.events import EventStore
     from polarnet.storage.frames import SplitStore
 
-    store = _kind_of(options.store).open(options.store)
+    store = kind_of(options.store).open(options.store)
     width = max(map(len, store.sequences), default=0)
     for name in store.sequences:
         facts = ""
@@ -250,4 +244,16 @@ def _labels(options: argparse.Namespace) -> int:
         middle_us = store.duration_us(options.sequence) // 2
         draw_labels(store.read(options.sequence, middle_us, middle_us + PICTURE_US), options.picture)
         print(f"picture {options.picture}")
+    return 0
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from polarnet.recovery.stream import replay
+    from polarnet.storage.events import EventStore
+
+    def write(data: bytes) -> None:
+        sys.stdout.buffer.write(data)
+        sys.stdout.buffer.flush()
+
+    replay(EventStore.open(options.store), options.sequence, options.speed, write)
     return 0

@@ -9,10 +9,11 @@ from polarnet.runtime.files import SUMS, changed_files
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.groups import open_group
+from polarnet.storage.parts import Store
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.recorder import read_running
 
-STORES = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}
+STORES: dict[str, type[Store]] = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}
 FILES: dict[str, Callable[[Path], object]] = {".safetensors": load_checkpoint, ".pt": read_running}
 
 
@@ -43,14 +44,20 @@ def _below(folder: Path) -> Iterator[tuple[str, list[str]]]:
                 yield str(file), _file_problems(file)
 
 
+def kind_of(path: str) -> type[Store]:
+    """Class of the store at a path; ValueError for other content."""
+    form = open_group(path).attrs.get("format")
+    if form not in STORES:
+        raise ValueError(f"{path}: expected a store of format {', '.join(STORES)}, got {form!r}")
+    return STORES[form]
+
+
 def _store_problems(path: str) -> list[str]:
     try:
-        form = open_group(path).attrs.get("format")
+        kind = kind_of(path)
     except (FileNotFoundError, ValueError) as error:
         return [str(error)]
-    if form not in STORES:
-        return [f"{path}: expected a store of format {', '.join(STORES)}, got {form!r}"]
-    return STORES[form].verify(path)
+    return kind.verify(path)
 
 
 def _file_problems(file: Path) -> list[str]:

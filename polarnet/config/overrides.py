@@ -1,6 +1,7 @@
 """Overrides of a command line, checked before Hydra reads them, so that a message lists keys and choices."""
 
 import fnmatch
+import functools
 import math
 import re
 from collections.abc import Sequence
@@ -22,7 +23,9 @@ def check_overrides(settings: type, root: Path, overrides: list[str], presets: P
     The groups are `experiment`, `sensor`, `polarizers` and `ablation`. Hydra refuses both as well, but this message
     lists the available keys and choices.
     """
-    _refuse_many_values(root / "params.yaml")
+    file = root / "params.yaml"
+    if (values := _values_of(file.read_text(encoding="utf-8"))) > MAX_VALUES:
+        raise ValueError(f"{file}: expected at most {MAX_VALUES} values, its aliases make {values:g}")
     groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
     for override in overrides:
         key, _, value = override.partition("=")
@@ -33,8 +36,9 @@ def check_overrides(settings: type, root: Path, overrides: list[str], presets: P
             raise ValueError(refusal)
 
 
-def _refuse_many_values(file: Path) -> None:
-    """ValueError for aliases that make more than `MAX_VALUES` values of a short YAML file."""
+@functools.lru_cache(maxsize=4)
+def _values_of(text: str) -> int | float:
+    """Number of values of a YAML text; its aliases may make many of a short one."""
     sizes: dict[int, int | float] = {}
 
     def size(node: Node) -> int | float:
@@ -45,9 +49,8 @@ def _refuse_many_values(file: Path) -> None:
             sizes[id(node)] = 1 + sum(map(size, parts))
         return sizes[id(node)]
 
-    root = YAML(typ="safe", pure=True).compose(file.read_text(encoding="utf-8"))
-    if root is not None and size(root) > MAX_VALUES:
-        raise ValueError(f"{file}: expected at most {MAX_VALUES} values, its aliases make {size(root):g}")
+    root = YAML(typ="safe", pure=True).compose(text)
+    return 0 if root is None else size(root)
 
 
 def _check_choices(roots: Sequence[Path], group: str, value: str) -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from polarnet.benchmark.references import REFERENCES
 from polarnet.benchmark.row_results import RowRecord, write_row
@@ -33,7 +34,7 @@ def context_of(config: Config, train_mean: float | None, weights: Path | None = 
 
 def setup_of(config: Config, method: Method, weights: Path | None = None) -> Setup:
     """Inputs of a method, with `weights`, else the weights in its section, else those of its training stage."""
-    section = getattr(config.methods, method.section)
+    section: Any = getattr(config.methods, method.section, None)  # a method without settings has no section
     if weights is None and method.weights is not None:
         if section.weights:
             weights = Path(section.weights)

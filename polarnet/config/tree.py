@@ -217,7 +217,7 @@ class Config:
     def used_baselines(self) -> list[str]:
         """Trained baselines whose weights a row of `benchmark.methods` uses; one with a file of its own does not."""
         sections = {METHODS[row].section for row in self.benchmark.methods if row in METHODS}
-        given = {section for section in sections if getattr(getattr(self.methods, section), "weights", None)}
+        given = {one for one in sections if getattr(getattr(self.methods, one, None), "weights", None)}
         return [name for name in BASELINES if (sections - given).intersection(trained_rows(name))]
 
     @property

@@ -23,6 +23,12 @@ class Events:
     """Events of one channel, in time order.
 
     The constructor checks only shapes and types, so that slices are cheap; `validate` checks every event.
+
+    >>> import numpy as np
+    >>> from polarnet.events import Events
+    >>> one = np.array([1])
+    >>> Events.from_columns(t=1000 * one, x=one, y=one, p=-one, height=120, width=180).t
+    tensor([1000])
     """
 
     t: Int64[Tensor, " n"]  # microseconds

@@ -20,7 +20,12 @@ TRAINED_WINDOW_US = 33_333
 
 
 class EventWindow(NamedTuple):
-    """Events with start_us <= t < stop_us of the four channels (0, 45, 90, 135 degrees), or of one channel."""
+    """Events with start_us <= t < stop_us of the four channels (0, 45, 90, 135 degrees), or of one channel.
+
+    >>> from polarnet.events import Events, EventWindow
+    >>> EventWindow([Events.empty(120, 180)] * 4, start_us=0, stop_us=33_333).length_us
+    33333
+    """
 
     channels: Sequence[Events]
     start_us: int

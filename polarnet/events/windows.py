@@ -1,6 +1,7 @@
 """Cut the events of a sequence into windows of time and encode them."""
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import torch
@@ -10,6 +11,15 @@ from torch import Tensor
 from polarnet.events.representations import Encode
 from polarnet.events.stream import Events, slice_count
 from polarnet.runtime.arrays import Array, whole_numbers
+
+BIN_EDGES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 13.0, 20.0, math.inf)
+"""Bin edges in events per pixel since the start; finer below 2, where the paper sees the change."""
+
+
+def events_per_pixel(events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Mean number of events per pixel before each time (t < time), averaged over the channels."""
+    counts = torch.stack([torch.searchsorted(e.t, t_us) for e in events]).double().mean(dim=0)
+    return (counts / (events[0].height * events[0].width)).float()
 
 
 def windows_of(t_us: Int64[Tensor, " n"]) -> list[tuple[int, int]]:

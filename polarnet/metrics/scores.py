@@ -15,7 +15,15 @@ def frame_scores(
     aolp: Float[Tensor, "n h w"],
     valid: Bool[Tensor, "n h w"] | None = None,
 ) -> Mapping[str, Float[Tensor, " n"]]:
-    """Scores of each frame as in the benchmark: mse, psnr, ssim, corr and, if an angle is predicted, aolp_deg."""
+    """Scores of each frame as in the benchmark: mse, psnr, ssim, corr and, if an angle is predicted, aolp_deg.
+
+    >>> import torch
+    >>> from polarnet.metrics import frame_scores
+    >>> from polarnet.stokes import Prediction
+    >>> truth = torch.full((2, 16, 16), 0.5)
+    >>> frame_scores(Prediction(truth), truth, truth)["mse"]
+    tensor([0., 0.])
+    """
     scores = {
         "mse": mse(prediction.dolp, dolp, valid),
         "psnr": psnr(prediction.dolp, dolp, valid),
@@ -37,6 +45,7 @@ def score(
     """Means of `frame_scores` over the frames after the first `warmup_frames`; ValueError if none is left.
 
     >>> import torch
+    >>> from polarnet.metrics import score
     >>> from polarnet.stokes import Prediction
     >>> truth = torch.full((3, 16, 16), 0.5)
     >>> score(Prediction(truth + 0.1), truth, truth)["mse"]

@@ -71,7 +71,13 @@ def with_truth_outside(
 
 
 def mse(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
-    """Mean squared error."""
+    """Mean squared error.
+
+    >>> import torch
+    >>> from polarnet.metrics import mse
+    >>> mse(torch.zeros(2, 16, 16), torch.full((2, 16, 16), 0.5))
+    tensor([0.2500, 0.2500])
+    """
     a, b = _frames(a=a, b=b)
     valid = None if valid is None else mask_of("valid", valid, a.shape)
     return mean_where((a - b).square(), valid)
@@ -99,7 +105,13 @@ def spread_mse(truth: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tens
 
 
 def psnr(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
-    """Peak signal-to-noise ratio in dB for the data range 1; 100 dB, not infinity, for equal frames."""
+    """Peak signal-to-noise ratio in dB for the data range 1; 100 dB, not infinity, for equal frames.
+
+    >>> import torch
+    >>> from polarnet.metrics import psnr
+    >>> round(psnr(torch.full((16, 16), 0.1), torch.zeros(16, 16)).item(), 2)
+    20.0
+    """
     a, b = _frames(a=a, b=b)
     valid = None if valid is None else mask_of("valid", valid, a.shape)
     _check_unit(b, valid)
@@ -184,6 +196,12 @@ def ssim(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = No
 
     Computed in float32 at least, even under autocast: variances are small differences of large means. ValueError for a
     frame smaller than 6 pixels.
+
+    >>> import torch
+    >>> from polarnet.metrics import ssim
+    >>> frame = torch.linspace(0, 1, 256).view(16, 16)
+    >>> round(ssim(frame, frame).item(), 3)
+    1.0
     """
     a, b = _frames(a=a, b=b)
     valid = None if valid is None else mask_of("valid", valid, a.shape)

@@ -59,7 +59,13 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], di
 
 
 def load_network(path: str | os.PathLike[str]) -> tuple[nn.Module, dict[str, Any]]:
-    """Load a DoLP network in evaluation mode, and its metadata (representation, training, versions)."""
+    """Load a DoLP network in evaluation mode, and its metadata (representation, training, versions).
+
+    >>> from polarnet.networks import load_network, shipped_weights
+    >>> network, metadata = load_network(shipped_weights())
+    >>> metadata["network"]
+    'polarnet'
+    """
     tensors, metadata = load_checkpoint(path)
     if metadata["network"] not in NETWORKS:
         raise ValueError(

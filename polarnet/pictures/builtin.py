@@ -78,3 +78,9 @@ BUILTIN_PHOTOS = (
         author="SpaceX",
     ),
 )
+"""Photographs in scikit-image's wheel.
+
+>>> from polarnet.pictures import BUILTIN_PHOTOS
+>>> BUILTIN_PHOTOS[2].path.name, BUILTIN_PHOTOS[2].licence
+('coffee.png', 'CC0-1.0')
+"""

@@ -179,7 +179,12 @@ def write_png(path: str | os.PathLike[str], rgb: Float32[np.ndarray, "h w 3"], b
 
 
 def read_rgb(path: str | os.PathLike[str]) -> Float[Tensor, "3 h w"]:
-    """sRGB code values in [0, 1] of a whole picture; raises like `read_picture` and `srgb_of`."""
+    """sRGB code values in [0, 1] of a whole picture; raises like `read_picture` and `srgb_of`.
+
+    >>> from polarnet.pictures import BUILTIN_PHOTOS, read_rgb
+    >>> read_rgb(BUILTIN_PHOTOS[0].path).shape
+    torch.Size([3, 512, 512])
+    """
     picture = read_picture(path)
     rows, columns = picture.pixels.shape[:2]
     rgb = srgb_of(fit(picture.pixels, rows, columns, 1.0), picture)

@@ -31,6 +31,12 @@ def read_four(
     earlier events are left out. Without it the files share one clock, which starts with the first event of all. `read`
     replaces `read_recording` where a file needs options. RecordingError where an angle is missing or duplicated, or
     where the sensor sizes differ.
+
+    >>> from pathlib import Path
+    >>> from polarnet.recordings import read_four
+    >>> size = Path("night.txt").write_text("40 30\\n0.5 3 2 1\\n")
+    >>> [len(channel) for channel in read_four(dict.fromkeys((0, 45, 90, 135), "night.txt"))]
+    [1, 1, 1, 1]
     """
     by_angle = {angle % 180: angle for angle in files}
     if sorted(by_angle) != list(POLARIZER_ANGLES_DEG) or len(by_angle) != len(files):
@@ -47,11 +53,16 @@ def read_four(
 
 
 def read_mosaic(
-    path: str | os.PathLike[str],
-    mosaic: Mosaic,
-    read: Callable[[Path], Recording] = read_recording,
+    path: str | os.PathLike[str], mosaic: Mosaic, read: Callable[[Path], Recording] = read_recording
 ) -> list[Events]:
-    """The four channels of one file of a camera with a mosaic; time starts with its first event."""
+    """The four channels of one file of a camera with a mosaic; time starts with its first event.
+
+    >>> from pathlib import Path
+    >>> from polarnet.recordings import read_mosaic
+    >>> size = Path("night.txt").write_text("40 30\\n0.5 3 2 1\\n")
+    >>> [len(channel) for channel in read_mosaic("night.txt", ((90, 45), (135, 0)))]
+    [0, 1, 0, 0]
+    """
     return _from_first_event(split_mosaic(read(Path(path)).events, mosaic))
 
 

@@ -131,7 +131,14 @@ def read_recording(
     part: str | None = None,
     clock_mhz: float | int | None = None,
 ) -> Recording:
-    """Read a whole file, with the arguments and errors of `open_recording`; logs a warning for each kind of damage."""
+    """Read a whole file, with the arguments and errors of `open_recording`; logs a warning for each kind of damage.
+
+    >>> from pathlib import Path
+    >>> from polarnet.recordings import read_recording
+    >>> size = Path("night.txt").write_text("40 30\\n0.5 3 2 1\\n")
+    >>> read_recording("night.txt").events.x
+    tensor([3], dtype=torch.int16)
+    """
     reader = open_recording(path, format, height=height, width=width, part=part, clock_mhz=clock_mhz)
     chunks = list(reader)
     for kind, count in reader.repairs.items():

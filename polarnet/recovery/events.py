@@ -20,7 +20,14 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
 
 
 class Recovery(NamedTuple):
-    """Predicted frames and their times."""
+    """Predicted frames and their times.
+
+    >>> import torch
+    >>> from polarnet.recovery import Recovery
+    >>> from polarnet.stokes import Prediction
+    >>> Recovery(torch.tensor([33_333]), Prediction(torch.zeros(1, 120, 180))).prediction.dolp.shape
+    torch.Size([1, 120, 180])
+    """
 
     t_us: Int64[Tensor, " n"]
     """Ends of the windows, microseconds."""

@@ -314,9 +314,12 @@ def recover(
     rule: WindowRule,
     recoverer: Recoverer,
     writer: RecoveryWriter,
-    frames: Callable[[Input, WindowRule, Recoverer], Iterable[Frame]] = frames_of,
+    frames: Iterable[Frame] | None = None,
 ) -> Summary:
-    """Recover and write all `frames`, with a progress bar; ValueError if the input is shorter than one window."""
+    """Write all `frames` (default: `frames_of`), with a progress bar.
+
+    ValueError if the input is shorter than one window.
+    """
     live = source.duration_us is None
     steps, latencies = array("d"), array("d")  # 16 bytes a frame, because a camera may run for days
     last_us, started = 0, time.perf_counter()
@@ -326,7 +329,7 @@ def recover(
             total=source.duration_us, desc="recover", unit_scale=1e-6, bar_format=LIVE_BAR if live else BAR
         ) as bar,
     ):
-        for frame in frames(source, rule, recoverer):
+        for frame in frames or frames_of(source, rule, recoverer):
             writer.add(frame.window, frame.prediction)
             steps.append(frame.step_s)
             latencies.append(frame.latency_s)

@@ -1,6 +1,8 @@
 """Read the pipeline's outputs for the report."""
 
+import csv
 import json
+from bisect import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +16,7 @@ from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from polarnet.events.stream import Events
+from polarnet.events.windows import BIN_EDGES, events_per_pixel
 from polarnet.pictures.manifest import SPLITS, Manifest, read_manifest
 from polarnet.reports.legend import legend_of
 from polarnet.reports.maps import polarization_hsv
@@ -105,6 +108,16 @@ class EventRate(NamedTuple):
     """Rate of one channel."""
 
 
+class BudgetPoint(NamedTuple):
+    """Mean error of a method over the scored frames of one bin of events per pixel."""
+
+    method: str
+    events_per_pixel: float
+    """Mean over the frames of the bin; events of a channel since the start of the sequence."""
+    mse: float
+    frames: int
+
+
 class History(NamedTuple):
     """Training curves of one network; epochs count from 0."""
 
@@ -141,6 +154,8 @@ class Artefacts:
     baselines: Mapping[str, History]
     """Trained baselines by name."""
     rates: Sequence[EventRate]
+    budget: Sequence[BudgetPoint]
+    """Error on the simulated test set by events per pixel, method by method."""
     overview: Overview | None
     """None if the benchmark stored no panel of the network."""
     thumbnails: Mapping[str, Mapping[str, UInt8[np.ndarray, "h w 3"]]]
@@ -167,6 +182,7 @@ def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
         ours=training_history(paths.train / OURS),
         baselines={name: training_history(paths.train / name) for name in baselines},
         rates=event_rates(events, frames),
+        budget=event_budget(paths.benchmark / "frames.csv", events),
         overview=_overview(panels, scenes, frames, events),
         thumbnails={
             split: thumbnails([entry.name for entry in pictures if entry.split == split], scenes) for split in SPLITS
@@ -225,6 +241,24 @@ def thumbnails(pictures: Sequence[str], scenes: SceneStore) -> dict[str, UInt8[n
         size = (THUMBNAIL_WIDTH, round(THUMBNAIL_WIDTH * rgb.shape[0] / rgb.shape[1]))
         small[picture] = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
     return small
+
+
+def event_budget(file: Path, events: EventStore) -> list[BudgetPoint]:
+    """Mean errors of each method by events per pixel, from the scores of all frames and the events scored."""
+    with file.open(newline="") as stream:
+        scores = [(row["method"], (row["sequence"], int(row["t_us"])), row["mse"]) for row in csv.DictReader(stream)]
+    times: dict[str, list[int]] = {}
+    for sequence, t_us in sorted({frame for _, frame, _ in scores}):
+        times.setdefault(sequence, []).append(t_us)
+    counts: dict[tuple[str, int], float] = {}
+    for sequence, ends in times.items():
+        per_pixel = events_per_pixel(events.read(sequence), torch.tensor(ends)).tolist()
+        counts |= {(sequence, end): count for end, count in zip(ends, per_pixel, strict=True)}
+    bins: dict[tuple[str, int], list[tuple[float, float]]] = {}
+    for method, frame, mse in scores:
+        bins.setdefault((method, bisect(BIN_EDGES, counts[frame])), []).append((counts[frame], float(mse)))
+    means = {key: np.mean(pairs, axis=0).tolist() for key, pairs in sorted(bins.items())}
+    return [BudgetPoint(key[0], count, mse, len(bins[key])) for key, (count, mse) in means.items()]
 
 
 def _overview(panels: Sequence[Panel], scenes: SceneStore, frames: FrameStore, events: EventStore) -> Overview | None:

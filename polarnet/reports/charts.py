@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import altair as alt
 
-from polarnet.reports.artefacts import EventRate, History, Results
+from polarnet.reports.artefacts import BudgetPoint, EventRate, History, Results
 from polarnet.reports.legend import Legend, in_order, with_structure
 from polarnet.reports.tables import Column
 
@@ -160,6 +160,19 @@ def reliability_chart(details: Mapping[str, Any], legend: Legend) -> Spec | None
         size=alt.Size("pixels:Q", legend=None), tooltip=["method:N", "expected:Q", "measured:Q", "pixels:Q"]
     )
     return _finished(line + curves.mark_line() + dots, 280)
+
+
+def budget_chart(points: Sequence[BudgetPoint], legend: Legend) -> Spec:
+    """Mean MSE against the events per pixel since the start of a sequence, a line a method."""
+    methods = in_order(dict.fromkeys(point.method for point in points))
+    values = [{**one._asdict(), "method": legend.label(one.method)} for one in points if one.events_per_pixel > 0]
+    scale = alt.Scale(domain=[*map(legend.label, methods)], range=[*map(legend.colour, methods)])
+    scale_x = alt.Scale(type="log", nice=False, padding=10)
+    x = alt.X("events_per_pixel:Q", title="events per pixel since the start", scale=scale_x)
+    y = alt.Y("mse:Q", title="MSE", axis=alt.Axis(tickCount=5, format="~g"))
+    lines = alt.Chart(alt.Data(values=values)).mark_line(point=True)
+    tooltip = ["method:N", "events_per_pixel:Q", "mse:Q", "frames:Q"]
+    return _finished(lines.encode(x=x, y=y, color=alt.Color("method:N", scale=scale, title=None), tooltip=tooltip), 280)
 
 
 def rates_chart(rates: Sequence[EventRate]) -> Spec:

@@ -18,6 +18,7 @@ def plot_events(events: Sequence[Events]) -> Image.Image:
     """ON (red) minus OFF (blue) events of each pixel, behind each of the four polarizers.
 
     >>> from polarnet.events import Events
+    >>> from polarnet.reports import plot_events
     >>> plot_events([Events.empty(20, 30)] * 4).mode
     'RGB'
     """
@@ -33,6 +34,7 @@ def plot_frame(s0: Float[Tensor, "h w"], dolp: Float[Tensor, "h w"], aolp: Float
     """S0 (in [0, 1]), DoLP, AoLP (radians) and their polarization as hue, saturation and value.
 
     >>> import torch
+    >>> from polarnet.reports import plot_frame
     >>> plot_frame(torch.rand(20, 30), torch.rand(20, 30), torch.rand(20, 30)).mode
     'RGB'
     """
@@ -49,6 +51,8 @@ def plot_prediction(prediction: Prediction, dolp: Float[Tensor, "h w"] | None = 
     """DoLP, AoLP and the expected error of one predicted frame, with the true `dolp` and the error if it is given.
 
     >>> import torch
+    >>> from polarnet.reports import plot_prediction
+    >>> from polarnet.stokes import Prediction
     >>> plot_prediction(Prediction(torch.rand(20, 30)), torch.rand(20, 30)).mode
     'RGB'
     """

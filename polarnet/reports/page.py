@@ -13,6 +13,7 @@ from polarnet.pictures.manifest import SPLITS
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, Results, read_artefacts, read_results
 from polarnet.reports.charts import (
     Spec,
+    budget_chart,
     rates_chart,
     reliability_chart,
     scatter_chart,
@@ -96,7 +97,8 @@ def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder:
         overview = png(overview_figure(artefacts.overview))
         (folder / "overview.png").write_bytes(overview)
     trainings, charts = _trainings(artefacts)
-    charts |= {"rates": rates_chart(artefacts.rates)}
+    budget = [point for point in artefacts.budget if not is_rotating(point.method)]  # that camera has other events
+    charts |= {"rates": rates_chart(artefacts.rates), "budget": budget_chart(budget, legend)}
     if heat := sets_chart([results, *artefacts.sets], SET_TITLES, legend):
         charts["sets"] = heat
     context = {

@@ -130,7 +130,19 @@ def true_pictures(
 def write_true_video(
     path: Path, channels: Sequence[Events], truth: TrueFrames, rate_hz: float = 30.0, gamma: float = 1.0
 ) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Write the pictures of `true_pictures` as a video; returns the one with most events, None if there is none."""
+    """Write the pictures of `true_pictures` as a video; returns the one with most events, None if there is none.
+
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> import torch
+    >>> from polarnet.events import Events
+    >>> from polarnet.reports import write_true_video
+    >>> from polarnet.storage.true_frames import TrueFrame, TrueFrames
+    >>> frame = TrueFrame(*torch.full((3, 20, 30), 0.5))
+    >>> truth = TrueFrames(np.array([0, 33_333]), lambda start, stop: [frame] * (stop - start))
+    >>> write_true_video(Path("grey.mp4"), [Events.empty(20, 30)] * 4, truth).dtype
+    dtype('uint8')
+    """
     busiest, most = None, -1
     with VideoWriter(path, rate_hz) as video:
         for picture, count in true_pictures(channels, truth, gamma):

@@ -20,8 +20,10 @@ class VideoWriter:
     Odd sides are made even by repeating the last row or column. After a kill, the file plays up to its last complete
     fragment. ValueError if a picture has another size than the first.
 
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder, VideoWriter(Path(folder, "grey.mp4"), rate_hz=30.0) as video:
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from polarnet.reports import VideoWriter
+    >>> with VideoWriter(Path("grey.mp4"), rate_hz=30.0) as video:
     ...     for level in range(0, 250, 10):
     ...         video.add(np.full((32, 48, 3), level, np.uint8))
     """

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from polarnet.events.representations import polarity_sums
 from polarnet.events.stream import Events, slice_time
+from polarnet.recordings.arrangements import read_plain
 from polarnet.recordings.recording import Recording, read_recording
 from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map
 from polarnet.storage.events import EventStore
@@ -65,7 +66,7 @@ def _joined(parts: Sequence[Film]) -> list[Film]:
 
 def _films(path: Path, sequences: Sequence[str], read: Callable[[Path], Recording]) -> Iterator[Film]:
     if not path.is_dir():
-        yield _events_film(path.name, [read(path).events], None)
+        yield _events_film(path.name, read_plain(path, read), None)
         return
     form = open_group(path).attrs.get("format")
     if form == EventStore.FORMAT:

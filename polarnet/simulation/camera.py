@@ -11,7 +11,12 @@ from polarnet.simulation.readout import PERFECT, ReadoutConfig
 
 @dataclass(frozen=True)
 class Camera:
-    """Sections `emulate`, `polarizers` and `readout` of params.yaml."""
+    """Sections `emulate`, `polarizers` and `readout` of params.yaml.
+
+    >>> from polarnet.simulation import POLARIZERS, SENSORS, Camera
+    >>> Camera(SENSORS["noisy"], POLARIZERS["film"]).polarizers.transmission
+    [0.737, 0.737, 0.737, 0.737]
+    """
 
     sensor: EmulatorConfig
     polarizers: PolarizersConfig = IDEAL

@@ -62,6 +62,11 @@ class EmulatorConfig(EsimConfig, VoltmeterConfig, DefectsConfig, RandomisedConfi
 
     A model ignores the parameters that it does not have. `emulate` takes the values as they are: ranges in `randomise`
     are drawn before (`Camera.drawn`).
+
+    >>> from dataclasses import replace
+    >>> from polarnet.simulation import SENSORS
+    >>> replace(SENSORS["default"], contrast_threshold_on=0.15).contrast_threshold_on
+    0.15
     """
 
     model: Annotated[str, one_of(MODELS)]
@@ -71,7 +76,14 @@ class EmulatorConfig(EsimConfig, VoltmeterConfig, DefectsConfig, RandomisedConfi
 
 @dataclass(frozen=True)
 class SensorState:
-    """State of a sensor after its last frame; hand it back to continue from there."""
+    """State of a sensor after its last frame; hand it back to continue from there.
+
+    >>> import torch
+    >>> from polarnet.simulation import SENSORS, emulate
+    >>> events, state = emulate(torch.zeros(2, 4, 8, 8), torch.tensor([0, 1000]), SENSORS["clean"], key=1)
+    >>> state.t_us
+    1000.0
+    """
 
     model: str
     height: int
@@ -103,6 +115,13 @@ def emulate(
     the order (t, y, x, p), and identical for any number of threads and any order of channels.
     TypeError for what is no array; ValueError for times that do not increase, values that are not finite or outside
     0..255, and sizes that do not fit.
+
+    >>> import torch
+    >>> from polarnet.simulation import SENSORS, emulate
+    >>> frames = torch.stack([torch.full((4, 8, 8), level) for level in (50.0, 200.0)])
+    >>> events, state = emulate(frames, torch.tensor([0, 1000]), SENSORS["clean"], key=1)
+    >>> events[0].p.unique()
+    tensor([1], dtype=torch.int8)
     """
     columns, state = emulate_columns(frames, t_us, config, key, state, channels, threads)
     return [events_of(c, state.height, state.width) for c in columns], state

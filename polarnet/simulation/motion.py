@@ -29,7 +29,13 @@ MAX_SPEED_PX_S = 1e6
 
 @section
 class SynthesizeConfig:
-    """Section `synthesize` of params.yaml. Speeds are in scene pixels and hold for every sensor pixel."""
+    """Section `synthesize` of params.yaml. Speeds are in scene pixels and hold for every sensor pixel.
+
+    >>> from dataclasses import replace
+    >>> from polarnet.simulation import MOTIONS
+    >>> replace(MOTIONS["default"], duration_s=2.0).duration_s
+    2.0
+    """
 
     sequences_per_picture: Annotated[int, Field(gt=0, le=10_000)]
     duration_s: Annotated[float, Field(gt=0, le=3600)]
@@ -75,7 +81,14 @@ class Sine:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A motion in closed form; the sensor never leaves the scene for which the trajectory was drawn."""
+    """A motion in closed form; the sensor never leaves the scene for which the trajectory was drawn.
+
+    >>> import numpy as np
+    >>> from polarnet.simulation import MOTIONS, random_trajectory
+    >>> trajectory = random_trajectory(MOTIONS["default"], 240, 320, np.random.default_rng(1))
+    >>> trajectory.pose(np.array([0.0, 0.5])).zoom
+    array([1., 1.])
+    """
 
     x: float  # mean column of the sensor's centre
     y: float  # mean row
@@ -127,6 +140,11 @@ def random_trajectory(
     The velocity along each axis is a sum of harmonics. The slowest harmonic lets the sensor swing over the scene and
     turn back before the border. The peak speed is drawn between the configured bounds and reached at a random time.
     Raises ValueError if the scene is too small for the sensor or for its slowest motion.
+
+    >>> import numpy as np
+    >>> from polarnet.simulation import MOTIONS, random_trajectory
+    >>> random_trajectory(MOTIONS["default"], 240, 320, np.random.default_rng(1)).speed_px_s <= 160
+    True
     """
     reach_x, reach_y = _reach(config)
     room = np.array([scene_width - 1 - 2 * reach_x, scene_height - 1 - 2 * reach_y]) - 2 * BORDER_SLACK_PX

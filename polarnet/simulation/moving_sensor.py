@@ -47,6 +47,14 @@ def emulate_motion(
     Times count from the start of the motion. `key` (64 bits) seeds the mismatch of the pixels and all noise. The
     channels of a DoFP sensor (`polarizers.layout`) have half its rows and columns. With `labels`, every event names its
     cause.
+
+    >>> import numpy as np
+    >>> import torch
+    >>> from polarnet.simulation import MOTIONS, SENSORS, emulate_motion, random_trajectory, scene_from_rgb
+    >>> trajectory = random_trajectory(MOTIONS["default"], 240, 320, np.random.default_rng(1))
+    >>> scene = scene_from_rgb(torch.rand(3, 240, 320))
+    >>> [channel.width for channel in emulate_motion(scene, trajectory, 1000, 120, 180, SENSORS["default"], key=1)]
+    [180, 180, 180, 180]
     """
     t_us = emulation_times_us(trajectory, duration_us, height, width, config)
     events, _ = emulate_motion_steps(

@@ -27,13 +27,27 @@ SENSORS = {
 """v2e's command-line defaults, its options `clean` and `noisy`, and `random`, which differs from sequence to sequence.
 
 Derive others with `dataclasses.replace`.
+
+>>> from polarnet.simulation import SENSORS
+>>> SENSORS["clean"].shot_noise_rate_hz
+0.0
 """
 
 POLARIZERS = {
     name: replace(IDEAL, **_preset("polarizers", name)["polarizers"])
     for name in ("ideal", "film", "wire_grid", "micropolarizers")
 }
-"""Polarizers of a `Camera`, as in conf/polarizers."""
+"""Polarizers of a `Camera`, as in conf/polarizers.
+
+>>> from polarnet.simulation import POLARIZERS
+>>> POLARIZERS["micropolarizers"].layout
+'dofp'
+"""
 
 MOTIONS = {"default": SynthesizeConfig(**_DEMO["synthesize"])}
-"""One second of a 120 x 180 px sensor that drifts at up to 160 px/s."""
+"""One second of a 120 x 180 px sensor that drifts at up to 160 px/s.
+
+>>> from polarnet.simulation import MOTIONS
+>>> MOTIONS["default"].frame_rate_hz
+30.0
+"""

@@ -29,6 +29,11 @@ class PolarizationScene:
     """Stokes parameters of the area that a sensor moves over: S0 in [0, 1], S1, S2 with hypot(S1, S2) <= S0.
 
     The constructor checks shape and type only; `check_scene` checks every pixel.
+
+    >>> import torch
+    >>> from polarnet.simulation import PolarizationScene
+    >>> PolarizationScene(torch.zeros(3, 240, 320)).width
+    320
     """
 
     stokes: Float32[Tensor, "3 h w"]
@@ -82,6 +87,11 @@ def scene_from_polarization(
 
     Raises TypeError for arguments that are not arrays. Raises ValueError for different shapes, integers, NaN,
     intensities and DoLP outside [0, 1], and angles outside [-pi, pi], which are probably in degrees.
+
+    >>> import torch
+    >>> from polarnet.simulation import scene_from_polarization
+    >>> scene_from_polarization(*torch.full((2, 240, 320), 0.5), torch.zeros(240, 320)).stokes[:, 0, 0]
+    tensor([0.5000, 0.2500, 0.0000])
     """
     s0, dolp = (fractions(name, image, "height width").float() for name, image in (("s0", s0), ("dolp", dolp)))
     aolp = floats("aolp", aolp, "height width").float()
@@ -94,6 +104,11 @@ def scene_from_rgb(rgb: Float[Array, "3 h w"]) -> PolarizationScene:
     """The scene whose (S0, DoLP, AoLP) are the value, saturation and hue of a picture in [0, 1].
 
     Raises TypeError and ValueError as `polarization_from_rgb`.
+
+    >>> import torch
+    >>> from polarnet.simulation import scene_from_rgb
+    >>> scene_from_rgb(torch.full((3, 240, 320), 0.5)).stokes[:, 0, 0]
+    tensor([0.5000, 0.0000, 0.0000])
     """
     return scene_from_polarization(*polarization_from_rgb(rgb))
 
@@ -104,6 +119,11 @@ def scene_from_intensities(intensities: Float[Array, "4 h w"]) -> PolarizationSc
     Noise makes some measurements unphysical: S1 and S2 are scaled down where hypot(S1, S2) exceeds S0.
     Raises TypeError if `intensities` is not an array, and ValueError for integers, NaN, another order of axes, negative
     values, and S0 above 1.
+
+    >>> import torch
+    >>> from polarnet.simulation import scene_from_intensities
+    >>> scene_from_intensities(torch.full((4, 240, 320), 0.25)).stokes[:, 0, 0]
+    tensor([0.5000, 0.0000, 0.0000])
     """
     stokes = stokes_from_intensities(fractions("intensities", intensities, "4 height width").float())
     check_range("intensities", stokes[0], 0, 1, "S0 = I0 + I90", "divide the intensities by the largest S0")

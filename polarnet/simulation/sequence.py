@@ -19,7 +19,15 @@ from polarnet.simulation.truth import frames_of
 
 
 class Simulation(NamedTuple):
-    """Events of a moving sensor behind four polarizers, and the truth at frame times."""
+    """Events of a moving sensor behind four polarizers, and the truth at frame times.
+
+    >>> from dataclasses import replace
+    >>> import torch
+    >>> from polarnet.simulation import MOTIONS, SENSORS, simulate
+    >>> motion = replace(MOTIONS["default"], duration_s=0.1, sensor_height=16, sensor_width=24)
+    >>> simulate(torch.rand(3, 120, 180), motion, SENSORS["default"], seed=1).t_us
+    tensor([     0,  33333,  66667, 100000])
+    """
 
     events: list[Events]
     """Behind the polarizers at 0, 45, 90 and 135 degrees, in microseconds from the start of the motion."""
@@ -50,6 +58,13 @@ def simulate(
     Raises TypeError for arguments of another kind. Raises ValueError for integers (divide 8 bits by 255, 16 bits by
     65535), values outside [0, 1], another order of axes, NaN and infinity, unphysical scenes, and pictures
     too small for the sensor and its motion. The message gives the remedy.
+
+    >>> from dataclasses import replace
+    >>> import torch
+    >>> from polarnet.simulation import MOTIONS, SENSORS, simulate
+    >>> motion = replace(MOTIONS["default"], duration_s=0.1, sensor_height=16, sensor_width=24)
+    >>> simulate(torch.rand(3, 120, 180), motion, SENSORS["default"], seed=1).dolp.shape
+    torch.Size([4, 16, 24])
     """
     for name, value, kinds, example in (
         ("motion", motion, (SynthesizeConfig,), 'MOTIONS["default"]'),

@@ -166,6 +166,12 @@ def simulate_video(
     `upsample`, interpolated frames are added so that nothing moves by more than about one pixel a step. The same
     arguments give the same events on any number of threads. ValueError for times that do not fit the frames, and as
     `simulate`.
+
+    >>> import torch
+    >>> from polarnet.simulation import SENSORS, simulate_video
+    >>> frames = torch.rand(3, 3, 16, 24)
+    >>> [channel.height for channel in simulate_video(frames, [0, 1000, 2000], SENSORS["default"], seed=1)]
+    [16, 16, 16, 16]
     """
     camera = sensor if isinstance(sensor, Camera) else Camera(sensor)
     if len(t_us) == 0 or t_us[0] != 0:

@@ -41,7 +41,16 @@ CONVENTIONS = {
 
 
 class EventStore(Store):
-    """Sequences of events in four channels; see `create` and `open`."""
+    """Sequences of events in four channels; see `create` and `open`.
+
+    >>> from polarnet.events import Events
+    >>> from polarnet.storage import EventStore
+    >>> store = EventStore.create("events.zarr", ["lake"], height=120, width=180, attributes={})
+    >>> store.write("lake", [Events.empty(120, 180)] * 4, duration_us=1_000_000)
+    >>> store.finish()
+    >>> EventStore.open("events.zarr").count("lake")
+    (0, 0, 0, 0)
+    """
 
     FORMAT = "polarnet.events"
     VERSION = 4

@@ -98,7 +98,16 @@ class SplitStore(Store):
 
 
 class FrameStore(SplitStore):
-    """Frames of sequences, each in the split train, val or test; see `create` and `open`."""
+    """Frames of sequences, each in the split train, val or test; see `create` and `open`.
+
+    >>> import torch
+    >>> from polarnet.storage import FrameStore
+    >>> store = FrameStore.create("frames.zarr", ["lake"], {"lake": "test"}, 1, height=12, width=18, attributes={})
+    >>> store.write("lake", torch.tensor([0]), torch.full((1, 4, 12, 18), 0.5), *torch.zeros(2, 1, 12, 18))
+    >>> store.finish()
+    >>> FrameStore.open("frames.zarr").of_split("test")
+    ['lake']
+    """
 
     FORMAT = "polarnet.frames"
     VERSION = 5

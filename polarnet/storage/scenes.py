@@ -73,6 +73,17 @@ class SceneStore(SplitStore):
     """Scenes and the sequences that move over them; see `create` and `open`.
 
     A part holds the scenes of its sequences, each once.
+
+    >>> import numpy as np
+    >>> import torch
+    >>> from polarnet.storage import SceneStore
+    >>> from polarnet.storage.scenes import Scene
+    >>> size = {"largest_picture": (12, 18), "sensor": (6, 9), "trajectory_names": ["x"], "attributes": {}}
+    >>> store = SceneStore.create("scenes.zarr", {"lake-00": "lake"}, {"lake-00": "test"}, **size)
+    >>> store.write("lake-00", Scene(*torch.zeros(3, 12, 18)), np.zeros(1), duration_us=1_000_000)
+    >>> store.finish()
+    >>> SceneStore.open("scenes.zarr").read("lake-00").s0.shape
+    torch.Size([12, 18])
     """
 
     FORMAT = "polarnet.scenes"

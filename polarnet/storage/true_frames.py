@@ -70,7 +70,16 @@ def truth_beside(store: str | os.PathLike[str]) -> Path | None:
 
 
 def open_truth(path: str | os.PathLike[str], sequence: str) -> TrueFrames:
-    """Open the true frames of a sequence; ValueError if a frame store lacks the sequence."""
+    """Open the true frames of a sequence; ValueError if a frame store lacks the sequence.
+
+    >>> import torch
+    >>> from polarnet.storage import FrameStore, open_truth
+    >>> store = FrameStore.create("truth", ["lake"], {"lake": "test"}, 1, height=12, width=18, attributes={})
+    >>> store.write("lake", torch.tensor([0]), torch.full((1, 4, 12, 18), 0.5), *torch.zeros(2, 1, 12, 18))
+    >>> store.finish()
+    >>> open_truth("truth", "lake")[0].dolp.shape
+    torch.Size([12, 18])
+    """
     group = open_group(path)
     if group.attrs.get("format") != FrameStore.FORMAT:
         return _appended(group)

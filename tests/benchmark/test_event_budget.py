@@ -7,7 +7,6 @@ from polarnet.benchmark.event_budget import (
     between_windows,
     by_sliding_window,
     by_window_length,
-    events_per_pixel,
     growing_window,
     last_window,
     recovered_alone,
@@ -17,6 +16,7 @@ from polarnet.benchmark.event_budget import (
 from polarnet.benchmark.resimulate import sequence_at
 from polarnet.benchmark.rows import opened
 from polarnet.config.tree import load
+from polarnet.events.windows import events_per_pixel
 from polarnet.methods import METHODS
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore

@@ -12,6 +12,8 @@ from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.score import BenchmarkConfig
+from polarnet.config.pipeline import context_of
+from polarnet.config.tree import load
 from polarnet.events.streaming import WindowRule
 from polarnet.methods import METHODS
 from polarnet.recordings.live import Piece
@@ -51,6 +53,12 @@ def test_it_is_a_row_of_the_benchmark_with_its_name_in_tables(activity, with_act
     assert metrics["activity"]["gflop"] is None
     assert ROWS["activity"].colour == "#123456"
     assert "activity" in [row.label for row in score_table(metrics).rows]
+
+
+def test_it_needs_no_section_in_the_configuration(activity, project_root):
+    config = load(project_root, ["benchmark.methods=[oracle_mean,activity]"])
+    assert context_of(config, None).setups["activity"].config is None
+    assert config.used_baselines == []
 
 
 def test_recover_runs_it(activity, sequence, make_setup):

@@ -13,11 +13,11 @@ from polarnet.storage.events import EventStore
 SIDE = 10
 
 
-@pytest.fixture
-def ramps(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
     """Events of 100 pixels under light that swings between 40 and 160 DN in a second: thresholds of ln 4 / 8."""
-    monkeypatch.chdir(tmp_path)
-    frames = tmp_path / "frames"
+    folder = tmp_path_factory.mktemp("recorded")
+    frames = folder / "frames"
     frames.mkdir()
     for k in range(61):
         for part in range(20):  # the light bends at the corners of the swing, up to the first frame after them
@@ -29,7 +29,16 @@ def ramps(tmp_path, monkeypatch):
         for event in range(8):
             t = 1_000_000 * k + 125_000 * event + 62_500
             rows += [f"{t} {x} {y} {0 if k % 2 else 1}" for y in range(SIDE) for x in range(SIDE)]
-    (tmp_path / "moving.txt").write_text("\n".join(rows))
+    (folder / "moving.txt").write_text("\n".join(rows))
+    return folder
+
+
+@pytest.fixture
+def ramps(recorded, tmp_path, monkeypatch):
+    """A folder of its own with these recordings, as the working directory."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("frames", "moving.txt"):
+        (tmp_path / name).symlink_to(recorded / name)
     return tmp_path
 
 

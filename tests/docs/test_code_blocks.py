@@ -27,7 +27,7 @@ BLOCK = re.compile(r"^ *```(\w*) *([^\n]*)\n(.*?)^ *```", re.DOTALL | re.MULTILI
 TESTED_ELSEWHERE = {"network.md": "networks/test_onnx_export.py", "recover.md": "recovery/test_recover.py",
                     "methods.md": "benchmark/test_new_method.py"}  # fmt: skip
 """Pages whose Python needs a network, a camera or a table; the named test runs it."""
-SHELL = {"source", "xdg-open", "cd", "git", "done", "for"}
+SHELL = {"source", "xdg-open", "cd", "cp", "git", "done", "for"}
 VARIABLES = {"$stage": "ingest", "$PWD": "/photographs"}
 
 

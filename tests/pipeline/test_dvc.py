@@ -1,9 +1,11 @@
 """dvc.yaml: a stage depends on the code that makes its outputs; a row of the tables on no other row's."""
 
+import contextlib
+import json
 import os
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -198,8 +200,18 @@ def edited(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(shutil.copytree(finished, tmp_path_factory.mktemp("edited") / "project"))
 
 
+@contextlib.contextmanager
+def modify_json(path: str, fs: object = None) -> Iterator[dict[str, Any]]:
+    """The content of dvc.lock to change, written as JSON, which is YAML too."""
+    file = Path(path)
+    data = json.loads(file.read_text()) if file.exists() else {}
+    yield data
+    file.write_text(json.dumps(data))
+
+
 def enter(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Work in `folder`, whose stages run by this Python."""
+    """Work in `folder`, whose stages run by this Python; DVC needs no second to note in dvc.lock that one has run."""
+    monkeypatch.setattr("dvc.dvcfile.modify_yaml", modify_json)
     monkeypatch.chdir(folder)
     monkeypatch.delenv("PYTHONPATH", raising=False)
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")

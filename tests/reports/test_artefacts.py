@@ -5,7 +5,7 @@ import pytest
 import torch
 from matplotlib.colors import rgb_to_hsv
 
-from polarnet.reports.artefacts import event_rates, read_artefacts, training_history
+from polarnet.reports.artefacts import event_budget, event_rates, read_artefacts, training_history
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 
@@ -80,3 +80,12 @@ def test_the_best_epoch_is_the_one_with_the_lowest_validation_mse(paths):
     assert history.best_epoch == 1
     assert list(history.loss) == ["total", "mse"]
     assert history.validation["psnr"] == [10.0, 11.0, 12.0]
+
+
+def test_errors_are_averaged_over_frames_with_a_similar_number_of_events(paths, tmp_path):
+    frames = "method,sequence,t_us,mse\nours,tree-00,20000,0.4\nours,tree-00,21000,0.2\nours,tree-00,200000,0.1\n"
+    (tmp_path / "frames.csv").write_text(frames)
+    early, late = event_budget(tmp_path / "frames.csv", EventStore.open(paths.events))
+    assert (early.method, early.mse, early.frames) == ("ours", pytest.approx(0.3), 2)
+    assert early.events_per_pixel == pytest.approx(500 / (24 * 36) * 0.1025, rel=0.3)
+    assert (late.mse, late.events_per_pixel) == (0.1, pytest.approx(500 / (24 * 36)))

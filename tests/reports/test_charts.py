@@ -1,5 +1,5 @@
-from polarnet.reports.artefacts import History
-from polarnet.reports.charts import scatter_chart, score_chart, spread_chart, term_label, training_chart
+from polarnet.reports.artefacts import BudgetPoint, History
+from polarnet.reports.charts import budget_chart, scatter_chart, score_chart, spread_chart, term_label, training_chart
 from polarnet.reports.legend import GENERAL
 from polarnet.reports.tables import COLUMNS
 
@@ -32,6 +32,14 @@ def test_every_scene_of_every_rival_is_a_dot_beside_ours():
 
 def test_the_spread_names_every_scene():
     assert len(values(spread_chart(MEANS, GENERAL))) == 4
+
+
+def test_a_method_keeps_its_colour_in_the_event_budget_and_zero_events_have_no_place_on_its_axis():
+    points = [BudgetPoint("ours", 0.0, 0.3, 1), BudgetPoint("ours", 2.0, 0.1, 4), BudgetPoint("cf", 2.0, 0.2, 4)]
+    spec = budget_chart(points, GENERAL)
+    assert [one["events_per_pixel"] for one in values(spec)] == [2.0, 2.0]
+    scale = spec["encoding"]["color"]["scale"]
+    assert dict(zip(scale["domain"], scale["range"], strict=True))[GENERAL.label("ours")] == GENERAL.colour("ours")
 
 
 def test_epochs_count_from_one():

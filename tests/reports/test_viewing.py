@@ -22,6 +22,12 @@ def test_a_recovery_is_a_film_of_its_dolp_and_aolp(tmp_path):
     assert {one.kind for one in film.maps} == {"dolp", "aolp"}
 
 
+def test_times_of_a_recording_count_from_its_first_event(tmp_path):
+    (tmp_path / "night.txt").write_text("40 30\n913000000 3 2 1\n913000240 4 2 1\n")
+    (film,) = films_of(tmp_path / "night.txt")
+    assert (film.t_us[0], film.t_us[-1]) == (10, 241)
+
+
 def test_an_unknown_sequence_is_refused_with_the_names_there_are(paths):
     with pytest.raises(ValueError, match=r"expected sequences among .*tree-00.*, got oak"):
         films_of(paths.frames, ["oak"])

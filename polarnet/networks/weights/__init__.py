@@ -4,7 +4,12 @@ from pathlib import Path
 
 
 def shipped_weights() -> Path:
-    """The checkpoint of the network `polarnet`; FileNotFoundError, which says what to do, where there is none."""
+    """The checkpoint of the network `polarnet`; FileNotFoundError, which says what to do, where there is none.
+
+    >>> from polarnet.networks import shipped_weights
+    >>> shipped_weights().name
+    'polarnet.safetensors'
+    """
     path = Path(__file__).parent / "polarnet.safetensors"
     if not path.is_file():
         raise FileNotFoundError(

@@ -3,8 +3,6 @@
 Its EVT3 decoder holds times back where the sensor's clock steps back, so `prophesee` reads EVT2 and EVT3.
 """
 
-import contextlib
-import itertools
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +18,6 @@ EVENT_STREAM = b"Event Stream"
 _library = IsolatedLibrary(
     "faery", "faery", "recordings", Path(__file__).with_name("faery_tasks.py"), "the file is damaged"
 )
-_readers = itertools.count()
 
 
 def matches_aedat4(path: Path, head: bytes) -> bool:
@@ -57,16 +54,8 @@ def _source(path: Path, choices: Choices, file_type: str) -> Source:
     height, width = sensor_size(path, choices, *_library.ask(path, "size", file_type))
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        reader = next(_readers)
-        try:
-            for number in itertools.count():
-                columns = _library.ask(path, "block", file_type, reader, number)
-                if columns is None:
-                    return
-                t, x, y, on = columns
-                yield Block(t, x, y, on.view(np.uint8))
-        finally:
-            with contextlib.suppress(RecordingError, RuntimeError):
-                _library.ask(path, "close", reader)
+        for table in _library.blocks(path, file_type):
+            t, x, y, on = (np.ascontiguousarray(table[name]) for name in ("t", "x", "y", "on"))
+            yield Block(t, x, y, on.view(np.uint8))
 
     return Source(height, width, blocks)

@@ -3,22 +3,14 @@
 import contextlib
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from polarnet.recordings.formats.isolated import IsolatedLibrary
-from polarnet.recordings.source import (
-    BLOCK_EVENTS,
-    Block,
-    CameraFrames,
-    Choices,
-    RecordingError,
-    Source,
-    sensor_size,
-)
+from polarnet.recordings.source import BLOCK_EVENTS, Block, CameraFrames, Choices, RecordingError, Source, sensor_size
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 DSEC_COLUMNS = ("events/t", "events/x", "events/y", "events/p")
@@ -42,19 +34,21 @@ _library = IsolatedLibrary(
 )
 
 
-def matches_e2p(path: Path, head: bytes) -> bool:
-    """Whether the file has one table of events."""
-    return _has_tables(path, head, ("events",))
+def matching(*tables: str) -> Callable[[Path, bytes], bool]:
+    """A check of whether a file is HDF5 with these tables."""
+
+    def matches(path: Path, head: bytes) -> bool:
+        if not head.startswith(MAGIC):
+            return False
+        try:
+            return set(tables) <= set(_described(path)["tables"])
+        except (RecordingError, RuntimeError):
+            return False  # `open_dsec` reports the reason
+
+    return matches
 
 
-def matches_esfp(path: Path, head: bytes) -> bool:
-    """Whether the file has the four columns of events at its top."""
-    return _has_tables(path, head, ESFP_COLUMNS)
-
-
-def matches_metavision(path: Path, head: bytes) -> bool:
-    """Whether the file has Prophesee's table of events."""
-    return _has_tables(path, head, (METAVISION,))
+matches_e2p, matches_esfp, matches_metavision = matching("events"), matching(*ESFP_COLUMNS), matching(METAVISION)
 
 
 def matches_dsec(path: Path, head: bytes) -> bool:
@@ -177,15 +171,6 @@ def open_metavision(path: Path, choices: Choices) -> Source:
             yield Block(_microseconds(path, table["t"]), table["x"], table["y"], table["p"])
 
     return Source(*sensor_size(path, choices, height, width), blocks)
-
-
-def _has_tables(path: Path, head: bytes, names: tuple[str, ...]) -> bool:
-    if not head.startswith(MAGIC):
-        return False
-    try:
-        return set(names) <= set(_described(path)["tables"])
-    except (RecordingError, RuntimeError):
-        return False  # `open_dsec` reports the reason
 
 
 def _described(path: Path) -> Description:

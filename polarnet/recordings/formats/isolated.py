@@ -3,13 +3,17 @@
 import atexit
 import contextlib
 import importlib.util
+import itertools
 import os
 import pickle
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from polarnet.recordings.source import RecordingError
 from polarnet.runtime.extras import installation
@@ -17,6 +21,8 @@ from polarnet.runtime.extras import installation
 PATIENCE_S = 60  # limit for an answer; a damaged file can put a library into an endless loop
 MAX_MIB = 8192  # address space of the process; a damaged file can state any size
 WORKER = Path(__file__).with_name("isolated_worker.py")
+
+_readers = itertools.count()
 
 
 class IsolatedLibrary:
@@ -67,6 +73,16 @@ class IsolatedLibrary:
         if kind == "error":
             raise RecordingError(f"{path.name}: {self._name} cannot read it: {answer}; {self._advice}")
         return answer
+
+    def blocks(self, path: Path, *arguments: Any) -> Iterator[np.ndarray]:
+        """The tables that the task `pieces` yields, joined to blocks."""
+        reader, numbers = next(_readers), itertools.count()
+        try:
+            while (table := self.ask(path, "block", reader, next(numbers), *arguments)) is not None:
+                yield table
+        finally:
+            with contextlib.suppress(RecordingError, RuntimeError):
+                self.ask(path, "release", reader)
 
     def _running(self) -> "subprocess.Popen[bytes]":
         if self._owner != os.getpid() or self._process is None or self._process.poll() is not None:

@@ -110,27 +110,9 @@ def _evt_size(header: bytes) -> tuple[int | None, int | None]:
     return None, None
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
-def _decode_evt2(words, state, t, x, y, p):
-    """Decode words by their upper 4 bits: 0 OFF, 1 ON, 8 the upper 28 bits of the time."""
-    high, turns = state[0], state[1]
-    n, orphans = 0, 0
-    for i in range(len(words)):
-        word = np.int64(words[i])
-        kind = word >> 28
-        if kind == 8:
-            before, high = high, word & 0xFFFFFFF
-            turns += before - high > 2**27
-        elif kind <= 1:
-            if high < 0:
-                orphans += 1
-                continue
-            t[n] = ((turns << 28 | high) << 6) | (word >> 22 & 0x3F)
-            x[n], y[n], p[n] = word >> 11 & 0x7FF, word & 0x7FF, kind
-            n += 1
-    state[0], state[1] = high, turns
-    return n, orphans
+def _decode_evt2(words: np.ndarray, *state_and_columns: np.ndarray) -> tuple[int, int]:
+    """Decode words like the upper halves of EVT2.1's, with one pixel each."""
+    return _decode_evt21(words.astype(np.uint64) << 32 | 1, *state_and_columns)
 
 
 @numba.njit(nogil=True, cache=True)
@@ -150,10 +132,11 @@ def _decode_evt21(words, state, t, x, y, p):
                 orphans += 1
                 continue
             now, column = ((turns << 28 | high) << 6) | (upper >> 22 & 0x3F), upper >> 11 & 0x7FF
-            for k in range(32):
-                if valid >> k & 1:
-                    t[n], x[n], y[n], p[n] = now, column + k, upper & 0x7FF, kind
+            while valid:
+                if valid & 1:
+                    t[n], x[n], y[n], p[n] = now, column, upper & 0x7FF, kind
                     n += 1
+                valid, column = valid >> 1, column + 1
     state[0], state[1] = high, turns
     return n, orphans
 

@@ -3,11 +3,11 @@
 Events are messages EventArray of dvs_msgs or prophesee_event_msgs: height, width and events of x, y, ts, polarity.
 """
 
-import contextlib
-import itertools
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+
+import numpy as np
 
 from polarnet.recordings.formats.isolated import IsolatedLibrary
 from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size
@@ -17,7 +17,6 @@ MAGIC = b"#ROSBAG V"
 _library = IsolatedLibrary(
     "rosbags", "rosbags", "rosbag", Path(__file__).with_name("rosbag_tasks.py"), "the bag is damaged"
 )
-_readers = itertools.count()
 
 
 def matches(path: Path, head: bytes) -> bool:
@@ -39,15 +38,7 @@ def open_rosbag(path: Path, choices: Choices) -> Source:
     height, width = sensor_size(path, choices, *_library.ask(path, "size", topic))
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        reader = next(_readers)
-        try:
-            for number in itertools.count():
-                columns = _library.ask(path, "block", topic, reader, number)
-                if columns is None:
-                    return
-                yield Block(*columns)
-        finally:
-            with contextlib.suppress(RecordingError, RuntimeError):
-                _library.ask(path, "close", reader)
+        for table in _library.blocks(path, topic):
+            yield Block(*np.ascontiguousarray(table.T))
 
     return Source(height, width, blocks)

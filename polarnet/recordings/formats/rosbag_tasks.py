@@ -8,13 +8,9 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-GATHERED_EVENTS = 2**16  # per answer
 EVENT_ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 EVENT = "uint16 x\nuint16 y\nbuiltin_interfaces/Time ts\nbool polarity"
 EVENT_ARRAY = "std_msgs/Header header\nuint32 height\nuint32 width\nEvent[] events"
-
-streams: dict[int, tuple[int, Iterator[np.ndarray]]] = {}
-"""Open files by reader number: the number of blocks returned so far, and the remaining messages."""
 
 
 def opened(path: str) -> AnyReader:
@@ -47,36 +43,11 @@ def size(path: str, topic: str) -> tuple[int | None, int | None]:
     return (None, None) if first is None else (int(first.height), int(first.width))
 
 
-def block(path: str, topic: str, reader: int, number: int) -> list[np.ndarray] | None:
-    """Columns t, x, y, p of a reader's next block; None after the last. `number` as in `faery_tasks.block`."""
-    done, tables = streams.get(reader, (-1, iter(())))
-    if done != number:
-        tables = map(table_of, messages(path, topic))
-        for _ in range(number):
-            gathered(tables)
-    batch = gathered(tables)
-    streams[reader] = number + 1, tables
-    return list(np.concatenate(batch).T) if batch else None
+def pieces(path: str, topic: str) -> Iterator[np.ndarray]:
+    """Rows t (microseconds), x, y, p of each message."""
+    for message in messages(path, topic):
+        rows = [(e.ts.sec * 10**6 + e.ts.nanosec // 1000, e.x, e.y, e.polarity) for e in message.events]
+        yield np.array(rows, np.int64).reshape(-1, 4)
 
 
-def table_of(message: Any) -> np.ndarray:
-    """Rows t (microseconds), x, y, p of a message."""
-    rows = [(e.ts.sec * 10**6 + e.ts.nanosec // 1000, e.x, e.y, e.polarity) for e in message.events]
-    return np.array(rows, np.int64).reshape(-1, 4)
-
-
-def gathered(tables: Iterator[np.ndarray]) -> list[np.ndarray]:
-    """Tables with about as many events as an answer holds; empty at the end."""
-    batch, count = [], 0
-    while count < GATHERED_EVENTS and (table := next(tables, None)) is not None:
-        batch.append(table)
-        count += len(table)
-    return batch
-
-
-def close(path: str, reader: int) -> None:
-    """Release the file."""
-    streams.pop(reader, None)
-
-
-TASKS: dict[str, Callable[..., Any]] = {"topics": topics, "size": size, "block": block, "close": close}
+TASKS: dict[str, Callable[..., Any]] = {"topics": topics, "size": size, "pieces": pieces}
