@@ -9,7 +9,7 @@ from polarnet.simulation.truth import synthesize
 @hydra_stage
 def main(config: Config) -> None:
     """Make a scene from every picture and move the sensor over it."""
-    images, scenes, frames = (Path(path) for path in (config.paths.images, config.paths.scenes, config.paths.frames))
+    images, scenes, frames = Path(config.paths.images), config.paths.scenes, config.paths.frames
     mapper, size = config.mapper("synthesize"), config.storage.sequences_per_part
     layout = config.polarizers.layout
     count = synthesize(images, scenes, frames, config.synthesize, config.seed, mapper, size, config.variation, layout)

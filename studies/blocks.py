@@ -190,6 +190,11 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
         caption="A search of {search[trials]:,.0f} trials at smoke size: {search[stopped]:.0f} were stopped after an "
         "epoch. Best validation MSE: {search[best][validation_mse]:.4f}. {origin}",
     ),
+    "ddp": Block(
+        "sweeps", "ddp", "studies.speed ddp --data FOLDER --write",
+        caption="Largest difference of a loss between two processes and one: {ddp[ddp_loss_difference]:.1e}, at "
+        "smoke size in float32. {origin}",
+    ),
     "readers": Block(
         "recordings", "readers", "studies.recordings", _reader_rows, _reader_columns,
         "Columns: millions of events a second, then the memory of polarnet's reader by number of events. {origin}",

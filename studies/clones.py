@@ -3,8 +3,8 @@
 python -m studies.clones [push] [queue] [--target STAGE] [--write]
 
 `push` sends the artefacts to a folder and to an S3-compatible server on loopback, and pulls them into another clone.
-It needs `pip install dvc-s3 'moto[server]'`. `queue` runs two experiments with two workers. Both write to
-docs/results/sweeps.json. `--target` limits the pipeline to a stage and those before it.
+It needs the extra `remote` and `pip install 'moto[server]'`. `queue` runs two experiments with two workers. Both
+write to docs/results/sweeps.json. `--target` limits the pipeline to a stage and those before it.
 """
 
 import argparse

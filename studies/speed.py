@@ -1,6 +1,6 @@
 """Time the first picture and the benchmark of own scenes, and check that launchers, clusters and stores change nothing.
 
-python -m studies.speed [demo] [scenes --scenes FOLDER] [launchers] [search] [dask] [s3] --data FOLDER [--write]
+python -m studies.speed [demo] [scenes --scenes FOLDER] [launchers] [search] [dask] [s3] [ddp] --data FOLDER [--write]
 
 `demo` and `scenes` go to docs/results/speed.json, the others to docs/results/sweeps.json. `--data` is a folder that the
 stages up to `weights` filled with `experiment=smoke`.
@@ -14,17 +14,24 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import fsspec
+
 from polarnet.config.sweep import write_comparison
+from polarnet.config.tree import DOLP_TRAINING
 from polarnet.runtime.cluster import pmap
+from polarnet.training.history import read_history
+from studies.clones import BUCKET, s3_server
 from studies.measure import ROOT, arguments_of, command_line, machine_record, write_section
 
 LAUNCHERS = {
@@ -39,6 +46,8 @@ KILLED_AFTER = 4
 """Finished points of the sweep that is killed."""
 SEARCH = ["loss.mse=1.0:30.0:log", "loss.ssim=0.0,1.0", "train.learning_rate=0.0003:0.01:log"]
 TRIALS = 12
+DDP = ["train.precision=fp32", "train.epochs=2", "train.batch_size=2"]
+SPLITS = ("train", "val")
 
 
 def polarnet(*words: str | Path, cwd: Path = ROOT, **environment: str) -> float:
@@ -164,46 +173,105 @@ def search(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 
 def dask(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Whether the events of two Dask workers on loopback are those of one process, byte for byte."""
-    from distributed import LocalCluster
+    """Deaths of a Dask worker and of the scheduler on loopback: whether the rerun gives the bytes of one process.
 
-    stage("emulate", options, f"paths.events={folder / 'alone.zarr'}")
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        stage(
-            "emulate", options, f"paths.events={folder / 'dask.zarr'}", f"cluster.address={cluster.scheduler_address}"
-        )
-    names = sorted(path.name for path in (folder / "alone.zarr").iterdir())
-    _, different, missing = filecmp.cmpfiles(folder / "alone.zarr", folder / "dask.zarr", names, shallow=False)
-    return {"bytes_equal": not different and not missing, "files": len(names), "workers": 2}
+    Counts the parts of the events that were finished before the rerun, and how many of them it computed again.
+    """
+    scenes = [f"paths.{name}={folder / name}.zarr" for name in ("scenes", "frames")]
+    stage("synthesize", options, "storage.sequences_per_part=1", *scenes)
+    stage("emulate", options, scenes[0], f"paths.events={folder / 'alone.zarr'}")
+    alone, events, unfinished = (folder / name for name in ("alone.zarr", "dask.zarr", "dask.zarr.tmp"))
+    overrides = [scenes[0], f"paths.events={events}"]
+    with dask_on_loopback() as (address, scheduler, workers):
+        words = words_of("emulate", options, *overrides, f"cluster.address={address}")
+        with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+            for victim in (workers[0], scheduler):
+                count = len(identities(unfinished))
+                while len(identities(unfinished)) <= count:
+                    if process.poll() is not None:
+                        raise RuntimeError("the stage ended before the worker and the scheduler were killed")
+                    time.sleep(0.001)
+                victim.kill()
+            assert process.stderr is not None
+            message = process.stderr.read().strip().splitlines()[-1]
+    before = identities(unfinished)
+    with dask_on_loopback() as (address, _, _):
+        stage("emulate", options, *overrides, f"cluster.address={address}")
+    names = sorted(path.name for path in alone.iterdir())
+    _, different, missing = filecmp.cmpfiles(alone, events, names, shallow=False)
+    after = identities(events)
+    return {
+        "bytes_equal": not different and not missing,
+        "files": len(names),
+        "workers": len(workers),
+        "message": message,
+        "finished_before_rerun": len(before),
+        "computed_twice": sum(after[part] != identity for part, identity in before.items()),
+    }
+
+
+def identities(store: Path) -> dict[str, tuple[int, int]]:
+    """Inode and time of every finished part of a store: others if it is written again, even with equal bytes."""
+    status = {path.name: path.stat() for path in store.glob("part-?????.zip")}
+    return {name: (one.st_ino, one.st_mtime_ns) for name, one in status.items()}
+
+
+@contextmanager
+def dask_on_loopback() -> Iterator[tuple[str, subprocess.Popen[bytes], list[subprocess.Popen[bytes]]]]:
+    """Address of a new Dask scheduler, its process, and those of two workers of one thread."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        host, port = free.getsockname()
+    address = f"tcp://{host}:{port}"
+
+    def start(kind: str, *words: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", "--no-dashboard", *words]
+        return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+
+    scheduler = start("scheduler", "--host", host, "--port", str(port))
+    workers = [start("worker", address, "--nthreads", "1", "--no-nanny") for _ in range(2)]
+    try:
+        yield address, scheduler, workers
+    finally:
+        for process in (scheduler, *workers):
+            process.kill()
+            process.wait()
 
 
 def s3(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Whether events read from an S3-compatible server on loopback are those of the local store."""
-    import s3fs
-    import torch
-    from moto.server import ThreadedMotoServer
+    """Whether stages that write and read an S3-compatible server on loopback give the bytes of local stores.
 
-    from polarnet.storage.events import EventStore
+    Training compares its loss in every epoch.
+    """
+    with s3_server() as address:
+        os.environ["AWS_ENDPOINT_URL"] = address
+        bucket, remote = fsspec.filesystem("s3"), f"s3://{BUCKET}"
+        for place in (folder, remote):
+            stores = [f"paths.{name}={place}/{name}.zarr" for name in ("scenes", "frames", "events")]
+            stage("synthesize", options, *stores)
+            stage("emulate", options, *stores)
+            trained = folder / ("here" if place == folder else "there")
+            stage("train", options, *stores, f"paths.train={trained}", f"paths.resume={folder / 'resume'}")
+        files = list(folder.glob("*.zarr/*"))
+        equal = [path.read_bytes() == bucket.cat(f"{BUCKET}/{path.relative_to(folder)}") for path in files]
+    here, there = (read_history(folder / name / DOLP_TRAINING) for name in ("here", "there"))
+    return {"bytes_equal": all(equal), "files": len(files), "losses_equal": here == there}
 
-    server = ThreadedMotoServer("127.0.0.1", port=0)
-    server.start()
-    try:
-        host, port = server.get_host_and_port()
-        os.environ |= {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_DEFAULT_REGION": "us-east-1"}
-        os.environ |= {"AWS_ACCESS_KEY_ID": "loopback", "AWS_SECRET_ACCESS_KEY": "loopback"}
-        remote = s3fs.S3FileSystem()
-        remote.mkdir("polarnet")
-        remote.put(str(options.data / "events.zarr"), "polarnet/events.zarr", recursive=True)
-        here, there = EventStore.open(options.data / "events.zarr"), EventStore.open("s3://polarnet/events.zarr")
-        equal = here.sequences == there.sequences and all(
-            torch.equal(a, b)
-            for name in here.sequences
-            for one, other in zip(here.read(name), there.read(name), strict=True)
-            for a, b in zip((one.t, one.x, one.y, one.p), (other.t, other.x, other.y, other.p), strict=True)
-        )
-    finally:
-        server.stop()
-    return {"bytes_equal": equal, "sequences": len(here.sequences)}
+
+def ddp(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Largest difference between the losses of a training by two processes (torchrun, gloo) and by one, in float32."""
+    histories = []
+    for processes in (1, 2):
+        words = [f"runtime.devices={processes}", "runtime.device=cpu", "runtime.threads=1", *DDP]
+        stage("train", options, *words, *(f"paths.{name}={folder / str(processes)}" for name in ("train", "resume")))
+        histories.append(read_history(folder / str(processes) / DOLP_TRAINING))
+    rows = list(zip(*histories, strict=True))
+    pairs = [(one[split]["total"], two[split]["total"]) for split in SPLITS for one, two in rows]
+    return {
+        "ddp_loss_difference": max(abs(one - two) for one, two in pairs),
+        "losses": {"one_process": [one for one, _ in pairs], "two_processes": [two for _, two in pairs]},
+        "overrides": DDP,
+    }
 
 
 STUDIES: dict[str, tuple[str, Callable[[argparse.Namespace, Path], dict[str, Any]]]] = {
@@ -213,8 +281,12 @@ STUDIES: dict[str, tuple[str, Callable[[argparse.Namespace, Path], dict[str, Any
     "search": ("sweeps", search),
     "dask": ("sweeps", dask),
     "s3": ("sweeps", s3),
+    "ddp": ("sweeps", ddp),
 }
-HEADLINES = ("demo_seconds", "benchmark_43_scenes_minutes", "launchers_equal", "resumed_trials_lost")
+ON_DATA = ("launchers", "search", "dask", "s3", "ddp")
+HEADLINES = (
+    "demo_seconds", "benchmark_43_scenes_minutes", "launchers_equal", "resumed_trials_lost", "ddp_loss_difference",
+)  # fmt: skip
 
 
 def main() -> None:
@@ -226,8 +298,8 @@ def main() -> None:
     options = arguments_of(parser)
     if "scenes" in options.studies and not options.scenes:
         parser.error("scenes: give --scenes FOLDER")
-    if {"launchers", "search", "dask", "s3"}.intersection(options.studies) and not options.data:
-        parser.error("launchers, search, dask, s3: give --data FOLDER")
+    if set(ON_DATA).intersection(options.studies) and not options.data:
+        parser.error(f"{', '.join(ON_DATA)}: give --data FOLDER")
     options.data = options.data and options.data.resolve()
     options.scenes = options.scenes and options.scenes.resolve()
     for name in options.studies:

@@ -30,8 +30,8 @@ def pmap(
 
     `address` names a Dask scheduler (extra `cluster`). Without it, `workers` processes share the items; one worker
     means this process. If a worker dies, only its current items are lost and handed out again. RuntimeError names the
-    unfinished items after workers have died `ATTEMPTS` times without one result. An exception raised by `function` ends
-    the map and propagates unchanged.
+    unfinished items after workers have died `ATTEMPTS` times without one result, or the scheduler if that has ended. An
+    exception raised by `function` ends the map and propagates unchanged.
     """
     with Bar(total=len(items), desc=label, unit="", disable=None if len(items) > 1 else True) as bar:
         if address is not None:
@@ -107,6 +107,8 @@ def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], addres
         order: dict[Any, int] = {future.key: i for i, future in enumerate(futures)}
         results: dict[int, Result] = {}
         for future, result in dask_as_completed(futures, with_results=True):
+            if future.cancelled():  # its result is then an exception, which Dask does not raise
+                raise RuntimeError(f"{address}: the Dask scheduler has ended; start it and run the same command again")
             results[order[future.key]] = result
             bar.update()
     return [results[i] for i in range(len(items))]

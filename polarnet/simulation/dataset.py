@@ -18,15 +18,15 @@ from polarnet.storage.scenes import SceneStore
 
 
 def emulate_scenes(
-    scenes: Path,
-    events: Path,
+    scenes: str | Path,
+    events: str | Path,
     camera: Camera,
     seed: int,
     mapper: Callable[..., Iterable[Any]],
     threads: int,
     labels: bool = False,
 ) -> int:
-    """Emulate all sequences of a scene store into an event store, and return their number.
+    """Emulate all sequences of a scene store into an event store, and return their number; both may be at a URL.
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks
     emulates one part on `threads` threads. The event store has the parts of the scene store. With `labels`, it stores

@@ -77,8 +77,8 @@ def valid_frames(
 
 def synthesize(
     images: Path,
-    scenes: Path,
-    frames: Path,
+    scenes: str | Path,
+    frames: str | Path,
     config: SynthesizeConfig,
     seed: int,
     mapper: Callable[..., Iterable[Any]],
@@ -151,8 +151,8 @@ def _motions(
 
 
 def _create(
-    scenes: Path,
-    frames: Path,
+    scenes: str | Path,
+    frames: str | Path,
     entries: Sequence[ManifestEntry],
     motions: Sequence[Motion],
     config: SynthesizeConfig,

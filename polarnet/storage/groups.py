@@ -42,12 +42,17 @@ class _WholeStore(WrapperStore[Any]):
         return content
 
 
+def is_url(path: str | os.PathLike[str]) -> bool:
+    """Whether a path is an fsspec URL, such as s3://BUCKET/NAME.zarr."""
+    return "://" in os.fspath(path)
+
+
 def open_group(path: str | os.PathLike[str]) -> zarr.Group:
     """Open the Zarr group in a local folder, a zip or at an fsspec URL; FileNotFoundError if there is none."""
     name = os.fspath(path)
     store: FsspecStore | ZipStore | LocalStore
     try:
-        if "://" in name:
+        if is_url(name):
             store = FsspecStore.from_url(name, read_only=True)
         elif Path(name).is_file():
             store = ZipStore(name, mode="r", read_only=True)

@@ -10,8 +10,8 @@ so that reading one decodes nothing of its neighbours. Chunks are compressed, so
 
 A store is written as NAME.zarr.tmp. One process writes a part, under a temporary name, and renames it when it is
 complete; different processes write different parts. After a kill a part is whole or missing, and a rerun makes the
-missing parts. `finish` marks the store complete and renames it. The same sequences give the same bytes, in any order of
-the parts.
+missing parts. `finish` marks the store complete and renames it. At an fsspec URL nothing is renamed, because an object
+of a bucket appears whole or not at all. The same sequences give the same bytes, in any order of the parts.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ import hashlib
 import json
 import os
 import shutil
+import tempfile
 import uuid
 import zipfile
 from collections import Counter
@@ -37,7 +38,7 @@ from zarr.storage import MemoryStore
 
 from polarnet.runtime.files import check_room, claimed, sha256
 from polarnet.runtime.sections import section
-from polarnet.storage.groups import REPAIR, Columns, create_array, open_group, raise_shortage
+from polarnet.storage.groups import REPAIR, Columns, create_array, is_url, open_group, raise_shortage
 
 DIGEST_LENGTH = 64  # characters of a SHA-256
 MAX_OPEN_PARTS = 64  # an open part has a file descriptor and about 2 MB of directory
@@ -107,7 +108,8 @@ class Store:
         """Create a store to write at PATH.tmp, or resume the unfinished one there if its header is equal.
 
         One process creates the store and sends it to the others that write. ValueError while a store that another
-        process created at `path` is unfinished.
+        process created at `path` is unfinished. With an fsspec URL as `path`, the store lies there from the start;
+        ValueError if another store does.
         """
         if not sequences:
             raise ValueError("expected at least one name, got none")
@@ -127,12 +129,14 @@ class Store:
             header = json.loads(json.dumps(header, allow_nan=False))  # as read back from disk
         except (TypeError, ValueError) as error:
             raise ValueError(f"the attributes of a store must be finite, plain JSON: {error}") from None
-        folder = Path(path).with_name(Path(path).name + ".tmp")
-        store = cls(str(folder), header)
-        store._claim.enter_context(claimed(Path(path)))
-        if _unsigned(folder) != header:
-            shutil.rmtree(folder, ignore_errors=True)
-        zarr.open_group(folder, mode="a", zarr_format=3).attrs.put(_signed({**header, "complete": False}))
+        store = cls(os.fspath(path) if is_url(path) else str(Path(path).with_name(Path(path).name + ".tmp")), header)
+        if not is_url(path):
+            store._claim.enter_context(claimed(Path(path)))
+        if (known := _unsigned(store.path)) != header:
+            if known is not None and is_url(path):
+                raise ValueError(f"{path}: expected nothing there, or this store unfinished, got another; delete it")
+            shutil.rmtree(store.path, ignore_errors=True)
+        zarr.open_group(store.path, mode="a", zarr_format=3).attrs.put(_signed({**header, "complete": False}))
         return store
 
     @classmethod
@@ -180,11 +184,17 @@ class Store:
             raise ValueError(
                 f"{self.path}: {len(missing)} not written yet: {', '.join(missing[:8])}; write them, then finish"
             )
+        digests = {part: self._written_digest(part) for part in self.parts}
+        group = zarr.open_group(self.path, mode="r+")
+        group.attrs.put(_signed({**self.header, "digests": digests, "complete": True}))
+        if not is_url(self.path):
+            self._rename()
+
+    def _rename(self) -> None:
+        """Move a finished store from PATH.tmp to PATH."""
         folder = Path(self.path)
         for leftover in [*folder.glob("*.tmp"), *folder.glob("*.partial")]:  # of processes killed while writing
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
-        digests = {part: self._written_digest(part) for part in self.parts}
-        zarr.open_group(folder, mode="r+").attrs.put(_signed({**self.header, "digests": digests, "complete": True}))
         final = folder.with_name(folder.name.removesuffix(".tmp"))
         replaced = final.with_name(final.name + ".old")
         shutil.rmtree(replaced, ignore_errors=True)
@@ -212,13 +222,17 @@ class Store:
                 f"{self.path}: {part} takes its sequences in order, expected {names[written]}, got {sequence}"
             )
         if not written:
-            self._unfinished[part] = _Part(Path(self._file(part)), self.columns)
+            self._unfinished[part] = _Part(self._file(part), self.columns)
         self._unfinished[part].append(sequence, columns, record)
         if sequence == names[-1]:
             self._unfinished.pop(part).finish()
-            sizes = [file.stat().st_size for file in Path(self.path).glob("part-*.zip")]
-            missing = len(self.parts) - len(sizes)
-            check_room(Path(self.path), missing * sum(sizes) // len(sizes), f"the {missing} missing parts")
+            if not is_url(self.path):
+                self._check_room()
+
+    def _check_room(self) -> None:
+        sizes = [file.stat().st_size for file in Path(self.path).glob("part-*.zip")]
+        missing = len(self.parts) - len(sizes)
+        check_room(Path(self.path), missing * sum(sizes) // len(sizes), f"the {missing} missing parts")
 
     def records_so_far(self, sequence: str) -> dict[str, Header]:
         """Records of the sequences before `sequence` in its part, while this process writes it."""
@@ -303,7 +317,8 @@ class Store:
         return self._part_of[sequence]
 
     def _is_whole(self, part: str) -> bool:
-        return Path(self._file(part)).exists()
+        files, name = fsspec.url_to_fs(self._file(part))
+        return files.exists(name)
 
     def _file(self, part: str) -> str:
         """Path or fsspec URL of a part."""
@@ -314,7 +329,7 @@ class Store:
         file = self._file(part)
         if part in self.digests and self._written_digest(part) != self.digests[part]:
             raise ValueError("it is not the part that was written into this store")
-        return open_group(f"zip::{file}" if "://" in file else file), {}
+        return open_group(f"zip::{file}" if is_url(file) else file), {}
 
     def _written_digest(self, part: str) -> str:
         """The digest at the end of a part, which says what its content was when it was written."""
@@ -326,10 +341,11 @@ class Store:
 class _Part:
     """A part that one process writes, under a temporary name until it is complete."""
 
-    def __init__(self, path: Path, columns: Columns):
+    def __init__(self, path: str, columns: Columns):
         self.path = path
         self.records: dict[str, Header] = {}
-        self._temporary = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
+        folder = tempfile.gettempdir() if is_url(path) else os.path.dirname(path)
+        self._temporary = Path(folder, f"{os.path.basename(path)}.{uuid.uuid4().hex}.tmp")
         self._zip = zipfile.ZipFile(self._temporary, "w")
         self._entries: dict[str, Buffer] = {}
         self._group = zarr.create_group(MemoryStore(self._entries))
@@ -359,7 +375,12 @@ class _Part:
             digest, _ = _digests(file)
             file.seek(-DIGEST_LENGTH, os.SEEK_END)
             file.write(digest)
-        os.replace(self._temporary, self.path)
+        if is_url(self.path):
+            bucket, name = fsspec.url_to_fs(self.path)
+            bucket.put_file(str(self._temporary), name)
+            self._temporary.unlink()
+        else:
+            os.replace(self._temporary, self.path)
 
     def _pack(self, entries: list[str]) -> None:
         """Move entries from memory into the zip, in an order and with a date that do not depend on the run."""
@@ -394,10 +415,11 @@ def _is_signed(header: Header) -> bool:
     return _signed({key: value for key, value in header.items() if key != "checksum"}) == header
 
 
-def _unsigned(folder: Path) -> Header | None:
+def _unsigned(path: str) -> Header | None:
     """The header that `create_parts` gave to a store; None if there is no store."""
     try:
-        header = json.loads((folder / "zarr.json").read_text())["attributes"]
+        with fsspec.open(f"{path}/zarr.json") as file:
+            header = json.load(file)["attributes"]
         return {key: value for key, value in header.items() if key not in ("digests", "complete", "checksum")}
     except (OSError, ValueError, KeyError):
         return None

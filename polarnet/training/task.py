@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import fsspec
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -19,6 +20,7 @@ from polarnet.simulation.camera import Camera
 from polarnet.simulation.fly import EmulatedEvents
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
+from polarnet.storage.groups import is_url
 from polarnet.storage.scenes import SceneStore
 from polarnet.storage.windows import EventSource, WindowDataset
 from polarnet.training.losses import FrameLoss
@@ -140,7 +142,13 @@ def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, de
 
 
 def content_hash(path: str) -> str:
-    """Return the sha256 of all file names and contents at `path`, or of the path string if nothing is there."""
+    """Return the sha256 of all file names and contents at `path`, or of the path string if nothing is there.
+
+    Of a store at a URL, it is the sha256 of zarr.json, which holds the checksum of each part.
+    """
+    if is_url(path):
+        with fsspec.open(f"{path}/zarr.json") as file:
+            return sha256(file.read())
     if not Path(path).exists():
         return sha256(path.encode())
     files = sorted(file for file in [Path(path), *Path(path).rglob("*")] if file.is_file())

@@ -2,6 +2,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -88,10 +89,27 @@ def test_an_error_of_the_function_comes_through_as_it_is(workers):
         pmap(fail_on_two, [1, 2, 3], workers=workers, label="values")
 
 
-def test_a_dask_cluster_gives_the_same_results():
+@pytest.fixture
+def cluster():
     dask = pytest.importorskip("dask")
     distributed = pytest.importorskip("distributed")
     forking = dask.config.set({"distributed.worker.multiprocessing-method": FORKSERVER.get_start_method()})
     with forking, distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        results = pmap(square, [3, 1, 2], workers=1, label="squares", address=cluster.scheduler_address)
+        yield cluster
+
+
+def test_a_dask_cluster_gives_the_same_results(cluster):
+    results = pmap(square, [3, 1, 2], workers=1, label="squares", address=cluster.scheduler_address)
     assert results == [9, 1, 4]
+
+
+def test_a_dask_scheduler_that_ends_is_an_error(cluster, tmp_path):
+    def end() -> None:
+        until(lambda: list(tmp_path.iterdir()))
+        cluster.close()
+
+    ender = threading.Thread(target=end)
+    ender.start()
+    with pytest.raises(RuntimeError, match="the Dask scheduler has ended; start it"):
+        pmap(note_and_sleep, [str(tmp_path)] * 3, workers=1, label="asleep", address=cluster.scheduler_address)
+    ender.join()

@@ -409,6 +409,25 @@ def test_a_url_is_read_and_verified_like_the_folder(finished):
         fsspec.filesystem("memory").rm("/bucket", recursive=True)
 
 
+def test_a_url_is_written_and_resumed_like_a_folder(finished):
+    bucket, url = fsspec.filesystem("memory"), "memory://written/store.zarr"
+    try:
+        killed = store_at(url)
+        for name in killed.parts["part-00000"]:
+            write(killed, name)
+        before = bucket.modified("/written/store.zarr/part-00000.zip")
+        with pytest.raises(ValueError, match="the store was never finished"):
+            Numbers.open(url)
+        with pytest.raises(ValueError, match="expected nothing there, or this store unfinished, got another"):
+            store_at(url, other=1)
+        write_missing_and_finish(url)
+        assert bucket.modified("/written/store.zarr/part-00000.zip") == before
+        for file in finished.iterdir():
+            assert bucket.cat(f"/written/store.zarr/{file.name}") == file.read_bytes()
+    finally:
+        bucket.rm("/written", recursive=True)
+
+
 def test_what_is_not_a_finished_store_of_this_version_is_refused(finished, copy, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nothing\.zarr: there is no Zarr v3 group; run the stage"):
         Numbers.open(tmp_path / "nothing.zarr")
