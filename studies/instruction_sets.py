@@ -107,8 +107,8 @@ def default_levels() -> dict[str, str]:
 
 def checked_levels(setting: Mapping[str, str], then: str = "") -> dict[str, str]:
     """`levels` under a setting; RuntimeError if the setting does not restrict the libraries as it says."""
-    default, found = default_levels(), levels(setting, then)
+    default, used = default_levels(), levels(setting, then)
     expected = {one: min(level, setting.get(one, level), key=LEVELS.index) for one, level in default.items()}
-    if found != expected:
-        raise RuntimeError(f"expected the levels {expected} under the setting {dict(setting)}, got {found}")
-    return found
+    if used != expected:
+        raise RuntimeError(f"expected the levels {expected} under the setting {dict(setting)}, got {used}")
+    return used

@@ -22,6 +22,7 @@ from studies.measure import arguments_of, command_line, machine_record, write_se
 MAX_WORDS = 40
 GENERATED = re.compile(r"<!-- results:.*?<!-- /results:[\w-]+ -->", re.DOTALL)
 SENTENCE_END = re.compile(r"(?<=[.!?])[)\"']*\s+(?=[A-Z\"'(`]|polarnet\b|v2e\b)")
+EXAMPLE = re.compile(r"^>>> .*(?:\n.+)*", re.MULTILINE)
 ABBREVIATION = re.compile(r"\b(?:e\.g|i\.e|vs|Eq|Eqs|Fig|Figs|Sec|Ref|et al|approx|No|resp)\.$")
 WORD = re.compile(r"\S*\w\S*")
 
@@ -72,7 +73,7 @@ def prose(texts: Mapping[str, str]) -> Iterator[Sentence]:
         if path.endswith(".md"):
             written = [text]
         elif path.startswith("polarnet/") and path.endswith(".py"):
-            written = [inspect.cleandoc(one) for one in docstrings(text)]
+            written = [EXAMPLE.sub("", inspect.cleandoc(one)) for one in docstrings(text)]
         else:
             continue
         for one in written:

@@ -43,15 +43,15 @@ def make(data: str, workers: int) -> None:
 
 def hashes(data: Path) -> dict[str, dict[str, str]]:
     """SHA-256 of each picture file, and of the columns and numbers of each sequence, by artefact."""
-    found = {"images": {path.name: sha256(path) for path in sorted((data / "images").iterdir())}}
+    items = {"images": {path.name: sha256(path) for path in sorted((data / "images").iterdir())}}
     for name, kind in STORES.items():
         store = kind.open(data / name)
         axes = {column.axis for column in store.columns.values()}  # the places of a sequence depend on the others
         for sequence in store.sequences:
             numbers = {key: value for key, value in store.record(sequence).items() if key not in axes}
             columns = [store.read_column(column, sequence) for column in store.columns]
-            found.setdefault(name, {})[sequence] = digest(numbers, *columns)
-    return found
+            items.setdefault(name, {})[sequence] = digest(numbers, *columns)
+    return items
 
 
 def bytes_of(data: Path) -> str:

@@ -68,9 +68,11 @@ def generated_pages() -> dict[str, str]:
 def player_page() -> str:
     """The player on a simulated sequence: events, truth, and the methods `SHOWN`; takes seconds."""
     photo = next(one for one in BUILTIN_PHOTOS if one.path.stem == PHOTOGRAPH)
-    made = simulate(read_rgb(photo.path), MOTIONS["default"], SENSORS["default"], seed=1)
-    truth = made.dolp[1:], made.aolp[1:]
-    sequence = TestSequence(PHOTOGRAPH, PHOTOGRAPH, made.events, made.t_us, *truth, made.intensities[1:, ::2].sum(1))
+    simulated = simulate(read_rgb(photo.path), MOTIONS["default"], SENSORS["default"], seed=1)
+    truth = simulated.dolp[1:], simulated.aolp[1:]
+    sequence = TestSequence(
+        PHOTOGRAPH, PHOTOGRAPH, simulated.events, simulated.t_us, *truth, simulated.intensities[1:, ::2].sum(1)
+    )
     windows, config, size = sequence.windows, load(ROOT), sequence.dolp.shape[1:]
     counts = torch.stack([torch.stack([*map(polarity_sums, window.channels)]).sum(0) for window in windows])
     maps = [Map("Events", "events", signed_bytes(counts).numpy())]
@@ -80,7 +82,7 @@ def player_page() -> str:
         prediction = method.step(method.start(*size), windows)[1]
         maps += _polarization(caption, prediction.dolp, prediction.aolp)
     first = config.benchmark.warmup_windows  # before, few events have arrived
-    film = Film(PHOTOGRAPH, made.t_us[1 + first :].tolist(), [m._replace(frames=m.frames[first:]) for m in maps])
+    film = Film(PHOTOGRAPH, simulated.t_us[1 + first :].tolist(), [m._replace(frames=m.frames[first:]) for m in maps])
     facts = {"photograph": f"{photo.file} of scikit-image by {photo.author}, {photo.licence}",
              "sensor": f"{size[0]} x {size[1]} pixels behind four polarizers, simulated",
              "by hand": f"polarnet demo --photograph {PHOTOGRAPH}"}  # fmt: skip

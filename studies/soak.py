@@ -143,9 +143,9 @@ def sequences(minutes: float, sequences: int) -> dict[str, Any]:
             store = EventStore.create(path, names, *SIZES["sequences"], {}, PER_PART)
             written = 0
             for name in names:
-                made = simulation(SIZES["sequences"], 0.1, seed=int(name))
-                store.write(name, made.events, int(made.t_us[-1]))
-                written += sum(map(len, made.events))
+                simulated = simulation(SIZES["sequences"], 0.1, seed=int(name))
+                store.write(name, simulated.events, int(simulated.t_us[-1]))
+                written += sum(map(len, simulated.events))
             store.finish()
             store = EventStore.open(path)
             for name in names:
@@ -168,7 +168,7 @@ def _start() -> None:
 def main() -> None:
     """The command line."""
     parser = command_line(__doc__, "docs/results/reliability.json")
-    parser.add_argument("--minutes", type=float, default=60.0, help="of live recovery")
+    parser.add_argument("--minutes", type=float, default=60.0, help="length of the live recovery")
     parser.add_argument("--sequences", type=int, default=10_000)
     arguments = arguments_of(parser)
     record = machine_record(ROOT)

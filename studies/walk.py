@@ -93,8 +93,8 @@ def new_environment(folder: Path) -> dict[str, str]:
     venv.create(folder, with_pip=True)
     packages = sysconfig.get_path("purelib", "venv", {"base": str(folder)})
     Path(packages, "shared.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    return {**kept, "PATH": f"{folder / 'bin'}:{kept['PATH']}", "POLARNET": str(ROOT)}
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    return {**inherited, "PATH": f"{folder / 'bin'}:{inherited['PATH']}", "POLARNET": str(ROOT)}
 
 
 def walked(walk: Walk, folder: Path, environment: Mapping[str, str]) -> list[float]:

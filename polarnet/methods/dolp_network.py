@@ -16,7 +16,7 @@ from polarnet.methods.method import Recoverer, Setup, State, WeightsConfig, each
 from polarnet.methods.window_length import of_any_length
 from polarnet.networks.checkpoint import load_network, trained_window_us
 from polarnet.networks.registry import NETWORKS
-from polarnet.networks.stokes_unet import MOST_BINNING, Binning, StokesUNet
+from polarnet.networks.stokes_unet import MAX_BINNING, Binning, StokesUNet
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
@@ -93,8 +93,8 @@ def told(network: nn.Module, metadata: Mapping[str, Any], thresholds: Sequence[f
 
 
 def _bin(network: nn.Module, metadata: Mapping[str, Any], side: int) -> None:
-    if not 1 <= side <= MOST_BINNING:
-        raise ValueError(f"binning: expected blocks with a side of 1 to {MOST_BINNING} px, got {side}")
+    if not 1 <= side <= MAX_BINNING:
+        raise ValueError(f"binning: expected blocks with a side of 1 to {MAX_BINNING} px, got {side}")
     _stokes_unet(network, metadata, "binning").binning = side
 
 

@@ -51,8 +51,8 @@ LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
 LOG_VARIANCE_OUTPUTS = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
 
 
-MOST_BINNING = 8
-Binning = Annotated[int, Field(ge=1, le=MOST_BINNING)]
+MAX_BINNING = 8
+Binning = Annotated[int, Field(ge=1, le=MAX_BINNING)]
 
 
 @section
