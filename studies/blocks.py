@@ -279,6 +279,25 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
         },
         f"Settings with equal bytes: {{isa_settings_equal}} of {len(SETTINGS)}. {{origin}}",
     ),
+    "mutation": Block(
+        "reliability", "mutation", "studies.mutation --write",
+        lambda results: [
+            {"name": module, "killed": 0, "timeout": 0, "survived": 0, **counted}
+            for module, counted in results["mutation"]["modules"].items()
+        ],
+        {
+            "module": "`{name}`", "mutants": "{mutants}", "killed": "{killed}", "tests without end": "{timeout}",
+            "survived": "{survived}",
+        },
+        "Score: {mutation_score:.1%} of {mutation[mutants]} mutants. {origin}",
+    ),
+    "survivors": Block(
+        "reliability", "mutation", "studies.mutation --write",
+        lambda results: [
+            {"name": name.replace("|", "\\|"), "why": why} for name, why in results["mutation"]["survivors"].items()
+        ],
+        {"surviving mutant": "`{name}`", "why": "{why}"}, caption="",
+    ),
     "soak": Block(
         "reliability", "soak", "studies.soak --write",
         lambda results: [{"name": name, **row} for name, row in results["soak"].items()],
