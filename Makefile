@@ -4,10 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 export PATH := $(CURDIR)/$(BIN):$(PATH)
-# Stages and tests start many processes. Without bytecode on disk, each of them would compile polarnet anew.
-export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: help setup repro scenes kernels trained beside test lint docs smoke clean
+.PHONY: help setup repro test lint docs smoke clean
 
 help:
 	@echo "make repro   set up and run the whole pipeline; the page is data/report/index.html"
@@ -23,29 +21,11 @@ $(READY): pyproject.toml constraints.txt .ci/lpips.txt .ci/setup
 	@.ci/setup "$(PYTHON)" "$(VENV)"
 	@touch $(READY)
 
-# The same as `dvc repro`, with pairs of tasks side by side where each leaves a core idle. Lines of the second trainings
-# start with `beside:`.
 repro: setup
-	$(MAKE) --no-print-directory --jobs=2 scenes kernels
-	dvc repro emulate weights
-	$(MAKE) --no-print-directory --jobs=2 trained beside
 	dvc repro
 
-scenes:
-	dvc repro synthesize
-
-kernels:
-	test -e data/events.zarr || python -m stages.kernels
-
-trained:
-	dvc --wait-for-lock repro --single-item train
-
-beside: SHELL := bash
-beside: .SHELLFLAGS := -o pipefail -c
-beside:
-	dvc --wait-for-lock repro --single-item train_baseline import_recordings calibrate sets emulate_rotating \
-		2>&1 | sed -u 's/^/beside: /'
-
+# Tests start many processes. Without bytecode on disk, each of them would compile polarnet anew.
+test: export PYTHONDONTWRITEBYTECODE =
 test: setup
 	python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 

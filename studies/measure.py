@@ -5,6 +5,7 @@ python -m studies.measure [pipeline | tests | benchmark | ablation | sweep] [--s
 
 import argparse
 import importlib.metadata
+import itertools
 import json
 import os
 import platform
@@ -28,7 +29,6 @@ ROOT = Path(__file__).resolve().parents[1]
 DEMO_METRICS = "data/benchmark/metrics.json"
 VERSIONS_OF = ("torch", "numpy", "numba", "zarr", "dvc", "hydra-core")
 STAGE_STARTS = re.compile(r"Running stage '([\w@+]+)'")  # printed by dvc repro
-BESIDE = "beside: "  # before the lines of stages that `make repro` runs beside others
 
 
 def machine_record(root: Path) -> dict[str, Any]:
@@ -291,40 +291,25 @@ def measure_sweep(root: Path, sweeps: Sequence[Path]) -> list[Path]:
 
 
 def _timed(target: str, folder: Path) -> tuple[float, dict[str, float]]:
-    """Run `make target`; return its minutes and those of each DVC stage that it ran.
-
-    Stages run in turn, and beside them those whose lines start with `BESIDE`.
-    """
+    """Run `make target`; return its minutes and those of each DVC stage that it ran."""
     started = time.monotonic()
-    seconds: dict[str, float] = {}
-    running: dict[bool, tuple[str, float]] = {}
-    latest: dict[bool, float] = {}
-
-    def end(beside: bool, now: float) -> None:
-        if beside in running:
-            name, start = running.pop(beside)
-            stage = name.partition("@")[0]  # all rows and all trained baselines together
-            seconds[stage] = seconds.get(stage, 0.0) + now - start
-
+    marks: list[tuple[str, float]] = []
     with subprocess.Popen(
         ["make", target], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     ) as process:
         assert process.stdout is not None
         for line in process.stdout:
             print(line, end="", flush=True)
-            now, beside = time.monotonic(), line.startswith(BESIDE)
             if match := STAGE_STARTS.search(line):
-                end(beside, now)
-                running[beside] = match[1], now
-            elif line.removeprefix(BESIDE).startswith("Stage '"):  # did not change, says the next `dvc repro`
-                end(beside, latest[beside])
-            latest[beside] = now
+                marks.append((match[1], time.monotonic()))
     ended = time.monotonic()
     if process.returncode:
         raise RuntimeError(f"make {target} failed in a fresh clone; what it printed is above")
-    end(False, ended)
-    end(True, latest.get(True, ended))
-    stages = {name: round(spent / 60, 2) for name, spent in seconds.items()}
+    spans = itertools.pairwise([*marks, ("", ended)])
+    stages: dict[str, float] = {}
+    for (name, start), (_, end) in spans:
+        stage = name.partition("@")[0]  # all rows and all trained baselines together
+        stages[stage] = round(stages.get(stage, 0) + (end - start) / 60, 2)
     return round((ended - started) / 60, 2), stages
 
 
