@@ -189,7 +189,7 @@ def _add_method(recover: argparse.ArgumentParser) -> None:
     )
     recover.add_argument(
         "--binning", type=int, metavar="N",
-        help="show the network blocks of N x N pixels, averaged: with 2, it takes a third of the time "
+        help="show the network blocks of N x N pixels, averaged: with 2, it is faster and sees less detail "
         "(default: as in its training)",
     )  # fmt: skip
     recover.add_argument(
