@@ -200,7 +200,7 @@ def test_the_small_paper_experiment_differs_from_the_papers_in_size_alone(projec
     assert set(paper) == set(small)
     assert {key for key in paper if paper[key] != small[key]} == {
         "ingest.limit", "ingest.val_fraction", "ingest.test_fraction", "storage.sequences_per_part", "train.epochs",
-        "train.precision", "baselines.e2v.epochs", "baselines.e2v.windows", "baselines.e2v.crop",
+        "train.crop", "train.precision", "baselines.e2v.epochs", "baselines.e2v.windows", "baselines.e2v.crop",
     }  # fmt: skip
 
 
