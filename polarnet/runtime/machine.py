@@ -92,6 +92,11 @@ def threads_of(config: RuntimeConfig) -> int:
     return config.threads or max(1, usable_cores() // config.workers)
 
 
+def processes_here() -> int:
+    """Number of processes on this machine that share this training (polarnet.training.parallel)."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+
+
 def device_of(config: RuntimeConfig) -> torch.device:
     """The torch device that `config.device` names; ValueError if it asks for a GPU and there is none."""
     own_gpu = f"cuda:{os.environ.get('LOCAL_RANK', 0)}"  # torchrun's number of this process
@@ -159,7 +164,7 @@ def tune() -> None:
 
 def configure(config: RuntimeConfig, seed: int) -> torch.device:
     """Set threads, seed torch, keep freed memory and request deterministic kernels; returns the device to run on."""
-    limit_threads(config.threads or max(1, usable_cores() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))))
+    limit_threads(config.threads or max(1, usable_cores() // processes_here()))
     tune()
     torch.manual_seed(seed)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")

@@ -12,7 +12,7 @@ from pydantic import Field, PositiveInt
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from polarnet.runtime.machine import generator_for, memory_handed_back
+from polarnet.runtime.machine import generator_for, memory_handed_back, processes_here
 from polarnet.runtime.sections import section
 from polarnet.storage.windows import WindowDataset, WindowSequence
 
@@ -124,10 +124,10 @@ class Visits(Dataset[WindowSequence]):
 def loaded_if_it_fits(dataset: WindowDataset, intensity: bool) -> list[WindowSequence] | None:
     """A dataset's encoded sequences, if they fit into `MEMORY_SHARE` of the free memory; None if they do not.
 
-    `intensity` says whether to keep the intensity.
+    Each process of a shared training loads them all. `intensity` says whether to keep the intensity.
     """
     bytes_each = sum(tensor.nbytes for tensor in packed(dataset[0], intensity)[1:] if tensor is not None)
-    if bytes_each * len(dataset) > MEMORY_SHARE * psutil.virtual_memory().available:
+    if bytes_each * len(dataset) * processes_here() > MEMORY_SHARE * psutil.virtual_memory().available:
         return None
     with memory_handed_back():
         return [packed(dataset[number], intensity) for number in range(len(dataset))]

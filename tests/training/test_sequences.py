@@ -1,5 +1,7 @@
 import math
+from types import SimpleNamespace
 
+import psutil
 import pytest
 import torch
 from torch.utils.data import Dataset
@@ -11,6 +13,7 @@ from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.windows import WindowDataset, WindowSequence
 from polarnet.training.sequences import (
+    MEMORY_SHARE,
     View,
     ViewConfig,
     Visits,
@@ -119,6 +122,16 @@ def test_a_dataset_in_memory_is_read_once(stores):
     loaded = loaded_if_it_fits(dataset, intensity=True)
     assert loaded[1] is loaded[1]
     assert torch.equal(loaded[1].inputs, dataset[1].inputs)
+
+
+def test_processes_of_a_machine_share_its_memory(stores, monkeypatch):
+    dataset = WindowDataset(EventStore.open(stores[0]), FrameStore.open(stores[1]), ["a", "b"], event_tensor)
+    needed = 2 * sum(tensor.nbytes for tensor in packed(dataset[0], True)[1:] if tensor is not None)
+    free = SimpleNamespace(available=1.5 * needed / MEMORY_SHARE)  # enough for one process
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
+    assert loaded_if_it_fits(dataset, intensity=True) is not None
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    assert loaded_if_it_fits(dataset, intensity=True) is None
 
 
 def test_counts_of_events_are_kept_as_bytes_and_seen_as_they_were():
