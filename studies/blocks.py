@@ -329,10 +329,10 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
     "paper-duration": Block(
         "lpips", "cost", "studies.lpips", duration_rows,
         {
-            "experiment": "`{name}`", "precision": "{precision}", "training": "{windows:,} windows",
-            "windows/s": "{rate:.2f}", "hours": "{hours:.0f}",
+            "precision": "{precision}", "training": "{windows:,} windows", "windows/s": "{rate:.2f}", "days": "{days:.0f}",
         },
-        "Training of the network with its loss, VGG included, on two cores; without E2VID, validation and simulation. "
+        "Training of the network of `experiment=paper` with its loss, VGG included, on two cores; without E2VID, "
+        "validation and simulation. "
         "{origin}",
     ),
     "paper-small": Block(

@@ -133,9 +133,7 @@ def queue(clone: Path, target: list[str]) -> dict[str, Any]:
     started = time.monotonic()
     if "Started '2'" not in (answer := dvc(clone, "queue", "start", "-j", "2")):  # it succeeds without workers too
         raise RuntimeError(f"dvc queue start: expected 2 workers, got {answer!r}; the workers need `dvc` in PATH")
-    together = 0
     while "Queued" in (status := dvc(clone, "queue", "status")) or "Running" in status:
-        together = max(together, status.count("Running"))
         time.sleep(POLL_S)
     seconds = round(time.monotonic() - started)
     dvc(clone, "queue", "stop")
@@ -145,7 +143,6 @@ def queue(clone: Path, target: list[str]) -> dict[str, Any]:
     return {
         "experiments": len(QUEUED),
         "succeeded": status.count("Success"),
-        "together": together,
         "seconds": seconds,
         "executed": sorted(set().union(*ran)),
         "scenes_differ": len(scenes) == len(QUEUED),

@@ -79,7 +79,7 @@ def table_rows(results: Results) -> list[Row]:
 
 
 def duration_rows(lpips: Results) -> list[Row]:
-    """Duration of the network's training in experiments paper and paper_small, from measured seconds a window.
+    """Duration of the network's training in experiment=paper, from measured seconds a window.
 
     Seconds with VGG were measured in fp32; in bf16 they are those of the network and of VGG, measured apart.
     """
@@ -90,16 +90,14 @@ def duration_rows(lpips: Results) -> list[Row]:
         "fp32": paper["step_ms"]["vgg"] / 1000 / paper["frames"],
         network["precision"]: 1 / network["train_frames_per_s"] + vgg_s,
     }
-    rows: list[Row] = []
-    for name in ("paper", "paper_small"):
-        values = preset_values(ROOT, "experiment", name)
-        share = 1 - values["ingest.val_fraction"] - values["ingest.test_fraction"]
-        frames = values["synthesize.duration_s"] * values["synthesize.frame_rate_hz"]
-        windows = round(values["ingest.limit"] * share) * values["train.epochs"] * round(frames)
-        for precision, one in seconds.items():
-            rows.append({"name": name, "precision": precision, "windows": windows, "rate": 1 / one,
-                         "hours": windows * one / 3600})  # fmt: skip
-    return rows
+    values = preset_values(ROOT, "experiment", "paper")
+    share = 1 - values["ingest.val_fraction"] - values["ingest.test_fraction"]
+    frames = values["synthesize.duration_s"] * values["synthesize.frame_rate_hz"]
+    windows = round(values["ingest.limit"] * share) * values["train.epochs"] * round(frames)
+    return [
+        {"precision": precision, "windows": windows, "rate": 1 / one, "days": windows * one / 86_400}
+        for precision, one in seconds.items()
+    ]
 
 
 SMALL_SCORES = ("mse", "psnr", "ssim", "lpips", "corr", "aolp_deg", "skill")
