@@ -68,7 +68,7 @@ def _fitted(scenes: Sequence[Scene], ridge: float) -> ExpectedErrors:
     features, squared = (torch.cat(field).numpy() for field in zip(*scenes, strict=True))
     mean, spread = features.mean(0), features.std(0)
     scale = np.where(spread > MIN_SPREAD, 1 / spread.clip(MIN_SPREAD), 0)
-    scaled = (features - mean) * scale
+    scaled = ((features - mean) * scale).astype(np.float64)  # once, instead of in every step
 
     def loss_and_slope(w: Float64[np.ndarray, " k"]) -> tuple[float, Float64[np.ndarray, " k"]]:
         expected = scaled @ w[:-1] + w[-1]
