@@ -329,7 +329,8 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
     "paper-duration": Block(
         "lpips", "cost", "studies.lpips", duration_rows,
         {
-            "precision": "{precision}", "training": "{windows:,} windows", "windows/s": "{rate:.2f}", "days": "{days:.0f}",
+            "precision": "{precision}", "training": "{windows:,} windows", "windows/s": "{rate:.2f}",
+            "days": "{days:.0f}",
         },
         "Training of the network of `experiment=paper` with its loss, VGG included, on two cores; without E2VID, "
         "validation and simulation. "

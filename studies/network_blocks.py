@@ -10,7 +10,7 @@ from polarnet.reports.curves import PAPER_EVENTS_PER_PIXEL
 from polarnet.reports.legend import LABELS, in_order
 from polarnet.reports.tables import COLUMNS, ERROR_PARTS
 from studies.measure import ABLATION_KEYS, ablation_about
-from studies.rate import ENDS, HELD, OURS, RATED
+from studies.rate import ENDS, HELD, OURS, RATE_HZ, RATED
 from studies.scenes import CHOICES
 from studies.tables import Block, Columns, Results, Row, listed, origin
 
@@ -231,6 +231,16 @@ def _between_rows(results: Results) -> Iterator[Row]:
             }  # fmt: skip
 
 
+def _speed_rows(results: Results) -> Iterator[Row]:
+    speed = results["speed"]
+    for name in [name for name in speed if name.startswith(BETWEEN)]:
+        size = name.removeprefix(BETWEEN)
+        full, blocks = (speed[f"windows_per_s_{size}{suffix}"] for suffix in ("", "_blocks_of_2"))
+        yield {"size": size.replace("x", " x "), "full": full, "blocks": blocks, "between": speed[name]}
+
+
+BETWEEN = f"ms_per_{RATE_HZ}hz_frame_"
+
 NETWORK_BLOCKS = {
     "headline": Block(
         "robustness", "test", "studies.robustness --write", _headline_rows,
@@ -326,6 +336,14 @@ NETWORK_BLOCKS = {
             "scenes": "{kind}", "number": "{scenes}", "window ends, dB": "{ends:.2f}",
             "carried on, dB lost": "{carried:.2f}", "held, dB lost": "{held:.2f}",
         },
+    ),
+    "robustness-speed": Block(
+        "robustness", "speed", "studies.robustness --conditions speed --threads 2 --write", _speed_rows,
+        {
+            "sensor": "{size}", "windows/s": "{full:.1f}", "windows/s, blocks of 2x2": "{blocks:.1f}",
+            f"ms a frame between windows, {RATE_HZ} Hz": "{between:.2f}",
+        },
+        "Shipped weights in {speed[precision]} with {speed[threads]} threads. {origin}",
     ),
     "robustness": _robustness("mse_over_oracle_mean", ".2f"),
     "robustness-median": _robustness("median_over_oracle_mean", ".2f"),

@@ -15,7 +15,7 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 - `time.2000hz.photographs`, `time.2000hz.measured`: frames between windows (`polarnet recover --rate 2000`), on the
   pictures of the sensors and on all measured scenes, at 16 times between the ends of two windows (`studies.rate`).
 - `speed`: windows a second of the first weights on random events, with and without blocks of 2x2 pixels, and ms of a
-  frame between windows, with --threads.
+  frame between windows, with --threads. `--conditions speed` measures nothing else and needs no photographs.
 
 Nothing is trained, except the constants: `train_mean` is the mean DoLP of the training photographs, and `constant_real`
 the mean DoLP of the measured scenes of all sources but the one that is scored. --split val is for choices and --split
@@ -31,7 +31,7 @@ import functools
 import json
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -269,10 +269,10 @@ def printed(tables: Mapping[str, Any], key: str) -> str:
 def parsed() -> argparse.Namespace:
     """The command line, with paths as every working directory understands them."""
     parser = command_line(__doc__, "docs/results/robustness.json")
-    parser.add_argument("--photographs", type=Path, required=True)
+    parser.add_argument("--photographs", type=Path)
     parser.add_argument("--photographs-large", type=Path, help="further photographs")
     parser.add_argument("--measured", type=Path, nargs="+", default=[], help="as ingest.source=polarization takes them")
-    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--work", type=Path)
     parser.add_argument(
         "--weights", nargs="+", default=[], metavar="[NAME=]FILE", help="checkpoints; default: the shipped one"
     )
@@ -285,6 +285,8 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1, help="processes that share the sequences")
     arguments = arguments_of(parser)
+    if arguments.conditions != ["speed"] and None in (arguments.photographs, arguments.work):
+        parser.error("expected --photographs and --work; only --conditions speed needs neither")
     for name in ("photographs", "photographs_large", "work", "firenet", "training"):
         if path := getattr(arguments, name):
             setattr(arguments, name, path.resolve())
@@ -319,69 +321,76 @@ def conditions_of(
     }
 
 
-def main() -> None:
-    """Score, print and perhaps write."""
-    arguments = parsed()
-    record = machine_record(ROOT)
-    arguments.work.mkdir(parents=True, exist_ok=True)
-    given = {"rgb": arguments.photographs, "more": arguments.photographs_large}
-    roots = {name: root for name, root in given.items() if root}
-    images = {name: ingested(root, arguments.work / name) for name, root in roots.items()}
-    if arguments.training:
-        print(f"{link_training(roots, images, arguments.training)} photographs in {arguments.training}")
-        return
-    conditions = conditions_of(images, arguments)
-    wanted = arguments.conditions or ["photographs", "photographs_large", "measured", "sensors", "time", "speed"]
-    common = [f"runtime.threads={arguments.threads}", f"runtime.workers={arguments.workers}"]
-    if arguments.firenet:
-        common.append(f"methods.firenet_published.weights={arguments.firenet}")
-    config = settings(*common)
-    configure(config.runtime, config.seed)
-    train_mean = statistics.fmean(mean_dolp(images["rgb"], "train"))
-    means = {
-        name: mean_dolp(part, "test")
+def selected(conditions: Mapping[str, Any], wanted: Sequence[str] | None) -> dict[str, Any]:
+    """The conditions whose names, or the beginnings of whose names, are `wanted`; None: all."""
+    return {
+        name: parts
         for name, parts in conditions.items()
-        if name.startswith("measured.")
-        for part, _ in parts
+        if wanted is None or any(name == one or name.startswith(f"{one}.") for one in wanted)
     }
-    first_weights = next(iter(arguments.weights.values()))
+
+
+def contexts_of(
+    condition: str, overrides: Sequence[str], train_mean: float, weights: Mapping[str, Path]
+) -> dict[str, Context]:
+    """Settings of each row of the network under a condition; blocks and known thresholds have the first weights."""
+    config = settings(*overrides)
+    contexts = {row: context_of(config, train_mean, file) for row, file in weights.items()}
+    variants = {} if condition.startswith(RATED) else {BLOCKS: f"methods.ours.binning={BINNING}"}
+    if condition.startswith("sensors.") and not config.emulate.randomise:
+        thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
+        variants[CALIBRATED] = f"methods.ours.thresholds={thresholds}"
+    first = next(iter(weights.values()))
+    return contexts | {
+        row: context_of(settings(*overrides, variant), train_mean, first) for row, variant in variants.items()
+    }
+
+
+def tables_of(
+    conditions: Mapping[str, list[tuple[Path, tuple[str, ...]]]],
+    means: Mapping[str, list[float]],
+    train_mean: float,
+    weights: Mapping[str, Path],
+    common: Sequence[str],
+) -> dict[str, Any]:
+    """Score every condition; returns its table, and one of all measured scenes. `means` has the mean DoLP by source."""
     results: dict[str, Scores] = {}
     tables: dict[str, Any] = {}
     for name, parts in conditions.items():
-        if not any(name == one or name.startswith(f"{one}.") for one in wanted):
-            continue
         others = [mean for source, of_source in means.items() if source != name for mean in of_source]
         constant = statistics.fmean(others) if others else train_mean
         for part, overrides in parts:
-            config = settings(*common, *overrides)
-            contexts = {row: context_of(config, train_mean, file) for row, file in arguments.weights.items()}
-            if not name.startswith(RATED):
-                binned = settings(*common, *overrides, f"methods.ours.binning={BINNING}")
-                contexts[BLOCKS] = context_of(binned, train_mean, first_weights)
-            if name.startswith("sensors.") and not config.emulate.randomise:
-                thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
-                calibrated = settings(*common, *overrides, f"methods.ours.thresholds={thresholds}")
-                contexts[CALIBRATED] = context_of(calibrated, train_mean, first_weights)
-            one = scored(part, config, contexts, constant, rated=name.startswith(RATED))
+            given = (*common, *overrides)
+            contexts = contexts_of(name, given, train_mean, weights)
+            one = scored(part, settings(*given), contexts, constant, rated=name.startswith(RATED))
             results[name] = results[name] + one if name in results else one
         tables[name] = table_of(results[name])
-        print(
-            name, {row: round(one["mse_over_oracle_mean"], 3) for row, one in tables[name]["rows"].items()}, flush=True
-        )
+        ratios = {row: round(one["mse_over_oracle_mean"], 3) for row, one in tables[name]["rows"].items()}
+        print(name, ratios, flush=True)
     if measured := [one for name, one in results.items() if name.startswith("measured.")]:
         tables["measured"] = table_of(functools.reduce(Scores.__add__, measured))
+    return tables
+
+
+def write_speed(config: Config, arguments: argparse.Namespace, record: Mapping[str, Any]) -> None:
+    """Measure and print the speed of the first weights by size of the sensor; with --write also keep it in docs."""
+    weights = next(iter(arguments.weights.values()))
+    speed: dict[str, Any] = {"threads": arguments.threads, "precision": precision_on(CPU, "auto")}
+    for height, width in SIZES:
+        size = f"{height}x{width}"
+        speed[f"windows_per_s_{size}"] = windows_per_s(weights, height, width)
+        speed[f"windows_per_s_{size}_blocks_of_{BINNING}"] = windows_per_s(weights, height, width, BINNING)
+        speed[f"ms_per_{RATE_HZ}hz_frame_{size}"] = ms_per_frame(height, width, config.between)
+    print(json.dumps(speed, indent=1))
+    if arguments.write:
+        print(write_section(ROOT, "robustness", "speed", speed, record))
+
+
+def write_tables(tables: Mapping[str, Any], arguments: argparse.Namespace, record: Mapping[str, Any]) -> None:
+    """Print the tables and keep them in --work; with --write also in docs."""
     for key in ("mse", "median_mse", "mse_over_oracle_mean", "median_over_oracle_mean", "level_mse", "psnr", "corr"):
         print(printed(tables, key), end="\n\n")
-    row, weights = next(iter(arguments.weights.items()))
-    figures = headlines(tables, row)
-    if "speed" in wanted:
-        rates = {
-            f"windows_per_s_{height}x{width}{suffix}": windows_per_s(weights, height, width, binning)
-            for height, width in SIZES
-            for suffix, binning in (("", None), (f"_blocks_of_{BINNING}", BINNING))
-        }
-        between = {f"ms_per_{RATE_HZ}hz_frame_{h}x{w}": ms_per_frame(h, w, config.between) for h, w in SIZES}
-        figures["speed"] = rates | between | {"threads": arguments.threads, "precision": precision_on(CPU, "auto")}
+    figures = headlines(tables, next(iter(arguments.weights)))
     print(json.dumps(figures, indent=1))
     section = {
         "split": arguments.split, "limit": arguments.limit, "sensor_limit": arguments.sensor_limit,
@@ -392,6 +401,38 @@ def main() -> None:
         print(write_section(ROOT, "robustness", arguments.split, section, record, figures))
         picture = ROOT / "docs" / "pictures" / f"robustness_{arguments.split}.png"
         picture.write_bytes(png(robustness_figure(tables, LIGHT)))
+
+
+def main() -> None:
+    """Score, print and perhaps write."""
+    arguments = parsed()
+    record = machine_record(ROOT)
+    common = [f"runtime.threads={arguments.threads}", f"runtime.workers={arguments.workers}"]
+    if arguments.firenet:
+        common.append(f"methods.firenet_published.weights={arguments.firenet}")
+    config = settings(*common)
+    configure(config.runtime, config.seed)
+    if arguments.conditions == ["speed"]:
+        write_speed(config, arguments, record)
+        return
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    given = {"rgb": arguments.photographs, "more": arguments.photographs_large}
+    roots = {name: root for name, root in given.items() if root}
+    images = {name: ingested(root, arguments.work / name) for name, root in roots.items()}
+    if arguments.training:
+        print(f"{link_training(roots, images, arguments.training)} photographs in {arguments.training}")
+        return
+    conditions = conditions_of(images, arguments)
+    means = {
+        name: [mean for part, _ in parts for mean in mean_dolp(part, "test")]
+        for name, parts in conditions.items()
+        if name.startswith("measured.")
+    }
+    train_mean = statistics.fmean(mean_dolp(images["rgb"], "train"))
+    chosen = selected(conditions, arguments.conditions)
+    write_tables(tables_of(chosen, means, train_mean, arguments.weights, common), arguments, record)
+    if arguments.conditions is None or "speed" in arguments.conditions:
+        write_speed(config, arguments, record)
 
 
 if __name__ == "__main__":
