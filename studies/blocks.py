@@ -341,7 +341,7 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
         lambda results: [{"name": name, **scores} for name, scores in results["paper_small"].items()],
         {
             "row": "`{name}`", "MSE": "{mse:.4f}", "PSNR": "{psnr:.2f}", "SSIM": "{ssim:.3f}", "LPIPS": "{lpips:.3f}",
-            "correlation": "{corr:.3f}", "AoLP error": "{aolp_deg:.1f}°", "skill": "{skill:.3f}",
+            "correlation": "{corr:.3f}", "AoLP error, °": "{aolp_deg:.1f}", "skill": "{skill:.3f}",
         },
         "`paper` is the network that experiment=paper_small trains, `ours` the shipped one. {origin}",
     ),
