@@ -287,5 +287,8 @@ def _write_exr(path: Path, prediction: Prediction) -> None:
 
 def _write_picture(path: Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> None:
     file = oiio.ImageOutput.create(str(path))
-    if not (file and file.open(str(path), spec) and file.write_image(np.ascontiguousarray(pixels)) and file.close()):
-        raise OSError(f"{path}: {file.geterror() if file else oiio.geterror()}")
+    done = file and file.open(str(path), spec) and file.write_image(np.ascontiguousarray(pixels)) and file.close()
+    problem = file.geterror() if file else oiio.geterror()  # a PNG that was cut off is done, but has a problem
+    if not done or problem:
+        first, *_ = problem.strip().splitlines() or ["OpenImageIO gives no reason"]
+        raise OSError(f"{path}: the picture was not written: {first}; make room or write to another disk")
