@@ -1,5 +1,6 @@
 """The protocol that all stores share: make, resume, finish, open, and survive being killed."""
 
+import errno
 import functools
 import gc
 import hashlib
@@ -10,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 from concurrent.futures import ProcessPoolExecutor
@@ -24,7 +26,7 @@ from part_fixtures import entries_to_change
 from zarr.storage import ZipStore
 
 import polarnet.storage.parts as parts_module
-from polarnet.storage.groups import Column, open_group
+from polarnet.storage.groups import Column, open_group, raise_shortage
 from polarnet.storage.parts import StorageConfig, Store
 
 NAMES = [f"s{i}" for i in range(5)]
@@ -220,6 +222,29 @@ def test_more_parts_are_read_than_files_may_be_open(finished, monkeypatch):
     for _ in range(3):
         assert_whole(store)
     assert len(os.listdir("/proc/self/fd")) <= before + 1
+
+
+def test_a_lack_of_descriptors_is_no_damage(finished, monkeypatch):
+    def refuse(path):
+        raise_shortage(OSError(errno.EMFILE, "Too many open files"), path)
+
+    store = Numbers.open(finished)
+    monkeypatch.setattr(parts_module, "open_group", refuse)
+    for read in (store.record, functools.partial(store.read_column, next(iter(store.columns)))):
+        with pytest.raises(RuntimeError, match="was not read, because the system gave no more") as refusal:
+            read(store.sequences[0])
+        assert "unreadable" not in str(refusal.value)
+
+
+def test_a_lack_of_threads_is_no_damage(finished, monkeypatch):
+    def refuse(*_):
+        raise RuntimeError("can't start new thread")
+
+    store = Numbers.open(finished)
+    monkeypatch.setattr(threading, "_start_new_thread", refuse)
+    with pytest.raises(RuntimeError, match="was not read, because the system gave no more") as refusal:
+        store.read_columns(store.sequences[0], [(name, 0, None) for name in store.columns])
+    assert str(finished) in str(refusal.value)
 
 
 def test_a_forked_process_shares_no_open_file_with_its_parent(finished):
