@@ -74,8 +74,6 @@ def pytest_collection() -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Search only what tests make for garbage."""
-    gc.freeze()
     gc.enable()
 
 
