@@ -1,5 +1,6 @@
 """The protocol that all stores share: make, resume, finish, open, and survive being killed."""
 
+import contextlib
 import errno
 import functools
 import gc
@@ -9,13 +10,14 @@ import os
 import pickle
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
 import zipfile
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from multiprocessing import Pipe, get_context
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import fsspec
@@ -321,19 +323,11 @@ def _rename_or_die(rename, last: str, source, target) -> None:
 
 def test_a_process_killed_at_any_moment_leaves_parts_whole_or_missing(finished, tmp_path):
     path = tmp_path / "store.zarr"
-    script = "import sys, test_parts as t; t._write_slowly(sys.argv[1])"
     done = set()
     for milliseconds in (2, 15, 30, 45):
-        writer = subprocess.Popen(
-            [sys.executable, "-c", script, str(path)],
-            stdout=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
-        )
-        assert writer.stdout is not None
-        assert writer.stdout.readline() == b"ready\n"
-        time.sleep(milliseconds / 1000)
-        writer.send_signal(signal.SIGKILL)
-        writer.wait()
+        with forked(_write_slowly, path) as writer:
+            time.sleep(milliseconds / 1000)
+        assert writer.exitcode == -signal.SIGKILL
         store = store_at(path)
         left = store.missing()
         for name in set(NAMES) - set(left):
@@ -348,25 +342,36 @@ def test_a_process_killed_at_any_moment_leaves_parts_whole_or_missing(finished, 
 
 def test_a_second_writer_is_refused_while_the_first_lives(tmp_path):
     path = tmp_path / "store.zarr"
-    script = "import sys, test_parts as t; store = t.store_at(t.Path(sys.argv[1])); print('ready', flush=True); input()"
-    with subprocess.Popen(
-        [sys.executable, "-c", script, str(path)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
-    ) as writer:
-        assert writer.stdout is not None
-        assert writer.stdout.readline() == b"ready\n"
-        with pytest.raises(ValueError, match=r"store\.zarr: another process is writing it; wait until that has ended"):
-            store_at(path)
-        writer.kill()
+    message = r"store\.zarr: another process is writing it; wait until that has ended"
+    with forked(_claim, path), pytest.raises(ValueError, match=message):
+        store_at(path)
     write_missing_and_finish(path)
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["store.zarr"]
 
 
-def _write_slowly(path: str) -> None:
-    store = store_at(Path(path))
-    print("ready", flush=True)
+@contextlib.contextmanager
+def forked(write: Callable[[Path, Connection], None], path: Path) -> Iterator[BaseProcess]:
+    """A process that has claimed a store and is killed at the end of the block."""
+    claimed, sender = Pipe(duplex=False)
+    process = get_context("fork").Process(target=write, args=(path, sender))
+    process.start()
+    try:
+        assert claimed.poll(60), "the process claims nothing"
+        yield process
+    finally:
+        process.kill()
+        process.join()
+
+
+def _claim(path: Path, claimed: Connection) -> None:
+    _store = store_at(path)
+    claimed.send(True)
+    signal.pause()
+
+
+def _write_slowly(path: Path, claimed: Connection) -> None:
+    store = store_at(path)
+    claimed.send(True)
     for name in store.missing():
         write(store, name)
         time.sleep(0.01)
