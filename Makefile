@@ -8,13 +8,13 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 .PHONY: help setup repro test thorough lint docs smoke clean
 
 help:
-	@echo "make repro   set up and run the whole pipeline; the page is data/report/index.html"
-	@echo "make test    set up and run the tests"
+	@echo "make repro     set up and run the whole pipeline; the page is data/report/index.html"
+	@echo "make test      set up and run the tests"
 	@echo "make thorough  the slow tests that make test leaves out"
-	@echo "make lint    ruff, mypy, import-linter, tables up to date"
-	@echo "make docs    the documentation site, in outputs/site"
-	@echo "make smoke   the pipeline at CI size, in outputs/run/smoke"
-	@echo "make clean   remove the virtual environment and caches (data/ stays)"
+	@echo "make lint      ruff, mypy, import-linter, tables up to date"
+	@echo "make docs      the documentation site, in outputs/site"
+	@echo "make smoke     the pipeline at CI size, in outputs/run/smoke"
+	@echo "make clean     remove the virtual environment and caches (data/ stays)"
 
 setup: $(READY)
 
