@@ -5,15 +5,16 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help setup repro test lint docs smoke clean
+.PHONY: help setup repro test thorough lint docs smoke clean
 
 help:
-	@echo "make repro   set up and run the whole pipeline; the page is data/report/index.html"
-	@echo "make test    set up and run the tests"
-	@echo "make lint    ruff, mypy, import-linter, tables up to date"
-	@echo "make docs    the documentation site, in outputs/site"
-	@echo "make smoke   the pipeline at CI size, in outputs/run/smoke"
-	@echo "make clean   remove the virtual environment and caches (data/ stays)"
+	@echo "make repro     set up and run the whole pipeline; the page is data/report/index.html"
+	@echo "make test      set up and run the tests"
+	@echo "make thorough  the slow tests that make test leaves out"
+	@echo "make lint      ruff, mypy, import-linter, tables up to date"
+	@echo "make docs      the documentation site, in outputs/site"
+	@echo "make smoke     the pipeline at CI size, in outputs/run/smoke"
+	@echo "make clean     remove the virtual environment and caches (data/ stays)"
 
 setup: $(READY)
 
@@ -25,9 +26,12 @@ repro: setup
 	dvc repro
 
 # Tests start many processes. Without bytecode on disk, each of them would compile polarnet anew.
-test: export PYTHONDONTWRITEBYTECODE =
+test thorough: export PYTHONDONTWRITEBYTECODE =
 test: setup
 	python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+thorough: setup
+	python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m thorough
 
 lint: setup
 	ruff check .

@@ -20,6 +20,7 @@ from omegaconf import DictConfig
 
 from polarnet.config.sweep import FAILURE, finished, mark_finished
 from polarnet.config.tree import hydra_command
+from polarnet.runtime.machine import end_with_parent
 
 # The trained network and the references for it; no other method of the benchmark depends on the training.
 REFERENCE_METHODS = "benchmark.methods=[zeros,train_mean,oracle_mean,ours]"
@@ -58,7 +59,7 @@ def main(node: DictConfig) -> None:
 def _failure(command: Sequence[str]) -> str | None:
     """Run a command, passing its errors on as they arrive; return the last line if it fails, None if it succeeds."""
     lines: deque[str] = deque(maxlen=20)
-    with subprocess.Popen(command, stderr=subprocess.PIPE) as child:
+    with subprocess.Popen(command, stderr=subprocess.PIPE, preexec_fn=end_with_parent) as child:
         assert child.stderr is not None
         for line in io.TextIOWrapper(child.stderr, errors="replace", newline=""):  # progress bars end lines with \r
             print(line, end="", file=sys.stderr, flush=True)

@@ -1,6 +1,7 @@
 """Fixtures and settings of several test modules."""
 
 import dataclasses
+import gc
 import importlib
 import json
 import os
@@ -63,12 +64,17 @@ def pytest_collection() -> None:
     from hypothesis import settings
 
     yaml.SafeLoader = yaml.CSafeLoader  # with which omegaconf reads params.yaml for every test that loads it
+    gc.disable()  # what collection makes lives to the end, and looking through it for garbage takes seconds
     for name, cases in FUZZ_CASES.items():
         settings.register_profile(name, max_examples=cases, deadline=None)
     settings.load_profile("ci" if os.environ.get("CI") else "local")
     if "PYTEST_XDIST_WORKER" in os.environ:
         for package in LARGE_PACKAGES:
             importlib.import_module(package)
+
+
+def pytest_collection_finish() -> None:
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -116,11 +122,13 @@ def unchecked_annotations() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", was)
 
 
-@pytest.fixture
-def brief_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")
+def brief_costs() -> Iterator[None]:
     """Measure the cost of a benchmark row once on one window; a full measurement takes longer than the scores."""
-    for name in ("COUNTED_WINDOWS", "TIMED_WINDOWS", "REPEATS"):
-        monkeypatch.setattr(f"polarnet.benchmark.cost.{name}", 1)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        for name in ("COUNTED_WINDOWS", "TIMED_WINDOWS", "REPEATS"):
+            monkeypatch.setattr(f"polarnet.benchmark.cost.{name}", 1)
+        yield
 
 
 @pytest.fixture

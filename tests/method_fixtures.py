@@ -45,7 +45,7 @@ def random_events(generator, windows=4, count=300):
     return Events(t, x, y, p, HEIGHT, WIDTH)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_sequence():
     def make(name="a", scene=None, windows=4, seed=0):
         generator = torch.Generator().manual_seed(seed)
@@ -91,7 +91,7 @@ def checkpoints(tmp_path_factory):
     return files
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_setup(checkpoints):
     """The setup of a section, with changes."""
 
@@ -111,7 +111,7 @@ def make_setup(checkpoints):
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_context(make_setup):
     """All methods; `changes` are those of the setups of some sections."""
 

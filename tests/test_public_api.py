@@ -81,6 +81,7 @@ def test_importing_the_rooms_loads_no_large_package():
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True).stdout.strip() == "[]"
 
 
+@pytest.mark.thorough
 def test_simulate_recover_score_and_look_in_a_few_lines():
     from polarnet.metrics import score
     from polarnet.networks import shipped_weights

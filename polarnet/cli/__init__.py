@@ -26,8 +26,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The arguments; words KEY=VALUE behind the options of a command with overrides count as overrides."""
-    parser = _parser()
-    options, rest = parser.parse_known_args(arguments)
+    parser, words = _parser(), sys.argv[1:] if arguments is None else arguments
+    if strange := [word for word in words if any("\ud800" <= character <= "\udfff" for character in word)]:
+        parser.error(f"{strange[0]!a}: expected a name in UTF-8; rename the file")
+    options, rest = parser.parse_known_args(words)
     if rest and (not hasattr(options, "overrides") or any(w.startswith("-") or "=" not in w for w in rest)):
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     if rest:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from polarnet.config.sweep import FAILURE
 from polarnet.runtime.extras import installation
+from polarnet.runtime.machine import end_with_parent
 from polarnet.training.history import HISTORY, best_row, read_history
 
 if TYPE_CHECKING:
@@ -99,8 +100,9 @@ def run_trial(command: Sequence[str], job: Path, trial: "optuna.Trial") -> float
     training, reported = job / "train" / "ours", 0
     with (job / "output.log").open("w") as log:
         process = subprocess.Popen(
-            [*command, f"hydra.run.dir={job}"], stdout=log, stderr=subprocess.STDOUT, start_new_session=True
-        )
+            [*command, f"hydra.run.dir={job}"], stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
+            preexec_fn=end_with_parent,
+        )  # fmt: skip
         try:
             while process.poll() is None:
                 time.sleep(POLL_S)

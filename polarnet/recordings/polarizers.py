@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
@@ -23,6 +23,7 @@ WINDOWS = 30  # the first second
 BLOCK = 4  # pixels, square; single pixels have too few events to compare
 MIN_BLOCKS = 1000  # with events in a window: the ratio of two misfits is then known to about 1 / sqrt(1000), 3 %
 HOT_PIXEL_FACTOR = 4.0
+DISTURBING_HZ = 10_000.0  # of one pixel: the shipped network's DoLP changes by 0.005 (rms), at 100,000 Hz by 0.08
 
 # Limits of misfits and counts: measured by studies/polarizers.py (docs/recover.md, section Checks).
 BETTER_FIT = 0.9  # misfit of other pairs over that of the pairs at right angles: lower only where the order is wrong
@@ -67,7 +68,8 @@ class ChannelCheck:
 
     def findings(self) -> list[str]:
         """Problems found, a sentence each; empty if there are none, or too few events to judge."""
-        return channel_findings(pair_misfits(self._windows), self.counts, mosaic=self._mosaic)
+        findings = channel_findings(pair_misfits(self._windows), self.counts, mosaic=self._mosaic)
+        return findings + disturbing_pixels(self._windows)
 
 
 def channel_findings(misfits: Misfits, counts: Sequence[int], *, mosaic: bool) -> list[str]:
@@ -102,6 +104,23 @@ def channel_findings(misfits: Misfits, counts: Sequence[int], *, mosaic: bool) -
     return []
 
 
+def disturbing_pixels(windows: Sequence[EventWindow]) -> list[str]:
+    """A sentence about hot pixels with so many events that they change DoLP of the whole image; empty without them."""
+    if not windows:
+        return []
+    seconds = len(windows) * WINDOW_US * 1e-6
+    counts, hot = _counts_and_hot_pixels(windows)
+    disturbing = sum(
+        int((bad & (count > DISTURBING_HZ * seconds)).sum()) for count, bad in zip(counts, hot, strict=True)
+    )
+    if not disturbing:
+        return []
+    return [
+        f"Hot pixels with more than {DISTURBING_HZ:,.0f} events a second: {disturbing}. DoLP is wrong in the whole "
+        f"image; remove them with --hot-pixels found, or with --hot-pixels FILE of a live camera."
+    ]
+
+
 def pair_misfits(windows: Sequence[EventWindow]) -> Misfits:
     """Differences between the sums of each pairing of the channels, without hot pixels.
 
@@ -110,9 +129,7 @@ def pair_misfits(windows: Sequence[EventWindow]) -> Misfits:
     if not windows:
         return Misfits(np.zeros(3), 0)
     first = windows[0].channels[0]
-    seconds = len(windows) * WINDOW_US * 1e-6
-    counts = np.sum([[event_counts(events) for events in window.channels] for window in windows], axis=0)
-    hot = [hot_pixels(count, seconds, HOT_PIXEL_FACTOR) for count in counts]
+    _, hot = _counts_and_hot_pixels(windows)
     cleaned = [[without_pixels(e, bad) for e, bad in zip(w.channels, hot, strict=True)] for w in windows]
     on = sum(int((events.p > 0).sum()) for channels in cleaned for events in channels)
     off = sum(len(events) for channels in cleaned for events in channels) - on
@@ -128,6 +145,14 @@ def pair_misfits(windows: Sequence[EventWindow]) -> Misfits:
         lit += int(np.count_nonzero(np.bincount(np.concatenate(place), minlength=blocks)))
         squares += [((sums[a] + sums[b] - sums[c] - sums[d]) ** 2).sum() for (a, b), (c, d) in PAIRS]
     return Misfits(np.sqrt(squares / max(lit, 1)), lit)
+
+
+def _counts_and_hot_pixels(
+    windows: Sequence[EventWindow],
+) -> tuple[Int64[np.ndarray, "channels h w"], list[Bool[np.ndarray, "h w"]]]:
+    """Number of events of each pixel of the channels, and which of these pixels are hot."""
+    counts = np.sum([[event_counts(events) for events in window.channels] for window in windows], axis=0)
+    return counts, [hot_pixels(count, len(windows) * WINDOW_US * 1e-6, HOT_PIXEL_FACTOR) for count in counts]
 
 
 def _block(events: Events, columns: int) -> Int64[np.ndarray, " n"]:

@@ -287,5 +287,20 @@ def _write_exr(path: Path, prediction: Prediction) -> None:
 
 def _write_picture(path: Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> None:
     file = oiio.ImageOutput.create(str(path))
-    if not (file and file.open(str(path), spec) and file.write_image(np.ascontiguousarray(pixels)) and file.close()):
-        raise OSError(f"{path}: {file.geterror() if file else oiio.geterror()}")
+    done = file and file.open(str(path), spec) and file.write_image(np.ascontiguousarray(pixels)) and file.close()
+    problem = file.geterror() if file else oiio.geterror()
+    if not done or problem or not _has_last_row(path):
+        first, *_ = problem.strip().splitlines() or ["it is cut off"]
+        raise OSError(f"{path}: the picture was not written: {first}; make room or write to another disk")
+
+
+def _has_last_row(path: Path) -> bool:
+    """Whether a picture is whole: on a full disk OpenImageIO loses the end of a file without an error."""
+    file = oiio.ImageInput.open(str(path))
+    if not file:
+        return False
+    spec = file.spec()
+    row = file.read_scanlines(spec.height - 1, spec.height, 0, 0, spec.nchannels, "unknown")
+    problem = file.geterror()
+    file.close()
+    return row is not None and not problem

@@ -8,6 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
+
+ZERO, ONE = np.int64(0), np.int64(1)
+"""Counts to pass to a kernel: numba would compile it for a literal 0 or 1, and once more for int64."""
 
 
 def compiled(kernel: Callable) -> Any:

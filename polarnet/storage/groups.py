@@ -71,11 +71,17 @@ def open_group(path: str | os.PathLike[str]) -> zarr.Group:
         raise ValueError(f"{name} is unreadable: {error}; {REPAIR}") from error
 
 
+class Shortage(RuntimeError):
+    """The system gave no more memory, threads or file descriptors."""
+
+
 def raise_shortage(error: Exception, path: str) -> None:
-    """RuntimeError if reading failed for want of memory, threads or file descriptors, not because of the file."""
+    """`Shortage` if reading failed for want of memory, threads or file descriptors, not because of the file."""
+    if isinstance(error, Shortage):
+        raise error
     short = isinstance(error, MemoryError) or getattr(error, "errno", None) in SHORTAGES
     if short or "can't start new thread" in str(error):
-        raise RuntimeError(
+        raise Shortage(
             f"{path} was not read, because the system gave no more memory, threads or file descriptors "
             f"({error or 'out of memory'}); lower runtime.workers, or raise the limits (ulimit -n, -u, -v)"
         ) from error

@@ -276,8 +276,12 @@ class Store:
 
     def read_columns(self, sequence: str, requests: Sequence[tuple[str, int, int | None]]) -> list[np.ndarray]:
         """`read_column` for several (name, start, stop), at the same time."""
-        with ThreadPoolExecutor(len(requests)) as pool:
-            return list(pool.map(lambda request: self.read_column(request[0], sequence, *request[1:]), requests))
+        try:
+            with ThreadPoolExecutor(len(requests)) as pool:
+                return list(pool.map(lambda request: self.read_column(request[0], sequence, *request[1:]), requests))
+        except RuntimeError as error:  # no thread started
+            raise_shortage(error, self.path)
+            raise
 
     def problems(self, sequence: str) -> list[str]:
         """Messages about unreadable or missing data of a sequence."""

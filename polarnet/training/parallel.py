@@ -13,7 +13,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from polarnet.runtime.machine import RuntimeConfig
+from polarnet.runtime.machine import RuntimeConfig, end_with_parent
 
 
 def launched(module: str, runtime: RuntimeConfig) -> bool:
@@ -28,15 +28,17 @@ def launched(module: str, runtime: RuntimeConfig) -> bool:
     if runtime.nodes > 1:
         meeting = ["--rdzv-backend=c10d", f"--rdzv-endpoint={runtime.rendezvous}"]
     torchrun = ["torch.distributed.run", f"--nnodes={runtime.nodes}", f"--nproc-per-node={runtime.devices}", *meeting]
-    status = subprocess.run([sys.executable, "-m", *torchrun, "-m", module, *sys.argv[1:]]).returncode
+    command = [sys.executable, "-m", *torchrun, "-m", module, *sys.argv[1:]]
+    status = subprocess.run(command, preexec_fn=end_with_parent).returncode
     if status:
         raise RuntimeError(f"{module}: a process of {runtime.devices} on this machine failed; its message is above")
     return True
 
 
 def join(device: torch.device) -> None:
-    """Join the process group if torchrun has started several processes."""
+    """Join the process group if torchrun has started several processes; this one then ends with torchrun."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        end_with_parent()
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
 
 

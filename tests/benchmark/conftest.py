@@ -13,12 +13,13 @@ __all__ = ["checkpoints", "context", "make_context", "make_sequence", "make_setu
 SCENES = {"t1": "photo", "a1": "lake", "a2": "lake", "b1": "wood", "c1": "town"}
 
 
-@pytest.fixture
-def five_scenes(make_sequence, tmp_path):
+@pytest.fixture(scope="session")
+def five_scenes(make_sequence, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("five_scenes")
     splits = {name: "train" if name.startswith("t") else "test" for name in SCENES}
-    frames = FrameStore.create(tmp_path / "frames.zarr", list(SCENES), splits, 5, 18, 20, {"scenes": SCENES})
-    events = EventStore.create(tmp_path / "events.zarr", list(SCENES), 18, 20, {})
-    rotating = EventStore.create(tmp_path / "rotating.zarr", list(SCENES), 18, 20, {})
+    frames = FrameStore.create(folder / "frames.zarr", list(SCENES), splits, 5, 18, 20, {"scenes": SCENES})
+    events = EventStore.create(folder / "events.zarr", list(SCENES), 18, 20, {})
+    rotating = EventStore.create(folder / "rotating.zarr", list(SCENES), 18, 20, {})
     for seed, name in enumerate(SCENES):
         clip = make_sequence(name, seed=seed)
         dolp, aolp, s0 = (torch.cat([x[:1], x]) for x in (clip.dolp, clip.aolp, clip.s0))
@@ -27,5 +28,5 @@ def five_scenes(make_sequence, tmp_path):
         rotating.write(name, [clip.rotating, *[Events.empty(18, 20)] * 3], 4000)
     for store in (frames, events, rotating):
         store.finish()
-    stores = EventStore.open(tmp_path / "events.zarr"), FrameStore.open(tmp_path / "frames.zarr")
-    return BenchmarkSet("simulated", *stores, EventStore.open(tmp_path / "rotating.zarr"))
+    stores = EventStore.open(folder / "events.zarr"), FrameStore.open(folder / "frames.zarr")
+    return BenchmarkSet("simulated", *stores, EventStore.open(folder / "rotating.zarr"))

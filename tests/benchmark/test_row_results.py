@@ -12,11 +12,13 @@ from polarnet.benchmark.score import BenchmarkConfig
 pytestmark = pytest.mark.usefixtures("brief_costs")
 
 ROWS = ["zeros", "cf", "ours"]
+CONFIG = BenchmarkConfig(ROWS, ["simulated"], 1, "fp32", False, "alex", 50, 2)
 
 
-@pytest.fixture
-def config():
-    return BenchmarkConfig(ROWS, ["simulated"], 1, "fp32", False, "alex", 50, 2)
+@pytest.fixture(scope="module")
+def benchmark(five_scenes, make_context, brief_costs):
+    """All rows in one run."""
+    return run_benchmark(five_scenes, make_context(), CONFIG, None)
 
 
 def written(folder, benchmark, rows=ROWS):
@@ -25,14 +27,13 @@ def written(folder, benchmark, rows=ROWS):
     return {row: folder / row for row in rows}
 
 
-def test_rows_that_ran_alone_give_the_table_of_one_run_to_the_last_digit(five_scenes, context, config, tmp_path):
-    together = run_benchmark(five_scenes, context, config, None)
+def test_rows_that_ran_alone_give_the_table_of_one_run_to_the_last_digit(five_scenes, context, benchmark, tmp_path):
     folders = {}
     for row in ROWS:
-        alone = run_benchmark(five_scenes, context, dataclasses.replace(config, methods=[row]), None)
+        alone = run_benchmark(five_scenes, context, dataclasses.replace(CONFIG, methods=[row]), None)
         folders |= written(tmp_path / "rows", alone, [row])
-    write_benchmark(tmp_path / "one", together, config, 1, {})
-    write_benchmark(tmp_path / "two", read_rows(folders, "simulated"), config, 1, {})
+    write_benchmark(tmp_path / "one", benchmark, CONFIG, 1, {})
+    write_benchmark(tmp_path / "two", read_rows(folders, "simulated"), CONFIG, 1, {})
     for file in ("metrics.json", "details.json", "frames.csv"):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes(), file
     for panel in ("a1", "c1"):
@@ -41,10 +42,8 @@ def test_rows_that_ran_alone_give_the_table_of_one_run_to_the_last_digit(five_sc
         assert all(np.array_equal(one[name], two[name]) for name in one.files)
 
 
-def test_a_table_holds_the_rows_it_is_asked_for_whatever_else_lies_in_the_folder(
-    five_scenes, context, config, tmp_path
-):
-    folders = written(tmp_path, run_benchmark(five_scenes, context, config, None))
+def test_a_table_holds_the_rows_it_is_asked_for_whatever_else_lies_in_the_folder(benchmark, tmp_path):
+    folders = written(tmp_path, benchmark)
     del folders["cf"]
     left = read_rows(folders, "simulated")
     assert {score.method for score in left.rows} == {"zeros", "ours"}
@@ -59,16 +58,16 @@ def test_a_row_that_was_left_out_says_why(tmp_path):
     assert read_record(tmp_path / "e2p") == record
 
 
-def test_a_row_or_a_set_that_was_not_run_is_named(five_scenes, context, config, tmp_path):
+def test_a_row_or_a_set_that_was_not_run_is_named(benchmark, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"row cf was not run; run `dvc repro`"):
         read_record(tmp_path / "cf")
-    folders = written(tmp_path, run_benchmark(five_scenes, context, config, None))
+    folders = written(tmp_path, benchmark)
     with pytest.raises(FileNotFoundError, match="row zeros has not run on set measured"):
         read_rows(folders, "measured")
 
 
-def test_rows_of_different_sequences_make_no_table(five_scenes, context, config, tmp_path):
-    folders = written(tmp_path, run_benchmark(five_scenes, context, config, None))
+def test_rows_of_different_sequences_make_no_table(benchmark, tmp_path):
+    folders = written(tmp_path, benchmark)
     file = folders["cf"] / "simulated" / "results.json"
     results = json.loads(file.read_text())
     results["frames"] = [score for score in results["frames"] if score[1] != "b1"]
@@ -77,8 +76,7 @@ def test_rows_of_different_sequences_make_no_table(five_scenes, context, config,
         read_rows(folders, "simulated")
 
 
-def test_a_row_written_anew_keeps_nothing_of_an_earlier_run(five_scenes, context, config, tmp_path):
-    benchmark = run_benchmark(five_scenes, context, config, None)
+def test_a_row_written_anew_keeps_nothing_of_an_earlier_run(benchmark, tmp_path):
     write_row(tmp_path / "cf", "cf", RowRecord(None, {}), {"simulated": benchmark, "measured": benchmark})
     written(tmp_path, benchmark, ["cf"])
     assert sorted(path.name for path in (tmp_path / "cf").iterdir()) == ["SHA256SUMS", "row.json", "simulated"]

@@ -166,6 +166,13 @@ def test_labels_counts_causes_and_scores_the_removal_of_hot_pixels(store, tmp_pa
     assert (tmp_path / "l.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_name_that_is_not_utf_8_is_refused_before_any_work(capsys):
+    with pytest.raises(SystemExit) as ending:
+        main(["recover", "camera\udcff.raw"])
+    assert ending.value.code == 2
+    assert "'camera\\udcff.raw': expected a name in UTF-8; rename the file" in capsys.readouterr().err
+
+
 def test_verify_of_something_else_says_what_was_expected(tmp_path, capsys):
     assert main(["verify", str(tmp_path / "nothing.zarr")]) == 1
     assert "there is no Zarr v3 group" in capsys.readouterr().out

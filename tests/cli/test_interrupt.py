@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 
+import pytest
 from skimage import data, io
 
 
@@ -27,6 +28,7 @@ def interrupted(command, folder, ready, project_root):
     return process.returncode, error
 
 
+@pytest.mark.thorough
 def test_a_benchmark_stops_in_one_line_and_a_rerun_continues(tmp_path, project_root):
     photographs = tmp_path / "photographs"
     photographs.mkdir()

@@ -39,6 +39,7 @@ def test_presets_and_stages_work_in_it(project, monkeypatch, capsys):
     assert "ingest" in capsys.readouterr().out
 
 
+@pytest.mark.thorough
 def test_dvc_runs_a_stage_in_it(project, project_root):
     pytest.importorskip("dvc")
     environment = os.environ | {

@@ -8,6 +8,8 @@ import sys
 import pytest
 from test_simulate import SMALL
 
+pytestmark = pytest.mark.thorough
+
 APART = ["unshare", "--net", "--map-root-user"]
 """Runs a command in a network namespace of its own, whose one interface is down."""
 SIZE = ["synthesize.sensor_height=60", "synthesize.sensor_width=90", "synthesize.duration_s=0.1"]

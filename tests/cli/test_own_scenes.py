@@ -138,7 +138,7 @@ def test_measured_polarization_is_found_and_scored(project_root, tmp_path, monke
     angles = {f"I{a}": s0 / 2 * (1 + degree * np.cos(2 * (np.deg2rad(a) - across))) for a in (0, 45, 90, 135)}
     np.savez(folder / "plate.npz", **angles)
     out = tmp_path / "out"
-    assert run(project_root, monkeypatch, folder, out) == 0
+    assert run(project_root, monkeypatch, folder, out, "--methods", "zeros,oracle_mean") == 0
     manifest = json.loads((out / "work" / "images" / "manifest.json").read_text())
     assert [picture["source"] for picture in manifest["pictures"]] == ["polarization"]
     assert json.loads((out / "metrics.json").read_text())["oracle_mean"]["skill"] == pytest.approx(0, abs=1e-3)

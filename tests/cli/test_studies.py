@@ -54,6 +54,7 @@ def weights(tmp_path_factory):
     return path
 
 
+@pytest.mark.thorough
 def test_the_event_budget_asks_its_three_questions_on_the_test_sequences_alone(config, weights, tmp_path, monkeypatch):
     monkeypatch.setattr(studies, "SLIDING_FRAMES", 3)
     results = studies.run_event_budget(config, tmp_path / "out", ["oracle_mean", "ours"], None, weights)
@@ -74,6 +75,7 @@ def test_the_event_budget_needs_the_network(config, tmp_path):
         studies.run_event_budget(config, tmp_path, ["zeros"], None, tmp_path / "none.safetensors")
 
 
+@pytest.mark.thorough
 def test_the_sensitivity_changes_one_setting_at_a_time_and_no_truth(config, tmp_path):
     results = studies.run_sensitivity(config, tmp_path / "out", ["zeros", "cf"], None, None)
     assert json.loads((tmp_path / "out" / "sensitivity.json").read_text()) == results

@@ -9,6 +9,8 @@ import zipfile
 
 import pytest
 
+pytestmark = pytest.mark.thorough
+
 SOURCES = ("polarnet", "stages", "studies", "conf", "params.yaml", "dvc.yaml", "pyproject.toml", "setup.py",
            "MANIFEST.in", "README.md", "LICENSE")  # fmt: skip
 BUILD = "import setuptools.build_meta as backend; backend.build_{kind}({folder!r})"  # what pip calls

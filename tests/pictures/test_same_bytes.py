@@ -35,6 +35,7 @@ def x86_64():
         pytest.skip("the settings are those of x86-64")
 
 
+@pytest.mark.thorough
 def test_the_bytes_are_the_same_on_a_processor_without_avx_and_fma(tmp_path, x86_64):
     setting = instruction_sets.SETTINGS["everything without AVX and FMA"]
     assert set(instruction_sets.checked_levels(setting).values()) == {"SSE"}
@@ -45,6 +46,7 @@ def test_the_bytes_are_the_same_on_a_processor_without_avx_and_fma(tmp_path, x86
     assert done.stdout.strip() == REFERENCE
 
 
+@pytest.mark.thorough
 def test_a_setting_without_effect_is_noticed(monkeypatch, x86_64):
     if instruction_sets.default_levels()["numpy"] == "SSE":
         pytest.skip("this processor has no instructions that a setting could switch off")

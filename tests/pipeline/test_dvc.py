@@ -1,6 +1,7 @@
 """dvc.yaml: a stage depends on the code that makes its outputs; a row of the tables on no other row's."""
 
 import contextlib
+import functools
 import json
 import os
 import shutil
@@ -282,18 +283,21 @@ def test_a_row_that_is_added_or_removed_runs_no_other_row(project):
     assert repro() == {"benchmark@firenet_published", "report"}
 
 
+thorough = functools.partial(pytest.param, marks=pytest.mark.thorough)
+
+
 @pytest.mark.parametrize(
     ("file", "stages"),
     [
         ("methods/e2v.py", {"benchmark@e2v", "report"}),
-        ("methods/complementary_filter.py", {"benchmark@cf", "benchmark@highpass", "benchmark@cf+gain",
-                                             "benchmark@highpass+gain", "report"}),
-        ("networks/stokes_unet.py", {"train", "report"}),
         ("networks/firenet.py", {"train_baseline@e2v", "report"}),
-        ("networks/cista_tc.py", {"report"}),
-        ("reports/figures.py", {"report"}),
-        ("benchmark/paired.py", {"report"}),
         ("cli/recordings.py", set()),
+        thorough("methods/complementary_filter.py", {"benchmark@cf", "benchmark@highpass", "benchmark@cf+gain",
+                                                     "benchmark@highpass+gain", "report"}),
+        thorough("networks/stokes_unet.py", {"train", "report"}),
+        thorough("networks/cista_tc.py", {"report"}),
+        thorough("reports/figures.py", {"report"}),
+        thorough("benchmark/paired.py", {"report"}),
     ],
 )  # fmt: skip
 def test_a_changed_file_runs_what_it_decides_and_weights_that_stay_the_same_run_no_row(

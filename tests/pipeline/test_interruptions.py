@@ -220,6 +220,7 @@ def over_dask(folder: Path, events: Path, cluster) -> None:
     assert emulate_scenes(folder / "scenes.zarr", events, config.camera, config.seed, mapper, 1) == SEQUENCES
 
 
+@pytest.mark.thorough
 def test_one_and_three_dask_workers_and_one_killed_half_way_give_the_bytes_of_one_process(
     folder, undisturbed, cluster, tmp_path
 ):

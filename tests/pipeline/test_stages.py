@@ -169,6 +169,7 @@ def paper(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "data"
 
 
+@pytest.mark.thorough
 def test_the_paper_experiment_goes_through_every_stage_at_reduced_sizes(paper):
     assert json.loads((paper / "images" / "manifest.json").read_text())["counts"]["train"] == 4  # of 8 photographs
     networks = {name: json.loads((paper / "train" / name / "best.json").read_text()) for name in ("ours", "e2v")}
@@ -186,6 +187,7 @@ def test_the_paper_experiment_goes_through_every_stage_at_reduced_sizes(paper):
     assert (paper / "calibrated" / "one_figure_8.pdf").stat().st_size > 0
 
 
+@pytest.mark.thorough
 def test_the_paper_experiment_leaves_table_2_and_its_figures(paper):
     files = {path.name for path in (paper / "report" / "paper").iterdir()}
     assert files == {"table_2.md", "table_2.csv", "table_2.tex"} | {
@@ -217,6 +219,7 @@ def test_the_same_values_give_the_same_bytes_whatever_the_number_of_workers(proj
         assert bytes_of(tmp_path / name) == bytes_of(data / name), name
 
 
+@pytest.mark.thorough
 def test_a_point_of_a_sweep_leaves_what_the_pipeline_made_and_kept_alone(project_root, data, tmp_path):
     parts = ("train", "benchmark")
     before = {name: bytes_of(data / name) for name in parts}

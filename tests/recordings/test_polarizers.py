@@ -112,6 +112,16 @@ def test_a_hot_pixel_changes_nothing(polarized):
     torch.testing.assert_close(torch.from_numpy(after), torch.from_numpy(before), rtol=0.01, atol=0)
 
 
+@pytest.mark.parametrize(("rate_hz", "sentence"), [(5_000, ""), (20_000, "Hot pixels with more than 10,000 events")])
+def test_a_hot_pixel_that_disturbs_the_whole_image_is_named(rate_hz, sentence):
+    times = torch.arange(0, DURATION_US, 1_000_000 // rate_hz)
+    where = torch.full((len(times),), 8, dtype=torch.int16)
+    hot = Events(times, where, where, torch.ones(len(times), dtype=torch.int8), 16, 16)
+    one = Events(times[:1], where[:1] - 5, where[:1], torch.ones(1, dtype=torch.int8), 16, 16)
+    assert findings([hot, one, one, one]).startswith(sentence)
+    assert bool(findings([hot, one, one, one])) == bool(sentence)
+
+
 def test_of_too_few_events_nothing_is_said():
     few = Events(torch.arange(100), *(torch.ones(100, dtype=torch.int16),) * 2, torch.ones(100).to(torch.int8), 40, 40)
     assert findings([few] * 4) == ""

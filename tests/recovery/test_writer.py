@@ -1,3 +1,4 @@
+import resource
 import shutil
 
 import cv2
@@ -117,3 +118,17 @@ def test_a_full_disk_stops_at_a_whole_frame_and_says_so(tmp_path, cores, monkeyp
         write()
     assert [cv2.imread(str(path)).shape for path in sorted((tmp_path / "png").iterdir())] == [(16, 72, 3)] * 3
     assert zarr.open_group(tmp_path / "recovered.zarr", mode="r")["t_us"].shape == (3,)
+
+
+@pytest.mark.parametrize("kind", ["png", "exr"])
+def test_a_picture_that_is_cut_off_is_an_error(tmp_path, kind):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (400, limits[1]))  # bytes of a file, as a quota or a full disk would
+    try:
+        with (
+            pytest.raises(OSError, match=rf"000000\.{kind}: the picture was not written: "),
+            RecoveryWriter(tmp_path, (kind,), 30.0) as writer,
+        ):
+            writer.add(window(0), frame(0))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)

@@ -42,7 +42,7 @@ CONDITIONS = {
 }
 
 
-@pytest.mark.parametrize("theme", [LIGHT, DARK])
+@pytest.mark.parametrize("theme", [LIGHT, pytest.param(DARK, marks=pytest.mark.thorough)])
 def test_the_figures_are_drawn_the_same_each_time(theme):
     for draw, results in (
         (event_budget_figure, BUDGET),

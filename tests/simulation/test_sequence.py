@@ -132,7 +132,8 @@ DTYPES = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(settings.default, max_examples=2 * settings.default.max_examples,
+          suppress_health_check=[HealthCheck.function_scoped_fixture])  # fmt: skip
 @given(values=DTYPES.flatmap(lambda dtype: SIDES.flatmap(lambda shape: arrays.arrays(dtype, tuple(shape)))))
 @example(values=np.full((3, 9, 9), 0.5, np.float16))
 @example(values=np.linspace(0, 1, 243, dtype=np.longdouble).reshape(3, 9, 9))

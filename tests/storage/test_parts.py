@@ -1,5 +1,7 @@
 """The protocol that all stores share: make, resume, finish, open, and survive being killed."""
 
+import contextlib
+import errno
 import functools
 import gc
 import hashlib
@@ -8,12 +10,14 @@ import os
 import pickle
 import shutil
 import signal
-import subprocess
-import sys
+import threading
 import time
 import zipfile
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from multiprocessing import Pipe, get_context
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import fsspec
@@ -24,7 +28,7 @@ from part_fixtures import entries_to_change
 from zarr.storage import ZipStore
 
 import polarnet.storage.parts as parts_module
-from polarnet.storage.groups import Column, open_group
+from polarnet.storage.groups import Column, open_group, raise_shortage
 from polarnet.storage.parts import StorageConfig, Store
 
 NAMES = [f"s{i}" for i in range(5)]
@@ -222,6 +226,29 @@ def test_more_parts_are_read_than_files_may_be_open(finished, monkeypatch):
     assert len(os.listdir("/proc/self/fd")) <= before + 1
 
 
+def test_a_lack_of_descriptors_is_no_damage(finished, monkeypatch):
+    def refuse(path):
+        raise_shortage(OSError(errno.EMFILE, "Too many open files"), path)
+
+    store = Numbers.open(finished)
+    monkeypatch.setattr(parts_module, "open_group", refuse)
+    for read in (store.record, functools.partial(store.read_column, next(iter(store.columns)))):
+        with pytest.raises(RuntimeError, match="was not read, because the system gave no more") as refusal:
+            read(store.sequences[0])
+        assert "unreadable" not in str(refusal.value)
+
+
+def test_a_lack_of_threads_is_no_damage(finished, monkeypatch):
+    def refuse(*_):
+        raise RuntimeError("can't start new thread")
+
+    store = Numbers.open(finished)
+    monkeypatch.setattr(threading, "_start_new_thread", refuse)
+    with pytest.raises(RuntimeError, match="was not read, because the system gave no more") as refusal:
+        store.read_columns(store.sequences[0], [(name, 0, None) for name in store.columns])
+    assert str(finished) in str(refusal.value)
+
+
 def test_a_forked_process_shares_no_open_file_with_its_parent(finished):
     store = Numbers.open(finished)
     assert_whole(store)
@@ -296,19 +323,11 @@ def _rename_or_die(rename, last: str, source, target) -> None:
 
 def test_a_process_killed_at_any_moment_leaves_parts_whole_or_missing(finished, tmp_path):
     path = tmp_path / "store.zarr"
-    script = "import sys, test_parts as t; t._write_slowly(sys.argv[1])"
     done = set()
     for milliseconds in (2, 15, 30, 45):
-        writer = subprocess.Popen(
-            [sys.executable, "-c", script, str(path)],
-            stdout=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
-        )
-        assert writer.stdout is not None
-        assert writer.stdout.readline() == b"ready\n"
-        time.sleep(milliseconds / 1000)
-        writer.send_signal(signal.SIGKILL)
-        writer.wait()
+        with forked(_write_slowly, path) as writer:
+            time.sleep(milliseconds / 1000)
+        assert writer.exitcode == -signal.SIGKILL
         store = store_at(path)
         left = store.missing()
         for name in set(NAMES) - set(left):
@@ -323,25 +342,36 @@ def test_a_process_killed_at_any_moment_leaves_parts_whole_or_missing(finished, 
 
 def test_a_second_writer_is_refused_while_the_first_lives(tmp_path):
     path = tmp_path / "store.zarr"
-    script = "import sys, test_parts as t; store = t.store_at(t.Path(sys.argv[1])); print('ready', flush=True); input()"
-    with subprocess.Popen(
-        [sys.executable, "-c", script, str(path)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
-    ) as writer:
-        assert writer.stdout is not None
-        assert writer.stdout.readline() == b"ready\n"
-        with pytest.raises(ValueError, match=r"store\.zarr: another process is writing it; wait until that has ended"):
-            store_at(path)
-        writer.kill()
+    message = r"store\.zarr: another process is writing it; wait until that has ended"
+    with forked(_claim, path), pytest.raises(ValueError, match=message):
+        store_at(path)
     write_missing_and_finish(path)
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["store.zarr"]
 
 
-def _write_slowly(path: str) -> None:
-    store = store_at(Path(path))
-    print("ready", flush=True)
+@contextlib.contextmanager
+def forked(write: Callable[[Path, Connection], None], path: Path) -> Iterator[BaseProcess]:
+    """A process that has claimed a store and is killed at the end of the block."""
+    claimed, sender = Pipe(duplex=False)
+    process = get_context("fork").Process(target=write, args=(path, sender))
+    process.start()
+    try:
+        assert claimed.poll(60), "the process claims nothing"
+        yield process
+    finally:
+        process.kill()
+        process.join()
+
+
+def _claim(path: Path, claimed: Connection) -> None:
+    _store = store_at(path)
+    claimed.send(True)
+    signal.pause()
+
+
+def _write_slowly(path: Path, claimed: Connection) -> None:
+    store = store_at(path)
+    claimed.send(True)
     for name in store.missing():
         write(store, name)
         time.sleep(0.01)

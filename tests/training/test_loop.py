@@ -113,7 +113,14 @@ def killed(task: Task, at: int, stores: tuple[Path, Path], folder: Path) -> None
         run(dataclasses.replace(task, unroll=unroll), stores, folder)
 
 
-@pytest.mark.parametrize("killed_at", range(1, 17))
+STEPS = 16
+USUAL_STEPS = (1, 2, 8, 9, STEPS)  # the first and last of each epoch, and one in the middle of a batch
+
+
+@pytest.mark.parametrize(
+    "killed_at",
+    [step if step in USUAL_STEPS else pytest.param(step, marks=pytest.mark.thorough) for step in range(1, STEPS + 1)],
+)
 def test_a_training_killed_at_any_step_and_resumed_ends_as_if_nothing_had_happened(
     stores, tmp_path, undisturbed, killed_at
 ):
@@ -145,7 +152,7 @@ def same_content(content: Any, whole: bytes) -> bool:
     return True
 
 
-@pytest.mark.parametrize("killed_at", [4, 9])
+@pytest.mark.parametrize("killed_at", [4, pytest.param(9, marks=pytest.mark.thorough)])
 def test_so_does_one_that_muon_trains(stores, tmp_path, killed_at):
     def task() -> Task:
         return dataclasses.replace(small_task(), optimizer="muon")

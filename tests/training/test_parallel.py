@@ -2,7 +2,11 @@
 
 import dataclasses
 import os
+import signal
 import socket
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -16,6 +20,18 @@ from polarnet.training.history import read_history
 from polarnet.training.parallel import add_up, join, launched, place
 from polarnet.training.sequences import Batch, parts_of
 
+ASLEEP = """
+import os, pathlib, sys, time, torch
+from polarnet.training.parallel import join
+join(torch.device("cpu"))
+pathlib.Path(sys.argv[1], str(os.getpid())).touch()
+time.sleep(600)
+"""
+START = """
+from types import SimpleNamespace
+from polarnet.training.parallel import launched
+launched("asleep", SimpleNamespace(devices=2, nodes=1))
+"""
 CONFIG = dataclasses.replace(TRAIN, batch_size=5)  # of six visits: one process has nothing of the last batch
 
 
@@ -86,3 +102,22 @@ def test_a_stage_that_cannot_start_is_an_error(project_root):
     runtime = dataclasses.replace(load(project_root).runtime, devices=2)
     with pytest.raises(RuntimeError, match=r"stages\.missing: a process of 2 on this machine failed"):
         launched("stages.missing", runtime)
+
+
+def test_the_processes_of_a_training_end_with_the_one_that_started_them(tmp_path):
+    (tmp_path / "asleep.py").write_text(ASLEEP)
+    notes = tmp_path / "notes"
+    notes.mkdir()
+    paths = os.pathsep.join([str(tmp_path), *sys.path])
+    main = subprocess.Popen([sys.executable, "-c", START, str(notes)], env={**os.environ, "PYTHONPATH": paths})
+    until(lambda: len(list(notes.iterdir())) == 2 or main.poll() is not None)
+    main.kill()
+    assert main.wait() == -signal.SIGKILL
+    until(lambda: not any(Path("/proc", note.name).exists() for note in notes.iterdir()))
+
+
+def until(true) -> None:
+    start = time.monotonic()
+    while not true():
+        assert time.monotonic() - start < 300
+        time.sleep(0.05)

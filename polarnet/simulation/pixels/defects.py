@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from polarnet.runtime.sections import section
-from polarnet.simulation.compilation import compiled
+from polarnet.simulation.compilation import ONE, ZERO, compiled
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.columns import HOT, Columns, empty_columns, trimmed, with_room
 from polarnet.simulation.pixels.randomness import key_for, mixed, uniform
@@ -96,7 +96,7 @@ def with_defects(
 @compiled
 def _hot_events(defects, width, start_us, stop_us, rounds_up, columns):
     """Write the events of the hot pixels, pixel by pixel; returns the columns and the number of events."""
-    used, mean_us = 0, 1e6 / defects.rate_hz
+    used, mean_us = ZERO, 1e6 / defects.rate_hz
     key = ~key_for(defects.key, randomness.HOT, defects.channel)  # the key itself chose the pixels
     for i in defects.hot:
         pixel_key = mixed(key, i)
@@ -110,7 +110,7 @@ def _hot_events(defects, width, start_us, stop_us, rounds_up, columns):
                 draw += 2
                 if time_us < start_us:
                     continue
-                columns = with_room(columns, used, 1)
+                columns = with_room(columns, used, ONE)
                 columns.t[used] = math.ceil(time_us) if rounds_up else math.floor(time_us)
                 columns.y[used], columns.x[used] = i // width, i % width
                 columns.p[used] = 1 if mixed(span_key, draw - 1) >> np.uint64(63) else -1

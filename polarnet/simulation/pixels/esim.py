@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from polarnet.runtime.sections import section
-from polarnet.simulation.compilation import compiled
+from polarnet.simulation.compilation import ZERO, compiled
 from polarnet.simulation.pixels.columns import SIGNAL, event_of, place_of
 from polarnet.simulation.pixels.light import FULL_SCALE, intensity_rows, ln
 from polarnet.simulation.pixels.pending import pending_events, roomier, write_in_order
@@ -96,7 +96,7 @@ def _respond(light, frame, y, w, physics, table, dn, logarithm):
 def start(light, pixels, steps):
     """Set the reference to the first frame; nothing fires."""
     dn, table = np.empty(pixels.logarithm.size, np.float32), _table(steps.physics)
-    _respond(light, 0, 0, steps.width, steps.physics, table, dn, pixels.logarithm)
+    _respond(light, ZERO, ZERO, steps.width, steps.physics, table, dn, pixels.logarithm)
     pixels.reference[:] = pixels.logarithm
 
 
@@ -104,11 +104,11 @@ def start(light, pixels, steps):
 def advance(light, pixels, steps, columns):
     """Take the pixels through `steps`; returns the columns with the events, and the number of events."""
     physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
-    rows, table, used = rows_of_strip(h, w), _table(physics), 0
+    rows, table, used = rows_of_strip(h, w), _table(physics), ZERO
     strip = np.empty((2, rows * w), np.float32)
     pending = pending_events(h * w, columns.unrounded_us.size > 0)
     for k in range(times_us.size - 1):
-        n = 0
+        n = ZERO
         for y in range(0, h, rows):
             first, stop = y * w, min(y + rows, h) * w
             dn, logarithm = strip[0, : stop - first], strip[1, : stop - first]

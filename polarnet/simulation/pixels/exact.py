@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.simulation.compilation import borrowing, compiled, inlined
+from polarnet.simulation.compilation import ZERO, borrowing, compiled, inlined
 from polarnet.simulation.pixels import physics, randomness
 from polarnet.simulation.pixels.active import empty_active, gather, keep_continuing, scatter
 from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL, event_of, place_of
@@ -110,7 +110,7 @@ def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: 
 def start(light, pixels, steps):
     """Adapt the pixels to the first frame, and draw each pixel's phase of the leak and first shot-noise candidate."""
     physics, time_us = steps.physics, steps.times_us[0]
-    intensity_rows(light, 0, 0, steps.width, pixels.dn)
+    intensity_rows(light, ZERO, ZERO, steps.width, pixels.dn)
     linlog(pixels.dn, pixels.linlog)
     phase_key = key_for(steps.key, randomness.LEAK_PHASE, steps.channel)
     jitter_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
@@ -141,7 +141,7 @@ def advance(light, pixels, steps, columns):
     jitter = physics.leak_jitter if physics.leak_rate_hz > 0 else 0.0
     pending = pending_events(h * w, columns.unrounded_us.size > 0)
     soonest_us = np.array([pixels.next_shot_us[y * w : (y + rows) * w].min() for y in range(0, h, rows)])
-    used = 0
+    used = ZERO
     for k in range(times_us.size - 1):
         start_us, stop_us = times_us[k], times_us[k + 1]
         has_shots = soonest_us.min() < stop_us
@@ -149,7 +149,7 @@ def advance(light, pixels, steps, columns):
             physics, start_us, stop_us, stop_us - start_us, physics.refractory_s * 1e6, jitter, leak_key, shot_key,
             has_shots,
         )  # fmt: skip
-        n, count = 0, 0
+        n, count = ZERO, ZERO
         for y in range(0, h, rows):
             first, stop = y * w, min(y + rows, h) * w
             dn, response = strip[0, : stop - first], strip[1, : stop - first]
@@ -176,7 +176,7 @@ def advance(light, pixels, steps, columns):
             count = _activate(words, first, before, rise, pixels, step, active, count)
             if count >= BATCH or y + rows >= h:
                 pending, n = _fire(pixels, step, active, count, w, pending, n)
-                count = 0
+                count = ZERO
         if has_shots:
             for y in range(0, h, rows):
                 if soonest_us[y // rows] < stop_us:

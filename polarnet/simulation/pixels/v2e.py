@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.simulation.compilation import borrowing, compiled
+from polarnet.simulation.compilation import ONE, ZERO, borrowing, compiled
 from polarnet.simulation.pixels import physics, randomness
 from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL, sort_ties, with_room
 from polarnet.simulation.pixels.light import intensity_rows, linlog_8bit, linlog_as_v2e
@@ -106,7 +106,7 @@ def _respond(light, frame, y, w, dn, linlog):
 def start(light, pixels, steps):
     """Set low-pass and memory to the first frame; nothing fires."""
     dn, linlog = np.empty(pixels.memory.size, np.float32), np.empty(pixels.memory.size, np.float32)
-    _respond(light, 0, 0, steps.width, dn, linlog)
+    _respond(light, ZERO, ZERO, steps.width, dn, linlog)
     pixels.filtered[:] = linlog
     if pixels.photoreceptor.size:
         pixels.photoreceptor[:] = linlog
@@ -127,14 +127,14 @@ def advance(light, pixels, steps, columns):
     leak_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
     shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
     max_share = physics.threshold_on / pixels.threshold_on.min() + physics.threshold_off / pixels.threshold_off.min()
-    used = 0
+    used = ZERO
     for k in range(times_us.size - 1):
         number = steps.first_number + k
         dt = (times_us[k + 1] - times_us[k]) * 1e-6
         step = Step(
             physics, times_us[k], times_us[k + 1], dt, mixed(leak_key, number), mixed(shot_key, number), max_share
         )
-        n, most = 0, 0
+        n, most = ZERO, ZERO
         for y in range(0, h, rows):
             first, stop = y * w, min(y + rows, h) * w
             dn, linlog, noise = strip[0, : stop - first], strip[1, : stop - first], strip[2, : stop - first]
@@ -336,7 +336,7 @@ def _emit_shots(light, frame, pixels, step, w, columns, used):
         draw += 2
         if u >= on + off:
             continue
-        columns = with_room(columns, used, 1)
+        columns = with_room(columns, used, ONE)
         columns.t[used], columns.x[used], columns.y[used] = np.int64(np.rint(step.stop_us)), i - row * w, row
         columns.p[used] = 1 if u < on else -1
         if columns.label.size:

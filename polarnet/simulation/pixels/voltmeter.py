@@ -10,7 +10,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from polarnet.runtime.sections import one_of, section
-from polarnet.simulation.compilation import compiled
+from polarnet.simulation.compilation import ZERO, compiled
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.columns import SIGNAL, event_of, place_of
 from polarnet.simulation.pixels.light import intensity_rows
@@ -83,17 +83,17 @@ def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: 
 @compiled
 def start(light, pixels, steps):
     """Adapt the pixels to the first frame; nothing fires."""
-    intensity_rows(light, 0, 0, steps.width, pixels.dn)
+    intensity_rows(light, ZERO, ZERO, steps.width, pixels.dn)
 
 
 @compiled
 def advance(light, pixels, steps, columns):
     """Take the pixels through `steps`; returns the columns with the events, and the number of events."""
     times_us, h, w = steps.times_us, steps.height, steps.width
-    passage_key, used, dn = key_for(steps.key, randomness.FIRST_PASSAGE, steps.channel), 0, np.empty(w, np.float32)
+    passage_key, used, dn = key_for(steps.key, randomness.FIRST_PASSAGE, steps.channel), ZERO, np.empty(w, np.float32)
     pending = pending_events(h * w, columns.unrounded_us.size > 0)
     for k in range(times_us.size - 1):
-        n, key = 0, mixed(passage_key, steps.first_number + k)
+        n, key = ZERO, mixed(passage_key, steps.first_number + k)
         step = Step(steps.physics, times_us[k], times_us[k + 1] - times_us[k], key)
         for y in range(h):
             intensity_rows(light, steps.first_frame + k, y, w, dn)
