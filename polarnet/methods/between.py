@@ -20,7 +20,7 @@ from typing import Annotated, NamedTuple
 
 import torch
 from jaxtyping import Float
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -41,12 +41,12 @@ CHANNELS = ((0, 1), (1, 1), (0, -1), (1, -1))
 class BetweenConfig:
     """Section `between` of params.yaml: frames between windows (`polarnet recover --rate`)."""
 
-    reach: PositiveInt
+    reach: Annotated[int, Field(gt=0, le=1000)]
     """Search range in pixels for the scene's motion from window to window, along each axis; also the largest
     displacement of a frame."""
     share: Annotated[float, Field(ge=0, le=1)]
     """Weight of the change that events count, against the change that the motion predicts; 0: motion alone."""
-    width: PositiveInt
+    width: Annotated[int, Field(gt=0, le=1000)]
     """Width in pixels of the neighbourhood over which the difference of the two is averaged, odd."""
     threshold_on: PositiveFloat
     """Mean contrast thresholds of the camera, natural-log intensity."""

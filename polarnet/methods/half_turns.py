@@ -49,7 +49,7 @@ class HalfTurnsConfig:
     """Prior precision of b / a and c / a, relative to the sum of the weights."""
     silent_dolp: Annotated[float, Field(ge=0, le=1)]
     """DoLP of a pixel with fewer than three events in half a turn."""
-    spread_window: Annotated[int, Field(ge=1)]
+    spread_window: Annotated[int, Field(ge=1, le=1000)]
     """Side of the square, in pixels, whose variance of DoLP tells the expected error; odd."""
     spread_scale: PositiveFloat
     """Expected squared error over that variance."""

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import torch
 from jaxtyping import Float
-from pydantic import Field, NonNegativeInt, PositiveInt
+from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -24,13 +24,13 @@ class DolpUNetConfig:
 
     channels: list[PositiveInt]
     """Channels of C1; of S1 and G1; of S2, G2, R1 and R2. The paper has 32, 64, 128."""
-    swin_depth: PositiveInt
+    swin_depth: Annotated[int, Field(gt=0, le=100)]
     """Blocks per stage; every second block has shifted tiles."""
     swin_window: Annotated[int, Field(ge=2)]
     """Side of an attention tile in pixels."""
     swin_heads: list[PositiveInt]
     """Attention heads of S1 and S2."""
-    residual_blocks: NonNegativeInt
+    residual_blocks: Annotated[int, Field(ge=0, le=100)]
     """Number of residual blocks; the paper has two, R1 and R2."""
     input_mixing: Annotated[str, one_of(("polarizers", "contrasts"))]
     """Input of C1. polarizers: the four event tensors, as in the paper; contrasts: their sum and differences, on a

@@ -62,7 +62,7 @@ class StokesUNetConfig:
     binning: Binning
     """Side in pixels of the blocks whose events are averaged before anything else. Time falls with its square; the
     outputs are interpolated back to the sensor's size."""
-    channels: list[PositiveInt]
+    channels: list[Annotated[int, Field(gt=0, le=4096)]]
     """Channels at 1/2, 1/4, 1/8, ... of the resolution; at least three numbers."""
     memories: list[Annotated[float, Field(ge=0, le=0.999)]]
     """Decay per window of each event sum that feeds the redundancy solver (0: present window only)."""
@@ -70,9 +70,9 @@ class StokesUNetConfig:
     """Decay per window of each sum of second moments."""
     scales: list[NonNegativeInt]
     """Widths of the neighbourhoods solved together, in pixels at quarter resolution, odd; 0: the whole image."""
-    reach: PositiveInt
+    reach: Annotated[int, Field(gt=0, le=1000)]
     """Search range in pixels along each axis for the scene's motion from window to window."""
-    panorama_margin: PositiveInt
+    panorama_margin: Annotated[int, Field(gt=0, le=4096)]
     """Margin of the panorama beyond the image, in pixels at half resolution."""
     panorama_prior: PositiveFloat
     """This field and the next four set the panorama filter: see `polarnet.networks.panorama.Memory`."""

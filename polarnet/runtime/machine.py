@@ -13,7 +13,7 @@ from typing import Annotated, TypeVar
 import numba
 import numpy as np
 import torch
-from pydantic import Field, PositiveInt
+from pydantic import Field
 
 from polarnet.runtime.sections import section
 
@@ -36,9 +36,9 @@ class RuntimeConfig:
     """Threads of torch and numba in each process; 0: one per core."""
     workers: Annotated[int, Field(gt=0, le=4096)]
     """Number of processes that share the sequences."""
-    devices: PositiveInt
+    devices: Annotated[int, Field(gt=0, le=4096)]
     """Number of processes on this machine that share a training, each on its own GPU, or all on the processor."""
-    nodes: PositiveInt
+    nodes: Annotated[int, Field(gt=0, le=4096)]
     """Number of machines that share a training; the same command starts on each."""
     rendezvous: str
     """Address at which the machines meet: host:port of one of them."""
