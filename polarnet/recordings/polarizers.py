@@ -23,7 +23,7 @@ WINDOWS = 30  # the first second
 BLOCK = 4  # pixels, square; single pixels have too few events to compare
 MIN_BLOCKS = 1000  # with events in a window: the ratio of two misfits is then known to about 1 / sqrt(1000), 3 %
 HOT_PIXEL_FACTOR = 4.0
-DISTURBING_HZ = 10_000.0  # of one pixel: the shipped network's DoLP changes by 0.005 (rms), at 100,000 Hz by 0.08
+DISTURBING_HZ = 10_000.0  # of one pixel; faster ones change the shipped network's DoLP far from the pixel
 
 # Limits of misfits and counts: measured by studies/polarizers.py (docs/recover.md, section Checks).
 BETTER_FIT = 0.9  # misfit of other pairs over that of the pairs at right angles: lower only where the order is wrong
