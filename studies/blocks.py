@@ -357,6 +357,17 @@ BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
         "{polarizer_presets[number]} presets; fully polarized light at {polarizer_presets[angles]} angles, and "
         "`{polarizer_presets[scene]}`. {origin}",
     ),
+    "polarizer-checks": Block(
+        "recordings", "polarizers", "studies.polarizers --write", lambda results: results["polarizers"]["rows"],
+        {
+            "": "{kind}", "mean DoLP": "{dolp_from:g} to {dolp_to:g}", "recordings": "{recordings}",
+            "counts, busiest over quietest": "{counts_min:.2f} to {counts_max:.2f}",
+            "misfit ratio of the other pairings": "{misfit_min:.2f} to {misfit_max:.2f}",
+            "warned: no polarizers": "{warned_no_polarizers}", "warned: order": "{warned_order}",
+            "warned after an exchange": "{warned_exchanged} of {exchanged}",
+        },
+        "{polarizers[photographs]} photographs. {origin}",
+    ),
     "sensor-fit": _sensor_fit(
         "sensor_fit",
         "{sensor_fit[static_s]} s of constant light and {sensor_fit[moving_s]:g} s of drifting leaves with "

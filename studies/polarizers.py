@@ -1,15 +1,17 @@
-"""Margins of the checks on polarizers (polarnet/recordings/polarizers.py), on simulated recordings.
+"""Margins of the checks on polarizers (polarnet/recordings/polarizers.py): python -m studies.polarizers [--write]
 
-`python -m studies.polarizers` lets five sensors move over the built-in photographs, whose DoLP is reduced by
-factors down to 0, and looks at each recording as four channels and as a mosaic of pixels with Sony's order. It prints
-the docs' table: misfits, counts, and how many recordings each warning names, by the mean DoLP of what was seen.
+Five sensors move over the built-in photographs, whose DoLP is reduced by factors down to 0. Each recording is checked
+as four channels and as a mosaic of pixels with Sony's order, in its own order of angles and with two angles exchanged.
+`--write` puts the table into docs/results/recordings.json, under `polarizers`: a row for each kind of recording and
+each range of mean DoLP.
 """
 
-import argparse
 import dataclasses
 import functools
+import json
 from collections import defaultdict
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 from torch.nn.functional import interpolate
 
@@ -20,6 +22,7 @@ from polarnet.recordings.polarizers import WINDOW_US, channel_findings, pair_mis
 from polarnet.simulation import BUILTIN_PHOTOS, MOTIONS, SENSORS, read_rgb, scene_from_polarization, simulate
 from polarnet.simulation.scene import polarization_from_rgb
 from polarnet.stokes import parse_mosaic
+from studies.measure import ROOT, arguments_of, command_line, machine_record, write_section
 
 HEIGHT, WIDTH, DURATION_S = 160, 240, 0.4
 FACTORS = (1.0, 0.3, 0.1, 0.03, 0.0)
@@ -71,13 +74,29 @@ def result_of(name: str, dolp: float, channels: list[Events], mosaic: bool) -> R
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--photographs", type=int, help="the first so many; default: all")
-    options = parser.parse_args()
+def figures_of(kind: str, low: float, high: float, results: Sequence[Result]) -> dict[str, Any]:
+    """One row of the table: extremes of `results`, and how many of them each warning names."""
+    return {
+        "kind": kind,
+        "dolp_from": low,
+        "dolp_to": high,
+        "recordings": len(results),
+        "counts_min": min(r.spread for r in results),
+        "counts_max": max(r.spread for r in results),
+        "misfit_min": min(r.lowest for r in results),
+        "misfit_max": max(r.highest for r in results),
+        "warned_no_polarizers": sum(r.equal for r in results),
+        "warned_order": sum(r.order for r in results),
+        "warned_exchanged": sum(r.exchanged_45_90 + r.exchanged_90_135 for r in results),
+        "exchanged": 2 * len(results),
+    }
+
+
+def recordings_of(photographs: int | None) -> dict[str, list[Result]]:
+    """Results of every photograph, sensor and factor by the kind of recording."""
     motion = dataclasses.replace(MOTIONS["default"], sensor_height=HEIGHT, sensor_width=WIDTH, duration_s=DURATION_S)
     results = defaultdict(list)
-    for photo in BUILTIN_PHOTOS[: options.photographs]:
+    for photo in BUILTIN_PHOTOS[:photographs]:
         rgb = interpolate(read_rgb(photo.path)[None], (400, 600), mode="bilinear", antialias=True)[0].clamp(0, 1)
         s0, dolp, aolp = polarization_from_rgb(rgb)
         for sensor, config in SENSORS_CHECKED.items():
@@ -88,25 +107,29 @@ def main() -> None:
                 cells = [split_mosaic(events, ORDER)[number] for number, events in enumerate(simulation.events)]
                 results["mosaic"].append(result_of(*case, cells, mosaic=True))
         print(f"{photo.path.stem} done", flush=True)
-    print(
-        "| | mean DoLP | recordings | counts | misfits | warned of no polarizers | of the order | of exchanged orders |"
-    )
-    print("|---|---|---:|---:|---:|---:|---:|---:|")
-    for kind, rows in results.items():
+    return results
+
+
+def main() -> None:
+    parser = command_line(__doc__, "docs/results/recordings.json")
+    parser.add_argument("--photographs", type=int, help="the first so many; default: all")
+    options = arguments_of(parser)
+    record = machine_record(ROOT)
+    results = recordings_of(options.photographs)
+    rows = []
+    for kind, of_kind in results.items():
         for low, high in BANDS:
-            of = [row for row in rows if (low < row.dolp <= high or row.dolp == low == high)]
-            if of:
-                print(
-                    f"| {kind} | {f'{low:g} to {high:g}' if high else '0'} | {len(of)} "
-                    f"| {min(r.spread for r in of):.2f} to {max(r.spread for r in of):.2f} "
-                    f"| {min(r.lowest for r in of):.2f} to {max(r.highest for r in of):.2f} "
-                    f"| {sum(r.equal for r in of)} | {sum(r.order for r in of)} "
-                    f"| {sum(r.exchanged_45_90 + r.exchanged_90_135 for r in of)} of {2 * len(of)} |"
-                )
-    for kind, rows in results.items():
-        for row in rows:
-            if row.order or (row.equal and row.dolp >= 0.1) or (not row.equal and row.dolp == 0):
-                print(f"{kind}: {row}")
+            within = [r for r in of_kind if low < r.dolp <= high or r.dolp == low == high]
+            rows += [figures_of(kind, low, high, within)] if within else []
+    for kind, of_kind in results.items():
+        for result in of_kind:
+            if result.order or (result.equal and result.dolp >= 0.1) or (not result.equal and result.dolp == 0):
+                print(f"{kind}: {result}")
+    print(json.dumps(rows, indent=2))
+    if options.write:
+        photographs = len(BUILTIN_PHOTOS[: options.photographs])
+        figures = {"photographs": photographs, "sensors": list(SENSORS_CHECKED), "rows": rows}
+        print(write_section(ROOT, "recordings", "polarizers", figures, record))
 
 
 if __name__ == "__main__":
