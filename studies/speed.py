@@ -1,12 +1,14 @@
 """Time the first picture and the benchmark of own scenes, and check that launchers, clusters and stores change nothing.
 
-python -m studies.speed [demo] [scenes --scenes FOLDER] [launchers] [search] [dask] [s3] [ddp] --data FOLDER [--write]
+python -m studies.speed [demo] [scenes --scenes FOLDER [--methods NAMES] [--overrides KEY=VALUE ...]]
+    [launchers] [search] [dask] [s3] [ddp] --data FOLDER [--write]
 
 `demo` and `scenes` go to docs/results/speed.json, the others to docs/results/sweeps.json. `--data` is a folder that the
 stages up to `weights` filled with `experiment=smoke`.
 """
 
 import argparse
+import csv
 import filecmp
 import functools
 import itertools
@@ -77,11 +79,15 @@ def demo(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 
 def scenes(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Minutes of `polarnet benchmark --scenes` with all cores, and the number of scenes."""
-    seconds = polarnet("benchmark", "--scenes", options.scenes, "--out", folder / "scenes")
-    lines = (folder / "scenes" / "frames.csv").read_text().splitlines()[1:]
-    count = len({line.split(",")[1] for line in lines})
-    return {f"benchmark_{count}_scenes_minutes": round(seconds / 60, 2)}
+    """Minutes of `polarnet benchmark --scenes` with all cores, the number of scenes, and the rows of its table."""
+    methods = ["--methods", options.methods] if options.methods else []
+    out = folder / "scenes"
+    seconds = polarnet("benchmark", "--scenes", options.scenes, "--out", out, *methods, *options.overrides)
+    with (out / "frames.csv").open(newline="") as file:
+        frames = list(csv.DictReader(file))
+    count = len({frame["scene"] for frame in frames})
+    rows = list(dict.fromkeys(frame["method"] for frame in frames))
+    return {f"benchmark_{count}_scenes_minutes": round(seconds / 60, 2), "rows": rows}
 
 
 def launchers(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
@@ -294,6 +300,8 @@ def main() -> None:
     parser = command_line(__doc__, "docs/results/speed.json and sweeps.json")
     parser.add_argument("studies", nargs="+", choices=tuple(STUDIES))
     parser.add_argument("--scenes", type=Path, help="folder of photographs")
+    parser.add_argument("--methods", help="of scenes, separated by commas; default: those of params.yaml")
+    parser.add_argument("--overrides", nargs="*", default=[], help="of scenes: methods.firenet_published.weights=FILE")
     parser.add_argument("--data", type=Path, help="folder of the stages' data at smoke size")
     options = arguments_of(parser)
     if "scenes" in options.studies and not options.scenes:
