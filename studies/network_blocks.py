@@ -203,6 +203,7 @@ ROBUSTNESS_ROWS = (
     "firenet_published+gain",
     "ours",
     "ours, thresholds given",
+    "ours, 2x2 blocks",
 )
 
 
