@@ -22,10 +22,10 @@ from torch import Tensor
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Recoverer, State
 from polarnet.reports.maps import (
+    EventScale,
     angle_image,
     dolp_image,
     encode_png,
-    event_full_scale,
     event_image,
     intensity_image,
     polarization_hsv,
@@ -46,7 +46,6 @@ MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, the network needs all cores: a concurrent writing thread delays every operation
 SHEET_PICTURES = 3  # of recovered.png
 GAP = 4  # pixels between the maps of a picture
-SCALE_INERTIA = 0.9  # share of the previous picture's full scale of events, which prevents flicker
 ZARR_CONVENTIONS = {
     "t_us": "time of the frame, microseconds from the first event; without --rate the end of its window",
     "dolp": "degree of linear polarization, divided by 65535",
@@ -72,9 +71,8 @@ class _Sample:
     pictures: list[Picture]
     every: int = 1
 
-    def offer(self, number: int, picture: Picture) -> None:
-        if number % self.every == 0:
-            self.pictures.append(picture)
+    def offer(self, picture: Picture) -> None:
+        self.pictures.append(picture)
         if len(self.pictures) > 2 * MAX_FRAMES:
             self.pictures, self.every = self.pictures[::2], 2 * self.every
 
@@ -102,7 +100,7 @@ class RecoveryWriter:
         self.frames = 0
         self._plain = False
         self._sample = _Sample([])
-        self._scale: float | None = None
+        self._scale = EventScale()
         self._sheet: Sheet | None = None
         self._arrays = AppendedFrames(folder / "recovered.zarr", ZARR_CONVENTIONS)
         self._video = VideoWriter(folder / VIDEO, video_rate_hz)
@@ -156,20 +154,27 @@ class RecoveryWriter:
             self._add_to_zarr(window, prediction)
         if "exr" in self.outputs:
             _write_exr(self.folder / "exr" / f"{number:06d}.exr", prediction)
-        if "mp4" in self.outputs:
-            self._video.add(self._labelled(window, prediction))
-        if "png" not in self.outputs and number % self._sample.every:
+        sampled = number % self._sample.every == 0
+        if not (sampled or {"mp4", "png"} & set(self.outputs)):
             return
-        picture = self._picture(window, prediction)
-        self._sample.offer(number, Picture(window.stop_us, picture, _byte_maps(window, prediction)))
+        events = signed_events(window)
+        shown = event_image(events, self._scale.after(events))
+        if "mp4" in self.outputs:
+            self._video.add(self._labelled(window, prediction, shown))
+        if not sampled and "png" not in self.outputs:
+            return
+        picture = _side_by_side(prediction, shown)
+        if sampled:
+            self._sample.offer(Picture(window.stop_us, picture, _byte_maps(events, prediction)))
         if "png" in self.outputs:
             _write_png(self.folder / "png" / f"{number:06d}.png", picture)
 
-    def _labelled(self, window: EventWindow, prediction: Prediction) -> UInt8[np.ndarray, "h w 3"]:
+    def _labelled(
+        self, window: EventWindow, prediction: Prediction, events: UInt8[np.ndarray, "h w 3"]
+    ) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The picture of the video: events and DoLP above polarization and AoLP, with their truth where it is known."""
         if self._sheet is None:
             self._sheet = Sheet(*prediction.dolp.shape)
-        (events,) = self._sheet.events(signed_events(window)[None])
         above, below = [Panel("events", events)], []
         plain = plain_intensity(prediction)
         if plain is None:
@@ -199,18 +204,6 @@ class RecoveryWriter:
             intensities = None if own.intensities is None else own.intensities[0]
         return None if intensities is None else intensities.mean(0).float()
 
-    def _picture(self, window: EventWindow, prediction: Prediction) -> UInt8[np.ndarray, "h w 3"]:
-        events = signed_events(window)
-        present = event_full_scale(events)
-        self._scale = present if self._scale is None else SCALE_INERTIA * self._scale + (1 - SCALE_INERTIA) * present
-        plain = plain_intensity(prediction)
-        maps = [dolp_image(prediction.dolp) if plain is None else intensity_image(plain)]
-        if prediction.aolp is not None:
-            maps.append(angle_image(prediction.dolp, prediction.aolp))
-        maps.append(event_image(events, self._scale))
-        gap = np.full((maps[0].shape[0], GAP, 3), 255, np.uint8)
-        return with_even_sides(np.concatenate([part for one in maps for part in (one, gap)][:-1], axis=1))
-
     def _add_to_zarr(self, window: EventWindow, prediction: Prediction) -> None:
         plain = plain_intensity(prediction)
         name, values = ("dolp", prediction.dolp) if plain is None else ("intensity", plain)
@@ -220,6 +213,16 @@ class RecoveryWriter:
         if prediction.log_variance is not None:
             frame["log_variance"] = prediction.log_variance.numpy().astype(np.float32)
         self._arrays.add(frame)
+
+
+def _side_by_side(prediction: Prediction, events: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    plain = plain_intensity(prediction)
+    maps = [dolp_image(prediction.dolp) if plain is None else intensity_image(plain)]
+    if prediction.aolp is not None:
+        maps.append(angle_image(prediction.dolp, prediction.aolp))
+    maps.append(events)
+    gap = np.full((maps[0].shape[0], GAP, 3), 255, np.uint8)
+    return with_even_sides(np.concatenate([part for one in maps for part in (one, gap)][:-1], axis=1))
 
 
 def plain_intensity(prediction: Prediction) -> Float[Tensor, "h w"] | None:
@@ -242,10 +245,10 @@ def _quantised(values: Tensor, largest: int) -> np.ndarray:
     return values.round().clamp(0, largest).numpy().astype(np.uint16)
 
 
-def _byte_maps(window: EventWindow, prediction: Prediction) -> dict[Kind, UInt8[Tensor, "h w"]]:
+def _byte_maps(events: Float[Tensor, "h w"], prediction: Prediction) -> dict[Kind, UInt8[Tensor, "h w"]]:
     """The maps of a frame as bytes."""
     plain = plain_intensity(prediction)
-    maps: dict[Kind, Tensor] = {"events": signed_bytes(signed_events(window))}
+    maps: dict[Kind, Tensor] = {"events": signed_bytes(events)}
     if plain is not None:
         return maps | {"s0": fraction_bytes(plain)}
     if prediction.intensities is not None:

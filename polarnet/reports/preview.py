@@ -17,9 +17,9 @@ from polarnet.events.representations import polarity_sums
 from polarnet.events.stream import Events, slice_time
 from polarnet.reports.maps import (
     DOLP_TABLE,
+    EventScale,
     angle_image,
     dolp_image,
-    event_full_scale,
     event_image,
     intensity_image,
     polarization_hsv,
@@ -35,7 +35,6 @@ FONT_SIZE = 13  # pixels
 LINE = 22  # height of a line of text
 BAR = (10, 120)  # height and width of the colour bar of DoLP
 TEXT_COLOUR = np.array([31, 35, 40], np.float32)
-SCALE_INERTIA = 0.9  # share of the previous picture's full scale of events, which prevents flicker
 
 
 class Panel(NamedTuple):
@@ -53,13 +52,12 @@ class Sheet:
         longer = max(height, width)
         zoom = -(-MIN_PANEL // longer) if longer < MIN_PANEL else min(1.0, MAX_PANEL / longer)
         self._size = round(height * zoom), round(width * zoom)
-        self._scale: float | None = None
+        self._scale = EventScale()
 
     def events(self, sums: Float[Tensor, "n h w"]) -> list[UInt8[np.ndarray, "h w 3"]]:
         """Maps of ON minus OFF events, coloured on one scale."""
-        present = event_full_scale(sums)
-        self._scale = present if self._scale is None else SCALE_INERTIA * self._scale + (1 - SCALE_INERTIA) * present
-        return [event_image(image, self._scale) for image in sums]
+        scale = self._scale.after(sums)
+        return [event_image(image, scale) for image in sums]
 
     def picture(self, rows: Sequence[Sequence[Panel]], foot: str) -> UInt8[np.ndarray, "h2 w2 3"]:
         """Rows of panels above a line of text and the colour bar of DoLP, with even sides."""
@@ -173,11 +171,17 @@ def _write(picture: UInt8[np.ndarray, "h w 3"], text: str, left: int) -> None:
     place[:] = np.rint(place * (1 - ink) + TEXT_COLOUR * ink).astype(np.uint8)
 
 
+@functools.cache
+def _font() -> FT2Font:
+    font = FT2Font(findfont("DejaVu Sans"))  # comes with matplotlib
+    font.set_size(FONT_SIZE, 72)
+    return font
+
+
 @functools.lru_cache(maxsize=64)
 def _text(text: str) -> Float[np.ndarray, "line w"]:
     """Coverage of each pixel of a line by the letters, in [0, 1]."""
-    font = FT2Font(findfont("DejaVu Sans"))  # comes with matplotlib
-    font.set_size(FONT_SIZE, 72)
+    font = _font()
     font.set_text(text, 0.0)
     font.draw_glyphs_to_bitmap(antialiased=True)
     ink = np.asarray(font.get_image()) / 255
