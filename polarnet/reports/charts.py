@@ -47,7 +47,7 @@ def score_chart(metrics: Mapping[str, Mapping[str, Any]], columns: Mapping[str, 
     ]
     names = list(dict.fromkeys(value["metric"] for value in values))
     chosen = alt.param("metric", value=names[0], bind=alt.binding_select(options=names, name="Score "))
-    x = alt.X("value:Q", title=None, scale=alt.Scale(zero=False, nice=True))
+    x = alt.X("value:Q", title=None, scale=alt.Scale(zero=False, nice=True), axis=alt.Axis(tickCount=5))
     order = [legend.label(method) for method in methods]
     base = alt.Chart(alt.Data(values=values)).encode(
         y=alt.Y("method:N", sort=order, title=None, axis=METHOD_AXIS), color=alt.Color("colour:N", scale=None)

@@ -217,7 +217,7 @@ def _spoken(method: str, legend: Legend) -> str:
 
 def _against(mse: float, other: float) -> str:
     change = round(100 * (mse / other - 1)) if other else 0
-    return f"{abs(change)} % {'lower' if change < 0 else 'higher'} than" if change else "the same as"
+    return f"{abs(change)}\N{NO-BREAK SPACE}% {'lower' if change < 0 else 'higher'} than" if change else "the same as"
 
 
 def _best_method(metrics: Scores) -> str:

@@ -4,6 +4,7 @@
 const TITLES = { events: "Events", s0: "S0", dolp: "DoLP", aolp: "AoLP", error: "error of DoLP", paper: "AoLP and DoLP (Fig. 3)" };
 const FRAMES_PER_SECOND = 6;
 const FULL_ERROR = 0.5; // DoLP at the end of the colours
+const PANE_WIDTH = 220; // pixels of the page that a pane needs, with its gap
 
 /** Grey values of a strip: a byte for each pixel of each frame. */
 async function strip(source, width) {
@@ -67,6 +68,7 @@ class Player {
     panes.addEventListener("pointermove", (event) => this.point(event));
     panes.addEventListener("keydown", (event) => this.step(event));
     panes.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
+    new ResizeObserver(() => this.fit()).observe(panes);
     this.find("wiped").addEventListener("pointermove", (event) => {
       if (!event.buttons && event.pointerType === "mouse") return;
       const box = event.currentTarget.getBoundingClientRect();
@@ -132,6 +134,7 @@ class Player {
       return { map, figure, value, canvas, title: titled(map) };
     });
     this.find("panes").replaceChildren(...this.panes.map((pane) => pane.figure));
+    this.fit();
     const names = this.panes.map((pane) => pane.title);
     const truth = this.shown.findIndex((map) => map.source === "truth" && map.kind === quantity);
     const first = this.shown.findIndex((map) => map.source !== "truth" && map.kind === quantity);
@@ -140,6 +143,15 @@ class Player {
     this.find("wipe").hidden = names.length < 2;
     this.legends();
     this.draw();
+  }
+
+  /** Spread the panes over as few rows as have room for them, about equally many in each. */
+  fit() {
+    if (!this.panes) return; // the first scene is still being decoded
+    const panes = this.find("panes");
+    const most = Math.max(2, Math.floor(panes.clientWidth / PANE_WIDTH));
+    const rows = Math.ceil(this.panes.length / most);
+    panes.style.setProperty("--columns", Math.ceil(this.panes.length / rows));
   }
 
   legends() {
