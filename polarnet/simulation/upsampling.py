@@ -15,7 +15,7 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 MAX_STEP_PX = 1.0
-FLOW_QUANTILE = 0.999  # of the flow's length over the pixels: single pixels without texture get any flow
+FLOW_QUANTILE = 0.999  # quantile of the flow's length taken as the motion: pixels without texture get arbitrary flow
 
 
 class StokesFrame(NamedTuple):

@@ -22,8 +22,8 @@ from polarnet.simulation.rendering import behind_polarizers, split_channels, wei
 from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb
 from polarnet.simulation.upsampling import StokesFrame, upsampled
 
-MOTION_STEPS = 64  # rendered frames a piece of a moving sensor
-PIECE_PIXELS = 2**20  # of a piece of a video; its light and Stokes parameters take 28 bytes a pixel
+MOTION_STEPS = 64  # rendered frames in a piece of a moving sensor's simulation
+PIECE_PIXELS = 2**20  # pixels of all frames in a piece of a video; light and Stokes parameters take 28 bytes each
 MAX_PIECE_FRAMES = 64
 
 
@@ -35,7 +35,7 @@ class Piece(NamedTuple):
     events: list[Events]
     t_us: Int64[Tensor, " n"]
     stokes: Float32[Tensor, "n 3 h w"]
-    """On the pixels of a channel."""
+    """True (S0, S1, S2) on the pixels of a channel."""
 
 
 class Drawn(NamedTuple):
@@ -58,7 +58,7 @@ def moving_pieces(
     threads: int = 1,
     labels: bool = False,
 ) -> Iterator[Piece]:
-    """`simulate` in pieces: joined and read out, their events are those of `simulate`.
+    """Simulate a moving sensor in pieces; joined and read out (`leave_sensors`), the events are those of `simulate`.
 
     With `labels`, every event names its cause.
     """

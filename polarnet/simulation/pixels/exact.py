@@ -32,7 +32,7 @@ from polarnet.simulation.pixels.strips import SPARE, flag_words, flagged, flags_
 EIGHT_BIT_VIDEO = False
 MIN_LAG = np.float32(1e-12)  # a smaller lag becomes 0: processors are slow with denormal numbers
 LONG_AGO_US = -1e18
-BATCH = 2000  # active pixels: fewer are not worth a pass of their own
+BATCH = 2000  # minimum number of active pixels that are followed in one pass, except for the last strip
 LOG2_E = np.float32(1 / math.log(2))
 # 2^f - 1 on [-1/2, 1/2]: f times a polynomial (Taylor's to f^6, whose error is below 1e-7), in pairs (Estrin's scheme)
 # because processors wait less for short chains
@@ -85,7 +85,7 @@ class Step(NamedTuple):
 
 
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
-    """Pixels before their first frame, with the mismatch of their channel."""
+    """State of the pixels before the first frame, with the thresholds and leak rates drawn for this channel."""
     n = height * width
     threshold_on, threshold_off = threshold_maps(physics, n, key, channel)
     leak_factor = leak_factor_map(physics, n, key, channel)
@@ -130,7 +130,7 @@ def start(light, pixels, steps):
 
 @compiled
 def advance(light, pixels, steps, columns):
-    """Take the pixels through `steps`; returns the columns with the events, and the number of events."""
+    """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
     physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
     rows = rows_of_strip(h, w)
     strip = np.empty((4, rows * w), np.float32)
@@ -327,7 +327,7 @@ def _next_crossing(active, count, refractory_us, duration_us):
 
 @borrowing
 def _insert_shots(pixels, step, active, count):
-    """Let shot noise that precedes a pixel's next crossing take its place; the crossing stands if none is accepted."""
+    """Replace a pixel's next crossing by the first accepted shot-noise event before it, if there is one."""
     for a in range(count):
         i = active.pixel[a]
         on, off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
@@ -386,7 +386,7 @@ def _append_events(active, count, width, start_us, pending, n):
 
 @inlined
 def _store_state(pixels, active, count, start_us):
-    """Write the state at the end of the step back, as it is if no further event follows."""
+    """Write the state at the end of the step back to the pixels, assuming that no further event follows."""
     pixel = active.pixel[:count]
     for a in range(count):
         active.now[a] = start_us + active.last_event[a]

@@ -9,7 +9,7 @@ from polarnet.simulation.compilation import borrowing, compiled, inlined
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: the increment of SplitMix64 (Steele et al., OOPSLA 2014)
 MIX_1, MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)  # its output function, variant 13
 DIGITS, BYTE_SUMS = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
-DIGITS_MEAN, DIGITS_SCALE = np.float32(60.0), np.float32(1 / math.sqrt(170.0))  # of the sum of eight numbers in 0..15
+DIGITS_MEAN, DIGITS_SCALE = np.float32(60.0), np.float32(1 / math.sqrt(170.0))  # for sums of eight numbers in 0..15
 
 # Purposes: each random quantity of a channel has a key of its own.
 THRESHOLD_ON, THRESHOLD_OFF, NOISE_RATE, LEAK_PHASE, LEAK_JITTER, SHOT_NOISE, FIRST_PASSAGE = range(1, 8)
