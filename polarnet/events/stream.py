@@ -206,7 +206,7 @@ def _joined(streams: Sequence[Events]) -> Events:
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _fires(y, x, p, height, width, threshold):
-    """Which events move their pixel's polarity sum across a multiple of `threshold`."""
+    """Mask of the events at which a coarse pixel fires, each time that its polarity sum has moved by `threshold`."""
     sums = np.zeros((height, width))
     fired = np.zeros(len(p), dtype=np.bool_)
     for i in range(len(p)):
