@@ -1,4 +1,4 @@
-"""Encode events as dense network input. Every function states where the first and last event lie on its time axis."""
+"""Encode events as dense network input. Encodings that weight time state where the first and last event lie in it."""
 
 from collections.abc import Callable
 

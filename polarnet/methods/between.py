@@ -74,8 +74,8 @@ class Between(NamedTuple):
     """(x, y) in pixels per microsecond: the point now at p was at p + velocity * t, t microseconds ago; 0 where the
     events confirm no motion."""
     maps: Float[Tensor, "c h2 w2"]
-    """DoLP, the log-variance if predicted, and atanh(s1), atanh(s2) if AoLP is predicted; continued beyond the border
-    by `reach` + 1."""
+    """DoLP, the log-variance if predicted, and atanh(s1), atanh(s2) if AoLP is predicted; the border pixels are
+    repeated `reach` + 1 times on each side."""
     change: Float[Tensor, "2 h w"]
     """Change of atanh(s1) and atanh(s2) since the end of the window, counted by the events."""
     t_us: int

@@ -48,9 +48,9 @@ class Pixels(NamedTuple):
     """Events of all pixels, one pixel after the other."""
 
     first: np.ndarray
-    """Index of each pixel's first event, and the number of events."""
+    """[n + 1], index of each pixel's first event, then the number of events."""
     phase: np.ndarray
-    """Twice the polarizer's angle."""
+    """Twice the polarizer's angle at the event, radians."""
     cos: np.ndarray
     sin: np.ndarray
     p: np.ndarray

@@ -57,7 +57,7 @@ class ModulationConfig:
     noise: PositiveFloat
     """Standard deviation of the change between two events, relative to the threshold."""
     silence_noise: PositiveFloat
-    """The same for the largest change between two events, which must not exceed the threshold."""
+    """Standard deviation, relative to the threshold, of the largest change without an event, which stays below it."""
     extinction_ratio: Annotated[float, Field(gt=1)] | None
     """Transmission of the polarizer along its axis over that across it; null: infinite."""
     window_turns: PositiveFloat
@@ -79,10 +79,10 @@ class ModulationState(NamedTuple):
     """Memory of the pixels [h w] between windows: their thresholds, which outlast the scene, and their last events."""
 
     log_thresholds: Float64[np.ndarray, "2 h w"]
-    """Natural logarithm of the ON and OFF threshold over its mean."""
+    """Natural logarithm of the ON and OFF threshold over its mean; `variances` holds its variance."""
     variances: Float64[np.ndarray, "2 h w"]
     last_us: Float64[np.ndarray, "h w"]
-    """NaN before the first event."""
+    """Time of the last event; NaN before the first."""
     guess: Float64[np.ndarray, "3 h w"]
     """The last fit, from which the next one starts: artanh(DoLP) as a vector, logarithm of the level; NaN: none."""
 

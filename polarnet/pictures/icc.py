@@ -49,7 +49,7 @@ def read_tags(profile: bytes) -> dict[str, bytes]:
         raise ValueError(f"the embedded colour profile is damaged ({len(profile)} bytes without the mark of ICC)")
     space = profile[16:20].decode("ascii", "replace").strip()
     if space != "RGB":
-        raise ValueError(f"the embedded colour profile is for {space}, not for RGB; convert the file to RGB first")
+        raise ValueError(f"the embedded colour profile is one of {space}, not of RGB; convert the file to RGB first")
     (count,) = struct.unpack_from(">I", profile, 128)
     if 132 + 12 * count > len(profile):
         raise ValueError(f"the embedded colour profile is cut off ({len(profile)} bytes, {count} tags)")

@@ -44,7 +44,7 @@ class RotatingConfig:
     """Section `rotating` of params.yaml: a polarizer that rotates in front of one sensor."""
 
     rate_hz: float
-    """Turns per second; negative: from 0 towards 135 degrees."""
+    """Turns per second; with a negative rate, the polarizer turns from 0 towards 135 degrees."""
     start_angle_deg: Annotated[float, Field(ge=-360, le=360)]
     extinction_ratio: Annotated[float, Field(ge=1)] | None
     """Transmission along the axis over that across it; null: infinite."""
@@ -124,7 +124,7 @@ def emulate_rotating(
         (events,), state = emulate(frames, times, emulator, key, state)
         pieces.append(events)
     if state is None:
-        raise ValueError("expected at least one time")
+        raise ValueError("expected at least one time to render the light at, got none")
     return RotatingSimulation(concatenate(pieces), rotation, state)
 
 

@@ -88,7 +88,7 @@ def video_pieces(
     threads: int = 1,
     labels: bool = False,
 ) -> Iterator[Piece]:
-    """Events of a camera whose pixels see the pixels of the frames, and the frames themselves as truth.
+    """Simulate, in pieces, a camera at rest, each pixel of which sees one pixel of the frames; these are the truth.
 
     The pixels adapt to the first frame. The channels of a DoFP sensor see every second row and column, and their truth
     is the mean of each 2x2 cell. With `upsample`, the sensor also sees interpolated frames (`upsampled`). With
@@ -160,12 +160,12 @@ def simulate_video(
     upsample: bool = False,
     threads: int = 1,
 ) -> list[Events]:
-    """Events of the four channels of a camera at rest whose pixels see the pixels of `frames` at times `t_us`.
+    """Events of the four channels of a camera at rest, each pixel of which sees one pixel of `frames`.
 
-    Frames are RGB pictures as for `simulate`, or scenes. Times are whole microseconds, the first of them 0. With
-    `upsample`, interpolated frames are added so that nothing moves by more than about one pixel a step. The same
-    arguments give the same events on any number of threads. ValueError for times that do not fit the frames, and as
-    `simulate`.
+    Frames are RGB pictures as for `simulate`, or scenes. Their times `t_us` are whole microseconds, the first of them
+    0. With `upsample`, interpolated frames are added so that nothing moves by more than about one pixel a step. The
+    same arguments give the same events on any number of threads. ValueError for times that do not fit the frames, and
+    as `simulate`.
 
     >>> import torch
     >>> from polarnet.simulation import SENSORS, simulate_video

@@ -29,7 +29,7 @@ class Active(NamedTuple):
     final_change: np.ndarray
     """float64, change at the end of the step if no event follows"""
     event: np.ndarray
-    """int64, this round's event as `pending.event_of` encodes it"""
+    """int64, this round's event as `columns.event_of` encodes it"""
     threshold_on: np.ndarray
     threshold_off: np.ndarray
     leak: np.ndarray

@@ -27,11 +27,11 @@ class DefectsConfig:
     """Hot and dead pixels, for every pixel model."""
 
     hot_pixel_share: Share
-    """Probability of a pixel to be hot: to fire at random times, whatever its light."""
+    """Probability that a pixel is hot: it fires at random times, whatever its light."""
     hot_pixel_rate_hz: Annotated[float, Field(ge=0, le=MAX_RATE_HZ)]
     """Events per second of a hot pixel, ON and OFF together."""
     dead_pixel_share: Share
-    """Probability of a pixel to be dead: never to fire."""
+    """Probability that a pixel is dead: it never fires."""
 
 
 class Defects(NamedTuple):

@@ -291,7 +291,7 @@ def _fire(pixels, step, active, count, width, pending, n):
 
 @borrowing
 def _fire_once(pixels, step, active, count, width, pending, n):
-    """One round; returns the numbers of pending events and of pixels that may fire in the next round."""
+    """Run one round of `_fire`; return the numbers of pending events and of pixels that may fire in the next round."""
     _next_crossing(active, count, step.refractory_us, step.duration_us)
     active.continues[:count] = 0
     if step.has_shots:
@@ -398,7 +398,7 @@ def _store_state(pixels, active, count, start_us):
 
 @inlined
 def _bits(key, i, time_us):
-    """Random bits of pixel i for a draw at a time."""
+    """64 random bits of pixel i for a draw at `time_us`."""
     return mixed(key ^ np.uint64(np.float64(time_us).view(np.int64)), i)
 
 
@@ -412,7 +412,7 @@ def _jittered_leak(nominal, jitter, key, i, number):
 
 @compiled
 def _until_next_shot(physics, key, i, time_us, threshold_on, threshold_off):
-    """Microseconds to the next event of a Poisson process with the rate of the pixel in the dark."""
+    """Microseconds to the next event of a Poisson process with the pixel's shot-noise rate in the dark."""
     share = physics.threshold_on / threshold_on + physics.threshold_off / threshold_off
     rate_hz = physics.shot_noise_rate_hz / 2 * DARK_SHOT_NOISE * share
     return -1e6 * math.log(uniform(_bits(key, i, time_us))) / rate_hz

@@ -85,7 +85,7 @@ def write_in_order(pending, n, start_us, stop_us, columns, used):
 
 @compiled
 def _sort(events, longest_us, in_order):
-    """Sort by counting over buckets of time, then by insertion within a bucket."""
+    """Sort `events` into `in_order`: by counting over buckets of time, then by insertion within each bucket."""
     shift = TIME_SHIFT
     while longest_us >> (shift - TIME_SHIFT) >= MAX_BUCKETS:
         shift += 1

@@ -39,16 +39,16 @@ def uniform(bits):
 
 @inlined
 def rough_normal(bits):
-    """Mean 0, variance 1, nearly Gaussian, from 64 random bits: see `rough_normals`."""
+    """A nearly Gaussian number of mean 0 and variance 1 from 64 random bits: see `rough_normals`."""
     sums = ((bits & DIGITS) + ((bits >> np.uint64(4)) & DIGITS)) * BYTE_SUMS
     return (np.float32((sums >> np.uint64(24)) & np.uint64(255)) - DIGITS_MEAN) * DIGITS_SCALE
 
 
 @borrowing
 def rough_normals(key, first_pixel, values):
-    """Fill `values` (float32) with mean 0, variance 1, nearly Gaussian: standardised sums of eight 4-bit random digits.
+    """Fill `values` (float32) with nearly Gaussian numbers: standardised sums of eight random digits from 0 to 15.
 
-    Excess kurtosis -0.15, |value| <= 4.6. For jitter that every pixel draws in every step: one hash serves two pixels.
+    Mean 0, variance 1, excess kurtosis -0.15, |value| <= 4.6. One hash serves two pixels, to save time.
     """
     half = (values.size + 1) // 2
     left, right = values[:half], values[values.size - half :]

@@ -184,7 +184,7 @@ def _buffer(photoreceptor, filtered, share):
 
 @borrowing
 def _leak(memory, threshold_on, leak_factor, noise, dt, physics):
-    """The reset switch leaks, so the reference sinks and a dark, motionless scene keeps firing ON events."""
+    """Lower each memory by the leak of the reset switch, which makes a dark, motionless scene fire ON events."""
     one, dt, rate, jitter = (
         np.float32(1),
         np.float32(dt),
@@ -303,7 +303,7 @@ def _consume(pixels, entries, n):
 
 @borrowing
 def _label(pixels, physics, i, time_us, polarity):
-    """LEAK for an ON event where the leak made up more than half a threshold."""
+    """Label of an event, whose time is remembered: LEAK for ON after a leak of over half a threshold, else SIGNAL."""
     leaked = physics.leak_rate_hz * pixels.leak_factor[i] * (time_us - pixels.last_event_us[i]) * 1e-6
     pixels.last_event_us[i] = time_us
     return LEAK if polarity > 0 and leaked > 0.5 else SIGNAL

@@ -58,7 +58,7 @@ class Pixels(NamedTuple):
     dn: np.ndarray
     """float32, light of the last frame, DN."""
     voltage: np.ndarray
-    """float64, thresholds since the last event."""
+    """float64, change since the last event, in thresholds."""
 
 
 class Step(NamedTuple):
