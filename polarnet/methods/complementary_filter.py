@@ -37,7 +37,7 @@ class FilterConfig:
     decay_per_event: NonNegativeFloat
     """k >= 0: a pixel's log intensity shrinks by exp(-k) at each of its events, independent of time."""
     contrast_on: PositiveFloat
-    """Step in log intensity per ON event."""
+    """c of an ON event: its step in log intensity."""
     contrast_off: Annotated[float, Field(le=0)]
     intensity_range: list[float]
     """Intensities mapped to 0 and 1, in all four channels."""

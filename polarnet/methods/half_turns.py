@@ -52,9 +52,9 @@ class HalfTurnsConfig:
     spread_window: Annotated[int, Field(ge=1, le=1000)]
     """Side in pixels, odd, of the square around a pixel in which the variance of DoLP gives the expected error."""
     spread_scale: PositiveFloat
-    """Expected squared error over that variance."""
+    """Expected squared error of DoLP over that variance."""
     variance_floor: PositiveFloat
-    """Smallest expected squared error."""
+    """Smallest expected squared error of DoLP."""
 
     def __post_init__(self):
         if self.spread_window % 2 == 0:
@@ -80,7 +80,7 @@ def fit_half_turn(
     size = events.height, events.width
     pixel = recent.y.numpy().astype(np.int64) * events.width + recent.x.numpy()
     lag = config.lag(rotation)
-    delay = math.copysign(float(np.angle(lag)), -rotation.rate_hz)  # the events show where the polarizer has been
+    delay = math.copysign(float(np.angle(lag)), -rotation.rate_hz)  # events lag, so they show an earlier angle
     phase = 2 * rotation.at(recent.t.numpy()) + delay
     step = np.where(recent.p.numpy() > 0, config.threshold_on, -config.threshold_off)
     fitted = _fit(pixel, np.cos(phase), np.sin(phase), step, events.height * events.width, config.ridge)

@@ -35,7 +35,7 @@ class RandomisedConfig:
                 try:
                     dataclasses.replace(self, randomise=None, **{name: _repeated(getattr(self, name), bound)})
                 except ValueError as error:
-                    first_line, _, _ = str(error).partition("\n")  # every value of a list is wrong alike
+                    first_line, _, _ = str(error).partition("\n")  # the others say the same of further list values
                     raise ValueError(f"randomise.{first_line}") from None
 
 

@@ -95,7 +95,7 @@ def make_folder_set(
 
 
 def kind_of(root: Path) -> str:
-    """`polarization` where the folder holds .npz files or pictures of four angles of one thing, else `photographs`.
+    """`polarization` if a folder holds .npz files or pictures NAME_0, NAME_45, NAME_90, NAME_135, else `photographs`.
 
     Raw mosaics look like photographs: name their kind.
     """

@@ -26,7 +26,7 @@ class StokesFrame(NamedTuple):
 
 
 def upsampled(frames: Iterable[StokesFrame]) -> Iterator[StokesFrame]:
-    """The frames, and interpolated ones between them, evenly spaced in whole microseconds."""
+    """Yield the frames, with interpolated frames evenly spaced between them, at whole microseconds."""
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     before: StokesFrame | None = None
     for after in frames:

@@ -1,4 +1,4 @@
-"""Events of a sequence on disk while they arrive: one file a column and channel, read back through memory maps."""
+"""Events of a sequence on disk while they arrive: a file for each column of each channel, read as memory maps."""
 
 from collections.abc import Sequence
 from pathlib import Path

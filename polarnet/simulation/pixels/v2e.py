@@ -69,7 +69,7 @@ class Firing(NamedTuple):
     entries: np.ndarray
     """int32 [h * w + 1, 4], a row per pixel: PIXEL, PLACE, CROSSED, ACCEPTED."""
     order: np.ndarray
-    """int32, scratch: entries with events left."""
+    """int32, working memory: indices of the entries with events left."""
     words: np.ndarray
     """uint64, flags of a strip."""
     candidates: np.ndarray
