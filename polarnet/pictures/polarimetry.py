@@ -187,10 +187,10 @@ def _measurement(values: Float64[np.ndarray, "4 h w"], saturated: Bool[np.ndarra
 
 
 def white_level(values: Shaped[np.ndarray, "n h w"]) -> float:
-    """The level at which values saturate.
+    """Level at which values saturate; UnreadablePicture unless they have 8 or 16 bits or are floats in [0, 1].
 
-    16-bit files saturate at the lowest of 10, 12, 14 and 16 bits that holds all values, because cameras often leave the
-    upper bits empty.
+    16-bit values are assumed to saturate at the lowest of 10, 12, 14 and 16 bits that holds them all, because cameras
+    often leave the upper bits empty.
     """
     if values.dtype == np.uint8:
         return 255.0
