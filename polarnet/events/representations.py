@@ -1,4 +1,4 @@
-"""Encode events as dense network input. Every function states where the first and last event lie on its time axis."""
+"""Encode events as dense network input. Encodings that weight time state where the first and last event lie in it."""
 
 from collections.abc import Callable
 
@@ -35,8 +35,8 @@ def polarity_sums(events: Events) -> Float[Tensor, "h w"]:
 def voxel_grid(events: Events, bins: int) -> Float[Tensor, "bins h w"]:
     """Each polarity split between the two nearest of `bins` instants (E2VID, Rebecq et al. 2019).
 
-    t* = (bins - 1) (t - first) / (last - first): the first event is in bin 0 and the last in bin n-1, whatever the
-    window's length. Bilinear in time only. If all events have the same time, they are in bin 0. ValueError for no bins.
+    t* = (bins - 1) (t - first) / (last - first): the first event is in bin 0 and the last in bin (bins - 1), whatever
+    the window's length. If all events have the same time, they are in bin 0. ValueError for no bins.
     """
     if bins < 1:
         raise ValueError(f"voxel_grid: expected at least one bin, got {bins}")

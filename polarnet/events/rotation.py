@@ -11,12 +11,12 @@ MIN_TRIGGERS = 2
 
 @dataclass(frozen=True)
 class Rotation:
-    """Angle of the polarizer's axis at known times; the rotation is even between them and goes on evenly outside."""
+    """Angle of the polarizer's axis at known times, interpolated linearly between them and extrapolated outside."""
 
     times_us: Float64[np.ndarray, " n"]
     """At least two, increasing."""
     angles: Float64[np.ndarray, " n"]
-    """Radians, without a jump at each turn."""
+    """Radians, unwrapped: a full turn adds 2 pi."""
 
     def __post_init__(self):
         if self.times_us.shape != self.angles.shape or len(self.times_us) < MIN_TRIGGERS:
@@ -50,7 +50,7 @@ class Rotation:
 
 
 def steady_rotation(rate_hz: float, start_angle: float = 0.0) -> Rotation:
-    """The polarizer turns at `rate_hz` from `start_angle` (radians) at time 0."""
+    """Rotation at `rate_hz` turns per second from `start_angle` (radians) at time 0; ValueError for a rate of 0."""
     if not (math.isfinite(rate_hz) and rate_hz):
         raise ValueError(f"rotation: expected a rate in turns per second other than 0, got {rate_hz}")
     return Rotation(
@@ -61,7 +61,7 @@ def steady_rotation(rate_hz: float, start_angle: float = 0.0) -> Rotation:
 def triggered_rotation(
     trigger_us: Int64[np.ndarray, " n"], start_angle: float = 0.0, turns_per_trigger: float = 1.0
 ) -> Rotation:
-    """The polarizer is at `start_angle` (radians) at the first trigger, and turns on to each next trigger."""
+    """Rotation from `start_angle` (radians) at the first trigger, by `turns_per_trigger` to each next trigger."""
     if len(trigger_us) < MIN_TRIGGERS:
         raise ValueError(f"rotation: expected at least two trigger times, got {len(trigger_us)}; give the rate instead")
     turns = turns_per_trigger * np.arange(len(trigger_us))

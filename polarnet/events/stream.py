@@ -133,14 +133,14 @@ def slice_count(events: Events, start: int, stop: int) -> Events:
 
 
 def select(events: Events, which: slice | Bool[Tensor, " n"] | Int64[Tensor, " m"]) -> Events:
-    """Events of a slice, of a mask, or in the order of their indices, with their labels."""
+    """Events chosen by a slice, a mask, or indices in any order, with their labels."""
     label = None if events.label is None else events.label[which]
     t, x, y, p = (getattr(events, name)[which] for name in _COLUMNS)
     return Events(t, x, y, p, events.height, events.width, label)
 
 
 def crop(events: Events, top: int, left: int, height: int, width: int) -> Events:
-    """Events of a part of the sensor, with coordinates from its own corner; ValueError if it exceeds the sensor."""
+    """Events in a part of the sensor, in coordinates from the part's corner; ValueError if it exceeds the sensor."""
     if not (0 <= top <= top + height <= events.height and 0 <= left <= left + width <= events.width):
         raise ValueError(
             f"crop: rows {top} to {top + height} and columns {left} to {left + width} are not on a sensor of "
@@ -206,7 +206,7 @@ def _joined(streams: Sequence[Events]) -> Events:
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _fires(y, x, p, height, width, threshold):
-    """Which events move their pixel's polarity sum across a multiple of `threshold`."""
+    """Mask of the events at which a coarse pixel fires, each time that its polarity sum has moved by `threshold`."""
     sums = np.zeros((height, width))
     fired = np.zeros(len(p), dtype=np.bool_)
     for i in range(len(p)):

@@ -14,7 +14,7 @@ from polarnet.events.stream import Events, concatenate, slice_count
 
 SHORTEST_STEP_US = 100
 MAX_PAUSE_US = 3_600_000_000
-"""Longest time without an event; a longer one is a damaged time stamp, and would give windows without end."""
+"""Longest accepted time without an event; a longer one comes from a damaged time stamp and gives endless windows."""
 TRAINED_WINDOW_US = 33_333
 """Window length in the training of the networks, 1/30 s."""
 

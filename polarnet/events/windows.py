@@ -33,7 +33,7 @@ def cut_windows(events: Events, t_us: Int64[Tensor, " n"]) -> list[Events]:
 
 
 def encode_windows(channels: Sequence[Events], t_us: Integer[Array, " n"], encode: Encode) -> Float[Tensor, "t c h w"]:
-    """Encode every window of every channel, channel by channel along the second axis.
+    """Encode every window between consecutive times `t_us`; the second axis holds the channels one after the other.
 
     ValueError for fewer than two frame times, which leave no window, and for times that do not increase.
     """

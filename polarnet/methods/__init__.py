@@ -1,4 +1,4 @@
-"""Methods from events to DoLP, one record each, collected from the modules of this folder."""
+"""Methods from events to DoLP: the `Method` records of all modules in this folder."""
 
 import importlib
 import pkgutil

@@ -1,16 +1,16 @@
 """DoLP between windows: the frame at the end of a window moves with the scene, and every event corrects it.
 
-A network predicts a frame at the end of each window, at the cost of a whole run. Two sources say how the frame goes on
-until the next one, and both are cheap:
+A network predicts a frame at the end of each window, at the cost of a whole run. Until the next frame, two cheap
+sources continue it:
 
-- Motion. The displacement of the events from the last window but one to the last window is that of the scene
+- Motion. The displacement between the events of the last two windows is that of the scene
   (`polarnet.networks.panorama.displacements`). The frame keeps moving at this velocity.
 - Events. log I0 - log I90 = 2 atanh(s1) and log I45 - log I135 = 2 atanh(s2), so an event of threshold c changes
   atanh(s1) or atanh(s2) of its pixel by c / 2.
 
-The events of single pixels are noisy, because thresholds differ between pixels. Their account of the change replaces
-that of the motion only in part (`BetweenConfig.share`), after a mean over neighbouring pixels. A frame at time t uses
-events before t only.
+The events of single pixels are noisy, because thresholds differ between pixels. The change that they count therefore
+replaces the change that the motion predicts only in part (`BetweenConfig.share`), after a mean over neighbouring
+pixels. A frame at time t uses events before t only.
 """
 
 import dataclasses
@@ -64,7 +64,7 @@ class BetweenConfig:
 
 
 class Between(NamedTuple):
-    """The frame at the end of the latest window, and what has happened since."""
+    """State between windows: the frame at the end of the latest window, its velocity, and the events since."""
 
     window: EventWindow
     """The window, whose events the next search of the motion needs."""
@@ -74,8 +74,8 @@ class Between(NamedTuple):
     """(x, y) in pixels per microsecond: the point now at p was at p + velocity * t, t microseconds ago; 0 where the
     events confirm no motion."""
     maps: Float[Tensor, "c h2 w2"]
-    """DoLP, the log-variance if predicted, and atanh(s1), atanh(s2) if AoLP is predicted; continued beyond the border
-    by `reach` + 1."""
+    """DoLP, the log-variance if predicted, and atanh(s1), atanh(s2) if AoLP is predicted; the border pixels are
+    repeated `reach` + 1 times on each side."""
     change: Float[Tensor, "2 h w"]
     """Change of atanh(s1) and atanh(s2) since the end of the window, counted by the events."""
     t_us: int
@@ -99,12 +99,12 @@ def anchored(before: Between | None, window: EventWindow, prediction: Prediction
 
 
 def carried(state: Between, channels: Sequence[Events], t_us: int, config: BetweenConfig) -> tuple[Between, Prediction]:
-    """State and frame at a time no earlier than that of the state; of the events, only those between both count.
+    """State and frame at `t_us`, no earlier than the time of the state; only events between the two times count.
 
     Let u be (atanh s1, atanh s2) at the end of the window, u(p + d) the same moved by the displacement d, and e the
     change counted by events. Then u(p + d) + share * mean(e - (u(p + d) - u(p))) is the frame at p. DoLP moves too, and
-    changes as the length of (s1, s2) does. A frame without AoLP moves only. At the end of the window, the frame is that
-    of the method.
+    changes as much as the length of (s1, s2). A frame without AoLP only moves. At the end of the window, the frame is
+    the method's own.
     """
     change = _counted(state.change, [slice_time(events, state.t_us, t_us) for events in channels], config)
     state = state._replace(change=change, t_us=t_us)
@@ -141,7 +141,7 @@ def _polarity(window: EventWindow) -> Float[Tensor, "h w"]:
 def _counted(
     change: Float[Tensor, "2 h w"], channels: Sequence[Events], config: BetweenConfig
 ) -> Float[Tensor, "2 h w"]:
-    """`change` with further events of the four channels."""
+    """`change` of atanh(s1) and atanh(s2) plus the change from further events of the four channels."""
     change = change.clone()
     for events, (row, sign) in zip(channels, CHANNELS, strict=True):
         step = torch.where(events.p > 0, config.threshold_on, -config.threshold_off)

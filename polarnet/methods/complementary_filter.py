@@ -35,9 +35,9 @@ class FilterConfig:
     cutoff_hz: NonNegativeFloat
     """Cutoff frequency, below which the scene fades to grey; 0: never."""
     decay_per_event: NonNegativeFloat
-    """Natural logarithm of a pixel's decay at each of its events, independent of time."""
+    """k >= 0: a pixel's log intensity shrinks by exp(-k) at each of its events, independent of time."""
     contrast_on: PositiveFloat
-    """Step in log intensity per ON event."""
+    """c of an ON event: its step in log intensity."""
     contrast_off: Annotated[float, Field(le=0)]
     intensity_range: list[float]
     """Intensities mapped to 0 and 1, in all four channels."""
@@ -48,7 +48,7 @@ class FilterConfig:
 
     @property
     def rate_per_us(self) -> float:
-        """Rate of the decay over time."""
+        """Decay rate omega of the log intensity, per microsecond."""
         return 2 * math.pi * self.cutoff_hz * 1e-6
 
 
@@ -116,7 +116,7 @@ def _integrate(log_intensity, updated_us, t, x, y, p, rate_per_us, per_event, co
 
 
 def open_filter(setup: Setup, intensity: Callable[[Image], Image]) -> Recoverer:
-    """Filter as a method, which integrates in each window the events that no earlier window held."""
+    """Wrap the filter as a method; each window integrates only the events that no earlier window held."""
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
         images = []

@@ -99,14 +99,14 @@ def _bin(network: nn.Module, metadata: Mapping[str, Any], side: int) -> None:
 
 
 def _stokes_unet(network: nn.Module, metadata: Mapping[str, Any], option: str) -> StokesUNet:
-    """The network, if it is the one that has this option."""
+    """Return the network if it is polarnet's own, which alone has this option; ValueError for another network."""
     if not isinstance(network, StokesUNet):
         raise ValueError(f"{option}: expected network polarnet, got {metadata['network']}; leave {option} out")
     return network
 
 
 def weighted_counts(steps: Sequence[float]) -> Encode:
-    """Return `event_counts` in which an ON and an OFF event count as `steps`."""
+    """Return an encoding like `event_counts`, in which an ON event counts steps[0] and an OFF event steps[1]."""
 
     def encode(events: Events, window_us: int) -> Float[Tensor, "2 h w"]:
         polarity, count = event_counts(events, window_us)

@@ -50,11 +50,11 @@ class HalfTurnsConfig:
     silent_dolp: Annotated[float, Field(ge=0, le=1)]
     """DoLP of a pixel with fewer than three events in half a turn."""
     spread_window: Annotated[int, Field(ge=1, le=1000)]
-    """Side of the square, in pixels, whose variance of DoLP tells the expected error; odd."""
+    """Side in pixels, odd, of the square around a pixel in which the variance of DoLP gives the expected error."""
     spread_scale: PositiveFloat
-    """Expected squared error over that variance."""
+    """Expected squared error of DoLP over that variance."""
     variance_floor: PositiveFloat
-    """Smallest expected squared error."""
+    """Smallest expected squared error of DoLP."""
 
     def __post_init__(self):
         if self.spread_window % 2 == 0:
@@ -80,7 +80,7 @@ def fit_half_turn(
     size = events.height, events.width
     pixel = recent.y.numpy().astype(np.int64) * events.width + recent.x.numpy()
     lag = config.lag(rotation)
-    delay = math.copysign(float(np.angle(lag)), -rotation.rate_hz)  # the events show where the polarizer has been
+    delay = math.copysign(float(np.angle(lag)), -rotation.rate_hz)  # events lag, so they show an earlier angle
     phase = 2 * rotation.at(recent.t.numpy()) + delay
     step = np.where(recent.p.numpy() > 0, config.threshold_on, -config.threshold_off)
     fitted = _fit(pixel, np.cos(phase), np.sin(phase), step, events.height * events.width, config.ridge)
@@ -93,7 +93,7 @@ def fit_half_turn(
 
 
 def half_turns_recoverer(config: HalfTurnsConfig, rotation: Rotation) -> Recoverer:
-    """The fit as a method: the sensor's events may be in any channel, the other channels are empty."""
+    """Wrap the fit as a method; the sensor's events may be in any channel, and the other channels are empty."""
 
     def start(height: int, width: int) -> Events:
         return Events.empty(height, width)
@@ -136,7 +136,7 @@ def _fit(
 ) -> Float64[np.ndarray, "3 count"]:
     """b / a, c / a and the number of events of each pixel, from events in time order."""
     level = np.zeros(count)  # sum of a pixel's steps since its first event
-    sums = np.zeros((count, 8))  # of w x (1, cos, sin, cos cos, cos sin, sin sin) and y w x (cos, sin); y w = 1 / y
+    sums = np.zeros((count, 8))  # sums of w (1, cos, sin, cos cos, cos sin, sin sin) and y w (cos, sin); y w = 1 / y
     fitted = np.zeros((3, count))
     ones = np.zeros(count)
     for k in range(len(pixel)):

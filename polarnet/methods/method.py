@@ -1,4 +1,4 @@
-"""The record of a method: its name, settings and weights, and its step from window to window."""
+"""Types of a method: its record (`Method`), its inputs (`Setup`) and its steps from window to window (`Recoverer`)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -93,7 +93,7 @@ class Weights:
     trained_by: str | None = None
     """Training whose best.safetensors is used if `methods.NAME.weights` is null; None: no training."""
     remedy: str = ""
-    """Advice on obtaining weights other than from a file."""
+    """Advice in messages on how to obtain weights without a file, for example by training."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class Method:
     wraps: "Method | None" = None
     """Wrapped method, whose predictions `convert` turns into those of this method."""
     convert: Callable[[Setup, State, Prediction], tuple[State, Prediction]] | None = None
-    """Setup, state (None at the start) and prediction of the wrapped method -> state, prediction."""
+    """(setup, state (None at the start), prediction of the wrapped method) -> (new state, prediction)."""
 
     @property
     def section(self) -> str:

@@ -1,4 +1,4 @@
-"""The fit of a rotating polarizer's modulation, pixel by pixel: the response to it, and compiled least squares."""
+"""Compiled least-squares fit of each pixel's modulation by a rotating polarizer, for `rotating_polarizer`."""
 
 import functools
 import itertools
@@ -12,16 +12,16 @@ from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION
 
 TWO_PI = 2 * math.pi
-UNKNOWNS = 5  # artanh(DoLP) (cos 2 AoLP, sin 2 AoLP), logarithms of both thresholds over their means, logarithm of l
-G_STEP, G_SIZE = 0.05, 52  # table of the lag: g = artanh(DoLP) up to 2.55, DoLP up to 0.988
-LEVEL_FIRST, LEVEL_STEP, LEVEL_SIZE = math.log(2.0), 0.1, 51  # logarithm of l, from 2 to 297 DN
-PHASES, SUBSTEPS = 192, 4  # table of the lag: phases of a period, and steps of its solution for each
-COARSE_NOISE = 0.1  # a first fit allows for larger residuals, so that it finds the right minimum
-RESTART_COST = 0.1  # cost for each event above which a pixel restarts from other initial values:
+UNKNOWNS = 5  # artanh(DoLP) (cos 2 AoLP, sin 2 AoLP), ln(ON and OFF threshold / mean), level: ln(mean light l in DN)
+G_STEP, G_SIZE = 0.05, 52  # axis of the lag tables: g = artanh(DoLP) up to 2.55, DoLP up to 0.988
+LEVEL_FIRST, LEVEL_STEP, LEVEL_SIZE = math.log(2.0), 0.1, 51  # axis of the lag tables: the level, from 2 to 297 DN
+PHASES, SUBSTEPS = 192, 4  # phases per period in the lag table, and steps of its numerical solution per phase
+COARSE_NOISE = 0.1  # minimum `noise` of the first fit: larger residuals help it to find the right minimum
+RESTART_COST = 0.1  # cost per event above which a pixel restarts from the initial values of the next two lines
 RESTART_G = (1.5, 0.3)
 RESTART_LEVELS = (6.0, 10.0, 15.0, 23.0, 34.0, 50.0, 75.0, 110.0)  # DN, because the knee makes a minimum at each level
 ITERATIONS = 20
-CONVERGED = 1e-4  # decrease of the cost
+CONVERGED = 1e-4  # decrease of the cost in an iteration, below which the fit stops
 DAMPING, DAMPING_MIN, DAMPING_MAX, DAMPING_FACTOR = 1e-2, 1e-7, 1e5, 10.0
 PIVOT_MIN, G_MIN = 1e-12, 1e-9
 
@@ -38,7 +38,7 @@ class ResponseModel(NamedTuple):
     """+1 or -1, the polarizer's sense of rotation."""
     lagged: bool
     lag: Float32[np.ndarray, "g l u"]
-    """Filtered response minus response, by artanh(DoLP), logarithm of l, and phase."""
+    """Response behind the photoreceptor's low-pass minus response, by artanh(DoLP), level and phase."""
     turning_points: Float32[np.ndarray, "2 g l"]
     """Maximum and minimum of the filtered response, minus those of the response."""
     silence_noise: float
@@ -48,9 +48,9 @@ class Pixels(NamedTuple):
     """Events of all pixels, one pixel after the other."""
 
     first: np.ndarray
-    """Index of each pixel's first event, and the number of events."""
+    """[n + 1], index of each pixel's first event, then the number of events."""
     phase: np.ndarray
-    """Twice the polarizer's angle."""
+    """Twice the polarizer's angle at the event, radians."""
     cos: np.ndarray
     sin: np.ndarray
     p: np.ndarray
@@ -60,18 +60,18 @@ class Pixels(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of one pixel's fit."""
+    """Working memory for the fit of a pixel with up to n events."""
 
     response: np.ndarray
     slope: np.ndarray
-    """Derivatives of the response by both g and the level [n 3]."""
+    """Derivatives [n 3] of the response by the two components of g and by the level."""
     jacobian: np.ndarray
 
 
 def response_model(
     threshold_on: float, threshold_off: float, phase_rate: float, cutoff_hz: float, knee: float, silence_noise: float
 ) -> ResponseModel:
-    """The model at a phase rate (of twice the polarizer's angle) in radians per second, negative if it falls."""
+    """Build the model for a phase rate: radians per second of twice the polarizer's angle, negative if that falls."""
     lag, turning_points = _lag_tables(abs(phase_rate), cutoff_hz, knee)
     direction, lagged = math.copysign(1.0, phase_rate), cutoff_hz > 0
     thresholds = math.log(threshold_on), math.log(threshold_off)
@@ -87,9 +87,10 @@ def fit_pixels(
     model: ResponseModel,
     noise: float,
 ) -> tuple[Float64[np.ndarray, "n 5"], Float64[np.ndarray, "n 5 5"], Float64[np.ndarray, " n"]]:
-    """Unknowns, covariance and cost of each pixel; the mean for fewer than two events.
+    """Fit the `UNKNOWNS` of each pixel; return them with their covariance and cost.
 
-    `start` is an initial g, `guess` a better one with the level (NaN: none); `mean` and `precision` are the prior.
+    `mean` and `precision` are the prior; a pixel with fewer than two events gets `mean`, covariance 0 and cost 0. The
+    fit starts from `guess` (g and level of an earlier fit) or, where that is NaN, from g = `start`.
     """
     fitted, cost = mean.copy(), np.zeros(len(mean))
     covariance = np.zeros((len(mean), UNKNOWNS, UNKNOWNS))
@@ -141,7 +142,7 @@ def _responses(light: np.ndarray, knee: float) -> np.ndarray:
 
 @compiled
 def _response(light, knee):
-    """Response and its derivative."""
+    """Response to light in DN and its derivative: logarithmic above the knee, linear below."""
     if light > knee:
         return math.log(light), 1 / light
     slope = math.log(knee) / knee
@@ -150,7 +151,7 @@ def _response(light, knee):
 
 @compiled
 def _cell(g, level):
-    """Cell of the tables and the place in it."""
+    """Indices of the table cell that holds (g, level), and the fractions of the cell at which they lie."""
     a = min(g / G_STEP, G_SIZE - 1.001)
     b = min(max((level - LEVEL_FIRST) / LEVEL_STEP, 0.0), LEVEL_SIZE - 1.001)
     return int(a), int(b), a - int(a), b - int(b)
@@ -288,7 +289,7 @@ def _solve(factor, right, x):
 
 @compiled
 def _descend(x, pixels, lo, hi, model, noise, mean, precision, scratch):
-    """Levenberg-Marquardt from `x`, in place; returns the cost."""
+    """Minimise the cost from `x`, in place, by the Levenberg-Marquardt method; return the cost."""
     square = (UNKNOWNS, UNKNOWNS)
     normal, tried_normal, factor = np.zeros(square), np.zeros(square), np.zeros(square)
     gradient, tried_gradient, step = np.zeros(UNKNOWNS), np.zeros(UNKNOWNS), np.zeros(UNKNOWNS)

@@ -29,7 +29,7 @@ from polarnet.methods.modulation import UNKNOWNS, Pixels, fit_pixels, response_m
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
-INITIAL_RATIO_MAX = 0.7  # DoLP 0.94
+INITIAL_RATIO_MAX = 0.7  # limit of q in `_initial_g`, for DoLP 0.94
 MISFIT_MAX = 20.0  # limit of one pixel's misfit in the mean over its neighbours
 MISFIT_STILL = 0.25  # misfit that a still scene reaches too, because `noise` is larger than what most pixels have
 MISFIT_SIDE, SPREAD_SIDE = 5, 3  # pixels; sides of the squares of that mean, and of the variance of DoLP
@@ -57,7 +57,7 @@ class ModulationConfig:
     noise: PositiveFloat
     """Standard deviation of the change between two events, relative to the threshold."""
     silence_noise: PositiveFloat
-    """The same for the largest change between two events, which must not exceed the threshold."""
+    """Standard deviation, relative to the threshold, of the largest change without an event, which stays below it."""
     extinction_ratio: Annotated[float, Field(gt=1)] | None
     """Transmission of the polarizer along its axis over that across it; null: infinite."""
     window_turns: PositiveFloat
@@ -79,10 +79,10 @@ class ModulationState(NamedTuple):
     """Memory of the pixels [h w] between windows: their thresholds, which outlast the scene, and their last events."""
 
     log_thresholds: Float64[np.ndarray, "2 h w"]
-    """Natural logarithm of the ON and OFF threshold over its mean."""
+    """Natural logarithm of the ON and OFF threshold over its mean; `variances` holds its variance."""
     variances: Float64[np.ndarray, "2 h w"]
     last_us: Float64[np.ndarray, "h w"]
-    """NaN before the first event."""
+    """Time of the last event; NaN before the first."""
     guess: Float64[np.ndarray, "3 h w"]
     """The last fit, from which the next one starts: artanh(DoLP) as a vector, logarithm of the level; NaN: none."""
 
@@ -146,7 +146,7 @@ def _with_misfit(prediction: Prediction, misfit: Float64[np.ndarray, "h w"], con
 
 
 def rotating_recoverer(config: ModulationConfig, rotation: Rotation) -> Recoverer:
-    """The fit as a method of `recover`: the sensor's events may be in any channel, the other channels are empty."""
+    """Wrap the fit as a method; the sensor's events may be in any channel, and the other channels are empty."""
 
     def start(height: int, width: int) -> ModulationState:
         return initial_state(height, width, config)
@@ -183,7 +183,7 @@ def silent_dolp(config: ModulationConfig) -> tuple[float, float]:
 def _prior(
     state: ModulationState, config: ModulationConfig
 ) -> tuple[Float64[np.ndarray, "n 5"], Float64[np.ndarray, "n 5"]]:
-    """Mean and precision of the unknowns before a window."""
+    """Prior mean and precision (1 / variance) of the unknowns (`modulation.UNKNOWNS`) before a window."""
     count = state.last_us.size
     mean, precision = np.zeros((count, UNKNOWNS)), np.ones((count, UNKNOWNS))
     mean[:, 2:4], precision[:, 2:4] = state.log_thresholds.reshape(2, -1).T, 1 / state.variances.reshape(2, -1).T
@@ -212,7 +212,7 @@ def _prediction(
 def _pixels_of(
     events: Events, rotation: Rotation, stop_us: int, last_us: Float64[np.ndarray, " n"]
 ) -> tuple[Pixels, Float64[np.ndarray, " n"]]:
-    """The events sorted by pixel, each pixel's last event before them in front; and each pixel's last event now."""
+    """Events sorted by pixel, after the pixel's last event of earlier windows; and the new time of its last event."""
     pixel = events.y.numpy().astype(np.int64) * events.width + events.x.numpy()
     remembered = np.flatnonzero(~np.isnan(last_us))
     t_us = np.concatenate([last_us[remembered], events.t.numpy().astype(np.float64)])
@@ -231,9 +231,9 @@ def _pixels_of(
 def _initial_g(
     pixels: Pixels, config: ModulationConfig, rotation: Rotation, duration_us: int
 ) -> Float64[np.ndarray, "n 2"]:
-    """g of each pixel from the first Fourier coefficient of its events.
+    """Initial g = artanh(m) (cos 2 AoLP, sin 2 AoLP) of each pixel, from the first Fourier coefficient of its events.
 
-    ln(1 + m cos x) has the coefficient 2 q with m = 2 q / (1 + q^2).
+    ln(1 + m cos x) with m = 2 q / (1 + q^2) has the first coefficient 2 q.
     """
     count = len(pixels.first) - 1
     owner = np.repeat(np.arange(count), np.diff(pixels.first))

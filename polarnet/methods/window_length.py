@@ -1,9 +1,9 @@
 """Windows of any length for a network that was trained on one length.
 
-The sums, recurrent layers and gains of a network belong to the windows of its training. Shorter windows are therefore
-joined with the ones before them, up to about that length, and longer windows are cut into parts of about that length.
-The network always sees the windows that it knows, and still returns one frame for each window it is given. Joined
-windows overlap and continue earlier states as in `polarnet.methods.overlap`.
+The sums, recurrent layers and gains of a network fit the window length of its training. Shorter windows are therefore
+joined with earlier windows up to about that length, and longer windows are cut into parts of about that length. The
+method still returns one frame for each window it is given. Joined windows overlap and continue earlier states as in
+`polarnet.methods.overlap`.
 """
 
 import itertools

@@ -1,4 +1,4 @@
-"""SSIM, LPIPS, correlation and the calibration of expected errors."""
+"""Scores of frames against their truth: MSE, PSNR, SSIM, LPIPS, correlation, and the calibration of expected errors."""
 
 from typing import TYPE_CHECKING
 

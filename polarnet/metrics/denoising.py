@@ -10,7 +10,7 @@ from polarnet.runtime.arrays import Array, as_tensor
 
 
 class DenoisingScores(NamedTuple):
-    """Scores of a denoiser, each in [0, 1]; NaN where the denominator is 0."""
+    """Scores of a denoiser: fractions in [0, 1], NaN where the denominator is 0, and numbers of events."""
 
     precision: float
     """Fraction of the removed events that are noise."""

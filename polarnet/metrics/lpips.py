@@ -193,7 +193,7 @@ class Lpips(nn.Module):
 
 
 def stored_record(folder: Path | str, purpose: Purpose) -> Mapping[str, str | None]:
-    """Backbone, sha256 and source of a purpose's weights in the folder of stage `weights`; all None without weights."""
+    """Backbone, sha256, source of a purpose's weights in `folder`; None if there are none; ValueError if damaged."""
     file = Path(folder) / f"{purpose}.json"
     if not file.is_file():
         return NO_RECORD

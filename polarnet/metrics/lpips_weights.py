@@ -176,8 +176,8 @@ def _installed_tensors(file: Path, backbone: str) -> dict[str, Tensor]:
     content = file.read_bytes()
     if sha256(content) != SOURCES[backbone].installed_sha256:
         raise ValueError(
-            f"{file} is not that of {DISTRIBUTION} 0.1.0: its sha256 is {sha256(content)}; `{INSTALL} "
-            f"--force-reinstall` puts it right"
+            f"{file} is not that of {DISTRIBUTION} 0.1.0: its sha256 is {sha256(content)}; repair it with "
+            f"`{INSTALL} --force-reinstall`"
         )
     arrays = unpickled_arrays(content, file.name)
     heads = {name: arrays.pop(name) for name in [*arrays] if name.startswith("NetLinLayer")}

@@ -45,7 +45,7 @@ def reliability(
     truth: Float[Tensor, "n h w"],
     valid: Bool[Tensor, "n h w"] | None = None,
 ) -> Reliability:
-    """Reliability of frames of DoLP in [0, 1] with their predicted log variance."""
+    """Reliability of the predicted `log_variance` of DoLP in [0, 1], over the `valid` pixels of n frames."""
     everywhere = torch.ones_like(truth, dtype=torch.bool) if valid is None else valid
     predicted, squared = log_variance[everywhere].double(), (dolp - truth)[everywhere].double().square()
     width = (HIGHEST - LOWEST) / BINS

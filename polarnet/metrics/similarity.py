@@ -4,7 +4,8 @@ Every function takes frames in [0, 1], numpy or torch, with any leading axes, re
 differentiable. TypeError for anything but an array; ValueError for integers, and for frames or masks of different
 shapes. Where the data range matters (`psnr`, `ssim`), ValueError also for a second frame, the truth, outside [0, 1].
 
-With a mask `valid`, values at other pixels do not matter, and a frame without any valid pixel gives NaN.
+With a mask `valid`, values at other pixels do not matter, and a frame without any valid pixel gives NaN, except in
+`gradient_agreement` (0) and `aolp_error_deg` (45 degrees).
 
 The perceptual distance, `Lpips`, is a network and lives in polarnet/metrics/lpips.py; its name is public here too.
 """
@@ -193,7 +194,6 @@ def ssim(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = No
     torchmetrics' `structural_similarity_index_measure`. scikit-image averages the interior alone, where both agree.
 
     With a mask, the mean covers the valid pixels. Kernels that reach invalid pixels use the truth `b` for `a` there.
-
     Computed in float32 at least, even under autocast: variances are small differences of large means. ValueError for a
     frame smaller than 6 pixels.
 

@@ -48,7 +48,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], di
     except ValueError as error:
         raise ValueError(f"{path.with_suffix('.json')} is not JSON: {error}") from None
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
-        raise ValueError(f"{path.with_suffix('.json')}: expected a {FORMAT}, which it does not say it is")
+        raise ValueError(f"{path.with_suffix('.json')}: expected a {FORMAT}, but the file states another format")
     content = path.read_bytes()
     if sha256(content) != metadata.get("sha256"):
         raise ValueError(f"{path} is not the file that {path.stem}.json describes; copy or train the pair again")

@@ -67,7 +67,7 @@ class E2p(PublishedNetwork):
 
     @classmethod
     def variant(cls, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-        """The number of maps of AoLP in a published file."""
+        """Return the argument `aolp_channels` for the number of AoLP maps in a published file."""
         head = tensors.get("branches.aolp.pred.weight")
         return {} if head is None else {"aolp_channels": len(head)}
 

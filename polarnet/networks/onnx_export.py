@@ -29,7 +29,7 @@ KEY = "polarnet"  # key of the JSON in the file's metadata_props
 OPSET = 20  # the first opset with GELU as one operator
 TOLERANCE = 1e-4  # absolute and relative difference of an output from torch's, far above that of float32 rounding
 CHECKED_WINDOWS = 5  # windows with events; one empty window follows
-MAX_VALUE = 3  # of an input image
+MAX_VALUE = 3  # largest absolute value in a random input image
 SEED = 0
 MEANINGS = {
     "dolp": "degree of linear polarization, not clamped to [0, 1]",
@@ -53,7 +53,7 @@ class OneWindow(nn.Module):
 
 
 def outputs_by_name(prediction: Prediction, state: Sequence[Tensor]) -> dict[str, Tensor]:
-    """Predicted maps under their names, then the new state: new_state_0, new_state_1, ..."""
+    """Predicted maps by their names in `Prediction`, then the new state as new_state_0, new_state_1, ..."""
     predicted = {name: field for name, field in prediction._asdict().items() if field is not None}
     return predicted | {f"new_state_{number}": tensor for number, tensor in enumerate(state)}
 
@@ -76,7 +76,7 @@ def export_network(
     program, description = _traced(network, metadata, windows[0])
     try:
         check_program(program, network, windows)
-    except Exception as error:  # of torch.testing, or of ONNX Runtime, whose errors share no other base class
+    except Exception as error:  # from torch.testing or ONNX Runtime, whose errors share no other base class
         raise RuntimeError(
             f"{path} is not written, because ONNX Runtime does not reproduce torch's outputs: {error}\n"
             f"Use the versions of torch, onnxscript and onnxruntime in constraints.txt"
@@ -152,7 +152,7 @@ def _file_content(program: Any, description: Mapping[str, Any]) -> bytes:
 def _description(
     metadata: Mapping[str, Any], prediction: Prediction, shape: list[int], states: list[list[int]]
 ) -> dict[str, Any]:
-    """Description of the file for users without polarnet."""
+    """Description of inputs, outputs and state, stored in the file for users without polarnet."""
     encode = REPRESENTATIONS[metadata["representation"]]
     return {
         "format": FORMAT,

@@ -1,4 +1,4 @@
-"""Base of the recurrent networks with published weights: one window after another, and files of their authors."""
+"""Base class of recurrent networks with published weights: runs windows in order and loads the authors' files."""
 
 import os
 import pickle
@@ -13,7 +13,7 @@ Network = TypeVar("Network", bound="PublishedNetwork")
 
 
 class StandIn:
-    """Replaces an object of the authors' code, such as their settings, in a file whose tensors alone are needed."""
+    """Empty replacement for an object of the authors' code in a file of which only the tensors are needed."""
 
     def __init__(self, *arguments: Any):
         pass
@@ -23,13 +23,13 @@ class StandIn:
 
 
 def read_content(path: str | os.PathLike[str]) -> Any:
-    """Content of a torch file, without running code from it: objects of other classes than torch's become `StandIn`.
+    """Load a torch file without running code from it; objects of classes that are not torch's become `StandIn`.
 
-    ValueError for a file that torch cannot read that way.
+    ValueError if torch cannot read the file.
     """
     try:
         unknown = torch.serialization.get_unsafe_globals_in_checkpoint(path)
-    except (ValueError, RuntimeError):  # older files than zips, which hold no others
+    except (ValueError, RuntimeError):  # files older than torch's zip format, which hold no such objects
         unknown = []
     inert: list[Any] = [(type(name.rpartition(".")[2], (StandIn,), {}), name) for name in unknown]
     try:
@@ -43,9 +43,9 @@ class PublishedNetwork(nn.Module):
     """Recurrent network that takes voxel grids of `bins` bins and passes its state from window to window."""
 
     label: ClassVar[str]
-    """Name of the network in errors."""
+    """Name of the network in error messages."""
     first_layer: ClassVar[str]
-    """Weight of the first layer, whose second axis is the bins."""
+    """Name of the first layer's weight, whose second axis has one entry per bin."""
 
     def __init__(self, bins: int):
         super().__init__()
@@ -83,7 +83,7 @@ class PublishedNetwork(nn.Module):
 
     @classmethod
     def variant(cls, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Arguments beside `bins`, for networks that were published in several variants."""
+        """Constructor arguments besides `bins`, for networks that were published in several variants."""
         return {}
 
     @classmethod

@@ -38,7 +38,7 @@ from polarnet.networks.threshold import Scale, scale_features
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
-STRIDE = 4  # stride of the largest recurrent layer; height and width in blocks are padded to multiples of it
+STRIDE = 4  # stride of the finest recurrent layer; height and width (in blocks of `binning`) are padded to multiples
 IMAGES = 2  # input images per channel: sum of polarities and number of events (representation `event_counts`)
 PARTS = ("redundancy", "slopes", "sums", "recurrence", "panorama", "sensitivity", "scale")
 MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate
@@ -46,7 +46,7 @@ WIDE = (3, 9)  # widths in pixels of the neighbourhoods that contribute fine str
 MAX_DOLP = 0.98  # largest DoLP passed to atanh, to keep it finite
 SENSITIVITY_TENSORS = 2  # numbers of ON and OFF events, and the change of their weights
 PANORAMA_TENSORS = 1 + len(Panorama._fields)  # events of the previous window, then the panorama
-NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window; the rest of the state is missing
+NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window: no sums, moments or wide sums, and no more
 LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
 LOG_VARIANCE_OUTPUTS = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
 

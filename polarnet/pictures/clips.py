@@ -66,13 +66,13 @@ class Clip:
 
     name: str
     words: str
-    """The kind of frames, in words."""
+    """Kind of the frames, for messages."""
     measured: bool
     """Whether the channels of a frame are four polarizers, not RGB."""
     count: int | None
     """Number of frames; None: not known before the end."""
     still: bool
-    """Whether it is a picture, or a measurement, not a video of one frame."""
+    """Whether the clip is a single picture or measurement; False for a video of one frame."""
     frames: Callable[[], Iterator[ClipFrame]]
 
 
@@ -109,12 +109,12 @@ def open_clip(paths: Sequence[Path], options: ClipOptions) -> Clip:
 
 @dataclass(frozen=True)
 class _Files:
-    """Where the levels of frames come from."""
+    """Source of the code values ("levels") of a clip's frames."""
 
     count: int | None
     still: bool
     levels: Callable[[], Iterator[tuple[str, Levels, float | None]]]
-    """Name, code values and time of each frame."""
+    """Iterates from the first frame over name, code values and time (microseconds; None: unknown) of each frame."""
 
 
 def _open_folder(folder: Path, name: str, options: ClipOptions) -> Clip:

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float32
 
 COVERINGS = 5.0  # summed area of the shapes over that of the picture; exp(-5) of it stays uncovered
-RADIUS_MIN_PX = (10.0, 32.0)  # of the smallest leaves, drawn per picture
-RADIUS_MAX = 0.45  # of the picture's shorter side
+RADIUS_MIN_PX = (10.0, 32.0)  # range from which each picture draws the radius of its smallest leaves
+RADIUS_MAX = 0.45  # largest radius over the picture's shorter side
 SIDES_MAX = 8
 NOISE_SIZE = 256  # pixels of the noise tile, a power of 2
 
@@ -29,11 +29,11 @@ LEAF = np.dtype(
         ("shape", "i4"),
         ("x", "f8"),  # centre
         ("y", "f8"),
-        ("radius", "f8"),  # of the circle that holds the leaf
-        ("cos", "f8"),  # of the leaf's own x axis
+        ("radius", "f8"),  # circle that holds the leaf
+        ("cos", "f8"),  # direction of the leaf's own x axis
         ("sin", "f8"),
         ("minor", "f8"),  # half width along the leaf's y axis over the one along its x axis
-        ("sides", "i4"),  # of a polygon: side k is normal_x x + normal_y y <= offset, in units of the radius
+        ("sides", "i4"),  # a polygon's sides; side k: normal_x x + normal_y y <= offset, in units of the radius
         ("normal_x", "f8", SIDES_MAX),
         ("normal_y", "f8", SIDES_MAX),
         ("offset", "f8", SIDES_MAX),
@@ -51,13 +51,13 @@ LEAF = np.dtype(
 
 
 def dead_leaves(generator: np.random.Generator, height: int, width: int) -> Float32[np.ndarray, "height width 3"]:
-    """One picture, sRGB code values in [0, 1], the same for the same state of the generator."""
+    """Generate one picture, sRGB code values in [0, 1], the same for the same state of the generator."""
     leaves = _draw_leaves(generator, height, width)
     picture = np.zeros((height, width, 3), dtype=np.float32)
     uncovered = np.ones((height, width), dtype=np.float32)
     _paint(picture, uncovered, leaves, _noise_tile(generator))
     picture += uncovered[..., None] * generator.uniform(0.1, 0.9, 3).astype(np.float32)
-    blur = generator.uniform(0.3, 0.8)  # of a lens; without it every edge is one pixel wide
+    blur = generator.uniform(0.3, 0.8)  # sigma of a lens's blur, pixels; without it every edge is one pixel wide
     blurred = cv2.GaussianBlur(picture.astype(np.float64), (0, 0), blur)  # in float32 it depends on the processor
     return np.clip(blurred, 0, 1).astype(np.float32)
 
@@ -69,7 +69,7 @@ def _draw_leaves(generator: np.random.Generator, height: int, width: int) -> np.
     mean_square = 2 * math.log(largest / smallest) / (smallest**-2 - largest**-2)
     outside = largest / 2  # leaves that fall beside the picture reach into it
     area = (height + 2 * outside) * (width + 2 * outside)
-    mean_filling = 0.6 * math.pi  # of the circle that holds the leaf
+    mean_filling = 0.6 * math.pi  # mean area of a leaf over its squared radius
     n = math.ceil(COVERINGS * area / (mean_filling * mean_square))
 
     leaves = np.zeros(n, dtype=LEAF)
@@ -84,7 +84,7 @@ def _draw_leaves(generator: np.random.Generator, height: int, width: int) -> np.
 
 
 def _draw_outlines(generator: np.random.Generator, leaves: np.ndarray) -> None:
-    """A third of discs and ellipses, a third of convex polygons, a third of rectangles; fills the fields in place."""
+    """Make a third of the leaves ellipses (some round), a third convex polygons, a third rectangles, in place."""
     n = len(leaves)
     turn = generator.uniform(0, 2 * math.pi, n)
     leaves["cos"], leaves["sin"] = np.cos(turn), np.sin(turn)
@@ -107,7 +107,7 @@ def _draw_outlines(generator: np.random.Generator, leaves: np.ndarray) -> None:
 
 
 def _draw_colours(generator: np.random.Generator, leaves: np.ndarray) -> None:
-    """Hues around a few that the picture favours, or any; saturation and value over nearly their whole range."""
+    """Draw most hues near a few of the picture's own; saturation and value span nearly their whole range."""
     n = len(leaves)
     favoured = generator.random(generator.integers(2, 7))
     spread = generator.uniform(0.01, 0.06)
@@ -150,7 +150,7 @@ def _paint(
     leaves: np.ndarray,
     noise: Float32[np.ndarray, "n n"],
 ) -> None:
-    """Add the leaves to a black picture from the topmost, the last, down; rims are blended over one pixel.
+    """Add the leaves to a black picture, from the topmost (the last) down; rims are blended over one pixel.
 
     `uncovered` is the share of each pixel that no leaf covers yet; at 0 the pixel is complete.
     """

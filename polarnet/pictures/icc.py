@@ -31,10 +31,10 @@ class MatrixProfile:
 
 
 def srgb_from_profile(rgb: Float32[np.ndarray, "h w 3"], profile: bytes) -> Float32[np.ndarray, "h w 3"]:
-    """Code values in [0, 1] of a device with this ICC profile as sRGB code values in [0, 1], out of gamut clipped.
+    """Convert code values in [0, 1] of a device with this ICC profile to sRGB in [0, 1]; clip colours out of gamut.
 
-    A profile that is sRGB leaves them untouched. Profiles made of tables are applied with 8 bits.
-    ValueError where the profile is damaged or not one of RGB.
+    Values of an sRGB profile stay unchanged. Profiles made of tables are applied with 8 bits.
+    ValueError if the profile is damaged or not for RGB.
     """
     tags = read_tags(profile)
     if any(tag in tags for tag in TABLES):
@@ -44,7 +44,7 @@ def srgb_from_profile(rgb: Float32[np.ndarray, "h w 3"], profile: bytes) -> Floa
 
 
 def read_tags(profile: bytes) -> dict[str, bytes]:
-    """The tagged elements of an ICC profile for RGB (ICC.1, section 7)."""
+    """Tagged elements of an ICC profile by tag (ICC.1, section 7); ValueError if it is damaged or not for RGB."""
     if len(profile) < 132 or profile[36:40] != b"acsp":
         raise ValueError(f"the embedded colour profile is damaged ({len(profile)} bytes without the mark of ICC)")
     space = profile[16:20].decode("ascii", "replace").strip()
@@ -106,7 +106,7 @@ def _curve(element: bytes) -> Curve:
 
 
 def _parametric_curve(element: bytes) -> Curve:
-    """Y = (a X + b)^g + e for X >= d, else c X + f; types 0 to 4 give ever more of the seven numbers."""
+    """Y = (a X + b)^g + e for X >= d, else c X + f; types 0 to 4 state 1, 3, 4, 5 and 7 of these numbers."""
     (kind,) = struct.unpack_from(">H", element, 8)
     if kind > 4:
         raise ValueError(f"the embedded colour profile has a parametric curve of unknown type {kind}")

@@ -16,7 +16,7 @@ from torch import Tensor
 from polarnet.pictures.icc import srgb_from_profile
 from polarnet.runtime.files import sha256
 
-MAX_PIXELS = 2**28  # of a picture; as float32 RGB it takes 3 GiB
+MAX_PIXELS = 2**28  # limit for one picture, which takes 3 GiB as float32 RGB
 SRGB = "srgb_rec709_scene"  # OpenImageIO's name
 TAKEN_AS_SRGB = {"", SRGB, "g22_rec709_scene"}  # a PNG that says gamma 1/2.2 is how older programs wrote sRGB
 LINEAR_FORMATS = {"openexr", "hdr"}  # hold linear light unless they say otherwise
@@ -77,17 +77,17 @@ class Picture:
 
 
 def picture_extensions() -> frozenset[str]:
-    """Lower-case extensions, without the dot, of files that are meant as pictures, readable here or not."""
+    """Lower-case extensions, without the dot, of picture files, including formats that cannot be read here."""
     formats = oiio.get_string_attribute("extension_list").split(";")
     known = {extension for entry in formats for extension in entry.partition(":")[2].split(",")}
     return frozenset(known - NO_PICTURES) | CAMERA_RAW | NOT_IN_THE_WHEEL
 
 
 def read_picture(path: str | os.PathLike[str]) -> Picture:
-    """The first picture of a file, without alpha and turned as its EXIF orientation says.
+    """Read the first picture of a file, without alpha and turned upright by its EXIF orientation.
 
-    Raises UnreadablePicture: not a picture, damaged or cut off (a JPEG that ends early is), camera raw,
-    fewer than three channels, or a number that is not finite.
+    Raises UnreadablePicture with the reason: no picture, damaged, cut off, camera raw, more than MAX_PIXELS, fewer
+    than three channels, or values that are not finite.
     """
     pixels, spec, file_format = _read(Path(path))
     profile = spec.get("ICCProfile")
@@ -143,10 +143,10 @@ def srgb_of(pixels: Float32[np.ndarray, "h w 3"], picture: Picture) -> Float32[n
 def fit(
     pixels: Shaped[np.ndarray, "h w c"], height: int, width: int, max_upscale: float
 ) -> Float32[np.ndarray, "height width c"]:
-    """The largest centred part of shape height:width, scaled to that size; integer pixels become [0, 1].
+    """Cut out the largest centred part of shape height:width and scale it to that size; integers become [0, 1].
 
-    Shrinks by averaging areas, enlarges by cubic interpolation, in the encoding the pixels have.
-    UnreadablePicture where the part would be enlarged more than `max_upscale` times.
+    Shrinks by averaging areas, enlarges by cubic interpolation, without decoding the pixels to linear light.
+    UnreadablePicture if the part would be enlarged more than `max_upscale` times.
     """
     rows, columns = pixels.shape[:2]
     part_height = min(rows, max(1, round(columns * height / width)))
@@ -234,7 +234,7 @@ def _names_profile(png: Path) -> bool:
 def _refuse_by_extension(path: Path) -> None:
     extension = path.suffix.lower().lstrip(".")
     if extension in CAMERA_RAW:
-        raise UnreadablePicture("camera raw: what can be read of it is a preview; develop it to 16-bit TIFF first")
+        raise UnreadablePicture("camera raw: only a preview in it can be read; develop it to 16-bit TIFF first")
     if extension in NOT_IN_THE_WHEEL:
         raise UnreadablePicture(f"OpenImageIO's wheel has no reader for .{extension}; convert it to PNG or TIFF first")
 
@@ -252,7 +252,7 @@ def _rgb_channels(names: Sequence[str], alpha: int) -> list[int]:
 
 
 def _plain(pixels: Shaped[np.ndarray, "h w c"]) -> Shaped[np.ndarray, "h w c"]:
-    """As uint8, uint16 or finite float32."""
+    """Pixels as uint8, uint16 or float32; UnreadablePicture if a value is not finite."""
     if pixels.dtype in (np.uint8, np.uint16):
         return pixels
     if np.issubdtype(pixels.dtype, np.integer):

@@ -47,7 +47,7 @@ from polarnet.runtime.sections import one_of, section
 
 logger = logging.getLogger(__name__)
 
-EDGE_BYTES = 1 << 16  # of a file's start and end, hashed to choose `limit` files without reading all of them
+EDGE_BYTES = 1 << 16  # bytes at a file's start and at its end, hashed to choose `limit` files without reading them all
 
 Mapper = Callable[..., Iterable[Any]]
 
@@ -58,7 +58,7 @@ class IngestConfig:
 
     source: Annotated[str, one_of(("builtin", "folder", "polarization"))]
     root: str
-    """Folder of the sources folder and polarization, searched recursively."""
+    """Folder that is searched recursively (source=folder and source=polarization)."""
     limit: PositiveInt | None
     """At most this many pictures of the folder, chosen by content hash."""
     dead_leaves: Annotated[int, Field(ge=0, le=1_000_000)]
@@ -67,12 +67,12 @@ class IngestConfig:
     """Pixels of every picture after the centre crop."""
     width: Annotated[int, Field(ge=16, le=16_384)]
     max_upscale: Annotated[float, Field(ge=1)]
-    """A picture that would have to be enlarged more is too small."""
+    """Largest enlargement; a photograph that needs more is skipped as too small."""
     val_fraction: Annotated[float, Field(ge=0, le=1)]
     test_fraction: Annotated[float, Field(ge=0, le=1)]
     mosaic: str
-    """Polarizer angles of the 2x2 pixels of a raw mosaic, even row / odd row, after RGGB or another order of a colour
-    sensor (source=polarization)."""
+    """Polarizer angles of the 2x2 pixels of a raw mosaic, even row / odd row (source=polarization). A colour sensor's
+    order of colours, such as RGGB, stands before them."""
     residual_max: PositiveFloat
     """Largest accepted median of |I0 + I90 - I45 - I135| / S0 (source=polarization)."""
 
@@ -88,7 +88,7 @@ class IngestConfig:
 class Source:
     """One picture to read, with its origin."""
 
-    files: tuple[Path, ...]  # four of them where each polarizer has its own
+    files: tuple[Path, ...]  # four if each polarizer angle has a file, else one
     kind: str  # photograph, folder or polarization
     stem: str
     origin: str
@@ -135,7 +135,7 @@ def _ingest_builtin(config: IngestConfig, seed: int, folder: Path, mapper: Mappe
 
 
 def _ingest_folder(config: IngestConfig, folder: Path, mapper: Mapper) -> Manifest:
-    """Read files in the order of their hashes until there are `limit` pictures."""
+    """Read all pictures, or with a `limit` that many, in the order of the hashes of their files."""
     sources, ignored = _find_pictures(Path(config.root), config.source)
     if config.limit is not None:
         sources.sort(key=lambda source: _edge_hash(source.files))
@@ -156,7 +156,7 @@ def _ingest_folder(config: IngestConfig, folder: Path, mapper: Mapper) -> Manife
 def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int]:
     """Files under `root` with a picture's extension, by path, and the number of other files."""
     if not root.is_dir():
-        raise ValueError(f"ingest.root: expected a folder with pictures, {root} is none; see ingest.source")
+        raise ValueError(f"ingest.root: expected a folder with pictures, got {root}; see ingest.source")
     files = sorted(path for path in root.rglob("*") if path.is_file())
     pictures = [path for path in files if path.suffix.lower().lstrip(".") in _extensions(kind)]
     groups = group_by_measurement(pictures) if kind == "polarization" else [(path,) for path in pictures]
@@ -190,7 +190,7 @@ def _edge_hash(files: Sequence[Path]) -> str:
                 size = file.seek(0, os.SEEK_END)
                 file.seek(max(0, size - EDGE_BYTES))
                 digest.update(file.read() + str(size).encode())
-        except OSError:  # named when it is its turn to be read
+        except OSError:  # reported once the file is read
             continue
     return digest.hexdigest()
 
@@ -326,7 +326,7 @@ def _check_not_empty(config: IngestConfig, manifest: Manifest) -> None:
     val, test = config.val_fraction, config.test_fraction
     for split, fraction in (("train", 1 - val - test), ("val", val), ("test", test)):
         if fraction > 0 and not manifest.counts[split]:
-            logger.warning("no picture is in split %s: %d pictures are few", split, len(manifest.pictures))
+            logger.warning("split %s is empty, because %d pictures are too few", split, len(manifest.pictures))
     if config.source != "builtin" and config.limit is not None and len(manifest.pictures) < config.limit:
         counts = ", ".join(f"{manifest.counts[split]} {split}" for split in SPLITS)
         logger.warning(

@@ -20,7 +20,7 @@ class ManifestEntry:
     name: str
     """Name of the source and the first 8 digits of `sha256`; sequence names begin with it."""
     file: str
-    """In the folder of the manifest."""
+    """Name of the picture's file in the folder of the manifest."""
     split: str = ""
     """train, val or test, once it is drawn; every sequence made of this picture belongs to it."""
     source: str
@@ -89,7 +89,7 @@ def split_by_content(hashes: Sequence[str], val_fraction: float, test_fraction: 
     """The split of each picture of one group, by the rank of its content hash.
 
     The first ceil(test_fraction n) are test, the next ceil(val_fraction n) val, the rest train. Names and order do not
-    matter, and another picture moves at most a few at the two borders.
+    matter, and adding a picture moves only a few others to another split.
     """
     n = len(hashes)
     # the tolerance: 0.1 * 30 is 3.0000000000000004, and nobody who writes 0.1 means 4 of 30

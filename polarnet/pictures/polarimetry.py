@@ -1,6 +1,6 @@
 """Measured polarization: pictures taken behind polarizers at 0, 45, 90 and 135 degrees, or through a mosaic of them.
 
-Code values are taken as proportional to light, as cameras for measuring write them.
+Code values are assumed proportional to light, as measurement cameras write them.
 """
 
 import os
@@ -20,9 +20,9 @@ from polarnet.pictures.images import UnreadablePicture, read_channels
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, parse_mosaic
 
 ANGLE_SUFFIX = re.compile(r"(?P<name>.+)_0*(?P<angle>0|45|90|135)")
-WHITE_LEVELS = (2**10 - 1, 2**12 - 1, 2**14 - 1, 2**16 - 1)  # of sensors whose values come as 16 bits
-STEPS = 2**16 - 1  # of the files written here
-COLOURS = ("RGGB", "BGGR", "GRBG", "GBRG")  # of the four blocks of 2x2 pixels in a colour sensor's 4x4 (Sony IMX250MYR)
+WHITE_LEVELS = (2**10 - 1, 2**12 - 1, 2**14 - 1, 2**16 - 1)  # possible saturation levels in 16-bit files
+STEPS = 2**16 - 1  # code value of an intensity of 1 in the files written here
+COLOURS = ("RGGB", "BGGR", "GRBG", "GBRG")  # order of the four 2x2 blocks in a colour sensor's 4x4 (Sony IMX250MYR)
 NPZ_KEYS = tuple(f"I{angle}" for angle in POLARIZER_ANGLES_DEG)
 
 
@@ -57,11 +57,11 @@ def parse_raw_mosaic(order: str) -> tuple[Mosaic, str | None]:
 def read_measurement(
     files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], mosaic: Mosaic, colours: str | None = None
 ) -> Measurement:
-    """The measurement in a group of files: four pictures, one .npz with I0, I45, I90, I135, or one raw mosaic.
+    """Read a measurement from four pictures, one .npz with I0, I45, I90, I135, or one raw mosaic.
 
     `mosaic` and `colours` are those of `parse_raw_mosaic`.
 
-    A single saturated angle follows from the other three, I0 + I90 = I45 + I135; a pixel with more is not valid.
+    One saturated angle of a pixel is computed from the others, I0 + I90 = I45 + I135; pixels with more are not valid.
     Raises UnreadablePicture if files are missing, damaged, or do not belong together.
     """
     paths = [Path(files)] if isinstance(files, (str, os.PathLike)) else [Path(file) for file in files]
@@ -73,7 +73,7 @@ def read_measurement(
 
 
 def read_levels(paths: Sequence[Path]) -> Shaped[np.ndarray, "n h w"]:
-    """Code values of a group of files: of four angles, or of one raw mosaic; raises as `read_measurement`."""
+    """Code values in a group of files: four angles (n = 4), or a raw mosaic (n = 1); raises as `read_measurement`."""
     if paths[0].suffix.lower() == ".npz":
         return _read_npz(paths[0])
     return _read_angles(paths) if ANGLE_SUFFIX.fullmatch(paths[0].stem) else _read_raw(paths[0])
@@ -82,7 +82,7 @@ def read_levels(paths: Sequence[Path]) -> Shaped[np.ndarray, "n h w"]:
 def levels_at_angles(
     levels: Shaped[np.ndarray, "n h w"], white: float, mosaic: Mosaic | None, colours: str | None = None
 ) -> tuple[Float64[np.ndarray, "4 h2 w2"], Bool[np.ndarray, "4 h2 w2"]]:
-    """Intensities at 0, 45, 90 and 135 degrees, and which of them saturate; S0 is 1 at twice the level `white`.
+    """Intensities at 0, 45, 90 and 135 degrees, and which of them saturate; S0 = I0 + I90 = 1 at I0 = I90 = `white`.
 
     `levels` are those of four angles, or of one raw frame of a `mosaic`, which is demosaicked.
     """
@@ -97,7 +97,7 @@ def levels_at_angles(
 def without_saturation(
     values: Float64[np.ndarray, "4 h w"], saturated: Bool[np.ndarray, "4 h w"]
 ) -> Float64[np.ndarray, "4 h w"]:
-    """Intensities in which a single saturated angle of a pixel follows from the other three."""
+    """Replace the saturated angle of a pixel by its value from the other three, if only one angle saturates."""
     i0, i45, i90, i135 = values
     from_the_others = np.stack([i45 + i135 - i90, i0 + i90 - i135, i45 + i135 - i0, i0 + i90 - i45])
     return np.where(saturated & (saturated.sum(axis=0) == 1), np.maximum(from_the_others, values), values)
@@ -135,7 +135,7 @@ def demosaic(
 
 
 def shrink(measurement: Measurement, height: int, width: int) -> Measurement:
-    """The centre of shape height:width, scaled down to that size by averaging; unchanged if it would be enlarged.
+    """Cut out the centre of shape height:width and average it to that size; unchanged if it would be enlarged.
 
     A pixel is valid if all pixels that it averages are valid.
     """
@@ -187,10 +187,10 @@ def _measurement(values: Float64[np.ndarray, "4 h w"], saturated: Bool[np.ndarra
 
 
 def white_level(values: Shaped[np.ndarray, "n h w"]) -> float:
-    """The level at which values saturate.
+    """Level at which values saturate; UnreadablePicture unless they have 8 or 16 bits or are floats in [0, 1].
 
-    16-bit files saturate at the lowest of 10, 12, 14 and 16 bits that holds all values, because cameras often leave the
-    upper bits empty.
+    16-bit values are assumed to saturate at the lowest of 10, 12, 14 and 16 bits that holds them all, because cameras
+    often leave the upper bits empty.
     """
     if values.dtype == np.uint8:
         return 255.0
@@ -219,7 +219,7 @@ def _read_npz(path: Path) -> Shaped[np.ndarray, "4 h w"]:
 
 
 def _read_angles(files: Sequence[Path]) -> Shaped[np.ndarray, "4 h w"]:
-    """The image itself, or the green channel of a colour picture, because polarization differs between colours."""
+    """Read a file per angle; colour pictures give their green channel, because polarization differs between colours."""
     by_angle: dict[int, Path] = {}
     for file in files:
         match = ANGLE_SUFFIX.fullmatch(file.stem)

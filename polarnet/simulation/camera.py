@@ -11,7 +11,7 @@ from polarnet.simulation.readout import PERFECT, ReadoutConfig
 
 @dataclass(frozen=True)
 class Camera:
-    """Sections `emulate`, `polarizers` and `readout` of params.yaml.
+    """Settings of a simulated camera: sections `emulate`, `polarizers` and `readout` of params.yaml.
 
     >>> from polarnet.simulation import POLARIZERS, SENSORS, Camera
     >>> Camera(SENSORS["noisy"], POLARIZERS["film"]).polarizers.transmission
@@ -33,7 +33,7 @@ class Camera:
         return {name: drawn for name, drawn in values.items() if drawn}
 
     def drawn(self, seed: int, sequence: str) -> "Camera":
-        """The camera of one sequence: with the values that it draws, and without ranges."""
+        """The camera of one sequence: the values that the sequence draws replace the ranges of `randomise`."""
         values = self.draws(seed, sequence)
         if not values:
             return self

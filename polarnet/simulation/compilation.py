@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 ZERO, ONE = np.int64(0), np.int64(1)
-"""Counts to pass to a kernel: numba would compile it for a literal 0 or 1, and once more for int64."""
+"""0 and 1 as int64 arguments of kernels: numba would compile a kernel once for a literal and once more for int64."""
 
 
 def compiled(kernel: Callable) -> Any:

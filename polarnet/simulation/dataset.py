@@ -30,7 +30,7 @@ def emulate_scenes(
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks
     emulates one part on `threads` threads. The event store has the parts of the scene store. With `labels`, it stores
-    the cause of each event. An interrupted run of the same scenes, camera and seed makes the missing parts.
+    the cause of each event. After an interruption, a run of the same scenes, camera and seed makes the missing parts.
     """
     source = SceneStore.open(scenes)
     attributes = origin_of(source, camera, seed)

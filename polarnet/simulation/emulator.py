@@ -38,13 +38,13 @@ class PixelModel(Protocol):
         """The model's parameters as a NamedTuple."""
 
     def initial(self, height: int, width: int, physics: Any, key: np.uint64, channel: int) -> Any:
-        """Pixels before their first frame: a NamedTuple of arrays [h * w]."""
+        """State of a channel's pixels before the first frame, mismatch included: a NamedTuple of arrays [h * w]."""
 
     def start(self, light: Light, pixels: Any, steps: Steps) -> None:
         """Adapt the pixels to the first frame, in place."""
 
     def advance(self, light: Light, pixels: Any, steps: Steps, columns: Columns) -> tuple[Columns, int]:
-        """Take the pixels through the steps, in place; returns the columns with the events, and their number."""
+        """Advance the pixels through the steps, in place; return the columns with the events, and their number."""
 
 
 MODELS: dict[str, PixelModel] = {
@@ -113,8 +113,8 @@ def emulate(
     given the state that the previous piece returned, gives the events of the whole clip. `key` (64 bits) seeds all
     noise. Each channel draws its mismatch and noise by its number in `channels` (default: 0, 1, ...). Events are in
     the order (t, y, x, p), and identical for any number of threads and any order of channels.
-    TypeError for what is no array; ValueError for times that do not increase, values that are not finite or outside
-    0..255, and sizes that do not fit.
+    TypeError for anything but an array; ValueError for times that do not increase, values that are not finite or
+    outside 0..255, and sizes that do not fit.
 
     >>> import torch
     >>> from polarnet.simulation import SENSORS, emulate
@@ -138,7 +138,7 @@ def emulate_columns(
     labels: bool = False,
     unrounded_times: bool = False,
 ) -> tuple[list[Columns], SensorState]:
-    """As `emulate`, in numpy columns; optionally with each event's process (`labels`) and `unrounded_times`."""
+    """`emulate` with events as numpy arrays; `labels` adds their causes, `unrounded_times` their times as floats."""
     frames = as_tensor("frames", frames).detach().cpu()
     check_shape("frames", frames, "... channels height width")
     channels = tuple(range(frames.shape[-3])) if channels is None else tuple(channels)
@@ -163,7 +163,7 @@ def emulate_lights(
     labels: bool = False,
     unrounded_times: bool = False,
 ) -> tuple[list[Columns], SensorState]:
-    """Events of channels under `lights` at times `t_us`, and the state after them. Threads share the channels out."""
+    """Events of channels under `lights` at times `t_us`, and the state after them; `threads` channels run at once."""
     forget_stale_code()
     model = MODELS[config.model]
     physics, seed = model.physics_of(config), np.uint64(key)
@@ -197,7 +197,7 @@ def emulate_lights(
 
 
 def events_of(columns: Columns, height: int, width: int, labels: bool = False) -> Events:
-    """The columns as events that share their memory, with the labels of the columns if they have them."""
+    """`Events` that share the memory of the columns, with their labels if `labels`."""
     t, x, y, p, label = (torch.from_numpy(column) for column in columns[:5])
     return Events(t, x, y, p, height, width, label if labels else None)
 

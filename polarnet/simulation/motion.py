@@ -19,8 +19,8 @@ HARMONICS = 3  # number of sines in the motion along each axis
 HARMONIC_SPEEDS = np.array([1.0, 0.5, 0.25])  # typical share of each sine in the speed: mostly drift, some turning
 PHASES = np.linspace(0, 2 * math.pi, 4096, endpoint=False)
 GRID_SLACK = 1e-4  # relative; a maximum over PHASES is at most (HARMONICS * pi / 4096)^2 = 5e-6 below the true one
-BORDER_SLACK_PX = 0.02  # the same for positions, up to scenes of 4000 pixels
-TURN_SHARE = 0.2  # share of the allowed speed and acceleration that roll may use, and zoom may use
+BORDER_SLACK_PX = 0.02  # GRID_SLACK for positions, enough for scenes of up to 4000 pixels a side
+TURN_SHARE = 0.2  # share of the allowed speed and acceleration for roll, and the same share again for zoom
 TURN_RATE_MAX = 2 * math.pi  # radians per second, maximum rate of the sines of roll and zoom
 FASTEST_OVER_SLOWEST = 3.0  # factor by which the sensor may turn back faster than the scene's border requires
 ATTEMPTS = 64
@@ -95,7 +95,7 @@ class Trajectory:
     x_sines: tuple[Sine, ...]  # HARMONICS sines
     y_sines: tuple[Sine, ...]
     roll: Sine  # radians
-    zoom: Sine  # about 1 + amplitude
+    zoom: Sine  # added to 1 + its amplitude, so that the zoom is at least 1
     speed_px_s: float  # maximum over all sensor pixels and times; reached once where roll and zoom are 0
 
     def pose(self, t_s: Float64[np.ndarray, "*n"]) -> Pose:
@@ -122,7 +122,7 @@ class Trajectory:
 
     @classmethod
     def from_vector(cls, vector: Float64[np.ndarray, " n"]) -> "Trajectory":
-        """The exact inverse of `to_vector`."""
+        """The trajectory with the coefficients of `to_vector`, exactly; ValueError for another number of them."""
         names = cls.vector_names()
         if vector.shape != (len(names),):
             raise ValueError(f"a trajectory has {len(names)} coefficients, got an array of shape {vector.shape}")
@@ -222,7 +222,7 @@ def _placed(
     room: Float64[np.ndarray, " 2"],
     generator: np.random.Generator,
 ) -> Trajectory:
-    """The shape walked at `rate` radians per second, somewhere in the room it has, with roll and zoom."""
+    """Trajectory along the shape at `rate` radians per second, at a random place within `room`, with roll and zoom."""
     order = np.arange(1, HARMONICS + 1)
     size = drift * speed / rate  # pixels per unit of the shape
     peak_time = generator.uniform(0, config.duration_s)
@@ -248,7 +248,7 @@ def _placed(
 def _turn(
     amplitude: float, coupling: float, config: SynthesizeConfig, speed: float, generator: np.random.Generator
 ) -> Sine:
-    """Roll or zoom slow enough to move the sensor's corners within its share of speed and acceleration.
+    """Roll or zoom that moves the sensor's corners no faster than its share of speed and acceleration allows.
 
     A pixel q away from the centre sees q exp(i roll) / zoom, whose second derivative is at most
     q (roll'' + 2 roll'^2 + zoom'' + 3 zoom'^2) since zoom >= 1 and 2 roll' zoom' <= roll'^2 + zoom'^2.
@@ -276,7 +276,7 @@ def _reach(config: SynthesizeConfig) -> tuple[float, float]:
 
 
 def frame_times_us(config: SynthesizeConfig) -> list[int]:
-    """Microseconds of the N + 1 ground-truth frames that bound the N windows of a sequence."""
+    """Times in microseconds of the N + 1 ground-truth frames that bound the N windows of a sequence."""
     windows = round(config.duration_s * config.frame_rate_hz)
     return [round(1e6 * k / config.frame_rate_hz) for k in range(windows + 1)]
 
@@ -289,11 +289,11 @@ def render(
     width: int,
     pitch: int = 1,
 ) -> Float32[Tensor, "n 3 h w"]:
-    """Stokes images on the moving sensor, by bilinear interpolation of the scene's.
+    """(S0, S1, S2) on the moving sensor at times `t_s` in seconds, interpolated bilinearly from those of the scene.
 
     `sensor_to_scene` maps sensor pixel (row, column) to a point of the scene; pixel centres are at integers in both.
-    A camera rolled by a measures angles from its own axes, so that its AoLP is the scene's minus a. Pixels lie `pitch`
-    pixels of the scene apart: 2 for the cells of a DoFP sensor.
+    The camera measures angles from its own axes: rolled by an angle a, it sees the scene's AoLP minus a. Its pixels are
+    `pitch` scene pixels apart: 2 for the cells of a DoFP sensor.
     """
     pose = trajectory.pose(np.asarray(t_s, dtype=np.float64))
     return torch.from_numpy(render_poses(scene, pose._replace(zoom=pose.zoom / pitch), height, width))

@@ -26,7 +26,7 @@ from polarnet.simulation.scene import PolarizationScene
 from polarnet.stokes import parse_mosaic
 
 CHANNELS = (0, 1, 2, 3)  # behind the polarizers at 0, 45, 90 and 135 degrees
-CHUNK = 16  # frames rendered at once if the sensor turns or zooms
+CHUNK = 16  # frames rendered at once, unless the sensor only drifts behind uniform polarizers
 
 
 def emulate_motion(
@@ -66,9 +66,9 @@ def emulate_motion(
 def leave_sensors(
     channels: list[Events], polarizers: PolarizersConfig, readout: ReadoutConfig, key: int, duration_us: int
 ) -> list[Events]:
-    """The channels as they leave their sensors: each its own, or all four one DoFP sensor.
+    """Apply the readout to the four channels of a whole sequence: to four sensors, or to one DoFP sensor.
 
-    Takes whole sequences, with the `key` and duration of their emulation.
+    `key` and `duration_us` are those of the emulation.
     """
     if readout.perfect:
         return channels

@@ -1,8 +1,8 @@
 """Polarizers of the simulated camera: extinction, angle errors, transmission, and the mosaic of a DoFP sensor.
 
-A linear polarizer weights the Stokes parameters (`polarnet.stokes.analyzer`), so that four numbers a channel describe
-film or wire grids before four sensors. The micropolarizers of a DoFP sensor differ from pixel to pixel, and a pixel
-receives some of its neighbours' light.
+A linear polarizer weights the Stokes parameters (`polarnet.stokes.analyzer`). Angle, extinction ratio and transmission
+therefore describe a film or wire grid before a whole sensor. The micropolarizers of a DoFP sensor differ from pixel to
+pixel, and a pixel receives some of its neighbours' light.
 """
 
 import math
@@ -90,7 +90,7 @@ def channel_size(layout: str, height: int, width: int) -> tuple[int, int]:
 
 
 def grid(layout: str, height: int, width: int) -> tuple[int, int, int]:
-    """Rows and columns of a sensor's channel, and the distance of its pixels in pixels of the sensor."""
+    """(rows, columns, pitch) of a sensor's channel; its pixels are `pitch` sensor pixels apart: 1, or 2 for DoFP."""
     rows, columns = channel_size(layout, height, width)
     return rows, columns, height // rows
 
@@ -109,7 +109,7 @@ def _ratios(polarizers: PolarizersConfig) -> list[float]:
 def analyzer_maps(
     polarizers: PolarizersConfig, height: int, width: int, key: int
 ) -> Float32[np.ndarray, "sensors 3 h w"]:
-    """Weights of (S0, S1, S2) of every pixel: of four sensors, or of one DoFP sensor.
+    """Weights of (S0, S1, S2) at every pixel of the four sensors, or of the one DoFP sensor.
 
     `key` (64 bits) seeds the differences between pixels.
     """
@@ -139,7 +139,7 @@ def _normal(purpose: int, channels: np.ndarray, key: int) -> Float64[np.ndarray,
 
 
 def mixed_with_neighbours(frames: Float32[np.ndarray, "n h w"], crosstalk: float) -> Float32[np.ndarray, "n h w"]:
-    """Light of a DoFP sensor's pixels with a share `crosstalk` from the four neighbours; the border repeats itself."""
+    """Light on a DoFP sensor with a share `crosstalk` from each pixel's four neighbours; edge pixels are repeated."""
     if crosstalk == 0:
         return frames
     padded = np.pad(frames, ((0, 0), (1, 1), (1, 1)), mode="edge")

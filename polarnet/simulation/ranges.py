@@ -10,7 +10,7 @@ from polarnet.runtime.machine import generator_for
 from polarnet.runtime.sections import section
 
 LOGARITHMIC = ("_hz", "_per_s", "extinction_ratio")
-"""Ends of the names of parameters that are drawn uniformly in their logarithm: rates, bandwidths, ratios."""
+"""Name suffixes of the parameters whose logarithm is drawn uniformly: rates, bandwidths, ratios."""
 
 
 @section
@@ -35,7 +35,7 @@ class RandomisedConfig:
                 try:
                     dataclasses.replace(self, randomise=None, **{name: _repeated(getattr(self, name), bound)})
                 except ValueError as error:
-                    first_line, _, _ = str(error).partition("\n")  # every value of a list is wrong alike
+                    first_line, _, _ = str(error).partition("\n")  # the others say the same of further list values
                     raise ValueError(f"randomise.{first_line}") from None
 
 
@@ -47,7 +47,7 @@ def _numbers(config: RandomisedConfig) -> list[str]:
 
 
 def _repeated(value: Any, number: float) -> Any:
-    """`number`, once for each value of a list."""
+    """`number`, or as many of them as `value` has if that is a list."""
     return [number] * len(value) if isinstance(value, list) else number
 
 

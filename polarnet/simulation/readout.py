@@ -70,7 +70,7 @@ def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) 
 def _bus(
     times_us: Float64[np.ndarray, " n"], rows: Int64[np.ndarray, " n"], event_us: float, max_wait_us: float
 ) -> tuple[Float64[np.ndarray, " n"], np.ndarray]:
-    """Times at which events leave a bus that takes `event_us` an event, row by row, and which of them it carries."""
+    """Time at which each event leaves the bus, which takes `event_us` per event, and whether the bus carries it."""
     leaves_us, carried = np.empty(times_us.size), np.zeros(times_us.size, np.bool_)
     free_us, first = -np.inf, 0
     while first < times_us.size:

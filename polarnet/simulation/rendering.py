@@ -28,8 +28,8 @@ def render_times_us(
     """Times of the rendered frames, from 0 to `duration_us`, `rate_hz` a second.
 
     Without a rate, there is one frame for each pixel of motion, and at least MIN_RATE_HZ a second.
-    Light changes smoothly between two pixels of the scene, and its slope jumps at each pixel. On a drifting sensor, all
-    pixels reach these jumps at the same time. Unless `regular`, the nearest frame is moved to each such time.
+    Light changes smoothly between two pixels of the scene, and its slope jumps at each pixel. All pixels of a drifting
+    sensor reach these jumps at once. Unless `regular`, each jump gets a frame: an extra one, or the nearest at a rate.
     """
     samples = 2 + math.ceil(SAMPLES_PER_STEP * duration_us * 1e-6 * max(trajectory.speed_px_s, MIN_RATE_HZ))
     sampled_us = np.linspace(0, duration_us, samples)
@@ -87,14 +87,14 @@ def drifts(pose: Pose) -> bool:
 def render_intensities(
     scene: PolarizationScene, pose: Pose, height: int, width: int, weights: Float32[np.ndarray, "sensors 3 *pixels"]
 ) -> Float32[np.ndarray, "sensors n h w"]:
-    """Digital numbers behind polarizers of these `weights` for any motion; the polarizers turn with the camera."""
+    """Light in DN behind polarizers of these `weights` for a sensor in n poses; the polarizers turn with it."""
     return behind_polarizers(render_poses(scene, pose, height, width).transpose(1, 0, 2, 3), weights)
 
 
 def split_channels(
     frames: Float32[np.ndarray, "sensors n h w"], polarizers: PolarizersConfig
 ) -> Float32[np.ndarray, "4 n h2 w2"]:
-    """Light of the four channels from that of the sensors: of four, or of one DoFP sensor."""
+    """Light of the four channels: that of four sensors unchanged, or a DoFP sensor's with crosstalk, split by cells."""
     if polarizers.layout == "dofp":
         return split_cells(mixed_with_neighbours(frames[0], polarizers.crosstalk), polarizers.mosaic)
     return frames
@@ -110,7 +110,7 @@ def weights_of(
 def behind_polarizers(
     stokes: Float32[np.ndarray, " 3 *shape"], weights: Float32[np.ndarray, "sensors 3 *pixels"]
 ) -> Float32[np.ndarray, " sensors *shape"]:
-    """Digital numbers behind polarizers that weight S0, S1 and S2: alike at all pixels, or with a weight for each."""
+    """Light in DN behind polarizers that weight S0, S1 and S2; the weights are those of a sensor, or of each pixel."""
     s0, s1, s2 = stokes
     return np.maximum(np.stack([a * s0 + b * s1 + c * s2 for a, b, c in weights]), 0) * FULL_SCALE
 

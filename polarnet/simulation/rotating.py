@@ -44,12 +44,12 @@ class RotatingConfig:
     """Section `rotating` of params.yaml: a polarizer that rotates in front of one sensor."""
 
     rate_hz: float
-    """Turns per second; negative: from 0 towards 135 degrees."""
+    """Turns per second; with a negative rate, the polarizer turns from 0 towards 135 degrees."""
     start_angle_deg: Annotated[float, Field(ge=-360, le=360)]
     extinction_ratio: Annotated[float, Field(ge=1)] | None
     """Transmission along the axis over that across it; null: infinite."""
     frames_per_turn: Annotated[int, Field(ge=32)]
-    """Light is rendered at least as often as this, and as section `emulate` says."""
+    """Minimum number of rendered frames per turn; `emulate.render_rate_hz` can raise it."""
 
     def __post_init__(self):
         if self.rate_hz == 0:
@@ -62,7 +62,7 @@ class RotatingConfig:
 
 
 class RotatingSimulation(NamedTuple):
-    """Events of the one sensor, and the polarizer's angle at their times."""
+    """Events of the one sensor, and the polarizer's angle over time."""
 
     events: Events
     rotation: Rotation
@@ -73,7 +73,7 @@ class RotatingSimulation(NamedTuple):
 def behind_rotating_polarizer(
     stokes: Float32[Tensor, "n 3 h w"], angles: Float64[np.ndarray, " n"], extinction_ratio: float | None
 ) -> Float32[Tensor, "n h w"]:
-    """Intensity behind a polarizer at the angle of each time; None: nothing passes across its axis."""
+    """Intensity behind a polarizer at angle `angles[k]` (radians) in frame k; a ratio of None means infinite."""
     leakage = 0.0 if extinction_ratio is None else 1 / extinction_ratio
     cos, sin = (torch.from_numpy(f(2 * angles)).float()[:, None, None] for f in (np.cos, np.sin))
     s0, s1, s2 = stokes.unbind(1)
@@ -124,7 +124,7 @@ def emulate_rotating(
         (events,), state = emulate(frames, times, emulator, key, state)
         pieces.append(events)
     if state is None:
-        raise ValueError("expected at least one time")
+        raise ValueError("expected at least one time to render the light at, got none")
     return RotatingSimulation(concatenate(pieces), rotation, state)
 
 
@@ -138,9 +138,9 @@ def emulate_rotating_scenes(
 ) -> int:
     """Emulate the test sequences of a scene store behind the rotating polarizer, and return their number.
 
-    The sensor, its readout and its motion are those of the four channels, its noise is not. The event store holds the
-    events in its first channel; one of the same scenes and settings is kept, any other is replaced. `mapper` is as in
-    `dataset.emulate_scenes`.
+    Sensor, readout and motion are those of the four channels, but the noise differs. Events are in the store's first
+    channel; the other three are empty. A store of the same scenes and settings is kept, any other is replaced.
+    `mapper` is as in `dataset.emulate_scenes`.
     """
     source = SceneStore.open(scenes)
     attributes = {**origin_of(source, camera, seed), "rotating": asdict(rotating)}

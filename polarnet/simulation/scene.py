@@ -1,4 +1,4 @@
-"""Scenes of polarized light: constant Stokes parameters, from photographs or from measured intensities."""
+"""Scenes of polarized light: Stokes parameters, constant in time, from photographs or from measured intensities."""
 
 import math
 from dataclasses import dataclass

@@ -31,7 +31,7 @@ MADE = "made.json"
 logger = logging.getLogger(__name__)
 
 MakeMapper = Callable[[str], Callable[..., Iterable[Any]]]
-"""`polarnet.runtime.cluster.pmap` with its workers bound, for a label; or one that gives the built-in `map`."""
+"""Label of a progress bar -> mapper: `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`."""
 
 
 @section
@@ -39,7 +39,7 @@ class SetsConfig:
     """Section `sets` of params.yaml: how test sets beyond `simulated` differ from it."""
 
     measured_root: str
-    """Folder of the measured polarization of `measured`, searched recursively."""
+    """Folder of the measurements for the test set `measured`, searched recursively."""
     rotation_max_deg: Annotated[float, Field(ge=0, le=90)]
     """This field and the next four set the motion of `complex_motion`."""
     zoom_max: Annotated[float, Field(ge=1, le=16)]
@@ -69,7 +69,7 @@ class Recipe:
 
 
 def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Recipe, mapper: MakeMapper) -> bool:
-    """The test pictures of `images` again, under the motion of `sets`. False if the folder is complete already."""
+    """Make a test set of the test pictures of `images` under the motion of `sets`; False if it is complete already."""
     harder = {name: value for name, value in asdict(sets).items() if name != "measured_root"}
     recipe = dataclasses.replace(recipe, motion=dataclasses.replace(recipe.motion, **harder))
     return _make(folder, recipe, mapper, functools.partial(_hold_out, images), _content(images))
@@ -78,11 +78,10 @@ def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Re
 def make_folder_set(
     root: Path, kind: str, folder: Path, recipe: Recipe, mapper: MakeMapper, limit: int | None = None
 ) -> bool:
-    """Every photograph or measured scene under `root`, all in the test split. False if the folder is complete already.
+    """Make a test set of all photographs or measured scenes under `root`; False if it is complete already.
 
-    With a `limit`, only so many pictures, in the order of the hashes of their content.
-    `kind` is photographs, polarization, or auto, which looks at the files. Raises ValueError if
-    no picture can be used.
+    A `limit` takes that many pictures at most, chosen by content hash. `kind` is photographs, polarization, or auto,
+    which looks at the files. Raises ValueError if no picture can be used.
     """
     if not root.is_dir():
         actual = "a file" if root.exists() else "no such folder"
@@ -96,7 +95,7 @@ def make_folder_set(
 
 
 def kind_of(root: Path) -> str:
-    """`polarization` where the folder holds .npz files or pictures of four angles of one thing, else `photographs`.
+    """`polarization` if a folder holds .npz files or pictures NAME_0, NAME_45, NAME_90, NAME_135, else `photographs`.
 
     Raw mosaics look like photographs: name their kind.
     """
@@ -110,9 +109,9 @@ def kind_of(root: Path) -> str:
 def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path], Any], source: str) -> bool:
     """Fill `folder`, resuming a stopped run with the same settings, seed and source pictures.
 
-    `fill` writes the pictures into a folder, and `source` is the hash of those that it reads. A folder made with others
-    is emptied first, and so is, with a warning, one whose files have changed since. The code is not
-    compared: DVC does that for the pipeline's sets.
+    `fill` writes the pictures into a folder, and `source` is the hash of its input. A folder made with other settings
+    or input is emptied first, as is one whose files have changed since, with a warning. Returns False if the folder is
+    complete already. Changes of the code are not noticed: DVC checks them for the pipeline's sets.
     """
     sections = {"ingest": asdict(recipe.ingest), "motion": asdict(recipe.motion), **recipe.camera.sections}
     settings = sections | {"seed": recipe.seed, "source": source, "labels": recipe.labels}

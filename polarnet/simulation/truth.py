@@ -40,7 +40,7 @@ class Motion(NamedTuple):
     sequence: str
     scene: str
     picture: str
-    """Name of the picture that the scene is, or a variant of."""
+    """Name of the picture that the scene is made from."""
     split: str
     trajectory: Trajectory
 
@@ -93,7 +93,7 @@ def synthesize(
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks makes
     one part of the stores, `sequences_per_part` sequences. Every trajectory depends only on the seed and the sequence's
-    name. An interrupted run makes the missing parts.
+    name. A run after an interruption makes the missing parts.
 
     Skips every picture too small for the sensor and its motion, with a warning. Raises ValueError if none is left.
     """
@@ -210,7 +210,7 @@ def _synthesize_part(
 
 
 def _planes_of(scene: str, picture: str, images: Path, variation: VariationConfig | None, seed: int) -> Scene:
-    """A picture in polarization, or a variant of one, quantised: the scene that is emulated, and so the truth."""
+    """Scene made from a picture, quantised as stored, so that events and truth are rendered from the same values."""
     polarization, valid = _read_polarization(images, picture)
     if variation and scene != picture:
         polarization = varied(polarization, variation, generator_for(seed, scene, "variation"))

@@ -15,7 +15,7 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 MAX_STEP_PX = 1.0
-FLOW_QUANTILE = 0.999  # of the flow's length over the pixels: single pixels without texture get any flow
+FLOW_QUANTILE = 0.999  # quantile of the flow's length taken as the motion: pixels without texture get arbitrary flow
 
 
 class StokesFrame(NamedTuple):
@@ -26,7 +26,7 @@ class StokesFrame(NamedTuple):
 
 
 def upsampled(frames: Iterable[StokesFrame]) -> Iterator[StokesFrame]:
-    """The frames, and interpolated ones between them, evenly spaced in whole microseconds."""
+    """Yield the frames, with interpolated frames evenly spaced between them, at whole microseconds."""
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     before: StokesFrame | None = None
     for after in frames:

@@ -31,18 +31,18 @@ class VariationConfig:
     share: Annotated[float, Field(ge=0, le=1)]
     """Share of variants with changed DoLP, and share with changed S0; AoLP is rotated in all."""
     dolp_factor: list[NonNegativeFloat]
-    """DoLP is multiplied by a number drawn between these two ..."""
+    """[smallest, largest] factor on DoLP."""
     dolp_exponent_spread: NonNegativeFloat
-    """... after being raised to a power whose logarithm is normal with this standard deviation."""
+    """DoLP is first raised to a power whose natural logarithm has mean 0 and this standard deviation."""
     dolp_spacing: Annotated[str, one_of(SPACINGS)]
     """Distribution of the factor: linear draws it uniformly, logarithmic draws its logarithm uniformly, so that a
     DoLP of a few percent, as in most measured scenes, is as frequent as a large one."""
     s0_factor: list[Annotated[float, Field(gt=0, le=1)]]
     s0_exponent_spread: NonNegativeFloat
     uniform_share: Annotated[float, Field(ge=0, le=1)]
-    """Share of variants whose polarization is drawn towards one uniform value of any DoLP and AoLP ..."""
+    """Share of variants whose polarization is drawn towards a uniform one of random DoLP and AoLP."""
     uniform_weight: list[Annotated[float, Field(ge=0, le=1)]]
-    """... by a weight between these two; 1: DoLP and AoLP are constant."""
+    """[smallest, largest] weight of the uniform polarization; 1: DoLP and AoLP are constant."""
 
     def __post_init__(self):
         for name in ("dolp_factor", "s0_factor", "uniform_weight"):

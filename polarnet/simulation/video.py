@@ -22,8 +22,8 @@ from polarnet.simulation.rendering import behind_polarizers, split_channels, wei
 from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb
 from polarnet.simulation.upsampling import StokesFrame, upsampled
 
-MOTION_STEPS = 64  # rendered frames a piece of a moving sensor
-PIECE_PIXELS = 2**20  # of a piece of a video; its light and Stokes parameters take 28 bytes a pixel
+MOTION_STEPS = 64  # rendered frames in a piece of a moving sensor's simulation
+PIECE_PIXELS = 2**20  # pixels of all frames in a piece of a video; light and Stokes parameters take 28 bytes each
 MAX_PIECE_FRAMES = 64
 
 
@@ -35,7 +35,7 @@ class Piece(NamedTuple):
     events: list[Events]
     t_us: Int64[Tensor, " n"]
     stokes: Float32[Tensor, "n 3 h w"]
-    """On the pixels of a channel."""
+    """True (S0, S1, S2) on the pixels of a channel."""
 
 
 class Drawn(NamedTuple):
@@ -58,7 +58,7 @@ def moving_pieces(
     threads: int = 1,
     labels: bool = False,
 ) -> Iterator[Piece]:
-    """`simulate` in pieces: joined and read out, their events are those of `simulate`.
+    """Simulate a moving sensor in pieces; joined and read out (`leave_sensors`), the events are those of `simulate`.
 
     With `labels`, every event names its cause.
     """
@@ -88,7 +88,7 @@ def video_pieces(
     threads: int = 1,
     labels: bool = False,
 ) -> Iterator[Piece]:
-    """Events of a camera whose pixels see the pixels of the frames, and the frames themselves as truth.
+    """Simulate, in pieces, a camera at rest, each pixel of which sees one pixel of the frames; these are the truth.
 
     The pixels adapt to the first frame. The channels of a DoFP sensor see every second row and column, and their truth
     is the mean of each 2x2 cell. With `upsample`, the sensor also sees interpolated frames (`upsampled`). With
@@ -160,12 +160,12 @@ def simulate_video(
     upsample: bool = False,
     threads: int = 1,
 ) -> list[Events]:
-    """Events of the four channels of a camera at rest whose pixels see the pixels of `frames` at times `t_us`.
+    """Events of the four channels of a camera at rest, each pixel of which sees one pixel of `frames`.
 
-    Frames are RGB pictures as for `simulate`, or scenes. Times are whole microseconds, the first of them 0. With
-    `upsample`, interpolated frames are added so that nothing moves by more than about one pixel a step. The same
-    arguments give the same events on any number of threads. ValueError for times that do not fit the frames, and as
-    `simulate`.
+    Frames are RGB pictures as for `simulate`, or scenes. Their times `t_us` are whole microseconds, the first of them
+    0. With `upsample`, interpolated frames are added so that nothing moves by more than about one pixel a step. The
+    same arguments give the same events on any number of threads. ValueError for times that do not fit the frames, and
+    as `simulate`.
 
     >>> import torch
     >>> from polarnet.simulation import SENSORS, simulate_video

@@ -12,10 +12,10 @@ CODEC = BloscCodec(cname="lz4", shuffle="shuffle")
 
 
 class AppendedFrames:
-    """Arrays of equal length, one row a frame; the first frame decides names, shapes and types.
+    """Zarr arrays of equal length, one row per frame; the first frame decides their names, shapes and types.
 
-    `conventions` explains each name; the group's attributes keep those in use. Nothing is written before the first
-    frame.
+    `conventions` explains each name, and is stored in the group's attributes for the names in use. Nothing is written
+    before the first frame.
     """
 
     def __init__(self, path: Path, conventions: Mapping[str, str]):
@@ -24,7 +24,7 @@ class AppendedFrames:
         self._buffer: dict[str, list[np.ndarray]] = {}
 
     def add(self, frame: Mapping[str, np.ndarray]) -> None:
-        """Add one frame."""
+        """Add one frame: the row of each array by name. A full chunk of frames is written to disk."""
         for name, values in frame.items():
             self._buffer.setdefault(name, []).append(values)
         if len(next(iter(self._buffer.values()))) == FRAMES_PER_CHUNK:

@@ -103,7 +103,7 @@ class EventStore(Store):
     ) -> None:
         """Write the four channels (0, 45, 90, 135 degrees) of the next sequence of a part; see `Store.append`.
 
-        `drawn` (plain JSON) are the parameters that this sequence alone has. A sequence that is already written stays
+        `drawn` (plain JSON) are the camera parameters drawn for this sequence. A sequence that is already written stays
         unchanged, since the store's attributes determine its events.
         ValueError, before anything is written, for events out of order, off the sensor or outside [0, duration_us], and
         for events without labels in a labelled store.
@@ -193,7 +193,7 @@ class EventStore(Store):
 
     def _check(self, channels: Sequence[Events], duration_us: int) -> None:
         if len(channels) != CHANNELS:
-            raise ValueError(f"expected a stream for each of {CHANNELS} polarizers, got {len(channels)}")
+            raise ValueError(f"expected a channel for each of {CHANNELS} polarizers, got {len(channels)}")
         if not 0 < duration_us <= MAX_DURATION_US:
             raise ValueError(f"expected a duration of 1 to {MAX_DURATION_US} us, got {duration_us}; cut the sequence")
         for angle, channel in zip(POLARIZER_ANGLES_DEG, channels, strict=True):
@@ -211,7 +211,7 @@ class EventStore(Store):
 
 
 def _milliseconds(duration_us: int) -> int:
-    """Length of the time index: every full millisecond from 0 up to the first at or after the end."""
+    """Number of rows of the time index: milliseconds from 0 up to the first at or after the end."""
     return -(-duration_us // 1000) + 1
 
 

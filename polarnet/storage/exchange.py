@@ -71,7 +71,7 @@ def label_file(path: Path) -> Path:
 
 
 def write_evt3(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:
-    """Write one sensor as Prophesee's raw file of 16-bit EVT3 words, without their vectors of neighbouring pixels.
+    """Write one sensor as Prophesee's raw file of 16-bit EVT3 words, without vector words (of neighbouring pixels).
 
     The header states the sensor's size. Such a file cannot hold the duration. ValueError for a side above 2048 px.
     """

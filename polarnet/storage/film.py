@@ -21,5 +21,5 @@ def angle_bytes(aolp: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
 
 
 def signed_bytes(counts: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
-    """ON minus OFF events from -127 to 127, plus `NO_EVENTS`; counts outside are clamped."""
+    """ON minus OFF events, clamped to -127 .. 127, plus `NO_EVENTS`."""
     return (counts.round().clamp(-127, 127) + NO_EVENTS).to(torch.uint8)

@@ -86,7 +86,7 @@ class SplitStore(Store):
     splits: dict[str, str]
     """Split of each sequence."""
     variant_of: dict[str, str]
-    """Name of the picture, for each sequence over a variant of it."""
+    """Name of the original picture, for each sequence whose scene is a variant."""
     masked: bool
     """Whether the store marks pixels whose light is unknown."""
 
@@ -118,7 +118,7 @@ class FrameStore(SplitStore):
 
     @functools.cached_property
     def columns(self) -> Columns:
-        """Times and images; the masks only where some pixels are masked."""
+        """Times and images of the frames; in a masked store, masks as well."""
         image, chunk = (self.height, self.width), min(self.n_frames, FRAMES_PER_CHUNK)
         columns = {
             "intensity": Column("frames", "uint16", chunk, (4, *image)),

@@ -19,7 +19,7 @@ REPAIR = "write this store again, or copy it again from where it is whole"
 
 @dataclass(frozen=True)
 class Column:
-    """One array of every part. A sequence has the same number of rows in all columns of an axis."""
+    """Layout of an array that every part has. A sequence has as many rows in each column of one `axis`."""
 
     axis: str
     dtype: str
@@ -76,7 +76,7 @@ class Shortage(RuntimeError):
 
 
 def raise_shortage(error: Exception, path: str) -> None:
-    """`Shortage` if reading failed for want of memory, threads or file descriptors, not because of the file."""
+    """Raise `Shortage` if `error` comes from a lack of memory, threads or file descriptors; otherwise do nothing."""
     if isinstance(error, Shortage):
         raise error
     short = isinstance(error, MemoryError) or getattr(error, "errno", None) in SHORTAGES

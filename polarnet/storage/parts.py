@@ -2,7 +2,7 @@
 
     NAME.zarr/zarr.json            header: format, version, names of the sequences, attributes, SHA-256 of each part
     NAME.zarr/part-00000.zip       a part: a zip of a Zarr group
-        zarr.json                  record of each sequence of the part: its rows in the columns, its numbers
+        zarr.json                  record of each sequence of the part: its rows in the columns, its own metadata
         events/t/...               one column: the rows of these sequences, one sequence after the other
 
 The store and each of its parts are Zarr v3 groups, each column is an array. Every sequence starts a chunk of its own,
@@ -193,7 +193,7 @@ class Store:
     def _rename(self) -> None:
         """Move a finished store from PATH.tmp to PATH."""
         folder = Path(self.path)
-        for leftover in [*folder.glob("*.tmp"), *folder.glob("*.partial")]:  # of processes killed while writing
+        for leftover in [*folder.glob("*.tmp"), *folder.glob("*.partial")]:  # from processes killed while writing
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         final = folder.with_name(folder.name.removesuffix(".tmp"))
         replaced = final.with_name(final.name + ".old")
@@ -209,11 +209,11 @@ class Store:
         return self._is_whole(self._part(sequence))
 
     def append(self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
-        """Add the next sequence to its part, with its rows in some columns and its numbers; the last one completes it.
+        """Add the next sequence to its part: rows of some columns, and a `record` of plain JSON.
 
-        The sequences of a part come in the store's order, from one process. A part begins anew with its first sequence.
-        ValueError for another order. OSError after a part if the disk has no room for the missing parts, which are
-        expected to be as large as the mean of those that are there.
+        The sequences of a part come in the store's order, from one process; ValueError for another order. The first one
+        starts the part anew, the last one completes it. OSError after a part if the disk has no room for the missing
+        parts, assumed to be as large as the mean of the written ones.
         """
         part, written = self._part(sequence), len(self.records_so_far(sequence))
         names = self.parts[part]
@@ -242,7 +242,7 @@ class Store:
         return self._unfinished[part].records
 
     def record(self, sequence: str) -> Header:
-        """Numbers of a stored sequence, and for each axis the start and stop of its rows."""
+        """Record of a stored sequence, with [start, stop] of its rows for each axis; ValueError if unreadable."""
         part = self._part(sequence)
         if part not in self._records:
             try:
@@ -256,7 +256,7 @@ class Store:
         return self._records[part][sequence]
 
     def read_column(self, name: str, sequence: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows `start` to `stop` (None: to the end) of a sequence; ValueError that names what cannot be read."""
+        """Rows of a sequence from `start` up to `stop` (None: the end); ValueError names an unreadable column."""
         part, record = self._part(sequence), self.record(sequence)
         try:
             first, end = record[self.columns[name].axis]
@@ -329,14 +329,14 @@ class Store:
         return f"{self.path}/{part}.zip"
 
     def _open(self, process: int, part: str) -> tuple[zarr.Group, dict[str, Any]]:
-        """The group of a part, and room for its arrays; a forked process must not share its parent's open file."""
+        """Group of a part and a dict for its arrays, cached by process: forks must not share their parent's file."""
         file = self._file(part)
         if part in self.digests and self._written_digest(part) != self.digests[part]:
             raise ValueError("it is not the part that was written into this store")
         return open_group(f"zip::{file}" if is_url(file) else file), {}
 
     def _written_digest(self, part: str) -> str:
-        """The digest at the end of a part, which says what its content was when it was written."""
+        """Digest that `_Part.finish` wrote at the end of a part."""
         with fsspec.open(self._file(part)) as file:
             file.seek(-DIGEST_LENGTH, os.SEEK_END)
             return file.read().decode("ascii", "replace")
@@ -357,7 +357,7 @@ class _Part:
         self._arrays = {name: create_array(self._group, name, column) for name, column in columns.items()}
 
     def append(self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
-        """Write the chunks of a sequence and take its record."""
+        """Write the chunks of a sequence, and hold its record until `finish`."""
         rows = {}
         for name, values in columns.items():
             column, array = self._columns[name], self._arrays[name]

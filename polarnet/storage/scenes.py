@@ -98,7 +98,7 @@ class SceneStore(SplitStore):
 
     @functools.cached_property
     def columns(self) -> Columns:
-        """Planes of the scenes; the mask only where some pixels are masked."""
+        """S0, DoLP and AoLP of the scenes, pixel by pixel; in a masked store, the mask as well."""
         types = {"s0": "uint16", "dolp": "uint16", "aolp": "uint16", **({"valid": "uint8"} if self.masked else {})}
         return {name: Column("pixels", dtype, CHUNK) for name, dtype in types.items()}
 
@@ -171,7 +171,7 @@ class SceneStore(SplitStore):
             self.append(sequence, self._pixels(name, scene), record)
 
     def read(self, sequence: str) -> SceneRecord:
-        """Everything about one sequence; ValueError that names the column of damaged data."""
+        """Scene, trajectory and duration of a sequence; ValueError names the column of damaged data."""
         record, requests = self.record(sequence), [(name, 0, None) for name in self.columns]
         s0, dolp, aolp, *mask = (rows.reshape(record["picture_size"]) for rows in self.read_columns(sequence, requests))
         scene = _dequantised([s0, dolp, aolp], torch.from_numpy(mask[0] == 1) if mask else None)

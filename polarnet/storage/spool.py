@@ -1,4 +1,4 @@
-"""Events of a sequence on disk while they arrive: one file a column and channel, read back through memory maps."""
+"""Events of a sequence on disk while they arrive: a file for each column of each channel, read as memory maps."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,9 +14,9 @@ TYPES: dict[str, type[np.generic]] = {"t": np.int64, "x": np.int16, "y": np.int1
 
 
 class EventSpool:
-    """Takes consecutive pieces of the channels of one sequence; as a context manager it closes its files.
+    """Writer of consecutive pieces of a sequence's channels to `folder`; as a context manager it closes its files.
 
-    Labels are kept if `labels`; every piece must then have them.
+    With `labels`, the labels are written too, and every piece must have them.
     """
 
     def __init__(self, folder: Path, labels: bool = False):

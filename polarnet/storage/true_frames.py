@@ -43,7 +43,7 @@ class TrueFrames:
     """
 
     def __init__(self, t_us: Int64[np.ndarray, " n"], block: Callable[[int, int], list[TrueFrame]]):
-        """`block` reads the frames from one number up to another."""
+        """`block(start, stop)` reads the frames from number `start` up to `stop`."""
         self.t_us = t_us
         self._block = functools.lru_cache(maxsize=2)(block)
 

@@ -41,12 +41,12 @@ class WindowSequence(NamedTuple):
     inputs: Float[Tensor, "t c h w"] | Int8[Tensor, "t c h w"]
     """Channel by channel (0, 45, 90, 135 degrees); c is 4 times the images per channel of the representation.
 
-    Bytes only while a training keeps them in memory.
+    int8 only in the memory of a training, where that is exact.
     """
     dolp: Float[Tensor, "t h w"]
     aolp: Float[Tensor, "t h w"]
     intensity: Float[Tensor, "t 4 h w"]
-    """Has no windows while a training that does not need intensities keeps sequences in memory."""
+    """Empty (t = 0) in the memory of a training that does not need intensities."""
     valid: Bool[Tensor, "t h w"] | None = None
     """Where the truth is known; None: everywhere."""
 

@@ -189,7 +189,7 @@ def test_an_empty_split_is_named_where_pictures_were_asked_for(fractions, empty,
     val, test = fractions
     config = dataclasses.replace(CONFIG, root=str(tmp_path / "pictures"), val_fraction=val, test_fraction=test)
     ingest(config, 1, tmp_path / "images", map)
-    assert caplog.messages == [f"no picture is in split {split}: 2 pictures are few" for split in empty]
+    assert caplog.messages == [f"split {split} is empty, because 2 pictures are too few" for split in empty]
 
 
 def on_two_threads_backwards(function: Callable[[Any], Any], items: Sequence[Any]) -> Iterable[Any]:

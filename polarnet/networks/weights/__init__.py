@@ -1,10 +1,10 @@
-"""The weights that come with the package, and where they are."""
+"""Weights that come with the package, and a function that locates them."""
 
 from pathlib import Path
 
 
 def shipped_weights() -> Path:
-    """The checkpoint of the network `polarnet`; FileNotFoundError, which says what to do, where there is none.
+    """Path of the checkpoint of network `polarnet` that comes with the package; FileNotFoundError if there is none.
 
     >>> from polarnet.networks import shipped_weights
     >>> shipped_weights().name

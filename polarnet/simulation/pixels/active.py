@@ -13,7 +13,7 @@ class Active(NamedTuple):
     pixel: np.ndarray
     """int32, index into the channel"""
     scratch: np.ndarray
-    """int32"""
+    """int32, working memory"""
     change: np.ndarray
     """float64, log intensity since the last event, at time `now`"""
     now: np.ndarray
@@ -29,7 +29,7 @@ class Active(NamedTuple):
     final_change: np.ndarray
     """float64, change at the end of the step if no event follows"""
     event: np.ndarray
-    """int64, this round's event as `pending.event_of` encodes it"""
+    """int64, this round's event as `columns.event_of` encodes it"""
     threshold_on: np.ndarray
     threshold_off: np.ndarray
     leak: np.ndarray
@@ -45,7 +45,7 @@ class Active(NamedTuple):
 
 @compiled
 def empty_active(capacity):
-    """Room for `capacity` pixels."""
+    """Uninitialised arrays for up to `capacity` pixels."""
     doubles, floats, events = np.empty((7, capacity)), np.empty((4, capacity), np.float32), np.empty(capacity, np.int64)
     ints, flags = np.empty((3, capacity), np.int32), np.empty((2, capacity), np.uint8)
     return Active(

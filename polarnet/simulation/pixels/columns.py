@@ -31,7 +31,7 @@ EVENT_BYTES = 8 + 2 + 2 + 1
 
 
 def empty_columns(capacity: int, labels: bool, unrounded_times: bool) -> Columns:
-    """Columns with room for `capacity` events."""
+    """Uninitialised arrays for up to `capacity` events of a channel."""
     # One allocation for all four: the system gives large blocks as huge pages, which costs far fewer page faults.
     block = np.empty(capacity * EVENT_BYTES, np.uint8)
     return Columns(
@@ -74,22 +74,22 @@ def with_room(columns, used, more):
 
 @inlined
 def place_of(y, x):
-    """Row and column as part of an event's integer."""
+    """Bits of row and column in the integer that `event_of` makes of an event."""
     return np.int64(y) << ROW_SHIFT | np.int64(x) << COLUMN_SHIFT
 
 
 @inlined
 def event_of(offset_us, place, on, label):
-    """The integer of an event, which sorts by (t, y, x, p): microseconds since some time, row, column, 1 for ON, label.
+    """Pack an event into an int64, so that integers sort by (t, y, x, p).
 
-    The fields have 31, 15, 15, 1 and 2 bits.
+    From the highest bits: microseconds since a base time (31 bits), row (15), column (15), 1 for ON (1), label (2).
     """
     return np.int64(offset_us) << TIME_SHIFT | place | np.int64(on) << POLARITY_SHIFT | np.int64(label)
 
 
 @compiled
 def sort_ties(columns, start, stop):
-    """Sort events start .. stop by (t, y, x, p)."""
+    """Sort the events from `start` up to `stop` by (t, y, x, p), in place."""
     events = np.empty(stop - start, np.int64)
     for i in range(events.size):
         t_us, place = columns.t[start + i] - columns.t[start], place_of(columns.y[start + i], columns.x[start + i])

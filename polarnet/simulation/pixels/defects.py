@@ -1,8 +1,8 @@
 """Hot and dead pixels of a channel: hot ones fire at random times whatever their light, dead ones never fire.
 
 Defects are drawn for each channel and apply to the events of every pixel model: both kinds lose their own events. The
-events of a hot pixel are a Poisson process, each ON or OFF with equal probability. Its time is divided into spans that
-start anew, because a Poisson process has no memory: no state is needed where a clip goes on.
+events of a hot pixel are a Poisson process, each ON or OFF with equal probability. A Poisson process has no memory, so
+each span of `SPAN_US` draws its own events, and a clip that is continued needs no state of its hot pixels.
 """
 
 import math
@@ -19,7 +19,7 @@ from polarnet.simulation.pixels.randomness import key_for, mixed, uniform
 
 Share = Annotated[float, Field(ge=0, le=1)]
 MAX_RATE_HZ = 1e5  # a pixel's refractory period allows no more
-SPAN_US = 1 << 16  # after which a hot pixel's process starts anew
+SPAN_US = 1 << 16  # span of time whose events a hot pixel draws independently of other spans
 
 
 @section
@@ -27,11 +27,11 @@ class DefectsConfig:
     """Hot and dead pixels, for every pixel model."""
 
     hot_pixel_share: Share
-    """Probability of a pixel to be hot: to fire at random times, whatever its light."""
+    """Probability that a pixel is hot: it fires at random times, whatever its light."""
     hot_pixel_rate_hz: Annotated[float, Field(ge=0, le=MAX_RATE_HZ)]
     """Events per second of a hot pixel, ON and OFF together."""
     dead_pixel_share: Share
-    """Probability of a pixel to be dead: never to fire."""
+    """Probability that a pixel is dead: it never fires."""
 
 
 class Defects(NamedTuple):
@@ -121,7 +121,7 @@ def _hot_events(defects, width, start_us, stop_us, rounds_up, columns):
 
 @compiled
 def _merged_order(columns, hot, silent, width):
-    """Places, in `columns` followed by `hot`, of the events of pixels that are not silent and of the hot ones."""
+    """Indices into `columns` followed by `hot` that sort the events in time and leave out those of silent pixels."""
     n, m = columns.t.size, hot.t.size
     order, written, k = np.empty(n + m, np.int64), 0, 0
     for i in range(n):

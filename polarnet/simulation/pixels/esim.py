@@ -21,7 +21,7 @@ from polarnet.simulation.pixels.strips import rows_of_strip
 
 EIGHT_BIT_VIDEO = False
 NO_CHANGE = 1e-6  # log intensity; the CPU variant ignores smaller changes
-NEARLY = np.float32(0.99999)  # narrows a first look at thresholds by more than rounding
+NEARLY = np.float32(0.99999)  # lowers thresholds by more than rounding in a first test; `_levels` then counts exactly
 
 
 @section
@@ -46,7 +46,7 @@ class Pixels(NamedTuple):
     """State of one channel, one array [h * w] per quantity."""
 
     reference: np.ndarray
-    """float32, the last level met."""
+    """float32, log intensity of the last level crossed."""
     logarithm: np.ndarray
     """float32, log intensity of the last frame."""
     last_event_us: np.ndarray
@@ -54,7 +54,7 @@ class Pixels(NamedTuple):
 
 
 def physics_of(config: EsimConfig, gpu: bool = False) -> Physics:
-    """The parameters of one variant."""
+    """Parameters for the kernels, of the GPU variant if `gpu`, else of the CPU variant."""
     return Physics(
         config.contrast_threshold_on,
         config.contrast_threshold_off,
@@ -65,7 +65,7 @@ def physics_of(config: EsimConfig, gpu: bool = False) -> Physics:
 
 
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
-    """Pixels before their first frame."""
+    """State of the pixels before the first frame: zeros, and no event yet."""
     n = height * width
     return Pixels(np.zeros(n, np.float32), np.zeros(n, np.float32), np.full(n, -np.inf))
 
@@ -102,7 +102,7 @@ def start(light, pixels, steps):
 
 @compiled
 def advance(light, pixels, steps, columns):
-    """Take the pixels through `steps`; returns the columns with the events, and the number of events."""
+    """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
     physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
     rows, table, used = rows_of_strip(h, w), _table(physics), ZERO
     strip = np.empty((2, rows * w), np.float32)
@@ -158,7 +158,7 @@ def _fire(pixels, physics, y, logarithm, start_us, stop_us, pending, n):
 
 @compiled
 def _levels(physics, before, after, reference, sign, threshold):
-    """Number of levels that are crossed."""
+    """Number of threshold levels that a pixel crosses between two frames."""
     if physics.gpu:
         return int(abs(after - reference) / threshold)
     crossed, level = 0, reference + sign * threshold

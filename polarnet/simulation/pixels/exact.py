@@ -32,7 +32,7 @@ from polarnet.simulation.pixels.strips import SPARE, flag_words, flagged, flags_
 EIGHT_BIT_VIDEO = False
 MIN_LAG = np.float32(1e-12)  # a smaller lag becomes 0: processors are slow with denormal numbers
 LONG_AGO_US = -1e18
-BATCH = 2000  # active pixels: fewer are not worth a pass of their own
+BATCH = 2000  # minimum number of active pixels that are followed in one pass, except for the last strip
 LOG2_E = np.float32(1 / math.log(2))
 # 2^f - 1 on [-1/2, 1/2]: f times a polynomial (Taylor's to f^6, whose error is below 1e-7), in pairs (Estrin's scheme)
 # because processors wait less for short chains
@@ -85,7 +85,7 @@ class Step(NamedTuple):
 
 
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
-    """Pixels before their first frame, with the mismatch of their channel."""
+    """State of the pixels before the first frame, with the thresholds and leak rates drawn for this channel."""
     n = height * width
     threshold_on, threshold_off = threshold_maps(physics, n, key, channel)
     leak_factor = leak_factor_map(physics, n, key, channel)
@@ -130,7 +130,7 @@ def start(light, pixels, steps):
 
 @compiled
 def advance(light, pixels, steps, columns):
-    """Take the pixels through `steps`; returns the columns with the events, and the number of events."""
+    """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
     physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
     rows = rows_of_strip(h, w)
     strip = np.empty((4, rows * w), np.float32)
@@ -291,7 +291,7 @@ def _fire(pixels, step, active, count, width, pending, n):
 
 @borrowing
 def _fire_once(pixels, step, active, count, width, pending, n):
-    """One round; returns the numbers of pending events and of pixels that may fire in the next round."""
+    """Run one round of `_fire`; return the numbers of pending events and of pixels that may fire in the next round."""
     _next_crossing(active, count, step.refractory_us, step.duration_us)
     active.continues[:count] = 0
     if step.has_shots:
@@ -327,7 +327,7 @@ def _next_crossing(active, count, refractory_us, duration_us):
 
 @borrowing
 def _insert_shots(pixels, step, active, count):
-    """Let shot noise that precedes a pixel's next crossing take its place; the crossing stands if none is accepted."""
+    """Replace a pixel's next crossing by the first accepted shot-noise event before it, if there is one."""
     for a in range(count):
         i = active.pixel[a]
         on, off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
@@ -386,7 +386,7 @@ def _append_events(active, count, width, start_us, pending, n):
 
 @inlined
 def _store_state(pixels, active, count, start_us):
-    """Write the state at the end of the step back, as it is if no further event follows."""
+    """Write the state at the end of the step back to the pixels, assuming that no further event follows."""
     pixel = active.pixel[:count]
     for a in range(count):
         active.now[a] = start_us + active.last_event[a]
@@ -398,7 +398,7 @@ def _store_state(pixels, active, count, start_us):
 
 @inlined
 def _bits(key, i, time_us):
-    """Random bits of pixel i for a draw at a time."""
+    """64 random bits of pixel i for a draw at `time_us`."""
     return mixed(key ^ np.uint64(np.float64(time_us).view(np.int64)), i)
 
 
@@ -412,7 +412,7 @@ def _jittered_leak(nominal, jitter, key, i, number):
 
 @compiled
 def _until_next_shot(physics, key, i, time_us, threshold_on, threshold_off):
-    """Microseconds to the next event of a Poisson process with the rate of the pixel in the dark."""
+    """Microseconds to the next event of a Poisson process with the pixel's shot-noise rate in the dark."""
     share = physics.threshold_on / threshold_on + physics.threshold_off / threshold_off
     rate_hz = physics.shot_noise_rate_hz / 2 * DARK_SHOT_NOISE * share
     return -1e6 * math.log(uniform(_bits(key, i, time_us))) / rate_hz

@@ -19,7 +19,7 @@ from polarnet.simulation.pixels.columns import (
 )
 
 PLACE_MASK, LABEL_MASK = np.int64(0x7FFF), np.int64(3)
-MAX_BUCKETS = 4096  # of the counting sort: one per microsecond in steps up to this long
+MAX_BUCKETS = 4096  # buckets of the counting sort; a step shorter than 4096 us has one bucket per microsecond
 
 
 class Pending(NamedTuple):
@@ -35,7 +35,7 @@ class Pending(NamedTuple):
 
 @compiled
 def pending_events(capacity, unrounded_times):
-    """Empty room for `capacity` events."""
+    """Uninitialised arrays for up to `capacity` events of a step."""
     return Pending(
         np.empty(capacity, np.int64), np.empty(capacity if unrounded_times else 0), np.empty(capacity, np.int64)
     )
@@ -85,7 +85,7 @@ def write_in_order(pending, n, start_us, stop_us, columns, used):
 
 @compiled
 def _sort(events, longest_us, in_order):
-    """Sort by counting over buckets of time, then by insertion within a bucket."""
+    """Sort `events` into `in_order`: by counting over buckets of time, then by insertion within each bucket."""
     shift = TIME_SHIFT
     while longest_us >> (shift - TIME_SHIFT) >= MAX_BUCKETS:
         shift += 1

@@ -46,7 +46,7 @@ class PixelConfig:
     leak_jitter: Annotated[float, Field(ge=0, le=1)]
     """Relative standard deviation of the leak: in each frame for `v2e`, in each interval of events for `exact`."""
     noise_rate_cov_decades: NonNegativeFloat
-    """Spread of the leak rate between pixels, as a power of ten."""
+    """Standard deviation between pixels of the decimal logarithm of the leak rate."""
     shot_noise_rate_hz: NonNegativeFloat
     """Noise events per second of a pixel in the dark, ON and OFF together; a quarter of it at full brightness."""
     refractory_period_us: NonNegativeFloat

@@ -9,7 +9,7 @@ from polarnet.simulation.compilation import borrowing, compiled, inlined
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: the increment of SplitMix64 (Steele et al., OOPSLA 2014)
 MIX_1, MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)  # its output function, variant 13
 DIGITS, BYTE_SUMS = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
-DIGITS_MEAN, DIGITS_SCALE = np.float32(60.0), np.float32(1 / math.sqrt(170.0))  # of the sum of eight numbers in 0..15
+DIGITS_MEAN, DIGITS_SCALE = np.float32(60.0), np.float32(1 / math.sqrt(170.0))  # for sums of eight numbers in 0..15
 
 # Purposes: each random quantity of a channel has a key of its own.
 THRESHOLD_ON, THRESHOLD_OFF, NOISE_RATE, LEAK_PHASE, LEAK_JITTER, SHOT_NOISE, FIRST_PASSAGE = range(1, 8)
@@ -39,16 +39,16 @@ def uniform(bits):
 
 @inlined
 def rough_normal(bits):
-    """Mean 0, variance 1, nearly Gaussian, from 64 random bits: see `rough_normals`."""
+    """A nearly Gaussian number of mean 0 and variance 1 from 64 random bits: see `rough_normals`."""
     sums = ((bits & DIGITS) + ((bits >> np.uint64(4)) & DIGITS)) * BYTE_SUMS
     return (np.float32((sums >> np.uint64(24)) & np.uint64(255)) - DIGITS_MEAN) * DIGITS_SCALE
 
 
 @borrowing
 def rough_normals(key, first_pixel, values):
-    """Fill `values` (float32) with mean 0, variance 1, nearly Gaussian: standardised sums of eight 4-bit random digits.
+    """Fill `values` (float32) with nearly Gaussian numbers: standardised sums of eight random digits from 0 to 15.
 
-    Excess kurtosis -0.15, |value| <= 4.6. For jitter that every pixel draws in every step: one hash serves two pixels.
+    Mean 0, variance 1, excess kurtosis -0.15, |value| <= 4.6. One hash serves two pixels, to save time.
     """
     half = (values.size + 1) // 2
     left, right = values[:half], values[values.size - half :]

@@ -16,13 +16,13 @@ def rows_of_strip(h, w):
 
 @compiled
 def flag_words(pixels):
-    """One byte per pixel, eight bytes to a word, all 0."""
+    """Flags of pixels, all 0: one byte per pixel, eight bytes to a word."""
     return np.zeros((pixels + 7) // 8, np.uint64)
 
 
 @compiled
 def flags_of(words, pixels):
-    """The bytes of the first pixels, to be set to 0 or 1 each."""
+    """Flags of the first `pixels` pixels as a view of bytes, each of which the caller sets to 0 or 1."""
     words[(pixels - 1) // 8] = 0  # the last strip may leave bytes of this word unset
     return words.view(np.uint8)[:pixels]
 

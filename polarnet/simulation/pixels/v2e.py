@@ -25,7 +25,7 @@ from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normals,
 from polarnet.simulation.pixels.strips import SPARE, flag_words, flagged, flags_of, rows_of_strip
 
 EIGHT_BIT_VIDEO = True
-NEARLY = np.float32(1.000001)  # widens a first look at thresholds by more than rounding; exact counts follow
+NEARLY = np.float32(1.000001)  # enlarges changes by more than rounding in a first test; `_count` then counts exactly
 PIXEL, PLACE, CROSSED, ACCEPTED = range(4)  # columns of the list of firing pixels; PLACE = row * 2^16 + column
 
 physics_of = physics.physics_of
@@ -45,7 +45,7 @@ class Pixels(NamedTuple):
     leak_factor: np.ndarray
     """Leak rate relative to the nominal rate, frozen per pixel."""
     refractory_since: np.ndarray
-    """Seconds of the last event that started a refractory period."""
+    """Time in seconds of the last event that started a refractory period."""
     last_event_us: np.ndarray
     """float64, kept while events are labelled: the leak since then tells a leak event from a signal event."""
 
@@ -69,7 +69,7 @@ class Firing(NamedTuple):
     entries: np.ndarray
     """int32 [h * w + 1, 4], a row per pixel: PIXEL, PLACE, CROSSED, ACCEPTED."""
     order: np.ndarray
-    """int32, scratch: entries with events left."""
+    """int32, working memory: indices of the entries with events left."""
     words: np.ndarray
     """uint64, flags of a strip."""
     candidates: np.ndarray
@@ -77,7 +77,7 @@ class Firing(NamedTuple):
 
 
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
-    """Pixels before their first frame, with the mismatch of their channel."""
+    """State of the pixels before the first frame, with the thresholds and leak rates drawn for this channel."""
     n = height * width
     real = np.float64 if physics.cutoff_hz > 0 or physics.source_follower_hz > 0 else np.float32
     threshold_on, threshold_off = threshold_maps(physics, n, key, channel)
@@ -116,7 +116,7 @@ def start(light, pixels, steps):
 
 @compiled
 def advance(light, pixels, steps, columns):
-    """Take the pixels through `steps`; returns the columns with the events, and the number of events."""
+    """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
     physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
     rows = rows_of_strip(h, w)
     strip = np.empty((3, rows * w), np.float32)
@@ -184,7 +184,7 @@ def _buffer(photoreceptor, filtered, share):
 
 @borrowing
 def _leak(memory, threshold_on, leak_factor, noise, dt, physics):
-    """The reset switch leaks, so the reference sinks and a dark, motionless scene keeps firing ON events."""
+    """Lower each memory by the leak of the reset switch, which makes a dark, motionless scene fire ON events."""
     one, dt, rate, jitter = (
         np.float32(1),
         np.float32(dt),
@@ -237,7 +237,7 @@ def _count(pixels, physics, first, stop, y, w, firing, n, most):
 def _emit(pixels, step, firing, n, most, columns, used):
     """Append the events of one step, slot by slot: the busiest pixel of the channel sets the number of slots for all.
 
-    Events within the refractory period of their pixel are not consumed: they try again in the next step.
+    An event within the refractory period of its pixel is suppressed; its change of light can fire in the next step.
     """
     physics, start_us, stop_us = step.physics, step.start_us, step.stop_us
     order = firing.order
@@ -303,7 +303,7 @@ def _consume(pixels, entries, n):
 
 @borrowing
 def _label(pixels, physics, i, time_us, polarity):
-    """LEAK for an ON event where the leak made up more than half a threshold."""
+    """Label of an event, whose time is remembered: LEAK for ON after a leak of over half a threshold, else SIGNAL."""
     leaked = physics.leak_rate_hz * pixels.leak_factor[i] * (time_us - pixels.last_event_us[i]) * 1e-6
     pixels.last_event_us[i] = time_us
     return LEAK if polarity > 0 and leaked > 0.5 else SIGNAL

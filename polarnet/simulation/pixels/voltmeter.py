@@ -18,7 +18,7 @@ from polarnet.simulation.pixels.pending import pending_events, roomier, write_in
 from polarnet.simulation.pixels.randomness import key_for, mixed, normal, uniform
 
 EIGHT_BIT_VIDEO = False
-DRAWS = 3  # random numbers for a passage
+DRAWS = 3  # random numbers for the way from one event to the next
 
 
 class Physics(NamedTuple):
@@ -58,7 +58,7 @@ class Pixels(NamedTuple):
     dn: np.ndarray
     """float32, light of the last frame, DN."""
     voltage: np.ndarray
-    """float64, thresholds since the last event."""
+    """float64, change since the last event, in thresholds."""
 
 
 class Step(NamedTuple):
@@ -76,7 +76,7 @@ def physics_of(config: VoltmeterConfig) -> Physics:
 
 
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
-    """Pixels before their first frame."""
+    """State of the pixels before the first frame: light and voltage 0."""
     return Pixels(np.zeros(height * width, np.float32), np.zeros(height * width))
 
 
@@ -88,7 +88,7 @@ def start(light, pixels, steps):
 
 @compiled
 def advance(light, pixels, steps, columns):
-    """Take the pixels through `steps`; returns the columns with the events, and the number of events."""
+    """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
     times_us, h, w = steps.times_us, steps.height, steps.width
     passage_key, used, dn = key_for(steps.key, randomness.FIRST_PASSAGE, steps.channel), ZERO, np.empty(w, np.float32)
     pending = pending_events(h * w, columns.unrounded_us.size > 0)
@@ -104,7 +104,7 @@ def advance(light, pixels, steps, columns):
 
 @compiled
 def _walk(pixels, step, y, dn, pending, n):
-    """Move the voltages of row y from threshold to threshold through a step; returns the pending events."""
+    """Move the voltages of row y from threshold to threshold through a step; return the pending events and number."""
     physics, start_us, dt = step.physics, step.start_us, step.duration_us
     base_us = math.floor(start_us)
     for x in range(dn.size):
