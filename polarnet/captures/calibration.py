@@ -43,7 +43,7 @@ def refined_starts(
 ) -> Alignment:
     """Refine the landmark's starts to less than a frame interval; starts `given` by hand stay unchanged.
 
-    Time 0 of the common clock is the mean of the four event captures' time 0, as before.
+    Time 0 of the common clock stays: the start times of the four event captures change by 0 on average.
     """
     lags = [
         _lag(events[e], starts[e], intensities[i], starts[i], config)
