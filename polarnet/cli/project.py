@@ -79,7 +79,7 @@ def settings_root() -> Path:
 
 
 def working_folder() -> Path:
-    """The folder that the paths of conf/config.yaml start from: the clone at or above the current folder, or that."""
+    """Start of the paths of conf/config.yaml: the clone at or above the current folder, else the current folder."""
     return _clone() or Path.cwd()
 
 
