@@ -20,7 +20,7 @@ RANGES_BEFORE = {
     "random_leak_rate_hz": ("leak_rate_hz",),
     "random_shot_noise_rate_hz": ("shot_noise_rate_hz",),
 }
-"""Parameters whose range some checkpoints hold under a key of its own, by this key."""
+"""Parameters with the same range, by the key of this range in some checkpoints."""
 
 
 SPEEDS = ("synthesize.speed_min_px_s", "synthesize.speed_max_px_s")

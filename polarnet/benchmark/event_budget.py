@@ -195,7 +195,7 @@ def between_windows(
     config: BetweenConfig,
     context: Context,
 ) -> dict[str, Any]:
-    """Scores as `by_sliding_window` has, of frames every `spacing_us` carried on between windows of `window_us`."""
+    """Mean scores, as in `by_sliding_window`, of frames every `spacing_us` carried on between `window_us` windows."""
     times = list(range(span_us[0], span_us[1] + 1, spacing_us))
     recoverer = opened(METHODS[method], context)
     of_sequences = []

@@ -42,7 +42,7 @@ class Thresholds(NamedTuple):
 
 
 class Lag(NamedTuple):
-    """Additional delay of one capture relative to another, beyond the assumed one."""
+    """Delay of pictures relative to events beyond the one assumed, with the evidence for it."""
 
     lag_us: float
     agreement: float

@@ -18,7 +18,7 @@ from polarnet.events.stream import Events
 from polarnet.recordings.source import RecordingError
 
 MAX_PICTURES = 64  # per capture, from the landmark on; bounds the memory of the refinement
-LANDMARK_ERROR_US = 500.0  # difference between the landmark's times in the events of two captures
+LANDMARK_ERROR_US = 500.0  # typical difference between the landmark's times in the events of two captures
 REDUNDANCY_SHARE = 1e-3  # share of the samples assumed independent: neighbours in space and time are not
 ITERATIONS = 6
 POLARIZER_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # I0 - I45 + I90 - I135 = 0

@@ -1,4 +1,4 @@
-"""The leak in increments of known light, and the thresholds without it.
+"""The leak, and the thresholds without it, from increments under known light.
 
 With a leak of r hertz, an increment of duration T is (1 - r T) ON thresholds, or one OFF threshold plus r T ON
 thresholds.

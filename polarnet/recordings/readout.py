@@ -20,7 +20,7 @@ MIN_BLOCKS = 4  # blocks of the top rate: fewer are no plateau
 PLATEAU = 0.95  # share of the top rate from which a block belongs to the plateau
 MAX_DISPERSION = 0.05  # of blocks at a limit; random events give (1 - u)^2 where the readout is busy for a share u
 MAX_ROUNDING = 0.03  # dispersion that the clock's steps alone may cause
-PARTS_PER_PIXEL = 8  # a pixel's own events are not random: a part must hold less than one of each active pixel
+PARTS_PER_PIXEL = 8  # active pixels for each event of a part, at least: events of the same pixel are not random
 
 ROW_READOUTS = 48  # mean readouts of a row in an interval of the search for lost rows
 REACH = 8  # rows within which a lost row has neighbours

@@ -33,7 +33,7 @@ class Rate(NamedTuple):
 
 
 def check_rate(rate_hz: float, rule: WindowRule, recoverer: Recoverer) -> None:
-    """ValueError for a rate out of range, a rate that windows or --step give as cheaply, and a rate beside a --step."""
+    """ValueError for a rate out of range or beside a --step, or one that windows or a --step reach as cheaply."""
     highest = 1_000_000 / SHORTEST_STEP_US
     if not 0 < rate_hz <= highest:
         raise ValueError(f"--rate: expected more than 0 and at most {highest:,.0f} frames a second, got {rate_hz:g}")

@@ -24,8 +24,8 @@ SETTING_LABELS = {
 def event_budget_figure(results: Mapping[str, Any], theme: Theme) -> Figure:
     """Draw PSNR (dB) and correlation of DoLP against events per pixel since the start, and against window length.
 
-    The third column has frames every 0.5 ms: from overlapping windows, against events per pixel in a window, and, as a
-    dashed line, frames that motion and events carry on between windows. `results` is the content of event_budget.json.
+    The third column has frames more often than windows: from overlapping windows, against the events per pixel in one,
+    and, as a dashed line, carried on by motion and events. `results` is the content of event_budget.json.
     """
     with matplotlib.rc_context(chart_style(theme)):
         figure = Figure(figsize=(9.6, 5.0), layout="constrained", facecolor="none")

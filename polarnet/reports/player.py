@@ -42,7 +42,7 @@ class Map(NamedTuple):
     """One quantity of a scene over its frames."""
 
     source: str
-    """Label of what shows it: a method, the truth, the recording."""
+    """Label of its origin: a method, the truth, or a recording."""
     kind: Kind
     frames: UInt8[np.ndarray, "n h w"]
     """Bytes in the steps of `polarnet.storage.film`."""

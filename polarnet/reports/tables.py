@@ -176,7 +176,7 @@ def paper_table(experiment: Literal["simulated", "real"]) -> Table:
 def as_markdown(table: Table, groups: Sequence[str] = ()) -> str:
     """A GitHub table: best values in bold, intervals small below their values, notes at the end.
 
-    `groups` are names before the headings, each for as many consecutive columns as the others.
+    `groups` split the columns into equal runs, left to right; a heading starts with the name of its group.
     """
     headings = _grouped(table, groups)
     lines = ["| | " + " | ".join(headings) + " |", "|---|" + "---:|" * len(headings)]

@@ -32,8 +32,8 @@ def films_of(
     """Films of a store, of a folder with stores, or of a camera's file, which `read` reads.
 
     A folder gives the events, frames and recovery of a sequence in one film. Without `sequences`, the first `MAX_FILMS`
-    of each store are read. ValueError for an unknown sequence, with the names of the others; FileNotFoundError if there
-    is nothing to show.
+    of each store are read. ValueError for an unknown sequence, with the known names; FileNotFoundError if there is
+    nothing to show.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path}: expected a store, a folder with stores or a recording; there is no such path")
