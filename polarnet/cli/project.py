@@ -46,7 +46,7 @@ def add_to(commands: Commands) -> None:
 
     stages = commands.add_parser(
         "stages",
-        help="list the stages in order, or those whose code is newer than dvc.lock",
+        help="list the stages in order, or those whose code or settings differ from dvc.lock",
         epilog="example: polarnet stages --unlocked",
     )
     stages.add_argument(
