@@ -13,7 +13,7 @@ from polarnet.reports.page import write_report
 from polarnet.reports.provenance import Run, facts
 from polarnet.reports.tables import as_plain
 
-PLUMBING = ("rows", "row", "baseline", "paths", "runtime", "cluster")  # what does not affect results
+PLUMBING = ("rows", "row", "baseline", "paths", "runtime", "cluster")  # sections that do not affect results
 
 
 @hydra_stage

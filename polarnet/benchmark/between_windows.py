@@ -1,4 +1,4 @@
-"""Frames at any time between windows, for scoring: carried on by motion and events, or held."""
+"""Frames between the ends of windows, for scoring: the last frame carried on by motion and events, or held."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -26,9 +26,9 @@ class FramesBetween(NamedTuple):
 def frames_between(
     sequence: TestSequence, t_us: Sequence[int], recoverer: Recoverer, config: BetweenConfig
 ) -> FramesBetween:
-    """Run a method over the windows of a sequence once, and carry its frames on to `t_us`, which increase.
+    """Predict a frame at the end of each window, and carry the last one on to each of the increasing times `t_us`.
 
-    ValueError for a time before the end of the first window.
+    The method runs once over the windows of the sequence. ValueError for a time before the end of the first window.
     """
     windows = sequence.windows
     if t_us[0] < windows[0].stop_us:

@@ -20,7 +20,7 @@ RANGES_BEFORE = {
     "random_leak_rate_hz": ("leak_rate_hz",),
     "random_shot_noise_rate_hz": ("shot_noise_rate_hz",),
 }
-"""Parameters whose range older checkpoints record under a key of its own."""
+"""Parameters with the same range, by the key of this range in some checkpoints."""
 
 
 SPEEDS = ("synthesize.speed_min_px_s", "synthesize.speed_max_px_s")
@@ -60,10 +60,10 @@ def stored(attributes: Mapping[str, Any], height: int, width: int) -> Conditions
 
 
 def _as_today(emulate: Mapping[str, Any]) -> dict[str, Any]:
-    """Section `emulate` by today's keys.
+    """Section `emulate` of any checkpoint, by the keys of `EmulatorConfig`.
 
-    Checkpoints trained before ON and OFF deviations were separate have one for both, a range for each of six parameters
-    beside the switch `randomise`, and no defective pixels.
+    Some checkpoints have one deviation for ON and OFF, a range for each of six parameters beside the switch
+    `randomise`, and no defective pixels.
     """
     section = {key: value for key, value in emulate.items() if not key.startswith("random_")}
     if "contrast_threshold_sigma" in section:
@@ -109,7 +109,7 @@ def sentence(conditions: Conditions) -> str:
 
 
 def warnings(used: Conditions, checkpoints: Mapping[str, Mapping[str, Any]], advice: str) -> list[str]:
-    """One warning per training whose sequences differ from `used`: both values of every key, and the keys to set.
+    """One warning per training whose sequences differ from `used`: both values of each such key, and the keys to set.
 
     `checkpoints` maps each row to the metadata of its weights. `advice` introduces the list of keys to set.
     """

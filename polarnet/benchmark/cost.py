@@ -94,7 +94,7 @@ def _peak_bytes(run: Callable[[], Any], device: torch.device) -> float:
 
 
 class _Observer(TorchDispatchMode):
-    """A mode that sees every operation; torch.compile skips it by default, and to say so imports for 1.5 s."""
+    """A mode that sees every operation. By default torch imports its compiler (1.5 s) to exclude the mode from it."""
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:

@@ -40,7 +40,7 @@ EVENTS_PER_PIXEL = (0.25, 0.5, 1.0, 2.0)
 
 
 def since_start(sequences: Iterable[TestSequence], methods: Sequence[str], context: Context) -> dict[str, list[dict]]:
-    """Frames, scenes and mean scores by method and bin of events per pixel since the start, without warm-up.
+    """Frames, scenes and mean scores by method and bin of events per pixel since the start; no window is warm-up.
 
     Means are taken over frames, then over scenes. Empty bins are left out.
     """
@@ -195,7 +195,7 @@ def between_windows(
     config: BetweenConfig,
     context: Context,
 ) -> dict[str, Any]:
-    """Mean scores of frames every `spacing_us`, carried on between windows of `window_us`, as `by_sliding_window`."""
+    """Mean scores, as in `by_sliding_window`, of frames every `spacing_us` carried on between `window_us` windows."""
     times = list(range(span_us[0], span_us[1] + 1, spacing_us))
     recoverer = opened(METHODS[method], context)
     of_sequences = []

@@ -48,7 +48,7 @@ def paired_comparisons(rows: Iterable[FrameScore], method: str) -> dict[str, dic
 
 
 def compared(gains: Float64[np.ndarray, " scenes"]) -> dict[str, Any]:
-    """Scenes, better, effect and p of the gains of the scenes; a gain of 0 counts for neither method."""
+    """`scenes`, `better`, `effect` and `p` from the gain in each scene; a gain of 0 counts for neither method."""
     moved = gains[gains != 0]
     effect, p = 0.0, 1.0
     if len(moved):

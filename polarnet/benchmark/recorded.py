@@ -24,7 +24,7 @@ from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 
 MAX_WINDOW_RATIO = 1.25  # between the frames' interval and the networks' window, beyond which a warning says so
-MIN_AGREEMENT = 0.1  # of events and frames; below it their lag is not known
+MIN_AGREEMENT = 0.1  # correlation of events and frames (`Lag.agreement`); below it their lag is not known
 MAX_LAG = 0.5  # frame intervals
 
 
@@ -74,10 +74,10 @@ def make_recorded_set(
 def read_recorded(
     path: Path, name: str, mosaic: Mosaic, cleaning: Cleaning, read: Callable[[Path], Recording] = read_recording
 ) -> Recorded:
-    """The four channels of a recording without noise, and its frames from one interval before the first event on.
+    """The four channels of a recording, without noise, and its frames; both last from the first frame to the last.
 
-    RecordingError unless three frames lie within the time of the events and one interval around it: otherwise the two
-    are on different clocks.
+    Frames more than one interval before the first event or after the last are left out. RecordingError if fewer than
+    three remain, as with different clocks, or if frames and sensor differ in size.
     """
     events, truth = read(path).events, read_truth(path, mosaic)
     if truth.light.shape[1:] != (events.height // 2 * 2, events.width // 2 * 2):

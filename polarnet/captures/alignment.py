@@ -19,7 +19,7 @@ DARKEST = 64.0  # of 4095; below it the logarithm is mostly noise
 BRIGHT = 400.0  # of 4095; darker pixels respond less than logarithmically and have a different threshold
 MAX_CHANGE = 1.0  # natural-log intensity; a larger change between two events is not one threshold step
 MAX_STEPS = 300_000
-STEP_US = 2_000  # of the first, coarse search
+STEP_US = 2_000  # between the lags of the first, coarse search
 FINEST_US = 20.0
 
 
@@ -42,7 +42,7 @@ class Thresholds(NamedTuple):
 
 
 class Lag(NamedTuple):
-    """Additional delay of one capture relative to another, beyond the assumed one."""
+    """Delay of pictures relative to events beyond the one assumed, with the evidence for it."""
 
     lag_us: float
     agreement: float
@@ -55,7 +55,7 @@ class Lag(NamedTuple):
 
 
 def steps(events: Events, corner: tuple[int, int], crop: tuple[int, int], start_us: int, stop_us: int) -> Steps:
-    """All pairs between two times, thinned evenly to at most 300,000."""
+    """Pairs within a crop (size and upper left corner as row, column) and [start_us, stop_us), thinned to 300,000."""
     pairs = Steps(*_steps(events.t.numpy(), events.x.numpy(), events.y.numpy(), events.p.numpy(), *corner, *crop))
     sample = np.flatnonzero((pairs.before_us >= start_us) & (pairs.after_us < stop_us))
     sample = sample[:: max(1, -(-len(sample) // MAX_STEPS))]
@@ -94,8 +94,8 @@ def agreement(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"
 def spread(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) -> float:
     """Variance of the changes signed by their polarities, with large ones clipped.
 
-    Only noise contributes where every change is one threshold. Unlike with `agreement`, noise in the pictures does not
-    move the extremum.
+    Only noise contributes where every change is one threshold. Noise in the pictures does not move the minimum, unlike
+    the maximum of `agreement`.
     """
     known = np.isfinite(change)
     return float(np.var(np.clip(polarity[known] * change[known], -MAX_CHANGE, MAX_CHANGE)))

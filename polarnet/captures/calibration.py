@@ -18,7 +18,7 @@ from polarnet.events.stream import Events
 from polarnet.recordings.source import RecordingError
 
 MAX_PICTURES = 64  # per capture, from the landmark on; bounds the memory of the refinement
-LANDMARK_ERROR_US = 500.0  # difference between the landmark's times in the events of two captures
+LANDMARK_ERROR_US = 500.0  # typical difference between the landmark's times in the events of two captures
 REDUNDANCY_SHARE = 1e-3  # share of the samples assumed independent: neighbours in space and time are not
 ITERATIONS = 6
 POLARIZER_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # I0 - I45 + I90 - I135 = 0
@@ -43,7 +43,7 @@ def refined_starts(
 ) -> Alignment:
     """Refine the landmark's starts to less than a frame interval; starts `given` by hand stay unchanged.
 
-    Time 0 of the common clock is the mean of the four event captures' time 0, as before.
+    Time 0 of the common clock stays: the start times of the four event captures change by 0 on average.
     """
     lags = [
         _lag(events[e], starts[e], intensities[i], starts[i], config)

@@ -26,7 +26,7 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG
 EVENT_CAPTURES = tuple(f"events_{angle}" for angle in POLARIZER_ANGLES_DEG)
 INTENSITY_CAPTURES = tuple(f"intensity_{angle}" for angle in POLARIZER_ANGLES_DEG)
 STARTS_FILE = "starts.json"
-STEPS_OF_8_BITS = 16.0  # 12-bit steps per level of 8 bits, the scale of the vendor's programs and the paper's 30
+STEPS_OF_8_BITS = 16.0  # 12-bit steps per level of 8 bits, the scale of the vendor's programs and of `dark_level`
 STAMP_US = 1000  # resolution of the computer's picture times, which are rounded down
 IRREGULAR_US = 3000.0  # larger deviations from a regular clock mean that the pictures were not taken by one
 
@@ -201,7 +201,7 @@ def region_of(picture: UInt16[np.ndarray, "h w"], config: RecordingsConfig) -> U
 def regular_times_us(name: str, stamps_us: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
     """Times of pictures from stamps rounded down to milliseconds, by the best-fitting regular clock.
 
-    Lost pictures leave gaps. Where no regular clock fits, the times are the middles of the milliseconds.
+    Lost pictures leave gaps. If no clock fits, times are mid-millisecond. RecordingError unless stamps increase.
     """
     middles = stamps_us + STAMP_US // 2
     steps = np.diff(stamps_us)
@@ -217,7 +217,7 @@ def regular_times_us(name: str, stamps_us: Int64[np.ndarray, " n"]) -> Int64[np.
 
 
 def intensity_start_us(name: str, capture: IntensityCapture, config: RecordingsConfig) -> int:
-    """Time of the first picture whose mean in the region is below `dark_level` (paper, section 4)."""
+    """Time of the first picture with a region mean below `dark_level` (paper, section 4); RecordingError if none."""
     dark = np.flatnonzero(capture.region < config.dark_level)
     if not len(dark):
         raise RecordingError(
@@ -233,7 +233,7 @@ def intensity_start_us(name: str, capture: IntensityCapture, config: RecordingsC
 
 
 def event_start_us(name: str, events: Events, config: RecordingsConfig) -> int:
-    """Time of negative event number `negative_events` in the region (paper, section 4)."""
+    """Time of negative event number `negative_events` in the region (paper, section 4); RecordingError if too few."""
     times = region_negative_times_us(events, config)
     if len(times) < config.negative_events:
         raise RecordingError(

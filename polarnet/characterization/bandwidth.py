@@ -1,4 +1,4 @@
-"""The photoreceptor's bandwidth: the one that makes increments most nearly whole thresholds."""
+"""The photoreceptor's bandwidth: the one for which increments (`known_light`) are closest to one threshold."""
 
 import math
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ from polarnet.characterization.leak import thresholds_without_leak
 from polarnet.characterization.thresholds import misfit
 
 CUTOFF_PIXELS = 600  # pixels that the bandwidth is fitted to
-CUTOFF_GRID = np.geomspace(5, 2500, 14)  # Hz
+CUTOFF_GRID = np.geomspace(5, 2500, 14)  # Hz, first guesses
 
 
 def bandwidth(sources: Sequence[Source], leak_hz: float) -> Estimate | None:
-    """Bandwidth that makes increments most nearly whole thresholds; None where it makes no difference."""
+    """Bandwidth in Hz, from flickers if there are any, else from all sources; None if the data do not determine it."""
     flickers = [source for source in sources if not source.moves]
     sources = flickers or sources
     pixels = sources[0].events.pixels

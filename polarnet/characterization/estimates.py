@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
-GROUPS = 8  # of pixels, whose differences give standard errors
-MAX_RELATIVE_ERROR = 0.5  # an estimate with a larger standard error is none
+GROUPS = 8  # groups of pixels, whose differences give standard errors
+MAX_RELATIVE_ERROR = 0.5  # an estimate with a larger standard error is discarded
 
 
 class Estimate(NamedTuple):
@@ -12,4 +12,4 @@ class Estimate(NamedTuple):
     value: float
     error: float
     """Standard error."""
-    source: str
+    source: str  # recordings and events behind the estimate, in words

@@ -22,9 +22,9 @@ from polarnet.characterization.refractory import between_shot_noise_us, piled_up
 from polarnet.characterization.thresholds import PixelThresholds, correlation, deviation
 from polarnet.events.stream import Events
 
-MAX_LEAK_ERROR = 0.05  # relative; where shot noise hides the leak, ages are few, and their error is no measure of it
+MAX_LEAK_ERROR = 0.05  # relative; above it shot noise hides the leak, and its error is unreliable
 MIN_PIXELS = 50
-MAX_SWING = 0.3  # of the OFF rate under constant light; larger: something moved or flickered
+MAX_SWING = 0.3  # relative swing of the OFF rate under constant light; larger: something moved or flickered
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def fit_sensor(
             )
     durations_us = [intervals_of(one).duration_us for one in ordered]
     dead_time = piled_up_us(durations_us) or (between_shot_noise_us(durations_us[0]) if noise else None)
-    reason = "no intervals of a pixel pile up at a shortest one, and shot noise is too rare to show it"
+    reason = "intervals between a pixel's events do not pile up at a minimum, and shot noise is too rare to show it"
     _enter(estimates, missing, "refractory_period_us", dead_time, reason)
     shortest_us = dead_time.value if dead_time else 0.0
     first = 0 if static is None else 1
@@ -113,7 +113,7 @@ def _enter(estimates, missing, name: str, estimate: Estimate | None, reason: str
 def _fit_known(
     sources: Sequence[Source], leak: Estimate | None, spread_decades: float, estimates, missing, notes: list[str]
 ) -> tuple[PolarityThresholds, Estimate | None]:
-    """Thresholds, and the leak from its drift if `leak` is None; enters the bandwidth and the thresholds."""
+    """Thresholds, and the leak (from its drift if `leak` is None); adds bandwidth and thresholds to `estimates`."""
     pixels = sources[0].events.pixels
     names = " and ".join(source.name for source in sources)
     cutoff = bandwidth(sources, leak.value if leak else 0.0)

@@ -10,11 +10,11 @@ from polarnet.characterization.increments import Intervals, PixelEvents
 from polarnet.characterization.light import Flicker, flicker_responses
 
 PHASES = 32
-PHASE_INTERVALS = 6000  # that the phase of a flicker is fitted to
+PHASE_INTERVALS = 6000  # intervals that the phase of a flicker is fitted to
 
 
 def exact_frequency(flicker: Flicker, events: PixelEvents) -> Flicker:
-    """The frequency on the recording's clock, from the drift of the events' phase between its two halves."""
+    """The flicker with its frequency on the recording's clock, from the drift of the phase of its events."""
     t_s, sign = events.t_us * 1e-6, np.where(events.on, 1.0, -1.0)
     middle = 0.5 * (t_s.min() + t_s.max())
     frequency = flicker.frequency_hz
@@ -31,7 +31,7 @@ def exact_frequency(flicker: Flicker, events: PixelEvents) -> Flicker:
 def flicker_phase(
     cycle: Float64[np.ndarray, " k"], frequency_hz: float, events: PixelEvents, intervals: Intervals
 ) -> float:
-    """Phase of the flicker at time 0: increments of one polarity are then most nearly equal."""
+    """Phase of the flicker at time 0, radians, which makes the increments of each polarity most nearly equal."""
     step = max(1, len(intervals.start) // PHASE_INTERVALS)
     start_us, stop_us = events.t_us[intervals.start[::step]], events.t_us[intervals.stop[::step]]
     on = intervals.on[::step]

@@ -1,4 +1,4 @@
-"""Increments of the filtered log light between consecutive events of a pixel: whole thresholds, without drift."""
+"""Pairs of consecutive events of a pixel, between which the filtered log light changes by one threshold."""
 
 from typing import NamedTuple
 
@@ -55,7 +55,7 @@ def intervals_of(events: PixelEvents) -> Intervals:
 
 
 def undisturbed(intervals: Intervals, refractory_us: float, margin: float = 1.3) -> Intervals:
-    """Intervals longer than the refractory period by `margin`, after another such interval.
+    """Intervals longer than `margin` times the refractory period, except those right after a shorter one.
 
     A crossing within the refractory period waits for its end: its increment exceeds one threshold, and the next
     increment lacks the excess.

@@ -13,8 +13,8 @@ from polarnet.characterization.increments import Intervals, PixelEvents, chosen_
 from polarnet.characterization.light import Flicker, MovingLight, flicker_cycle, flicker_responses, moving_responses
 from polarnet.events.stream import Events
 
-SETTLING_US = 100_000  # after the first frame, whose photoreceptor state is unknown
-BLOCK = 8  # consecutive intervals of a pixel in one half of the data
+SETTLING_US = 100_000  # after the first frame, left out, because the photoreceptor's state is unknown
+BLOCK = 8  # consecutive intervals; even blocks make one half of the data, odd blocks the other
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class Source(NamedTuple):
     intervals: Intervals
     responses: Callable[[PixelEvents, float], Float64[np.ndarray, " n"]]
     moves: bool
-    """Whether the light is one of frames."""
+    """Whether the light is a moving scene with frames, not a flicker."""
 
 
 class Increments(NamedTuple):
-    """Increments in the direction of the events' polarity."""
+    """Changes of the filtered log light between two events of a pixel, times the polarity of the second event."""
 
     increment: Float64[np.ndarray, " n"]
     duration_s: Float64[np.ndarray, " n"]

@@ -1,4 +1,4 @@
-"""The leak in increments of known light, and the thresholds without it.
+"""The leak, and the thresholds without it, from increments under known light.
 
 With a leak of r hertz, an increment of duration T is (1 - r T) ON thresholds, or one OFF threshold plus r T ON
 thresholds.
@@ -14,8 +14,8 @@ from polarnet.characterization.estimates import GROUPS, Estimate
 from polarnet.characterization.known_light import Increments
 from polarnet.characterization.thresholds import PixelThresholds, pixel_thresholds
 
-LEAKED = 0.25  # intervals in which the leak alone makes this part of a threshold tell nothing of thresholds
-ROUNDS = 4  # each finds three quarters of the leak that the one before has missed (normal errors within NEAR)
+LEAKED = 0.25  # of a threshold: an interval in which the leak alone makes more is not used
+ROUNDS = 4  # each finds three quarters of the leak that is still missing (normal errors within NEAR)
 NEAR = 2.0  # standard deviations from the threshold: the shift by shot noise within it grows with its square
 MIN_NEAR = 0.02  # the same, relative to the threshold
 
@@ -40,12 +40,12 @@ def thresholds_without_leak(data: Increments, leak_hz: float, pixels: int) -> Po
 
 
 def leak_drift(data: Increments, pixels: int, spread_decades: float) -> Estimate | None:
-    """Median leak of the pixels, from increments that shrink (ON) or grow (OFF) with their duration.
+    """Median leak of the pixels in Hz, from increments that shrink (ON) or grow (OFF) with their duration.
 
-    Shot noise that ends an interval shortens both kinds, so little of it remains in half their difference. Only
-    increments near a threshold count. The leak takes those of long intervals away from it, so what is found of the leak
-    is removed from the increments, and the rest is estimated again. None if increments do not drift. `spread_decades`
-    is the log-normal spread of the leak between pixels, by which its mean exceeds the median.
+    Shot noise that ends an interval shortens both kinds, so it nearly cancels in half the difference of their slopes.
+    Only increments near a threshold count. The leak moves those of long intervals away from it, so the leak found so
+    far is removed from the increments and the rest is estimated again, in `ROUNDS` rounds. None if increments do not
+    drift. `spread_decades` is the log-normal spread of the leak between pixels, by which its mean exceeds the median.
     """
     leaks, leak = np.zeros(GROUPS), 0.0
     thresholds = _thresholds(data, data.increment, 0.0, pixels)

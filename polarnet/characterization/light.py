@@ -18,7 +18,7 @@ from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION
 TIMES_FILE = "timestamps.txt"
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of sRGB's primaries (IEC 61966-2-1)
 STEPS_PER_CYCLE = 256  # linear pieces of a flicker's cycle: 3e-4 of the contrast off at most
-PIECES = 4  # linear in time, between two frames
+PIECES = 4  # linear pieces of the response between two frames
 SETTLED = 12.0  # time constants of the photoreceptor after which a cycle repeats itself
 
 
@@ -113,9 +113,9 @@ def moving_responses(
 ) -> Float64[np.ndarray, " n"]:
     """Filtered response of each event's pixel at its time; NaN outside the frames' times.
 
-    Events are ordered by pixel, then time. Between two frames the response to the light is the cubic of the slopes of
-    parabolas through three frames (Catmull and Rom), in `PIECES` pieces. A straight line would cut corners, which moves
-    increments of short and long intervals by different amounts and so feigns a leak. The filter is that of
+    Events are ordered by pixel, then time. Between two frames the response to the light is a cubic (Catmull and Rom) in
+    `PIECES` linear pieces; its slope at a frame is that of a parabola through three frames. A straight line would shift
+    increments of short and long intervals by different amounts and so feign a leak. The filter is that of
     `pixels.exact` with the bandwidth at the mean light of a piece. It starts adapted to the first frame.
     """
     frames = light.frames.reshape(len(light.frames), -1)

@@ -20,7 +20,7 @@ HOT_FACTOR = 10.0  # times the median number of events of a pixel
 FEWEST_HOT_EVENTS = 10
 NODES = np.linspace(-3, 3, 61)  # leaks of the pixels, standard deviations from the median
 NODE_WEIGHTS = np.exp(-(NODES**2) / 2) / np.exp(-(NODES**2) / 2).sum()
-MAX_LEAKS, MAX_AGES = 20_000, 250_000  # the leak is fitted to as many pixels as hold so many
+MAX_LEAKS, MAX_AGES = 20_000, 250_000  # in the fit of the leak, which uses fewer pixels if there are more
 PRIOR_SPREAD_DECADES, PRIOR_JITTER, PRIOR_WIDTH = 0.1, 0.1, 0.5  # v2e's values; standard deviation of the logarithm
 YOUNG = 0.4  # ages below this part of the mean leak interval see shot noise alone
 FAR = 6.0  # standard deviations beyond which the leak is certain not to have fired
@@ -60,7 +60,7 @@ class _Ages(NamedTuple):
 
 
 def hot_under_constant_light(counts: Int64[np.ndarray, " pixels"]) -> Bool[np.ndarray, " pixels"]:
-    """Pixels with more than ten times the median number of events, and at least ten events more than it."""
+    """Pixels with more events than ten times the median number of a pixel, plus ten."""
     return counts > HOT_FACTOR * np.median(counts) + FEWEST_HOT_EVENTS
 
 

@@ -8,8 +8,8 @@ from jaxtyping import Float64
 
 from polarnet.characterization.estimates import Estimate
 
-PILE_UP = 3.0  # times more intervals within 10 % of the shortest than in the next 10 %
-MIN_TICKS = 5  # of the recording's clock, in a refractory period that can be told from it
+PILE_UP = 3.0  # intervals of 0.9 to 1.1 times the shortest, over those of 1.1 to 1.3 times the shortest
+MIN_TICKS = 5  # ticks of the recording's clock in the shortest refractory period that can be measured
 SHORTEST = 5  # rank of the interval that shot noise is judged by, so that a few false events do not count
 MAX_ERROR = 0.05  # relative; without a refractory period the error is about as large as the estimate
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-MIN_INTERVALS = 6  # of one polarity: fewer give no threshold of a pixel
+MIN_INTERVALS = 6  # intervals of one polarity that a pixel needs for a threshold
 FIRST_SCALES = (0.4, 0.25, 0.15, 0.1)  # widths of the robust mean while it approaches the most frequent value
 REFINEMENTS = 12
 MIN_SCALE = 0.003  # relative: 1 us and float32 in a simulation; cameras are far above
@@ -63,7 +63,7 @@ def pixel_thresholds(
 
 
 def most_frequent(increment: Float64[np.ndarray, " n"]) -> float:
-    """Mode of the increments' logarithm, in bins of 10 % over three."""
+    """Most frequent increment, from a histogram of logarithms in bins of 0.1, each with its two neighbours."""
     counts, edges = np.histogram(np.log(increment), np.arange(np.log(0.01), np.log(8.0), 0.1))
     smooth = np.convolve(counts, np.ones(3), "same")
     return float(np.exp(edges[np.argmax(smooth)] + 0.05))
@@ -99,7 +99,7 @@ def correlation(on: PixelThresholds, off: PixelThresholds) -> float:
 def misfit(
     increment: Float64[np.ndarray, " n"], pixel: Int64[np.ndarray, " n"], threshold: Float64[np.ndarray, " pixels"]
 ) -> float:
-    """Share of increments that are no whole threshold of their pixel, in a smooth measure from 0 to 1."""
+    """Share of increments far from the threshold of their pixel, 0 to 1; small deviations count little."""
     e = (increment / threshold[pixel] - 1) / MAX_SCALE
     return float(np.mean(np.minimum(e * e, 1.0) * (3 - 3 * np.minimum(e * e, 1.0) + np.minimum(e * e, 1.0) ** 2)))
 

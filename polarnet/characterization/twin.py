@@ -25,11 +25,11 @@ MAX_DURATION_US = 20_000_000
 CHUNK_PIXELS = 1 << 22  # frames times pixels of one piece of simulated light
 STATIC_STEP_US = 1_000_000
 STEPS_PER_CYCLE = 64
-LEAVES_RATE_HZ = 300.0  # at least; faster motion gets a frame for each pixel
+LEAVES_RATE_HZ = 300.0  # frames a second, at least; faster motion gets a frame for each pixel
 MAX_SPEED_PX_S = 3000.0
 WARM_UP_US = 100_000  # of the pixels before a stand-in scene is compared
 LEAVES_MARGIN = 80  # pixels that the stand-in scene extends beyond the sensor
-LEAVES_BLUR = 1.0  # pixels, a lens's
+LEAVES_BLUR = 1.0  # pixels, standard deviation of a lens's blur
 DARKEST_LEAF = 0.04
 FIRST_SPEED_PX_S = 60.0
 SPEED_ROUNDS = 4
@@ -95,8 +95,7 @@ def compare(
 
     A number is constant light in DN. None: the light is not known, and the twin sees drifting dead leaves whose speed
     gives the recording's event rate. At most the first 20 seconds and the middle 240 x 240 pixels are compared, without
-    the recording's hot pixels; the twin has none.
-    ValueError for a recording without events.
+    the recording's hot pixels; the twin has none. ValueError for fewer than two events.
     """
     if len(recording) < 2:
         raise ValueError(f"{name}: expected events to compare, got {len(recording)}; record for longer")

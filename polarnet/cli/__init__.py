@@ -10,7 +10,7 @@ from polarnet.runtime.environment import INTERRUPTED, STOPPED, let_threads_sleep
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; the exit status."""
+    """Run the command line and return the exit status."""
     let_threads_sleep()
     silence_bindings()
     options = _options(arguments)

@@ -10,7 +10,7 @@ COPIED = ("params.yaml", "conf/**/*.yaml", "stages/*.py", "data/*/README.md")
 CODE = ("polarnet/", "${item.module}")
 """Dependencies in dvc.yaml on the code of polarnet, which a project replaces by `REQUIREMENTS`."""
 REQUIREMENTS = "requirements.txt"
-FILTERS = "needs: *filters"  # of rows without weights, whose code is all that they need
+FILTERS = "needs: *filters"  # in the entries of rows without weights, which need their own code alone
 IGNORED = "/data/*\n!/data/*/\n/data/*/*\n!/data/*/README.md\n/outputs/\n__pycache__/\n"
 DVC = "[core]\n    analytics = false\n    no_scm = true\n"  # `dvc init --force` in a Git repository replaces it
 

@@ -40,7 +40,7 @@ RECORDED = {
 
 
 class Inputs(NamedTuple):
-    """Inputs of a run besides its test set, and what cannot run."""
+    """Inputs of a run besides its test set, and the methods that cannot run."""
 
     context: Context
     methods: list[str]
@@ -63,11 +63,10 @@ def benchmark_folder(
 
     `out` receives metrics.json, cost.json, details.json, frames.csv, panels and index.html. `work` receives the
     pictures, scenes and events, so a stopped run resumes and a second run only runs the methods. `limit` is the
-    maximum number of pictures. Methods without
-    weights are left out and unusable files are skipped; `notes` lists both. Size, duration and sensor are printed
-    first, with a warning if a network was trained with others. `weights` is a checkpoint of the DoLP network; None
-    uses the shipped one. Raises ValueError if the folder has no usable file, or if the weights for an LPIPS column are
-    missing.
+    maximum number of pictures. Methods without weights are left out and unusable files are skipped; the notes list
+    both. Size, duration and sensor are printed first, with a warning if a network was trained with others. `weights` is
+    a checkpoint of the DoLP network; None uses the shipped one. Raises ValueError if the folder has no usable file, or
+    if the weights for an LPIPS column are missing.
     """
     inputs = _inputs(config, weights)
     used = configured(config.synthesize, config.emulate)
@@ -99,7 +98,7 @@ def benchmark_recordings(
     """
     inputs = _inputs(config, weights)
     for row in filter(is_rotating, inputs.methods):
-        inputs.left_out[row] = "recordings hold the events of four channels, not of one camera behind a rotating one"
+        inputs.left_out[row] = "recordings hold the events of four channels, not those behind a rotating polarizer"
     inputs = inputs._replace(methods=[row for row in inputs.methods if not is_rotating(row)])
     try:
         notes = make_recorded_set(root, work, mosaic, cleaning)

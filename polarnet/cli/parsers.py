@@ -33,12 +33,12 @@ def add_hot_pixel_factor(command: argparse.ArgumentParser) -> None:
 def add_cleaning(command: argparse.ArgumentParser) -> None:
     """Add the options that remove noise from events, which `cleaning_of` reads."""
     command.add_argument(
-        "--hot-pixels", metavar="found|FILE", help="remove hot pixels: those found, or those of FILE, `x y` a line"
+        "--hot-pixels", metavar="found|FILE", help="remove hot pixels: found detects them, FILE has lines `x y`"
     )
     command.add_argument(
         "--background",
         metavar="TIME",
-        help="remove events without an event of a neighbouring pixel within TIME before, such as 10ms",
+        help="remove each event before which no neighbouring pixel fired within TIME, such as 10ms",
     )
     add_hot_pixel_factor(command)
 

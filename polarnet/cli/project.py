@@ -46,7 +46,7 @@ def add_to(commands: Commands) -> None:
 
     stages = commands.add_parser(
         "stages",
-        help="list the stages in order, or those whose code is newer than dvc.lock",
+        help="list the stages in order, or those whose code or settings differ from dvc.lock",
         epilog="example: polarnet stages --unlocked",
     )
     stages.add_argument(
@@ -79,7 +79,7 @@ def settings_root() -> Path:
 
 
 def working_folder() -> Path:
-    """The folder that the paths of conf/config.yaml start from: the clone at or above the current folder, or that."""
+    """Start of the paths of conf/config.yaml: the clone at or above the current folder, else the current folder."""
     return _clone() or Path.cwd()
 
 

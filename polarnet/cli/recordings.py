@@ -118,7 +118,7 @@ def _add_recovery(commands: Commands) -> None:
 
 
 def _add_input(recover: argparse.ArgumentParser) -> None:
-    """Add the recordings, and the options that say how light reached them."""
+    """Add the input, and the options that describe its polarizers, its sequences and its size."""
     recover.add_argument("input", nargs="+", metavar="INPUT", help="recordings, an event store, a folder, or -")
     recover.add_argument(
         "--angles", nargs=4, type=int, metavar="DEG", help="polarizer angles of the four files, in order"
@@ -136,7 +136,7 @@ def _add_input(recover: argparse.ArgumentParser) -> None:
         help="times of that polarizer's triggers in us, one a turn: text or HDF5",
     )
     recover.add_argument(
-        "--start-angle", type=float, metavar="DEG", help="its angle at time 0, or at the first trigger (default: 0)"
+        "--start-angle", type=float, metavar="DEG", help="polarizer angle at time 0 or the first trigger (default: 0)"
     )
     recover.add_argument("--sequence", metavar="NAME", help="sequence of an event store or folder with several")
     recover.add_argument(
@@ -327,7 +327,7 @@ def _input(
     work: Path,
     captures: "Callable[[], RecordingsConfig]",
 ) -> "tuple[Input, LiveLines | LiveCamera | None]":
-    """The cleaned events that the options name, and what counts the lines of live input."""
+    """Cleaned events of the input; for live input also its reader, which counts the unusable lines."""
     from polarnet.recordings.recording import read_recording
     from polarnet.recovery.stream import Arrangement, open_files, open_live
 
@@ -383,9 +383,9 @@ def _recover_rotating(options: argparse.Namespace) -> int:
 
     if options.method not in (None, "rotating_polarizer") or options.weights or options.thresholds or options.binning:
         raise ValueError(
-            "--rotating: expected no --method but rotating_polarizer (for moving scenes), no --weights, "
-            "--thresholds or --binning, because a fit without network recovers DoLP with the thresholds of section "
-            "modulation; leave it out"
+            "--rotating: expected no --method but rotating_polarizer (for moving scenes), and no --weights, "
+            "--thresholds or --binning, because a fit recovers DoLP without a network, with the thresholds of "
+            "params.yaml; leave it out"
         )
     settings = load(settings_root())
     config, moving = settings.modulation, options.method is not None

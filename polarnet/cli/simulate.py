@@ -88,7 +88,7 @@ def add_to(commands: Commands) -> None:
 
 
 class _Times(NamedTuple):
-    """Times of a clip's frames: stated ones, or a rate; neither: those of the video."""
+    """Times of a clip's frames: `t_us`, or multiples of 1 / `rate_hz`; if both are None, those of the video itself."""
 
     t_us: list[int] | None
     rate_hz: float | None
@@ -193,7 +193,7 @@ def _times_of(options: argparse.Namespace, clip: "Clip", path: Path) -> _Times:
 def _run(
     config: "Config", clip: "Clip", times: _Times | None, upsample: bool, folder: Path, outputs: "Outputs"
 ) -> dict[str, str]:
-    """Simulate into `folder`; facts to print."""
+    """Simulate into `folder` and return the facts to print."""
     from polarnet import __version__
     from polarnet.cli.simulated_files import write_simulation
     from polarnet.runtime.machine import threads_of

@@ -38,7 +38,7 @@ def check_overrides(settings: type, root: Path, overrides: list[str], presets: P
 
 @functools.lru_cache(maxsize=4)
 def _values_of(text: str) -> int | float:
-    """Number of values of a YAML text; its aliases may make many of a short one."""
+    """Number of values in a YAML text, with every alias written out: a few lines can make billions."""
     sizes: dict[int, int | float] = {}
 
     def size(node: Node) -> int | float:

@@ -54,7 +54,7 @@ class SweepTable(Callback):
 
 
 def write_comparison(folder: Path) -> str:
-    """Write comparison.md, .json, .csv and, of points that differ, .png into a sweep's folder; the table and files."""
+    """Write comparison.md, .json, .csv and, if points differ, .png into a sweep's folder; return the table as text."""
     points = sweep_points(folder)
     rows = sweep_rows(points)
     table = f"{sweep_table(rows)}\n\n{ABOUT}\n{best_point(rows)}"
@@ -138,7 +138,7 @@ def mean_scores(scores: Sequence[Mapping[str, float | None]], names: Mapping[str
 
 
 def swept_axes(rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, list[str]], list[float], str] | None:
-    """Values of each swept key and the validation MSE of each finished row, and its heading; None if none finished."""
+    """Values of the keys that differ between finished rows, validation MSE and its heading; None if none differs."""
     done = [row for row in rows if row["validation"]]
     given = [dict(one.lstrip("+").split("=", 1) for one in row["overrides"]) for row in done]
     keys = [

@@ -84,7 +84,7 @@ class RowConfig:
     module: str
     """File of the row's method."""
     needs: str
-    """Path of what else the row is computed from."""
+    """Path of a further input of the row: the folder of its training, another artefact, or a file of code."""
     settings: str
     """Section of params.yaml that the row depends on."""
 
@@ -215,7 +215,7 @@ class Config:
 
     @property
     def used_baselines(self) -> list[str]:
-        """Trained baselines whose weights a row of `benchmark.methods` uses; one with a file of its own does not."""
+        """Baselines whose training a row of `benchmark.methods` uses: the row has no file of weights in `methods`."""
         sections = {METHODS[row].section for row in self.benchmark.methods if row in METHODS}
         given = {one for one in sections if getattr(getattr(self.methods, one, None), "weights", None)}
         return [name for name in BASELINES if (sections - given).intersection(trained_rows(name))]

@@ -27,10 +27,10 @@ def read_four(
 ) -> list[Events]:
     """The four channels, in the order 0, 45, 90, 135 degrees, from files keyed by polarizer angle.
 
-    Angles are in degrees, of any half turn. `start_us` gives the start of the common clock in each file's own clock;
-    earlier events are left out. Without it the files share one clock, which starts with the first event of all. `read`
-    replaces `read_recording` where a file needs options. RecordingError where an angle is missing or duplicated, or
-    where the sensor sizes differ.
+    Angles are in degrees and count modulo 180. `start_us` gives the start of the common clock in each file's own clock;
+    earlier events are left out. Without it the files share one clock, whose time 0 is the earliest of all events.
+    `read` replaces `read_recording` where a file needs options. RecordingError where an angle is missing or duplicated,
+    or where the sensor sizes differ.
 
     >>> from pathlib import Path
     >>> from polarnet.recordings import read_four
@@ -55,7 +55,7 @@ def read_four(
 def read_mosaic(
     path: str | os.PathLike[str], mosaic: Mosaic, read: Callable[[Path], Recording] = read_recording
 ) -> list[Events]:
-    """The four channels of one file of a camera with a mosaic; time starts with its first event.
+    """The four channels (0, 45, 90, 135 degrees) of a file of a camera with a mosaic; time 0 is its first event.
 
     >>> from pathlib import Path
     >>> from polarnet.recordings import read_mosaic
@@ -77,7 +77,7 @@ def shifted(events: Events, origin_us: int) -> Events:
 
 
 def _from_first_event(channels: Sequence[Events]) -> list[Events]:
-    """The channels on a clock that starts with the first event of all."""
+    """The channels, with time 0 at the earliest event of any of them."""
     start_us = min((int(channel.t[0]) for channel in channels if len(channel)), default=0)
     return [shifted(channel, start_us) for channel in channels]
 
@@ -100,6 +100,6 @@ def write_store(path: str | os.PathLike[str], sequences: Mapping[str, Sequence[E
 
 
 def _digest(channels: Sequence[Events]) -> str:
-    """Digest of all columns; it keeps an interrupted store of other events from being resumed."""
+    """SHA-256 of all columns, so that an interrupted store of other events is not resumed."""
     columns = (column for channel in channels for column in (channel.t, channel.x, channel.y, channel.p))
     return sha256(*(part for c in columns for part in (len(c).to_bytes(8, "little"), c.numpy().data)))

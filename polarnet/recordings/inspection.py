@@ -18,7 +18,7 @@ MAX_PIXELS = 2**25
 EVENTS_PER_PIXEL = 0.15  # in the part shown: enough to see edges, few enough not to smear them
 PEAK_US = (1_000, 10_000, 100_000)  # intervals of the peak rate; the first that holds MIN_STEPS of the clock is taken
 MIN_STEPS = 10
-START_SHARE = 0.5  # of all pixels: if as many fire at the first time, a camera or a simulator started
+START_SHARE = 0.5  # of all pixels: more events at the first time mean that a camera or a simulator started
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Inspection:
     """Events per second in the busiest interval of `peak_us`; None for a recording that is shorter."""
     peak_us: int
     start_events: int
-    """Events at the first time if most pixels fired then, else 0; no part of the peak and of the busiest part."""
+    """Events at the first time if more than half the pixels fired then, else 0; left out of peak and busiest part."""
     readout: Readout
     repairs: Mapping[str, int]
     pictures: int
@@ -233,7 +233,7 @@ class _Part(NamedTuple):
 
 
 class _Busiest:
-    """Finds the busiest of the consecutive parts of a recording; a part ends with all events of a time."""
+    """Finds the busiest part of a recording, cut into parts of 0.15 events per pixel that split no time stamp."""
 
     def __init__(self, pixels: int):
         self._size = max(1, round(EVENTS_PER_PIXEL * pixels))

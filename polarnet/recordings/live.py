@@ -51,9 +51,9 @@ class Piece(NamedTuple):
 class LiveLines:
     """Read lines as they arrive, in pieces; ends with the input, or once a file has not grown for `idle_s`.
 
-    Unusable lines are left out and counted in `counts`; late lines are those older than an event of an earlier piece.
-    RecordingError where more than 1 % (and 8) are of one kind, or where the first line is not a size. The source is
-    closed at its end, unless it is standard input.
+    Unusable lines, and late ones, which are older than an event of an earlier piece, are left out and counted in
+    `counts`. RecordingError where more than 1 % of the lines (and 8) are unusable for the same reason, or where the
+    first line is not a size. The source is closed at its end, unless it is standard input.
     """
 
     def __init__(self, source: BinaryIO, name: str, mosaic: Mosaic | None, idle_s: float):

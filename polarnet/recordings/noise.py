@@ -27,18 +27,18 @@ class Cleaning(NamedTuple):
     """Noise to remove, as the user asks for it."""
 
     hot: str | None
-    """A file of hot pixels, lines `x y` of the sensor; `FOUND`: look for them; None: keep them."""
+    """File with a line `x y` for each hot pixel of the sensor; `FOUND`: detect hot pixels; None: keep them."""
     hot_factor: float
     """A pixel is found to be hot above this multiple of the third busiest of the 5 x 5 pixels around it."""
     background_us: int | None
-    """An event stays if one of its 8 neighbours of the channel fired within this time before it; None: all stay."""
+    """Time before an event in which one of the 8 pixels around it must fire, else it is removed; None: no removal."""
 
 
 class Cleaner:
     """Removes noise from the pieces of a recording; `removed` counts the events, `hot` the hot pixels.
 
     `mosaic` is the arrangement of the sensor's polarizers, whose channels have half its rows and columns; None if each
-    channel has a sensor. Found hot pixels need the whole recording in one piece: ValueError for live input.
+    channel has its own sensor. Found hot pixels need the whole recording in one piece: ValueError for live input.
     """
 
     def __init__(self, cleaning: Cleaning, mosaic: Mosaic | None):
@@ -73,7 +73,7 @@ class Cleaner:
             yield piece._replace(channels=self(piece.channels, piece.until_us))
 
     def sentence(self) -> str:
-        """The count of what was removed."""
+        """Number of removed events of each kind, in words."""
         return ", ".join(
             f"{count:,} events of {f'{self.hot} ' if kind == 'hot pixels' else ''}{kind}"
             for kind, count in self.removed.items()

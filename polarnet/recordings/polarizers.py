@@ -21,9 +21,9 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG
 WINDOW_US = 33_333
 WINDOWS = 30  # the first second
 BLOCK = 4  # pixels, square; single pixels have too few events to compare
-MIN_BLOCKS = 1000  # with events in a window: the ratio of two misfits is then known to about 1 / sqrt(1000), 3 %
+MIN_BLOCKS = 1000  # blocks with events: the ratio of two misfits is then known to about 1 / sqrt(1000), 3 %
 HOT_PIXEL_FACTOR = 4.0
-DISTURBING_HZ = 10_000.0  # of one pixel; faster ones change the shipped network's DoLP far from the pixel
+DISTURBING_HZ = 10_000.0  # events a second of a pixel; more change the shipped network's DoLP far from the pixel
 
 # Limits of misfits and counts: measured by studies/polarizers.py (docs/recover.md, section Checks).
 BETTER_FIT = 0.9  # misfit of other pairs over that of the pairs at right angles: lower only where the order is wrong
@@ -117,7 +117,7 @@ def disturbing_pixels(windows: Sequence[EventWindow]) -> list[str]:
         return []
     return [
         f"Hot pixels with more than {DISTURBING_HZ:,.0f} events a second: {disturbing}. DoLP is wrong in the whole "
-        f"image; remove them with --hot-pixels found, or with --hot-pixels FILE of a live camera."
+        f"image; remove them with --hot-pixels found, or for a live camera with --hot-pixels FILE."
     ]
 
 

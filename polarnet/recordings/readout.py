@@ -13,23 +13,23 @@ from jaxtyping import Bool, Float64, Int64
 
 from polarnet.events.stream import Events
 
-MARK_EVENTS = 32  # a part has at least as many events
+MARK_EVENTS = 32  # smallest number of events in a part, the events between two marks
 MAX_MARKS = 2**18  # beyond it, every second mark is dropped
-PARTS = 16  # in a block
+PARTS = 16  # consecutive parts in a block
 MIN_BLOCKS = 4  # blocks of the top rate: fewer are no plateau
 PLATEAU = 0.95  # share of the top rate from which a block belongs to the plateau
-MAX_DISPERSION = 0.05  # of a readout at its limit: random events of a readout that is busy for a share u have (1 - u)^2
+MAX_DISPERSION = 0.05  # of blocks at a limit; random events give (1 - u)^2 where the readout is busy for a share u
 MAX_ROUNDING = 0.03  # dispersion that the clock's steps alone may cause
-PARTS_PER_PIXEL = 8  # a pixel's own events are not random: a part must hold less than one of each active pixel
+PARTS_PER_PIXEL = 8  # active pixels for each event of a part, at least: events of the same pixel are not random
 
 ROW_READOUTS = 48  # mean readouts of a row in an interval of the search for lost rows
 REACH = 8  # rows within which a lost row has neighbours
 MIN_EXPECTED = 16  # readouts that a lost row should have had
 MIN_LOST = 4  # cases: fewer are no evidence
-BUSY_TO_QUIET = 4  # cases at rates above the mean for each one below it, in the same number of intervals
+BUSY_TO_QUIET = 4  # cases in intervals above the mean rate for each case in as many intervals below it
 
 MIN_SWEEP_STEPS = 1000
-SWEEP_SHARE = 0.9  # of the steps go the same way
+SWEEP_SHARE = 0.9  # share of the steps that go the same way
 MIN_SWEEP_ROWS_PER_US = 0.05  # 50,000 rows a second: nothing in a scene moves as fast
 
 LONGEST_GAPS = 20
@@ -47,7 +47,7 @@ class Limit(NamedTuple):
     time_share: float
     """Share of the recording's time at this rate."""
     dispersion: float
-    """Variance of the time of a part over that of a random stream."""
+    """Variance of the duration of a part, relative to that of as many random events."""
 
 
 class Sweep(NamedTuple):
@@ -57,7 +57,7 @@ class Sweep(NamedTuple):
     """rows or columns"""
     rising: bool
     delay_us: float
-    """Delay of each row or column behind the one before."""
+    """Time between the readouts of two neighbouring rows or columns."""
 
 
 class LostRows(NamedTuple):
@@ -65,7 +65,7 @@ class LostRows(NamedTuple):
 
     rows: Int64[np.ndarray, " n"]
     cases: int
-    """Intervals of the recording and rows without events in them."""
+    """Number of lost readouts: pairs of an interval of the recording and a row."""
 
 
 class Gap(NamedTuple):
@@ -90,11 +90,11 @@ class Readout(NamedTuple):
     empty_rows: Int64[np.ndarray, " n"]
     """Rows without any event."""
     gap: Gap | None
-    """The longest."""
+    """The longest time without events; None if all events have the same time."""
 
 
 class ReadoutSigns:
-    """Collects the signs from a recording's events in constant memory; no time may be split between two `add`."""
+    """Collects the signs from a recording's events in constant memory; one call of `add` gets all events of a time."""
 
     def __init__(self, height: int, width: int):
         self._height, self._width = height, width
@@ -114,7 +114,7 @@ class ReadoutSigns:
         self._interval_start_us = 0
 
     def add(self, events: Events) -> None:
-        """Add the events that follow."""
+        """Add the next events, in time order."""
         t, y, x = (column.numpy().astype(np.int64) for column in (events.t, events.y, events.x))
         first = np.flatnonzero(np.r_[True, t[1:] != t[:-1]])
         new_row = np.r_[True, (t[1:] != t[:-1]) | (y[1:] != y[:-1])]
@@ -126,7 +126,7 @@ class ReadoutSigns:
         self._last_us = int(times_us[-1])
 
     def _add_marks(self, new_row: np.ndarray, first: np.ndarray, times_us: np.ndarray) -> None:
-        """Count events and rows up to every time at which another `_mark_events` are complete."""
+        """Add a mark (time, events and rows so far) at each time when another `_mark_events` events are complete."""
         rows = self._rows + np.add.reduceat(new_row, first, dtype=np.int64).cumsum()
         events = self._events + np.r_[first[1:], len(new_row)]
         before = np.r_[self._events, events[:-1]]
@@ -149,7 +149,7 @@ class ReadoutSigns:
             self._longest = sorted(candidates, key=lambda c: (-c[0], c[1]))[:LONGEST_GAPS]
 
     def _add_sweeps(self, times_us: np.ndarray, first: np.ndarray, y: np.ndarray, x: np.ndarray) -> None:
-        """Count the steps from one time to the next by direction, where all events of both have the same row."""
+        """Add up steps between consecutive times by direction, where each time has events in one row (or column)."""
         for axis, place in enumerate((y, x)):
             low, high = np.minimum.reduceat(place, first), np.maximum.reduceat(place, first)
             single = low == high
@@ -167,7 +167,7 @@ class ReadoutSigns:
             self._last_place[axis], self._last_single[axis] = low[-1], single[-1]
 
     def _add_intervals(self, t: np.ndarray, y: np.ndarray) -> None:
-        """Count each row's readouts in intervals of `_interval_readouts`; `t` and `y` are theirs."""
+        """Count the readouts of each row in intervals of `_interval_readouts`; `t` and `y` are of all readouts."""
         start = 0
         while start < len(t):
             room = self._interval_readouts - int(self._interval_rows.sum())
@@ -201,7 +201,7 @@ class ReadoutSigns:
         )
 
     def _plateau(self, marks: np.ndarray, column: int, counts: np.ndarray) -> "Limit | bool | None":
-        """The plateau of the rate of events (column 1) or rows (2); False without one, None where it cannot be seen."""
+        """Limit of the rate of events (column 1) or rows (2); False if there is none, None where none could be seen."""
         if len(marks) == 0 or not self._step_us:
             return None
         active_pixels = counts.sum() ** 2 / (counts.astype(np.float64) ** 2).sum()
@@ -251,17 +251,17 @@ class ReadoutSigns:
 
 
 def _thinned(marks: Int64[np.ndarray, "n 3"], column: int, size: int) -> Int64[np.ndarray, "m 3"]:
-    """The first mark of each `size` of what a column counts."""
+    """The first mark within every `size` events (column 1) or rows (2)."""
     return marks[np.flatnonzero(np.diff(marks[:, column] // size, prepend=-1))]
 
 
 def _blocks(
     marks: Int64[np.ndarray, "n 3"], column: int
 ) -> tuple[Float64[np.ndarray, " b"], Float64[np.ndarray, " b"], Float64[np.ndarray, " b"]] | None:
-    """Number, duration and dispersion of blocks of `PARTS` parts between marks; None if there are too few.
+    """Number, duration (us) and dispersion of each block of `PARTS` parts; None for fewer than `MIN_BLOCKS` blocks.
 
-    The dispersion is that of the parts' durations less what their numbers explain, from differences of neighbours, so
-    that a rate that drifts counts little. It is 1 for a random stream and 0 for one evenly spaced.
+    The dispersion is the variance of the parts' durations that their numbers do not explain, relative to a random
+    stream: 1 for random events, 0 for even spacing. Differences of neighbouring parts keep out a drift of the rate.
     """
     count = (len(marks) - 1) // PARTS
     if count < MIN_BLOCKS:

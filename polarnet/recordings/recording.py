@@ -51,7 +51,7 @@ FORMATS = {
 }
 """Ordered as they are tried on a file of unknown format."""
 FOLDERS = ("store", "rosbag")
-"""Formats of which a folder may be the file."""
+"""Formats whose recordings may be folders."""
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,9 @@ def open_recording(
     """Open a file to read it chunk by chunk.
 
     `format` is a key of FORMATS; None detects it from the content. `height` and `width` are needed where the file does
-    not state them. `part` is SEQUENCE/ANGLE of an event store. `clock_mhz` is the clock of a CeleX-5 whose BIN file
-    counts its ticks. RecordingError where the format is unknown or the content cannot be events; RuntimeError naming
-    the package to install where an optional one is missing.
+    not state them. `part` is SEQUENCE/ANGLE of an event store, or a topic of a bag. `clock_mhz` is the clock of a
+    CeleX-5 whose file holds clock ticks. RecordingError where the format is unknown or the content cannot be events;
+    RuntimeError naming the package to install where an optional one is missing.
     """
     path = Path(path)
     if not path.exists():

@@ -31,7 +31,7 @@ REPAIRS = {
 """Kinds of damage that readers count. No event is ever given another time, pixel or polarity."""
 
 SAFE = ("cut_tail", "no_change", "unsorted", "pauses")
-"""Repairs allowed any number of times; too many of any other kind make the file refused."""
+"""Repairs allowed any number of times. A file with too many of another kind is refused."""
 
 
 class RecordingError(ValueError):
@@ -54,9 +54,9 @@ class Choices:
     height: int | None = None
     width: int | None = None
     part: str | None = None
-    """SEQUENCE/ANGLE of an event store."""
+    """SEQUENCE/ANGLE of an event store, or a topic of a bag."""
     clock_mhz: float | int | None = None
-    """Clock of a CeleX-5 that did not run at its usual rate."""
+    """Clock of a CeleX-5; None: 100 MHz in a BIN file, and times in microseconds in a CSV file."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def header_lines(path: Path, prefix: bytes, last: bytes, max_bytes: int) -> tupl
 
 
 def unwrapped(blocks: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Times without wraps, and entries, of each block that is not empty; column `t` has 32-bit microseconds."""
+    """Unwrapped times (int64) and entries of each block that is not empty; column `t` has 32-bit microseconds."""
     turns, before = 0, 0
     for block in blocks:
         if len(block):

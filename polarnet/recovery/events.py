@@ -48,8 +48,8 @@ def recover(
     Windows lie between consecutive `t_us` (default: every 1/30 s from 0, which the networks are trained on), so m times
     give m - 1 frames. `weights` is a checkpoint of the DoLP network (default: the shipped one), and `thresholds` are
     the camera's contrast thresholds, ON and OFF (default: estimated). `binning` is the side of the pixel blocks that
-    the network sees (default: that of its training); 2 is faster on large sensors. ValueError for
-    another number of channels, for times that do not increase, and for events that end before the first window.
+    the network sees (default: that of its training); 2 is faster on large sensors. ValueError for another number of
+    channels, for times that do not increase, and for events that end before the first window.
 
     >>> from polarnet.recovery import recover
     >>> from polarnet.simulation import MOTIONS, SENSORS, simulate

@@ -1,4 +1,4 @@
-"""`polarnet recover --rate`: frames at a fixed rate, which the events carry on from window to window."""
+"""`polarnet recover --rate`: frames at a fixed rate; between windows, motion and events update the last frame."""
 
 import operator
 import time
@@ -33,7 +33,7 @@ class Rate(NamedTuple):
 
 
 def check_rate(rate_hz: float, rule: WindowRule, recoverer: Recoverer) -> None:
-    """ValueError for a rate that windows give anyway, that is too high, or that the method has a cheaper way to."""
+    """ValueError for a rate out of range or beside a --step, or one that windows or a --step reach as cheaply."""
     highest = 1_000_000 / SHORTEST_STEP_US
     if not 0 < rate_hz <= highest:
         raise ValueError(f"--rate: expected more than 0 and at most {highest:,.0f} frames a second, got {rate_hz:g}")
@@ -59,8 +59,8 @@ def frames_at_rate(
 ) -> Iterator[Frame]:
     """Yield the frames of a rate, each as soon as its last event has arrived and its window has been processed.
 
-    The method runs once a window, like `frames_of`. A frame's window, which the pictures show, is as long as the last
-    one and ends with the frame.
+    The method runs once a window, as in `frames_of`. The window of a frame, whose events the pictures show, ends at the
+    time of the frame and is as long as the method's last window.
     """
     warm_up(recoverer, source.height, source.width)
     cutter = WindowCutter(rule, source.height, source.width)

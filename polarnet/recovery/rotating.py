@@ -24,7 +24,7 @@ def open_rotating(
 ) -> tuple[Input, Rotation]:
     """Read the camera's events, reduced to `size` (height, width) if given, and count times from the first event.
 
-    `rotation` has the times of the file; the one returned has those of the events.
+    `rotation` is by the file's clock, the returned one by that of the events. RecordingError for a file without events.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: there is no such file")
@@ -59,7 +59,7 @@ def rotation_of(rate_hz: float | None, triggers: Path | None, start_angle_deg: f
 def half_turn_rule(
     rotation: Rotation, window_turns: float, length_us: int | None = None, step_us: int | None = None
 ) -> WindowRule:
-    """Windows of `window_turns` turns, or of `length_us`, one every half turn, or every `step_us`."""
+    """Windows as long as `length_us` (default: `window_turns` turns), one every `step_us` (default: half a turn)."""
     step_us = step_us or max(1, round(rotation.half_turn_us))
     length_us = length_us or max(step_us, round(2 * window_turns * rotation.half_turn_us))
     return WindowRule(length_us, None, min(step_us, length_us))

@@ -10,7 +10,7 @@ from polarnet.reports.rerun_log import RerunLog
 from polarnet.stokes import Prediction
 from polarnet.storage.true_frames import TrueFrames
 
-MAX_GAP = 0.01  # of a window, between the end of a window and its true frame
+MAX_GAP = 0.01  # between the end of a window and its true frame, as a fraction of the window
 
 
 def logged(log: RerunLog, frames: Iterable[Frame], live: bool) -> Iterator[Frame]:

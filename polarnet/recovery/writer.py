@@ -41,10 +41,10 @@ from polarnet.storage.true_frames import TrueFrames
 
 VIDEO = "recovered.mp4"
 PNG_STORED, NO_FILTER = 0, 8  # no compression, libpng's PNG_FILTER_NONE: larger files, but fast to write
-MIN_FREE_BYTES = 2**26  # of the disk, which the last frames, the video's index and the page need
+MIN_FREE_BYTES = 2**26  # disk space kept free for the last frames, the video's index and the page
 MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, the network needs all cores: a concurrent writing thread delays every operation
-SHEET_PICTURES = 3  # of recovered.png
+SHEET_PICTURES = 3  # pictures in recovered.png
 GAP = 4  # pixels between the maps of a picture
 ZARR_CONVENTIONS = {
     "t_us": "time of the frame, microseconds from the first event; without --rate the end of its window",

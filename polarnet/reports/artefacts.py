@@ -105,7 +105,7 @@ class EventRate(NamedTuple):
     seconds: float
     events: int
     per_pixel_second: float
-    """Rate of one channel."""
+    """Events per pixel and second, mean over the four channels."""
 
 
 class BudgetPoint(NamedTuple):
@@ -244,7 +244,7 @@ def thumbnails(pictures: Sequence[str], scenes: SceneStore) -> dict[str, UInt8[n
 
 
 def event_budget(file: Path, events: EventStore) -> list[BudgetPoint]:
-    """Mean errors of each method by events per pixel, from the scores of all frames and the events scored."""
+    """Mean MSE of each method by bin of events per pixel (`BIN_EDGES`), from frames.csv and the events behind it."""
     with file.open(newline="") as stream:
         scores = [(row["method"], (row["sequence"], int(row["t_us"])), row["mse"]) for row in csv.DictReader(stream)]
     times: dict[str, list[int]] = {}

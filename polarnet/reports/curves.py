@@ -22,9 +22,10 @@ SETTING_LABELS = {
 
 
 def event_budget_figure(results: Mapping[str, Any], theme: Theme) -> Figure:
-    """PSNR and correlation against events per pixel since the start, by window length, and of frames more often.
+    """Draw PSNR (dB) and correlation of DoLP against events per pixel since the start, and against window length.
 
-    Those come from overlapping windows (against their events per pixel), or are carried on between windows (a line).
+    The third column has frames more often than windows: from overlapping windows, against the events per pixel in one,
+    and, as a dashed line, carried on by motion and events. `results` is the content of event_budget.json.
     """
     with matplotlib.rc_context(chart_style(theme)):
         figure = Figure(figsize=(9.6, 5.0), layout="constrained", facecolor="none")

@@ -22,7 +22,7 @@ from polarnet.reports.artefacts import Panel
 from polarnet.reports.legend import GENERAL, Legend, with_structure
 from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image, hue_wheel
 
-HEADING_LETTERS = 19  # of a line above a picture
+HEADING_LETTERS = 19  # in a line above a picture
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def comparison_figure(
 ) -> Figure:
     """Draw panels like the paper's Fig. 9 and 10: a row each, with events, truth and the DoLP of `methods`.
 
-    MSE and PSNR stand below each method. Methods that predict one value everywhere are left out.
+    MSE and PSNR stand below each method; methods of one constant value are left out. ValueError without panels.
     """
     if not panels:
         raise ValueError("a comparison needs at least one panel, got none")
@@ -93,7 +93,7 @@ def score_line(recovered: Float[Tensor, "h w"], truth: Float[Tensor, "h w"]) -> 
 
 
 def draw_wheel(axes: Axes, theme: Theme, size: int, label_size: float) -> None:
-    """Draw the wheel of `size` pixels, with the angle of polarization at four directions."""
+    """Draw `hue_wheel`, `size` pixels wide, labelled with AoLP at 0, 45, 90 and 135 degrees."""
     axes.imshow(hue_wheel(size))
     axes.axis("off")
     for angle, (across, up, sideways, upright) in {

@@ -155,7 +155,7 @@ def _write_page(
 
 
 def _results_context(results: Results, legend: Legend, films: Sequence[Film]) -> dict[str, Any]:
-    """Template values of the results on the test set, and empty values of what only a pipeline's report has."""
+    """Template values of the results on the test set; empty for the parts that only a pipeline's report has."""
     metrics, details = results.metrics, results.details
     return {
         "details": details,

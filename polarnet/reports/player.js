@@ -173,7 +173,7 @@ class Player {
     this.paint(canvas, kind, Uint8Array.from({ length: 128 }, (_, i) => 2 * i + 1), 0);
   }
 
-  /** AoLP by direction: opposite directions are one angle. The paper's map darkens with DoLP, here the radius. */
+  /** AoLP by direction: opposite directions are one angle. The paper's map is brighter for larger DoLP, the radius. */
   wheel_legend(canvas, kind) {
     const size = 64, middle = (size - 1) / 2;
     Object.assign(canvas, { width: size, height: size, className: "wheel" });
@@ -184,7 +184,7 @@ class Player {
     }), 0);
   }
 
-  /** Colour a byte a pixel; of the paper's map two, AoLP and DoLP: colours scale with DoLP, as S = 1 and V = DoLP. */
+  /** Colour one byte a pixel, or two for the paper's map: AoLP is the hue, and DoLP scales the colour (V = DoLP). */
   paint(canvas, kind, values, frame) {
     const context = canvas.getContext("2d"), size = canvas.width * canvas.height, table = this.colours[kind];
     const image = context.createImageData(canvas.width, canvas.height), top = table.length / 3;

@@ -42,7 +42,7 @@ class Map(NamedTuple):
     """One quantity of a scene over its frames."""
 
     source: str
-    """Label of what shows it: a method, the truth, the recording."""
+    """Label of its origin: a method, the truth, or a recording."""
     kind: Kind
     frames: UInt8[np.ndarray, "n h w"]
     """Bytes in the steps of `polarnet.storage.film`."""
@@ -113,7 +113,7 @@ def _scene(film: Film, frames: int) -> dict[str, Any]:
 
 
 def _strip(frames: UInt8[np.ndarray, "n h w"], kind: Kind) -> dict[str, Any]:
-    """The strip's data URI; the count at the largest value of events; mean and largest error of the strip's DoLP."""
+    """`strip`: data URI; for events `scale`: count at full scale; for DoLP `error`: mean and largest coding error."""
     about: dict[str, Any] = {}
     if kind == "events":
         signed = frames.astype(np.float32) - NO_EVENTS
@@ -138,7 +138,7 @@ def _reduced(frames: UInt8[np.ndarray, "n h w"], kind: Kind) -> UInt8[np.ndarray
     factor = MAX_SIDE / max(height, width)
     if factor >= 1:
         return frames
-    method = cv2.INTER_NEAREST if kind == "aolp" else cv2.INTER_AREA  # a mean of angles is none
+    method = cv2.INTER_NEAREST if kind == "aolp" else cv2.INTER_AREA  # angles have no plain mean
     size = (round(width * factor), round(height * factor))
     return np.stack([cv2.resize(frame, size, interpolation=method) for frame in frames])
 

@@ -117,7 +117,7 @@ class Sheet:
 def true_pictures(
     channels: Sequence[Events], truth: TrueFrames, gamma: float = 1.0
 ) -> Iterator[tuple[UInt8[np.ndarray, "h w 3"], int]]:
-    """A picture (`Sheet.truth`) for the events between each two true frames, and their number, with progress."""
+    """Yield a picture (`Sheet.truth`) and the number of events between each two true frames, with a progress bar."""
     sheet = Sheet(channels[0].height, channels[0].width)
     for k in ProgressBar(range(1, len(truth)), "video", unit="picture"):
         span = int(truth.t_us[k - 1]), int(truth.t_us[k])

@@ -16,7 +16,7 @@ def parallel_coordinates(
 ) -> Figure:
     """One axis for each swept key and one for the score; the line of the lowest score is drawn last and thick.
 
-    `values` has the value of each point, by key. Numbers are placed in their order, words as they first appear.
+    `values` has a value for each point, by key. An axis spaces them evenly: numbers by size, words as they appear.
     """
     with matplotlib.rc_context(chart_style(theme)):
         figure = Figure(figsize=(2.2 * (len(values) + 1), 3.6), layout="constrained", facecolor=theme.face)

@@ -124,10 +124,9 @@ def score_table(
 ) -> Table:
     """Scores of the methods in the fixed order; a metric without any value gets no column.
 
-    With `warmup_windows`, a note states which windows are scored.
-
-    The LPIPS heading names the backbone from the rows' `lpips_backbone`. Rows of another camera are not ranked, and a
-    note says so. Methods missing in `labels` come last, under their own key.
+    With `warmup_windows`, a note states which windows are scored. The LPIPS heading names the backbone from the rows'
+    `lpips_backbone`. Rows of another camera are not ranked, and a note says so. Methods missing in `labels` come last,
+    under their own key. ValueError without scores.
     """
     if not scores:
         raise ValueError("a table needs the scores of at least one method, got none")
@@ -177,7 +176,7 @@ def paper_table(experiment: Literal["simulated", "real"]) -> Table:
 def as_markdown(table: Table, groups: Sequence[str] = ()) -> str:
     """A GitHub table: best values in bold, intervals small below their values, notes at the end.
 
-    `groups` name equal shares of the columns, in the headings.
+    `groups` split the columns into equal runs, left to right; a heading starts with the name of its group.
     """
     headings = _grouped(table, groups)
     lines = ["| | " + " | ".join(headings) + " |", "|---|" + "---:|" * len(headings)]

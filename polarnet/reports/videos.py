@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 CODEC, PIXELS = "libx264", "yuv420p"  # the one pair that every browser plays
 QUALITY = {"preset": "ultrafast", "crf": "18", "threads": "1"}  # a second thread would take the network's core
 LAYOUT = {"movflags": "hybrid_fragmented", "flush_packets": "1"}  # plays after a kill, an ordinary MP4 once closed
-SECONDS_PER_FRAGMENT = 2  # what a kill may cost
+SECONDS_PER_FRAGMENT = 2  # the most that a kill loses
 
 
 class VideoWriter:

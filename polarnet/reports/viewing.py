@@ -32,7 +32,7 @@ def films_of(
     """Films of a store, of a folder with stores, or of a camera's file, which `read` reads.
 
     A folder gives the events, frames and recovery of a sequence in one film. Without `sequences`, the first `MAX_FILMS`
-    of each store are read. ValueError names the sequences there are for an unknown one; FileNotFoundError if there is
+    of each store are read. ValueError for an unknown sequence, with the known names; FileNotFoundError if there is
     nothing to show.
     """
     if not path.exists():
@@ -51,7 +51,7 @@ def _is_store(path: Path) -> bool:
 
 
 def _joined(parts: Sequence[Film]) -> list[Film]:
-    """One film for each name: maps of equal times and sizes together, others under the name of their store."""
+    """One film for each name, with the maps of equal times and sizes; others get a film named after their first map."""
     films: dict[str, Film] = {}
     for part in sorted(parts, key=lambda film: film.maps[0].kind == "events"):  # the truth sets the times
         name, known = part.name, films.get(part.name)

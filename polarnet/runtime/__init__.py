@@ -1,1 +1,1 @@
-"""Device, threads, worker processes, array and range checks: what every room builds on."""
+"""Device, threads, worker processes, files, and checks of arrays and ranges, which all other packages use."""

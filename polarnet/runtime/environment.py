@@ -1,4 +1,4 @@
-"""Manners of polarnet's programs: environment, Ctrl-C and quiet libraries; a user's own program keeps its own."""
+"""Environment, Ctrl-C and quiet libraries in polarnet's programs; importing polarnet elsewhere changes none of them."""
 
 import atexit
 import os
@@ -33,5 +33,5 @@ def announce_interrupts() -> None:
 
 
 def silence_bindings() -> None:
-    """Drop what C++ libraries print once Python has ended: nanobind's lists of leaks, which no setting turns off."""
+    """Discard output of C++ libraries after Python's end, such as nanobind's lists of leaks, which no setting stops."""
     atexit.register(lambda: os.dup2(os.open(os.devnull, os.O_WRONLY), 2))  # registered first, so it runs last

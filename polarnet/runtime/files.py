@@ -1,4 +1,4 @@
-"""The hash of contents, files that are written whole or not at all, and the settings that came with the package."""
+"""Checksums and locks, files that are written whole or not at all, and the settings shipped with the package."""
 
 import hashlib
 import shutil
@@ -96,7 +96,7 @@ def check_seal(folder: Path, names: Collection[str] | None = None) -> None:
 
 @contextmanager
 def claimed(path: Path) -> Iterator[None]:
-    """The right of this process alone to write `path`, held in PATH.lock.tmp; it ends with the process at the latest.
+    """Lock `path`, by PATH.lock.tmp, so that only this process may write it, until the block or the process ends.
 
     ValueError if another process has it.
     """

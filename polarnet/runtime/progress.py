@@ -1,4 +1,4 @@
-"""Progress of everything that takes longer than two seconds: a bar on a terminal, elsewhere a line now and then."""
+"""Progress of work that takes longer than two seconds: a bar on a terminal, elsewhere a line every 30 s."""
 
 import sys
 from collections.abc import Callable

@@ -53,7 +53,7 @@ def section(config_class: type[Section]) -> type[Section]:
 
 
 def _absurd_number(value: Any, key: str = "") -> str | None:
-    """The reason why a number anywhere in a value is none that a setting can have; None if there is none."""
+    """Message about the first number in a nested value that is NaN or beyond `MAX_NUMBER`; None if there is none."""
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for name, inner in items:
         inside = f"{key}[{name}]" if isinstance(value, list) else f"{key}.{name}".removeprefix(".")
@@ -93,7 +93,7 @@ def unknown_key(config_class: Any, path: Sequence[str]) -> str | None:
 
 
 def _without_none(hint: Any) -> Any:
-    """The type that may also be None."""
+    """The type X of an annotation `X | None`; other annotations are returned unchanged."""
     kinds = [kind for kind in typing.get_args(hint) if kind is not type(None)]
     return kinds[0] if isinstance(hint, types.UnionType) and len(kinds) == 1 else hint
 

@@ -50,7 +50,7 @@ def fitted(scenes: Sequence[Scene]) -> ExpectedErrors:
     """
     if not any(scene.squared.any() for scene in scenes):
         pixels = sum(len(scene.squared) for scene in scenes)
-        raise ValueError(f"expected errors can be fitted to errors alone, got {pixels} pixels without any")
+        raise ValueError(f"a fit of expected errors needs pixels with errors, got {pixels} pixels without any")
     losses = dict.fromkeys(RIDGES, 0.0)
     for fold in range(min(FOLDS, len(scenes))):
         others = [scene for k, scene in enumerate(scenes) if k % FOLDS != fold]

@@ -15,7 +15,7 @@ class Muon(Optimizer):
     Adam's steps are dominated by a few directions. `torch.optim.Muon` accepts only matrices, so a convolution's weight
     is flattened to (outputs, everything else). Muon's steps are about as long as Adam's (`match_rms_adamw`), so both
     share one learning rate. Adam also trains the layers that the network lists in `outputs`, because their results are
-    read as numbers.
+    used as quantities, not as features.
     """
 
     def __init__(self, network: nn.Module, learning_rate: float):

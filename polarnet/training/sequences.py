@@ -18,7 +18,7 @@ from polarnet.storage.windows import WindowDataset, WindowSequence
 
 Sequences = WindowDataset | list[WindowSequence]
 
-MEMORY_SHARE = 0.7  # of the memory free at the start of a training, for its sequences
+MEMORY_SHARE = 0.7  # share of the free memory that the sequences of a training may take
 EIGHTH_TURN = math.pi / 4  # angle between neighbouring polarizers
 
 

@@ -33,7 +33,7 @@ LAST_LINE = b"#End Of ASCII Header"  # only in newer files; an event can begin w
 MAX_HEADER_BYTES = 2**20  # jAER writes its settings into the header
 ENTRY = np.dtype([("address", ">u4"), ("t", ">u4")])
 NO_EVENT = 1 << 31 | 1 << 10
-SAMPLE, RESET_READ, SIGNAL_READ = 1 << 31, 0, 1  # a frame's sample, and the two values of its bits 10 and 11
+SAMPLE, RESET_READ, SIGNAL_READ = 1 << 31, 0, 1  # the bit of a frame's sample, and the bits 10 and 11 of its two reads
 SENSORS = {b"346": (260, 346), b"240": (180, 240), b"128": None}
 """Height and width by the number in the camera's class name in the header; the DVS128 uses another address layout."""
 
@@ -57,7 +57,7 @@ def open_aedat2(path: Path, choices: Choices) -> Source:
 
 
 def aedat2_frames(path: Path) -> CameraFrames:
-    """Frames of a DAVIS: the light of every pixel; the time is the mean of the middles of the pixels' exposures.
+    """Frames of a DAVIS: 10-bit light of every pixel, and the mean over the pixels of the middle of their exposure.
 
     A frame that lacks samples, such as the last one of a file, is left out. RecordingError if none is complete.
     """
@@ -87,7 +87,7 @@ def aedat2_frames(path: Path) -> CameraFrames:
 
 
 def _described(path: Path, choices: Choices) -> tuple[int, int, int]:
-    """Bytes of the header, height and width."""
+    """Length of the header in bytes, and height and width of the sensor."""
     header, after, ended = header_lines(path, b"#", LAST_LINE, MAX_HEADER_BYTES)
     if not header.startswith(MAGIC) or (not ended and after.startswith(b"#")):
         raise RecordingError(f"{path.name}: expected AEDAT-2's header of # lines, and events after it")

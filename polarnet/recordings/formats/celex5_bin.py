@@ -140,7 +140,8 @@ def celex5_pictures(path: Path) -> Iterator[Picture]:
 def _unpacked(data: np.ndarray) -> np.ndarray:
     """Unpack two 12-bit pixels from 3 bytes: their high 8 bits, then the low 4 of the first, then those of the second.
 
-    The sensor counts darkness. Its mode replaces the high bits of pixel (0, 0), which gets the value of the next pixel.
+    The sensor sends larger values for darker pixels, so they are inverted. It sends its mode in place of the high bits
+    of pixel (0, 0), which gets the value of pixel (0, 1).
     """
     first, second, low = data.reshape(-1, 3).T.astype(np.uint16)
     pixels = np.stack([first << 4 | low & 15, second << 4 | low >> 4], axis=1)

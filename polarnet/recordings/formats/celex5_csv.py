@@ -19,7 +19,7 @@ MODES = {
 
 
 def matches(path: Path, head: bytes) -> bool:
-    """Whether the lines match one of the modes; four columns must not be `t,x,y,p`."""
+    """Whether the columns are those of a mode; four columns that end with a polarity are `t,x,y,p` and do not match."""
     lines = [line.words for line in numbers_of(head)]
     if not lines or b"," not in head or len(lines[0]) not in MODES:
         return False

@@ -41,7 +41,7 @@ def open_event_stream(path: Path, choices: Choices) -> Source:
 
 
 def aedat4_frames(path: Path) -> CameraFrames:
-    """The grey frames of the file, with the middle of their exposure, else the time of the frame."""
+    """Grey frames, timed by the middle of their exposure, or by their time stamp where the file has no exposure."""
     answer = _library.ask(path, "frames")
     if answer is None:
         raise RecordingError(

@@ -14,7 +14,7 @@ def size(path: str, file_type: str) -> tuple[int, int]:
 
 
 def pieces(path: str, file_type: str) -> Iterator[np.ndarray]:
-    """Packets with the columns t, x, y, on."""
+    """Packets of events: structured arrays with the fields t, x, y, on."""
     return iter(faery.events_stream_from_file(path, file_type=file_type))
 
 

@@ -1,4 +1,4 @@
-"""HDF5 files of four kinds: columns of events in DSEC's layout or ESfP's, E2P's polarization camera, Prophesee's."""
+"""HDF5 files in four layouts: columns of DSEC and of ESfP, E2P's table from a polarization camera, and Prophesee's."""
 
 import contextlib
 import re
@@ -20,7 +20,7 @@ TRIGGERS = "triggers"  # times of a trigger signal in microseconds
 MAX_WHOLE = 2**53  # largest whole number that a float holds exactly
 E2P_COLUMNS = 4  # columns of /events: t in microseconds, x, y, p of 0 or 1
 E2P_FRAMES, E2P_MAPS = ("frame_ts", "frame"), ("intensity", "dolp", "aolp")
-E2P_WHITE = 255.0  # of its maps: S0 / 2 and DoLP 1, AoLP 90 degrees; -90 degrees are 0
+E2P_WHITE = 255.0  # level in its maps of saturated light, of DoLP 1 and of AoLP 90 degrees; level 0 is AoLP -90 degrees
 
 Description = dict[str, Any]
 

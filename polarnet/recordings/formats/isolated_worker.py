@@ -38,7 +38,7 @@ def block(
 
 
 def gathered(pieces: Iterator[np.ndarray]) -> list[np.ndarray]:
-    """Pieces with about as many events as an answer holds; empty at the end."""
+    """The next pieces, at least `GATHERED_EVENTS` events together; fewer before the end, none at the end."""
     batch, count = [], 0
     while count < GATHERED_EVENTS and (piece := next(pieces, None)) is not None:
         batch.append(piece)

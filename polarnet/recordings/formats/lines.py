@@ -29,8 +29,8 @@ def number_blocks(
     """Read the lines of a file from byte `skip_bytes` as rows of len(decimals) whole numbers.
 
     Column i is multiplied by 10**decimals[i]. Where decimals[i] > 0 the rest is rounded; elsewhere a fraction makes the
-    line unreadable. Numbers are separated by blanks, commas or semicolons; # starts a comment. Other lines are left out
-    and counted as `unreadable_lines`, or as `cut_tail` after the last line end.
+    line unreadable. Numbers are separated by blanks, commas or semicolons; # starts a comment. Unreadable lines are
+    left out and counted as `unreadable_lines`, but one at the end without a line feed as `cut_tail`.
     """
     shift = np.array(decimals, np.int64)
     with path.open("rb") as file:

@@ -1,8 +1,7 @@
 """Files of Prophesee's cameras, little endian: EVT2, EVT2.1, EVT3 (raw) and DAT. Each begins with lines of %.
 
 EVT sends the high bits of the time occasionally, and the low bits in between. A sensor's clock sometimes steps back by
-some microseconds within the same high bits. Times are those of the words, regardless of earlier ones. DAT has 8 bytes
-per event.
+some microseconds within the same high bits; its events keep their earlier times. DAT has 8 bytes per event.
 """
 
 import re
@@ -111,7 +110,7 @@ def _evt_size(header: bytes) -> tuple[int | None, int | None]:
 
 
 def _decode_evt2(words: np.ndarray, *state_and_columns: np.ndarray) -> tuple[int, int]:
-    """Decode words like the upper halves of EVT2.1's, with one pixel each."""
+    """Decode words of 32 bits: each is the upper half of an EVT2.1 word, for one pixel."""
     return _decode_evt21(words.astype(np.uint64) << 32 | 1, *state_and_columns)
 
 
@@ -144,7 +143,7 @@ def _decode_evt21(words, state, t, x, y, p):
 @numba.njit(nogil=True, cache=True)
 @no_type_check
 def _decode_evt3(words, state, t, x, y, p):
-    """Decode words by their upper 4 bits: 0 y, 2 x, 3 base x, 4 and 5 pixels after it, 6 and 8 the time."""
+    """Decode words by their upper 4 bits: 0 y, 2 x, 3 base x, 4 and 5 masks of 12 and 8 pixels from it, 6, 8 time."""
     high, turns, low, row, base, polarity = state
     n, orphans = 0, 0
     for i in range(len(words)):

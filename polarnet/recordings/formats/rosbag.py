@@ -27,7 +27,7 @@ def matches(path: Path, head: bytes) -> bool:
 def open_rosbag(path: Path, choices: Choices) -> Source:
     """Open the events of a bag with one topic of them, or of the topic that `part` names."""
     if path.is_file() and path.suffix != ".bag":
-        raise RecordingError(f"{path.name}: expected a name that ends in .bag, by which rosbags tells bags; rename it")
+        raise RecordingError(f"{path.name}: expected a name that ends in .bag, as the package rosbags does; rename it")
     topics, others = _library.ask(path, "topics")
     if choices.part not in topics and (choices.part is not None or len(topics) != 1):
         raise RecordingError(
