@@ -300,8 +300,8 @@ def main() -> None:
     parser = command_line(__doc__, "docs/results/speed.json and sweeps.json")
     parser.add_argument("studies", nargs="+", choices=tuple(STUDIES))
     parser.add_argument("--scenes", type=Path, help="folder of photographs")
-    parser.add_argument("--methods", help="of scenes, separated by commas; default: those of params.yaml")
-    parser.add_argument("--overrides", nargs="*", default=[], help="of scenes: methods.firenet_published.weights=FILE")
+    parser.add_argument("--methods", help="rows for scenes, separated by commas; default: those of params.yaml")
+    parser.add_argument("--overrides", nargs="*", default=[], help="for scenes: methods.firenet_published.weights=FILE")
     parser.add_argument("--data", type=Path, help="folder of the stages' data at smoke size")
     options = arguments_of(parser)
     if "scenes" in options.studies and not options.scenes:

@@ -158,12 +158,12 @@ class RecoveryWriter:
         if not (sampled or {"mp4", "png"} & set(self.outputs)):
             return
         events = signed_events(window)
-        shown = event_image(events, self._scale.after(events))
+        pixels = event_image(events, self._scale.after(events))
         if "mp4" in self.outputs:
-            self._video.add(self._labelled(window, prediction, shown))
+            self._video.add(self._labelled(window, prediction, pixels))
         if not sampled and "png" not in self.outputs:
             return
-        picture = _side_by_side(prediction, shown)
+        picture = _side_by_side(prediction, pixels)
         if sampled:
             self._sample.offer(Picture(window.stop_us, picture, _byte_maps(events, prediction)))
         if "png" in self.outputs:
