@@ -289,6 +289,20 @@ NETWORK_BLOCKS = {
         {"training scenes": "{about}", "trainings": "{trainings}"} | score_columns(), f"{SEVERAL} {{origin}}",
         _overrides("choices"),
     ),
+    "data-curve": Block(
+        "data_curve", "curve", "studies.data_curve", lambda results: results["curve"]["rows"],
+        {"photographs": "{photographs}", "sequences": "{sequences}", "visits to each": "{visits}"} | {
+            f"{title}: {heading}": f"{{{name}[{key}]{form}}}"
+            for name, title in (("photographs_large", "photographs"), ("measured", "measured scenes"))
+            for heading, key, form in (
+                ("MSE ↓", "mse", ":.4f"), ("level ↓", "level_mse", ":.4f"), ("PSNR ↑", "psnr", ":.2f"),
+                ("corr. ↑", "corr", ":.3f"), ("over the oracle mean ↓", "mse_over_oracle_mean", ":.2f"),
+            )
+        },
+        "One training each, scored on {curve[scenes][photographs_large]} photographs and "
+        "{curve[scenes][measured]} measured scenes. {origin}",
+        _overrides("curve"),
+    ),
     "event_budget": Block(
         "event_budget", "budget", "studies.study", _budget_rows, _budget_columns, lines=_budget_lines
     ),

@@ -73,7 +73,7 @@ PARAMETERS = {
 
 def drawn_sensor(number: int, seed: int) -> EmulatorConfig:
     """Sensor `number` of the draws of `seed`."""
-    ranges = {name: list(bounds) for name, bounds in RANGES.items()}
+    ranges: dict[str, list[float | str]] = {name: list(bounds) for name, bounds in RANGES.items()}
     camera = Camera(replace(SENSORS["default"], model="exact", randomise=ranges))
     sensor = camera.drawn(seed, f"sensor {number}").sensor
     sigmas = {

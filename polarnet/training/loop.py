@@ -88,8 +88,10 @@ def train(
     optimizer = OPTIMIZERS[task.optimizer](network, config.learning_rate)
     progress = recorder.resume(network, optimizer)
     wait_for_all()  # every process has read the running checkpoint before the first process writes it again
-    loaded = loaded_if_it_fits(split.train, task.wants_intensity)
-    sequences, workers = (split.train, workers) if loaded is None else (loaded, 0)
+    loaded = loaded_if_it_fits(split.train, task.wants_intensity, workers)
+    sequences = split.train if loaded is None else loaded
+    if loaded is not None and device.type == "cpu":
+        workers = 0  # the cores are busy with the training itself; beside a GPU, workers prepare the views
     for epoch in range(progress.epoch, config.epochs):
         visits = Visits(sequences, config, seed, epoch)
         order = shuffled(len(visits), seed, epoch)
@@ -163,10 +165,12 @@ def gradients_of(network: nn.Module, processes: int) -> list[Tensor]:
 
 
 def runs_of(task: Task, batch: Batch, length: int, device: torch.device) -> Iterator[Run]:
-    """Yield runs of `length` windows of a batch."""
-    inputs, truth, valid = task.streams(batch)
-    windows, frames = (tensor.to(device).split(length) for tensor in (inputs, truth))
-    masks = [None] * len(frames) if valid is None else valid.to(device).split(length)
+    """Yield runs of `length` windows of a batch, on the device."""
+    fields = {name: getattr(batch, name) for name in ("inputs", "dolp", "aolp", "intensity", "valid")}
+    there = {name: field.to(device) for name, field in fields.items() if field is not None}
+    inputs, truth, valid = task.streams(batch._replace(**there | {"inputs": there["inputs"].float()}))
+    windows, frames = inputs.split(length), truth.split(length)
+    masks = [None] * len(frames) if valid is None else valid.split(length)
     return zip(windows, frames, masks, strict=True)
 
 

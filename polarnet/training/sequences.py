@@ -63,7 +63,7 @@ def apply_view(sequence: WindowSequence, view: View) -> WindowSequence:
         return frames[view.start : stop, ..., view.top : bottom, view.left : right].flip(mirrored).contiguous()
 
     polarizers = [(view.turn + view.direction * j) % 4 for j in range(4)]
-    inputs = cropped(sequence.inputs).unflatten(1, (4, -1))[:, polarizers].flatten(1, 2).float()
+    inputs = cropped(sequence.inputs).unflatten(1, (4, -1))[:, polarizers].flatten(1, 2)
     aolp = view.direction * (cropped(sequence.aolp) - view.turn * EIGHTH_TURN)
     intensity = cropped(sequence.intensity)[:, polarizers]
     valid = None if sequence.valid is None else cropped(sequence.valid)
@@ -121,16 +121,37 @@ class Visits(Dataset[WindowSequence]):
         return apply_view(sequence, random_view(count, height, width, self.config, generator))
 
 
-def loaded_if_it_fits(dataset: WindowDataset, intensity: bool) -> list[WindowSequence] | None:
+class _Packed(Dataset[WindowSequence]):
+    """A dataset's sequences, each `packed` by the process that reads it."""
+
+    def __init__(self, dataset: WindowDataset, intensity: bool):
+        self.dataset, self.intensity = dataset, intensity
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, index: int) -> WindowSequence:
+        return packed(self.dataset[index], self.intensity)
+
+
+def loaded_if_it_fits(dataset: WindowDataset, intensity: bool, workers: int) -> list[WindowSequence] | None:
     """A dataset's encoded sequences, if they fit into `MEMORY_SHARE` of the free memory; None if they do not.
 
-    Each process of a shared training loads them all. `intensity` says whether to keep the intensity.
+    `workers` processes read and encode them; 0 or 1: this process. Each process of a shared training loads them all.
+    `intensity` says whether to keep the intensity.
     """
     bytes_each = sum(tensor.nbytes for tensor in packed(dataset[0], intensity)[1:] if tensor is not None)
     if bytes_each * len(dataset) * processes_here() > MEMORY_SHARE * psutil.virtual_memory().available:
         return None
+    workers = workers if workers > 1 else 0
+    loader = DataLoader(_Packed(dataset, intensity), batch_size=None, num_workers=workers)
     with memory_handed_back():
-        return [packed(dataset[number], intensity) for number in range(len(dataset))]
+        return [_own(sequence) if workers else sequence for sequence in loader]
+
+
+def _own(sequence: WindowSequence) -> WindowSequence:
+    """Copy a sequence out of the memory shared with the worker that read it, which is limited."""
+    return WindowSequence(sequence.name, *(None if field is None else field.clone() for field in sequence[1:]))  # type: ignore[arg-type]
 
 
 def packed(sequence: WindowSequence, intensity: bool) -> WindowSequence:

@@ -59,6 +59,14 @@ def test_polarizers_and_readout_are_drawn_too_each_angle_by_itself():
     assert camera.draws(1, "a")["readout"] == {"jitter_us": drawn.readout.jitter_us}
 
 
+def test_a_pixel_model_is_drawn_among_names_as_often_as_each_stands_in_the_list():
+    camera = randomised(model=["exact", "exact", "exact", "dvs_voltmeter"])
+    drawn = [camera.drawn(1, str(number)).sensor.model for number in range(400)]
+    # of 400, with probability 1/4: 100, with a standard deviation of 8.7
+    assert drawn.count("dvs_voltmeter") == pytest.approx(100, abs=35)
+    assert drawn.count("exact") + drawn.count("dvs_voltmeter") == 400
+
+
 def test_without_ranges_the_camera_stays_itself():
     camera = Camera(SENSOR)
     assert camera.drawn(1, "a") is camera
@@ -75,10 +83,12 @@ def test_without_ranges_the_camera_stays_itself():
             {"cutoff_hz": [0.0, 300.0]},
             r"^randomise.cutoff_hz: expected a lowest value > 0, .* logarithm is drawn uniformly$",
         ),
-        ({"cutoff_hz": ["slow", 300.0]}, r"^randomise.cutoff_hz\[0\]: expected a valid number, got 'slow'$"),
-        ({"cutoff_hz": [300.0]}, r"^randomise.cutoff_hz: expected at least 2 values, got \[300.0\]$"),
+        ({"cutoff_hz": ["slow", 300.0]}, r"^randomise.cutoff_hz: expected \[lowest, highest\], got \['slow', 300.0\]$"),
+        ({"cutoff_hz": [300.0]}, r"^randomise.cutoff_hz: expected \[lowest, highest\], got \[300.0\]$"),
         ({"leak_jitter": [0.0, 1.5]}, r"^randomise.leak_jitter: expected <= 1, got 1.5$"),
-        ({"model": [0.0, 1.0]}, r"^randomise.model: expected one of v2e, exact"),
+        ({"model": ["exact", "mine"]}, r"^randomise.model: expected one of v2e, exact.*, got 'mine'"),
+        ({"model": []}, r"^randomise.model: expected at least one name, got \[\]$"),
+        ({"model": [0.0, 1.0]}, r"^randomise.model: expected"),
     ],
 )
 def test_a_range_that_makes_no_sense_is_refused_by_its_key(ranges, message):

@@ -117,11 +117,14 @@ def test_an_epoch_visits_each_sequence_as_often_as_it_should_under_other_views()
     assert torch.equal(visits[0].inputs, visits[0].inputs)
 
 
-def test_a_dataset_in_memory_is_read_once(stores):
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_dataset_in_memory_is_read_once_by_this_process_or_by_workers(stores, workers):
     dataset = WindowDataset(EventStore.open(stores[0]), FrameStore.open(stores[1]), ["a", "b"], event_tensor)
-    loaded = loaded_if_it_fits(dataset, intensity=True)
+    loaded = loaded_if_it_fits(dataset, intensity=True, workers=workers)
+    assert [one.name for one in loaded] == ["a", "b"]
     assert loaded[1] is loaded[1]
     assert torch.equal(loaded[1].inputs, dataset[1].inputs)
+    assert not any(one.inputs.is_shared() for one in loaded)
 
 
 def test_processes_of_a_machine_share_its_memory(stores, monkeypatch):
@@ -129,17 +132,18 @@ def test_processes_of_a_machine_share_its_memory(stores, monkeypatch):
     needed = 2 * sum(tensor.nbytes for tensor in packed(dataset[0], True)[1:] if tensor is not None)
     free = SimpleNamespace(available=1.5 * needed / MEMORY_SHARE)  # enough for one process
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
-    assert loaded_if_it_fits(dataset, intensity=True) is not None
+    assert loaded_if_it_fits(dataset, intensity=True, workers=1) is not None
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    assert loaded_if_it_fits(dataset, intensity=True) is None
+    assert loaded_if_it_fits(dataset, intensity=True, workers=1) is None
 
 
 def test_counts_of_events_are_kept_as_bytes_and_seen_as_they_were():
     counts = sequence()._replace(inputs=torch.randint(-128, 128, (3, 8, 6, 8)).float())
     compact = packed(counts, intensity=True)
     assert compact.inputs.dtype == torch.int8
-    assert torch.equal(apply_view(compact, WHOLE).inputs, counts.inputs)
-    assert apply_view(compact, WHOLE).inputs.dtype == torch.float32
+    seen = apply_view(compact, WHOLE).inputs
+    assert seen.dtype == torch.int8
+    assert torch.equal(seen.float(), counts.inputs)
 
 
 @pytest.mark.parametrize("value", [0.5, 128.0, -129.0, 1e9])
