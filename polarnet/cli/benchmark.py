@@ -26,6 +26,7 @@ examples:
   polarnet benchmark --event-budget --limit 4"""
 
 PDAVIS = "90 45 / 135 0"
+PART = 2  # scenes
 
 
 def add_to(commands: Commands) -> None:
@@ -97,8 +98,9 @@ def _benchmark(options: argparse.Namespace) -> int:
     cleaning = cleaning_of(options)
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
         chosen = [f"benchmark.methods=[{options.methods}]"] if own and options.methods else []
-        workers = [f"runtime.workers={usable_cores()}"] if own else []  # an override replaces it
-        config = load(settings, [*workers, *options.overrides, *chosen], folder)
+        # all cores, and small parts, which share few scenes evenly among them; an override replaces both
+        shared = [f"runtime.workers={usable_cores()}", f"storage.sequences_per_part={PART}"] if own else []
+        config = load(settings, [*shared, *options.overrides, *chosen], folder)
         configure(config.runtime, config.seed)
         if root is None:
             return _study(options, config, out, weights)
