@@ -23,8 +23,8 @@ from polarnet.storage.frames import FrameStore
 from studies.measure import arguments_of, command_line, machine_record, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
-SHORT = ("variation.scenes_per_picture=1", "train.crop=[60,90]", "benchmark.lpips=false")
-"""Overrides of all trainings: half as many scenes, on crops."""
+SHORT = ("variation.scenes_per_picture=1", "train.windows=6", "train.crop=[60,90]", "benchmark.lpips=false")
+"""Overrides of all trainings: fewer scenes, and visits of six windows of crops."""
 CONDITIONS = ("photographs_large", "measured")
 FIGURES = ("mse", "level_mse", "psnr", "corr", "mse_over_oracle_mean", "median_over_oracle_mean")
 
