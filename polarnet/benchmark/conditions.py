@@ -6,23 +6,11 @@ from typing import Any, NamedTuple
 
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
+from polarnet.simulation.ranges import NAMES
 
 NOT_COMPARED = ("synthesize.sequences_per_picture",)
 MODEL_ALONE = {"esim_log_eps": ("esim", "esim_gpu"), "voltmeter_camera": ("dvs_voltmeter",)}
 """Parameters that exist only in the pixel models listed."""
-
-
-RANGES_BEFORE = {
-    "random_threshold_on": ("contrast_threshold_on",),
-    "random_threshold_off": ("contrast_threshold_off",),
-    "random_threshold_sigma": ("contrast_threshold_sigma_on", "contrast_threshold_sigma_off"),
-    "random_cutoff_hz": ("cutoff_hz",),
-    "random_leak_rate_hz": ("leak_rate_hz",),
-    "random_shot_noise_rate_hz": ("shot_noise_rate_hz",),
-}
-"""Parameters with the same range, by the key of this range in some checkpoints."""
-
-
 SPEEDS = ("synthesize.speed_min_px_s", "synthesize.speed_max_px_s")
 
 
@@ -54,25 +42,7 @@ def configured(synthesize: SynthesizeConfig, emulate: EmulatorConfig) -> Conditi
 def stored(attributes: Mapping[str, Any], height: int, width: int) -> Conditions:
     """Conditions from the attributes of an event store; only the size if its events were not simulated."""
     size = {"sensor_height": height, "sensor_width": width}
-    return Conditions(
-        attributes.get("scenes", {}).get("synthesize", {}) | size, _as_today(attributes.get("emulate", {}))
-    )
-
-
-def _as_today(emulate: Mapping[str, Any]) -> dict[str, Any]:
-    """Section `emulate` of any checkpoint, by the keys of `EmulatorConfig`.
-
-    Some checkpoints have one deviation for ON and OFF, a range for each of six parameters beside the switch
-    `randomise`, and no defective pixels.
-    """
-    section = {key: value for key, value in emulate.items() if not key.startswith("random_")}
-    if "contrast_threshold_sigma" in section:
-        sigma = section.pop("contrast_threshold_sigma")
-        section |= {"contrast_threshold_sigma_on": sigma, "contrast_threshold_sigma_off": sigma}
-        section |= {"contrast_threshold_correlation": 0.0, "hot_pixel_share": 0.0, "dead_pixel_share": 0.0}
-        ranges = {new: emulate[old] for old, news in RANGES_BEFORE.items() for new in news}
-        section["randomise"] = ranges if emulate["randomise"] else None
-    return section
+    return Conditions(attributes.get("scenes", {}).get("synthesize", {}) | size, attributes.get("emulate", {}))
 
 
 def trained_on(metadata: Mapping[str, Any]) -> Conditions | None:
@@ -91,11 +61,13 @@ def sentence(conditions: Conditions) -> str:
         text += f", {scene['duration_s']:g} s at {scene['frame_rate_hz']:g} frames a second"
     if not sensor:
         return f"{text}."
-    text += f"; sensor: model {sensor['model']}"
-    if sensor["model"] == "dvs_voltmeter":
+    drawn = sensor["randomise"] or {}
+    text += "; sensor: " + ("" if "model" in drawn else f"model {sensor['model']}")
+    if sensor["model"] == "dvs_voltmeter" and not drawn:
         return f"{text} with the constants of {sensor['voltmeter_camera']}."
-    if sensor["randomise"]:
-        return f"{text}, {', '.join(sensor['randomise'])} drawn for each sequence (emulate.randomise)."
+    if drawn:
+        comma = "" if "model" in drawn else ", "
+        return f"{text}{comma}{', '.join(drawn)} drawn for each sequence (emulate.randomise)."
     on, off = sensor["contrast_threshold_on"], sensor["contrast_threshold_off"]
     text += f", contrast thresholds {on:g} (ON) and {off:g} (OFF)"
     if sensor["model"] not in MODEL_ALONE["esim_log_eps"]:
@@ -135,10 +107,10 @@ def _warning(used: Conditions, trained: Conditions | None, advice: str) -> str:
     ranges = trained.emulate.get("randomise")
     if ranges and used.emulate and not used.emulate["randomise"]:  # one sensor, against those that the training drew
         keys.remove("emulate.randomise")
-        for name, (low, high) in ranges.items():
+        for name, listed in ranges.items():
             key, value = f"emulate.{name}", used.emulate[name]
-            there[key], nearest[key] = [low, high], min(max(value, low), high)
-            if value != nearest[key]:
+            there[key], nearest[key] = listed, _nearest(name, value, listed)
+            if value != nearest[key] and key in here:
                 keys.append(key)
     if _within_speeds(here, there):
         keys = [key for key in keys if key not in SPEEDS]
@@ -147,6 +119,14 @@ def _warning(used: Conditions, trained: Conditions | None, advice: str) -> str:
     both = ", ".join(f"{key} {_printed(here[key])} (training: {_printed(there[key])})" for key in keys)
     settings = " ".join(f"{key}={_printed(nearest[key])}" for key in keys)
     return f"these sequences differ from those of its training: {both}. {advice} {settings}"
+
+
+def _nearest(name: str, value: Any, listed: list[Any]) -> Any:
+    """The value that a training drew from `listed` (`randomise`) and that is nearest to `value`; a name if of NAMES."""
+    if name in NAMES:
+        return value if value in listed else listed[0]
+    lowest, highest = listed
+    return min(max(value, lowest), highest)
 
 
 def _within_speeds(here: Mapping[str, Any], there: Mapping[str, Any]) -> bool:

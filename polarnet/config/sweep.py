@@ -61,9 +61,11 @@ def write_comparison(folder: Path) -> str:
     (folder / "comparison.md").write_text(f"{table}\n")
     (folder / "comparison.json").write_text(json.dumps({"rows": rows, "points": points}, indent=2) + "\n")
     write_csv(rows, folder / "comparison.csv")
+    kinds = ".json and .csv"
     if axes := swept_axes(rows):
         (folder / "comparison.png").write_bytes(_plot(axes))
-    return f"{table}\nwritten to {folder / 'comparison.md'}, .json, .csv and .png"
+        kinds = ".json, .csv and .png"
+    return f"{table}\nwritten to {folder / 'comparison.md'}, {kinds}"
 
 
 def finished(job: Path, overrides: Sequence[str]) -> bool:
