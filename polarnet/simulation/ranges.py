@@ -18,7 +18,7 @@ class RandomisedConfig:
     """A section whose parameters may differ from sequence to sequence."""
 
     randomise: dict[str, list[float | str]] | None
-    """What is drawn for each sequence: [lowest, highest] of a number, or the names that a parameter of NAMES may take.
+    """Draws of each sequence: [lowest, highest] of a number, or the names that a parameter of NAMES may take.
 
     A name that is listed twice is drawn twice as often. null: nothing is drawn.
     """

@@ -121,6 +121,7 @@ def test_panels_show_one_window_of_different_scenes_and_every_method(five_scenes
         assert panel["dolp_cf"].dtype == np.float32
 
 
+@pytest.mark.thorough
 def test_all_but_the_time_is_the_same_in_two_runs(five_scenes, context, tmp_path):
     some = config(methods=["cf", "e2v", "ours"])
     for name in ("one", "two"):
@@ -155,6 +156,7 @@ def test_a_predicted_value_that_is_not_a_number_is_named(sequence):
         at_stored_precision("m", "a", Prediction(sequence.dolp))
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("forked_workers")
 def test_two_processes_give_the_rows_of_one(five_scenes, context, tmp_path):
     chosen = config(methods=["zeros", "cf"])

@@ -67,6 +67,7 @@ def test_a_static_and_a_moving_recording_give_the_sensor(fit):
     assert value["shot_noise_rate_hz"] == pytest.approx(1.0, rel=0.1)
 
 
+@pytest.mark.thorough
 def test_a_flicker_of_unknown_phase_gives_thresholds_and_bandwidth():
     flicker = Flicker(100.0, 0.8, 20.0)
     t_us, values = flicker_light(flicker, 0.0, 2e6)
@@ -78,6 +79,7 @@ def test_a_flicker_of_unknown_phase_gives_thresholds_and_bandwidth():
     assert fit.missing["shot_noise_rate_hz"] == "needs a static recording"
 
 
+@pytest.mark.thorough
 def test_without_known_light_thresholds_are_missing_and_keep_the_default(static):
     fit = fit_sensor(static, 200.0, [])
     assert "moving recording with frames" in fit.missing["contrast_threshold_on"]
@@ -86,6 +88,7 @@ def test_without_known_light_thresholds_are_missing_and_keep_the_default(static)
     assert sensor.leak_rate_hz == pytest.approx(0.1, rel=0.1)
 
 
+@pytest.mark.thorough
 def test_a_moving_recording_given_as_the_static_one_is_noted(fit, moving):
     assert not any("constant" in note for note in fit.notes)
     assert "was not constant" in fit_sensor(moving.events, 200.0, []).notes[0]

@@ -26,6 +26,7 @@ def poisson(rate_hz: float, generator) -> tuple[list, list]:
     return times, [generator.random(len(t)) < 0.5 for t in times]
 
 
+@pytest.mark.thorough
 def test_a_poisson_process_of_2_hz_gives_1_hz_of_each_polarity():
     noise = estimate_noise(recorded(*poisson(2.0, np.random.default_rng(3))))
     assert noise.shot_off_hz == pytest.approx(1.0, abs=0.03)  # 36,000 events: standard error 0.005
@@ -33,6 +34,7 @@ def test_a_poisson_process_of_2_hz_gives_1_hz_of_each_polarity():
     assert noise.leak_error_hz > 0.5 * noise.leak_hz or noise.leak_hz < 0.05
 
 
+@pytest.mark.thorough
 def test_on_events_about_every_4_seconds_are_a_leak_of_a_quarter_hertz():
     generator = np.random.default_rng(4)
     ages = 4 / (1 - 0.1 * generator.standard_normal((PIXELS, 30)))

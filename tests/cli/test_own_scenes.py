@@ -113,6 +113,7 @@ def test_nothing_usable_says_what_was_expected(project_root, tmp_path, monkeypat
     assert "expected a folder of photographs or of measured polarization" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_methods_and_the_number_of_pictures_may_be_chosen(photographs, project_root, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     assert run(project_root, monkeypatch, photographs, out, "--methods", "cf,cf+gain") == 0

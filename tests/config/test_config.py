@@ -284,6 +284,7 @@ def test_the_base_experiment_undoes_a_sensor_too_and_no_sensor_is_called_like_an
     assert not set(preset_names(project_root, "experiment")) & set(preset_names(project_root, "sensor"))
 
 
+@pytest.mark.thorough
 def test_every_ablation_is_accepted_on_the_command_line_and_changes_something(project_root):
     experiment = "experiment=photographs"  # docs/network.md sweeps over its ablations
     whole = load(project_root, [experiment])

@@ -103,6 +103,7 @@ def test_a_job_is_finished_for_its_own_overrides_alone(tmp_path):
     assert not finished(tmp_path, ["seed=2"])
 
 
+@pytest.mark.thorough
 def test_a_refused_point_is_a_row_with_its_reason_and_stops_no_other(project_root, tmp_path):
     arguments = ["-m", "train.epochs=0,-1", f"hydra.sweep.dir={tmp_path}"]
     done = preloaded.run_stage(project_root, "trial", arguments)

@@ -44,6 +44,7 @@ DOLP = np.array([[0.25, 0.4, 0.6], [0.8, 0.9, 0.5]])
 AOLP = np.array([[0.0, 0.3, 1.0], [1.6, 2.4, 3.1]])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rate_hz", [4.0, -4.0])
 def test_exact_crossings_give_dolp_back_to_a_thousandth(rate_hz):
     rotation = steady_rotation(rate_hz, 0.5)

@@ -270,11 +270,13 @@ def test_a_new_trained_baseline_trains_itself_and_runs_itself_and_no_other_train
     assert repro() == weights | {"train_baseline@sobel", "benchmark@sobel", "report"}
 
 
+@pytest.mark.thorough
 def test_a_changed_setting_of_a_method_runs_its_rows_and_the_report(project):
     set_params(project, lambda params: params["methods"]["cf"].update(cutoff_hz=1.0))
     assert repro() == {"benchmark@cf", "benchmark@cf+gain", "report"}
 
 
+@pytest.mark.thorough
 def test_a_row_that_is_added_or_removed_runs_no_other_row(project):
     removed: dict[str, Any] = {}
     set_params(project, lambda params: removed.update(params["rows"].pop("highpass")))

@@ -162,6 +162,7 @@ def undisturbed(folder: Path, start_forked: Callable[[list[str]], Running]) -> U
     return Undisturbed(digest(events), first - start, (time.monotonic() - first) / (PARTS - 1))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("start", ["start_forked", "start_cold"])
 def test_ten_deaths_at_random_moments_change_no_byte_and_no_finished_part(
     folder, start, undisturbed, tmp_path, request

@@ -81,6 +81,7 @@ def data(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.thorough
 def test_the_benchmark_has_a_row_for_every_method_with_lpips_and_says_of_which_backbone(data):
     metrics = json.loads((data / "benchmark" / "metrics.json").read_text())
     assert set(metrics) == {"zeros", "train_mean", "oracle_mean", "cf", "highpass", "cf+gain", "e2v", "e2p", "ours"}
@@ -112,6 +113,7 @@ def test_a_baseline_that_no_row_uses_is_not_trained(project_root, tmp_path):
     assert not (tmp_path / "data").exists()
 
 
+@pytest.mark.thorough
 def test_a_row_run_alone_gives_the_scores_of_one_pass_over_all_rows(project_root, data, tmp_path):
     shutil.copytree(data / "benchmark", tmp_path / "benchmark")
     for row in ("cf+gain", "ours", "e2vid"):
@@ -124,6 +126,7 @@ def test_a_row_run_alone_gives_the_scores_of_one_pass_over_all_rows(project_root
             assert alone["reliability"] == together["reliability"]
 
 
+@pytest.mark.thorough
 def test_a_damaged_input_ends_a_stage_with_one_line_that_names_the_file(project_root, data, tmp_path):
     shutil.copytree(data / "scenes.zarr", tmp_path / "scenes.zarr")
     part = tmp_path / "scenes.zarr" / "part-00000.zip"
@@ -198,6 +201,7 @@ def test_the_paper_experiment_leaves_table_2_and_its_figures(paper):
     assert rows[0].count("LPIPS (vgg)") == 2
 
 
+@pytest.mark.thorough
 def test_pictures_are_split_by_source(data):
     manifest = json.loads((data / "images" / "manifest.json").read_text())
     splits = [picture["split"] for picture in manifest["pictures"]]
@@ -206,12 +210,14 @@ def test_pictures_are_split_by_source(data):
     assert len({picture["sha256"] for picture in manifest["pictures"]}) == len(splits)
 
 
+@pytest.mark.thorough
 def test_the_page_needs_no_other_file(data):
     page = (data / "report" / "index.html").read_text()
     assert "data:image/png;base64," in page
     assert 'src="http' not in page
 
 
+@pytest.mark.thorough
 def test_the_same_values_give_the_same_bytes_whatever_the_number_of_workers(project_root, data, tmp_path):
     for stage in ("ingest", "synthesize", "emulate"):
         run_stage(project_root, stage, tmp_path, "runtime.workers=2", "runtime.threads=2")
@@ -233,6 +239,7 @@ def test_a_point_of_a_sweep_leaves_what_the_pipeline_made_and_kept_alone(project
     assert own["oracle_mean"]["mse"] == whole["oracle_mean"]["mse"]
 
 
+@pytest.mark.thorough
 def test_a_removed_method_is_in_no_table_and_no_picture_though_its_files_are_there(project_root, data, tmp_path):
     """The report alone, over rows among which `highpass` still lies."""
     folders = {name: tmp_path / name for name in ("benchmark", "report")}

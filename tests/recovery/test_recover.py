@@ -151,6 +151,7 @@ def test_the_lines_on_the_page_run_as_they_stand(store, channels, weights, proje
     torch.testing.assert_close(names["prediction"].dolp[0], last.prediction.dolp, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.thorough
 def test_windows_that_overlap_give_a_frame_every_tenth_of_a_millisecond(store, weights):
     source = opened(store)
     frames = list(frames_of(source, WindowRule(33_333, None, 100), dolp_recoverer(*load_network(weights))))

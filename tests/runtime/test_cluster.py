@@ -59,6 +59,7 @@ def test_a_killed_worker_loses_nothing(tmp_path):
     assert (tmp_path / "died").exists()
 
 
+@pytest.mark.thorough
 def test_workers_end_with_the_process_that_started_them(tmp_path):
     script = "import sys, test_cluster as t; t.pmap(t.note_and_sleep, [sys.argv[1]] * 2, workers=2, label='asleep')"
     paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])

@@ -132,6 +132,7 @@ def test_it_rests_on_pictures_as_they_are_without_their_variants(stores, tmp_pat
     assert json.loads(content["best.json"])["expected_errors"]["sequences"] == 2
 
 
+@pytest.mark.thorough
 def test_a_training_ends_with_it_even_if_killed_in_its_midst(stores, tmp_path, task_of):
     calls = 0
 

@@ -49,6 +49,7 @@ def test_a_training_of_e2p_leaves_a_checkpoint_of_the_published_size(stores, tmp
     assert metadata["loss"] == {"aolp_mse": 50.0, "aolp_ssim_loss": 1.0, "dolp_mse": 50.0, "dolp_ssim_loss": 1.0}
 
 
+@pytest.mark.thorough
 def test_one_sequence_can_be_learnt_by_heart(stores):
     config = dataclasses.replace(E2P, windows=None, crop=None, symmetries=False, learning_rate=1e-2)
     task = e2p_task(config, None, SEED)

@@ -43,6 +43,7 @@ def train_as(rank: int, port: int, stores: tuple[Path, Path], folder: Path) -> N
     torch.distributed.destroy_process_group()
 
 
+@pytest.mark.thorough
 def test_two_processes_train_like_one_with_the_same_batches(stores, tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -104,6 +105,7 @@ def test_a_stage_that_cannot_start_is_an_error(project_root):
         launched("stages.missing", runtime)
 
 
+@pytest.mark.thorough
 def test_the_processes_of_a_training_end_with_the_one_that_started_them(tmp_path):
     (tmp_path / "asleep.py").write_text(ASLEEP)
     notes = tmp_path / "notes"

@@ -141,9 +141,9 @@ def test_counts_of_events_are_kept_as_bytes_and_seen_as_they_were():
     counts = sequence()._replace(inputs=torch.randint(-128, 128, (3, 8, 6, 8)).float())
     compact = packed(counts, intensity=True)
     assert compact.inputs.dtype == torch.int8
-    seen = apply_view(compact, WHOLE).inputs
-    assert seen.dtype == torch.int8
-    assert torch.equal(seen.float(), counts.inputs)
+    inputs = apply_view(compact, WHOLE).inputs
+    assert inputs.dtype == torch.int8
+    assert torch.equal(inputs.float(), counts.inputs)
 
 
 @pytest.mark.parametrize("value", [0.5, 128.0, -129.0, 1e9])

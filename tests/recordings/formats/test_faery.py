@@ -41,6 +41,7 @@ def test_a_cut_file_is_refused_with_what_the_library_says(tmp_path):
         read_recording(path)
 
 
+@pytest.mark.thorough
 def test_damage_that_crashes_the_library_ends_in_events_or_in_the_reason(tmp_path):
     """Bytes that state sizes and places: some of them end the process that faery runs in, and none ours."""
     sound = write(tmp_path / "e.aedat4").read_bytes()
