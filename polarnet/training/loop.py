@@ -88,10 +88,9 @@ def train(
     optimizer = OPTIMIZERS[task.optimizer](network, config.learning_rate)
     progress = recorder.resume(network, optimizer)
     wait_for_all()  # every process has read the running checkpoint before the first process writes it again
-    loaded = loaded_if_it_fits(split.train, task.wants_intensity, workers)
-    sequences = split.train if loaded is None else loaded
-    if loaded is not None and device.type == "cpu":
-        workers = 0  # the cores are busy with the training itself; beside a GPU, workers prepare the views
+    helpers = workers if device.type == "cuda" else 0  # on a processor, the training itself needs the cores
+    loaded = loaded_if_it_fits(split.train, task.wants_intensity, helpers)
+    sequences, workers = (split.train, workers) if loaded is None else (loaded, helpers)
     for epoch in range(progress.epoch, config.epochs):
         visits = Visits(sequences, config, seed, epoch)
         order = shuffled(len(visits), seed, epoch)
