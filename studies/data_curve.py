@@ -6,8 +6,9 @@ python -m studies.data_curve --training FOLDER --photographs FOLDER --photograph
 --training has the training photographs, as `studies.robustness --training` links them. Each size takes that many of
 them, every set within the next larger one (`ingest.limit`), and trains with `experiment=shipped` and the overrides
 SHORT. Small sets are visited more often, so that all networks train for about as long. `studies.robustness` scores the
-networks on the test split of both sets of photographs and on the measured scenes. Finished trainings in --work are
-reused, interrupted ones resumed. --write puts the curve into docs/results/data_curve.json.
+networks on the test split of both sets of photographs and on the measured scenes. The sizes are trained in the order
+given. Finished trainings in --work are reused, interrupted ones resumed. --write puts the curve into
+docs/results/data_curve.json.
 """
 
 import argparse
@@ -74,7 +75,7 @@ def parsed() -> argparse.Namespace:
     for name in ("--training", "--photographs", "--photographs-large", "--work"):
         parser.add_argument(name, type=Path, required=True)
     parser.add_argument("--measured", type=Path, nargs="+", required=True)
-    parser.add_argument("--sizes", type=int, nargs="+", default=[100, 300, 574], help="photographs of each training")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[574, 300, 100], help="photographs of each training")
     parser.add_argument("--visits", type=int, default=1066, help="visits of each training, about")
     parser.add_argument("--limit", type=int, default=24, help="scored pictures of each set")
     parser.add_argument("--jobs", type=int, default=2, help="trainings at a time")
@@ -105,7 +106,7 @@ def main() -> None:
     scenes = {name: tables[name]["scenes"] for name in CONDITIONS}
     print(json.dumps(rows, indent=1))
     if arguments.write:
-        curve = {"overrides": SHORT, "scenes": scenes, "rows": rows}
+        curve = {"overrides": SHORT, "scenes": scenes, "rows": sorted(rows, key=lambda row: row["photographs"])}
         print(write_section(ROOT, "data_curve", "curve", curve, record))
 
 
