@@ -20,10 +20,10 @@ from polarnet.storage.events import EventStore
 from polarnet.training.dolp import dolp_task
 from polarnet.training.e2v import E2vConfig, e2v_task
 from polarnet.training.history import read_history
-from polarnet.training.loop import TrainConfig, set_learning_rate, train, validate
+from polarnet.training.loop import TrainConfig, runs_of, set_learning_rate, train, validate
 from polarnet.training.losses import LossConfig
 from polarnet.training.recorder import Recorder
-from polarnet.training.sequences import stack
+from polarnet.training.sequences import Batch, stack
 from polarnet.training.task import Task, describe, open_split
 
 SEED = 7
@@ -58,6 +58,16 @@ class Killed(Exception):
 
 def small_task() -> Task:
     return dolp_task("paper", NETWORK, TRAIN, LOSS, None, SEED)
+
+
+def test_counts_kept_as_bytes_reach_the_network_as_the_same_numbers_in_float32():
+    counts = torch.randint(-128, 128, (4, 2, 4, 16, 20)).to(torch.int8)
+    truth, none = torch.rand(4, 2, 16, 20), torch.zeros(0, 2, 4, 16, 20)
+    runs = list(runs_of(small_task(), Batch(["a", "b"], counts, truth, truth, none), 3, CPU))
+    assert [len(windows) for windows, _, _ in runs] == [3, 1]
+    windows = torch.cat([windows for windows, _, _ in runs])
+    assert windows.dtype == torch.float32
+    assert torch.equal(windows, counts.float())
 
 
 def run(task: Task, stores: tuple[Path, Path], folder: Path, config: TrainConfig | E2vConfig = TRAIN) -> Path:
