@@ -58,8 +58,14 @@ def reproduced(folder: Path, target: list[str]) -> Path:
     run(folder, "git", "clone", "--quiet", ROOT, clone)
     run(clone, "-m", "polarnet.cli", "preset", "smoke")
     dvc(clone, "repro", *target)
-    run(clone, "git", "-c", "user.name=study", "-c", "user.email=study@localhost", "commit", "-qam", "smoke size")
+    commit(clone, "smoke size")
     return clone
+
+
+def commit(clone: Path, message: str) -> None:
+    """Commit all changes of a clone, new files included."""
+    run(clone, "git", "add", "--all")
+    run(clone, "git", "-c", "user.name=study", "-c", "user.email=study@localhost", "commit", "-qm", message)
 
 
 def push(clone: Path, target: list[str]) -> dict[str, Any]:

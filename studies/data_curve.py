@@ -21,7 +21,7 @@ from typing import Any
 
 from polarnet.runtime.machine import usable_cores
 from polarnet.storage.frames import FrameStore
-from studies.measure import arguments_of, command_line, machine_record, write_section
+from studies.measure import arguments_of, command_line, machine_record, run_stage, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = ("variation.scenes_per_picture=1", "train.windows=6", "train.crop=[60,90]", "benchmark.lpips=false")
@@ -30,28 +30,22 @@ CONDITIONS = ("photographs_large", "measured")
 FIGURES = ("mse", "level_mse", "psnr", "corr", "mse_over_oracle_mean", "median_over_oracle_mean")
 
 
-def stage(name: str, arguments: argparse.Namespace, photographs: int, *overrides: str) -> None:
-    """Run one stage of the pipeline on `photographs` of the training photographs."""
+def trained(photographs: int, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Train a network on a set; returns its checkpoint, and the numbers of sequences and of visits to each."""
     data = arguments.work / str(photographs)
     common = (
         "experiment=shipped", f"ingest.root={arguments.training}", f"ingest.limit={photographs}",
         f"paths.data={data}", f"paths.resume={data / 'resume'}",
-        f"runtime.threads={max(1, usable_cores() // arguments.jobs)}", "runtime.workers=1",
+        f"runtime.threads={max(1, usable_cores() // arguments.jobs)}", "runtime.workers=1", *SHORT,
     )  # fmt: skip
-    subprocess.run([sys.executable, "-m", f"stages.{name}", *common, *SHORT, *overrides], cwd=ROOT, check=True)
-
-
-def trained(photographs: int, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Train a network on a set; returns its checkpoint, and the numbers of sequences and of visits to each."""
-    data = arguments.work / str(photographs)
     weights = data / "train" / "ours" / "best.safetensors"
     if not (data / "events.zarr").exists():
         for step in ("ingest", "synthesize", "emulate"):
-            stage(step, arguments, photographs)
+            run_stage(step, *common)
     sequences = len(FrameStore.open(data / "frames.zarr").of_split("train"))
     visits = max(1, round(arguments.visits / sequences))
     if not weights.exists():
-        stage("train", arguments, photographs, f"train.visits={visits}")
+        run_stage("train", *common, f"train.visits={visits}")
     return {"weights": weights, "sequences": sequences, "visits": visits}
 
 

@@ -1,8 +1,8 @@
-"""Size and wording of the code base: python -m studies.house [--published RANGE] [--trained RANGE] [--write]
+"""Size and wording of the code base: python -m studies.house [--uses WORD] [--write]
 
-Counts the files and lines of every folder, the lines of function bodies and the uses of retired words in this clone. A
-RANGE is a commit that added a baseline, or FROM..TO for a branch; git then says how many files it touched. --write puts
-the figures into docs/results/house.json.
+Counts the files and lines of every folder, the lines of function bodies and the uses of retired words in this clone.
+`studies.new_baselines` counts the files of a new baseline, `studies.measure tests` the minutes of the tests. --write
+puts the figures into docs/results/house.json.
 """
 
 import ast
@@ -86,13 +86,12 @@ def tracked_texts(root: Path) -> Iterator[tuple[str, str]]:
             yield path, (root / path).read_text(encoding="utf-8")
 
 
-def figures(root: Path, published: str | None, trained: str | None) -> dict[str, Any]:
-    """Everything that docs/results/house.json holds; earlier figures stay for a baseline that is not named."""
+def figures(root: Path) -> dict[str, Any]:
+    """Section `house` of docs/results/house.json."""
     texts = dict(tracked_texts(root))
     package = {path: text for path, text in texts.items() if path.startswith("polarnet/") and path.endswith(".py")}
     bodies = [length for text in package.values() for length in body_lines(text)]
-    known = read_results(root, "house").get("house", {})
-    baselines = {"files_per_published_baseline": published, "files_per_trained_baseline": trained}
+    baselines = read_results(root, "house").get("baselines", {})
     uses = total(retired_uses(text) for text in texts.values())
     return {
         "package_lines": sum(text.count("\n") for text in package.values()),
@@ -100,7 +99,7 @@ def figures(root: Path, published: str | None, trained: str | None) -> dict[str,
         "dvc_yaml_lines": texts["dvc.yaml"].count("\n"),
         "body_median": median(bodies),
         "body_p90": round(quantiles(bodies, n=10)[-1]),
-        **{key: touched_files(root, commits) if commits else known.get(key) for key, commits in baselines.items()},
+        **{f"files_per_{kind}_baseline": one["files"] for kind, one in baselines.items()},
         "retired_words": sum(uses.values()),
         "retired": {name: count for name, count in uses.items() if count},
         "test_minutes": read_results(root, "pipeline").get("test_minutes"),
@@ -119,8 +118,6 @@ def total(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
 def main() -> None:
     """Print the figures, and write them if asked."""
     parser = command_line(__doc__, "docs/results/house.json")
-    parser.add_argument("--published", metavar="RANGE", help="commits that added a baseline with published weights")
-    parser.add_argument("--trained", metavar="RANGE", help="commits that added a trained baseline")
     parser.add_argument(
         "--uses", metavar="WORD", choices=[*RETIRED, "all"], help="list the lines that use a retired word"
     )
@@ -132,7 +129,7 @@ def main() -> None:
                 if options.uses in words or (words and options.uses == "all"):
                     print(f"{path}:{number}: {line.strip()}")
         return
-    measured = figures(ROOT, options.published, options.trained)
+    measured = figures(ROOT)
     print(json.dumps(measured, indent=2))
     if options.write:
         print(f"wrote {write_section(ROOT, 'house', 'house', measured, machine_record(ROOT))}")

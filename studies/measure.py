@@ -12,6 +12,7 @@ import platform
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -64,6 +65,11 @@ def arguments_of(parser: argparse.ArgumentParser) -> argparse.Namespace:
     if arguments.write and (changed := uncommitted(ROOT)):
         parser.error(f"--write: commit first, because the figures name a commit; changed:\n{changed}")
     return arguments
+
+
+def run_stage(name: str, *overrides: str) -> None:
+    """Run stage `name` of the pipeline with these overrides; CalledProcessError if it fails."""
+    subprocess.run([sys.executable, "-m", f"stages.{name}", *overrides], cwd=ROOT, check=True)
 
 
 def read_results(root: Path, name: str) -> dict[str, Any]:

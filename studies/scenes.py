@@ -10,13 +10,11 @@ folder --work is reused. --write puts the scores into docs/results/scenes.json.
 
 import argparse
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from polarnet.pictures.manifest import read_manifest
-from studies.measure import ABLATION_KEYS, arguments_of, command_line, machine_record, write_section
+from studies.measure import ABLATION_KEYS, arguments_of, command_line, machine_record, run_stage, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
 HELD_OUT = 1 / 3  # share of the remaining photographs
@@ -45,7 +43,7 @@ def stage(name: str, arguments: argparse.Namespace, data: Path, *overrides: str)
         "experiment=photographs", "loss.lpips=0", f"paths.data={data}",
         f"runtime.threads={arguments.threads}",
     )  # fmt: skip
-    subprocess.run([sys.executable, "-m", f"stages.{name}", *common, *overrides], cwd=ROOT, check=True)
+    run_stage(name, *common, *overrides)
 
 
 def without_test_split(arguments: argparse.Namespace) -> Path:

@@ -3,8 +3,6 @@
 import csv
 import dataclasses
 import json
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -19,6 +17,7 @@ from polarnet.simulation.scene import polarization_from_rgb
 from polarnet.simulation.truth import synthesize
 from polarnet.stokes import dolp, stokes_from_intensities
 from polarnet.storage.scenes import SceneStore
+from studies.measure import run_stage
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -32,7 +31,7 @@ def ingested(root: Path, folder: Path, *overrides: str) -> Path:
     """Folder of the pictures of `root`, made by stage ingest if missing."""
     if not (folder / "images" / MANIFEST).exists():
         common = ("experiment=photographs", f"ingest.root={root}", f"paths.data={folder}", *overrides)
-        subprocess.run([sys.executable, "-m", "stages.ingest", *common], cwd=ROOT, check=True)
+        run_stage("ingest", *common)
     return folder / "images"
 
 

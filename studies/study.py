@@ -36,6 +36,7 @@ from studies.measure import (
     machine_record,
     measure_benchmark,
     read_results,
+    run_stage,
     write_section,
 )
 from studies.network_blocks import best_reconstruction, seeds_of
@@ -68,7 +69,7 @@ def common(arguments: argparse.Namespace) -> list[str]:
 
 def stage(name: str, arguments: argparse.Namespace, *overrides: str) -> None:
     """Run one stage of the pipeline on the data of this study."""
-    subprocess.run([sys.executable, "-m", f"stages.{name}", *common(arguments), *overrides], cwd=ROOT, check=True)
+    run_stage(name, *common(arguments), *overrides)
 
 
 def trained(row: str, arguments: argparse.Namespace) -> Path:

@@ -86,25 +86,30 @@ def sentence(conditions: Conditions) -> str:
     text = f"Sequences of {scene['sensor_height']}x{scene['sensor_width']} pixels (height x width)"
     if "duration_s" in scene:
         text += f", {scene['duration_s']:g} s at {scene['frame_rate_hz']:g} frames a second"
-    if not sensor:
-        return f"{text}."
+    return f"{text}; sensor: {_sensor(sensor)}." if sensor else f"{text}."
+
+
+def _sensor(sensor: Mapping[str, Any]) -> str:
+    """The pixel model and its parameters in words, or the names of those drawn for each sequence."""
     drawn = sensor["randomise"] or {}
-    text += "; sensor: " + ("" if "model" in drawn else f"model {sensor['model']}")
-    if sensor["model"] == "dvs_voltmeter" and not drawn:
-        return f"{text} with the constants of {sensor['voltmeter_camera']}."
+    model = f"model {sensor['model']}"
     if drawn:
-        comma = "" if "model" in drawn else ", "
-        return f"{text}{comma}{', '.join(drawn)} drawn for each sequence (emulate.randomise)."
-    on, off = sensor["contrast_threshold_on"], sensor["contrast_threshold_off"]
-    text += f", contrast thresholds {on:g} (ON) and {off:g} (OFF)"
-    if sensor["model"] not in MODEL_ALONE["esim_log_eps"]:
-        cutoff = f"{sensor['cutoff_hz']:g} Hz" if sensor["cutoff_hz"] else "none"
-        text += (
-            f", mismatch {sensor['contrast_threshold_sigma_on']:g} (ON) and "
-            f"{sensor['contrast_threshold_sigma_off']:g} (OFF), cutoff {cutoff}, leak {sensor['leak_rate_hz']:g} Hz, "
-            f"shot noise {sensor['shot_noise_rate_hz']:g} Hz"
+        return (
+            ", ".join(([] if "model" in drawn else [model]) + [*drawn]) + " drawn for each sequence (emulate.randomise)"
         )
-    return f"{text}, refractory period {sensor['refractory_period_us']:g} us."
+    if sensor["model"] == "dvs_voltmeter":
+        return f"{model} with the constants of {sensor['voltmeter_camera']}"
+    on, off = sensor["contrast_threshold_on"], sensor["contrast_threshold_off"]
+    parts = [model, f"contrast thresholds {on:g} (ON) and {off:g} (OFF)"]
+    if sensor["model"] not in MODEL_ALONE["esim_log_eps"]:
+        sigma_on, sigma_off = sensor["contrast_threshold_sigma_on"], sensor["contrast_threshold_sigma_off"]
+        parts += [
+            f"mismatch {sigma_on:g} (ON) and {sigma_off:g} (OFF)",
+            f"cutoff {sensor['cutoff_hz']:g} Hz" if sensor["cutoff_hz"] else "cutoff none",
+            f"leak {sensor['leak_rate_hz']:g} Hz",
+            f"shot noise {sensor['shot_noise_rate_hz']:g} Hz",
+        ]
+    return ", ".join([*parts, f"refractory period {sensor['refractory_period_us']:g} us"])
 
 
 def warnings(used: Conditions, checkpoints: Mapping[str, Mapping[str, Any]], advice: str) -> list[str]:

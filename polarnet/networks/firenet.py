@@ -8,7 +8,6 @@ from collections.abc import Mapping
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from polarnet.networks.published import PublishedNetwork
 
@@ -49,7 +48,7 @@ class FireNet(PublishedNetwork):
         """Return the unclamped intensity at the end of one window, and the next state; `state` is None at the start."""
         self.check_bins(voxels)
         before1, before2 = state or (None, None)
-        x = F.relu(self.head(voxels.contiguous(memory_format=torch.channels_last)))
+        x = self.head(voxels.contiguous(memory_format=torch.channels_last)).relu_()
         after1 = self.G1(x, before1)
         after2 = self.G2(self.R1(after1), before2)
         intensity = self.pred(self.R2(after2))
@@ -92,8 +91,8 @@ class ConvGRU(nn.Module):
         """Return the new state; a `state` of None (at the start) counts as zeros."""
         state = torch.zeros_like(x) if state is None else state.to(x.dtype)
         both = torch.cat([x, state], dim=1)
-        reset, update = torch.sigmoid(self.reset_gate(both)), torch.sigmoid(self.update_gate(both))
-        candidate = torch.tanh(self.out_gate(torch.cat([x, reset * state], dim=1)))
+        reset, update = self.reset_gate(both).sigmoid_(), self.update_gate(both).sigmoid_()
+        candidate = self.out_gate(torch.cat([x, reset * state], dim=1)).tanh_()
         return torch.lerp(state, candidate, update)
 
 
@@ -107,7 +106,7 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """Return a tensor of the same shape."""
-        return F.relu(x + self.conv2(F.relu(self.conv1(x))))
+        return self.conv2(self.conv1(x).relu_()).add_(x).relu_()
 
 
 def _own_name(name: str) -> str:

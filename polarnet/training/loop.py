@@ -165,9 +165,9 @@ def gradients_of(network: nn.Module, processes: int) -> list[Tensor]:
 
 def runs_of(task: Task, batch: Batch, length: int, device: torch.device) -> Iterator[Run]:
     """Yield runs of `length` windows of a batch, on the device."""
-    fields = {name: getattr(batch, name) for name in ("inputs", "dolp", "aolp", "intensity", "valid")}
-    there = {name: field.to(device) for name, field in fields.items() if field is not None}
-    inputs, truth, valid = task.streams(batch._replace(**there | {"inputs": there["inputs"].float()}))
+    read = batch if task.wants_intensity else batch._replace(intensity=batch.intensity[:0])
+    there = Batch(read.names, *(None if field is None else field.to(device) for field in read[1:]))  # type: ignore
+    inputs, truth, valid = task.streams(there._replace(inputs=there.inputs.float()))
     windows, frames = inputs.split(length), truth.split(length)
     masks = [None] * len(frames) if valid is None else valid.split(length)
     return zip(windows, frames, masks, strict=True)

@@ -1,5 +1,6 @@
 """Training batches: sequences, augmented and stacked. The seed alone determines them."""
 
+import functools
 import math
 from collections.abc import Iterator, Sequence
 from typing import Annotated, NamedTuple
@@ -121,19 +122,6 @@ class Visits(Dataset[WindowSequence]):
         return apply_view(sequence, random_view(count, height, width, self.config, generator))
 
 
-class _Packed(Dataset[WindowSequence]):
-    """A dataset's sequences, each `packed` by the process that reads it."""
-
-    def __init__(self, dataset: WindowDataset, intensity: bool):
-        self.dataset, self.intensity = dataset, intensity
-
-    def __len__(self) -> int:
-        return len(self.dataset)
-
-    def __getitem__(self, index: int) -> WindowSequence:
-        return packed(self.dataset[index], self.intensity)
-
-
 def loaded_if_it_fits(dataset: WindowDataset, intensity: bool, workers: int) -> list[WindowSequence] | None:
     """A dataset's encoded sequences, if they fit into `MEMORY_SHARE` of the free memory; None if they do not.
 
@@ -144,7 +132,8 @@ def loaded_if_it_fits(dataset: WindowDataset, intensity: bool, workers: int) -> 
     if bytes_each * len(dataset) * processes_here() > MEMORY_SHARE * psutil.virtual_memory().available:
         return None
     workers = workers if workers > 1 else 0
-    loader = DataLoader(_Packed(dataset, intensity), batch_size=None, num_workers=workers)
+    packing = functools.partial(packed, intensity=intensity)
+    loader = DataLoader(dataset, batch_size=None, collate_fn=packing, num_workers=workers)
     with memory_handed_back():
         return [_own(sequence) if workers else sequence for sequence in loader]
 
