@@ -15,6 +15,7 @@ import argparse
 import json
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,7 @@ def trained(photographs: int, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"weights": weights, "sequences": sequences, "visits": visits}
 
 
-def scored(networks: dict[str, Path], arguments: argparse.Namespace) -> dict[str, Any]:
+def scored(networks: Mapping[str, Path], arguments: argparse.Namespace, conditions: Sequence[str]) -> dict[str, Any]:
     """The tables of `studies.robustness` for these networks, by condition."""
     work = arguments.work / "scores"
     measured = map(str, arguments.measured)
@@ -57,22 +58,23 @@ def scored(networks: dict[str, Path], arguments: argparse.Namespace) -> dict[str
         sys.executable, "-m", "studies.robustness", "--photographs", str(arguments.photographs),
         "--photographs-large", str(arguments.photographs_large), "--measured", *measured, "--work", str(work),
         "--weights", *(f"{name}={file}" for name, file in networks.items()), "--limit", str(arguments.limit),
-        "--workers", str(usable_cores()), "--conditions", *CONDITIONS,
+        "--workers", str(usable_cores()), "--conditions", *conditions,
     ]  # fmt: skip
     subprocess.run(command, cwd=ROOT, check=True)
     return json.loads((work / "robustness_test.json").read_text())["tables"]
 
 
-def parsed() -> argparse.Namespace:
-    """The command line, with paths as every working directory understands them."""
-    parser = command_line(__doc__, "docs/results/data_curve.json")
+def with_folders(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    """Add the folders of photographs, measured scenes and intermediate files, and --limit."""
     for name in ("--training", "--photographs", "--photographs-large", "--work"):
         parser.add_argument(name, type=Path, required=True)
     parser.add_argument("--measured", type=Path, nargs="+", required=True)
-    parser.add_argument("--sizes", type=int, nargs="+", default=[574, 300, 100], help="photographs of each training")
-    parser.add_argument("--visits", type=int, default=1066, help="visits of each training, about")
     parser.add_argument("--limit", type=int, default=24, help="scored pictures of each set")
-    parser.add_argument("--jobs", type=int, default=2, help="trainings at a time")
+    return parser
+
+
+def resolved(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """The command line, with paths as every working directory understands them."""
     arguments = arguments_of(parser)
     for name in ("training", "photographs", "photographs_large", "work"):
         setattr(arguments, name, getattr(arguments, name).resolve())
@@ -82,12 +84,16 @@ def parsed() -> argparse.Namespace:
 
 def main() -> None:
     """Train and score, print and perhaps write."""
-    arguments = parsed()
+    parser = with_folders(command_line(__doc__, "docs/results/data_curve.json"))
+    parser.add_argument("--sizes", type=int, nargs="+", default=[574, 300, 100], help="photographs of each training")
+    parser.add_argument("--visits", type=int, default=1066, help="visits of each training, about")
+    parser.add_argument("--jobs", type=int, default=2, help="trainings at a time")
+    arguments = resolved(parser)
     record = machine_record(ROOT)
     with ThreadPoolExecutor(arguments.jobs) as pool:
         trainings = list(pool.map(lambda size: trained(size, arguments), arguments.sizes))
     networks = {f"photographs_{size}": one["weights"] for size, one in zip(arguments.sizes, trainings, strict=True)}
-    tables = scored(networks, arguments)
+    tables = scored(networks, arguments, CONDITIONS)
     rows = [
         {
             "photographs": size,

@@ -30,7 +30,7 @@ SETS = {"simulated": "new photographs", "measured": "measured scenes"}
 
 
 def seeds_of(results: Results) -> dict[str, Any]:
-    """The entries of docs/results/network.json or expected_errors.json by training seed."""
+    """The entries of a file of docs/results by training seed."""
     return {name.removeprefix("seed_"): entry for name, entry in results.items() if name.startswith("seed_")}
 
 
@@ -240,6 +240,16 @@ def _speed_rows(results: Results) -> Iterator[Row]:
         yield {"size": size.replace("x", " x "), "full": full, "blocks": blocks, "between": speed[name]}
 
 
+def _retrained_rows(results: Results) -> Iterator[Row]:
+    """The shipped weights, each other seed of their recipe, and the mean."""
+    seeds = seeds_of(results)
+    yield {"label": "shipped weights", **results["shipped"]}
+    for name, row in seeds.items():
+        yield {"label": f"seed {name}", **row}
+    if seeds:
+        yield {"label": f"mean of {results['networks']}", **results["mean"]}
+
+
 BETWEEN = f"ms_per_{RATE_HZ}hz_frame_"
 
 NETWORK_BLOCKS = {
@@ -288,6 +298,18 @@ NETWORK_BLOCKS = {
         "scenes", "choices", "studies.scenes", _choice_rows,
         {"training scenes": "{about}", "trainings": "{trainings}"} | score_columns(), f"{SEVERAL} {{origin}}",
         _overrides("choices"),
+    ),
+    "retrained": Block(
+        "seeds", "shipped", "studies.seeds", _retrained_rows,
+        {"": "{label}"} | {
+            f"{title}: {heading}": f"{{{name}[{key}]:.2f}}"
+            for name, title in (
+                ("photographs", "photographs"), ("photographs_large", "larger set"), ("measured", "measured scenes")
+            )
+            for heading, key in (("MSE ↓", "mse_over_oracle_mean"), ("median ↓", "median_over_oracle_mean"))
+        },
+        "MSE and median MSE relative to the oracle mean's, on {scenes[photographs]}, {scenes[photographs_large]} and "
+        "{scenes[measured]} scenes. {origin}",
     ),
     "data-curve": Block(
         "data_curve", "curve", "studies.data_curve", lambda results: results["curve"]["rows"],
