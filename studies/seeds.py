@@ -50,7 +50,7 @@ def means(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 def main() -> None:
     """Train and score, print and perhaps write."""
     parser = with_folders(command_line(__doc__, "docs/results/seeds.json"))
-    parser.add_argument("--seed", type=int, required=True, help="of all stages; the shipped weights have 1")
+    parser.add_argument("--seed", type=int, required=True, help="seed of all stages; the shipped weights have 1")
     arguments = resolved(parser)
     record, name = machine_record(ROOT), f"seed_{arguments.seed}"
     weights = trained(arguments.seed, arguments.training, arguments.work / name)

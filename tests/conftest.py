@@ -225,7 +225,7 @@ def write_trial() -> Callable[..., None]:
         }
         if validation or test:
             scores = validation or {"mse": 0.5, "psnr": 3.0}
-            row = {f"train_{name}": value for name, value in loss.items()}
+            row = {f"train_{'ssim_loss' if name == 'ssim' else name}": value for name, value in loss.items()}
             row |= {f"val_{name}": value for name, value in scores.items()}
             files["train/ours/history.csv"] = f"epoch,{','.join(row)}\n0,{','.join(map(str, row.values()))}\n"
         if test:

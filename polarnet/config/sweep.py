@@ -86,13 +86,19 @@ def best_point(rows: Sequence[Mapping[str, Any]]) -> str:
     if not best["validation"]:
         return "No point finished."
     mse, count = best["validation"]["mse"], len(best["seeds"])
-    shared = set(best["overrides"]).intersection(*(row["overrides"] for row in rows[1:])) if rows[1:] else set()
+    shared = shared_overrides(rows)
     own = " ".join(one for one in best["overrides"] if one not in shared)
     words = f"Best: {own or 'the settings of params.yaml'}, validation MSE {mse['mean']:.4f}"
     if mse["std"] is None:
         return f"{words}, of one seed; sweep over seed=1,2,3 for an interval."
     half = float(t.ppf(0.975, count - 1)) * mse["std"] / count**0.5
     return f"{words}, 95 % interval over {count} seeds {mse['mean'] - half:.4f} to {mse['mean'] + half:.4f}."
+
+
+def shared_overrides(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Overrides that all of several `sweep_rows` have; none of a single row."""
+    first, *others = (row["overrides"] for row in rows)
+    return [one for one in first if others and all(one in overrides for overrides in others)]
 
 
 def sweep_points(folder: Path) -> list[dict[str, Any]]:
@@ -153,7 +159,8 @@ def swept_axes(rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, list[str]],
 
 
 def sweep_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format `sweep_rows` as a Markdown table."""
+    """Format `sweep_rows` as a Markdown table, with the overrides that all rows share in a line below it."""
+    shared = shared_overrides(rows)
     headings = [heading for names in COLUMNS.values() for heading in names.values()]
     lines = [f"| jobs | overrides | seeds | {' | '.join(headings)} | notes |", "|" + "---|" * (4 + len(headings))]
     for row in rows:
@@ -161,10 +168,9 @@ def sweep_table(rows: Sequence[Mapping[str, Any]]) -> str:
         seeds = f"{finished} of {finished + failed}" if failed else f"{finished}"
         cells = [_cell(row[split].get(name)) for split, names in COLUMNS.items() for name in names]
         notes = "; ".join(row["notes"]).replace("|", "/")
-        lines.append(
-            f"| {' '.join(row['jobs'])} | {' '.join(row['overrides'])} | {seeds} | {' | '.join(cells)} | {notes} |"
-        )
-    return "\n".join(lines)
+        own = " ".join(one for one in row["overrides"] if one not in shared)
+        lines.append(f"| {' '.join(row['jobs'])} | {own} | {seeds} | {' | '.join(cells)} | {notes} |")
+    return "\n".join([*lines, *(["", f"Shared overrides: {' '.join(shared)}"] if shared else [])])
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -211,8 +217,9 @@ def _point(job: Path) -> dict[str, Any]:
 
 
 def _dropped_terms(weights: Any, terms: Mapping[str, float]) -> list[str]:
-    """Note on loss terms that have a nonzero weight but were missing from the training."""
-    names = [name for name, weight in weights.items() if weight and name not in terms]
+    """Note on loss terms that have a nonzero weight but were missing from the training; 1 - SSIM is `ssim_loss`."""
+    computed = {term.removesuffix("_loss") for term in terms}
+    names = [name for name, weight in weights.items() if weight and name not in computed]
     return [f"not in this training's loss: {', '.join(names)}"] if names else []
 
 

@@ -58,6 +58,14 @@ def test_the_table_says_which_scores_are_of_the_test_split_and_has_failures_and_
     )
 
 
+def test_overrides_that_all_points_share_stand_once_below_the_table(tmp_path, write_trial):
+    for number, weight in enumerate(("0.0", "1.0")):
+        write_trial(tmp_path / str(number), ["network=paper", f"loss.ssim={weight}"], test=scored(0.04))
+    lines = sweep_table(sweep_rows(sweep_points(tmp_path))).splitlines()
+    assert [line.split(" | ")[1] for line in lines[2:4]] == ["loss.ssim=0.0", "loss.ssim=1.0"]
+    assert lines[4:] == ["", "Shared overrides: network=paper"]
+
+
 def test_a_failed_seed_counts_in_no_mean_and_is_named(tmp_path, write_trial):
     write_trial(tmp_path / "0", ["seed=1"], validation={"mse": 0.03, "psnr": 14.0}, test=scored(0.04))
     write_trial(tmp_path / "1", ["seed=2"], seed=2, validation={"mse": 9.0, "psnr": 14.0}, failure="benchmark: killed")
