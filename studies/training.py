@@ -16,7 +16,8 @@ Each measurement has its own process; they take turns, and figures are medians o
 the rate of a matrix product with the same threads and precision. The profile is that of the last turn.
 
 `--write` merges the figures into docs/results/network.json: the section `throughput` and the headline figures
-`train_speedup_over_eager_fp32` and `infer_windows_per_s` of `paper`, and `ours.infer_windows_per_s` of `polarnet`.
+`train_speedup_over_eager_fp32` and `infer_windows_per_s` of `paper`, and `ours.infer_windows_per_s` of `polarnet`; on
+a GPU the section alone, as `throughput_cuda`.
 """
 
 import argparse
@@ -172,8 +173,9 @@ def in_own_process(name: str, setting: str, threads: int, device: str) -> dict[s
 
 def measure(names: list[str], settings: list[str], rounds: int, threads: int, device: str) -> dict[str, Any]:
     """The section `throughput`, printed as it comes."""
+    of_gpu = torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else device
     figures: dict[str, Any] = {
-        "threads": threads, "device": device, "rounds": rounds, "height": HEIGHT, "width": WIDTH, "batch": BATCH,
+        "threads": threads, "device": of_gpu, "rounds": rounds, "height": HEIGHT, "width": WIDTH, "batch": BATCH,
         "run_windows": RUN, "networks": {},
     }  # fmt: skip
     for name in names:
@@ -230,7 +232,9 @@ def main() -> None:
     settings = list(SETTINGS if arguments.compile else SETTINGS[:2])
     figures = measure(arguments.networks, settings, arguments.rounds, arguments.threads, arguments.device)
     if arguments.write:
-        path = write_section(ROOT, "network", "throughput", figures, record, headlines(figures["networks"]))
+        kind = torch.device(arguments.device).type
+        section, above = ("throughput", headlines(figures["networks"])) if kind == "cpu" else (f"throughput_{kind}", {})
+        path = write_section(ROOT, "network", section, figures, record, above)
         print(f"written to {path.relative_to(ROOT)}")
 
 

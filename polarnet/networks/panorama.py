@@ -136,8 +136,8 @@ def follow(changes: Float[Tensor, "b c h w"], motion: Motion, panorama: Panorama
     level = level * F.pad(level.new_ones(height, width), beyond, value=memory.fade)
     own = panorama.own + changes
 
-    frame = motion.displacement.new_tensor([width, height])
-    entered = (motion.displacement.abs() / frame).sum(-1).clamp(max=1)[:, None, None, None]
+    across, down = motion.displacement.abs().unbind(-1)
+    entered = (across / width + down / height).clamp(max=1)[:, None, None, None]
     remaining = 1 - memory.renewal * entered
     of_level, of_own, real, imaginary = (expected - panorama.explained).split(1, dim=1)
     of_level = expected[0] + remaining.square() * (of_level - expected[0])

@@ -148,6 +148,8 @@ class StokesUNet(nn.Module):
     predicts_stokes = True
     optimizer = "muon"
     outputs = ("choose", "gains", "trust", "add", "scale.out")
+    memories: Float[Tensor, " m"]
+    decays: Float[Tensor, " d"]
 
     def __init__(self, config: StokesUNetConfig, in_channels: int = 4 * IMAGES):
         super().__init__()
@@ -156,7 +158,9 @@ class StokesUNet(nn.Module):
                 f"network=polarnet takes {4 * IMAGES} images (representation event_counts), got {in_channels}"
             )
         self.binning = config.binning
-        self.memories, self.decays, self.scales = config.memories, config.decays, config.scales
+        self.scales = config.scales
+        self.register_buffer("memories", torch.tensor(config.memories), persistent=False)
+        self.register_buffer("decays", torch.tensor(config.decays), persistent=False)
         self.without = frozenset(config.without)
         self.reach, self.margin = config.reach, config.panorama_margin
         self.memory = Memory(*(getattr(config, f"panorama_{name}") for name in Memory._fields))
@@ -224,7 +228,7 @@ class StokesUNet(nn.Module):
         before_wide, others = others[: len(WIDE)], others[len(WIDE) :]
         before_panorama, recurrent = others[:PANORAMA_TENSORS], others[PANORAMA_TENSORS:]
 
-        keep = inputs.new_tensor(self.memories).view(-1, 1, 1, 1)
+        keep = self.memories.view(-1, 1, 1, 1)
         sensor = (math.ceil(height / self.binning), math.ceil(width / self.binning))
         panorama, certain, next_panorama = self._panorama(polarity, sensor, before_panorama)
         clues = scale_features(panorama, equalised.total.flatten(), equalised.mismatch.flatten())
@@ -282,8 +286,7 @@ class StokesUNet(nn.Module):
         with torch.autocast(events.device.type, enabled=False):
             windows = self._unless("redundancy", events).split(streams)  # a single window fits into a core's cache
             moments = torch.stack([self.moments(window, pooled=4).flatten(1, 2) for window in windows]).unsqueeze(2)
-            keep = moments.new_tensor(self.decays).view(-1, 1, 1, 1)
-            sums = faded(moments, keep, state)
+            sums = faded(moments, self.decays.view(-1, 1, 1, 1), state)
             shape = (len(self.decays), len(self.memories), MOMENTS)
             near = neighbourhoods(sums.flatten(0, 1).flatten(1, 2), self.scales)
             stacked = torch.stack([mean.unflatten(1, shape).transpose(1, 2) for mean in near], dim=3)

@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from statistics import fmean
 from typing import Annotated
 
@@ -22,6 +23,7 @@ from polarnet.training.losses import known_frames
 from polarnet.training.optimizers import OPTIMIZERS
 from polarnet.training.parallel import add_up, place, wait_for_all
 from polarnet.training.recorder import Recorder
+from polarnet.training.replay import Replayed
 from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, loaded_if_it_fits, parts_of, shuffled
 from polarnet.training.task import Split, State, Task
 
@@ -88,6 +90,10 @@ def train(
     optimizer = OPTIMIZERS[task.optimizer](network, config.learning_rate)
     progress = recorder.resume(network, optimizer)
     wait_for_all()  # every process has read the running checkpoint before the first process writes it again
+    stepped = task
+    if device.type == "cuda" and config.accumulate == 1:
+        uncached = autocast(config.precision, device, cache_enabled=False)
+        stepped = replace(task, unroll=Replayed(task, uncached))
     helpers = workers if device.type == "cuda" else 0  # on a processor, the training itself needs the cores
     loaded = loaded_if_it_fits(split.train, task.wants_intensity, helpers)
     sequences, workers = (split.train, workers) if loaded is None else (loaded, helpers)
@@ -97,7 +103,7 @@ def train(
         batches = batches_of(visits, order[progress.visits :], config.batch_size, workers)
         for batch in recorder.show(batches, progress, len(order), config.epochs):
             set_learning_rate(optimizer, config, (epoch + progress.visits / len(order)) / config.epochs)
-            losses = train_batch(task, optimizer, batch, config, device)
+            losses = train_batch(stepped, optimizer, batch, config, device)
             progress.add(losses, len(batch.names))
             recorder.keep(progress, network, optimizer)
         recorder.end_epoch(progress, network, validate(task, split.val, config, device, workers))
@@ -215,9 +221,10 @@ def set_learning_rate(optimizer: torch.optim.Optimizer, config: LoopConfig, done
         group["lr"] = config.learning_rate * rise * fall
 
 
-def autocast(precision: str, device: torch.device) -> torch.autocast:
+def autocast(precision: str, device: torch.device, cache_enabled: bool = True) -> torch.autocast:
     """Run convolutions and matrix products in bfloat16 if `precision` resolves to bf16 on this device."""
-    return torch.autocast(device.type, torch.bfloat16, enabled=precision_on(device, precision) == "bf16")
+    enabled = precision_on(device, precision) == "bf16"
+    return torch.autocast(device.type, torch.bfloat16, enabled, cache_enabled)
 
 
 @torch.no_grad()
