@@ -11,6 +11,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from polarnet.networks.redundancy import enlarged
+
 
 def contrasts(events: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b c h w"]:
     """Return (e0 + e45 + e90 + e135) / 2, e0 - e90, e45 - e135 and (e0 + e90) - (e45 + e135) of the four channels.
@@ -98,8 +100,8 @@ class UpBlock(nn.Module):
     def forward(self, x: Float[Tensor, "n c h2 w2"], skip: Float[Tensor, "n d h w"]) -> Float[Tensor, "n d h w"]:
         """Return the upsampled image. `skip` has its shape: twice the height and width of x, or one pixel less."""
         height, width = skip.shape[-2:]
-        enlarged = F.interpolate(self.narrow(x), scale_factor=2, mode="bilinear")
-        return F.relu(self.smooth(enlarged[..., :height, :width] + skip))
+        twice = enlarged(self.narrow(x), 2)
+        return F.relu(self.smooth(twice[..., :height, :width] + skip))
 
 
 class Level(nn.Module):

@@ -10,9 +10,8 @@ after training (`polarnet.training.calibration`).
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from polarnet.networks.redundancy import block_means
+from polarnet.networks.redundancy import block_means, enlarged
 
 FEATURES = 5
 MIN_DISAGREEMENT = 1e-3  # squared DoLP, added because candidates that agree may share an error
@@ -66,5 +65,5 @@ def error_features(
     of_frame = [disagreement.mean((-1, -2), keepdim=True), silence[:, None, None, None]]
     bounded = block_means(dolp, 2).clamp(0, 1)
     room = torch.log(bounded * (1 - bounded) + MIN_ROOM)
-    fine = F.interpolate(of_pixels, scale_factor=2, mode="bilinear")
+    fine = enlarged(of_pixels, 2)
     return torch.cat([fine, *(one.expand_as(room) for one in of_frame), room], dim=1)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.redundancy import block_means, box_means
+from polarnet.networks.redundancy import block_means, box_means, enlarged
 
 BLOCK = 4  # side in pixels of the blocks whose means form a neighbourhood
 BLOCKS = 3  # width of a neighbourhood in blocks
@@ -88,4 +88,4 @@ class Equaliser(nn.Module):
 
 def _near(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
     """Return means over the neighbourhood of each pixel."""
-    return F.interpolate(box_means(block_means(x, BLOCK), BLOCKS), scale_factor=BLOCK, mode="bilinear")
+    return enlarged(box_means(block_means(x, BLOCK), BLOCKS), BLOCK)

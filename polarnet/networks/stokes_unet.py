@@ -29,6 +29,7 @@ from polarnet.networks.redundancy import (
     SlopeMoments,
     block_means,
     box_means,
+    enlarged,
     faded,
     length,
     neighbourhoods,
@@ -247,11 +248,11 @@ class StokesUNet(nn.Module):
         y2 = self.at_half(self.up_half(y4, skip=x2))
 
         weights = self.choose(y4).float().softmax(1)
-        coarse = F.interpolate(self._mixed(candidates, weights), scale_factor=4, mode="bilinear")
+        coarse = enlarged(self._mixed(candidates, weights), 4)
         gains = self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float())
         moved = _moved(coarse[:, :2], [_differences(sums), *wide], gains)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
-        share = certain * F.interpolate(torch.sigmoid(self.trust(y2).float()), scale_factor=2, mode="bilinear")
+        share = certain * enlarged(torch.sigmoid(self.trust(y2).float()), 2)
         fine = torch.cat(averaged(moved, dolp, images[:, 1:3], share, self.around), dim=1)
         features = torch.cat([y2, F.pixel_unshuffle(fine, 2).to(y2.dtype)], dim=1)
         added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(features)))), 2).float()
@@ -259,8 +260,8 @@ class StokesUNet(nn.Module):
         recovered = fine + added[:, :3]
         features = error_features(candidates.dolp, weights[:, :-1], candidates.evidence, recovered[:, 2:])
         log_variance = LOG_VARIANCE + added[:, 3:] + F.interpolate(self.expected(features), scale_factor=2)
-        enlarged = self._enlarged(torch.cat([recovered, log_variance], dim=1))
-        stokes, dolp, log_variance = enlarged[:, :2], enlarged[:, 2], enlarged[:, 3]
+        of_pixels = self._enlarged(torch.cat([recovered, log_variance], dim=1))
+        stokes, dolp, log_variance = of_pixels[:, :2], of_pixels[:, 2], of_pixels[:, 3]
         aolp = torch.remainder(torch.atan2(stokes[:, 1], stokes[:, 0]) / 2, math.pi)
         maps = [dolp, aolp, log_variance, stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
@@ -349,7 +350,7 @@ class StokesUNet(nn.Module):
 
     def _enlarged(self, maps: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h2 w2"]:
         """Interpolate maps of blocks to the sensor's pixels."""
-        return maps if self.binning == 1 else F.interpolate(maps, scale_factor=self.binning, mode="bilinear")
+        return maps if self.binning == 1 else enlarged(maps, self.binning)
 
     def _mixed(self, candidates: Candidates, weights: Float[Tensor, "n c1 h w"]) -> Float[Tensor, "n 3 h w"]:
         """Mix the candidates to s1, s2 and DoLP. The last weight belongs to the constant, which adds to DoLP only."""
@@ -404,8 +405,8 @@ def averaged(
     short = length(*stokes.unbind(1))[:, None]
     own = torch.atanh(stokes / short * torch.maximum(short, dolp).clamp(max=MAX_DOLP))
     constants = box_means(block_means(own, 4) - block_means(panorama, 2), around)
-    panorama = panorama + F.interpolate(constants, scale_factor=2, mode="bilinear")
-    aligned = torch.tanh(F.interpolate(panorama, scale_factor=2, mode="bilinear"))
+    panorama = panorama + enlarged(constants, 2)
+    aligned = torch.tanh(enlarged(panorama, 2))
     return torch.lerp(stokes, aligned, share), torch.lerp(dolp, length(*aligned.unbind(1))[:, None], share)
 
 

@@ -97,13 +97,19 @@ class PolarizationLoss(FrameLoss):
         The maps of `predicted` and `truth` are DoLP, s1 and s2; `predicted` adds the log-variance.
         """
         terms = super().__call__(predicted[:, :, 0], truth[:, :, 0], valid)
-        everywhere = truth[:, :, 0].new_ones(truth[:, :, 0].shape, dtype=torch.bool) if valid is None else valid
         if "stokes" in self._more:
             errors = (predicted[:, :, 1:3] - truth[:, :, 1:]).square().sum(2)
-            terms["stokes"] = errors[everywhere].mean() if everywhere.any() else 0 * errors.sum()
+            terms["stokes"] = _mean_of_known(errors, valid)
         if "uncertainty" in self._more:
             log_variance = predicted[:, :, 3].clamp(*LOG_VARIANCES)
             squared = (predicted[:, :, 0].detach().clamp(0, 1) - truth[:, :, 0]).square()
             nll = (squared * torch.exp(-log_variance) + log_variance) / 2
-            terms["uncertainty"] = nll[everywhere].mean() if everywhere.any() else 0 * nll.sum()
+            terms["uncertainty"] = _mean_of_known(nll, valid)
         return terms
+
+
+def _mean_of_known(of_pixels: Frames, valid: Valid) -> Float[Tensor, ""]:
+    """Mean over the valid pixels; 0 if there is none."""
+    if valid is None:
+        return of_pixels.flatten().mean()
+    return of_pixels[valid].mean() if valid.any() else 0 * of_pixels.sum()
