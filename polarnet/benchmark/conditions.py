@@ -94,9 +94,8 @@ def _sensor(sensor: Mapping[str, Any]) -> str:
     drawn = sensor["randomise"] or {}
     model = f"model {sensor['model']}"
     if drawn:
-        return (
-            ", ".join(([] if "model" in drawn else [model]) + [*drawn]) + " drawn for each sequence (emulate.randomise)"
-        )
+        names = [*drawn] if "model" in drawn else [model, *drawn]
+        return f"{', '.join(names)} drawn for each sequence (emulate.randomise)"
     if sensor["model"] == "dvs_voltmeter":
         return f"{model} with the constants of {sensor['voltmeter_camera']}"
     on, off = sensor["contrast_threshold_on"], sensor["contrast_threshold_off"]

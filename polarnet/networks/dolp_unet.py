@@ -53,6 +53,7 @@ class DolpUNet(nn.Module):
 
     representation = "event_tensor"
     predicts_stokes = False
+    replays = False
     optimizer = "adam"
     outputs = ("p1",)
 

@@ -91,7 +91,7 @@ def train(
     progress = recorder.resume(network, optimizer)
     wait_for_all()  # every process has read the running checkpoint before the first process writes it again
     stepped = task
-    if device.type == "cuda" and config.accumulate == 1:
+    if device.type == "cuda" and task.replays and config.accumulate == 1:
         uncached = autocast(config.precision, device, cache_enabled=False)
         stepped = replace(task, unroll=Replayed(task, uncached))
     helpers = workers if device.type == "cuda" else 0  # on a processor, the training itself needs the cores
