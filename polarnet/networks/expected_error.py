@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from polarnet.networks.redundancy import block_means, enlarged
+from polarnet.networks.blocks import enlarged
+from polarnet.networks.redundancy import block_means
 
 FEATURES = 5
 MIN_DISAGREEMENT = 1e-3  # squared DoLP, added because candidates that agree may share an error

@@ -176,22 +176,6 @@ def pooled_means(x: Float[Tensor, "n c h w"], width: int) -> Float[Tensor, "n c 
     return F.avg_pool2d(means, (width, 1), stride=1, padding=(width // 2, 0), count_include_pad=False)
 
 
-def enlarged(x: Float[Tensor, "n c h w"], factor: int) -> Float[Tensor, "n c h2 w2"]:
-    """Interpolate bilinearly to `factor` times the height and width."""
-    return enlarged_by_products(x, factor) if x.is_cuda else F.interpolate(x, scale_factor=factor, mode="bilinear")
-
-
-def enlarged_by_products(x: Float[Tensor, "n c h w"], factor: int) -> Float[Tensor, "n c h2 w2"]:
-    """Return the same as `enlarged`, as products with two matrices.
-
-    On a GPU, the deterministic gradient of F.interpolate sorts its summands; that of a product has none to sort.
-    """
-    with torch.autocast(x.device.type, enabled=False):
-        units = (torch.eye(size, dtype=x.dtype, device=x.device)[None] for size in x.shape[-2:])
-        down, across = (F.interpolate(unit, scale_factor=factor, mode="linear")[0] for unit in units)
-        return ((x @ across).mT @ down).mT
-
-
 def inside(pixels: int, width: int, like: Tensor) -> Float[Tensor, " pixels"]:
     """For each pixel of a row, count how many of the `width` pixels around it lie inside the row."""
     middle = torch.arange(pixels, device=like.device)

@@ -18,6 +18,7 @@ from polarnet.networks.blocks import (
     compressed,
     contrasts,
     conv3x3,
+    enlarged,
     on_blocks,
 )
 from polarnet.networks.expected_error import ExpectedError, error_features
@@ -29,7 +30,6 @@ from polarnet.networks.redundancy import (
     SlopeMoments,
     block_means,
     box_means,
-    enlarged,
     faded,
     length,
     neighbourhoods,

@@ -11,8 +11,6 @@ from polarnet.networks.redundancy import (
     SecondMoments,
     SlopeMoments,
     box_means,
-    enlarged,
-    enlarged_by_products,
     faded,
     neighbourhoods,
     pooled_means,
@@ -148,12 +146,3 @@ def test_neighbourhoods_are_means_of_what_lies_inside_the_image():
 def test_means_by_pooling_equal_means_by_convolution_up_to_the_image_border(width: int):
     images = torch.randn(2, 5, 15, 23, generator=torch.Generator().manual_seed(1))
     assert torch.allclose(pooled_means(images, width), box_means(images, width), atol=1e-6)
-
-
-@pytest.mark.parametrize("factor", [2, 4])
-def test_enlargement_by_products_equals_bilinear_interpolation_and_so_does_its_gradient(factor: int):
-    images = torch.randn(2, 5, 15, 23, generator=torch.Generator().manual_seed(1), requires_grad=True)
-    large, expected = enlarged_by_products(images, factor), enlarged(images, factor)
-    assert torch.allclose(large, expected, atol=1e-6)
-    gradient, expected_gradient = (torch.autograd.grad(one.square().sum(), images)[0] for one in (large, expected))
-    assert torch.allclose(gradient, expected_gradient, atol=1e-4)
