@@ -173,9 +173,9 @@ def in_own_process(name: str, setting: str, threads: int, device: str) -> dict[s
 
 def measure(names: list[str], settings: list[str], rounds: int, threads: int, device: str) -> dict[str, Any]:
     """The section `throughput`, printed as it comes."""
-    of_gpu = torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else device
+    processor = torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else device
     figures: dict[str, Any] = {
-        "threads": threads, "device": of_gpu, "rounds": rounds, "height": HEIGHT, "width": WIDTH, "batch": BATCH,
+        "threads": threads, "device": processor, "rounds": rounds, "height": HEIGHT, "width": WIDTH, "batch": BATCH,
         "run_windows": RUN, "networks": {},
     }  # fmt: skip
     for name in names:

@@ -13,16 +13,10 @@ from polarnet.training.loop import autocast, train_batch
 from polarnet.training.optimizers import OPTIMIZERS
 from polarnet.training.replay import Replayed
 from polarnet.training.sequences import Batch
-from polarnet.training.task import Task
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = load(ROOT)
 STEPS = 3  # batches; each has a run without a state and one that continues it
-
-
-def polarnet_task() -> Task:
-    loss = dataclasses.replace(CONFIG.loss, lpips=0.0)
-    return dolp_task("polarnet", CONFIG.networks.polarnet, CONFIG.train, loss, None, 1)
 
 
 def batches() -> list[Batch]:
@@ -41,7 +35,8 @@ def batches() -> list[Batch]:
 
 def losses(device: torch.device, replayed: bool) -> list[float]:
     """The loss of each step of a training of a few batches."""
-    task = polarnet_task()
+    loss = dataclasses.replace(CONFIG.loss, lpips=0.0)
+    task = dolp_task("polarnet", CONFIG.networks.polarnet, CONFIG.train, loss, None, 1)
     section = dataclasses.replace(CONFIG.train, bptt_windows=2, precision="fp32")
     task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = OPTIMIZERS[task.optimizer](task.network, 1e-3)
