@@ -4,8 +4,8 @@ python -m studies.data_curve --training FOLDER --photographs FOLDER --photograph
     --work FOLDER [--sizes N ...] [--visits N] [--jobs N] [--write]
 
 --training has the training photographs, as `studies.robustness --training` links them. Each size takes that many of
-them, every set within the next larger one (`ingest.limit`), and trains with `experiment=shipped` and the overrides
-SHORT. Small sets are visited more often, so that all networks train for about as long. `studies.robustness` scores the
+them, every set within the next larger one (`ingest.limit`), and trains with `experiment=shipped`, but fewer visits.
+Small sets are visited more often, so that all networks train for about as long. `studies.robustness` scores the
 networks on the test split of both sets of photographs and on the measured scenes. The sizes are trained in the order
 given. Finished trainings in --work are reused, interrupted ones resumed. --write puts the curve into
 docs/results/data_curve.json.
@@ -25,8 +25,8 @@ from polarnet.storage.frames import FrameStore
 from studies.measure import arguments_of, command_line, machine_record, run_stage, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
-SHORT = ("variation.scenes_per_picture=1", "train.windows=6", "train.crop=[60,90]", "benchmark.lpips=false")
-"""Overrides of all trainings: fewer scenes, and visits of six windows of crops."""
+OVERRIDES = ("benchmark.lpips=false",)
+"""Overrides of all trainings."""
 CONDITIONS = ("photographs_large", "measured")
 FIGURES = ("mse", "level_mse", "psnr", "corr", "mse_over_oracle_mean", "median_over_oracle_mean")
 
@@ -37,7 +37,7 @@ def trained(photographs: int, arguments: argparse.Namespace) -> dict[str, Any]:
     common = (
         "experiment=shipped", f"ingest.root={arguments.training}", f"ingest.limit={photographs}",
         f"paths.data={data}", f"paths.resume={data / 'resume'}",
-        f"runtime.threads={max(1, usable_cores() // arguments.jobs)}", "runtime.workers=1", *SHORT,
+        f"runtime.threads={max(1, usable_cores() // arguments.jobs)}", "runtime.workers=1", *OVERRIDES,
     )  # fmt: skip
     weights = data / "train" / "ours" / "best.safetensors"
     if not (data / "events.zarr").exists():
@@ -106,7 +106,7 @@ def main() -> None:
     scenes = {name: tables[name]["scenes"] for name in CONDITIONS}
     print(json.dumps(rows, indent=1))
     if arguments.write:
-        curve = {"overrides": SHORT, "scenes": scenes, "rows": sorted(rows, key=lambda row: row["photographs"])}
+        curve = {"overrides": OVERRIDES, "scenes": scenes, "rows": sorted(rows, key=lambda row: row["photographs"])}
         print(write_section(ROOT, "data_curve", "curve", curve, record))
 
 

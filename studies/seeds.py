@@ -3,10 +3,11 @@
 python -m studies.seeds --seed N --training FOLDER --photographs FOLDER --photographs-large FOLDER --measured FOLDER ...
     --work FOLDER [--write]
 
-The stages run with `experiment=shipped` on the training photographs (`studies.robustness --training`), all with seed
-N: it decides motion, scenes, sensors and the network. `studies.robustness` scores the network and the shipped one on
-the test split of both sets of photographs and on the measured scenes. An interrupted run resumes. --write puts both
-rows into docs/results/seeds.json, whose means are over the shipped weights and all seeds there.
+The stages run on the training photographs (`studies.robustness --training`) with `experiment=shipped`, and a second
+training with `experiment=shipped_whole`, all with seed N: it decides motion, scenes, sensors and the network.
+`studies.robustness` scores the network and the shipped one on the test split of both sets of photographs and on the
+measured scenes. An interrupted run resumes. --write puts both rows into docs/results/seeds.json, whose means are over
+the shipped weights and all seeds there.
 """
 
 from pathlib import Path
@@ -20,21 +21,25 @@ from studies.measure import ROOT, command_line, machine_record, read_results, ru
 CONDITIONS = ("photographs", "photographs_large", "measured")
 FIGURES = ("mse", "psnr", "corr", "mse_over_oracle_mean", "median_over_oracle_mean")
 SHIPPED = "shipped"
+FIRST = ("experiment=shipped",)
 
 
 def trained(seed: int, training: Path, data: Path) -> Path:
-    """Checkpoint of a training with this seed; finished stages are not run again."""
+    """Checkpoint after both trainings with this seed; finished stages are not run again."""
     common = (
-        "experiment=shipped", f"seed={seed}", f"ingest.root={training}", f"paths.data={data}",
-        f"paths.resume={data / 'resume'}", "benchmark.lpips=false",
+        f"seed={seed}", f"ingest.root={training}", f"paths.data={data}", f"paths.resume={data / 'resume'}",
+        "benchmark.lpips=false",
     )  # fmt: skip
-    for name, output in (("ingest", "images"), ("synthesize", "scenes.zarr"), ("emulate", "events.zarr")):
-        if not (data / output).exists():
-            run_stage(name, *common)
-    weights = data / "train" / "ours" / "best.safetensors"
-    if not weights.exists():
-        run_stage("train", *common)
-    return weights
+    crops, whole = (data / name / "ours" / "best.safetensors" for name in ("train", "whole"))
+    second = ("experiment=shipped_whole", f"train.start={crops}", f"paths.train={data / 'whole'}")
+    stages: tuple[tuple[str, Path, tuple[str, ...]], ...] = (
+        ("ingest", data / "images", FIRST), ("synthesize", data / "scenes.zarr", FIRST),
+        ("emulate", data / "events.zarr", FIRST), ("train", crops, FIRST), ("train", whole, second),
+    )  # fmt: skip
+    for stage, output, settings in stages:
+        if not output.exists():
+            run_stage(stage, *settings, *common)
+    return whole
 
 
 def row_of(tables: dict[str, Any], network: str) -> dict[str, Any]:

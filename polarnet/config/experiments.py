@@ -43,8 +43,12 @@ def preset_names(root: Path, group: str) -> list[str]:
 
 
 def preset_values(root: Path, group: str, name: str) -> dict[str, Any]:
-    """Values of one preset by dotted key."""
-    return _flat(YAML(typ="safe").load(root / "conf" / group / f"{name}.yaml") or {})
+    """Values of one preset by dotted key, with those of the presets under its `defaults` (Hydra's defaults list)."""
+    content = YAML(typ="safe").load(root / "conf" / group / f"{name}.yaml") or {}
+    values: dict[str, Any] = {}
+    for other in content.pop("defaults", ()):
+        values |= {} if other == "_self_" else preset_values(root, group, other)
+    return values | _flat(content)
 
 
 def group_of(root: Path, name: str) -> str:

@@ -19,6 +19,8 @@ TERMS = {
     "ssim_loss": "1 - SSIM",
     "lpips": "LPIPS",
     "stokes": "S1/S0, S2/S0",
+    "relative_mse": "MSE (relative)",
+    "relative_stokes": "S1/S0, S2/S0 (relative)",
     "uncertainty": "likelihood of the error",
 }
 """Legend labels of loss terms."""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 
 import torch
 from jaxtyping import Bool, Float
-from pydantic import NonNegativeFloat
+from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from polarnet.metrics.similarity import Lpips, mean_where, mse, ssim, with_truth_outside
@@ -32,6 +32,9 @@ class LossConfig:
     uncertainty: NonNegativeFloat
     """Weight of the negative log-likelihood of DoLP's error under its predicted variance. Only the variance learns
     from this term."""
+    half_weight: PositiveFloat | None
+    """Mean squared DoLP of a frame whose squared errors count half in `mse` and `stokes`; those of unpolarized frames
+    count fully, and those of strongly polarized frames less. None: all frames count alike."""
 
     def __post_init__(self):
         if self.mse == self.ssim == self.lpips == 0:
@@ -69,7 +72,7 @@ class FrameLoss:
         self._terms = {name: known[name] for name in self.weights}
 
     def __call__(self, predicted: Frames, truth: Frames, valid: Valid = None) -> dict[str, Float[Tensor, ""]]:
-        """Return the unweighted terms by name; all are 0 if no frame has a valid pixel."""
+        """Return the terms by name, before their weights; all are 0 if no frame has a valid pixel."""
         a, b, known = known_frames(predicted, truth, valid)
         if not len(a):
             return {name: 0 * predicted.sum() for name in self._terms}
@@ -81,13 +84,18 @@ class FrameLoss:
 
 
 class PolarizationLoss(FrameLoss):
-    """A `FrameLoss` of DoLP, plus terms for (s1, s2) and the log-variance if the network predicts them."""
+    """A `FrameLoss` of DoLP, plus terms for (s1, s2) and the log-variance if the network predicts them.
+
+    With `config.half_weight`, the terms `mse` and `stokes` are replaced by `relative_mse` and `relative_stokes`.
+    """
 
     def __init__(self, config: LossConfig, lpips: Lpips | None, *, dolp_only: bool):
-        super().__init__({"mse": config.mse, "ssim_loss": config.ssim, "lpips": config.lpips}, lpips)
-        more = {} if dolp_only else {"stokes": config.stokes, "uncertainty": config.uncertainty}
-        self._more = {name: weight for name, weight in more.items() if weight}
-        self.weights |= self._more
+        prefix = "" if config.half_weight is None else "relative_"
+        of_dolp = {f"{prefix}mse": config.mse, "ssim_loss": config.ssim, "lpips": config.lpips}
+        super().__init__({name: weight for name, weight in of_dolp.items() if name != "relative_mse"}, lpips)
+        more = {} if dolp_only else {f"{prefix}stokes": config.stokes, "uncertainty": config.uncertainty}
+        self.weights = {name: weight for name, weight in (of_dolp | more).items() if weight}
+        self._half_weight = config.half_weight
 
     def __call__(
         self, predicted: Float[Tensor, "t b k h w"], truth: Float[Tensor, "t b m h w"], valid: Valid = None
@@ -97,15 +105,30 @@ class PolarizationLoss(FrameLoss):
         The maps of `predicted` and `truth` are DoLP, s1 and s2; `predicted` adds the log-variance.
         """
         terms = super().__call__(predicted[:, :, 0], truth[:, :, 0], valid)
-        if "stokes" in self._more:
-            errors = (predicted[:, :, 1:3] - truth[:, :, 1:]).square().sum(2)
-            terms["stokes"] = _mean_of_known(errors, valid)
-        if "uncertainty" in self._more:
+        if "relative_mse" in self.weights:
+            squared = (predicted[:, :, 0] - truth[:, :, 0]).square()
+            terms["relative_mse"] = self._relative(squared, truth, valid)
+        if "stokes" in self.weights:
+            terms["stokes"] = _mean_of_known(_stokes_errors(predicted, truth), valid)
+        if "relative_stokes" in self.weights:
+            terms["relative_stokes"] = self._relative(_stokes_errors(predicted, truth), truth, valid)
+        if "uncertainty" in self.weights:
             log_variance = predicted[:, :, 3].clamp(*LOG_VARIANCES)
             squared = (predicted[:, :, 0].detach().clamp(0, 1) - truth[:, :, 0]).square()
             nll = (squared * torch.exp(-log_variance) + log_variance) / 2
             terms["uncertainty"] = _mean_of_known(nll, valid)
         return terms
+
+    def _relative(self, errors: Frames, truth: Float[Tensor, "t b m h w"], valid: Valid) -> Float[Tensor, ""]:
+        """Mean of `errors` in which a frame counts fully if it is unpolarized, and less the higher its DoLP."""
+        assert self._half_weight is not None
+        level = mean_where(truth[:, :, 0].square(), valid).nan_to_num(0.0)  # NaN: no valid pixel
+        return _mean_of_known(errors * (self._half_weight / (self._half_weight + level))[..., None, None], valid)
+
+
+def _stokes_errors(predicted: Float[Tensor, "t b k h w"], truth: Float[Tensor, "t b m h w"]) -> Frames:
+    """Squared error of (s1, s2) at each pixel."""
+    return (predicted[:, :, 1:3] - truth[:, :, 1:]).square().sum(2)
 
 
 def _mean_of_known(of_pixels: Frames, valid: Valid) -> Float[Tensor, ""]:

@@ -75,7 +75,7 @@ def test_a_wrong_type_is_refused_with_its_key(project_root):
 
 
 def test_a_typo_on_the_command_line_is_refused_with_the_keys_there_are(project_root):
-    with pytest.raises(ValueError, match=r"loss\.msee is not a setting; loss has lpips, mse, ssim"):
+    with pytest.raises(ValueError, match=r"loss\.msee is not a setting; loss has half_weight, lpips, mse, ssim"):
         check_overrides(Config, project_root, ["loss.msee=1.0"])
     with pytest.raises(ValueError, match=r"seed\.x is not a setting; seed is a value, not a section"):
         check_overrides(Config, project_root, ["seed.x=1"])
@@ -125,7 +125,7 @@ def test_the_base_of_each_group_may_change_nothing(project_root):
 
 def test_a_typo_in_params_yaml_is_refused_with_the_keys_there_are(project):
     edit(project, "  mse: 10.0\n  ssim: 1.0", "  mse: 10.0\n  sim: 1.0")
-    with pytest.raises(ValueError, match=r"loss\.sim is not a setting; loss has lpips, mse, ssim"):
+    with pytest.raises(ValueError, match=r"loss\.sim is not a setting; loss has half_weight, lpips, mse, ssim"):
         load(project)
 
 
@@ -305,6 +305,15 @@ def test_a_preset_keeps_comments_and_unrelated_values_and_the_base_undoes_it(pro
     assert load(project).seed == 7
     write_preset(project, BASE["experiment"])
     assert (project / "params.yaml").read_text() == original.replace("seed: 1 ", "seed: 7 ")
+
+
+def test_a_preset_on_top_of_another_means_the_same_to_hydra_and_to_dvc(project):
+    write_preset(project, "shipped_whole")
+    by_dvc, by_hydra = load(project), load(project, ["experiment=shipped_whole"])
+    assert by_dvc == by_hydra
+    first = load(project, ["experiment=shipped"])
+    assert by_hydra.train != first.train
+    assert dataclasses.replace(by_hydra, train=first.train) == first
 
 
 def test_an_unknown_preset_lists_the_ones_there_are(project):

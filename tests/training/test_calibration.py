@@ -18,7 +18,7 @@ from polarnet.training.losses import LossConfig
 from polarnet.training.task import Task, open_split
 
 TRAIN = TrainConfig(**LOOP, representation=None, optimizer=None, start=None)
-LOSS = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=0.04)
+LOSS = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=0.04, half_weight=None)
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ def test_constant_frames_half_apart():
 
 
 def of_dolp(mse: float, ssim: float, lpips: float, network: Lpips | None = None) -> PolarizationLoss:
-    config = LossConfig(mse=mse, ssim=ssim, lpips=lpips, stokes=1.0, uncertainty=1.0)
+    config = LossConfig(mse=mse, ssim=ssim, lpips=lpips, stokes=1.0, uncertainty=1.0, half_weight=None)
     return PolarizationLoss(config, network, dolp_only=True)
 
 
@@ -61,7 +61,7 @@ def of_everything(dolp: float, s1: float, s2: float, log_variance: float) -> tor
 
 
 def test_angles_and_uncertainty_are_judged_where_a_network_predicts_them():
-    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=2.0, uncertainty=3.0)
+    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=2.0, uncertainty=3.0, half_weight=None)
     loss = PolarizationLoss(config, None, dolp_only=False)
     terms = loss(of_everything(0.5, 0.3, 0.4, math.log(0.02)), of_everything(0.4, 0.1, 0.4, 0)[:, :, :3])
     assert {name: round(term.item(), 5) for name, term in terms.items()} == {
@@ -72,8 +72,44 @@ def test_angles_and_uncertainty_are_judged_where_a_network_predicts_them():
     assert loss.total(terms).item() == pytest.approx(0.01 + 2 * 0.04 + 3 * terms["uncertainty"].item())
 
 
+def of_two_frames(half_weight: float | None) -> tuple[PolarizationLoss, torch.Tensor, torch.Tensor]:
+    """A loss, and predictions and truths of an unpolarized frame and of one with a mean squared DoLP of 0.25."""
+    config = LossConfig(mse=2.0, ssim=0.0, lpips=0.0, stokes=3.0, uncertainty=0.0, half_weight=half_weight)
+    truth = torch.stack([of_everything(0.0, 0.0, 0.0, 0.0)[0, 0], of_everything(0.5, 0.3, 0.4, 0.0)[0, 0]])[:, None]
+    return (
+        PolarizationLoss(config, None, dolp_only=False),
+        truth + torch.tensor([0.1, 0.2, 0, 0])[:, None, None],
+        truth[:, :, :3],
+    )
+
+
+def test_with_a_half_weight_errors_count_half_where_the_mean_squared_dolp_has_that_value():
+    plain, predicted, truth = of_two_frames(half_weight=None)
+    relative, _, _ = of_two_frames(half_weight=0.25)
+    shares = (1 + 0.5) / 2  # of the unpolarized and the polarized frame
+    terms = relative(predicted, truth)
+    assert {name: round(term.item(), 6) for name, term in terms.items()} == {
+        "relative_mse": round(shares * 0.01, 6), "relative_stokes": round(shares * 0.04, 6),
+    }  # fmt: skip
+    torch.testing.assert_close(relative.total(terms), shares * plain.total(plain(predicted, truth)))
+
+
+def test_frames_without_a_valid_pixel_count_in_no_relative_term_and_leave_the_gradient_finite():
+    relative, predicted, truth = of_two_frames(half_weight=0.25)
+    predicted = predicted.clone().requires_grad_()
+    valid = torch.ones(2, 1, 12, 12, dtype=torch.bool)
+    valid[1] = False
+    terms = relative(predicted, truth, valid)
+    assert terms["relative_mse"].item() == pytest.approx(0.01)
+    relative.total(terms).backward()
+    assert predicted.grad is not None
+    assert predicted.grad[0, :, :3].any()
+    assert predicted.grad.isfinite().all()
+    assert not predicted.grad[1].any()
+
+
 def test_the_uncertainty_learns_from_the_error_and_the_error_not_from_the_uncertainty():
-    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=0.0, uncertainty=1.0)
+    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=0.0, uncertainty=1.0, half_weight=None)
     predicted = of_everything(0.5, 0.3, 0.4, 0.0).clone().requires_grad_()
     PolarizationLoss(config, None, dolp_only=False)(predicted, torch.zeros(2, 3, 3, 12, 12))["uncertainty"].backward()
     assert predicted.grad is not None
@@ -82,7 +118,7 @@ def test_the_uncertainty_learns_from_the_error_and_the_error_not_from_the_uncert
 
 
 def test_masked_pixels_count_neither_for_angles_nor_for_uncertainty():
-    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=1.0)
+    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=1.0, half_weight=None)
     valid = torch.zeros(2, 3, 12, 12, dtype=torch.bool)
     valid[..., :6] = True
     predicted = of_everything(0.5, 0.5, 0.0, 0.0).clone()
@@ -98,7 +134,7 @@ def test_a_weight_of_zero_is_not_even_computed():
 
 def test_a_loss_of_nothing_is_refused():
     with pytest.raises(ValueError, match="mse, ssim, lpips: expected at least one weight > 0"):
-        LossConfig(mse=0.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=1.0)
+        LossConfig(mse=0.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=1.0, half_weight=None)
 
 
 def test_masked_pixels_and_frames_count_in_no_term_and_get_no_gradient():
