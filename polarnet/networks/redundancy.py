@@ -171,7 +171,7 @@ def box_means(x: Float[Tensor, "n c h w"], width: int) -> Float[Tensor, "n c h w
 
 
 def pooled_means(x: Float[Tensor, "n c h w"], width: int) -> Float[Tensor, "n c h w"]:
-    """Return the same as `box_means`, by pooling, which is faster on a GPU."""
+    """Return the same as `box_means`, by pooling along one axis after the other; used on a GPU."""
     means = F.avg_pool2d(x.float(), (1, width), stride=1, padding=(0, width // 2), count_include_pad=False)
     return F.avg_pool2d(means, (width, 1), stride=1, padding=(width // 2, 0), count_include_pad=False)
 

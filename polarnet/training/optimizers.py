@@ -67,7 +67,7 @@ class Muon(Optimizer):
         self._share_groups()
 
     def _replay(self) -> None:
-        """Update the matrices on a GPU by one CUDA graph, instead of some 1,500 operations launched one by one.
+        """Update the matrices on a GPU by one CUDA graph, which launches all their operations at once.
 
         The graph leaves the step of learning rate 1 in `_matrices`. A weight without a gradient counts as one whose
         gradient is 0.

@@ -1,7 +1,7 @@
 """Training steps on a GPU, recorded once as CUDA graphs and replayed.
 
-A run of windows takes several thousand small operations, forward and backward. A GPU computes them faster than the
-processor can launch them one by one. A replay launches all of them at once, with the same results.
+A run of windows takes many small operations, forward and backward, which the processor launches one by one. A replay
+launches all of them at once, with the same results.
 """
 
 from collections.abc import Callable
