@@ -22,7 +22,7 @@ from typing import Any
 
 from polarnet.runtime.machine import usable_cores
 from polarnet.storage.frames import FrameStore
-from studies.measure import arguments_of, command_line, machine_record, run_stage, write_section
+from studies.measure import arguments_of, command_line, machine_record, run_missing, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
 OVERRIDES = ("benchmark.lpips=false",)
@@ -36,18 +36,12 @@ def trained(photographs: int, arguments: argparse.Namespace) -> dict[str, Any]:
     data = arguments.work / str(photographs)
     common = (
         "experiment=shipped", f"ingest.root={arguments.training}", f"ingest.limit={photographs}",
-        f"paths.data={data}", f"paths.resume={data / 'resume'}",
         f"runtime.threads={max(1, usable_cores() // arguments.jobs)}", "runtime.workers=1", *OVERRIDES,
     )  # fmt: skip
-    weights = data / "train" / "ours" / "best.safetensors"
-    if not (data / "events.zarr").exists():
-        for step in ("ingest", "synthesize", "emulate"):
-            run_stage(step, *common)
+    run_missing(data, *common, until="emulate")
     sequences = len(FrameStore.open(data / "frames.zarr").of_split("train"))
     visits = max(1, round(arguments.visits / sequences))
-    if not weights.exists():
-        run_stage("train", *common, f"train.visits={visits}")
-    return {"weights": weights, "sequences": sequences, "visits": visits}
+    return {"weights": run_missing(data, *common, f"train.visits={visits}"), "sequences": sequences, "visits": visits}
 
 
 def scored(networks: Mapping[str, Path], arguments: argparse.Namespace, conditions: Sequence[str]) -> dict[str, Any]:

@@ -72,6 +72,22 @@ def run_stage(name: str, *overrides: str) -> None:
     subprocess.run([sys.executable, "-m", f"stages.{name}", *overrides], cwd=ROOT, check=True)
 
 
+STAGE_OUTPUTS = {
+    "ingest": "images", "synthesize": "scenes.zarr", "emulate": "events.zarr", "train": "train/ours/best.safetensors",
+}  # fmt: skip
+"""Outputs of the stages of a training in its folder of data, in order."""
+
+
+def run_missing(data: Path, *overrides: str, until: str = "train") -> Path:
+    """Run the stages of a training up to `until` whose outputs `data` lacks; returns the path of the last output."""
+    for stage, output in STAGE_OUTPUTS.items():
+        if not (data / output).exists():
+            run_stage(stage, f"paths.data={data}", f"paths.resume={data / 'resume'}", *overrides)
+        if stage == until:
+            return data / output
+    raise ValueError(f"until: expected one of {', '.join(STAGE_OUTPUTS)}, got {until!r}")
+
+
 def read_results(root: Path, name: str) -> dict[str, Any]:
     """Content of docs/results/NAME.json; empty if the file does not exist yet."""
     path = root / "docs" / "results" / f"{name}.json"

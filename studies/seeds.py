@@ -3,8 +3,8 @@
 python -m studies.seeds --seed N --training FOLDER --photographs FOLDER --photographs-large FOLDER --measured FOLDER ...
     --work FOLDER [--write]
 
-The stages run on the training photographs (`studies.robustness --training`) with `experiment=shipped`, and a second
-training with `experiment=shipped_whole`, all with seed N: it decides motion, scenes, sensors and the network.
+The stages run on the training photographs (`studies.robustness --training`) with `experiment=shipped` and then with
+`experiment=shipped_whole`, all with seed N: it decides motion, scenes, sensors and the network.
 `studies.robustness` scores the network and the shipped one on the test split of both sets of photographs and on the
 measured scenes. An interrupted run resumes. --write puts both rows into docs/results/seeds.json, whose means are over
 the shipped weights and all seeds there.
@@ -16,30 +16,18 @@ from typing import Any
 
 from polarnet.networks.weights import shipped_weights
 from studies.data_curve import resolved, scored, with_folders
-from studies.measure import ROOT, command_line, machine_record, read_results, run_stage, write_section
+from studies.measure import ROOT, command_line, machine_record, read_results, run_missing, write_section
 
 CONDITIONS = ("photographs", "photographs_large", "measured")
 FIGURES = ("mse", "psnr", "corr", "mse_over_oracle_mean", "median_over_oracle_mean")
 SHIPPED = "shipped"
-FIRST = ("experiment=shipped",)
 
 
-def trained(seed: int, training: Path, data: Path) -> Path:
+def trained(seed: int, training: Path, folder: Path) -> Path:
     """Checkpoint after both trainings with this seed; finished stages are not run again."""
-    common = (
-        f"seed={seed}", f"ingest.root={training}", f"paths.data={data}", f"paths.resume={data / 'resume'}",
-        "benchmark.lpips=false",
-    )  # fmt: skip
-    crops, whole = (data / name / "ours" / "best.safetensors" for name in ("train", "whole"))
-    second = ("experiment=shipped_whole", f"train.start={crops}", f"paths.train={data / 'whole'}")
-    stages: tuple[tuple[str, Path, tuple[str, ...]], ...] = (
-        ("ingest", data / "images", FIRST), ("synthesize", data / "scenes.zarr", FIRST),
-        ("emulate", data / "events.zarr", FIRST), ("train", crops, FIRST), ("train", whole, second),
-    )  # fmt: skip
-    for stage, output, settings in stages:
-        if not output.exists():
-            run_stage(stage, *settings, *common)
-    return whole
+    common = (f"seed={seed}", f"ingest.root={training}", "benchmark.lpips=false")
+    first = run_missing(folder / "shipped", "experiment=shipped", *common)
+    return run_missing(folder / "shipped_whole", "experiment=shipped_whole", f"train.start={first}", *common)
 
 
 def row_of(tables: dict[str, Any], network: str) -> dict[str, Any]:
