@@ -59,6 +59,7 @@ def dolp_task(
             "config": asdict(network_config),
             "in_channels": in_channels,
             "representation": representation,
+            "half_weight": loss.half_weight,
             **start,
         },
         wants_intensity=False,

@@ -119,12 +119,13 @@ def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, de
     optimizer used for the network.
     """
     events, frames = split.train.events, split.train.frames
+    settings = {name: value for name, value in asdict(config).items() if name != "start"}  # start_sha256 stands for it
     lpips = stored_record(weights, "loss") if any("lpips" in term for term in task.loss.weights) else NO_RECORD
     return {
         **task.description,
         "training": {
             "seed": seed,
-            **asdict(config),
+            **settings,
             "optimizer": task.optimizer,
             "precision": precision_on(device, config.precision),
         },

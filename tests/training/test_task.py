@@ -124,6 +124,20 @@ def test_a_checkpoint_tells_what_its_events_were_made_from(simulated, tmp_path):
     assert described["store"]["data"]["events_sha256"] != described["fly"]["data"]["events_sha256"]
 
 
+def test_a_checkpoint_tells_what_decided_its_weights_without_a_path_of_this_machine(simulated, tmp_path):
+    save_network(tmp_path / "start.safetensors", dolp())
+    config = dataclasses.replace(TRAIN, start=str(tmp_path / "start.safetensors"))
+    described = []
+    for half_weight in (0.05, 0.1):
+        loss = dataclasses.replace(LOSS, half_weight=half_weight)
+        task = dolp_task("paper", NETWORK, config, loss, None, SEED)
+        split = split_of(simulated, "store", task)
+        described.append(describe(task, split, config, tmp_path, SEED, torch.device("cpu")))
+    assert [one["half_weight"] for one in described] == [0.05, 0.1]
+    assert described[0]["start_sha256"] == load_checkpoint(config.start)[1]["sha256"]
+    assert str(tmp_path) not in json.dumps(described[0]["training"])
+
+
 @pytest.fixture
 def masked(simulated, tmp_path):
     """The simulated sequences with the left third of all frames masked, and all of the first three frames."""
