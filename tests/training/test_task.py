@@ -1,7 +1,9 @@
 """Both ways to feed a training give the same numbers."""
 
 import dataclasses
+import json
 import shutil
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -125,8 +127,9 @@ def test_a_checkpoint_tells_what_its_events_were_made_from(simulated, tmp_path):
 
 
 def test_a_checkpoint_tells_what_decided_its_weights_without_a_path_of_this_machine(simulated, tmp_path):
-    save_network(tmp_path / "start.safetensors", dolp())
-    config = dataclasses.replace(TRAIN, start=str(tmp_path / "start.safetensors"))
+    start = str(tmp_path / "start.safetensors")
+    save_checkpoint(Path(start), dolp().network.state_dict(), {"network": "paper"})
+    config = dataclasses.replace(TRAIN, start=start)
     described = []
     for half_weight in (0.05, 0.1):
         loss = dataclasses.replace(LOSS, half_weight=half_weight)
@@ -134,7 +137,7 @@ def test_a_checkpoint_tells_what_decided_its_weights_without_a_path_of_this_mach
         split = split_of(simulated, "store", task)
         described.append(describe(task, split, config, tmp_path, SEED, torch.device("cpu")))
     assert [one["half_weight"] for one in described] == [0.05, 0.1]
-    assert described[0]["start_sha256"] == load_checkpoint(config.start)[1]["sha256"]
+    assert described[0]["start_sha256"] == load_checkpoint(start)[1]["sha256"]
     assert str(tmp_path) not in json.dumps(described[0]["training"])
 
 
