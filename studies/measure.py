@@ -80,12 +80,13 @@ STAGE_OUTPUTS = {
 
 def run_missing(data: Path, *overrides: str, until: str = "train") -> Path:
     """Run the stages of a training up to `until` whose outputs `data` lacks; returns the path of the last output."""
-    for stage, output in STAGE_OUTPUTS.items():
-        if not (data / output).exists():
+    stages = list(STAGE_OUTPUTS)
+    if until not in stages:
+        raise ValueError(f"until: expected one of {', '.join(stages)}, got {until!r}")
+    for stage in stages[: stages.index(until) + 1]:
+        if not (data / STAGE_OUTPUTS[stage]).exists():
             run_stage(stage, f"paths.data={data}", f"paths.resume={data / 'resume'}", *overrides)
-        if stage == until:
-            return data / output
-    raise ValueError(f"until: expected one of {', '.join(STAGE_OUTPUTS)}, got {until!r}")
+    return data / STAGE_OUTPUTS[until]
 
 
 def read_results(root: Path, name: str) -> dict[str, Any]:

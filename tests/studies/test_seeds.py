@@ -40,6 +40,7 @@ def test_missing_stages_run_as_far_as_asked(ran, tmp_path):
     assert [name for name, _ in ran] == ["synthesize", "emulate"]
     with pytest.raises(ValueError, match="until: expected one of ingest, synthesize, emulate, train, got 'report'"):
         run_missing(tmp_path, until="report")
+    assert len(ran) == 2
 
 
 def test_the_mean_is_over_networks_for_each_condition_and_figure():
