@@ -195,6 +195,7 @@ def _overrides(section: str) -> Callable[[Results], Iterator[str]]:
 
 SEVERAL = "Several trainings: mean ± standard deviation."
 
+BLOCKS = "ours, 2x2 blocks"
 ROBUSTNESS_ROWS = (
     "zeros",
     "train_mean",
@@ -203,7 +204,7 @@ ROBUSTNESS_ROWS = (
     "firenet_published+gain",
     "ours",
     "ours, thresholds given",
-    "ours, 2x2 blocks",
+    BLOCKS,
 )
 
 
@@ -218,6 +219,14 @@ def _robustness(key: str, form: str) -> Block:
         {"scenes": "`{name}`", "number": "{scenes}", "mean DoLP": "{mean_dolp:.3f}"}
         | {f"`{row}`": f"{{value[{row}]:{form}}}" for row in ROBUSTNESS_ROWS},
     )  # fmt: skip
+
+
+def _off_by_rows(results: Results) -> Iterator[Row]:
+    """The factor by which expected errors are off, by set of scenes and sensor."""
+    for name, table in results["test"]["tables"].items():
+        factors = {row: table["rows"].get(row, {}).get("error_factor") for row in (OURS, BLOCKS)}
+        if None not in factors.values():
+            yield {"name": name, "scenes": table["scenes"], "full": factors[OURS], "blocks": factors[BLOCKS]}
 
 
 def _between_rows(results: Results) -> Iterator[Row]:
@@ -384,4 +393,8 @@ NETWORK_BLOCKS = {
     ),
     "robustness": _robustness("mse_over_oracle_mean", ".2f"),
     "robustness-median": _robustness("median_over_oracle_mean", ".2f"),
+    "robustness-expected": Block(
+        "robustness", "test", "studies.robustness --write", _off_by_rows,
+        {"scenes": "`{name}`", "number": "{scenes}", f"`{OURS}`": "{full:.2f}", f"`{BLOCKS}`": "{blocks:.2f}"},
+    ),
 }  # fmt: skip

@@ -96,6 +96,10 @@ class SplitStore(Store):
             raise ValueError(f"expected a split of {', '.join(SPLITS)}, got {split!r}")
         return [name for name in self.sequences if self.splits[name] == split]
 
+    def original_of(self, sequence: str) -> str:
+        """The original picture of a sequence or variant; the sequence itself if the store names no pictures."""
+        return self.variant_of.get(sequence) or self.attributes.get("scenes", {}).get(sequence, sequence)
+
 
 class FrameStore(SplitStore):
     """Frames of sequences, each in the split train, val or test; see `create` and `open`.

@@ -67,6 +67,7 @@ def dolp_task(
         scored=lambda maps: maps[:, :, 0],
         replays=build.replays,
         unroll_with_features=unroll_with_features if build.predicts_stokes else None,
+        scene_dolp=config.scene_dolp,
     )
 
 

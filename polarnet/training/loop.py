@@ -18,7 +18,7 @@ from polarnet.runtime.files import check_room
 from polarnet.runtime.machine import precision_on
 from polarnet.runtime.sections import one_of, section
 from polarnet.storage.windows import WindowDataset
-from polarnet.training.calibration import Scene, fitted
+from polarnet.training.calibration import Scene, fitted, joined, weights_for
 from polarnet.training.losses import known_frames
 from polarnet.training.optimizers import OPTIMIZERS
 from polarnet.training.parallel import add_up, place, wait_for_all
@@ -29,7 +29,7 @@ from polarnet.training.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
 COPIES_OF_WEIGHTS = 12  # on disk: best, last, and twice (old and new) the running checkpoint with best and two moments
-MAX_SCENES = 200  # sequences in the expected-error fit, spread evenly; more cost time and change it little
+MAX_SCENES = 300  # sequences in the expected-error fit, spread evenly; more cost time and change it little
 MAX_BLOCKS = 10_000  # 2x2-pixel blocks per sequence in the expected-error fit; errors of neighbouring blocks are alike
 
 Run = tuple[Tensor, Tensor, Tensor | None]
@@ -72,6 +72,14 @@ class TrainConfig(LoopConfig):
     """Name of the optimizer; null: the network's own default."""
     start: str | None
     """Checkpoint (.safetensors) of the same network whose weights the training starts from; null: random weights."""
+    scene_dolp: Annotated[list[PositiveFloat], Field(min_length=2, max_length=2)] | None
+    """[median, 90th percentile] of the mean DoLP of real scenes: expected errors are fitted half to the training
+    pictures and half to scenes like these, variants included; null: to the training pictures alone."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.scene_dolp is not None and not self.scene_dolp[0] < self.scene_dolp[1] < 1:
+            raise ValueError(f"scene_dolp: expected median < 90th percentile < 1, got {self.scene_dolp}")
 
 
 def train(
@@ -95,7 +103,8 @@ def train(
         uncached = autocast(config.precision, device, cache_enabled=False)
         stepped = replace(task, unroll=Replayed(task, uncached))
     helpers = workers if device.type == "cuda" else 0  # on a processor, the training itself needs the cores
-    loaded = loaded_if_it_fits(split.train, task.wants_intensity, helpers)
+    trained = progress.epoch == config.epochs
+    loaded = None if trained else loaded_if_it_fits(split.train, task.wants_intensity, helpers)
     sequences, workers = (split.train, workers) if loaded is None else (loaded, helpers)
     for epoch in range(progress.epoch, config.epochs):
         visits = Visits(sequences, config, seed, epoch)
@@ -110,10 +119,9 @@ def train(
         recorder.keep(progress, network, optimizer, at_once=True)
     if task.unroll_with_features is not None and recorder.writes:
         network.load_state_dict(progress.best)
-        names = [name for name in split.train.sequences if name not in split.train.frames.variant_of]
-        names = names[:: math.ceil(len(names) / MAX_SCENES)]
-        scenes = WindowDataset(split.train.events, split.train.frames, names, split.train.encode)
-        recorder.calibrated(progress, network, calibrate(task, scenes, config, device, workers))
+        recorder.calibrated(
+            progress, network, calibrate(task, sequences_to_fit(task, split.train), config, device, workers)
+        )
     recorder.finish()
 
 
@@ -227,17 +235,29 @@ def autocast(precision: str, device: torch.device, cache_enabled: bool = True) -
     return torch.autocast(device.type, torch.bfloat16, enabled, cache_enabled)
 
 
+def sequences_to_fit(task: Task, dataset: WindowDataset) -> WindowDataset:
+    """At most MAX_SCENES sequences; those of variants only if the task says for which scenes to fit."""
+    varied = dataset.frames.variant_of
+    names = [name for name in dataset.sequences if name not in varied]
+    if task.scene_dolp is not None:
+        names += [name for name in dataset.sequences if name in varied]
+    names = names[:: math.ceil(len(names) / MAX_SCENES)]
+    return WindowDataset(dataset.events, dataset.frames, names, dataset.encode)
+
+
 @torch.no_grad()
 def calibrate(
     task: Task, dataset: WindowDataset, config: LoopConfig, device: torch.device, workers: int
 ) -> dict[str, int | float]:
     """Fit the network's expected errors to its errors on `dataset` (polarnet.training.calibration).
 
-    The fit also includes one frame of each sequence predicted without any events. Returns a record of the fit for the
-    checkpoint. ValueError if the network has no error at all.
+    The fit also includes one frame of each sequence predicted without any events. If the task names the DoLP of real
+    scenes, half of its weight is on the pictures, and half on all sequences, with `weights_for` such scenes. Returns a
+    record of the fit for the checkpoint. ValueError if the network has no error at all.
     """
     task.network.eval()
-    scenes, mean_squared = [], []
+    sampled: dict[str, Scene] = {}
+    mean_squared, mean_dolp = [], []
     for batch in batches_of(dataset, range(len(dataset)), 1, workers):
         every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / MAX_BLOCKS)))  # along each axis
         runs = list(runs_of(task, batch, config.bptt_windows, device))
@@ -252,11 +272,20 @@ def calibrate(
             still = (torch.zeros_like(windows[:1]), frames[:1], None if valid is None else valid[:1])
             samples.append(sampled_errors(task, still, None, every, config.precision)[0])
             mean_squared.append(squared.mean().item())
-            scenes.append(Scene(*(torch.cat(field) for field in zip(*samples, strict=True))))
-    fit = fitted(scenes)
+            mean_dolp.append((batch.dolp if batch.valid is None else batch.dolp[batch.valid]).mean().item())
+            sampled[batch.names[0]] = joined(samples)
+    if task.scene_dolp is not None:
+        pictures = [float(name not in dataset.frames.variant_of) for name in sampled]
+        real = weights_for(mean_dolp, *task.scene_dolp)
+        for (name, scene), picture, weight in zip(sampled.items(), pictures, real, strict=True):
+            sampled[name] = scene._replace(weights=scene.weights * (picture + fmean(pictures) * weight))
+    of_pictures: dict[str, list[Scene]] = {}
+    for name, scene in sampled.items():
+        of_pictures.setdefault(dataset.frames.original_of(name), []).append(scene)
+    fit = fitted([joined(scenes) for scenes in of_pictures.values()])
     task.network.expect(fit.weight, fit.bias)  # type: ignore[operator]
     task.network.train()
-    return {"sequences": len(scenes), "mse": fmean(mean_squared), "ridge": fit.ridge}
+    return {"sequences": len(sampled), "mse": fmean(mean_squared), "ridge": fit.ridge}
 
 
 def sampled_errors(task: Task, run: Run, state: State, every: int, precision: str) -> tuple[Scene, State]:
@@ -271,4 +300,5 @@ def sampled_errors(task: Task, run: Run, state: State, every: int, precision: st
     squared, share_known = (avg_pool2d(image.flatten(0, 1), 2)[:, ::every, ::every] for image in (errors, known))
     height, width = (every * size for size in squared.shape[-2:])
     features = features[..., :height:every, :width:every].permute(0, 2, 3, 1)[share_known == 1]
-    return Scene(features.double().cpu(), squared[share_known == 1].double().cpu()), state
+    squared = squared[share_known == 1].double().cpu()
+    return Scene(features.double().cpu(), squared, torch.ones_like(squared)), state

@@ -1,6 +1,6 @@
 """The network-specific parts of a training (`Task`) and its data (`Split`)."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -61,6 +61,9 @@ class Task:
     ) = None
     """Same as `unroll`, but with the `scored` map alone and, at half resolution, features of its expected error. None:
     the network expects no error. A network with this function has a method `expect(weight, bias)`."""
+    scene_dolp: Sequence[float] | None = None
+    """Median and 90th percentile of the mean DoLP of real scenes, for which the expected errors are fitted, too. None:
+    they are fitted to the training pictures alone."""
 
 
 @dataclass(frozen=True)

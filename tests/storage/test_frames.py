@@ -103,6 +103,16 @@ def test_splits_are_kept_in_order(finished):
         store.of_split("validation")
 
 
+def test_a_picture_and_its_variants_are_one_picture(tmp_path):
+    attributes = {"scenes": {"lake-00": "lake", "lake-variant01-00": "lake-variant01"}}
+    names = ["lake-00", "lake-variant01-00", "other"]
+    store = FrameStore.create(
+        tmp_path / "frames.zarr", names, dict.fromkeys(names, "train"), 1, height=4, width=4, attributes=attributes,
+        variant_of={"lake-variant01-00": "lake"},
+    )  # fmt: skip
+    assert [store.original_of(name) for name in names] == ["lake", "lake", "other"]
+
+
 def test_black_unpolarized_frames_are_not_taken_for_missing_ones(tmp_path):
     store = store_at(tmp_path / "f.zarr", sequences=["a"])
     t_us, intensity, dolp, aolp = frames_of(1)

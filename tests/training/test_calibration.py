@@ -11,13 +11,13 @@ from polarnet.events.representations import event_tensor
 from polarnet.networks.checkpoint import load_network
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
-from polarnet.training.calibration import RIDGES, Scene, fitted
+from polarnet.training.calibration import RIDGES, Scene, fitted, weights_for
 from polarnet.training.dolp import dolp_task
 from polarnet.training.loop import TrainConfig, calibrate
 from polarnet.training.losses import LossConfig
 from polarnet.training.task import Task, open_split
 
-TRAIN = TrainConfig(**LOOP, representation=None, optimizer=None, start=None)
+TRAIN = TrainConfig(**LOOP, representation=None, optimizer=None, start=None, scene_dolp=None)
 LOSS = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=0.04, half_weight=None)
 
 
@@ -38,8 +38,14 @@ def scenes_of(in_all: float, in_each: float) -> list[Scene]:
         features = torch.randn(5000, 4, generator=generator, dtype=torch.float64) * torch.tensor([0.01, 5, 1, 0])
         noise = torch.randn(5000, generator=generator, dtype=torch.float64)
         expected = 100 * in_all * features[:, 0] + (-1) ** (k % 5) * in_each * features[:, 2] - 4
-        scenes.append(Scene(features, expected.exp() * noise.square()))
+        squared = expected.exp() * noise.square()
+        scenes.append(Scene(features, squared, torch.ones_like(squared)))
     return scenes
+
+
+def two_scenes() -> list[Scene]:
+    """Two scenes of equal errors that no feature tells apart."""
+    return [scene._replace(features=0 * scene.features) for scene in scenes_of(in_all=0.0, in_each=0.0)[:2]]
 
 
 def test_what_tells_how_large_errors_are_is_found_however_small_it_is():
@@ -71,6 +77,39 @@ def test_without_any_error_there_is_nothing_to_expect():
     scenes = [scene._replace(squared=0 * scene.squared) for scene in scenes_of(in_all=1.0, in_each=0.0)]
     with pytest.raises(ValueError, match="got 100000 pixels without any"):
         fitted(scenes)
+
+
+def test_the_errors_of_heavy_scenes_decide():
+    first, large = two_scenes()
+    small = first._replace(squared=0.01 * first.squared)
+    light = large._replace(weights=1e-6 * large.weights)
+    for scenes, expected in (((small, large), large.squared.mean() / 2), ((small, light), small.squared.mean())):
+        fit = fitted(scenes)
+        errors = torch.cat([(scene.features @ fit.weight + fit.bias).exp() for scene in scenes])
+        assert errors.mean().item() == pytest.approx(expected.item(), rel=0.05)
+
+
+def test_weights_do_not_depend_on_their_scale():
+    scenes = scenes_of(in_all=1.0, in_each=0.0)
+    doubled = [scene._replace(weights=2 * scene.weights) for scene in scenes]
+    assert fitted(doubled).weight.tolist() == fitted(scenes).weight.tolist()
+
+
+def test_weighted_sequences_are_polarized_like_the_scenes_that_errors_are_expected_for():
+    degree = torch.rand(2000, generator=torch.Generator().manual_seed(0)).tolist()
+    weights = weights_for(degree, 0.045, 0.13)
+    assert sum(weights) == pytest.approx(len(degree))
+
+    def share_below(limit: float) -> float:
+        return sum(weight for weight, one in zip(weights, degree, strict=True) if one < limit) / len(degree)
+
+    assert share_below(0.045) == pytest.approx(0.5, abs=0.02)
+    assert share_below(0.13) == pytest.approx(0.9, abs=0.02)
+
+
+def test_a_single_sequence_weighs_1_and_equal_ones_share_their_part():
+    assert weights_for([0.3], 0.045, 0.13) == [1.0]
+    assert sum(weights_for([0.0, 0.0, 0.2], 0.045, 0.13)) == pytest.approx(3)
 
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
@@ -112,7 +151,8 @@ def test_of_what_it_has_seen_nothing_of_it_expects_the_errors_of_a_guess(stores,
     assert still[0] == pytest.approx(sum(errors) / len(errors), rel=0.25)
 
 
-def test_it_rests_on_pictures_as_they_are_without_their_variants(stores, tmp_path, task_of):
+@pytest.mark.parametrize(("scene_dolp", "sequences"), [(None, 2), ([0.045, 0.13], 3)])
+def test_it_rests_on_variants_only_if_the_scenes_it_is_for_are_named(stores, tmp_path, task_of, scene_dolp, sequences):
     source = FrameStore.open(stores[1])
     frames = FrameStore.create(
         tmp_path / "frames.zarr",
@@ -127,9 +167,24 @@ def test_it_rests_on_pictures_as_they_are_without_their_variants(stores, tmp_pat
     for name in source.sequences:
         frames.write(name, *source.frames(name))
     frames.finish()
-    content = bytes_of(run(task_of(), (stores[0], tmp_path / "frames.zarr"), tmp_path / "run", TRAIN))
+    task = dataclasses.replace(task_of(), scene_dolp=scene_dolp)
+    content = bytes_of(run(task, (stores[0], tmp_path / "frames.zarr"), tmp_path / "run", TRAIN))
     assert source.of_split("train") == ["a", "b", "c"]
-    assert json.loads(content["best.json"])["expected_errors"]["sequences"] == 2
+    assert json.loads(content["best.json"])["expected_errors"]["sequences"] == sequences
+
+
+def test_for_weakly_polarized_scenes_it_expects_more_of_what_the_weakest_ones_had(stores, task_of):
+    off_by = []
+    for scene_dolp in (None, [0.0001, 0.0002]):
+        task = dataclasses.replace(task_of(), scene_dolp=scene_dolp)
+        split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
+        weakest = min(split.train, key=lambda sequence: float(sequence.dolp.mean()))
+        calibrate(task, split.train, TRAIN, CPU, 0)
+        with torch.no_grad():
+            prediction = task.network.unroll(weakest.inputs[:, None], None)[0]
+        errors = (prediction.dolp[:, 0].clamp(0, 1) - weakest.dolp).square().mean()
+        off_by.append(abs(float((prediction.log_variance.exp().mean() / errors).log())))
+    assert off_by[1] < 0.8 * off_by[0]
 
 
 @pytest.mark.thorough
