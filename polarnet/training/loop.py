@@ -259,21 +259,11 @@ def calibrate(
     sampled: dict[str, Scene] = {}
     mean_squared, mean_dolp = [], []
     for batch in batches_of(dataset, range(len(dataset)), 1, workers):
-        every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / MAX_BLOCKS)))  # along each axis
-        runs = list(runs_of(task, batch, config.bptt_windows, device))
-        samples: list[Scene] = []
-        state: State = None
-        for run in runs:
-            sample, state = sampled_errors(task, run, state, every, config.precision)
-            samples.append(sample)
-        squared = torch.cat([sample.squared for sample in samples])
-        if len(squared):
-            windows, frames, valid = runs[0]
-            still = (torch.zeros_like(windows[:1]), frames[:1], None if valid is None else valid[:1])
-            samples.append(sampled_errors(task, still, None, every, config.precision)[0])
-            mean_squared.append(squared.mean().item())
+        scene, mse = sampled_sequence(task, batch, config, device)
+        if len(scene.squared):
+            sampled[batch.names[0]] = scene
+            mean_squared.append(mse)
             mean_dolp.append((batch.dolp if batch.valid is None else batch.dolp[batch.valid]).mean().item())
-            sampled[batch.names[0]] = joined(samples)
     if task.scene_dolp is not None:
         pictures = [float(name not in dataset.frames.variant_of) for name in sampled]
         real = weights_for(mean_dolp, *task.scene_dolp)
@@ -286,6 +276,21 @@ def calibrate(
     task.network.expect(fit.weight, fit.bias)  # type: ignore[operator]
     task.network.train()
     return {"sequences": len(sampled), "mse": fmean(mean_squared), "ridge": fit.ridge}
+
+
+def sampled_sequence(task: Task, batch: Batch, config: LoopConfig, device: torch.device) -> tuple[Scene, float]:
+    """Sampled errors of a batch's only sequence and of one frame without events, and the MSE without that frame."""
+    every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / MAX_BLOCKS)))  # along each axis
+    runs = list(runs_of(task, batch, config.bptt_windows, device))
+    samples: list[Scene] = []
+    state: State = None
+    for run in runs:
+        sample, state = sampled_errors(task, run, state, every, config.precision)
+        samples.append(sample)
+    mse = torch.cat([sample.squared for sample in samples]).mean().item()
+    windows, frames, valid = runs[0]
+    still = (torch.zeros_like(windows[:1]), frames[:1], None if valid is None else valid[:1])
+    return joined([*samples, sampled_errors(task, still, None, every, config.precision)[0]]), mse
 
 
 def sampled_errors(task: Task, run: Run, state: State, every: int, precision: str) -> tuple[Scene, State]:
