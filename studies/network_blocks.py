@@ -245,8 +245,12 @@ def _speed_rows(results: Results) -> Iterator[Row]:
     speed = results["speed"]
     for name in [name for name in speed if name.startswith(BETWEEN)]:
         size = name.removeprefix(BETWEEN)
-        full, blocks = (speed[f"windows_per_s_{size}{suffix}"] for suffix in ("", "_blocks_of_2"))
-        yield {"size": size.replace("x", " x "), "full": full, "blocks": blocks, "between": speed[name]}
+        rates = {
+            key + of_blocks: speed[f"windows_per_s_{kind}{size}{suffix}"]
+            for key, kind in (("together", ""), ("alone", "alone_"))
+            for of_blocks, suffix in (("", ""), ("_blocks", "_blocks_of_2"))
+        }
+        yield {"size": size.replace("x", " x "), **rates, "between": speed[name]}
 
 
 def _retrained_rows(results: Results) -> Iterator[Row]:
@@ -386,7 +390,9 @@ NETWORK_BLOCKS = {
     "robustness-speed": Block(
         "robustness", "speed", "studies.robustness --conditions speed --threads 2 --write", _speed_rows,
         {
-            "sensor": "{size}", "windows/s": "{full:.1f}", "windows/s, blocks of 2x2": "{blocks:.1f}",
+            "sensor": "{size}", "windows/s of a file": "{together:.1f}",
+            "of a file, blocks of 2x2": "{together_blocks:.1f}", "of a camera": "{alone:.1f}",
+            "of a camera, blocks of 2x2": "{alone_blocks:.1f}",
             f"ms a frame between windows, {RATE_HZ} Hz": "{between:.2f}",
         },
         "Shipped weights in {speed[precision]} with {speed[threads]} threads. {origin}",

@@ -14,7 +14,7 @@ from polarnet.benchmark.between_windows import frames_between
 from polarnet.benchmark.resimulate import resimulated, sequence_at
 from polarnet.benchmark.rows import Context, opened, predictions_of
 from polarnet.benchmark.score import FrameScore, score_sequence
-from polarnet.events.stream import Events, slice_time
+from polarnet.events.stream import Events, concatenate, slice_time
 from polarnet.events.streaming import EventWindow
 from polarnet.methods import METHODS
 from polarnet.methods.between import BetweenConfig, anchored, carried
@@ -67,30 +67,37 @@ def rated_scores(
     return rows, float(truth.mean())
 
 
-@torch.inference_mode()
-def ms_per_frame(height: int, width: int, config: BetweenConfig) -> float:
-    """Ms of computation for a frame of the rate, on random events; the search of the motion is shared by a window."""
+def random_windows(height: int, width: int, number: int) -> list[EventWindow]:
+    """This number of windows of random events, one after the other."""
     generator = torch.Generator().manual_seed(0)
-    count = round(EVENTS_PER_PIXEL * height * width)
-    window_us, frames = round(1e6 / FRAME_RATE_HZ), round(RATE_HZ / FRAME_RATE_HZ)
+    window_us, count = round(1e6 / FRAME_RATE_HZ), round(EVENTS_PER_PIXEL * height * width)
 
     def random_channel() -> Events:
-        t = torch.randint(0, 3 * window_us, (3 * count,), generator=generator).sort().values
+        t = torch.randint(0, number * window_us, (number * count,), generator=generator).sort().values
         y, x = (torch.randint(0, size, t.shape, generator=generator).short() for size in (height, width))
         p = torch.randint(0, 2, t.shape, generator=generator) * 2 - 1
         return Events(t, x, y, p.to(torch.int8), height, width)
 
     channels = [random_channel() for _ in range(4)]
-    stokes = torch.rand(2, height, width, generator=generator) - 0.5
-    frame = Prediction(torch.hypot(*stokes), torch.zeros(height, width), torch.zeros(height, width), stokes)
-    windows = [
+    starts = range(0, number * window_us, window_us)
+    return [
         EventWindow([slice_time(events, start, start + window_us) for events in channels], start, start + window_us)
-        for start in (0, window_us)
+        for start in starts
     ]
-    state = anchored(None, windows[0], frame, config)
+
+
+@torch.inference_mode()
+def ms_per_frame(height: int, width: int, config: BetweenConfig) -> float:
+    """Ms of computation for a frame of the rate, on random events; the search of the motion is shared by a window."""
+    first, second, third = random_windows(height, width, 3)
+    channels = [concatenate(parts) for parts in zip(first.channels, second.channels, third.channels, strict=True)]
+    stokes = torch.rand(2, height, width, generator=torch.Generator().manual_seed(0)) - 0.5
+    frame = Prediction(torch.hypot(*stokes), torch.zeros(height, width), torch.zeros(height, width), stokes)
+    frames = round(RATE_HZ / FRAME_RATE_HZ)
+    state = anchored(None, first, frame, config)
     start = time.perf_counter()
-    state = anchored(state, windows[1], frame, config)
+    state = anchored(state, second, frame, config)
     state = state._replace(velocity=torch.tensor(VELOCITY))  # random events confirm none
     for number in range(1, frames + 1):
-        state, _ = carried(state, channels, 2 * window_us + round(1e6 * number / RATE_HZ), config)
+        state, _ = carried(state, channels, second.stop_us + round(1e6 * number / RATE_HZ), config)
     return 1000 * (time.perf_counter() - start) / frames

@@ -92,7 +92,7 @@ def network_of(
 def latency_ms(channels: Sequence[Events], recoverer: Recoverer) -> float:
     """The median of a step when windows come one by one."""
     source = Input("stream", channels[0].height, channels[0].width, [piece_of(channels)], None)
-    return 1000 * statistics.median(frame.step_s for frame in frames_of(source, WINDOWS, recoverer, pixels_at_once=1))
+    return 1000 * statistics.median(frame.step_s for frame in frames_of(source, WINDOWS, recoverer, at_once=1))
 
 
 def piece_of(channels: Sequence[Events]) -> Piece:

@@ -14,8 +14,9 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 - `time.5ms`: the same with windows of 5 ms.
 - `time.2000hz.photographs`, `time.2000hz.measured`: frames between windows (`polarnet recover --rate 2000`), on the
   pictures of the sensors and on all measured scenes, at 16 times between the ends of two windows (`studies.rate`).
-- `speed`: windows a second of the first weights on random events, with and without blocks of 2x2 pixels, and ms of a
-  frame between windows, with --threads. `--conditions speed` measures nothing else and needs no photographs.
+- `speed`: windows a second of the first weights on random events, many at once and one by one, with and without blocks
+  of 2x2 pixels, and ms of a frame between windows, with --threads. `--conditions speed` measures nothing else and needs
+  no photographs.
 
 Nothing is trained, except the constants: `train_mean` is the mean DoLP of the training photographs, and `constant_real`
 the mean DoLP of the measured scenes of all sources but the one that is scored. --split val is for choices and --split
@@ -57,7 +58,7 @@ from polarnet.stokes import Prediction
 from polarnet.storage.scenes import SceneStore
 from studies.figures import robustness_figure
 from studies.measure import arguments_of, command_line, machine_record, write_section
-from studies.rate import ENDS, EVENTS_PER_PIXEL, FRAME_RATE_HZ, OURS, RATE_HZ, RATED, ms_per_frame, rated_scores
+from studies.rate import ENDS, FRAME_RATE_HZ, OURS, RATE_HZ, RATED, ms_per_frame, random_windows, rated_scores
 from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -91,7 +92,7 @@ SENSORS: dict[str, tuple[str, ...]] = {
 TIMES: dict[str, tuple[str, ...]] = {"5ms": ("synthesize.frame_rate_hz=200",)}
 """Overrides that change the windows."""
 SIZES = ((120, 180), (260, 346), (480, 640))
-TIMED_WINDOWS, WARM_WINDOWS = 12, 4
+RUNS, TIMED_WINDOWS, WARM_RUNS = 3, 12, 3
 CPU = torch.device("cpu")
 CALIBRATED = "ours, thresholds given"
 BLOCKS = "ours, 2x2 blocks"
@@ -199,23 +200,22 @@ def table_of(scores: Scores) -> dict[str, Any]:
     return table
 
 
-@torch.inference_mode()
-def windows_per_s(weights: Path, height: int, width: int, binning: int | None = None) -> float:
-    """Windows a second of the network on random events, one at a time as from a camera, as precise as `recover`."""
-    network, metadata = load_network(weights)
-    recoverer = dolp_recoverer(network, metadata, CPU, binning=binning)
-    stream: Any = recoverer.network
-    generator = torch.Generator().manual_seed(0)
-    count = torch.poisson(torch.full((1, 4, 1, height, width), EVENTS_PER_PIXEL), generator)
-    sign = torch.randint(0, 2, count.shape, generator=generator) * 2 - 1
-    windows = torch.cat([count * sign, count], dim=2).flatten(1, 2)
-    state = None
-    with torch.autocast(CPU.type, torch.bfloat16, enabled=precision_on(CPU, "auto") == "bf16"):
-        for number in range(WARM_WINDOWS + TIMED_WINDOWS):
-            if number == WARM_WINDOWS:
+def windows_per_s(weights: Path, height: int, width: int, binning: int | None = None) -> dict[str, float]:
+    """Windows a second of the network on random events, as precise as `recover`, which are in memory.
+
+    `together` takes as many at once as `recover` of a file, `alone` one after the other as from a camera.
+    """
+    recoverer = dolp_recoverer(*load_network(weights), CPU, precision_on(CPU, "auto"), binning=binning)
+    rates = {}
+    for name, size, runs in (("together", recoverer.at_once(height, width), RUNS), ("alone", 1, TIMED_WINDOWS)):
+        windows = random_windows(height, width, size * (WARM_RUNS + runs))
+        state = recoverer.start(height, width)
+        for number in range(WARM_RUNS + runs):
+            if number == WARM_RUNS:
                 start = time.perf_counter()
-            _, state = stream(windows, state)
-    return TIMED_WINDOWS / (time.perf_counter() - start)
+            state, _ = recoverer.step(state, windows[number * size : (number + 1) * size])
+        rates[name] = size * runs / (time.perf_counter() - start)
+    return rates
 
 
 def headlines(tables: Mapping[str, Any], row: str) -> dict[str, Any]:
@@ -378,8 +378,10 @@ def write_speed(config: Config, arguments: argparse.Namespace, record: Mapping[s
     speed: dict[str, Any] = {"threads": arguments.threads, "precision": precision_on(CPU, "auto")}
     for height, width in SIZES:
         size = f"{height}x{width}"
-        speed[f"windows_per_s_{size}"] = windows_per_s(weights, height, width)
-        speed[f"windows_per_s_{size}_blocks_of_{BINNING}"] = windows_per_s(weights, height, width, BINNING)
+        for suffix, binning in (("", None), (f"_blocks_of_{BINNING}", BINNING)):
+            rates = windows_per_s(weights, height, width, binning)
+            speed[f"windows_per_s_{size}{suffix}"] = rates["together"]
+            speed[f"windows_per_s_alone_{size}{suffix}"] = rates["alone"]
         speed[f"ms_per_{RATE_HZ}hz_frame_{size}"] = ms_per_frame(height, width, config.between)
     print(json.dumps(speed, indent=1))
     if arguments.write:

@@ -37,8 +37,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from polarnet.config.tree import load
 from polarnet.events.representations import REPRESENTATIONS, channels_of
+from polarnet.methods.method import windows_at_once
 from polarnet.networks.registry import NETWORKS
-from polarnet.recovery.stream import PIXELS_AT_ONCE
 from polarnet.runtime.machine import configure, device_of, limit_threads, precision_on, usable_cores
 from polarnet.stokes import Prediction
 from polarnet.training.loop import autocast
@@ -99,7 +99,7 @@ def measure_one(name: str, setting: str, threads: int, device_name: str) -> dict
                 loss = loss + loss_of(prediction)
         loss.backward()
 
-    at_once = 1 if setting == "naive" else PIXELS_AT_ONCE // (HEIGHT * WIDTH)
+    at_once = 1 if setting == "naive" else windows_at_once(HEIGHT, WIDTH)
 
     @torch.inference_mode()
     def infer() -> None:

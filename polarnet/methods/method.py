@@ -16,6 +16,8 @@ from polarnet.runtime.files import sha256
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
+PIXELS_AT_ONCE = 4 * 120 * 180  # total over the windows that a method processes at once; bounds the memory of a network
+
 State = Any
 """State of a method before a window: tensors, or None at the start."""
 
@@ -58,6 +60,11 @@ class Setup:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bf16")
 
 
+def windows_at_once(height: int, width: int) -> int:
+    """Number of windows of this size in pixels that a method processes at once."""
+    return max(1, PIXELS_AT_ONCE // (height * width))
+
+
 class Recoverer(NamedTuple):
     """A method with its settings and weights, ready for events. It is stateless: the caller passes the state.
 
@@ -73,6 +80,8 @@ class Recoverer(NamedTuple):
     """Whether the method skips events that an earlier window held, so that windows may overlap freely."""
     network: nn.Module | None = None
     """The method's network; None for a filter."""
+    at_once: Callable[[int, int], int] = windows_at_once
+    """Height and width of a channel -> number of windows of a run (`step`), if so many are known already."""
 
     @torch.no_grad()
     def step(self, state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:

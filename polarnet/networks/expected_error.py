@@ -1,11 +1,13 @@
 """Expected error of DoLP, from a few features that also work on new scenes.
 
 The features measure three things. The redundancy's candidates disagree where the scene is poorly known. DoLP is
-bounded, so middle values can have larger errors. Few events carry little information, and no events carry none.
+bounded, so middle values can have larger errors. Without events there is no evidence.
 
-The expected squared error is the exponential of a linear function of these features. Its few coefficients are fitted
+The expected squared error is the exponential of a quadratic function of these features. Its few coefficients are fitted
 after training (`polarnet.training.calibration`).
 """
+
+from itertools import combinations_with_replacement
 
 import torch
 from jaxtyping import Float
@@ -14,8 +16,11 @@ from torch import Tensor, nn
 from polarnet.networks.blocks import enlarged
 from polarnet.networks.redundancy import block_means
 
-FEATURES = 5
+BASIC = 4
+FEATURES = BASIC + BASIC * (BASIC + 1) // 2  # basic ones, their squares and products
 MIN_DISAGREEMENT = 1e-3  # squared DoLP, added because candidates that agree may share an error
+USUAL_DISAGREEMENT = 0.007  # squared DoLP; disagreement and room are relative to usual values, so that products of
+USUAL_ROOM = 0.17  # features say more than the features
 MIN_WEIGHT = 1e-6  # lower limit of the candidates' total weight
 MIN_ROOM = 0.05  # added to dolp * (1 - dolp)
 LITTLE_EVIDENCE = 0.1  # mean evidence of a frame with a silence of 1/2
@@ -49,22 +54,22 @@ def error_features(
 ) -> Float[Tensor, "n k 2*h 2*w"]:
     """Compute features of the errors of `dolp` at half its resolution; the candidates are at quarter resolution.
 
-    The five features are:
+    The four basic features are:
 
     - log of the weighted variance of the candidates' DoLP,
-    - log of the candidates' evidence,
-    - mean of the first feature over the frame,
+    - mean of this feature over the frame,
     - silence: lack of evidence in the frame, from 0 to 1,
     - log of the room for errors, dolp * (1 - dolp).
+
+    Their squares and products follow.
     """
     total = weights.sum(1, keepdim=True).clamp(min=MIN_WEIGHT)
     mean = (weights * candidates).sum(1, keepdim=True) / total
     variance = (weights * (candidates - mean).square()).sum(1, keepdim=True) / total
-    disagreement = torch.log(variance + MIN_DISAGREEMENT)
-    of_pixels = torch.cat([disagreement, torch.log1p(evidence).mean(1, keepdim=True)], dim=1)
+    disagreement = torch.log((variance + MIN_DISAGREEMENT) / USUAL_DISAGREEMENT)
     silence = 1 / (1 + evidence.mean((1, 2, 3)) / LITTLE_EVIDENCE)
-    of_frame = [disagreement.mean((-1, -2), keepdim=True), silence[:, None, None, None]]
     bounded = block_means(dolp, 2).clamp(0, 1)
-    room = torch.log(bounded * (1 - bounded) + MIN_ROOM)
-    fine = enlarged(of_pixels, 2)
-    return torch.cat([fine, *(one.expand_as(room) for one in of_frame), room], dim=1)
+    room = torch.log((bounded * (1 - bounded) + MIN_ROOM) / USUAL_ROOM)
+    of_frame = [disagreement.mean((-1, -2), keepdim=True), silence[:, None, None, None]]
+    basic = [enlarged(disagreement, 2), *(one.expand_as(room) for one in of_frame), room]
+    return torch.cat([*basic, *(a * b for a, b in combinations_with_replacement(basic, 2))], dim=1)

@@ -48,6 +48,7 @@ MAX_DOLP = 0.98  # largest DoLP passed to atanh, to keep it finite
 SENSITIVITY_TENSORS = 2  # numbers of ON and OFF events, and the change of their weights
 PANORAMA_TENSORS = 1 + len(Panorama._fields)  # events of the previous window, then the panorama
 NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window: no sums, moments or wide sums, and no more
+SOLVER_TENSORS = SENSITIVITY_TENSORS + len(NO_STATE) + PANORAMA_TENSORS  # the recurrent layers' states follow
 LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
 LOG_VARIANCE_OUTPUTS = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
 
@@ -119,6 +120,24 @@ class Candidates(NamedTuple):
     dolp: Float[Tensor, "n c h w"]
     evidence: Float[Tensor, "n c h w"]
     """Weighted number of events behind the solution; for the panorama, weighted energy of its slopes."""
+
+
+class Solved(NamedTuple):
+    """First half of the network, for n = t * b images: the input of `StokesUNet.refine_windows`."""
+
+    x2: Float[Tensor, "n c h/2 w/2"]
+    """The U-Net's features at half resolution."""
+    x4: Float[Tensor, "n d h/4 w/4"]
+    """Its features at quarter resolution."""
+    candidates: Candidates
+    sums: list[Float[Tensor, "t b m 2 h w"]]
+    """Sums of e0 - e90 and e45 - e135 for each memory, at single pixels and averaged over each width of `WIDE`."""
+    images: Float[Tensor, "n 4 h/2 w/2"]
+    """The panorama's four images."""
+    certain: Float[Tensor, "n 1 1 1"]
+    """The panorama's certainty."""
+    size: tuple[int, int]
+    """Height and width of the sensor."""
 
 
 class StokesUNet(nn.Module):
@@ -219,16 +238,22 @@ class StokesUNet(nn.Module):
         self, inputs: Float[Tensor, "t b 8 h w"], state: list[Tensor] | None = None
     ) -> tuple[Prediction, Float[Tensor, "n k h2 w2"], list[Tensor]]:
         """Same as `unroll`, with the `error_features` of the n = t * b padded images at half resolution."""
+        before = state or []
+        solved, solver = self.solve_windows(inputs, before[:SOLVER_TENSORS])
+        prediction, features, recurrent = self.refine_windows(solved, before[SOLVER_TENSORS:])
+        return prediction, features, [*solver, *recurrent]
+
+    def solve_windows(self, inputs: Float[Tensor, "t b 8 h w"], state: list[Tensor]) -> tuple[Solved, list[Tensor]]:
+        """First half of `unroll`: everything before the recurrent layers. `state` is empty at the start."""
         t, b, _, height, width = inputs.shape
         side = STRIDE * self.binning
         inputs = block_means(F.pad(inputs, (0, -width % side, 0, -height % side)), self.binning)  # no events in padding
         polarity, count = inputs.unflatten(2, (4, IMAGES)).unbind(3)
-        equalised, sensitivity = self.equaliser(polarity, count, state[:SENSITIVITY_TENSORS] if state else [])
+        equalised, sensitivity = self.equaliser(polarity, count, state[:SENSITIVITY_TENSORS])
         if "sensitivity" not in self.without:
             polarity, count = equalised.polarity, equalised.events
-        before_sums, before_moments, *others = state[SENSITIVITY_TENSORS:] if state else NO_STATE
-        before_wide, others = others[: len(WIDE)], others[len(WIDE) :]
-        before_panorama, recurrent = others[:PANORAMA_TENSORS], others[PANORAMA_TENSORS:]
+        before_sums, before_moments, *others = state[SENSITIVITY_TENSORS:] or NO_STATE
+        before_wide, before_panorama = others[: len(WIDE)], others[len(WIDE) :]
 
         keep = self.memories.view(-1, 1, 1, 1)
         sensor = (math.ceil(height / self.binning), math.ceil(width / self.binning))
@@ -245,13 +270,24 @@ class StokesUNet(nn.Module):
 
         x2 = on_blocks(self.stem, _event_images(sums.flatten(0, 1), scale * count.flatten(0, 1)))
         x2 = F.relu(x2 + self.from_mosaic(_panorama_images(images, certain)))
-        y4, recurrent = self._quarter(x2, candidates, b, recurrent)
+        solved = Solved(
+            x2, self._joined(x2, candidates), candidates, [_differences(sums), *wide], images, certain, (height, width)
+        )
+        return solved, [*sensitivity, steps[-1], moments, *(means[-1] for means in wide_steps), *next_panorama]
+
+    def refine_windows(
+        self, solved: Solved, state: list[Tensor]
+    ) -> tuple[Prediction, Float[Tensor, "n k h2 w2"], list[Tensor]]:
+        """Second half of `unroll`. `state` holds the states of the recurrent layers, empty at the start."""
+        x2, x4, candidates, sums, images, certain, (height, width) = solved
+        t, b = sums[0].shape[:2]
+        y4, recurrent = self._quarter(x4, b, state)
         y2 = self.at_half(self.up_half(y4, skip=x2))
 
         weights = self.choose(y4).float().softmax(1)
         coarse = enlarged(self._mixed(candidates, weights), 4)
         gains = self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float())
-        moved = _moved(coarse[:, :2], [_differences(sums), *wide], gains)
+        moved = _moved(coarse[:, :2], sums, gains)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
         share = certain * enlarged(torch.sigmoid(self.trust(y2).float()), 2)
         fine = torch.cat(averaged(moved, dolp, images[:, 1:3], share, self.around), dim=1)
@@ -266,8 +302,7 @@ class StokesUNet(nn.Module):
         aolp = torch.remainder(torch.atan2(stokes[:, 1], stokes[:, 0]) / 2, math.pi)
         maps = [dolp, aolp, log_variance, stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
-        state = [*sensitivity, steps[-1], moments, *(means[-1] for means in wide_steps), *next_panorama, *recurrent]
-        return prediction, self._enlarged(features), state
+        return prediction, self._enlarged(features), recurrent
 
     @torch.no_grad()
     def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:
@@ -336,13 +371,16 @@ class StokesUNet(nn.Module):
             own = F.pad(panorama.own, (0, own.shape[-1] - width, 0, own.shape[-2] - height))
             return images, certain, [events[-1], panorama.level, own, panorama.explained]
 
-    def _quarter(
-        self, x2: Float[Tensor, "n c h2 w2"], candidates: Candidates, streams: int, state: list[Tensor]
-    ) -> tuple[Float[Tensor, "n d h w"], list[Tensor]]:
-        """Return the U-Net's features at quarter resolution, and the recurrent states after the last window."""
+    def _joined(self, x2: Float[Tensor, "n c h2 w2"], candidates: Candidates) -> Float[Tensor, "n d h w"]:
+        """Return the U-Net's features at quarter resolution, before the recurrent layers."""
         inputs = torch.cat([*candidates[:3], torch.log1p(candidates.evidence)], dim=1)
         inputs = inputs.contiguous(memory_format=torch.channels_last)
-        x4 = F.relu(self.join(F.relu(self.to_quarter(x2) + self.from_candidates(inputs))))
+        return F.relu(self.join(F.relu(self.to_quarter(x2) + self.from_candidates(inputs))))
+
+    def _quarter(
+        self, x4: Float[Tensor, "n d h w"], streams: int, state: list[Tensor]
+    ) -> tuple[Float[Tensor, "n d h w"], list[Tensor]]:
+        """Return the features after the recurrent layers, and these layers' states after the last window."""
         if "recurrence" in self.without:
             streams, state = len(x4), []
         g4, first = self.gru_quarter(x4, streams, state[0] if state else None)

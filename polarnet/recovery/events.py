@@ -15,7 +15,6 @@ from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.methods.method import State, each_map
 from polarnet.networks.checkpoint import load_network
 from polarnet.networks.weights import shipped_weights
-from polarnet.recovery.stream import PIXELS_AT_ONCE
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
 
 
@@ -70,7 +69,7 @@ def recover(
         *load_network(weights or shipped_weights()), device, thresholds=thresholds, binning=binning
     )
     state: State = recoverer.start(events[0].height, events[0].width)
-    size, parts = max(1, PIXELS_AT_ONCE // (events[0].height * events[0].width)), []
+    size, parts = recoverer.at_once(events[0].height, events[0].width), []
     for first in range(0, len(windows), size):
         state, prediction = recoverer.step(state, windows[first : first + size])
         parts.append(each_map(prediction, Tensor.cpu))

@@ -13,7 +13,7 @@ from polarnet.methods.between import Between, BetweenConfig, anchored, carried
 from polarnet.methods.method import Recoverer, each_map
 from polarnet.methods.overlap import advance, begin, warm_up
 from polarnet.recordings.live import Piece
-from polarnet.recovery.stream import PIXELS_AT_ONCE, Frame, Input, runs_of
+from polarnet.recovery.stream import Frame, Input, runs_of
 
 
 class Rate(NamedTuple):
@@ -54,9 +54,7 @@ def check_rate(rate_hz: float, rule: WindowRule, recoverer: Recoverer) -> None:
         )
 
 
-def frames_at_rate(
-    source: Input, rule: WindowRule, recoverer: Recoverer, rate: Rate, pixels_at_once: int = PIXELS_AT_ONCE
-) -> Iterator[Frame]:
+def frames_at_rate(source: Input, rule: WindowRule, recoverer: Recoverer, rate: Rate) -> Iterator[Frame]:
     """Yield the frames of a rate, each as soon as its last event has arrived and its window has been processed.
 
     The method runs once a window, as in `frames_of`. The window of a frame, whose events the pictures show, ends at the
@@ -65,7 +63,7 @@ def frames_at_rate(
     warm_up(recoverer, source.height, source.width)
     cutter = WindowCutter(rule, source.height, source.width)
     history = begin(recoverer, source.height, source.width)
-    most = max(1, pixels_at_once // (source.height * source.width))
+    most = recoverer.at_once(source.height, source.width)
     held: Sequence[Events] = [Events.empty(source.height, source.width)] * 4
     state, number = None, 0
     for piece in source.pieces:

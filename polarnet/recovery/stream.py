@@ -40,7 +40,6 @@ from polarnet.storage.exchange import EXPORT_INDEX
 from polarnet.storage.parts import unknown_sequence
 
 STANDARD_INPUT = "-"
-PIXELS_AT_ONCE = 4 * 120 * 180  # total over the windows of one batch; bounds the memory of a network
 BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}{postfix}]"
 LIVE_BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
 
@@ -271,18 +270,16 @@ def open_method(
     return method.open(setup), name
 
 
-def frames_of(
-    source: Input, rule: WindowRule, recoverer: Recoverer, pixels_at_once: int = PIXELS_AT_ONCE
-) -> Iterator[Frame]:
+def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: int | None = None) -> Iterator[Frame]:
     """Yield a frame for each window as soon as the window's last event has arrived.
 
-    Windows that are already available, such as those of a file, are processed in batches of up to `pixels_at_once`
-    pixels.
+    Windows that are already available, such as those of a file, are processed in runs of up to `at_once` windows
+    (default: `Recoverer.at_once`).
     """
     warm_up(recoverer, source.height, source.width, source.channels)
     cutter = WindowCutter(rule, source.height, source.width, source.channels)
     history = begin(recoverer, source.height, source.width)
-    most = max(1, pixels_at_once // (source.height * source.width))
+    most = at_once or recoverer.at_once(source.height, source.width)
     for piece in source.pieces:
         for windows in runs_of(cutter.add(piece.channels, piece.until_us), most):
             start = time.perf_counter()
@@ -327,7 +324,7 @@ def recover(
         ) as bar,
     ):
         for frame in frames or frames_of(source, rule, recoverer):
-            writer.add(frame.window, frame.prediction)
+            writer.add(frame.window, frame.prediction, live)
             steps.append(frame.step_s)
             latencies.append(frame.latency_s)
             bar.update(frame.window.stop_us - last_us)

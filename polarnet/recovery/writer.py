@@ -43,7 +43,7 @@ VIDEO = "recovered.mp4"
 PNG_STORED, NO_FILTER = 0, 8  # no compression, libpng's PNG_FILTER_NONE: larger files, but fast to write
 MIN_FREE_BYTES = 2**26  # disk space kept free for the last frames, the video's index and the page
 MAX_QUEUED = 64  # frames waiting to be written
-FEW_CORES = 2  # up to this number, the network needs all cores: a concurrent writing thread delays every operation
+FEW_CORES = 2  # up to this number, a live camera's network needs all cores: a writing thread delays every operation
 SHEET_PICTURES = 3  # pictures in recovered.png
 GAP = 4  # pixels between the maps of a picture
 ZARR_CONVENTIONS = {
@@ -123,11 +123,11 @@ class RecoveryWriter:
             self._arrays.flush()  # after an error, too: the frames up to it are whole
             self._video.close()
 
-    def add(self, window: EventWindow, prediction: Prediction) -> None:
-        """Add a frame on the CPU; returns before it is written, unless the queue is long or cores are few."""
+    def add(self, window: EventWindow, prediction: Prediction, live: bool = False) -> None:
+        """Add a frame on the CPU; returns before it is written, unless the queue is long, or `live` and cores few."""
         self._plain = plain_intensity(prediction) is not None
         self._waiting.append(self._thread.submit(self._write, self.frames, window, prediction))
-        self._wait(MAX_QUEUED if usable_cores() > FEW_CORES else 0)
+        self._wait(0 if live and usable_cores() <= FEW_CORES else MAX_QUEUED)
         self.frames += 1
 
     def write_page(self, source: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:

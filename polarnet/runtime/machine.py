@@ -67,18 +67,25 @@ def limit_threads(threads: int) -> None:
 
 
 @contextmanager
+def torch_threads(number: int) -> Iterator[None]:
+    """Run torch on this number of threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
 def one_thread() -> Iterator[None]:
     """Run torch on one thread, so that its bytes do not depend on the number of threads.
 
     Threads split an image between them. torch computes the last values of each part one by one, and rounds them
     differently from whole vectors.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with torch_threads(1):
         yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def on_one_thread(function: Callable[[Item], Result], item: Item) -> Result:

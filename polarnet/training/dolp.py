@@ -16,11 +16,15 @@ from polarnet.training.losses import LossConfig, PolarizationLoss
 from polarnet.training.sequences import Batch
 from polarnet.training.task import State, Task, initialised
 
+FITTED = "expected."  # tensors of the expected errors, which every training fits anew
+
 
 def dolp_task(
     name: str, network_config: NetworkConfig, config: TrainConfig, loss: LossConfig, lpips: Lpips | None, seed: int
 ) -> Task:
     """Build the task that trains a network `name` (a key of NETWORKS), from the seed or from `config.start`.
+
+    The expected errors of `config.start` are left out, because they fit the errors of that network.
 
     The truth is a stack of DoLP, s1 and s2. The prediction is the same stack plus the log-variance, or DoLP alone if
     the network predicts nothing else. ValueError if the checkpoint holds another network, FileNotFoundError if there is
@@ -34,7 +38,8 @@ def dolp_task(
     start: dict[str, str] = {}
     if config.start is not None:
         tensors, known = load_checkpoint(config.start)
-        load_tensors(network, tensors, Path(config.start))
+        unfitted = {key: tensor for key, tensor in network.state_dict().items() if key.startswith(FITTED)}
+        load_tensors(network, tensors | unfitted, Path(config.start))
         start = {"start_sha256": known["sha256"]}
 
     def unroll(inputs: Tensor, state: State) -> tuple[Float[Tensor, "t b k h w"], State]:

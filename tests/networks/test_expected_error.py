@@ -3,7 +3,16 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.expected_error import FEATURES, MIN_DISAGREEMENT, MIN_ROOM, ExpectedError, error_features
+from polarnet.networks.expected_error import (
+    BASIC,
+    FEATURES,
+    MIN_DISAGREEMENT,
+    MIN_ROOM,
+    USUAL_DISAGREEMENT,
+    USUAL_ROOM,
+    ExpectedError,
+    error_features,
+)
 
 EVEN = torch.full((1, 2, 4, 6), 0.5)
 
@@ -14,14 +23,15 @@ def features(candidates=EVEN, weights=EVEN, evidence=EVEN, dolp=0.5):
 
 def test_candidates_that_agree_say_the_least_and_the_others_how_far_they_are_apart():
     assert features().shape == (1, FEATURES, 8, 12)
-    apart, _, of_frame, _, _ = features()[0]
-    assert apart.unique().item() == of_frame.unique().item() == pytest.approx(math.log(MIN_DISAGREEMENT))
+    agree = math.log(MIN_DISAGREEMENT / USUAL_DISAGREEMENT)
+    apart, of_frame, _, _ = features()[0, :BASIC]
+    assert apart.unique().item() == of_frame.unique().item() == pytest.approx(agree)
     candidates = EVEN.clone()
     candidates[:, 0, :, 3:] = 0.9
-    apart, _, of_frame, _, _ = features(candidates)[0]
-    disagree = math.log(0.2**2 + MIN_DISAGREEMENT)
+    apart, of_frame, _, _ = features(candidates)[0, :BASIC]
+    disagree = math.log((0.2**2 + MIN_DISAGREEMENT) / USUAL_DISAGREEMENT)
     assert apart[:, -1].unique().item() == pytest.approx(disagree)
-    assert of_frame.unique().item() == pytest.approx((disagree + math.log(MIN_DISAGREEMENT)) / 2)
+    assert of_frame.unique().item() == pytest.approx((disagree + agree) / 2)
 
 
 def test_a_candidate_that_the_network_does_not_trust_does_not_count():
@@ -32,24 +42,32 @@ def test_a_candidate_that_the_network_does_not_trust_does_not_count():
 
 
 def test_much_evidence_hardly_any_and_none_in_a_frame_are_told_apart():
-    assert features(evidence=3 * EVEN)[0, 1].unique().item() == pytest.approx(math.log(2.5))
-    silence = [features(evidence=share * EVEN)[0, 3].unique().item() for share in (100, 0.2, 0)]
+    silence = [features(evidence=share * EVEN)[0, 2].unique().item() for share in (100, 0.2, 0)]
     assert silence == pytest.approx([0, 0.5, 1], abs=0.01)
     evidence = 0 * EVEN
     evidence[..., 0] = 60.0
-    assert features(evidence=evidence)[0, 3].unique().item() < 0.01
+    assert features(evidence=evidence)[0, 2].unique().item() < 0.01
 
 
 def test_errors_of_middle_values_have_most_room():
-    assert features(dolp=0.2)[0, 4].unique().item() == pytest.approx(math.log(0.16 + MIN_ROOM))
-    assert features(dolp=-0.1)[0, 4].unique().item() == features(dolp=1.1)[0, 4].unique().item()
+    assert features(dolp=0.2)[0, 3].unique().item() == pytest.approx(math.log((0.16 + MIN_ROOM) / USUAL_ROOM))
+    assert features(dolp=-0.1)[0, 3].unique().item() == features(dolp=1.1)[0, 3].unique().item()
+
+
+def test_squares_and_products_of_all_pairs_follow():
+    candidates, evidence = EVEN.clone(), 0.1 * EVEN
+    candidates[:, 0, :, 3:] = 0.9
+    computed = features(candidates, evidence=evidence, dolp=0.2)[0]
+    basic = computed[:BASIC]
+    pairs = [basic[j] * basic[k] for j in range(BASIC) for k in range(j, BASIC)]
+    torch.testing.assert_close(computed[BASIC:], torch.stack(pairs))
 
 
 def test_it_says_nothing_until_it_is_told_and_has_nothing_to_learn():
     expected = ExpectedError()
     assert not [*expected.parameters()]
     assert not expected(torch.randn(2, FEATURES, 3, 5)).any()
-    expected.weight.copy_(torch.tensor([1.0, 0.0, 0.0, 0.0, 2.0]))
+    expected.weight[0], expected.weight[-1] = 1.0, 2.0
     expected.bias.fill_(-3.0)
     inputs = torch.randn(2, FEATURES, 3, 5)
-    torch.testing.assert_close(expected(inputs), inputs[:, :1] + 2 * inputs[:, 4:] - 3)
+    torch.testing.assert_close(expected(inputs), inputs[:, :1] + 2 * inputs[:, -1:] - 3)

@@ -41,7 +41,7 @@ def cores(request, monkeypatch):
 def written(tmp_path, cores):
     with RecoveryWriter(tmp_path, ("zarr", "png", "exr", "mp4"), 30.0) as writer:
         for k in range(FRAMES):
-            writer.add(window(k), frame(k))
+            writer.add(window(k), frame(k), live=True)
     writer.write_page("a & b", {"windows": "of 1 ms"}, ["one note"])
     return tmp_path
 
@@ -112,7 +112,7 @@ def test_a_full_disk_stops_at_a_whole_frame_and_says_so(tmp_path, cores, monkeyp
     def write() -> None:
         with RecoveryWriter(tmp_path, ("zarr", "png"), 30.0) as writer:
             for k in range(FRAMES):
-                writer.add(window(k), frame(k))
+                writer.add(window(k), frame(k), live=True)
 
     with pytest.raises(OSError, match=r"the disk is full; all 3 frames"):
         write()

@@ -1,5 +1,7 @@
 import dataclasses
 import json
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -8,7 +10,7 @@ from test_loop import CPU, LOOP, SEED, Killed, bytes_of, run
 
 from polarnet.config.tree import load
 from polarnet.events.representations import event_tensor
-from polarnet.networks.checkpoint import load_network
+from polarnet.networks.checkpoint import load_checkpoint, load_network
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.training.calibration import RIDGES, Scene, fitted, weights_for
@@ -23,9 +25,9 @@ LOSS = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=0.04, ha
 
 @pytest.fixture(scope="module")
 def task_of(project_root):
-    """A new task of a small polarnet."""
+    """A new task of a small polarnet, from a checkpoint if one is given."""
     config = dataclasses.replace(load(project_root).networks.polarnet, channels=[4, 4, 4], reach=3, scales=[1, 0])
-    return lambda: dolp_task("polarnet", config, TRAIN, LOSS, None, SEED)
+    return lambda start=None: dolp_task("polarnet", config, dataclasses.replace(TRAIN, start=start), LOSS, None, SEED)
 
 
 def scenes_of(in_all: float, in_each: float) -> list[Scene]:
@@ -151,33 +153,35 @@ def test_of_what_it_has_seen_nothing_of_it_expects_the_errors_of_a_guess(stores,
     assert still[0] == pytest.approx(sum(errors) / len(errors), rel=0.25)
 
 
-@pytest.mark.parametrize(("scene_dolp", "sequences"), [(None, 2), ([0.045, 0.13], 3)])
-def test_it_rests_on_variants_only_if_the_scenes_it_is_for_are_named(stores, tmp_path, task_of, scene_dolp, sequences):
-    source = FrameStore.open(stores[1])
-    frames = FrameStore.create(
-        tmp_path / "frames.zarr",
-        source.sequences,
-        source.splits,
-        len(source.t_us("a")),
-        source.height,
-        source.width,
-        {},
-        variant_of={"b": "a"},
+def rewritten(frames: Path, path: Path, dolp_factors: Mapping[str, float], variant_of: Mapping[str, str]) -> FrameStore:
+    """A copy of a frame store, with DoLP multiplied by the factor of its sequence, and with variants."""
+    source = FrameStore.open(frames)
+    windows = len(source.t_us(source.sequences[0]))
+    copy = FrameStore.create(
+        path, source.sequences, source.splits, windows, source.height, source.width, {}, variant_of=variant_of
     )
     for name in source.sequences:
-        frames.write(name, *source.frames(name))
-    frames.finish()
+        t_us, intensity, dolp, aolp, *valid = source.frames(name)
+        copy.write(name, t_us, intensity, dolp_factors.get(name, 1.0) * dolp, aolp, *valid)
+    copy.finish()
+    return FrameStore.open(path)
+
+
+@pytest.mark.parametrize(("scene_dolp", "sequences"), [(None, 2), ([0.045, 0.13], 3)])
+def test_it_rests_on_variants_only_if_the_scenes_it_is_for_are_named(stores, tmp_path, task_of, scene_dolp, sequences):
+    frames = rewritten(stores[1], tmp_path / "frames.zarr", {}, {"b": "a"})
     task = dataclasses.replace(task_of(), scene_dolp=scene_dolp)
     content = bytes_of(run(task, (stores[0], tmp_path / "frames.zarr"), tmp_path / "run", TRAIN))
-    assert source.of_split("train") == ["a", "b", "c"]
+    assert frames.of_split("train") == ["a", "b", "c"]
     assert json.loads(content["best.json"])["expected_errors"]["sequences"] == sequences
 
 
-def test_for_weakly_polarized_scenes_it_expects_more_of_what_the_weakest_ones_had(stores, task_of):
+def test_for_weakly_polarized_scenes_it_expects_more_of_what_the_weakest_ones_had(stores, tmp_path, task_of):
+    rewritten(stores[1], tmp_path / "frames.zarr", {"a": 1.3, "c": 1.3}, {})  # which no event tells
     off_by = []
     for scene_dolp in (None, [0.0001, 0.0002]):
         task = dataclasses.replace(task_of(), scene_dolp=scene_dolp)
-        split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
+        split = open_split(EventStore.open(stores[0]), str(tmp_path / "frames.zarr"), task.encode)
         weakest = min(split.train, key=lambda sequence: float(sequence.dolp.mean()))
         calibrate(task, split.train, TRAIN, CPU, 0)
         with torch.no_grad():
@@ -185,6 +189,18 @@ def test_for_weakly_polarized_scenes_it_expects_more_of_what_the_weakest_ones_ha
         errors = (prediction.dolp[:, 0].clamp(0, 1) - weakest.dolp).square().mean()
         off_by.append(abs(float((prediction.log_variance.exp().mean() / errors).log())))
     assert off_by[1] < 0.8 * off_by[0]
+
+
+def test_a_training_starts_from_the_weights_of_another_but_not_from_its_expected_errors(stores, tmp_path, task_of):
+    run(task_of(), stores, tmp_path / "run", TRAIN)
+    start = tmp_path / "run" / "out" / "best.safetensors"
+    tensors, _ = load_checkpoint(start)
+    begun = task_of(str(start)).network.state_dict()
+    assert tensors["expected.weight"].any()
+    assert not begun["expected.weight"].any()
+    assert begun["expected.bias"] == 0
+    others = [name for name in begun if not name.startswith("expected.")]
+    assert all(torch.equal(begun[name], tensors[name]) for name in others)
 
 
 @pytest.mark.thorough
