@@ -127,8 +127,6 @@ class Solved(NamedTuple):
 
     x2: Float[Tensor, "n c h/2 w/2"]
     """The U-Net's features at half resolution."""
-    x4: Float[Tensor, "n d h/4 w/4"]
-    """Its features at quarter resolution."""
     candidates: Candidates
     sums: list[Float[Tensor, "t b m 2 h w"]]
     """Sums of e0 - e90 and e45 - e135 for each memory, at single pixels and averaged over each width of `WIDE`."""
@@ -270,18 +268,16 @@ class StokesUNet(nn.Module):
 
         x2 = on_blocks(self.stem, _event_images(sums.flatten(0, 1), scale * count.flatten(0, 1)))
         x2 = F.relu(x2 + self.from_mosaic(_panorama_images(images, certain)))
-        solved = Solved(
-            x2, self._joined(x2, candidates), candidates, [_differences(sums), *wide], images, certain, (height, width)
-        )
+        solved = Solved(x2, candidates, [_differences(sums), *wide], images, certain, (height, width))
         return solved, [*sensitivity, steps[-1], moments, *(means[-1] for means in wide_steps), *next_panorama]
 
     def refine_windows(
         self, solved: Solved, state: list[Tensor]
     ) -> tuple[Prediction, Float[Tensor, "n k h2 w2"], list[Tensor]]:
         """Second half of `unroll`. `state` holds the states of the recurrent layers, empty at the start."""
-        x2, x4, candidates, sums, images, certain, (height, width) = solved
+        x2, candidates, sums, images, certain, (height, width) = solved
         t, b = sums[0].shape[:2]
-        y4, recurrent = self._quarter(x4, b, state)
+        y4, recurrent = self._quarter(x2, candidates, b, state)
         y2 = self.at_half(self.up_half(y4, skip=x2))
 
         weights = self.choose(y4).float().softmax(1)
@@ -371,16 +367,13 @@ class StokesUNet(nn.Module):
             own = F.pad(panorama.own, (0, own.shape[-1] - width, 0, own.shape[-2] - height))
             return images, certain, [events[-1], panorama.level, own, panorama.explained]
 
-    def _joined(self, x2: Float[Tensor, "n c h2 w2"], candidates: Candidates) -> Float[Tensor, "n d h w"]:
-        """Return the U-Net's features at quarter resolution, before the recurrent layers."""
+    def _quarter(
+        self, x2: Float[Tensor, "n c h2 w2"], candidates: Candidates, streams: int, state: list[Tensor]
+    ) -> tuple[Float[Tensor, "n d h w"], list[Tensor]]:
+        """Return the U-Net's features at quarter resolution, and the recurrent states after the last window."""
         inputs = torch.cat([*candidates[:3], torch.log1p(candidates.evidence)], dim=1)
         inputs = inputs.contiguous(memory_format=torch.channels_last)
-        return F.relu(self.join(F.relu(self.to_quarter(x2) + self.from_candidates(inputs))))
-
-    def _quarter(
-        self, x4: Float[Tensor, "n d h w"], streams: int, state: list[Tensor]
-    ) -> tuple[Float[Tensor, "n d h w"], list[Tensor]]:
-        """Return the features after the recurrent layers, and these layers' states after the last window."""
+        x4 = F.relu(self.join(F.relu(self.to_quarter(x2) + self.from_candidates(inputs))))
         if "recurrence" in self.without:
             streams, state = len(x4), []
         g4, first = self.gru_quarter(x4, streams, state[0] if state else None)
