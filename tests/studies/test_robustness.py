@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 from collections import Counter
 
 import pytest
@@ -7,7 +8,7 @@ from polarnet.benchmark.score import FrameScore
 from polarnet.config.pipeline import context_of
 from polarnet.networks.weights import shipped_weights
 from polarnet.storage.scenes import SceneStore
-from studies.rate import rated_scores
+from studies.rate import EVENTS_PER_PIXEL, random_windows, rated_scores
 from studies.robustness import SENSORS, Scores, headlines, table_of
 from studies.scored_pictures import settings, sources_of
 
@@ -82,3 +83,12 @@ def test_a_folder_with_a_manifest_has_a_source_for_each_repo(tmp_path):
 @pytest.mark.parametrize("name", SENSORS)
 def test_every_sensor_but_the_default_changes_the_configuration(name):
     assert (settings(*SENSORS[name]) == settings()) == (name == "default")
+
+
+def test_random_windows_follow_each_other_and_hold_as_many_events_as_a_camera_fires():
+    windows = random_windows(24, 36, 5)
+    assert all(one.stop_us == after.start_us for one, after in itertools.pairwise(windows))
+    for window in windows:
+        assert all(((events.t >= window.start_us) & (events.t < window.stop_us)).all() for events in window.channels)
+    per_pixel = sum(len(events) for window in windows for events in window.channels) / (5 * 4 * 24 * 36)
+    assert per_pixel == pytest.approx(EVENTS_PER_PIXEL, rel=0.01)
