@@ -13,14 +13,7 @@ from torch import Tensor, nn
 from polarnet.events.representations import REPRESENTATIONS, Encode, event_counts
 from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
-from polarnet.methods.method import (
-    Recoverer,
-    Setup,
-    State,
-    WeightsConfig,
-    each_map,
-    weights_file,
-)
+from polarnet.methods.method import Recoverer, Setup, State, WeightsConfig, each_map, weights_file
 from polarnet.methods.two_threads import Sharing
 from polarnet.methods.window_length import of_any_length
 from polarnet.networks.checkpoint import load_network, trained_window_us
@@ -58,9 +51,9 @@ def dolp_recoverer(
     """Wrap a network and the metadata of its checkpoint (`load_network`) as a method.
 
     `precision` is fp32 or bf16 (autocast). Two threads share runs of many windows (`polarnet.methods.two_threads`).
-    Windows may have any length (`polarnet.methods.window_length`).
-    `thresholds` are the camera's contrast thresholds, ON and OFF (`told`), and `binning` is the side of the pixel
-    blocks that the network sees (default: that of its training).
+    Windows may have any length (`polarnet.methods.window_length`). `thresholds` are the camera's contrast thresholds,
+    ON and OFF (`told`), and `binning` is the side of the pixel blocks that the network sees (default: that of its
+    training).
     """
     place = torch.device(device)
     ready: Any = network.to(place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
@@ -77,8 +70,8 @@ def dolp_recoverer(
         return encoded(windows, encode)[:, None].to(place)
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        if sharing is not None and sharing.takes(windows):
-            return sharing.predict(state, windows)
+        if sharing is not None and len(parts := sharing.parts(windows)) > 1:
+            return sharing.predict(state, parts)
         with autocast():
             prediction, state = ready.unroll(encode_on_device(windows), state)
         return state, each_map(prediction, lambda field: field[:, 0])

@@ -1,8 +1,8 @@
 """Run polarnet's network on two threads, for runs of many windows.
 
 The first half of the network (`StokesUNet.solve_windows`) does not depend on its recurrent layers. One thread therefore
-solves the next windows while the other refines the present ones. Both halves take about as long. A window is many short
-operations, which two threads cannot share nearly as well.
+solves the next windows while the other refines the present ones. On a small sensor, a window is many short operations,
+which two threads share less well (docs/benchmark.md has windows a second).
 """
 
 from collections import deque
@@ -42,22 +42,22 @@ class Sharing(NamedTuple):
         """Number of windows of a run; one thread has nobody to share them with."""
         return (PARTS if torch.get_num_threads() > 1 else 1) * self.part(height, width)
 
-    def takes(self, windows: Sequence[EventWindow]) -> bool:
-        """Whether there are two threads, and several parts for them."""
+    def parts(self, windows: Sequence[EventWindow]) -> list[Sequence[EventWindow]]:
+        """Split a run of windows; on one thread, the run is a single part."""
+        if torch.get_num_threads() == 1:
+            return [windows]
         first = windows[0].channels[0]
-        return torch.get_num_threads() > 1 and len(windows) > self.part(first.height, first.width)
+        size = self.part(first.height, first.width)
+        return [windows[k : k + size] for k in range(0, len(windows), size)]
 
-    def predict(self, state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        """State and prediction after a run of windows, as `Recoverer.predict`.
+    def predict(self, state: State, parts: Sequence[Sequence[EventWindow]]) -> tuple[State, Prediction]:
+        """State and prediction after all windows of the `parts` of a run, as `Recoverer.predict`.
 
         Results are those of `StokesUNet.unroll` for each part. Each thread has half of torch's threads.
         """
-        first = windows[0].channels[0]
-        size = self.part(first.height, first.width)
-        parts = [windows[k : k + size] for k in range(0, len(windows), size)]
         before = state or []
         solver, recurrent = before[:SOLVER_TENSORS], before[SOLVER_TENSORS:]
-        half = max(1, torch.get_num_threads() // 2)
+        half = torch.get_num_threads() // 2
 
         def solve(part: Sequence[EventWindow]) -> Solved:
             nonlocal solver

@@ -19,8 +19,8 @@ from polarnet.networks.redundancy import block_means
 BASIC = 4
 FEATURES = BASIC + BASIC * (BASIC + 1) // 2  # basic ones, their squares and products
 MIN_DISAGREEMENT = 1e-3  # squared DoLP, added because candidates that agree may share an error
-USUAL_DISAGREEMENT = 0.007  # squared DoLP; disagreement and room are relative to usual values, so that products of
-USUAL_ROOM = 0.17  # features say more than the features
+USUAL_DISAGREEMENT = 0.007  # squared DoLP; features near 0 are less collinear with their squares and products
+USUAL_ROOM = 0.17  # the same for the room for errors
 MIN_WEIGHT = 1e-6  # lower limit of the candidates' total weight
 MIN_ROOM = 0.05  # added to dolp * (1 - dolp)
 LITTLE_EVIDENCE = 0.1  # mean evidence of a frame with a silence of 1/2

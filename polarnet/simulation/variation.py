@@ -1,10 +1,9 @@
-"""Variants of training scenes: AoLP rotated, DoLP rescaled or drawn towards one value, intensity regraded, light added.
+"""Variants of training scenes: AoLP rotated, DoLP rescaled or drawn towards one value, intensity regraded.
 
 Photographs are highly polarized, because saturation becomes DoLP; measured scenes are hardly polarized. Variants lie in
 between and have any angle, so that a network cannot learn the averages of one kind of scene. A scene of about one hue
 has nearly uniform polarization. The logarithms of the four channels then change alike for any DoLP, and the only cue
-left is the pixel's response to dim and bright light. `uniform_share` makes more such scenes. Glass, paint and haze add
-light of their own polarization to a scene, which polarizes dark places most. `reflection_share` adds such light.
+left is the pixel's response to dim and bright light. `uniform_share` makes more such scenes.
 """
 
 import math
@@ -44,13 +43,9 @@ class VariationConfig:
     """Share of variants whose polarization is drawn towards a uniform one of random DoLP and AoLP."""
     uniform_weight: list[Annotated[float, Field(ge=0, le=1)]]
     """[smallest, largest] weight of the uniform polarization; 1: DoLP and AoLP are constant."""
-    reflection_share: Annotated[float, Field(ge=0, le=1)]
-    """Share of variants with added light of one intensity and one random polarization."""
-    reflection_intensity: list[Annotated[float, Field(gt=0)]]
-    """[smallest, largest] intensity of the added light, relative to the mean S0; its logarithm is drawn uniformly."""
 
     def __post_init__(self):
-        for name in ("dolp_factor", "s0_factor", "uniform_weight", "reflection_intensity"):
+        for name in ("dolp_factor", "s0_factor", "uniform_weight"):
             values = getattr(self, name)
             if len(values) != 2 or values[0] > values[1]:
                 raise ValueError(f"{name}: expected [smaller, larger], got {values}")
@@ -73,24 +68,7 @@ def varied(
         s0 = _graded(s0, config.s0_factor, config.s0_exponent_spread, generator)
     if generator.random() < config.uniform_share:
         dolp, aolp = _drawn_to_one(dolp, aolp, config.uniform_weight, generator)
-    scene = torch.stack([s0, dolp, aolp])
-    if generator.random() < config.reflection_share:
-        return _with_reflection(scene, config.reflection_intensity, generator)
-    return scene
-
-
-def _with_reflection(
-    scene: Float[Tensor, "3 h w"], intensity: list[float], generator: np.random.Generator
-) -> Float[Tensor, "3 h w"]:
-    """S0, DoLP and AoLP of a scene with added light of one intensity, DoLP and AoLP; S0 stays at most 1."""
-    low, high = map(math.log, intensity)
-    s0, dolp, aolp = scene.double()  # float32 would depend on the processor
-    added = math.exp(generator.uniform(low, high)) * s0.mean()
-    degree, angle = generator.uniform(0, MAX_DOLP), generator.uniform(0, math.pi)
-    light = torch.stack([added, added * degree * math.cos(2 * angle), added * degree * math.sin(2 * angle)])
-    mixed = (stokes.stokes_from_polarization(s0, dolp, aolp) + light[:, None, None]) / (1 + added)
-    maps = [mixed[0].clamp(max=1), stokes.dolp(mixed).clamp(max=MAX_DOLP), stokes.aolp(mixed)]
-    return torch.stack(maps).to(scene.dtype)
+    return torch.stack([s0, dolp, aolp])
 
 
 def _drawn_to_one(

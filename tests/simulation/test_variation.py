@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from polarnet.simulation.variation import VariationConfig, varied
-from polarnet.stokes import stokes_from_polarization
 
 CONFIG = VariationConfig(
     scenes_per_picture=1,
@@ -18,8 +17,6 @@ CONFIG = VariationConfig(
     s0_exponent_spread=0.35,
     uniform_share=0.0,
     uniform_weight=[0.5, 1.0],
-    reflection_share=0.0,
-    reflection_intensity=[0.05, 1.0],
 )
 
 
@@ -101,23 +98,3 @@ def test_a_weight_of_one_half_halves_the_variation_of_polarization():
 def test_a_range_upside_down_is_refused():
     with pytest.raises(ValueError, match="dolp_factor: expected \\[smaller, larger\\]"):
         replace(CONFIG, dolp_factor=[1.3, 0.1])
-
-
-def test_a_reflection_adds_light_of_one_intensity_and_polarization():
-    plain = replace(CONFIG, share=0.0)
-    before = stokes_from_polarization(*varied(scene(), plain, np.random.default_rng(5)).double())
-    lit = varied(
-        scene(), replace(plain, reflection_share=1.0, reflection_intensity=[0.5, 0.5]), np.random.default_rng(5)
-    )
-    after = stokes_from_polarization(*lit.double())
-    added = 0.5 * before[0].mean()
-    light = after * (1 + added) - before  # S0 is scaled by 1 / (1 + added), so that it stays at most 1
-    assert light.flatten(1).std(1).max() < 1e-5
-    assert light[0].mean().item() == pytest.approx(float(added), rel=1e-4)
-    assert 0 < float(light[1:].flatten(1).mean(1).norm() / added) < 0.99
-    assert lit[1][before[0] < 0.1].mean() != pytest.approx(float(scene()[1][before[0] < 0.1].mean()), rel=0.05)
-
-
-def test_a_reflection_of_no_intensity_is_refused():
-    with pytest.raises(ValueError, match="reflection_intensity"):
-        replace(CONFIG, reflection_intensity=[0.0, 1.0])
