@@ -6,7 +6,7 @@ the frames of the windows themselves. The first two are scored at 16 times betwe
 
 import itertools
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 
@@ -14,8 +14,8 @@ from polarnet.benchmark.between_windows import frames_between
 from polarnet.benchmark.resimulate import resimulated, sequence_at
 from polarnet.benchmark.rows import Context, opened, predictions_of
 from polarnet.benchmark.score import FrameScore, score_sequence
-from polarnet.events.stream import Events, concatenate, slice_time
-from polarnet.events.streaming import EventWindow
+from polarnet.events.stream import Events
+from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
 from polarnet.methods import METHODS
 from polarnet.methods.between import BetweenConfig, anchored, carried
 from polarnet.simulation.camera import Camera
@@ -32,6 +32,7 @@ HELD, ENDS = ", held", ", window ends"
 """Endings of the rows beside that of a network: its last frame unchanged, and its frames at the ends of windows."""
 FRAME_RATE_HZ = 30.0  # of the windows that `benchmark.warmup_windows` counts
 EVENTS_PER_PIXEL = 0.8  # a window; the default sensor's mean
+WINDOW_US = round(1e6 / FRAME_RATE_HZ)
 VELOCITY = (1e-4, -0.7e-4)  # pixels per microsecond, 4 pixels a window
 
 
@@ -67,30 +68,31 @@ def rated_scores(
     return rows, float(truth.mean())
 
 
-def random_windows(height: int, width: int, number: int) -> list[EventWindow]:
-    """This number of windows of random events, one after the other."""
+def random_channels(height: int, width: int, windows: int) -> list[Events]:
+    """Random events of four channels, as long as this number of windows."""
     generator = torch.Generator().manual_seed(0)
-    window_us, count = round(1e6 / FRAME_RATE_HZ), round(EVENTS_PER_PIXEL * height * width)
+    count = windows * round(EVENTS_PER_PIXEL * height * width)
 
     def random_channel() -> Events:
-        t = torch.randint(0, number * window_us, (number * count,), generator=generator).sort().values
+        t = torch.randint(0, windows * WINDOW_US, (count,), generator=generator).sort().values
         y, x = (torch.randint(0, size, t.shape, generator=generator).short() for size in (height, width))
         p = torch.randint(0, 2, t.shape, generator=generator) * 2 - 1
         return Events(t, x, y, p.to(torch.int8), height, width)
 
-    channels = [random_channel() for _ in range(4)]
-    starts = range(0, number * window_us, window_us)
-    return [
-        EventWindow([slice_time(events, start, start + window_us) for events in channels], start, start + window_us)
-        for start in starts
-    ]
+    return [random_channel() for _ in range(4)]
+
+
+def windows_of(channels: Sequence[Events], windows: int) -> list[EventWindow]:
+    """The first windows of the channels, one after the other."""
+    cutter = WindowCutter(WindowRule(WINDOW_US, None, None), channels[0].height, channels[0].width)
+    return list(cutter.add(channels, windows * WINDOW_US))
 
 
 @torch.inference_mode()
 def ms_per_frame(height: int, width: int, config: BetweenConfig) -> float:
     """Ms of computation for a frame of the rate, on random events; the search of the motion is shared by a window."""
-    first, second, third = random_windows(height, width, 3)
-    channels = [concatenate(parts) for parts in zip(first.channels, second.channels, third.channels, strict=True)]
+    channels = random_channels(height, width, 3)
+    first, second = windows_of(channels, 2)
     stokes = torch.rand(2, height, width, generator=torch.Generator().manual_seed(0)) - 0.5
     frame = Prediction(torch.hypot(*stokes), torch.zeros(height, width), torch.zeros(height, width), stokes)
     frames = round(RATE_HZ / FRAME_RATE_HZ)

@@ -58,7 +58,17 @@ from polarnet.stokes import Prediction
 from polarnet.storage.scenes import SceneStore
 from studies.figures import robustness_figure
 from studies.measure import arguments_of, command_line, machine_record, write_section
-from studies.rate import ENDS, FRAME_RATE_HZ, OURS, RATE_HZ, RATED, ms_per_frame, random_windows, rated_scores
+from studies.rate import (
+    ENDS,
+    FRAME_RATE_HZ,
+    OURS,
+    RATE_HZ,
+    RATED,
+    ms_per_frame,
+    random_channels,
+    rated_scores,
+    windows_of,
+)
 from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -201,14 +211,15 @@ def table_of(scores: Scores) -> dict[str, Any]:
 
 
 def windows_per_s(weights: Path, height: int, width: int, binning: int | None = None) -> dict[str, float]:
-    """Windows a second of the network on random events, as precise as `recover`, which are in memory.
+    """Windows a second of the network on random events in memory, as precise as `recover`.
 
     `together` takes as many at once as `recover` of a file, `alone` one after the other as from a camera.
     """
     recoverer = dolp_recoverer(*load_network(weights), CPU, precision_on(CPU, "auto"), binning=binning)
     rates = {}
     for name, size, runs in (("together", recoverer.at_once(height, width), RUNS), ("alone", 1, TIMED_WINDOWS)):
-        windows = random_windows(height, width, size * (WARM_RUNS + runs))
+        count = size * (WARM_RUNS + runs)
+        windows = windows_of(random_channels(height, width, count), count)
         state = recoverer.start(height, width)
         for number in range(WARM_RUNS + runs):
             if number == WARM_RUNS:

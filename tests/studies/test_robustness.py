@@ -8,7 +8,7 @@ from polarnet.benchmark.score import FrameScore
 from polarnet.config.pipeline import context_of
 from polarnet.networks.weights import shipped_weights
 from polarnet.storage.scenes import SceneStore
-from studies.rate import EVENTS_PER_PIXEL, random_windows, rated_scores
+from studies.rate import EVENTS_PER_PIXEL, random_channels, rated_scores, windows_of
 from studies.robustness import SENSORS, Scores, headlines, table_of
 from studies.scored_pictures import settings, sources_of
 
@@ -86,7 +86,7 @@ def test_every_sensor_but_the_default_changes_the_configuration(name):
 
 
 def test_random_windows_follow_each_other_and_hold_as_many_events_as_a_camera_fires():
-    windows = random_windows(24, 36, 5)
+    windows = windows_of(random_channels(24, 36, 5), 5)
     assert all(one.stop_us == after.start_us for one, after in itertools.pairwise(windows))
     for window in windows:
         assert all(((events.t >= window.start_us) & (events.t < window.stop_us)).all() for events in window.channels)
