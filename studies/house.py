@@ -70,12 +70,12 @@ def folder_sizes(files: Mapping[str, str]) -> dict[str, dict[str, int]]:
     return sizes
 
 
-def touched_files(root: Path, commits: str) -> int:
-    """Number of files of the package and its configuration that a commit, or a range FROM..TO, changes or adds."""
-    ends = commits.split("..") if ".." in commits else [f"{commits}~1", commits]
-    paths = git(root, "diff", "--name-only", *ends, "--", *BASELINE_FILES, ":!*.safetensors", ":!*/weights/*.json")
+def touched_files(root: Path, commit: str) -> int:
+    """Number of files of the package and its configuration that a commit changes or adds."""
+    others = (":!*.safetensors", ":!*/weights/*.json")
+    paths = git(root, "diff", "--name-only", f"{commit}~1", commit, "--", *BASELINE_FILES, *others)
     if not paths:
-        raise ValueError(f"expected a commit or FROM..TO that changes {', '.join(BASELINE_FILES)}, got {commits}")
+        raise ValueError(f"expected a commit that changes {', '.join(BASELINE_FILES)}, got {commit}")
     return len(paths.splitlines())
 
 

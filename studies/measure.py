@@ -19,11 +19,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from polarnet.config.sweep import COLUMNS, mean_scores, sweep_points
 from polarnet.reports.figures import LIGHT
 from polarnet.reports.maps import png
 from polarnet.reports.provenance import git, processor
-from polarnet.runtime.machine import usable_cores
+from polarnet.runtime.machine import bf16_units, usable_cores
 from studies.figures import loss_sweep_figure
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,6 +38,7 @@ def machine_record(root: Path) -> dict[str, Any]:
     """Machine, versions and commit of a measurement: the keys common to all files in docs/results."""
     return {
         "machine": processor(),
+        "bf16_units": bf16_units(torch.device("cpu")),
         "cores": usable_cores(),
         "load": round(os.getloadavg()[0], 2),
         "versions": {"python": platform.python_version()} | {n: importlib.metadata.version(n) for n in VERSIONS_OF},

@@ -40,7 +40,7 @@ def test_the_minutes_of_a_target_are_those_of_its_stages(tmp_path):
 
 def test_figures_name_their_machine_and_commit(project_root):
     record = machine_record(project_root)
-    assert set(record) == {"machine", "cores", "load", "versions", "commit"}
+    assert set(record) == {"machine", "bf16_units", "cores", "load", "versions", "commit"}
     assert record["commit"] == git(project_root, "rev-parse", "HEAD")
 
 
