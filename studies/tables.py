@@ -96,6 +96,6 @@ def origin(record: Mapping[str, Any]) -> str:
     """
     cores = "one core" if record["cores"] == 1 else f"{record['cores']} cores"
     versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
-    processor = " with ".join([record["machine"], *record.get("bf16_units", ())])  # older records do not have the units
-    where = f"{processor}, load {record['load']:.1f} before the start"
+    units = " and ".join(record.get("bf16_units", ()))  # older records do not have them
+    where = f"{record['machine']}{units and f' with {units}'}, load {record['load']:.1f} before the start"
     return f"On {cores} ({where}; {versions}; commit `{record['commit'][:10]}`)."

@@ -10,7 +10,7 @@ import pytest
 from studies.blocks import BLOCKS
 from studies.docs import block_text, update_results_blocks
 from studies.network_blocks import best_reconstruction
-from studies.tables import markdown
+from studies.tables import markdown, origin
 
 BEFORE = "# title\n\n<!-- results:lpips -->\n<!-- /results:lpips -->\n\nafter\n"
 NO_FIGURE = re.compile(r"On \S+ cores? \(.*?`\)\.|```.*?```|`[^`]*`|[Ss]eed \d", re.DOTALL)
@@ -125,3 +125,11 @@ def test_a_block_that_is_open_or_unknown_is_an_error(project, text, error):
     (project / "README.md").write_text(text)
     with pytest.raises(ValueError, match=error):
         update_results_blocks(project, check=True)
+
+
+def test_the_sentence_below_a_table_names_the_bf16_units_that_the_record_has():
+    older = {"machine": "Xeon", "cores": 2, "load": 0.5, "versions": {"torch": "2.13.0"}, "commit": "0123456789ab"}
+    end = ", load 0.5 before the start; torch 2.13.0; commit `0123456789`)."
+    assert origin(older) == f"On 2 cores (Xeon{end}"
+    assert origin({**older, "bf16_units": []}) == f"On 2 cores (Xeon{end}"
+    assert origin({**older, "bf16_units": ["AMX", "AVX512-BF16"]}) == f"On 2 cores (Xeon with AMX and AVX512-BF16{end}"
