@@ -221,6 +221,19 @@ def _robustness(key: str, form: str) -> Block:
     )  # fmt: skip
 
 
+def _compared_trainings(results: Results) -> Iterator[Row]:
+    """MSE relative to the oracle mean's of each network under each condition of the validation split."""
+    section = results["val"]
+    for name, table in section["tables"].items():
+        ratios = {row: table["rows"][row]["mse_over_oracle_mean"] for row in section["weights"]}
+        yield {"name": name, "scenes": table["scenes"], "value": ratios}
+
+
+def _compared_columns(results: Results) -> Columns:
+    networks = {name: f"{{value[{name}]:.3f}}" for name in results["val"]["weights"]}
+    return {"scenes": "`{name}`", "number": "{scenes}"} | networks
+
+
 def _off_by_rows(results: Results) -> Iterator[Row]:
     """The factor by which expected errors are off, by set of scenes and sensor."""
     for name, table in results["test"]["tables"].items():
@@ -399,6 +412,10 @@ NETWORK_BLOCKS = {
     ),
     "robustness": _robustness("mse_over_oracle_mean", ".2f"),
     "robustness-median": _robustness("median_over_oracle_mean", ".2f"),
+    "robustness-trainings": Block(
+        "robustness", "val", "studies.robustness --split val --weights NAME=FILE ... --write", _compared_trainings,
+        _compared_columns,
+    ),
     "robustness-expected": Block(
         "robustness", "test", "studies.robustness --write", _off_by_rows,
         {"scenes": "`{name}`", "number": "{scenes}", f"`{OURS}`": "{full:.2f}", f"`{BLOCKS}`": "{blocks:.2f}"},

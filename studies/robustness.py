@@ -21,7 +21,8 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 Nothing is trained, except the constants: `train_mean` is the mean DoLP of the training photographs, and `constant_real`
 the mean DoLP of the measured scenes of all sources but the one that is scored. --split val is for choices and --split
 test for figures. --limit takes the first N pictures of each set; --sensor-limit of the sensors alone. Events are
-simulated in memory, and pictures are kept in --work. --write puts the scores into docs/results/robustness.json.
+simulated in memory, and pictures are kept in --work. --write puts the scores into docs/results/robustness.json, and
+those of the test split also into docs/pictures.
 
 The second command scores nothing. It fills --training with links to the training photographs of both folders. A
 network trained on them (`ingest.root`) has seen no photograph of --split val and --split test.
@@ -411,9 +412,11 @@ def write_tables(tables: Mapping[str, Any], arguments: argparse.Namespace, recor
     }  # fmt: skip
     (arguments.work / f"robustness_{arguments.split}.json").write_text(json.dumps(section, indent=2) + "\n")
     if arguments.write:
-        print(write_section(ROOT, "robustness", arguments.split, section, record, figures))
-        picture = ROOT / "docs" / "pictures" / f"robustness_{arguments.split}.png"
-        picture.write_bytes(png(robustness_figure(tables, LIGHT)))
+        of_test = arguments.split == "test"
+        print(write_section(ROOT, "robustness", arguments.split, section, record, figures if of_test else None))
+        if of_test:
+            picture = ROOT / "docs" / "pictures" / "robustness_test.png"
+            picture.write_bytes(png(robustness_figure(tables, LIGHT)))
 
 
 def main() -> None:
