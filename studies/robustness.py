@@ -76,6 +76,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SENSORS: dict[str, tuple[str, ...]] = {
     "default": (),
     "noisy": ("sensor=noisy",),
+    "noisy_300_hz": ("sensor=noisy", "emulate.cutoff_hz=300"),  # the default sensor's bandwidth
     "thresholds_0.1": ("emulate.contrast_threshold_on=0.1", "emulate.contrast_threshold_off=0.1"),
     "thresholds_0.4": ("emulate.contrast_threshold_on=0.4", "emulate.contrast_threshold_off=0.4"),
     "off_1.4_times_on": ("emulate.contrast_threshold_off=0.28",),
