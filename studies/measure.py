@@ -82,13 +82,18 @@ STAGE_OUTPUTS = {
 
 
 def run_missing(data: Path, *overrides: str, until: str = "train") -> Path:
-    """Run the stages of a training up to `until` whose outputs `data` lacks; returns the path of the last output."""
+    """Run the stages of a training up to `until` whose outputs `data` lacks; returns the path of the last output.
+
+    A training that was cut off is resumed: its running checkpoint is deleted only at its end.
+    """
     stages = list(STAGE_OUTPUTS)
     if until not in stages:
         raise ValueError(f"until: expected one of {', '.join(stages)}, got {until!r}")
+    resume = data / "resume"
     for stage in stages[: stages.index(until) + 1]:
-        if not (data / STAGE_OUTPUTS[stage]).exists():
-            run_stage(stage, f"paths.data={data}", f"paths.resume={data / 'resume'}", *overrides)
+        cut_off = stage == "train" and any(resume.glob("*/running.pt"))
+        if cut_off or not (data / STAGE_OUTPUTS[stage]).exists():
+            run_stage(stage, f"paths.data={data}", f"paths.resume={resume}", *overrides)
     return data / STAGE_OUTPUTS[until]
 
 

@@ -401,7 +401,7 @@ NETWORK_BLOCKS = {
         },
     ),
     "robustness-speed": Block(
-        "robustness", "speed", "studies.robustness --conditions speed --threads 2 --write", _speed_rows,
+        "robustness", "speed", "studies.network_speed --threads 2 --write", _speed_rows,
         {
             "sensor": "{size}", "windows/s of a file": "{together:.1f}",
             "of a file, blocks of 2x2": "{together_blocks:.1f}", "of a camera": "{alone:.1f}",

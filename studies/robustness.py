@@ -8,15 +8,13 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 - `photographs_large`: the same splits of --photographs and of --photographs-large together.
 - `measured.SOURCE`: all measured scenes of one source. A folder with a manifest.csv (columns file, repo) has one source
   for each repo; any other folder is one source.
-- `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS.
+- `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS (`studies.conditions`).
   `ours, thresholds given` is told the contrast thresholds of the sensor (`methods.ours.thresholds`).
-- `ours, 2x2 blocks`, under each condition, is the network on blocks of pixels (`methods.ours.binning=2`).
-- `time.5ms`: the same with windows of 5 ms.
+- `time.5ms`: the scenes of the sensors with windows of 5 ms.
 - `time.2000hz.photographs`, `time.2000hz.measured`: frames between windows (`polarnet recover --rate 2000`), on the
   pictures of the sensors and on all measured scenes, at 16 times between the ends of two windows (`studies.rate`).
-- `speed`: windows a second of the first weights on random events, many at once and one by one, with and without blocks
-  of 2x2 pixels, and ms of a frame between windows, with --threads. `--conditions speed` measures nothing else and needs
-  no photographs.
+
+Under each condition but the last two, `ours, 2x2 blocks` is the network on blocks of pixels (`methods.ours.binning=2`).
 
 Nothing is trained, except the constants: `train_mean` is the mean DoLP of the training photographs, and `constant_real`
 the mean DoLP of the measured scenes of all sources but the one that is scored. --split val is for choices and --split
@@ -32,7 +30,6 @@ import argparse
 import functools
 import json
 import statistics
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,18 +42,17 @@ from polarnet.benchmark.rows import Context, available, predictions_of
 from polarnet.benchmark.score import FrameScore, scene_means, score_sequence, scored_windows
 from polarnet.config.pipeline import context_of
 from polarnet.config.tree import Config
-from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.metrics.reliability import Reliability, reliability
-from polarnet.networks.checkpoint import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.reports.figures import LIGHT
 from polarnet.reports.maps import png
 from polarnet.runtime.files import sha256
-from polarnet.runtime.machine import configure, precision_on
+from polarnet.runtime.machine import configure
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.stokes import Prediction
 from polarnet.storage.scenes import SceneStore
+from studies.conditions import BINNING, conditions_of, selected
 from studies.figures import robustness_figure
 from studies.measure import arguments_of, command_line, machine_record, write_section
 from studies.rate import (
@@ -65,50 +61,13 @@ from studies.rate import (
     OURS,
     RATE_HZ,
     RATED,
-    ms_per_frame,
-    random_channels,
     rated_scores,
-    windows_of,
 )
-from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
+from studies.scored_pictures import ingested, link_training, mean_dolp, scenes_of, settings
 
 ROOT = Path(__file__).resolve().parents[1]
-SENSORS: dict[str, tuple[str, ...]] = {
-    "default": (),
-    "noisy": ("sensor=noisy",),
-    "noisy_300_hz": ("sensor=noisy", "emulate.cutoff_hz=300"),  # the default sensor's bandwidth
-    "thresholds_0.1": ("emulate.contrast_threshold_on=0.1", "emulate.contrast_threshold_off=0.1"),
-    "thresholds_0.4": ("emulate.contrast_threshold_on=0.4", "emulate.contrast_threshold_off=0.4"),
-    "off_1.4_times_on": ("emulate.contrast_threshold_off=0.28",),
-    "mismatch_0.06": ("emulate.contrast_threshold_sigma_on=0.06", "emulate.contrast_threshold_sigma_off=0.06"),
-    "mismatch_half": ("emulate.contrast_threshold_sigma_on=0.1", "emulate.contrast_threshold_sigma_off=0.1"),
-    "slow": ("synthesize.speed_min_px_s=10", "synthesize.speed_max_px_s=40"),
-    "fast": (
-        "synthesize.speed_min_px_s=160", "synthesize.speed_max_px_s=320", "synthesize.acceleration_max_px_s2=3200",
-    ),
-    "60_hz": ("synthesize.frame_rate_hz=60",),
-    "260x346": ("synthesize.sensor_height=260", "synthesize.sensor_width=346"),
-    "v2e": ("emulate.model=v2e",),
-    "esim": ("emulate.model=esim",),
-    "esim_gpu": ("emulate.model=esim_gpu",),
-    "dvs_voltmeter": ("emulate.model=dvs_voltmeter",),
-    "imperfect_polarizers": (
-        "polarizers.extinction_ratio=[100,100,100,100]", "polarizers.angle_error_deg=[2,-2,-2,2]",
-        "polarizers.transmission=[1,0.95,1,0.95]",
-    ),
-    "dofp": ("polarizers.layout=dofp", "synthesize.sensor_height=240", "synthesize.sensor_width=360"),
-    "saturating_readout": ("readout.max_events_per_s=300000",),  # a sensor fires 500,000 a second on average
-    "randomised": ("sensor=random",),
-}  # fmt: skip
-"""Overrides of params.yaml by name; the scenes are the same, at the same places where the sensor has the same size."""
-TIMES: dict[str, tuple[str, ...]] = {"5ms": ("synthesize.frame_rate_hz=200",)}
-"""Overrides that change the windows."""
-SIZES = ((120, 180), (260, 346), (480, 640))
-RUNS, TIMED_WINDOWS, WARM_RUNS = 3, 12, 3
-CPU = torch.device("cpu")
 CALIBRATED = "ours, thresholds given"
 BLOCKS = "ours, 2x2 blocks"
-BINNING = 2
 CONSTANT = "constant_real"
 METHODS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
 NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published+gain")
@@ -212,25 +171,6 @@ def table_of(scores: Scores) -> dict[str, Any]:
     return table
 
 
-def windows_per_s(weights: Path, height: int, width: int, binning: int | None = None) -> dict[str, float]:
-    """Windows a second of the network on random events in memory, as precise as `recover`.
-
-    `together` takes as many at once as `recover` of a file, `alone` one after the other as from a camera.
-    """
-    recoverer = dolp_recoverer(*load_network(weights), CPU, precision_on(CPU, "auto"), binning=binning)
-    rates = {}
-    for name, size, runs in (("together", recoverer.at_once(height, width), RUNS), ("alone", 1, TIMED_WINDOWS)):
-        count = size * (WARM_RUNS + runs)
-        windows = windows_of(random_channels(height, width, count), count)
-        state = recoverer.start(height, width)
-        for number in range(WARM_RUNS + runs):
-            if number == WARM_RUNS:
-                start = time.perf_counter()
-            state, _ = recoverer.step(state, windows[number * size : (number + 1) * size])
-        rates[name] = size * runs / (time.perf_counter() - start)
-    return rates
-
-
 def headlines(tables: Mapping[str, Any], row: str) -> dict[str, Any]:
     """Figures of one row that stand above the sections of docs/results/robustness.json."""
     figures: dict[str, Any] = {}
@@ -282,10 +222,10 @@ def printed(tables: Mapping[str, Any], key: str) -> str:
 def parsed() -> argparse.Namespace:
     """The command line, with paths as every working directory understands them."""
     parser = command_line(__doc__, "docs/results/robustness.json")
-    parser.add_argument("--photographs", type=Path)
+    parser.add_argument("--photographs", type=Path, required=True)
     parser.add_argument("--photographs-large", type=Path, help="further photographs")
     parser.add_argument("--measured", type=Path, nargs="+", default=[], help="as ingest.source=polarization takes them")
-    parser.add_argument("--work", type=Path)
+    parser.add_argument("--work", type=Path, required=True)
     parser.add_argument(
         "--weights", nargs="+", default=[], metavar="[NAME=]FILE", help="checkpoints; default: the shipped one"
     )
@@ -298,8 +238,6 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1, help="processes that share the sequences")
     arguments = arguments_of(parser)
-    if arguments.conditions != ["speed"] and None in (arguments.photographs, arguments.work):
-        parser.error("expected --photographs and --work; only --conditions speed needs neither")
     for name in ("photographs", "photographs_large", "work", "firenet", "training"):
         if path := getattr(arguments, name):
             setattr(arguments, name, path.resolve())
@@ -307,40 +245,6 @@ def parsed() -> argparse.Namespace:
     pairs = [given.rpartition("=") for given in arguments.weights]
     arguments.weights = {name or OURS: Path(file).resolve() for name, _, file in pairs} or {OURS: shipped_weights()}
     return arguments
-
-
-def conditions_of(
-    images: Mapping[str, Path], arguments: argparse.Namespace
-) -> dict[str, list[tuple[Path, tuple[str, ...]]]]:
-    """Folders of pictures and overrides by condition; `images` are the ingested photographs."""
-    work, limit = arguments.work, arguments.limit
-    parts = {name: part_of(folder, work / name, arguments.split, limit) for name, folder in images.items()}
-    conditions: dict[str, list[tuple[Path, tuple[str, ...]]]] = {"photographs": [(parts["rgb"], ())]}
-    if "more" in parts:
-        conditions["photographs_large"] = [(part, ()) for part in parts.values()]
-    for folder in arguments.measured:
-        for name, root in sources_of(folder, work).items():
-            chosen = ("ingest.source=polarization", "ingest.val_fraction=0", "ingest.test_fraction=1")
-            measured = ingested(root, work / name, *chosen)
-            conditions[f"measured.{name}"] = [(part_of(measured, work / name, "test", limit), ())]
-    small = part_of(images["rgb"], work / "rgb", arguments.split, arguments.sensor_limit or limit)
-    others = {"sensors": SENSORS, "time": TIMES}
-    scenes = [part for name, parts in conditions.items() if name.startswith("measured.") for part in parts]
-    conditions[f"{RATED}.photographs"] = [(small, ())]
-    if scenes:
-        conditions[f"{RATED}.measured"] = scenes
-    return conditions | {
-        f"{kind}.{name}": [(small, overrides)] for kind, of in others.items() for name, overrides in of.items()
-    }
-
-
-def selected(conditions: Mapping[str, Any], wanted: Sequence[str] | None) -> dict[str, Any]:
-    """The conditions whose names, or the beginnings of whose names, are `wanted`; None: all."""
-    return {
-        name: parts
-        for name, parts in conditions.items()
-        if wanted is None or any(name == one or name.startswith(f"{one}.") for one in wanted)
-    }
 
 
 def contexts_of(
@@ -385,22 +289,6 @@ def tables_of(
     return tables
 
 
-def write_speed(config: Config, arguments: argparse.Namespace, record: Mapping[str, Any]) -> None:
-    """Measure and print the speed of the first weights by size of the sensor; with --write also keep it in docs."""
-    weights = next(iter(arguments.weights.values()))
-    speed: dict[str, Any] = {"threads": arguments.threads, "precision": precision_on(CPU, "auto")}
-    for height, width in SIZES:
-        size = f"{height}x{width}"
-        for suffix, binning in (("", None), (f"_blocks_of_{BINNING}", BINNING)):
-            rates = windows_per_s(weights, height, width, binning)
-            speed[f"windows_per_s_{size}{suffix}"] = rates["together"]
-            speed[f"windows_per_s_alone_{size}{suffix}"] = rates["alone"]
-        speed[f"ms_per_{RATE_HZ}hz_frame_{size}"] = ms_per_frame(height, width, config.between)
-    print(json.dumps(speed, indent=1))
-    if arguments.write:
-        print(write_section(ROOT, "robustness", "speed", speed, record))
-
-
 def write_tables(tables: Mapping[str, Any], arguments: argparse.Namespace, record: Mapping[str, Any]) -> None:
     """Print the tables and keep them in --work; with --write also in docs."""
     for key in ("mse", "median_mse", "mse_over_oracle_mean", "median_over_oracle_mean", "level_mse", "psnr", "corr"):
@@ -429,9 +317,6 @@ def main() -> None:
         common.append(f"methods.firenet_published.weights={arguments.firenet}")
     config = settings(*common)
     configure(config.runtime, config.seed)
-    if arguments.conditions == ["speed"]:
-        write_speed(config, arguments, record)
-        return
     arguments.work.mkdir(parents=True, exist_ok=True)
     given = {"rgb": arguments.photographs, "more": arguments.photographs_large}
     roots = {name: root for name, root in given.items() if root}
@@ -448,8 +333,6 @@ def main() -> None:
     train_mean = statistics.fmean(mean_dolp(images["rgb"], "train"))
     chosen = selected(conditions, arguments.conditions)
     write_tables(tables_of(chosen, means, train_mean, arguments.weights, common), arguments, record)
-    if arguments.conditions is None or "speed" in arguments.conditions:
-        write_speed(config, arguments, record)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,10 @@ from polarnet.benchmark.score import FrameScore
 from polarnet.config.pipeline import context_of
 from polarnet.networks.weights import shipped_weights
 from polarnet.storage.scenes import SceneStore
-from studies.rate import EVENTS_PER_PIXEL, random_channels, rated_scores, windows_of
-from studies.robustness import SENSORS, Scores, headlines, table_of
+from studies.conditions import SENSORS
+from studies.network_speed import EVENTS_PER_PIXEL, random_channels, windows_of
+from studies.rate import rated_scores
+from studies.robustness import Scores, headlines, table_of
 from studies.scored_pictures import settings, sources_of
 
 ERRORS = {"pale": 0.001, "middle": 0.01, "strong": 0.1}

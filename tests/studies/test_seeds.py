@@ -43,6 +43,18 @@ def test_missing_stages_run_as_far_as_asked(ran, tmp_path):
     assert len(ran) == 2
 
 
+def test_a_training_that_was_cut_off_after_its_first_checkpoint_is_resumed(ran, tmp_path):
+    running = tmp_path / "resume" / "0123456789abcdef" / "running.pt"
+    running.parent.mkdir(parents=True)
+    running.touch()
+    run_missing(tmp_path)
+    run_missing(tmp_path)
+    assert [name for name, _ in ran] == ["ingest", "synthesize", "emulate", "train", "train"]
+    running.unlink()
+    run_missing(tmp_path)
+    assert len(ran) == 5
+
+
 def test_the_mean_is_over_networks_for_each_condition_and_figure():
     tables = {
         name: {"rows": {"a": dict.fromkeys(FIGURES, 1.0) | {"other": 5.0}, "b": dict.fromkeys(FIGURES, 2.0 + place)}}
