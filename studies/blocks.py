@@ -15,6 +15,7 @@ from studies.noise import NOISE_BLOCK
 from studies.paper import duration_rows, table_rows
 from studies.planning import PLANNING_BLOCKS
 from studies.recorded import RECORDED_BLOCK
+from studies.robustness_blocks import ROBUSTNESS_BLOCKS
 from studies.rotating import CURVES
 from studies.tables import Block, Columns, Results, Row, listed
 
@@ -133,7 +134,7 @@ def _sensor_fit(section: str, stimulus: str) -> Block:
     )  # fmt: skip
 
 
-BLOCKS = NETWORK_BLOCKS | PLANNING_BLOCKS | {
+BLOCKS = NETWORK_BLOCKS | ROBUSTNESS_BLOCKS | PLANNING_BLOCKS | {
     "pipeline-scores": Block(
         "pipeline", "metrics", "studies.measure",
         lambda results: _demo_table(results["metrics"], results.get("weights", {})),

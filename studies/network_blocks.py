@@ -10,7 +10,6 @@ from polarnet.reports.curves import PAPER_EVENTS_PER_PIXEL
 from polarnet.reports.legend import LABELS, in_order
 from polarnet.reports.tables import COLUMNS, ERROR_PARTS
 from studies.measure import ABLATION_KEYS, ablation_about
-from studies.rate import ENDS, HELD, OURS, RATE_HZ, RATED
 from studies.scenes import CHOICES
 from studies.tables import Block, Columns, Results, Row, listed, origin
 
@@ -46,35 +45,6 @@ def best_reconstruction(rows: Mapping[str, Mapping[str, Any]]) -> str:
     """The intensity reconstruction with the smallest MSE."""
     intensity = [row for row in rows if row in METHODS and METHODS[row].reconstructs]
     return min(intensity, key=lambda row: rows[row]["mse"])
-
-
-def _headline_rows(results: Results) -> Iterator[Row]:
-    tables = {name: results["test"]["tables"][name]["rows"] for name in HEADLINE_SETS}
-    for label, methods in HEADLINE_METHODS.items():
-        yield {"label": label} | {
-            name: min((rows[method] for method in methods), key=lambda scores: scores["mse"])
-            for name, rows in tables.items()
-        }
-
-
-HEADLINE_SETS = {"photographs_large": "photographs", "measured": "measured scenes"}
-HEADLINE_METHODS = {
-    "mean DoLP of each frame, taken from the truth": ("oracle_mean",),
-    "best constant": ("zeros", "train_mean", "constant_real"),
-    "best intensity reconstruction": ("highpass+gain", "firenet_published+gain"),
-    "polarnet": ("ours",),
-}
-"""Rows of the README's table and the methods they stand for; of several, the one with the smallest MSE on the set."""
-
-
-def _headline_lines(results: Results) -> list[str]:
-    tables = results["test"]["tables"]
-    photographs, measured = (tables[name]["scenes"] for name in HEADLINE_SETS)
-    sources = sum(name.startswith("measured.") for name in tables)
-    return [
-        f"The shipped weights on {photographs} photographs and {measured} measured scenes of {sources} sources. The "
-        "best constant is zero, the mean DoLP of the training photographs, or that of the measured validation scenes."
-    ]
 
 
 def _network_rows(name: str) -> Callable[[Results], Iterator[Row]]:
@@ -195,76 +165,6 @@ def _overrides(section: str) -> Callable[[Results], Iterator[str]]:
 
 SEVERAL = "Several trainings: mean ± standard deviation."
 
-BLOCKS = "ours, 2x2 blocks"
-ROBUSTNESS_ROWS = (
-    "zeros",
-    "train_mean",
-    "constant_real",
-    "highpass+gain",
-    "firenet_published+gain",
-    "ours",
-    "ours, thresholds given",
-    BLOCKS,
-)
-
-
-def _robustness(key: str, form: str) -> Block:
-    """One score of every method, relative to the oracle mean's, on every set of scenes and under every sensor."""
-    return Block(
-        "robustness", "test", "studies.robustness --write",
-        lambda results: [
-            {"name": name, **table, "value": {row: one[key] for row, one in table["rows"].items()}}
-            for name, table in results["test"]["tables"].items()
-        ],
-        {"scenes": "`{name}`", "number": "{scenes}", "mean DoLP": "{mean_dolp:.3f}"}
-        | {f"`{row}`": f"{{value[{row}]:{form}}}" for row in ROBUSTNESS_ROWS},
-    )  # fmt: skip
-
-
-def _compared_trainings(results: Results) -> Iterator[Row]:
-    """MSE relative to the oracle mean's of each network under each condition of the validation split."""
-    section = results["val"]
-    for name, table in section["tables"].items():
-        ratios = {row: table["rows"][row]["mse_over_oracle_mean"] for row in section["weights"]}
-        yield {"name": name, "scenes": table["scenes"], "value": ratios}
-
-
-def _compared_columns(results: Results) -> Columns:
-    networks = {name: f"{{value[{name}]:.3f}}" for name in results["val"]["weights"]}
-    return {"scenes": "`{name}`", "number": "{scenes}"} | networks
-
-
-def _off_by_rows(results: Results) -> Iterator[Row]:
-    """The factor by which expected errors are off, by set of scenes and sensor."""
-    for name, table in results["test"]["tables"].items():
-        factors = {row: table["rows"].get(row, {}).get("error_factor") for row in (OURS, BLOCKS)}
-        if None not in factors.values():
-            yield {"name": name, "scenes": table["scenes"], "full": factors[OURS], "blocks": factors[BLOCKS]}
-
-
-def _between_rows(results: Results) -> Iterator[Row]:
-    """PSNR of frames between windows, by kind of scenes."""
-    for name, table in results["test"]["tables"].items():
-        if name.startswith(RATED):
-            psnr = {row: one["psnr"] for row, one in table["rows"].items()}
-            ends = psnr[OURS + ENDS]
-            yield {
-                "kind": name.removeprefix(f"{RATED}."), "scenes": table["scenes"], "ends": ends,
-                "carried": ends - psnr[OURS], "held": ends - psnr[OURS + HELD],
-            }  # fmt: skip
-
-
-def _speed_rows(results: Results) -> Iterator[Row]:
-    speed = results["speed"]
-    for name in [name for name in speed if name.startswith(BETWEEN)]:
-        size = name.removeprefix(BETWEEN)
-        rates = {
-            key + of_blocks: speed[f"windows_per_s_{kind}{size}{suffix}"]
-            for key, kind in (("together", ""), ("alone", "alone_"))
-            for of_blocks, suffix in (("", ""), ("_blocks", "_blocks_of_2"))
-        }
-        yield {"size": size.replace("x", " x "), **rates, "between": speed[name]}
-
 
 def _retrained_rows(results: Results) -> Iterator[Row]:
     """The shipped weights, which have seed 1, each other seed of their recipe, and the mean."""
@@ -276,17 +176,7 @@ def _retrained_rows(results: Results) -> Iterator[Row]:
         yield {"label": f"mean of {results['networks']}", **results["mean"]}
 
 
-BETWEEN = f"ms_per_{RATE_HZ}hz_frame_"
-
 NETWORK_BLOCKS = {
-    "headline": Block(
-        "robustness", "test", "studies.robustness --write", _headline_rows,
-        {"": "{label}"} | {
-            heading: form for name, title in HEADLINE_SETS.items()
-            for heading, form in score_columns(("mse", "psnr"), f"{name}[{{}}]", f"{title}: ").items()
-        },
-        caption="", lines=_headline_lines,
-    ),
     "networks-simulated": Block(
         "network", "seed_1", "studies.study", _network_rows("simulated"), {"": "{label}"} | score_columns(), caption="",
         beside="benchmark",
@@ -392,32 +282,5 @@ NETWORK_BLOCKS = {
         "Rows are in the order of validation MSE; ± is the standard deviation over seeds. LPIPS has the backbone "
         "`{loss_weights[lpips_backbone]}`. {origin}",
         _overrides("loss_weights"),
-    ),
-    "between": Block(
-        "robustness", "test", "studies.robustness --write", _between_rows,
-        {
-            "scenes": "{kind}", "number": "{scenes}", "window ends, dB": "{ends:.2f}",
-            "carried on, dB lost": "{carried:.2f}", "held, dB lost": "{held:.2f}",
-        },
-    ),
-    "robustness-speed": Block(
-        "robustness", "speed", "studies.network_speed --threads 2 --write", _speed_rows,
-        {
-            "sensor": "{size}", "windows/s of a file": "{together:.1f}",
-            "of a file, blocks of 2x2": "{together_blocks:.1f}", "of a camera": "{alone:.1f}",
-            "of a camera, blocks of 2x2": "{alone_blocks:.1f}",
-            f"ms a frame between windows, {RATE_HZ} Hz": "{between:.2f}",
-        },
-        "Shipped weights in {speed[precision]} with {speed[threads]} threads. {origin}",
-    ),
-    "robustness": _robustness("mse_over_oracle_mean", ".2f"),
-    "robustness-median": _robustness("median_over_oracle_mean", ".2f"),
-    "robustness-trainings": Block(
-        "robustness", "val", "studies.robustness --split val --weights NAME=FILE ... --write", _compared_trainings,
-        _compared_columns,
-    ),
-    "robustness-expected": Block(
-        "robustness", "test", "studies.robustness --write", _off_by_rows,
-        {"scenes": "`{name}`", "number": "{scenes}", f"`{OURS}`": "{full:.2f}", f"`{BLOCKS}`": "{blocks:.2f}"},
     ),
 }  # fmt: skip

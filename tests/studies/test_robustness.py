@@ -12,6 +12,7 @@ from studies.conditions import SENSORS
 from studies.network_speed import EVENTS_PER_PIXEL, random_channels, windows_of
 from studies.rate import rated_scores
 from studies.robustness import Scores, headlines, table_of
+from studies.robustness_blocks import mean_over_kinds
 from studies.scored_pictures import settings, sources_of
 
 ERRORS = {"pale": 0.001, "middle": 0.01, "strong": 0.1}
@@ -48,6 +49,12 @@ def test_measured_scenes_are_compared_with_the_best_row_that_needs_no_truth():
     rows = table_of(scores())
     rows["rows"]["ours"]["error_factor"] = 1.2
     assert headlines({"measured": rows}, "ours")["measured"]["mse_over_best_baseline"] == pytest.approx(0.2)
+
+
+def test_each_kind_of_scenes_counts_equally_in_a_choice_between_networks():
+    ratios = {"photographs_large": 1.0, "measured.one": 2.0, "measured.two": 8.0, "sensors.noisy": 2.0}
+    rows = {name: {"ours": {"mse_over_oracle_mean": ratio}} for name, ratio in ratios.items()}
+    assert mean_over_kinds(rows, "ours") == pytest.approx(2.0)  # of 1, 4 and 2
 
 
 def test_the_loss_between_windows_is_the_larger_of_photographs_and_measured_scenes():
