@@ -85,16 +85,12 @@ class BenchmarkSet:
             )
         return names
 
-    def scene_of(self, sequence: str) -> str:
-        """The source picture of a sequence. If the frame store names no scenes, every sequence is its own scene."""
-        return self.frames.attributes.get("scenes", {}).get(sequence, sequence)
-
     def sequence(self, name: str) -> TestSequence:
         """One sequence with its truth."""
         truth = self.frames.frames(name)
         i0, _, i90, _ = truth.intensity[1:].unbind(1)
         events = self.events.read(name)
-        scene = self.scene_of(name)
+        scene = self.frames.original_of(name)
         valid = None if truth.valid is None else truth.valid[1:]
         rotating = None if self.rotating is None else self.rotating.read(name)[0]
         s0 = i0 + i90
@@ -128,7 +124,7 @@ def run_benchmark(
     names = test_set.sequences
     if lpips is not None:
         lpips = lpips.to(context.device)
-    panels = _spread(names, config.panel_scenes, {name: test_set.scene_of(name) for name in names})
+    panels = _spread(names, config.panel_scenes, {name: test_set.frames.original_of(name) for name in names})
     task = functools.partial(
         _measured, test_set=test_set, context=context, config=config, lpips=lpips, panel_sequences=panels
     )

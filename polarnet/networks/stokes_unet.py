@@ -1,7 +1,6 @@
 """polarnet's own network: it solves the redundancy of four polarizers at many scales and refines it with a U-Net."""
 
 import math
-from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple
 
 import torch
@@ -22,6 +21,7 @@ from polarnet.networks.blocks import (
     on_blocks,
 )
 from polarnet.networks.expected_error import ExpectedError, error_features
+from polarnet.networks.fine_structure import WIDE, averaged, differences, moved_by_events, wide_differences
 from polarnet.networks.panorama import Memory, Motion, Panorama, certainty, displacements, empty_panorama, follow
 from polarnet.networks.redundancy import (
     MOMENTS,
@@ -29,7 +29,6 @@ from polarnet.networks.redundancy import (
     SecondMoments,
     SlopeMoments,
     block_means,
-    box_means,
     faded,
     length,
     neighbourhoods,
@@ -43,8 +42,6 @@ STRIDE = 4  # stride of the finest recurrent layer; height and width (in blocks 
 IMAGES = 2  # input images per channel: sum of polarities and number of events (representation `event_counts`)
 PARTS = ("redundancy", "slopes", "sums", "recurrence", "panorama", "sensitivity", "scale")
 MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate
-WIDE = (3, 9)  # widths in pixels of the neighbourhoods that contribute fine structure, besides the single pixel
-MAX_DOLP = 0.98  # largest DoLP passed to atanh, to keep it finite
 SENSITIVITY_TENSORS = 2  # numbers of ON and OFF events, and the change of their weights
 PANORAMA_TENSORS = 1 + len(Panorama._fields)  # events of the previous window, then the panorama
 NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window: no sums, moments or wide sums, and no more
@@ -260,7 +257,7 @@ class StokesUNet(nn.Module):
         scale = torch.ones_like(certain) if "scale" in self.without else self.scale(clues)
         images, of_window = scale * self.step * panorama, scale.view(t, b, 1, 1, 1, 1)
         steps = faded(polarity.unsqueeze(2), keep, before_sums)  # t, b, memory, polarizer
-        wide_steps = _wide_differences(polarity, before_wide, keep)
+        wide_steps = wide_differences(polarity, before_wide, keep)
         sums, wide = of_window * steps, [of_window * means for means in wide_steps]
         from_sums, moments = self._candidates(sums.flatten(0, 1), b, before_moments)
         from_slopes = self._slope_candidates(images)
@@ -268,7 +265,7 @@ class StokesUNet(nn.Module):
 
         x2 = on_blocks(self.stem, _event_images(sums.flatten(0, 1), scale * count.flatten(0, 1)))
         x2 = F.relu(x2 + self.from_mosaic(_panorama_images(images, certain)))
-        solved = Solved(x2, candidates, [_differences(sums), *wide], images, certain, (height, width))
+        solved = Solved(x2, candidates, [differences(sums), *wide], images, certain, (height, width))
         return solved, [*sensitivity, steps[-1], moments, *(means[-1] for means in wide_steps), *next_panorama]
 
     def refine_windows(
@@ -283,7 +280,7 @@ class StokesUNet(nn.Module):
         weights = self.choose(y4).float().softmax(1)
         coarse = enlarged(self._mixed(candidates, weights), 4)
         gains = self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float())
-        moved = _moved(coarse[:, :2], sums, gains)
+        moved = moved_by_events(coarse[:, :2], sums, gains)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
         share = certain * enlarged(torch.sigmoid(self.trust(y2).float()), 2)
         fine = torch.cat(averaged(moved, dolp, images[:, 1:3], share, self.around), dim=1)
@@ -393,53 +390,6 @@ class StokesUNet(nn.Module):
     def _unless(self, part: str, x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """Return `x`, or 0 * x if this part is left out (which keeps the gradient path)."""
         return 0 * x if part in self.without else x
-
-
-def _wide_differences(
-    polarity: Float[Tensor, "t b 4 h w"], before: Sequence[Tensor | None], keep: Float[Tensor, "m 1 1 1"]
-) -> list[Float[Tensor, "t b m 2 h w"]]:
-    """Update the sums `before` of e0 - e90 and e45 - e135, for each memory, averaged over each width of `WIDE`.
-
-    Averaging and summing commute, so each window is averaged once instead of once per memory.
-    """
-    now = _differences(polarity)
-    near = (box_means(now.flatten(0, 1), width).contiguous().unflatten(0, now.shape[:2]) for width in WIDE)
-    return [faded(means.unsqueeze(2), keep, state) for means, state in zip(near, before, strict=True)]
-
-
-def _differences(events: Float[Tensor, "*b 4 h w"]) -> Float[Tensor, "*b 2 h w"]:
-    """Return e0 - e90 and e45 - e135."""
-    return events[..., :2, :, :] - events[..., 2:, :, :]
-
-
-def _moved(
-    stokes: Float[Tensor, "n 2 h w"], sums: Sequence[Float[Tensor, "t b m 2 h w"]], gains: Float[Tensor, "n g h w"]
-) -> Float[Tensor, "n 2 h w"]:
-    """Update (s1, s2) by adding gains times event sums to atanh(s1) and atanh(s2)."""
-    moves = stokes.new_zeros(())
-    for gain, near in zip(gains.contiguous().chunk(len(sums), dim=1), sums, strict=True):
-        moves = torch.addcmul(moves, gain.unflatten(1, (-1, 1)), near.flatten(0, 1))
-    return torch.tanh(torch.atanh(MAX_DOLP * stokes) + moves.sum(1))
-
-
-def averaged(
-    stokes: Float[Tensor, "n 2 h w"],
-    dolp: Float[Tensor, "n 1 h w"],
-    panorama: Float[Tensor, "n 2 h/2 w/2"],
-    share: Float[Tensor, "n 1 #h #w"],
-    around: int,
-) -> tuple[Float[Tensor, "n 2 h w"], Float[Tensor, "n 1 h w"]]:
-    """Interpolate (s1, s2) and DoLP towards a panorama, with weight `share`.
-
-    `panorama` holds atanh(s1) and atanh(s2) up to additive constants. The constants are chosen so that its mean over
-    `around` pixels at quarter resolution matches that of (s1, s2).
-    """
-    short = length(*stokes.unbind(1))[:, None]
-    own = torch.atanh(stokes / short * torch.maximum(short, dolp).clamp(max=MAX_DOLP))
-    constants = box_means(block_means(own, 4) - block_means(panorama, 2), around)
-    panorama = panorama + enlarged(constants, 2)
-    aligned = torch.tanh(enlarged(panorama, 2))
-    return torch.lerp(stokes, aligned, share), torch.lerp(dolp, length(*aligned.unbind(1))[:, None], share)
 
 
 def _panorama_images(images: Float[Tensor, "n 4 h w"], certain: Float[Tensor, "n 1 1 1"]) -> Float[Tensor, "n 5 h w"]:
