@@ -134,7 +134,7 @@ def _sensor_fit(section: str, stimulus: str) -> Block:
     )  # fmt: skip
 
 
-BLOCKS = NETWORK_BLOCKS | ROBUSTNESS_BLOCKS | PLANNING_BLOCKS | {
+BLOCKS = ROBUSTNESS_BLOCKS | NETWORK_BLOCKS | PLANNING_BLOCKS | {
     "pipeline-scores": Block(
         "pipeline", "metrics", "studies.measure",
         lambda results: _demo_table(results["metrics"], results.get("weights", {})),
