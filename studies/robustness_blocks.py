@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from statistics import geometric_mean
 from typing import Any
 
+from studies.earlier_weights import FACTORS, RATIOS, figures_of
 from studies.network_blocks import score_columns
 from studies.rate import ENDS, HELD, OURS, RATE_HZ, RATED
 from studies.robustness import BLOCKS, CALIBRATED, CONSTANT
@@ -100,6 +101,12 @@ def mean_over_kinds(tables: Mapping[str, Mapping[str, Any]], network: str) -> fl
     return geometric_mean(map(geometric_mean, of_kind.values()))
 
 
+def _earlier_rows(results: Results) -> Iterator[Row]:
+    """Earlier shipped weights, then today's."""
+    yield from results["test"]["rows"]
+    yield {"about": "today's", **figures_of(results["robustness"]["test"]["tables"])}
+
+
 def _off_by_rows(results: Results) -> Iterator[Row]:
     """The factor by which expected errors are off, by set of scenes and sensor."""
     for name, table in results["test"]["tables"].items():
@@ -172,6 +179,13 @@ ROBUSTNESS_BLOCKS = {
             "source left out": "`{name}`", "number": "{scenes}", "chosen by all others": "{chosen}",
             "its MSE there": "{ratio:.3f}",
         },
+    ),
+    "robustness-earlier": Block(
+        "earlier_weights", "test", "studies.earlier_weights", _earlier_rows,
+        {"weights; expected errors": "{about}"}
+        | {f"`{name}`": f"{{ratio[{name}]:.2f}}" for name in RATIOS}
+        | {f"`{name}`, off by": f"{{factor[{name}]:.2f}}" for name in FACTORS},
+        beside="robustness",
     ),
     "robustness-expected": Block(
         "robustness", "test", "studies.robustness --write", _off_by_rows,
