@@ -104,7 +104,9 @@ def mean_over_kinds(tables: Mapping[str, Mapping[str, Any]], network: str) -> fl
 def _earlier_rows(results: Results) -> Iterator[Row]:
     """Earlier shipped weights, then today's."""
     yield from results["test"]["rows"]
-    yield {"about": "today's", **figures_of(results["robustness"]["test"]["tables"])}
+    today = results["robustness"]
+    commit = today["records"]["test"]["commit"]
+    yield {"about": "today's", "commit": commit, **figures_of(today["test"]["tables"])}
 
 
 def _off_by_rows(results: Results) -> Iterator[Row]:
@@ -184,7 +186,9 @@ ROBUSTNESS_BLOCKS = {
         "earlier_weights", "test", "studies.earlier_weights", _earlier_rows,
         {"weights; expected errors": "{about}"}
         | {f"`{name}`": f"{{ratio[{name}]:.2f}}" for name in RATIOS}
-        | {f"`{name}`, off by": f"{{factor[{name}]:.2f}}" for name in FACTORS},
+        | {f"`{name}`, off by": f"{{factor[{name}]:.2f}}" for name in FACTORS}
+        | {"commit": "`{commit:.10}`"},
+        "Each row was measured at its commit. They were collected here: {origin}",
         beside="robustness",
     ),
     "robustness-expected": Block(
