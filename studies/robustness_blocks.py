@@ -188,7 +188,7 @@ ROBUSTNESS_BLOCKS = {
         | {f"`{name}`": f"{{ratio[{name}]:.2f}}" for name in RATIOS}
         | {f"`{name}`, off by": f"{{factor[{name}]:.2f}}" for name in FACTORS}
         | {"commit": "`{commit:.10}`"},
-        "Each row was measured at its commit. They were collected here: {origin}",
+        "Each row was measured at the commit that it names.",
         beside="robustness",
     ),
     "robustness-expected": Block(
