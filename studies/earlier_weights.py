@@ -17,7 +17,7 @@ MEASURED = {
     "4546618": "crops, then whole sequences (`loss.half_weight=0.05`); five features, fitted to photographs",
     "a9a6e44": "the same network; five features, half of the weight on scenes like real ones",
 }
-"""What the weights and their expected errors were, by the commit of their figures."""
+"""Training and expected errors, by the commit that has the figures."""
 RATIOS = (
     "photographs", "photographs_large", "measured", "sensors.default", "sensors.noisy", "sensors.thresholds_0.4",
     "sensors.dvs_voltmeter", "sensors.saturating_readout", "sensors.randomised",
