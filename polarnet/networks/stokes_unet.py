@@ -34,18 +34,20 @@ from polarnet.networks.redundancy import (
     neighbourhoods,
 )
 from polarnet.networks.sensitivity import Equaliser
+from polarnet.networks.shot_noise import Counts, ShotNoise, isolated_events, moved_by_noise
 from polarnet.networks.threshold import Scale, scale_features
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
 STRIDE = 4  # stride of the finest recurrent layer; height and width (in blocks of `binning`) are padded to multiples
 IMAGES = 2  # input images per channel: sum of polarities and number of events (representation `event_counts`)
-PARTS = ("redundancy", "slopes", "sums", "recurrence", "panorama", "sensitivity", "scale")
+PARTS = ("redundancy", "slopes", "shot_noise", "sums", "recurrence", "panorama", "sensitivity", "scale")
 MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate
 SENSITIVITY_TENSORS = 2  # numbers of ON and OFF events, and the change of their weights
+NOISE_TENSORS = 2  # numbers of isolated events and quiet pixels, and the events around each pixel in the last window
 PANORAMA_TENSORS = 1 + len(Panorama._fields)  # events of the previous window, then the panorama
 NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window: no sums, moments or wide sums, and no more
-SOLVER_TENSORS = SENSITIVITY_TENSORS + len(NO_STATE) + PANORAMA_TENSORS  # the recurrent layers' states follow
+SOLVER_TENSORS = SENSITIVITY_TENSORS + NOISE_TENSORS + len(NO_STATE) + PANORAMA_TENSORS  # then the recurrent layers'
 LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
 LOG_VARIANCE_OUTPUTS = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
 
@@ -91,6 +93,7 @@ class StokesUNetConfig:
 
     - redundancy: all candidates are 0
     - slopes: the panorama's candidates are 0
+    - shot_noise: isolated events do not move the level
     - sums: the gains that move (s1, s2) by event sums are 0
     - recurrence: recurrent layers restart in each window
     - panorama: there is none
@@ -131,6 +134,8 @@ class Solved(NamedTuple):
     """The panorama's four images."""
     certain: Float[Tensor, "n 1 1 1"]
     """The panorama's certainty."""
+    noise: Counts
+    """Isolated events, mostly of shot noise."""
     size: tuple[int, int]
     """Height and width of the sensor."""
 
@@ -144,16 +149,19 @@ class StokesUNet(nn.Module):
     1. Mixing: the redundancy gives candidates for (s1, s2) from changes in time and from the panorama's slopes. The
        U-Net mixes these candidates and a constant with weights for each pixel. The mixture is coarse but on the true
        scale.
-    2. Fine structure: e0 - e90 counts the change of 2 atanh(s1) at a pixel. Sums of such differences, times gains from
+    2. Shot noise: where there is much of it, the rates of isolated events move the level of the whole sensor
+       (`polarnet.networks.shot_noise`).
+    3. Fine structure: e0 - e90 counts the change of 2 atanh(s1) at a pixel. Sums of such differences, times gains from
        the U-Net, therefore update (s1, s2).
-    3. Panorama: the result is averaged with the panorama (`polarnet.networks.panorama`). The panorama's unknown
+    4. Panorama: the result is averaged with the panorama (`polarnet.networks.panorama`). The panorama's unknown
        constants are fitted to the result around each pixel. The panorama has no trained parameters; the U-Net receives
        it as an input and chooses its weight at each pixel.
-    4. Correction: the U-Net sees the result and adds an unconstrained correction.
+    5. Correction: the U-Net sees the result and adds an unconstrained correction.
 
-    The state is a list. It starts with the numbers of ON and OFF events and the change of their weights, the event
-    sums, the sums of moments, and the sums averaged over each width of `WIDE`. The events of the previous window with
-    the panorama follow, then the states of the recurrent layers.
+    The state is a list. It starts with the numbers of ON and OFF events and the change of their weights. The numbers of
+    isolated events and the events around each pixel follow, then the event sums, the sums of moments, and the sums
+    averaged over each width of `WIDE`. The events of the previous window with the panorama follow, then the states of
+    the recurrent layers.
 
     DoLP is predicted separately from the length of (s1, s2). Where (s1, s2) are uncertain, their mean is too short,
     like any mean over angles. The outputs are linear, as in the paper's network.
@@ -190,6 +198,7 @@ class StokesUNet(nn.Module):
         self.solve = LeastSquares(memories, len(config.decays), scales)
         self.slopes = SlopeMoments()
         self.solve_slopes = LeastSquares(1, 1, scales)
+        self.shot_noise = ShotNoise()
         self.stem = conv3x3(4 * (4 * memories + 1), half)
         self.from_mosaic = nn.Conv2d(5, half, kernel_size=3, padding=1, bias=False)  # name in shipped weights
         self.to_quarter = nn.Conv2d(half, quarter, kernel_size=2, stride=2)
@@ -244,10 +253,14 @@ class StokesUNet(nn.Module):
         side = STRIDE * self.binning
         inputs = block_means(F.pad(inputs, (0, -width % side, 0, -height % side)), self.binning)  # no events in padding
         polarity, count = inputs.unflatten(2, (4, IMAGES)).unbind(3)
-        equalised, sensitivity = self.equaliser(polarity, count, state[:SENSITIVITY_TENSORS])
+        before_sensitivity, state = state[:SENSITIVITY_TENSORS], state[SENSITIVITY_TENSORS:]
+        before_noise, state = state[:NOISE_TENSORS], state[NOISE_TENSORS:]
+        equalised, sensitivity = self.equaliser(polarity, count, before_sensitivity)
+        raw = count
         if "sensitivity" not in self.without:
             polarity, count = equalised.polarity, equalised.events
-        before_sums, before_moments, *others = state[SENSITIVITY_TENSORS:] or NO_STATE
+        noise, isolated = isolated_events(count, raw, before_noise)
+        before_sums, before_moments, *others = state or NO_STATE
         before_wide, before_panorama = others[: len(WIDE)], others[len(WIDE) :]
 
         keep = self.memories.view(-1, 1, 1, 1)
@@ -265,14 +278,15 @@ class StokesUNet(nn.Module):
 
         x2 = on_blocks(self.stem, _event_images(sums.flatten(0, 1), scale * count.flatten(0, 1)))
         x2 = F.relu(x2 + self.from_mosaic(_panorama_images(images, certain)))
-        solved = Solved(x2, candidates, [differences(sums), *wide], images, certain, (height, width))
-        return solved, [*sensitivity, steps[-1], moments, *(means[-1] for means in wide_steps), *next_panorama]
+        solved = Solved(x2, candidates, [differences(sums), *wide], images, certain, noise, (height, width))
+        last_wide = [means[-1] for means in wide_steps]
+        return solved, [*sensitivity, *isolated, steps[-1], moments, *last_wide, *next_panorama]
 
     def refine_windows(
         self, solved: Solved, state: list[Tensor]
     ) -> tuple[Prediction, Float[Tensor, "n k h2 w2"], list[Tensor]]:
         """Second half of `unroll`. `state` holds the states of the recurrent layers, empty at the start."""
-        x2, candidates, sums, images, certain, (height, width) = solved
+        x2, candidates, sums, images, certain, noise, (height, width) = solved
         t, b = sums[0].shape[:2]
         y4, recurrent = self._quarter(x2, candidates, b, state)
         y2 = self.at_half(self.up_half(y4, skip=x2))
@@ -280,7 +294,8 @@ class StokesUNet(nn.Module):
         weights = self.choose(y4).float().softmax(1)
         coarse = enlarged(self._mixed(candidates, weights), 4)
         gains = self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float())
-        moved = moved_by_events(coarse[:, :2], sums, gains)
+        level = moved_by_noise(coarse[:, :2], self._unless("shot_noise", self.shot_noise(noise)))
+        moved = moved_by_events(level, sums, gains)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
         share = certain * enlarged(torch.sigmoid(self.trust(y2).float()), 2)
         fine = torch.cat(averaged(moved, dolp, images[:, 1:3], share, self.around), dim=1)

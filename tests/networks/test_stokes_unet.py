@@ -63,7 +63,7 @@ def test_any_height_and_width_come_back_with_everything_predicted():
         assert prediction.stokes.shape == (2, 2, height, width)
         assert prediction.aolp.min() >= 0
         assert prediction.aolp.max() < math.pi
-        assert len(state) == 2 + 1 + 1 + 2 + 4 + 3
+        assert len(state) == 2 + 2 + 1 + 1 + 2 + 4 + 3
 
 
 @torch.no_grad()
@@ -138,17 +138,27 @@ def test_it_costs_at_most_three_times_what_the_papers_network_costs():
     assert flops(StokesUNet(SHIPPED).eval(), 8) < 3 * flops(DolpUNet(paper), 4)
 
 
+def shot_noise(windows: int, height: int, width: int) -> torch.Tensor:
+    """ON events at random pixels, most of them in channel 135: [windows, 1, 8, h, w]."""
+    chance = torch.tensor([0.1, 0.1, 0.1, 0.2]).view(4, 1, 1)
+    noise = (torch.rand(windows, 4, height, width, generator=torch.Generator().manual_seed(2)) < chance).float()
+    return noise.repeat_interleave(2, dim=1)[:, None]
+
+
 @torch.no_grad()
 def test_each_part_can_be_left_out_and_then_does_nothing():
     windows = moving_events(4, 48, 64)
+    windows[..., :32] = 0  # half of the sensor sees nothing that moves
+    windows += shot_noise(4, 48, 64)
     whole, _ = network().unroll(windows)
     without = {part: network(without=[part]) for part in PARTS}
     predictions = {part: built.unroll(windows)[0] for part, built in without.items()}
     assert all((one.dolp - whole.dolp).abs().max() > 1e-3 for one in predictions.values())
     without["redundancy"].moments.log_mismatch.add_(1)
     without["slopes"].slopes.log_activity.add_(1)
+    without["shot_noise"].shot_noise.gain.add_(1)
     without["sums"].gains.weight.add_(1)
-    for part in ("redundancy", "slopes", "sums"):
+    for part in ("redundancy", "slopes", "shot_noise", "sums"):
         torch.testing.assert_close(without[part].unroll(windows)[0].dolp, predictions[part].dolp)
     without["recurrence"].gru_quarter.from_state.weight.add_(1)
     torch.testing.assert_close(without["recurrence"].unroll(windows)[0].dolp, predictions["recurrence"].dolp)
