@@ -19,6 +19,7 @@ from torch.nn import functional as F
 
 from polarnet.networks.redundancy import length
 
+NINE = 9  # pixels in a neighbourhood, the pixel included
 COUNTS = 2  # isolated events and quiet pixels, of each channel
 KEPT = 0.98  # decay of both per window
 FEW = 3.0  # events of the usual rate that are added to those of each channel
@@ -49,18 +50,12 @@ def isolated_events(
     counts, before = state or [raw.new_zeros(COUNTS, *raw.shape[1:3]), torch.zeros_like(raw[0])]
     after = []
     for weighted, now in zip(events, raw, strict=True):
-        around = _sums_of_nine(now)
+        around = NINE * F.avg_pool2d(now, 3, stride=1, padding=1)
         quiet = ((around - now < SILENT) & (before < BEFORE)).to(now.dtype)
         counts = KEPT * counts + torch.stack([(quiet * weighted).sum((-1, -2)), quiet.sum((-1, -2))])
         before = around
         after.append(counts)
     return Counts(*torch.stack(after, dim=1)), [counts, before]
-
-
-def _sums_of_nine(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-    padded = F.pad(x, (1, 1, 1, 1))
-    rows = padded[..., :-2] + padded[..., 1:-1] + padded[..., 2:]
-    return rows[..., :-2, :] + rows[..., 1:-1, :] + rows[..., 2:, :]
 
 
 class ShotNoise(nn.Module):

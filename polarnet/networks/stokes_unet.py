@@ -47,7 +47,7 @@ SENSITIVITY_TENSORS = 2  # numbers of ON and OFF events, and the change of their
 NOISE_TENSORS = 2  # numbers of isolated events and quiet pixels, and the events around each pixel in the last window
 PANORAMA_TENSORS = 1 + len(Panorama._fields)  # events of the previous window, then the panorama
 NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window: no sums, moments or wide sums, and no more
-SOLVER_TENSORS = SENSITIVITY_TENSORS + NOISE_TENSORS + len(NO_STATE) + PANORAMA_TENSORS  # then the recurrent layers'
+SOLVER_TENSORS = SENSITIVITY_TENSORS + NOISE_TENSORS + len(NO_STATE) + PANORAMA_TENSORS  # recurrent layers' follow
 LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
 LOG_VARIANCE_OUTPUTS = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
 

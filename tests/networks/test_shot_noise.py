@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.shot_noise import GAIN, USUAL_RATE, ShotNoise, isolated_events
+from polarnet.networks.shot_noise import GAIN, USUAL_RATE, ShotNoise, isolated_events, moved_by_noise
 
 
 def noise(rates: list[float], windows: int = 30) -> torch.Tensor:
@@ -12,9 +12,9 @@ def noise(rates: list[float], windows: int = 30) -> torch.Tensor:
     return torch.poisson(means, torch.Generator().manual_seed(0))
 
 
-def level(*windows: torch.Tensor) -> torch.Tensor:
+def level(windows: torch.Tensor) -> torch.Tensor:
     """Changes of (s1, s2) after the last window."""
-    counts, _ = isolated_events(torch.cat(windows), torch.cat(windows), [])
+    counts, _ = isolated_events(windows, windows, [])
     return ShotNoise()(counts)[-1].flatten().detach()
 
 
@@ -70,3 +70,10 @@ def test_exchanged_channels_exchange_the_signs():
 def test_a_sensor_with_little_shot_noise_keeps_its_level():
     assert level(noise([0.005, 0.01, 0.01, 0.02])).abs().max() < 0.01
     assert level(torch.zeros(3, 1, 4, 48, 64)).tolist() == [0, 0]
+
+
+def test_no_vector_becomes_longer_than_1():
+    moved = moved_by_noise(torch.tensor([0.9, 0.0]).view(1, 2, 1, 1), torch.tensor([0.3, 0.5]).view(1, 2, 1, 1))
+    assert moved.flatten().tolist() == pytest.approx([1.2 / 1.3, 0.5 / 1.3])
+    kept = moved_by_noise(torch.tensor([0.2, 0.1]).view(1, 2, 1, 1), torch.tensor([0.1, 0.1]).view(1, 2, 1, 1))
+    assert kept.flatten().tolist() == pytest.approx([0.3, 0.2])
