@@ -75,5 +75,5 @@ def test_a_sensor_with_little_shot_noise_keeps_its_level():
 def test_no_vector_becomes_longer_than_1():
     moved = moved_by_noise(torch.tensor([0.9, 0.0]).view(1, 2, 1, 1), torch.tensor([0.3, 0.5]).view(1, 2, 1, 1))
     assert moved.flatten().tolist() == pytest.approx([1.2 / 1.3, 0.5 / 1.3])
-    kept = moved_by_noise(torch.tensor([0.2, 0.1]).view(1, 2, 1, 1), torch.tensor([0.1, 0.1]).view(1, 2, 1, 1))
-    assert kept.flatten().tolist() == pytest.approx([0.3, 0.2])
+    short = moved_by_noise(torch.tensor([0.2, 0.1]).view(1, 2, 1, 1), torch.tensor([0.1, 0.1]).view(1, 2, 1, 1))
+    assert short.flatten().tolist() == pytest.approx([0.3, 0.2])
