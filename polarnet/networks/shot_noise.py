@@ -5,9 +5,9 @@ A pixel fires ON and OFF events from shot noise even while its light is constant
 therefore tell which of them is darker, even where polarization is uniform and the redundancy of four channels says
 nothing.
 
-Shot noise is counted where little else fires: an event is isolated if its channel has no event at the eight pixels
-around it in the same window, and at most one at all nine in the window before. Isolated events also come from edges of
-low contrast, so a sensor with few of them says nothing.
+Shot noise is counted where little else fires: a pixel's events are isolated if its channel is silent at the eight
+pixels around it in the same window, and at most one of all nine fired in the window before. Isolated events also come
+from edges of low contrast, so a sensor with few of them says nothing.
 """
 
 from typing import NamedTuple
@@ -19,12 +19,10 @@ from torch.nn import functional as F
 
 from polarnet.networks.redundancy import length
 
-NINE = 9  # pixels in a neighbourhood, the pixel included
 COUNTS = 2  # isolated events and quiet pixels, of each channel
 KEPT = 0.98  # decay of both per window
 FEW = 3.0  # events of the usual rate that are added to those of each channel
-SILENT = 0.01  # largest mean number of events at a silent pixel (a block of `binning`), far below one event
-BEFORE = 1.0 + SILENT  # largest number of events at and around a quiet pixel in the window before
+NINE = 9  # pixels in a neighbourhood, the pixel included
 GAIN = 0.4  # change of s1 per difference of the rates' logarithms; this and the next: from training photographs
 USUAL_RATE = 0.09  # isolated events per quiet pixel and window with which shot noise moves the level by half of this
 SHARPNESS = 6.0  # exponent of the rate over USUAL_RATE
@@ -34,25 +32,23 @@ class Counts(NamedTuple):
     """Numbers of isolated events and of quiet pixels of the sensor, summed over time, after each of t windows."""
 
     isolated: Float[Tensor, "t b 4"]
+    """Several events of a pixel in one window count once, so that a hot pixel counts little."""
     quiet: Float[Tensor, "t b 4"]
 
 
 @torch.no_grad()
-def isolated_events(
-    events: Float[Tensor, "t b 4 h w"], raw: Float[Tensor, "t b 4 h w"], state: list[Tensor]
-) -> tuple[Counts, list[Tensor]]:
-    """Count isolated events and quiet pixels over t windows.
+def isolated_events(count: Float[Tensor, "t b 4 h w"], state: list[Tensor]) -> tuple[Counts, list[Tensor]]:
+    """Count isolated events and quiet pixels over t windows, from the numbers of events at the sensor's pixels.
 
-    `events` are numbers of events, weighted by the pixels' sensitivities (`polarnet.networks.sensitivity`), so that a
-    hot pixel counts little; `raw` are the same without weights. `state` is empty at the start. Otherwise it holds the
-    last counts, and the events around each pixel in the window before.
+    `state` is empty at the start. Otherwise it holds the last counts, and how many of the nine pixels around each pixel
+    fired in the window before.
     """
-    counts, before = state or [raw.new_zeros(COUNTS, *raw.shape[1:3]), torch.zeros_like(raw[0])]
+    counts, before = state or [count.new_zeros(COUNTS, *count.shape[1:3]), torch.zeros_like(count[0])]
     after = []
-    for weighted, now in zip(events, raw, strict=True):
-        around = NINE * F.avg_pool2d(now, 3, stride=1, padding=1)
-        quiet = ((around - now < SILENT) & (before < BEFORE)).to(now.dtype)
-        counts = KEPT * counts + torch.stack([(quiet * weighted).sum((-1, -2)), quiet.sum((-1, -2))])
+    for fired in (count > 0).to(count.dtype):
+        around = torch.round(NINE * F.avg_pool2d(fired, 3, stride=1, padding=1))
+        quiet = ((around == fired) & (before <= 1)).to(fired.dtype)
+        counts = KEPT * counts + torch.stack([(quiet * fired).sum((-1, -2)), quiet.sum((-1, -2))])
         before = around
         after.append(counts)
     return Counts(*torch.stack(after, dim=1)), [counts, before]

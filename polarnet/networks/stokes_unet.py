@@ -44,7 +44,7 @@ IMAGES = 2  # input images per channel: sum of polarities and number of events (
 PARTS = ("redundancy", "slopes", "shot_noise", "sums", "recurrence", "panorama", "sensitivity", "scale")
 MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate
 SENSITIVITY_TENSORS = 2  # numbers of ON and OFF events, and the change of their weights
-NOISE_TENSORS = 2  # numbers of isolated events and quiet pixels, and the events around each pixel in the last window
+NOISE_TENSORS = 2  # isolated events and quiet pixels; how many pixels around each one fired in the last window
 PANORAMA_TENSORS = 1 + len(Panorama._fields)  # events of the previous window, then the panorama
 NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window: no sums, moments or wide sums, and no more
 SOLVER_TENSORS = SENSITIVITY_TENSORS + NOISE_TENSORS + len(NO_STATE) + PANORAMA_TENSORS  # recurrent layers' follow
@@ -158,10 +158,10 @@ class StokesUNet(nn.Module):
        it as an input and chooses its weight at each pixel.
     5. Correction: the U-Net sees the result and adds an unconstrained correction.
 
-    The state is a list. It starts with the numbers of ON and OFF events and the change of their weights. The numbers of
-    isolated events and the events around each pixel follow, then the event sums, the sums of moments, and the sums
-    averaged over each width of `WIDE`. The events of the previous window with the panorama follow, then the states of
-    the recurrent layers.
+    The state is a list. It starts with the numbers of isolated events and of quiet pixels, and the number of pixels
+    that fired around each pixel. The numbers of ON and OFF events and the change of their weights follow, then the
+    event sums, the sums of moments, and the sums averaged over each width of `WIDE`. The events of the previous window
+    with the panorama follow, then the states of the recurrent layers.
 
     DoLP is predicted separately from the length of (s1, s2). Where (s1, s2) are uncertain, their mean is too short,
     like any mean over angles. The outputs are linear, as in the paper's network.
@@ -250,17 +250,15 @@ class StokesUNet(nn.Module):
     def solve_windows(self, inputs: Float[Tensor, "t b 8 h w"], state: list[Tensor]) -> tuple[Solved, list[Tensor]]:
         """First half of `unroll`: everything before the recurrent layers. `state` is empty at the start."""
         t, b, _, height, width = inputs.shape
+        noise, isolated = isolated_events(inputs.unflatten(2, (4, IMAGES))[:, :, :, 1], state[:NOISE_TENSORS])
         side = STRIDE * self.binning
         inputs = block_means(F.pad(inputs, (0, -width % side, 0, -height % side)), self.binning)  # no events in padding
         polarity, count = inputs.unflatten(2, (4, IMAGES)).unbind(3)
-        before_sensitivity, state = state[:SENSITIVITY_TENSORS], state[SENSITIVITY_TENSORS:]
-        before_noise, state = state[:NOISE_TENSORS], state[NOISE_TENSORS:]
-        equalised, sensitivity = self.equaliser(polarity, count, before_sensitivity)
-        raw = count
+        state = state[NOISE_TENSORS:]
+        equalised, sensitivity = self.equaliser(polarity, count, state[:SENSITIVITY_TENSORS])
         if "sensitivity" not in self.without:
             polarity, count = equalised.polarity, equalised.events
-        noise, isolated = isolated_events(count, raw, before_noise)
-        before_sums, before_moments, *others = state or NO_STATE
+        before_sums, before_moments, *others = state[SENSITIVITY_TENSORS:] or NO_STATE
         before_wide, before_panorama = others[: len(WIDE)], others[len(WIDE) :]
 
         keep = self.memories.view(-1, 1, 1, 1)
@@ -280,7 +278,7 @@ class StokesUNet(nn.Module):
         x2 = F.relu(x2 + self.from_mosaic(_panorama_images(images, certain)))
         solved = Solved(x2, candidates, [differences(sums), *wide], images, certain, noise, (height, width))
         last_wide = [means[-1] for means in wide_steps]
-        return solved, [*sensitivity, *isolated, steps[-1], moments, *last_wide, *next_panorama]
+        return solved, [*isolated, *sensitivity, steps[-1], moments, *last_wide, *next_panorama]
 
     def refine_windows(
         self, solved: Solved, state: list[Tensor]

@@ -14,17 +14,17 @@ def noise(rates: list[float], windows: int = 30) -> torch.Tensor:
 
 def level(windows: torch.Tensor) -> torch.Tensor:
     """Changes of (s1, s2) after the last window."""
-    counts, _ = isolated_events(windows, windows, [])
+    counts, _ = isolated_events(windows, [])
     return ShotNoise()(counts)[-1].flatten().detach()
 
 
 def test_an_event_with_another_one_beside_it_is_not_isolated():
     events = torch.zeros(1, 1, 4, 8, 8)
-    events[0, 0, 0, 1, 1] = 2  # the second event of the same pixel is no neighbour
+    events[0, 0, 0, 1, 1] = 2  # the second event of the same pixel is neither a neighbour nor counted
     events[0, 0, 1, 5, 5] = events[0, 0, 1, 6, 6] = 1
     events[0, 0, 2, 7, 7] = events[0, 0, 3, 7, 7] = 1  # another channel is no neighbour
-    counts, _ = isolated_events(events, events, [])
-    assert counts.isolated.tolist() == [[[2, 0, 1, 1]]]
+    counts, _ = isolated_events(events, [])
+    assert counts.isolated.tolist() == [[[1, 0, 1, 1]]]
     assert counts.quiet.tolist() == [[[64 - 8, 64 - 14, 64 - 3, 64 - 3]]]
 
 
@@ -33,23 +33,15 @@ def test_an_event_where_others_were_in_the_window_before_is_not_isolated():
     events[0, 0, 0, 1, 1:3] = 1
     events[0, 0, 1, 1, 1] = 1  # a single one before is allowed
     events[1, 0, :, 1, 1] = 1
-    counts, _ = isolated_events(events, events, [])
+    counts, _ = isolated_events(events, [])
     assert (counts.isolated[1] > counts.isolated[0]).tolist() == [[False, True, True, True]]
-
-
-def test_events_count_with_their_weights():
-    events = noise([0.05] * 4, windows=3)
-    counts, _ = isolated_events(events, events, [])
-    weighted, _ = isolated_events(0.5 * events, events, [])
-    torch.testing.assert_close(weighted.isolated, 0.5 * counts.isolated)
-    torch.testing.assert_close(weighted.quiet, counts.quiet)
 
 
 def test_windows_at_once_are_windows_one_by_one_with_the_state_carried():
     events, state = noise([0.05, 0.1, 0.1, 0.2], windows=4), []
-    together, last = isolated_events(events, events, [])
+    together, last = isolated_events(events, [])
     for number, window in enumerate(events):
-        counts, state = isolated_events(window[None], window[None], state)
+        counts, state = isolated_events(window[None], state)
         torch.testing.assert_close(counts.isolated[0], together.isolated[number])
     for one, other in zip(state, last, strict=True):
         torch.testing.assert_close(one, other)

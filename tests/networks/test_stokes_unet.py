@@ -70,12 +70,20 @@ def test_any_height_and_width_come_back_with_everything_predicted():
 @torch.no_grad()
 def test_binning_sees_block_means_and_answers_at_every_pixel():
     inputs = events(3, 2, 8, 24, 40)
-    coarse, features, _ = network(binning=1).unroll_with_features(block_means(inputs, 2))
-    fine, fine_features, _ = network(binning=2).unroll_with_features(inputs)
+    left_out = ["shot_noise"]  # counted at single pixels
+    coarse, features, _ = network(binning=1, without=left_out).unroll_with_features(block_means(inputs, 2))
+    fine, fine_features, _ = network(binning=2, without=left_out).unroll_with_features(inputs)
     enlarged = F.interpolate(coarse.dolp.flatten(0, 1)[:, None], scale_factor=2, mode="bilinear")
     torch.testing.assert_close(fine.dolp.flatten(0, 1)[:, None], enlarged)
     assert fine.stokes.shape == (3, 2, 2, 24, 40)
     assert fine_features.shape[-2:] == (12, 20) != features.shape[-2:]
+
+
+def test_shot_noise_is_counted_at_single_pixels_whatever_the_blocks():
+    inputs = torch.poisson(torch.full((3, 1, 8, 21, 35), 0.1), torch.Generator().manual_seed(0))
+    pixels, blocks = (network(binning=side).solve_windows(inputs, [])[0].noise for side in (1, 2))
+    assert pixels.isolated.min() > 0
+    assert [torch.equal(one, other) for one, other in zip(pixels, blocks, strict=True)] == [True, True]
 
 
 @torch.no_grad()
