@@ -27,7 +27,7 @@ LOSS = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=0.04, ha
 def task_of(project_root):
     """A new task of a small polarnet, from a checkpoint if one is given."""
     parameters = load(project_root).networks.polarnet
-    left_out = ["shot_noise"]  # edges fire most isolated events of so small a sensor
+    left_out = ["shot_noise"]  # tested by itself
     config = dataclasses.replace(parameters, channels=[4, 4, 4], reach=3, scales=[1, 0], without=left_out)
     return lambda start=None: dolp_task("polarnet", config, dataclasses.replace(TRAIN, start=start), LOSS, None, SEED)
 
