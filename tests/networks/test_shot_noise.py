@@ -20,19 +20,20 @@ def level(windows: torch.Tensor) -> torch.Tensor:
 
 def test_an_event_with_another_one_beside_it_is_not_isolated():
     events = torch.zeros(1, 1, 4, 8, 8)
-    events[0, 0, 0, 1, 1] = 2  # the second event of the same pixel is neither a neighbour nor counted
-    events[0, 0, 1, 5, 5] = events[0, 0, 1, 6, 6] = 1
-    events[0, 0, 2, 7, 7] = events[0, 0, 3, 7, 7] = 1  # another channel is no neighbour
+    events[0, 0, 0, 2, 2] = 2  # the second event of the same pixel is neither a neighbour nor counted
+    events[0, 0, 1, 4, 4] = events[0, 0, 1, 5, 5] = 1
+    events[0, 0, 2, 6, 6] = events[0, 0, 3, 6, 6] = 1  # another channel is no neighbour
+    events[0, 0, 3, 1, 1] = 1  # beside four counted pixels, but none itself
     counts, _ = isolated_events(events, [])
     assert counts.isolated.tolist() == [[[1, 0, 1, 1]]]
-    assert counts.quiet.tolist() == [[[64 - 8, 64 - 14, 64 - 3, 64 - 3]]]
+    assert counts.quiet.tolist() == [[[16, 16 - 4, 16, 16 - 4]]]
 
 
 def test_an_event_where_others_were_in_the_window_before_is_not_isolated():
     events = torch.zeros(2, 1, 4, 8, 8)
-    events[0, 0, 0, 1, 1:3] = 1
-    events[0, 0, 1, 1, 1] = 1  # a single one before is allowed
-    events[1, 0, :, 1, 1] = 1
+    events[0, 0, 0, 2, 2:4] = 1
+    events[0, 0, 1, 2, 2] = 1  # a single one before is allowed
+    events[1, 0, :, 2, 2] = 1
     counts, _ = isolated_events(events, [])
     assert (counts.isolated[1] > counts.isolated[0]).tolist() == [[False, True, True, True]]
 
