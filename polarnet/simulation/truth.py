@@ -4,7 +4,7 @@ import functools
 import itertools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -213,6 +213,8 @@ def _planes_of(scene: str, picture: str, images: Path, variation: VariationConfi
     """Scene made from a picture, quantised as stored, so that events and truth are rendered from the same values."""
     polarization, valid = _read_polarization(images, picture)
     if variation and scene != picture:
+        if valid is not None:  # unknown polarization must not move to known pixels
+            variation = replace(variation, mirrored_share=0.0)
         polarization = varied(polarization, variation, generator_for(seed, scene, "variation"))
     s0, dolp, aolp = polarization
     return as_stored(Scene(s0, dolp, aolp, valid))

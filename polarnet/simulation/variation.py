@@ -4,6 +4,9 @@ Photographs are highly polarized, because saturation becomes DoLP; measured scen
 between and have any angle, so that a network cannot learn the averages of one kind of scene. A scene of about one hue
 has nearly uniform polarization. The logarithms of the four channels then change alike for any DoLP, and the only cue
 left is the pixel's response to dim and bright light. `uniform_share` makes more such scenes.
+
+Polarization follows colour in photographs, and shape and material in measured scenes. `mirrored_share` makes scenes
+whose light says nothing about their polarization.
 """
 
 import math
@@ -19,6 +22,8 @@ from polarnet import stokes
 from polarnet.runtime.sections import one_of, section
 
 MAX_DOLP = 0.99
+MIRRORED = ((-1,), (-2,), (-1, -2))
+"""Image axes of the mirrorings that `mirrored_share` draws from."""
 SPACINGS = ("linear", "logarithmic")
 
 
@@ -43,6 +48,8 @@ class VariationConfig:
     """Share of variants whose polarization is drawn towards a uniform one of random DoLP and AoLP."""
     uniform_weight: list[Annotated[float, Field(ge=0, le=1)]]
     """[smallest, largest] weight of the uniform polarization; 1: DoLP and AoLP are constant."""
+    mirrored_share: Annotated[float, Field(ge=0, le=1)]
+    """Share of variants whose DoLP and AoLP are mirrored against S0, along one image axis or both."""
 
     def __post_init__(self):
         for name in ("dolp_factor", "s0_factor", "uniform_weight"):
@@ -68,6 +75,9 @@ def varied(
         s0 = _graded(s0, config.s0_factor, config.s0_exponent_spread, generator)
     if generator.random() < config.uniform_share:
         dolp, aolp = _drawn_to_one(dolp, aolp, config.uniform_weight, generator)
+    if generator.random() < config.mirrored_share:
+        axes = MIRRORED[generator.integers(len(MIRRORED))]
+        dolp, aolp = dolp.flip(axes), aolp.flip(axes)
     return torch.stack([s0, dolp, aolp])
 
 

@@ -14,6 +14,7 @@ from PIL import Image
 from polarnet.config.tree import load
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
+from polarnet.pictures.polarimetry import Measurement, write_intensities
 from polarnet.simulation.motion import (
     HARMONICS,
     Sine,
@@ -113,6 +114,29 @@ def test_each_training_sequence_over_a_variant_names_its_picture(images, stores,
     variant, picture = next(iter(scenes.variant_of.items()))
     assert scenes.scene_of[variant] == f"{picture}-variant01"
     assert not torch.equal(scenes.read(variant).aolp, scenes.read(f"{picture}-00").aolp)
+
+
+def test_variants_of_photographs_are_mirrored_and_those_of_measured_scenes_are_not(images, tmp_path, project_root):
+    folder = shutil.copytree(images, tmp_path / "images")
+    manifest = read_manifest(folder)
+    first, second = [entry for entry in manifest.pictures if entry.split == "train"][:2]
+    intensities = np.random.default_rng(0).uniform(0.1, 0.5, (4, first.height, first.width)).astype(np.float32)
+    measurement = Measurement(intensities, np.ones(intensities.shape[1:], bool), residual=0.0, saturated=0.0)
+    write_intensities(folder / f"{first.name}.npz", measurement)
+    write_manifest(manifest, folder)
+
+    def degrees(mirrored_share: float) -> dict[str, torch.Tensor]:
+        variation = dataclasses.replace(
+            load(project_root).variation, scenes_per_picture=1, mirrored_share=mirrored_share
+        )
+        paths = [tmp_path / f"{kind}-{mirrored_share}.zarr" for kind in ("scenes", "frames")]
+        synthesize(folder, *paths, CONFIG, 1, map, SEQUENCES_PER_PART, variation)
+        store = SceneStore.open(paths[0])
+        return {entry.name: store.read(f"{entry.name}-variant01-00").dolp for entry in (first, second)}
+
+    plain, mirrored = degrees(0.0), degrees(1.0)
+    assert torch.equal(plain[first.name], mirrored[first.name])
+    assert not torch.equal(plain[second.name], mirrored[second.name])
 
 
 def test_pictures_too_small_for_the_window_are_left_out(images, stores, tmp_path, caplog):

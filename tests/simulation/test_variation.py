@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.simulation.variation import VariationConfig, varied
+from polarnet.simulation.variation import MIRRORED, VariationConfig, varied
 
 CONFIG = VariationConfig(
     scenes_per_picture=1,
@@ -17,6 +17,7 @@ CONFIG = VariationConfig(
     s0_exponent_spread=0.35,
     uniform_share=0.0,
     uniform_weight=[0.5, 1.0],
+    mirrored_share=0.0,
 )
 
 
@@ -98,3 +99,15 @@ def test_a_weight_of_one_half_halves_the_variation_of_polarization():
 def test_a_range_upside_down_is_refused():
     with pytest.raises(ValueError, match="dolp_factor: expected \\[smaller, larger\\]"):
         replace(CONFIG, dolp_factor=[1.3, 0.1])
+
+
+def test_a_mirrored_variant_has_its_polarization_flipped_in_one_of_three_ways_and_its_light_as_it_was():
+    config, seen = replace(CONFIG, share=0.0, mirrored_share=1.0), set()
+    for seed in range(20):
+        s0, dolp, aolp = varied(scene(), config, np.random.default_rng(seed))
+        _, _, plain = varied(scene(), replace(config, mirrored_share=0.0), np.random.default_rng(seed))
+        [axes] = [axes for axes in MIRRORED if torch.equal(dolp, scene()[1].flip(axes))]
+        assert torch.equal(s0, scene()[0])
+        assert torch.equal(aolp, plain.flip(axes))
+        seen.add(axes)
+    assert seen == set(MIRRORED)
