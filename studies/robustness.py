@@ -1,7 +1,7 @@
 """Methods on photographs, on measured scenes and on other sensors, in one table.
 
 python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] --measured FOLDER ... --work FOLDER
-    [--weights [NAME=]FILE ...] [--firenet FILE] [--split test|val] [--conditions NAME ...] [--limit N] [--write]
+    [--weights [NAME=]FILE ...] [--firenet FILE] [--split test|val|train] [--conditions NAME ...] [--limit N] [--write]
 python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] --work FOLDER --training FOLDER
 
 - `photographs`: a split of the pipeline's (`experiment=photographs`) of the folder --photographs.
@@ -18,9 +18,10 @@ Under each condition but the last two, `ours, 2x2 blocks` is the network on bloc
 
 Nothing is trained, except the constants: `train_mean` is the mean DoLP of the training photographs, and `constant_real`
 the mean DoLP of the measured scenes of all sources but the one that is scored. --split val is for choices and --split
-test for figures. --limit takes the first N pictures of each set; --sensor-limit of the sensors alone. Events are
-simulated in memory, and pictures are kept in --work. --write puts the scores into docs/results/robustness.json, and
-those of the test split also into docs/pictures.
+test for figures; --split train shows how well a network knows the photographs that it was trained on. --limit takes the
+first N pictures of each set; --sensor-limit of the sensors alone. Events are simulated in memory, and pictures are kept
+in --work. --write puts the scores into docs/results/robustness.json, and those of the test split also into
+docs/pictures.
 
 The second command scores nothing. It fills --training with links to the training photographs of both folders. A
 network trained on them (`ingest.root`) has seen no photograph of --split val and --split test.
@@ -231,7 +232,8 @@ def parsed() -> argparse.Namespace:
     )
     parser.add_argument("--training", type=Path, help="folder for links to the training photographs")
     parser.add_argument("--firenet", type=Path, help="published weights of FireNet")
-    parser.add_argument("--split", choices=("test", "val"), default="test", help="split of the photographs")
+    parser.add_argument("--split", choices=("test", "val", "train"), default="test", help="split of the photographs")
+    parser.add_argument("--section", help="where --write puts a table of --split val or train; default: the split")
     parser.add_argument("--conditions", nargs="+", help="only these, such as photographs measured sensors.noisy")
     parser.add_argument("--limit", type=int, help="pictures of each set")
     parser.add_argument("--sensor-limit", type=int, help="pictures of each sensor; default: as --limit")
@@ -302,7 +304,8 @@ def write_tables(tables: Mapping[str, Any], arguments: argparse.Namespace, recor
     (arguments.work / f"robustness_{arguments.split}.json").write_text(json.dumps(section, indent=2) + "\n")
     if arguments.write:
         of_test = arguments.split == "test"
-        print(write_section(ROOT, "robustness", arguments.split, section, record, figures if of_test else None))
+        name = arguments.split if of_test else arguments.section or arguments.split
+        print(write_section(ROOT, "robustness", name, section, record, figures if of_test else None))
         if of_test:
             picture = ROOT / "docs" / "pictures" / "robustness_test.png"
             picture.write_bytes(png(robustness_figure(tables, LIGHT)))

@@ -65,17 +65,20 @@ def _robustness(key: str, form: str) -> Block:
     )  # fmt: skip
 
 
-def _compared_trainings(results: Results) -> Iterator[Row]:
-    """MSE relative to the oracle mean's of each network under each condition of the validation split."""
-    section = results["val"]
-    for name, table in section["tables"].items():
-        ratios = {row: table["rows"][row]["mse_over_oracle_mean"] for row in section["weights"]}
-        yield {"name": name, "scenes": table["scenes"], "value": ratios}
+def _compared(section: str) -> Block:
+    """MSE relative to the oracle mean's of each network under each condition of a section that starts with its split."""
 
+    def rows(results: Results) -> Iterator[Row]:
+        for name, table in results[section]["tables"].items():
+            ratios = {row: table["rows"][row]["mse_over_oracle_mean"] for row in results[section]["weights"]}
+            yield {"name": name, "scenes": table["scenes"], "value": ratios}
 
-def _compared_columns(results: Results) -> Columns:
-    networks = {name: f"{{value[{name}]:.3f}}" for name in results["val"]["weights"]}
-    return {"scenes": "`{name}`", "number": "{scenes}"} | networks
+    def columns(results: Results) -> Columns:
+        networks = {name: f"{{value[{name}]:.3f}}" for name in results[section]["weights"]}
+        return {"scenes": "`{name}`", "number": "{scenes}"} | networks
+
+    command = f"studies.robustness --split {section.partition('_')[0]} --weights NAME=FILE ... --write"
+    return Block("robustness", section, command, rows, columns)
 
 
 def _left_out_rows(results: Results) -> Iterator[Row]:
@@ -171,10 +174,9 @@ ROBUSTNESS_BLOCKS = {
     ),
     "robustness": _robustness("mse_over_oracle_mean", ".2f"),
     "robustness-median": _robustness("median_over_oracle_mean", ".2f"),
-    "robustness-trainings": Block(
-        "robustness", "val", "studies.robustness --split val --weights NAME=FILE ... --write", _compared_trainings,
-        _compared_columns,
-    ),
+    "robustness-trainings": _compared("val"),
+    "robustness-mirrored": _compared("val_mirrored"),
+    "robustness-mirrored-train": _compared("train_mirrored"),
     "robustness-left-out": Block(
         "robustness", "val", "studies.robustness --split val --weights NAME=FILE ... --write", _left_out_rows,
         {
