@@ -66,7 +66,7 @@ def _robustness(key: str, form: str) -> Block:
 
 
 def _compared(section: str) -> Block:
-    """MSE relative to the oracle mean's of each network under each condition of a section that starts with its split."""
+    """MSE relative to the oracle mean's of each network, by condition; a section's name begins with its split."""
 
     def rows(results: Results) -> Iterator[Row]:
         for name, table in results[section]["tables"].items():
