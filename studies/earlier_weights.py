@@ -17,6 +17,7 @@ MEASURED = {
     "4546618": "crops, then whole sequences (`loss.half_weight=0.05`); five features, fitted to photographs",
     "a9a6e44": "the same network; five features, half of the weight on scenes like real ones",
     "70dea80": "weakly polarized frames weighted more (`loss.half_weight=0.02`); four features, squares and products",
+    "8bc01fe": "the same network with the level from shot noise",
 }
 """Training and expected errors, by the commit that has the figures."""
 RATIOS = (
