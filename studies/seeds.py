@@ -3,9 +3,8 @@
 python -m studies.seeds --seed N --training FOLDER --photographs FOLDER --photographs-large FOLDER --measured FOLDER ...
     --work FOLDER [--write]
 
-The stages run on the training photographs (`studies.robustness --training`) with `experiment=shipped`, then with
-`experiment=shipped_whole` and `experiment=shipped_mirrored`, all with seed N: it decides motion, scenes, sensors and
-the network.
+The stages run on the training photographs (`studies.robustness --training`) with `experiment=shipped` and then with
+`experiment=shipped_whole`, all with seed N: it decides motion, scenes, sensors and the network.
 `studies.robustness` scores the network and the shipped one on the test split of both sets of photographs and on the
 measured scenes. An interrupted run resumes. --write puts both rows into docs/results/seeds.json, whose means are over
 the shipped weights and all seeds there.
@@ -22,16 +21,13 @@ from studies.measure import ROOT, command_line, machine_record, read_results, ru
 CONDITIONS = ("photographs", "photographs_large", "measured")
 FIGURES = ("mse", "psnr", "corr", "mse_over_oracle_mean", "median_over_oracle_mean")
 SHIPPED = "shipped"
-TRAININGS = ("shipped", "shipped_whole", "shipped_mirrored")  # names in conf/experiment
 
 
-def trained(seed: int, photographs: Path, folder: Path) -> Path:
-    """Checkpoint after all trainings with this seed; finished stages are not run again."""
-    common = (f"seed={seed}", f"ingest.root={photographs}", "benchmark.lpips=false")
-    weights = run_missing(folder / TRAININGS[0], f"experiment={TRAININGS[0]}", *common)
-    for training in TRAININGS[1:]:
-        weights = run_missing(folder / training, f"experiment={training}", f"train.start={weights}", *common)
-    return weights
+def trained(seed: int, training: Path, folder: Path) -> Path:
+    """Checkpoint after both trainings with this seed; finished stages are not run again."""
+    common = (f"seed={seed}", f"ingest.root={training}", "benchmark.lpips=false")
+    first = run_missing(folder / "shipped", "experiment=shipped", *common)
+    return run_missing(folder / "shipped_whole", "experiment=shipped_whole", f"train.start={first}", *common)
 
 
 def row_of(tables: dict[str, Any], network: str) -> dict[str, Any]:
