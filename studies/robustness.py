@@ -233,7 +233,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--training", type=Path, help="folder for links to the training photographs")
     parser.add_argument("--firenet", type=Path, help="published weights of FireNet")
     parser.add_argument("--split", choices=("test", "val", "train"), default="test", help="split of the photographs")
-    parser.add_argument("--section", help="where --write puts a table of --split val or train; default: the split")
+    parser.add_argument("--section", help="name of the figures of --split val or train in the file; default: the split")
     parser.add_argument("--conditions", nargs="+", help="only these, such as photographs measured sensors.noisy")
     parser.add_argument("--limit", type=int, help="pictures of each set")
     parser.add_argument("--sensor-limit", type=int, help="pictures of each sensor; default: as --limit")

@@ -102,12 +102,12 @@ def test_a_range_upside_down_is_refused():
 
 
 def test_a_mirrored_variant_has_its_polarization_flipped_in_one_of_three_ways_and_its_light_as_it_was():
-    config, seen = replace(CONFIG, share=0.0, mirrored_share=1.0), set()
+    config, ways = replace(CONFIG, share=0.0, mirrored_share=1.0), set()
     for seed in range(20):
         s0, dolp, aolp = varied(scene(), config, np.random.default_rng(seed))
         _, _, plain = varied(scene(), replace(config, mirrored_share=0.0), np.random.default_rng(seed))
         [axes] = [axes for axes in MIRRORED if torch.equal(dolp, scene()[1].flip(axes))]
         assert torch.equal(s0, scene()[0])
         assert torch.equal(aolp, plain.flip(axes))
-        seen.add(axes)
-    assert seen == set(MIRRORED)
+        ways.add(axes)
+    assert ways == set(MIRRORED)
