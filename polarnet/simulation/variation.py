@@ -6,7 +6,7 @@ has nearly uniform polarization. The logarithms of the four channels then change
 left is the pixel's response to dim and bright light. `uniform_share` makes more such scenes.
 
 Polarization follows colour in photographs, and shape and material in measured scenes. `mirrored_share` makes scenes
-whose light says nothing about their polarization.
+whose light says less about their polarization.
 """
 
 import math
