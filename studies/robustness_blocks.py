@@ -177,6 +177,7 @@ ROBUSTNESS_BLOCKS = {
     "robustness-trainings": _compared("val"),
     "robustness-mirrored": _compared("val_mirrored"),
     "robustness-mirrored-train": _compared("train_mirrored"),
+    "robustness-shot-noise": _compared("val_shot_noise"),
     "robustness-left-out": Block(
         "robustness", "val", "studies.robustness --split val --weights NAME=FILE ... --write", _left_out_rows,
         {
