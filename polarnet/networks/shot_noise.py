@@ -23,7 +23,6 @@ from polarnet.networks.redundancy import length
 COUNTS = 2  # isolated events and quiet pixels, of each channel
 KEPT = 0.98  # decay of both per window
 FEW = 3.0  # events of the usual rate that are added to those of each channel
-NINE = 9  # pixels in a neighbourhood, the pixel included
 APART = 2  # pixels from one counted pixel to the next along each axis
 GAIN = 0.4  # change of s1 per difference of the rates' logarithms; this and the next: from training photographs
 USUAL_RATE = 0.09  # isolated events per quiet pixel and window with which shot noise moves the level by half of this
@@ -48,10 +47,12 @@ def isolated_events(count: Float[Tensor, "t b 4 h w"], state: list[Tensor]) -> t
     counted = (..., slice(None, None, APART), slice(None, None, APART))
     counts, before = state or [count.new_zeros(COUNTS, *count.shape[1:3]), torch.zeros_like(count[0][counted])]
     after = []
-    for fired in (count > 0).to(count.dtype):
-        around = torch.round(NINE * F.avg_pool2d(fired, 3, stride=APART, padding=1))
-        centre = fired[counted]
-        quiet = ((around == centre) & (before <= 1)).to(fired.dtype)
+    for window in count:
+        fired = F.pad(F.relu(torch.sign(window)), (1, 1, 1, 1))
+        rows = fired[..., :-2:APART, :] + fired[..., 1:-1:APART, :] + fired[..., 2::APART, :]
+        around = rows[..., :-2:APART] + rows[..., 1:-1:APART] + rows[..., 2::APART]
+        centre = fired[..., 1:-1:APART, 1:-1:APART]
+        quiet = ((around == centre) & (before <= 1)).to(count.dtype)
         counts = KEPT * counts + torch.stack([(quiet * centre).sum((-1, -2)), quiet.sum((-1, -2))])
         before = around
         after.append(counts)

@@ -33,6 +33,7 @@ MIN_PANEL, MAX_PANEL = 240, 640  # pixels of a panel's longer side: small sensor
 GAP, MARGIN = 8, 12
 FONT_SIZE = 13  # pixels
 LINE = 22  # height of a line of text
+TEXTS = 64  # drawn lines of text that are kept
 BAR = (10, 120)  # height and width of the colour bar of DoLP
 TEXT_COLOUR = np.array([31, 35, 40], np.float32)
 
@@ -92,11 +93,9 @@ class Sheet:
             enlarged = height > image.shape[0]
             method = cv2.INTER_NEAREST if enlarged else cv2.INTER_AREA
             panel = image if image.shape[:2] == self._size else cv2.resize(image, (width, height), interpolation=method)
-            head = _white(LINE, width)
-            _write(head, caption, 0)
             framed = panel.copy()
             framed[[0, -1]], framed[:, [0, -1]] = 200, 200  # white maps would have no edge
-            parts += [np.concatenate([head, framed]), _white(LINE + height, GAP)]
+            parts += [np.concatenate([_head(caption, width), framed]), _white(LINE + height, GAP)]
         return np.concatenate(parts[:-1], axis=1)
 
     def _foot(self, width: int, text: str) -> UInt8[np.ndarray, "h2 w2 3"]:
@@ -160,6 +159,15 @@ def _white(height: int, width: int) -> UInt8[np.ndarray, "height width 3"]:
     return np.full((height, width, 3), 255, np.uint8)
 
 
+@functools.lru_cache(maxsize=TEXTS)
+def _head(caption: str, width: int) -> UInt8[np.ndarray, "height width 3"]:
+    """The caption above a panel, for reading only."""
+    head = _white(LINE, width)
+    _write(head, caption, 0)
+    head.setflags(write=False)
+    return head
+
+
 def _widened(part: UInt8[np.ndarray, "h w 3"], width: int) -> UInt8[np.ndarray, "h2 w2 3"]:
     return np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=255)
 
@@ -178,7 +186,7 @@ def _font() -> FT2Font:
     return font
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=TEXTS)
 def _text(text: str) -> Float[np.ndarray, "line w"]:
     """Coverage of each pixel of a line by the letters, in [0, 1]."""
     font = _font()
