@@ -44,8 +44,8 @@ def isolated_events(count: Float[Tensor, "t b 4 h w"], state: list[Tensor]) -> t
     `state` is empty at the start. Otherwise it holds the last counts, and how many of the nine pixels around each
     counted pixel fired in the window before.
     """
-    counted = (..., slice(None, None, APART), slice(None, None, APART))
-    counts, before = state or [count.new_zeros(COUNTS, *count.shape[1:3]), torch.zeros_like(count[0][counted])]
+    nothing = torch.zeros_like(count[0, ..., ::APART, ::APART])
+    counts, before = state or [count.new_zeros(COUNTS, *count.shape[1:3]), nothing]
     after = []
     for window in count:
         fired = F.pad(F.relu(torch.sign(window)), (1, 1, 1, 1))
