@@ -7,7 +7,7 @@ from setuptools import setup
 from setuptools.command.build_py import build_py
 
 SETTINGS = ("params.yaml", "dvc.yaml", "conf/**/*.yaml", "stages/*.py", "data/*/README.md")
-INSTALLED = Path("polarnet", "config", "settings")  # polarnet.runtime.files.shipped_settings reads it
+INSTALLED = Path("polarnet", "config", "settings")  # polarnet.terminal.installation.shipped_settings reads it
 
 
 class BuildWithSettings(build_py):

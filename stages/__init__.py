@@ -1,6 +1,6 @@
 """Hydra entry points, one for each DVC stage."""
 
-from polarnet.runtime.environment import announce_interrupts, let_threads_sleep, silence_bindings
+from polarnet.terminal.environment import announce_interrupts, let_threads_sleep, silence_bindings
 
 announce_interrupts()
 silence_bindings()

@@ -11,10 +11,10 @@ from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.machine import device_of, threads_of
 from polarnet.training.baselines import BASELINES
 from polarnet.training.dolp import dolp_task
-from polarnet.training.loop import LoopConfig, train
-from polarnet.training.parallel import join, launched
-from polarnet.training.recorder import Recorder
-from polarnet.training.task import Task, describe, open_events, open_split
+from polarnet.training.engine.loop import LoopConfig, train
+from polarnet.training.engine.parallel import join, launched
+from polarnet.training.engine.recorder import Recorder
+from polarnet.training.engine.task import Task, describe, open_events, open_split
 
 
 @hydra_stage

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt8
 
 from polarnet.events.stream import Events
-from polarnet.networks.e2p import MOSAIC
+from polarnet.networks.e2p.network import MOSAIC
 from polarnet.storage.exchange import h5py_module
 
 WHITE = 255

@@ -23,7 +23,7 @@ import torch
 
 from polarnet.benchmark.row_results import read_record, read_rows
 from polarnet.metrics.lpips import Lpips, stored_record
-from polarnet.networks.checkpoint import load_checkpoint
+from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.pictures.images import read_rgb
 from polarnet.pictures.manifest import read_manifest
 from polarnet.runtime.machine import generator_for
@@ -31,8 +31,8 @@ from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.parts import Store
 from polarnet.storage.scenes import SceneStore
-from polarnet.training.history import read_history
-from polarnet.training.recorder import read_running
+from polarnet.training.engine.history import read_history
+from polarnet.training.engine.recorder import read_running
 from studies.measure import arguments_of, command_line, machine_record, write_section
 
 ROOT = Path(__file__).resolve().parents[1]

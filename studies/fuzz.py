@@ -35,7 +35,7 @@ from safetensors.torch import save
 
 from polarnet.config.tree import ROOT_VARIABLE, Config
 from polarnet.events.stream import Events
-from polarnet.networks.checkpoint import load_checkpoint, save_checkpoint
+from polarnet.networks.base.checkpoint import load_checkpoint, save_checkpoint
 from polarnet.pictures.images import read_rgb
 from polarnet.recordings.formats import isolated
 from polarnet.recordings.recording import FORMATS

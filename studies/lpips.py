@@ -33,9 +33,9 @@ from polarnet.metrics.lpips import BACKBONES, Lpips
 from polarnet.metrics.lpips_weights import find_weights, local_source
 from polarnet.runtime.machine import configure, device_of, precision_on, usable_cores
 from polarnet.training.dolp import dolp_task
-from polarnet.training.loop import train_batch
-from polarnet.training.optimizers import OPTIMIZERS
-from polarnet.training.sequences import Batch
+from polarnet.training.engine.loop import train_batch
+from polarnet.training.engine.optimizers import OPTIMIZERS
+from polarnet.training.engine.sequences import Batch
 from studies.measure import arguments_of, command_line, machine_record, read_results, write_section
 
 ROOT = Path(__file__).resolve().parents[1]

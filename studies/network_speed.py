@@ -18,7 +18,7 @@ from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
 from polarnet.methods.between import BetweenConfig, anchored, carried
 from polarnet.methods.dolp_network import dolp_recoverer
-from polarnet.networks.checkpoint import load_network
+from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.machine import configure, precision_on
 from polarnet.stokes import Prediction

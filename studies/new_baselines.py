@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 import torch
 from ruamel.yaml import YAML
 
-from polarnet.networks.firenet import FireNet
+from polarnet.networks.e2v.firenet import FireNet
 from studies.clones import commit, dvc, executed, reproduced
 from studies.house import touched_files
 from studies.measure import ROOT, arguments_of, command_line, machine_record, write_section
 
 CALM_NETWORK = '''"""FireNet with half its contrast."""
 
-from polarnet.networks.firenet import FireNet
+from polarnet.networks.e2v.firenet import FireNet
 
 
 class CalmFireNet(FireNet):
@@ -47,7 +47,7 @@ SMALL_NETWORK = '''"""FireNet with one recurrent layer."""
 
 from torch.nn import functional as F
 
-from polarnet.networks.firenet import FireNet
+from polarnet.networks.e2v.firenet import FireNet
 
 
 class SmallFireNet(FireNet):
@@ -80,7 +80,7 @@ import dataclasses
 
 from polarnet.networks.small_firenet import SmallFireNet
 from polarnet.training.e2v import E2vConfig, e2v_task
-from polarnet.training.task import Baseline, initialised
+from polarnet.training.engine.task import Baseline, initialised
 
 
 def task(config, lpips, seed):

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 
 import torch
 
-from polarnet.benchmark.between_windows import frames_between
-from polarnet.benchmark.resimulate import resimulated, sequence_at
+from polarnet.analysis.between_windows import frames_between
+from polarnet.analysis.resimulate import resimulated, sequence_at
 from polarnet.benchmark.rows import Context, opened, predictions_of
 from polarnet.benchmark.score import FrameScore, score_sequence
 from polarnet.methods import METHODS

@@ -19,7 +19,7 @@ from PIL import Image
 from polarnet.cli.own_scenes import benchmark_recordings
 from polarnet.config.tree import Config, load
 from polarnet.events.mosaic import join_mosaic
-from polarnet.networks.e2p import MOSAIC
+from polarnet.networks.e2p.network import MOSAIC
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.recordings.noise import Cleaning
 from polarnet.recordings.recording import FORMATS

@@ -38,8 +38,7 @@ from polarnet.events.streaming import WindowRule
 from polarnet.methods import METHODS
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.methods.method import Recoverer
-from polarnet.networks.checkpoint import load_network
-from polarnet.networks.registry import NETWORKS
+from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import write_store
 from polarnet.recordings.live import LiveLines, Piece
@@ -79,7 +78,7 @@ def network_of(
     try:
         weights = weights or shipped_weights()
     except FileNotFoundError:
-        build, _ = NETWORKS[config.network]
+        build = config.network_config.network_class
         representation = config.train.representation or build.representation
         torch.manual_seed(config.seed)
         module = build(config.network_config, 4 * channels_of(REPRESENTATIONS[representation]))

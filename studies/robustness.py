@@ -38,7 +38,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from polarnet.benchmark.resimulate import resimulated
+from polarnet.analysis.resimulate import resimulated
 from polarnet.benchmark.rows import Context, available, predictions_of
 from polarnet.benchmark.score import FrameScore, scene_means, score_sequence, scored_windows
 from polarnet.config.pipeline import context_of

@@ -31,7 +31,7 @@ from skimage import data
 
 from polarnet.events.streaming import WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
-from polarnet.networks.checkpoint import load_network
+from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.live import LiveLines, Piece, live_lines
 from polarnet.recovery.stream import Input, recover

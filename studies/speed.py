@@ -32,7 +32,7 @@ import fsspec
 from polarnet.config.sweep import write_comparison
 from polarnet.config.tree import DOLP_TRAINING
 from polarnet.runtime.cluster import pmap
-from polarnet.training.history import read_history
+from polarnet.training.engine.history import read_history
 from studies.clones import BUCKET, s3_server
 from studies.measure import ROOT, arguments_of, command_line, machine_record, write_section
 

@@ -41,7 +41,7 @@ from polarnet.methods.method import windows_at_once
 from polarnet.networks.registry import NETWORKS
 from polarnet.runtime.machine import configure, device_of, limit_threads, precision_on, usable_cores
 from polarnet.stokes import Prediction
-from polarnet.training.loop import autocast
+from polarnet.training.engine.loop import autocast
 from studies.measure import arguments_of, command_line, machine_record, write_section
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -58,10 +58,11 @@ MEASURED = ("train_frames_per_s", "infer_windows_per_s")
 def network_of(name: str, setting: str, device: torch.device) -> tuple[nn.Module, int]:
     """The network with random weights under a setting, and its input channels."""
     config = load(ROOT)
-    build, _ = NETWORKS[name]
+    settings = getattr(config.networks, name)
+    build = settings.network_class
     channels = 4 * channels_of(REPRESENTATIONS[build.representation])
     torch.manual_seed(0)
-    network = build(getattr(config.networks, name), channels).to(device)
+    network = build(settings, channels).to(device)
     if setting == "naive":
         for module in network.modules():
             if isinstance(module, nn.Conv2d):

@@ -12,12 +12,12 @@ from polarnet.methods.half_turns import HalfTurnsConfig
 from polarnet.methods.method import Setup
 from polarnet.methods.postprocessing import PostprocessingConfig
 from polarnet.methods.stokes_gain import GainConfig
-from polarnet.networks.checkpoint import save_checkpoint
-from polarnet.networks.cista_tc import CistaTc
-from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
-from polarnet.networks.e2p import E2p
-from polarnet.networks.e2vid import E2vid
-from polarnet.networks.firenet import FireNet
+from polarnet.networks.base.checkpoint import save_checkpoint
+from polarnet.networks.cista_tc.network import CistaTc
+from polarnet.networks.e2p.network import E2p
+from polarnet.networks.e2v.e2vid import E2vid
+from polarnet.networks.e2v.firenet import FireNet
+from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
 
 HEIGHT, WIDTH = 18, 20
 WINDOW_US = 1000

@@ -24,7 +24,7 @@ from polarnet.methods.method import (
     weights_record,
     why_absent,
 )
-from polarnet.networks.checkpoint import load_checkpoint
+from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.stokes import Prediction
 
 ROWS: Mapping[str, Reference | Method] = ChainMap(METHODS, REFERENCES)  # type: ignore[arg-type]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from polarnet import __version__
 from polarnet.cli import benchmark, convert, demo, networks, new, project, recordings, sensors, simulate, stores
-from polarnet.runtime.environment import INTERRUPTED, STOPPED, let_threads_sleep, silence_bindings
+from polarnet.terminal.environment import INTERRUPTED, STOPPED, let_threads_sleep, silence_bindings
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

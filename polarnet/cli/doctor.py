@@ -15,11 +15,11 @@ from polarnet.config.tree import load
 from polarnet.methods import METHODS
 from polarnet.metrics.lpips import BACKBONES
 from polarnet.metrics.lpips_weights import local_source
-from polarnet.networks.checkpoint import load_checkpoint
+from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.networks.weights import shipped_weights
-from polarnet.runtime.extras import EXTRAS, installation, missing, requirements
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import bf16_units, usable_cores
+from polarnet.terminal.installation import EXTRAS, installation, missing, requirements
 
 PACKAGES = ("torch", "numpy", "numba", "zarr", "OpenImageIO", "opencv-contrib-python-headless", "scikit-image",
             "dvc", "hydra-core")  # fmt: skip

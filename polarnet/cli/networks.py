@@ -28,8 +28,8 @@ def add_to(commands: Commands) -> None:
 
 
 def _onnx(options: argparse.Namespace) -> int:
-    from polarnet.networks.checkpoint import load_network
     from polarnet.networks.onnx_export import TOLERANCE, export_network
+    from polarnet.networks.registry import load_network
     from polarnet.networks.weights import shipped_weights
 
     weights = options.weights or shipped_weights()

@@ -39,7 +39,7 @@ def write_project(folder: Path) -> None:
     """Write a project into a new or empty folder; ValueError for another one."""
     import shutil
 
-    from polarnet.runtime.files import shipped_settings
+    from polarnet.terminal.installation import shipped_settings
 
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder}: expected a new or an empty folder, got one with files; name another")

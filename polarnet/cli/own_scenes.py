@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from polarnet.benchmark.conditions import announced, configured
-from polarnet.benchmark.recorded import make_recorded_set
+from polarnet.analysis.conditions import announced, configured
+from polarnet.analysis.recorded import make_recorded_set
 from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.rows import Context, available, metadata_used, weights_used
 from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp

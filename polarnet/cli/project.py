@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.cli.parsers import Commands
-from polarnet.runtime.files import shipped_settings
+from polarnet.terminal.installation import shipped_settings
 
 CODE = ("polarnet/", "stages/")
 """Dependencies of stages that are code."""

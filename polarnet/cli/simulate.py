@@ -196,9 +196,9 @@ def _run(
     """Simulate into `folder` and return the facts to print."""
     from polarnet import __version__
     from polarnet.cli.simulated_files import write_simulation
+    from polarnet.clips.video import drawn_camera, moving_pieces, video_pieces
     from polarnet.runtime.machine import threads_of
     from polarnet.simulation.motion import frame_times_us
-    from polarnet.simulation.video import drawn_camera, moving_pieces, video_pieces
     from polarnet.stokes import POLARIZER_ANGLES_DEG
 
     threads, labels = threads_of(config.runtime), outputs.labels

@@ -11,19 +11,19 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from polarnet import stokes
+from polarnet.clips.video import Drawn, Piece
 from polarnet.events.mosaic import join_mosaic
 from polarnet.events.stream import Events
 from polarnet.reports.maps import encode_png
 from polarnet.reports.preview import write_true_video
-from polarnet.runtime.progress import ProgressBar
 from polarnet.simulation.moving_sensor import leave_sensors
-from polarnet.simulation.video import Drawn, Piece
 from polarnet.storage.appended import AppendedFrames
 from polarnet.storage.events import MAX_DURATION_US, EventStore
 from polarnet.storage.exchange import FORMS, label_file
 from polarnet.storage.frames import CONVENTIONS, quantise_angle, quantise_fraction
 from polarnet.storage.spool import EventSpool
 from polarnet.storage.true_frames import APPENDED, open_truth
+from polarnet.terminal.progress import ProgressBar
 
 STORE = "store"
 FORMATS = (STORE, *FORMS)

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from polarnet.benchmark.conditions import announced, configured, stored
-from polarnet.benchmark.event_budget import (
+from polarnet.analysis.conditions import announced, configured, stored
+from polarnet.analysis.event_budget import (
     between_windows,
     by_sliding_window,
     by_window_length,
@@ -20,9 +20,9 @@ from polarnet.benchmark.event_budget import (
     recovered_alone,
     since_start,
 )
+from polarnet.analysis.sensitivity import sensitivity
 from polarnet.benchmark.rows import ROWS, Context, metadata_used, why_left_out
 from polarnet.benchmark.run import train_mean_dolp
-from polarnet.benchmark.sensitivity import sensitivity
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.config.pipeline import context_of, pipeline_set, set_names
 from polarnet.config.tree import Config

@@ -4,14 +4,14 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from polarnet.networks.checkpoint import load_checkpoint
+from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.runtime.files import SUMS, changed_files
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.groups import open_group
 from polarnet.storage.parts import Store
 from polarnet.storage.scenes import SceneStore
-from polarnet.training.recorder import read_running
+from polarnet.training.engine.recorder import read_running
 
 STORES: dict[str, type[Store]] = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}
 FILES: dict[str, Callable[[Path], object]] = {".safetensors": load_checkpoint, ".pt": read_running}

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from polarnet.config.sweep import FAILURE
-from polarnet.runtime.extras import installation
 from polarnet.runtime.machine import end_with_parent
-from polarnet.training.history import HISTORY, best_row, read_history
+from polarnet.terminal.installation import installation
+from polarnet.training.engine.history import HISTORY, best_row, read_history
 
 if TYPE_CHECKING:
     import optuna

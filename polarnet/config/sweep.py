@@ -11,7 +11,7 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from polarnet.training.history import HISTORY, best_row, read_history
+from polarnet.training.engine.history import HISTORY, best_row, read_history
 
 FAILURE = "failure.txt"
 """File in the folder of a failed job with the reason in one line."""

@@ -29,7 +29,6 @@ from polarnet.metrics.lpips_weights import LpipsConfig, local_source
 from polarnet.networks.registry import NETWORKS, NetworkConfig
 from polarnet.pictures.ingest import IngestConfig
 from polarnet.runtime.cluster import pmap
-from polarnet.runtime.environment import INTERRUPTED, STOPPED
 from polarnet.runtime.machine import RuntimeConfig, configure, threads_of
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.camera import Camera
@@ -41,9 +40,10 @@ from polarnet.simulation.rotating import RotatingConfig
 from polarnet.simulation.sets import Recipe, SetsConfig
 from polarnet.simulation.variation import VariationConfig
 from polarnet.storage.parts import StorageConfig
+from polarnet.terminal.environment import INTERRUPTED, STOPPED
 from polarnet.training.baselines import BASELINES
-from polarnet.training.loop import TrainConfig
-from polarnet.training.losses import LossConfig
+from polarnet.training.engine.loop import TrainConfig
+from polarnet.training.engine.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
 EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # subfolder of the project in which DVC runs queued experiments
@@ -65,7 +65,7 @@ else:
     def _assembled(name: str, fields: Mapping[str, Any]) -> type:
         return section(dataclasses.make_dataclass(name, fields.items(), frozen=True))
 
-    NetworksConfig = _assembled("NetworksConfig", {name: config for name, (_, config) in NETWORKS.items()})
+    NetworksConfig = _assembled("NetworksConfig", NETWORKS)
     """Section `networks` of params.yaml: one section for each network; `network` names the network in use."""
     MethodsConfig = _assembled("MethodsConfig", {m.name: m.config for m in METHODS.values() if m.config is not None})
     """Section `methods` of params.yaml: one section for each method whose record declares settings."""

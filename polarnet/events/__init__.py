@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from polarnet.runtime.lazy import attach
+from polarnet.terminal.lazy import attach
 
 if TYPE_CHECKING:
     from polarnet.events.stream import Events as Events

@@ -4,7 +4,7 @@ A network predicts a frame at the end of each window, at the cost of a whole run
 sources continue it:
 
 - Motion. The displacement between the events of the last two windows is that of the scene
-  (`polarnet.networks.panorama.displacements`). The frame keeps moving at this velocity.
+  (`polarnet.networks.polarnet.panorama.displacements`). The frame keeps moving at this velocity.
 - Events. log I0 - log I90 = 2 atanh(s1) and log I45 - log I135 = 2 atanh(s2), so an event of threshold c changes
   atanh(s1) or atanh(s2) of its pixel by c / 2.
 
@@ -27,9 +27,9 @@ from torch.nn import functional as F
 from polarnet.events.representations import event_counts
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow
-from polarnet.networks.fine_structure import MAX_DOLP
-from polarnet.networks.panorama import displacements
-from polarnet.networks.redundancy import box_means
+from polarnet.networks.polarnet.fine_structure import MAX_DOLP
+from polarnet.networks.polarnet.panorama import displacements
+from polarnet.networks.polarnet.redundancy import box_means
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 

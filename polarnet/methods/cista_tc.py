@@ -1,7 +1,7 @@
 """CISTA-TC with its authors' weights (Liu, Dragotti, ICASSP 2022), without E2VID's post-processing of the images."""
 
 from polarnet.methods.intensity_network import intensity_methods
-from polarnet.networks.cista_tc import CistaTc
+from polarnet.networks.cista_tc.network import CistaTc
 
 METHODS = intensity_methods(
     "cista_tc",

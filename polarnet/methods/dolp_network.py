@@ -16,9 +16,9 @@ from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Recoverer, Setup, State, WeightsConfig, each_map, weights_file
 from polarnet.methods.two_threads import Sharing
 from polarnet.methods.window_length import of_any_length
-from polarnet.networks.checkpoint import load_network, trained_window_us
-from polarnet.networks.registry import NETWORKS
-from polarnet.networks.stokes_unet import MAX_BINNING, Binning, StokesUNet
+from polarnet.networks.base.checkpoint import trained_window_us
+from polarnet.networks.polarnet.stokes_unet import MAX_BINNING, Binning, StokesUNet
+from polarnet.networks.registry import NETWORKS, load_network
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 

@@ -11,7 +11,7 @@ from polarnet.events.representations import voxel_grid
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.intensity_network import load_baseline, voxel_grids
 from polarnet.methods.method import Method, Recoverer, Setup, State, Weights, WeightsConfig, weights_file
-from polarnet.networks.e2p import MOSAIC, E2p, angle_of, interleaved
+from polarnet.networks.e2p.network import MOSAIC, E2p, angle_of, interleaved
 from polarnet.stokes import Prediction
 
 

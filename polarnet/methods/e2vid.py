@@ -1,7 +1,7 @@
 """E2VID (Rebecq et al., CVPR 2019 and TPAMI 2021), trained by the pipeline or with its authors' weights."""
 
 from polarnet.methods.intensity_network import intensity_methods
-from polarnet.networks.e2vid import E2vid
+from polarnet.networks.e2v.e2vid import E2vid
 
 COLOUR = "#2f6fb0"
 NETWORKS = {"e2vid": E2vid}

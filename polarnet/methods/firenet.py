@@ -4,7 +4,7 @@ FireNet+ (Stoffregen et al., ECCV 2020) takes voxel grids that are not normalise
 """
 
 from polarnet.methods.intensity_network import intensity_methods
-from polarnet.networks.firenet import FireNet
+from polarnet.networks.e2v.firenet import FireNet
 
 COLOUR = "#3d8fd9"
 NETWORKS = {"firenet": FireNet}

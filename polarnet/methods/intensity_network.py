@@ -13,7 +13,7 @@ from polarnet.events.streaming import EventWindow
 from polarnet.methods.intensities import from_intensities, with_gain
 from polarnet.methods.method import Method, Recoverer, Setup, State, Weights, WeightsConfig, weights_file
 from polarnet.methods.postprocessing import postprocessed
-from polarnet.networks.checkpoint import load_checkpoint, load_tensors
+from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
 from polarnet.stokes import Prediction
 
 Networks = Mapping[str, Any]

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.postprocessing import PostprocessingConfig
 from polarnet.methods.stokes_gain import GainConfig
-from polarnet.networks.checkpoint import load_checkpoint
+from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.runtime.files import sha256
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction

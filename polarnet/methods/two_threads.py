@@ -16,7 +16,7 @@ from torch import Tensor
 
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import State, windows_at_once
-from polarnet.networks.stokes_unet import SOLVER_TENSORS, Solved, StokesUNet
+from polarnet.networks.polarnet.stokes_unet import SOLVER_TENSORS, Solved, StokesUNet
 from polarnet.runtime.machine import torch_threads
 from polarnet.stokes import Prediction
 

@@ -19,10 +19,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from polarnet.events.representations import REPRESENTATIONS, channels_of
-from polarnet.networks.checkpoint import trained_window_us
-from polarnet.runtime.extras import installation
+from polarnet.networks.base.checkpoint import trained_window_us
 from polarnet.runtime.files import replaced
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
+from polarnet.terminal.installation import installation
 
 FORMAT = "polarnet-onnx-1"
 KEY = "polarnet"  # key of the JSON in the file's metadata_props

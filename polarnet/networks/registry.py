@@ -1,14 +1,48 @@
-"""DoLP networks by their names in params.yaml. A new network needs one module and one entry here."""
+"""DoLP networks by their names in params.yaml. A new network needs one folder and one entry here."""
 
+import os
+from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
-from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
-from polarnet.networks.stokes_unet import StokesUNet, StokesUNetConfig
+from torch import nn
+
+from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
+from polarnet.networks.paper.dolp_unet import DolpUNetConfig
+from polarnet.networks.polarnet.stokes_unet import StokesUNetConfig
 
 NetworkConfig = DolpUNetConfig | StokesUNetConfig
 
-NETWORKS: dict[str, tuple[type[Any], type[NetworkConfig]]] = {
-    "paper": (DolpUNet, DolpUNetConfig),
-    "polarnet": (StokesUNet, StokesUNetConfig),
-}
-"""Class of each network, and class of its section in params.yaml."""
+NETWORKS: dict[str, type[NetworkConfig]] = {"paper": DolpUNetConfig, "polarnet": StokesUNetConfig}
+"""Class of each network's section in params.yaml, which names the network's own class."""
+
+
+def load_network(path: str | os.PathLike[str]) -> tuple[nn.Module, dict[str, Any]]:
+    """Load a DoLP network in evaluation mode, and its metadata (representation, training, versions).
+
+    >>> from polarnet.networks import load_network, shipped_weights
+    >>> network, metadata = load_network(shipped_weights())
+    >>> metadata["network"]
+    'polarnet'
+    """
+    tensors, metadata = load_checkpoint(path)
+    if metadata["network"] not in NETWORKS:
+        raise ValueError(
+            f"{path} holds a {metadata['network']!r}; expected a DoLP network, one of {', '.join(NETWORKS)}"
+        )
+    config_class = NETWORKS[metadata["network"]]
+    needed, given = {entry.name for entry in fields(config_class)}, set(metadata["config"])
+    if needed != given:
+        raise ValueError(
+            f"{Path(path).with_suffix('.json')}: expected a config with the keys of networks.{metadata['network']} in "
+            f"params.yaml, got one that lacks {_listed(needed - given)} and has besides {_listed(given - needed)}; "
+            "edit the JSON, or train again"
+        )
+    config = config_class(**metadata["config"])
+    network = config.network_class(config, metadata["in_channels"])
+    load_tensors(network, tensors, path)
+    return network.eval(), metadata
+
+
+def _listed(keys: set[str]) -> str:
+    return ", ".join(sorted(keys)) or "nothing"

@@ -16,8 +16,8 @@ from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import Events
 from polarnet.recordings.live import POLL_S, Piece
 from polarnet.recordings.source import RecordingError
-from polarnet.runtime.extras import installation
 from polarnet.stokes import Mosaic
+from polarnet.terminal.installation import installation
 
 SCHEME, CAMERA = "dv://", "camera"
 NETWORK = re.compile(r"(?P<host>[^:/]+):(?P<port>\d{1,5})")

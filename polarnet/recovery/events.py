@@ -13,7 +13,7 @@ from polarnet.events.streaming import TRAINED_WINDOW_US, EventWindow
 from polarnet.events.windows import windows_of
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.methods.method import State, each_map
-from polarnet.networks.checkpoint import load_network
+from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
 

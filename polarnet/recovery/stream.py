@@ -24,7 +24,7 @@ from polarnet.methods import METHODS
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.methods.method import Method, Recoverer, Setup, each_map, why_absent
 from polarnet.methods.overlap import advance, begin, warm_up
-from polarnet.networks.checkpoint import load_network
+from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import read_four, read_mosaic, read_plain
 from polarnet.recordings.live import LiveLines, Piece, live_lines
@@ -33,11 +33,11 @@ from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.recording import Recording, detect_format
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import RuntimeConfig, device_of, precision_on, tune
-from polarnet.runtime.progress import ProgressBar
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, Prediction
 from polarnet.storage.events import EventStore
 from polarnet.storage.exchange import EXPORT_INDEX
 from polarnet.storage.parts import unknown_sequence
+from polarnet.terminal.progress import ProgressBar
 
 STANDARD_INPUT = "-"
 BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}{postfix}]"

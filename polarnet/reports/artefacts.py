@@ -25,7 +25,7 @@ from polarnet.simulation.motion import Pose, Trajectory, sensor_to_scene
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
-from polarnet.training.history import HISTORY, best_row, read_history
+from polarnet.training.engine.history import HISTORY, best_row, read_history
 
 OURS = "ours"  # folder of the DoLP network's training
 THUMBNAIL_WIDTH = 208  # pixels, twice the displayed size

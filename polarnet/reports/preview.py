@@ -25,9 +25,9 @@ from polarnet.reports.maps import (
     polarization_hsv,
 )
 from polarnet.reports.videos import VideoWriter, with_even_sides
-from polarnet.runtime.progress import ProgressBar
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.true_frames import TrueFrame, TrueFrames
+from polarnet.terminal.progress import ProgressBar
 
 MIN_PANEL, MAX_PANEL = 240, 640  # pixels of a panel's longer side: small sensors are enlarged, large ones reduced
 GAP, MARGIN = 8, 12

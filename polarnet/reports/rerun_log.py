@@ -13,11 +13,11 @@ import torch
 from polarnet.events.representations import polarity_sums
 from polarnet.events.streaming import TRAINED_WINDOW_US, EventWindow
 from polarnet.reports.maps import angle_image, dolp_image, event_full_scale, event_image, intensity_image
-from polarnet.runtime.extras import installation
 from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore
 from polarnet.storage.parts import unknown_sequence
 from polarnet.storage.true_frames import TrueFrame, TrueFrames, open_truth, truth_beside
+from polarnet.terminal.installation import installation
 
 VIEWER = "viewer"
 """Destination that stands for the running viewer."""

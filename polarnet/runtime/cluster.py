@@ -8,9 +8,9 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
-from polarnet.runtime.extras import installation
 from polarnet.runtime.machine import end_with_parent, limit_threads, tune, usable_cores
-from polarnet.runtime.progress import ProgressBar as Bar
+from polarnet.terminal.installation import installation
+from polarnet.terminal.progress import ProgressBar as Bar
 
 ATTEMPTS = 4  # Dask's own limit for a task whose workers die (allowed-failures 3)
 

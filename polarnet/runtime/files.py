@@ -1,4 +1,4 @@
-"""Checksums and locks, files that are written whole or not at all, and the settings shipped with the package."""
+"""Checksums and locks, and files that are written whole or not at all."""
 
 import hashlib
 import shutil
@@ -8,8 +8,6 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-PACKAGE = Path(__file__).parents[1]
-INSTALLED = PACKAGE / "config" / "settings"
 SUMS = "SHA256SUMS"
 """File with the checksums of a folder, in the format of `sha256sum --check`."""
 REMAKE = "run the stage that makes it again, or copy the folder again from where it is whole"
@@ -25,16 +23,6 @@ def sha256(*parts: bytes | memoryview | Path) -> str:
         else:
             digest.update(part)
     return digest.hexdigest()
-
-
-def shipped_settings() -> Path:
-    """Folder of params.yaml and conf/ beside the code: the copy that setup.py puts into a wheel, or the source tree."""
-    return PACKAGE.parent if in_source_tree() else INSTALLED
-
-
-def in_source_tree() -> bool:
-    """Whether the code lies in a clone, and not in a wheel, which has a copy of the settings."""
-    return not INSTALLED.is_dir()
 
 
 @contextmanager

@@ -100,7 +100,7 @@ def threads_of(config: RuntimeConfig) -> int:
 
 
 def processes_here() -> int:
-    """Number of processes on this machine that share this training (polarnet.training.parallel)."""
+    """Number of processes on this machine that share this training (polarnet.training.engine.parallel)."""
     return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
 
 

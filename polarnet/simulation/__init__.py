@@ -6,7 +6,7 @@ alone loads none.
 
 from typing import TYPE_CHECKING
 
-from polarnet.runtime.lazy import attach
+from polarnet.terminal.lazy import attach
 
 if TYPE_CHECKING:
     from polarnet.pictures.builtin import BUILTIN_PHOTOS as BUILTIN_PHOTOS
@@ -28,6 +28,5 @@ if TYPE_CHECKING:
     from polarnet.simulation.scene import scene_from_rgb as scene_from_rgb
     from polarnet.simulation.sequence import Simulation as Simulation
     from polarnet.simulation.sequence import simulate as simulate
-    from polarnet.simulation.video import simulate_video as simulate_video
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -8,10 +8,10 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from polarnet.runtime.files import shipped_settings
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.polarizers import IDEAL
+from polarnet.terminal.installation import shipped_settings
 
 
 def _preset(group: str, name: str) -> dict[str, Any]:

@@ -14,10 +14,10 @@ import numpy as np
 
 from polarnet.events.labels import LABELS
 from polarnet.events.stream import Events, slice_count
-from polarnet.runtime.extras import installation
-from polarnet.runtime.progress import ProgressBar
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore, first_at_millisecond
+from polarnet.terminal.installation import installation
+from polarnet.terminal.progress import ProgressBar
 
 HDF5_CHUNK = 2**16  # events
 BLOCK = 2**18  # events converted at once

@@ -4,7 +4,7 @@ import importlib
 import pkgutil
 from pathlib import Path
 
-from polarnet.training.task import Baseline
+from polarnet.training.engine.task import Baseline
 
 _NAMES = [name for _, name, _ in pkgutil.iter_modules([str(Path(__file__).parent)]) if name != "baselines"]
 _RECORDS = [getattr(importlib.import_module(f"{__package__}.{name}"), "BASELINE", None) for name in _NAMES]

@@ -2,6 +2,7 @@
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -9,20 +10,19 @@ from torch import Tensor
 
 from polarnet.events.representations import REPRESENTATIONS, channels_of
 from polarnet.metrics.similarity import Lpips
-from polarnet.networks.checkpoint import load_checkpoint, load_tensors
-from polarnet.networks.registry import NETWORKS, NetworkConfig
-from polarnet.training.loop import TrainConfig
-from polarnet.training.losses import LossConfig, PolarizationLoss
-from polarnet.training.sequences import Batch
-from polarnet.training.task import State, Task, initialised
+from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
+from polarnet.training.engine.loop import TrainConfig
+from polarnet.training.engine.losses import LossConfig, PolarizationLoss
+from polarnet.training.engine.sequences import Batch
+from polarnet.training.engine.task import State, Task, initialised
 
 FITTED = "expected."  # tensors of the expected errors, which every training fits anew
 
 
 def dolp_task(
-    name: str, network_config: NetworkConfig, config: TrainConfig, loss: LossConfig, lpips: Lpips | None, seed: int
+    name: str, network_config: Any, config: TrainConfig, loss: LossConfig, lpips: Lpips | None, seed: int
 ) -> Task:
-    """Build the task that trains a network `name` (a key of NETWORKS), from the seed or from `config.start`.
+    """Build the task that trains a network `name` (a key of section `networks`), from the seed or from `config.start`.
 
     The expected errors of `config.start` are left out, because they fit the errors of that network.
 
@@ -30,7 +30,7 @@ def dolp_task(
     the network predicts nothing else. ValueError if the checkpoint holds another network, FileNotFoundError if there is
     none.
     """
-    build, _ = NETWORKS[name]
+    build = network_config.network_class
     representation = config.representation or build.representation
     encode = REPRESENTATIONS[representation]
     in_channels = 4 * channels_of(encode)

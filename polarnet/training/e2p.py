@@ -11,12 +11,12 @@ from torch import Tensor
 from polarnet.events.representations import voxel_grid
 from polarnet.events.stream import Events
 from polarnet.metrics.similarity import Lpips
-from polarnet.networks.e2p import BRANCHES, E2p, coded_aolp, interleaved
+from polarnet.networks.e2p.network import BRANCHES, E2p, coded_aolp, interleaved
 from polarnet.runtime.sections import section
-from polarnet.training.loop import LoopConfig
-from polarnet.training.losses import FrameLoss
-from polarnet.training.sequences import Batch
-from polarnet.training.task import Baseline, Task, initialised
+from polarnet.training.engine.loop import LoopConfig
+from polarnet.training.engine.losses import FrameLoss
+from polarnet.training.engine.sequences import Batch
+from polarnet.training.engine.task import Baseline, Task, initialised
 
 
 @section

@@ -10,10 +10,10 @@ from polarnet.events.stream import Events
 from polarnet.metrics.similarity import Lpips
 from polarnet.networks.e2v import ARCHITECTURES
 from polarnet.runtime.sections import one_of, section
-from polarnet.training.loop import LoopConfig
-from polarnet.training.losses import FrameLoss
-from polarnet.training.sequences import Batch
-from polarnet.training.task import Baseline, Task, initialised
+from polarnet.training.engine.loop import LoopConfig
+from polarnet.training.engine.losses import FrameLoss
+from polarnet.training.engine.sequences import Batch
+from polarnet.training.engine.task import Baseline, Task, initialised
 
 
 @section

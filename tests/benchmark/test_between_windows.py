@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from polarnet.benchmark.between_windows import frames_between
+from polarnet.analysis.between_windows import frames_between
 from polarnet.benchmark.rows import opened, run
 from polarnet.config.tree import load
 from polarnet.methods import METHODS

@@ -2,7 +2,7 @@ import dataclasses
 
 import pytest
 
-from polarnet.benchmark.conditions import configured, sentence, stored, trained_on, warnings
+from polarnet.analysis.conditions import configured, sentence, stored, trained_on, warnings
 from polarnet.config.tree import load
 
 

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from polarnet.benchmark.between_windows import frames_between
-from polarnet.benchmark.event_budget import (
+from polarnet.analysis.between_windows import frames_between
+from polarnet.analysis.event_budget import (
     EVENTS_PER_PIXEL,
     between_windows,
     by_sliding_window,
@@ -13,7 +13,7 @@ from polarnet.benchmark.event_budget import (
     since_start,
     sliding_recovery,
 )
-from polarnet.benchmark.resimulate import sequence_at
+from polarnet.analysis.resimulate import sequence_at
 from polarnet.benchmark.rows import opened
 from polarnet.config.tree import load
 from polarnet.events.windows import events_per_pixel

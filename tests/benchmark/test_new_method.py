@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from polarnet import methods
-from polarnet.benchmark.event_budget import since_start, sliding_recovery
+from polarnet.analysis.event_budget import since_start, sliding_recovery
 from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.run import run_benchmark

@@ -7,12 +7,12 @@ import pytest
 import torch
 from recording_fixtures import make_events, make_random_events
 
-from polarnet.benchmark.recorded import clock_notes, frame_lag, make_recorded_set, read_recorded
+from polarnet.analysis.recorded import clock_notes, frame_lag, make_recorded_set, read_recorded
 from polarnet.cli import main
 from polarnet.config.tree import load
 from polarnet.events.mosaic import join_mosaic
 from polarnet.events.stream import Events
-from polarnet.networks.e2p import MOSAIC
+from polarnet.networks.e2p.network import MOSAIC
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import write_png
 from polarnet.recordings.arrangements import shifted

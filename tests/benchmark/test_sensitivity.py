@@ -3,8 +3,8 @@ import dataclasses
 import pytest
 import torch
 
-from polarnet.benchmark.resimulate import resimulated, sequence_at
-from polarnet.benchmark.sensitivity import CHANNEL_SIGNS, SETTINGS, cameras, sensitivity
+from polarnet.analysis.resimulate import resimulated, sequence_at
+from polarnet.analysis.sensitivity import CHANNEL_SIGNS, SETTINGS, cameras, sensitivity
 from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import write_png
@@ -95,7 +95,7 @@ def test_twice_the_speed_is_twice_the_speed(stores, config, monkeypatch):
         speeds.append(trajectory.speed_px_s)
         return list(stores[2].read("leaf-00"))
 
-    monkeypatch.setattr("polarnet.benchmark.resimulate.emulate_motion", noting)
+    monkeypatch.setattr("polarnet.analysis.resimulate.emulate_motion", noting)
     resimulated(scenes, "leaf-00", config.synthesize, [config.camera] * 4, config.seed, speed=2.0)
     stored = Trajectory.from_vector(scenes.read("leaf-00").trajectory.numpy())
     assert speeds == [pytest.approx(2 * stored.speed_px_s, rel=1e-6)]

@@ -46,7 +46,7 @@ def test_the_help_of_a_command_ends_with_examples_that_it_understands(name):
 def test_doctor_names_the_rows_that_can_use_a_file_of_weights(tmp_path, capsys):
     import torch
 
-    from polarnet.networks.e2p import E2p
+    from polarnet.networks.e2p.network import E2p
 
     torch.save({"state_dict": E2p(5, aolp_channels=2).state_dict()}, tmp_path / "e2p.pth")
     assert main(["doctor", "--weights", str(tmp_path / "e2p.pth")]) == 0

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from polarnet.cli import main
-from polarnet.networks.checkpoint import save_checkpoint
-from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.networks.base.checkpoint import save_checkpoint
+from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import write_png
 from polarnet.runtime.machine import generator_for

@@ -7,8 +7,8 @@ from ruamel.yaml import YAML
 
 from polarnet.cli import main
 from polarnet.config.tree import load
-from polarnet.runtime.files import shipped_settings
 from polarnet.storage.events import EventStore
+from polarnet.terminal.installation import shipped_settings
 
 SIDE = 10
 

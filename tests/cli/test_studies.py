@@ -9,8 +9,8 @@ import torch
 
 from polarnet.cli import studies
 from polarnet.config.tree import load
-from polarnet.networks.checkpoint import save_checkpoint
-from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.networks.base.checkpoint import save_checkpoint
+from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
 from polarnet.storage.frames import FrameStore
 
 NETWORK = DolpUNetConfig(

@@ -18,10 +18,10 @@ from polarnet.methods.intensities import from_intensities, with_gain
 from polarnet.methods.intensity_network import intensity_network, load_baseline
 from polarnet.methods.method import Method, Recoverer, WeightsConfig, weights_record, why_absent
 from polarnet.methods.postprocessing import postprocessed
-from polarnet.networks.checkpoint import load_network
-from polarnet.networks.e2p import E2p, interleaved
-from polarnet.networks.firenet import FireNet
-from polarnet.networks.stokes_unet import StokesUNet
+from polarnet.networks.e2p.network import E2p, interleaved
+from polarnet.networks.e2v.firenet import FireNet
+from polarnet.networks.polarnet.stokes_unet import StokesUNet
+from polarnet.networks.registry import load_network
 from polarnet.stokes import Prediction, intensities_from_stokes, stokes_from_polarization
 
 RECONSTRUCTING = [name for name, method in METHODS.items() if method.reconstructs and method.wraps is None]

@@ -3,7 +3,7 @@ import torch
 
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.methods.two_threads import PARTS
-from polarnet.networks.checkpoint import load_network
+from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.machine import torch_threads
 from studies.network_speed import random_channels, windows_of

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from polarnet.networks.blocks import (
+from polarnet.networks.base.blocks import (
     ConvGRU,
     Level,
     ResidualBlock,

@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from polarnet.networks.checkpoint import load_checkpoint, load_network, load_tensors, save_checkpoint
-from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors, save_checkpoint
+from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.networks.registry import load_network
 
 CONFIG = DolpUNetConfig(
     channels=[4, 4, 4], swin_depth=1, swin_window=4, swin_heads=[1, 1], residual_blocks=1, input_mixing="contrasts"

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.networks.cista_tc import CistaTc
+from polarnet.networks.cista_tc.network import CistaTc
 
 
 @pytest.mark.shared

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig, compressed, contrasts
+from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig, compressed, contrasts
 
 PAPER = DolpUNetConfig(
     channels=[32, 64, 128], swin_depth=2, swin_window=5, swin_heads=[2, 4], residual_blocks=2, input_mixing="contrasts"

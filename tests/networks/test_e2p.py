@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.networks.e2p import E2p, MosaicHead, angle_of, coded_aolp, decoded_aolp, interleaved
+from polarnet.networks.e2p.network import E2p, MosaicHead, angle_of, coded_aolp, decoded_aolp, interleaved
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from polarnet.networks.e2vid import ConvLstm, E2vid, reflected
+from polarnet.networks.e2v.e2vid import ConvLstm, E2vid, reflected
 
 
 def official_tensors():

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.expected_error import (
+from polarnet.networks.polarnet.expected_error import (
     BASIC,
     FEATURES,
     MIN_DISAGREEMENT,

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from polarnet.networks.firenet import ConvGRU, FireNet
+from polarnet.networks.e2v.firenet import ConvGRU, FireNet
 
 
 def test_it_has_the_published_number_of_parameters():

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.panorama import Memory, Motion, certainty, displacements, empty_panorama, follow
+from polarnet.networks.polarnet.panorama import Memory, Motion, certainty, displacements, empty_panorama, follow
 
 MEMORY = Memory(prior=1.0, noise=0.01, drift=0.01, renewal=0.15, fade=0.95)
 HEIGHT, WIDTH, MARGIN = 44, 60, 16

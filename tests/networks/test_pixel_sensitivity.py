@@ -1,6 +1,6 @@
 import torch
 
-from polarnet.networks.sensitivity import MISMATCH, WEIGHTS, Equaliser
+from polarnet.networks.polarnet.sensitivity import MISMATCH, WEIGHTS, Equaliser
 
 WINDOWS, HEIGHT, WIDTH = 40, 48, 64
 

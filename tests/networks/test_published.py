@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from polarnet.networks.published import PublishedNetwork
+from polarnet.networks.base.published import PublishedNetwork
 
 
 class Counter(PublishedNetwork):

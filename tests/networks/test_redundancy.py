@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from polarnet.networks.blocks import contrasts
-from polarnet.networks.redundancy import (
+from polarnet.networks.base.blocks import contrasts
+from polarnet.networks.polarnet.redundancy import (
     MOMENTS,
     LeastSquares,
     SecondMoments,

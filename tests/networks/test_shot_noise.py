@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.shot_noise import GAIN, USUAL_RATE, ShotNoise, isolated_events, moved_by_noise
+from polarnet.networks.polarnet.shot_noise import GAIN, USUAL_RATE, ShotNoise, isolated_events, moved_by_noise
 
 
 def noise(rates: list[float], windows: int = 30) -> torch.Tensor:

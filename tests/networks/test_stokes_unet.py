@@ -9,10 +9,10 @@ from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
 from polarnet.config.tree import load
-from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
-from polarnet.networks.fine_structure import averaged
-from polarnet.networks.redundancy import block_means
-from polarnet.networks.stokes_unet import PARTS, StokesUNet
+from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.networks.polarnet.fine_structure import averaged
+from polarnet.networks.polarnet.redundancy import block_means
+from polarnet.networks.polarnet.stokes_unet import PARTS, StokesUNet
 from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
 
 SHIPPED = load(Path(__file__).resolve().parents[2]).networks.polarnet

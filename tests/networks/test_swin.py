@@ -1,6 +1,6 @@
 import torch
 
-from polarnet.networks.swin import (
+from polarnet.networks.paper.swin import (
     PatchMerging,
     SwinBlock,
     WindowAttention,

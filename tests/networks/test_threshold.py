@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.threshold import FEATURES, MAX_LOG_SCALE, MIN_FEATURE, Scale, scale_features
+from polarnet.networks.polarnet.threshold import FEATURES, MAX_LOG_SCALE, MIN_FEATURE, Scale, scale_features
 
 
 def trained() -> Scale:

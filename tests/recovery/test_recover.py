@@ -12,9 +12,10 @@ from polarnet.config.tree import load
 from polarnet.events.stream import Events, slice_count, slice_time
 from polarnet.events.streaming import EventWindow, WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
-from polarnet.networks.checkpoint import load_network, save_checkpoint
-from polarnet.networks.dolp_unet import DolpUNet, DolpUNetConfig
-from polarnet.networks.firenet import FireNet
+from polarnet.networks.base.checkpoint import save_checkpoint
+from polarnet.networks.e2v.firenet import FireNet
+from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines

@@ -19,7 +19,7 @@ from polarnet.simulation.truth import synthesize
 from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
-from polarnet.training.history import write_history
+from polarnet.training.engine.history import write_history
 
 SPLITS = {"park": "train", "lake": "val", "tree": "test", "leaf": "test"}
 HISTORY = [

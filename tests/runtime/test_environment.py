@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from polarnet.runtime.environment import let_threads_sleep
+from polarnet.terminal.environment import let_threads_sleep
 
 IMPORT_EVERYTHING = """
 import importlib, json, os, pkgutil, sys

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from polarnet.clips import video as video_module
+from polarnet.clips.video import moving_pieces, video_pieces
 from polarnet.events.stream import concatenate
 from polarnet.runtime.machine import seed_for
 from polarnet.simulation import (
@@ -18,10 +20,8 @@ from polarnet.simulation import (
     simulate,
     simulate_video,
 )
-from polarnet.simulation import video as video_module
 from polarnet.simulation.scene import check_scene, scene_from_polarization, scene_from_rgb
 from polarnet.simulation.upsampling import StokesFrame, upsampled
-from polarnet.simulation.video import moving_pieces, video_pieces
 from polarnet.stokes import intensities_from_stokes
 
 H, W = 24, 36

@@ -5,12 +5,12 @@ import pytest
 import torch
 
 from polarnet.events.stream import Events
-from polarnet.networks.checkpoint import save_checkpoint
+from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.pictures.images import write_png
 from polarnet.pictures.manifest import Manifest, ManifestEntry, write_manifest
 from polarnet.runtime.files import SUMS, seal
 from polarnet.storage.events import EventStore
-from polarnet.training.history import write_history
+from polarnet.training.engine.history import write_history
 from studies import faults
 
 FAULTS = 90

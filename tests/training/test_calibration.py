@@ -10,14 +10,15 @@ from test_loop import CPU, LOOP, SEED, Killed, bytes_of, run
 
 from polarnet.config.tree import load
 from polarnet.events.representations import event_tensor
-from polarnet.networks.checkpoint import load_checkpoint, load_network
+from polarnet.networks.base.checkpoint import load_checkpoint
+from polarnet.networks.registry import load_network
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
-from polarnet.training.calibration import RIDGES, Scene, fitted, weights_for
 from polarnet.training.dolp import dolp_task
-from polarnet.training.loop import TrainConfig, calibrate
-from polarnet.training.losses import LossConfig
-from polarnet.training.task import Task, open_split
+from polarnet.training.engine.calibration import RIDGES, Scene, fitted, weights_for
+from polarnet.training.engine.loop import TrainConfig, calibrate
+from polarnet.training.engine.losses import LossConfig
+from polarnet.training.engine.task import Task, open_split
 
 TRAIN = TrainConfig(**LOOP, representation=None, optimizer=None, start=None, scene_dolp=None)
 LOSS = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=0.04, half_weight=None)

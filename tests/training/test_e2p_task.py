@@ -8,14 +8,14 @@ import torch
 
 from polarnet.metrics.lpips import Lpips
 from polarnet.metrics.similarity import ssim
-from polarnet.networks.checkpoint import load_checkpoint
-from polarnet.networks.e2p import coded_aolp
+from polarnet.networks.base.checkpoint import load_checkpoint
+from polarnet.networks.e2p.network import coded_aolp
 from polarnet.storage.events import EventStore
 from polarnet.training.e2p import BranchLoss, E2pConfig, e2p_task
-from polarnet.training.loop import train, train_batch, validate
-from polarnet.training.recorder import Recorder
-from polarnet.training.sequences import stack
-from polarnet.training.task import describe, open_split
+from polarnet.training.engine.loop import train, train_batch, validate
+from polarnet.training.engine.recorder import Recorder
+from polarnet.training.engine.sequences import stack
+from polarnet.training.engine.task import describe, open_split
 
 SEED = 7
 CPU = torch.device("cpu")

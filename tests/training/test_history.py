@@ -1,7 +1,7 @@
 import pytest
 from ruamel.yaml import YAML
 
-from polarnet.training.history import HISTORY, best_row, read_history, write_history
+from polarnet.training.engine.history import HISTORY, best_row, read_history, write_history
 
 ROWS = [
     {"epoch": 0, "train": {"total": 1 / 3, "ssim_loss": 0.5}, "val": {"mse": 0.25, "psnr": 6.0}},

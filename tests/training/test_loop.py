@@ -11,20 +11,21 @@ from typing import Any
 import pytest
 import torch
 
-from polarnet.networks.checkpoint import load_checkpoint, load_network
-from polarnet.networks.dolp_unet import DolpUNetConfig
-from polarnet.networks.e2vid import E2vid
+from polarnet.networks.base.checkpoint import load_checkpoint
+from polarnet.networks.e2v.e2vid import E2vid
+from polarnet.networks.paper.dolp_unet import DolpUNetConfig
+from polarnet.networks.registry import load_network
 from polarnet.runtime.files import SUMS
 from polarnet.runtime.machine import precision_on
 from polarnet.storage.events import EventStore
 from polarnet.training.dolp import dolp_task
 from polarnet.training.e2v import E2vConfig, e2v_task
-from polarnet.training.history import read_history
-from polarnet.training.loop import TrainConfig, runs_of, set_learning_rate, train, validate
-from polarnet.training.losses import LossConfig
-from polarnet.training.recorder import Recorder
-from polarnet.training.sequences import Batch, stack
-from polarnet.training.task import Task, describe, open_split
+from polarnet.training.engine.history import read_history
+from polarnet.training.engine.loop import TrainConfig, runs_of, set_learning_rate, train, validate
+from polarnet.training.engine.losses import LossConfig
+from polarnet.training.engine.recorder import Recorder
+from polarnet.training.engine.sequences import Batch, stack
+from polarnet.training.engine.task import Task, describe, open_split
 
 SEED = 7
 CPU = torch.device("cpu")

@@ -5,7 +5,7 @@ import torch
 
 from polarnet.metrics.lpips import Lpips
 from polarnet.metrics.similarity import ssim
-from polarnet.training.losses import FrameLoss, LossConfig, PolarizationLoss
+from polarnet.training.engine.losses import FrameLoss, LossConfig, PolarizationLoss
 
 
 def frames(value: float) -> torch.Tensor:

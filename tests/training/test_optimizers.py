@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from polarnet.training.optimizers import OPTIMIZERS
+from polarnet.training.engine.optimizers import OPTIMIZERS
 
 RATE = 0.01
 

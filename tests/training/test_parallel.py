@@ -15,21 +15,21 @@ import torch.multiprocessing
 from preloaded import FORKSERVER
 from test_loop import CPU, TRAIN, run, small_task
 
-from polarnet.networks.checkpoint import load_checkpoint
-from polarnet.training.history import read_history
-from polarnet.training.parallel import add_up, join, launched, place
-from polarnet.training.sequences import Batch, parts_of
+from polarnet.networks.base.checkpoint import load_checkpoint
+from polarnet.training.engine.history import read_history
+from polarnet.training.engine.parallel import add_up, join, launched, place
+from polarnet.training.engine.sequences import Batch, parts_of
 
 ASLEEP = """
 import os, pathlib, sys, time, torch
-from polarnet.training.parallel import join
+from polarnet.training.engine.parallel import join
 join(torch.device("cpu"))
 pathlib.Path(sys.argv[1], str(os.getpid())).touch()
 time.sleep(600)
 """
 START = """
 from types import SimpleNamespace
-from polarnet.training.parallel import launched
+from polarnet.training.engine.parallel import launched
 launched("asleep", SimpleNamespace(devices=2, nodes=1))
 """
 CONFIG = dataclasses.replace(TRAIN, batch_size=5)  # of six visits: one process has nothing of the last batch

@@ -9,10 +9,10 @@ import torch
 
 from polarnet.config.tree import load
 from polarnet.training.dolp import dolp_task
-from polarnet.training.loop import autocast, train_batch
-from polarnet.training.optimizers import OPTIMIZERS
-from polarnet.training.replay import Replayed
-from polarnet.training.sequences import Batch
+from polarnet.training.engine.loop import autocast, train_batch
+from polarnet.training.engine.optimizers import OPTIMIZERS
+from polarnet.training.engine.replay import Replayed
+from polarnet.training.engine.sequences import Batch
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = load(ROOT)

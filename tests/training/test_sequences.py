@@ -12,7 +12,7 @@ from polarnet.runtime.machine import generator_for
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.windows import WindowDataset, WindowSequence
-from polarnet.training.sequences import (
+from polarnet.training.engine.sequences import (
     MEMORY_SHARE,
     View,
     ViewConfig,

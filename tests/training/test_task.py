@@ -9,15 +9,15 @@ from typing import Any
 import pytest
 import torch
 
-from polarnet.networks.checkpoint import load_checkpoint, save_checkpoint
-from polarnet.networks.dolp_unet import DolpUNetConfig
+from polarnet.networks.base.checkpoint import load_checkpoint, save_checkpoint
+from polarnet.networks.paper.dolp_unet import DolpUNetConfig
 from polarnet.storage.frames import FrameStore
 from polarnet.training.dolp import dolp_task
 from polarnet.training.e2v import E2vConfig, e2v_task
-from polarnet.training.loop import TrainConfig, train_batch, validate
-from polarnet.training.losses import LossConfig
-from polarnet.training.sequences import Visits, batches_of
-from polarnet.training.task import Split, Task, describe, open_events, open_split
+from polarnet.training.engine.loop import TrainConfig, train_batch, validate
+from polarnet.training.engine.losses import LossConfig
+from polarnet.training.engine.sequences import Visits, batches_of
+from polarnet.training.engine.task import Split, Task, describe, open_events, open_split
 
 SEED = 5
 LOOP: dict[str, Any] = {

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from polarnet.recordings.source import RecordingError
-from polarnet.runtime.extras import installation
+from polarnet.terminal.installation import installation
 
 PATIENCE_S = 60  # limit for an answer; a damaged file can put a library into an endless loop
 MAX_MIB = 8192  # address space of the process; a damaged file can state any size

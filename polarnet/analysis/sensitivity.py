@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from polarnet.benchmark.resimulate import resimulated
+from polarnet.analysis.resimulate import resimulated
 from polarnet.benchmark.rows import Context, predictions_of
 from polarnet.benchmark.score import FrameScore, mean_scores, score_sequence
-from polarnet.runtime.progress import ProgressBar
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.storage.scenes import SceneStore
+from polarnet.terminal.progress import ProgressBar
 
 CHANNEL_SIGNS = (1, -1, -1, 1)
 """Signs of the threshold error behind 0, 45, 90 and 135 degrees, opposite within each pair that gives S1 or S2."""

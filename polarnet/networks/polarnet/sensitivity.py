@@ -15,8 +15,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.blocks import enlarged
-from polarnet.networks.redundancy import block_means, box_means
+from polarnet.networks.base.blocks import enlarged
+from polarnet.networks.polarnet.redundancy import block_means, box_means
 
 BLOCK = 4  # side in pixels of the blocks whose means form a neighbourhood
 BLOCKS = 3  # width of a neighbourhood in blocks

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.firenet import ConvGRU, ResidualBlock
-from polarnet.networks.published import PublishedNetwork
+from polarnet.networks.base.firenet_layers import ConvGRU, ResidualBlock
+from polarnet.networks.base.published import PublishedNetwork
 from polarnet.stokes import aolp
 
 CHANNELS = 32

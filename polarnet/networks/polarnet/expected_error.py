@@ -4,7 +4,7 @@ The features measure three things. The redundancy's candidates disagree where th
 bounded, so middle values can have larger errors. Without events there is no evidence.
 
 The expected squared error is the exponential of a quadratic function of these features. Its few coefficients are fitted
-after training (`polarnet.training.calibration`).
+after training (`polarnet.training.engine.calibration`).
 """
 
 from itertools import combinations_with_replacement
@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from polarnet.networks.blocks import enlarged
-from polarnet.networks.redundancy import block_means
+from polarnet.networks.base.blocks import enlarged
+from polarnet.networks.polarnet.redundancy import block_means
 
 BASIC = 4
 FEATURES = BASIC + BASIC * (BASIC + 1) // 2  # basic ones, their squares and products
@@ -29,7 +29,7 @@ LITTLE_EVIDENCE = 0.1  # mean evidence of a frame with a silence of 1/2
 class ExpectedError(nn.Module):
     """Correction to the initial log-variance, at half resolution: weight @ features + bias.
 
-    Weight and bias are not trained by gradients. They stay 0 until `polarnet.training.loop.calibrate` sets them.
+    Weight and bias are not trained by gradients. They stay 0 until `polarnet.training.engine.loop.calibrate` sets them.
     """
 
     weight: Float[Tensor, " k"]

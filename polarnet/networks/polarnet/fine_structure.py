@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from polarnet.networks.blocks import enlarged
-from polarnet.networks.redundancy import block_means, box_means, faded, length
+from polarnet.networks.base.blocks import enlarged
+from polarnet.networks.polarnet.redundancy import block_means, box_means, faded, length
 
 WIDE = (3, 9)  # widths in pixels of the neighbourhoods that contribute fine structure, besides the single pixel
 MAX_DOLP = 0.98  # largest DoLP passed to atanh, to keep it finite

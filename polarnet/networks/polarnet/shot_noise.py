@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.redundancy import length
+from polarnet.networks.polarnet.redundancy import length
 
 COUNTS = 2  # isolated events and quiet pixels, of each channel
 KEPT = 0.98  # decay of both per window

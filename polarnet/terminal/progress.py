@@ -13,7 +13,7 @@ LINE_S = 30.0  # between two lines where the output is no terminal, such as a lo
 class ProgressBar(tqdm):
     """tqdm with the rate and the time left, from `PATIENCE_S` on; a line every `LINE_S` in a log.
 
-    >>> from polarnet.runtime.progress import ProgressBar
+    >>> from polarnet.terminal.progress import ProgressBar
     >>> sum(ProgressBar(range(10), "sum", unit="number"))
     45
     """

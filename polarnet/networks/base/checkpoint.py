@@ -6,7 +6,6 @@ Loading runs no code from either file. Neither file contains a date, so equal tr
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from polarnet.networks.registry import NETWORKS
 from polarnet.runtime.files import check_seal, replaced, sha256
 
 FORMAT = "polarnet-checkpoint-1"
@@ -58,32 +56,6 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], di
         raise ValueError(f"{path} is not a safetensors file: {error}") from None
 
 
-def load_network(path: str | os.PathLike[str]) -> tuple[nn.Module, dict[str, Any]]:
-    """Load a DoLP network in evaluation mode, and its metadata (representation, training, versions).
-
-    >>> from polarnet.networks import load_network, shipped_weights
-    >>> network, metadata = load_network(shipped_weights())
-    >>> metadata["network"]
-    'polarnet'
-    """
-    tensors, metadata = load_checkpoint(path)
-    if metadata["network"] not in NETWORKS:
-        raise ValueError(
-            f"{path} holds a {metadata['network']!r}; expected a DoLP network, one of {', '.join(NETWORKS)}"
-        )
-    build, config_class = NETWORKS[metadata["network"]]
-    needed, given = {entry.name for entry in fields(config_class)}, set(metadata["config"])
-    if needed != given:
-        raise ValueError(
-            f"{Path(path).with_suffix('.json')}: expected a config with the keys of networks.{metadata['network']} in "
-            f"params.yaml, got one that lacks {_listed(needed - given)} and has besides {_listed(given - needed)}; "
-            "edit the JSON, or train again"
-        )
-    network = build(config_class(**metadata["config"]), metadata["in_channels"])
-    load_tensors(network, tensors, path)
-    return network.eval(), metadata
-
-
 def trained_window_us(metadata: Mapping[str, Any]) -> int | None:
     """Return the length of a training's windows in microseconds; None unless its events were simulated."""
     settings = metadata.get("data", {}).get("events_from", {}).get("scenes", {}).get("synthesize")
@@ -101,10 +73,6 @@ def load_tensors(network: nn.Module, tensors: Mapping[str, Tensor], path: str | 
             f"is {shapes.get(wrong[0], 'absent')} ({len(wrong)} tensors differ)"
         )
     network.load_state_dict(tensors)
-
-
-def _listed(keys: set[str]) -> str:
-    return ", ".join(sorted(keys)) or "nothing"
 
 
 def _check_suffix(path: Path) -> None:

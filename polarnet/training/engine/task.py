@@ -23,8 +23,8 @@ from polarnet.storage.frames import FrameStore
 from polarnet.storage.groups import is_url
 from polarnet.storage.scenes import SceneStore
 from polarnet.storage.windows import EventSource, WindowDataset
-from polarnet.training.losses import FrameLoss
-from polarnet.training.sequences import Batch
+from polarnet.training.engine.losses import FrameLoss
+from polarnet.training.engine.sequences import Batch
 
 State = list[Tensor] | None
 Network = TypeVar("Network", bound=nn.Module)
@@ -55,7 +55,7 @@ class Task:
     """Function that picks the map to score from the predicted or true maps; its validation MSE selects the best
     epoch."""
     replays: bool = False
-    """Whether a GPU may replay `unroll` (polarnet.training.replay)."""
+    """Whether a GPU may replay `unroll` (polarnet.training.engine.replay)."""
     unroll_with_features: (
         Callable[[Tensor, State], tuple[Float[Tensor, "t b h w"], Float[Tensor, "n c i j"], State]] | None
     ) = None

@@ -9,7 +9,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.blocks import (
+from polarnet.networks.base.blocks import (
     ConvGRU,
     Level,
     ResidualBlock,
@@ -20,10 +20,18 @@ from polarnet.networks.blocks import (
     enlarged,
     on_blocks,
 )
-from polarnet.networks.expected_error import ExpectedError, error_features
-from polarnet.networks.fine_structure import WIDE, averaged, differences, moved_by_events, wide_differences
-from polarnet.networks.panorama import Memory, Motion, Panorama, certainty, displacements, empty_panorama, follow
-from polarnet.networks.redundancy import (
+from polarnet.networks.polarnet.expected_error import ExpectedError, error_features
+from polarnet.networks.polarnet.fine_structure import WIDE, averaged, differences, moved_by_events, wide_differences
+from polarnet.networks.polarnet.panorama import (
+    Memory,
+    Motion,
+    Panorama,
+    certainty,
+    displacements,
+    empty_panorama,
+    follow,
+)
+from polarnet.networks.polarnet.redundancy import (
     MOMENTS,
     LeastSquares,
     SecondMoments,
@@ -33,9 +41,9 @@ from polarnet.networks.redundancy import (
     length,
     neighbourhoods,
 )
-from polarnet.networks.sensitivity import Equaliser
-from polarnet.networks.shot_noise import Counts, ShotNoise, isolated_events, moved_by_noise
-from polarnet.networks.threshold import Scale, scale_features
+from polarnet.networks.polarnet.sensitivity import Equaliser
+from polarnet.networks.polarnet.shot_noise import Counts, ShotNoise, isolated_events, moved_by_noise
+from polarnet.networks.polarnet.threshold import Scale, scale_features
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
@@ -76,13 +84,13 @@ class StokesUNetConfig:
     panorama_margin: Annotated[int, Field(gt=0, le=4096)]
     """Margin of the panorama beyond the image, in pixels at half resolution."""
     panorama_prior: PositiveFloat
-    """This field and the next four set the panorama filter: see `polarnet.networks.panorama.Memory`."""
+    """This field and the next four set the panorama filter: see `polarnet.networks.polarnet.panorama.Memory`."""
     panorama_noise: PositiveFloat
     panorama_drift: NonNegativeFloat
     panorama_renewal: Annotated[float, Field(ge=0, le=1)]
     panorama_fade: Annotated[float, Field(ge=0, le=1)]
     panorama_step: PositiveFloat
-    """Change of natural-log intensity per event of the sensor whose scale (`polarnet.networks.threshold`) is 1."""
+    """Change of natural-log intensity per event of a sensor with scale 1 (module `threshold`)."""
     panorama_scale: PositiveInt
     """Width of the neighbourhood whose mean comes from the network instead of the panorama, in pixels at quarter
     resolution, odd."""
@@ -110,6 +118,11 @@ class StokesUNetConfig:
             raise ValueError(f"panorama_scale: expected an odd number, got {self.panorama_scale}")
         if unknown := set(self.without) - set(PARTS):
             raise ValueError(f"without: expected some of {', '.join(PARTS)}, got {', '.join(sorted(unknown))}")
+
+    @property
+    def network_class(self) -> type[Any]:
+        """Class of the network with these settings."""
+        return StokesUNet
 
 
 class Candidates(NamedTuple):
@@ -144,18 +157,18 @@ class StokesUNet(nn.Module):
     """Recurrent network from the events of four channels to DoLP, AoLP and DoLP's expected squared error.
 
     0. Sensor: each event is weighted by its pixel's estimated threshold relative to other pixels'
-       (`polarnet.networks.sensitivity`), and all event sums by the sensor's estimated threshold
-       (`polarnet.networks.threshold`).
+       (`polarnet.networks.polarnet.sensitivity`), and all event sums by the sensor's estimated threshold
+       (`polarnet.networks.polarnet.threshold`).
     1. Mixing: the redundancy gives candidates for (s1, s2) from changes in time and from the panorama's slopes. The
        U-Net mixes these candidates and a constant with weights for each pixel. The mixture is coarse but on the true
        scale.
     2. Shot noise: where there is much of it, the rates of isolated events move the level of the whole sensor
-       (`polarnet.networks.shot_noise`).
+       (`polarnet.networks.polarnet.shot_noise`).
     3. Fine structure: e0 - e90 counts the change of 2 atanh(s1) at a pixel. Sums of such differences, times gains from
        the U-Net, therefore update (s1, s2).
-    4. Panorama: the result is averaged with the panorama (`polarnet.networks.panorama`). The panorama's unknown
-       constants are fitted to the result around each pixel. The panorama has no trained parameters; the U-Net receives
-       it as an input and chooses its weight at each pixel.
+    4. Panorama: the result is averaged with the panorama (module `panorama`), whose unknown constants are fitted to
+       the result around each pixel. The panorama has no trained parameters; the U-Net receives it as an input and
+       chooses its weight at each pixel.
     5. Correction: the U-Net sees the result and adds an unconstrained correction.
 
     The state is a list. It starts with the numbers of isolated events and of quiet pixels, and the number of pixels

@@ -18,12 +18,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from polarnet.networks.checkpoint import save_checkpoint
+from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.runtime.files import claimed, replaced, seal, sha256
-from polarnet.runtime.progress import ProgressBar
-from polarnet.training.history import Row, best_row, write_history
-from polarnet.training.parallel import place
-from polarnet.training.sequences import Batch
+from polarnet.terminal.progress import ProgressBar
+from polarnet.training.engine.history import Row, best_row, write_history
+from polarnet.training.engine.parallel import place
+from polarnet.training.engine.sequences import Batch
 
 KEEP_EVERY_S = 60.0  # writing a running checkpoint of the paper's network takes 0.1 s
 

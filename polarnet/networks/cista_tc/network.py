@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.e2vid import ConvLstm, reflected
-from polarnet.networks.published import PublishedNetwork
+from polarnet.networks.base.published import PublishedNetwork
+from polarnet.networks.e2v.e2vid import ConvLstm, reflected
 
 CHANNELS = 64  # features at half resolution
 ATOMS = 128  # channels of the sparse code

@@ -19,8 +19,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from polarnet.benchmark.between_windows import frames_between
-from polarnet.benchmark.resimulate import sequence_at
+from polarnet.analysis.between_windows import frames_between
+from polarnet.analysis.resimulate import sequence_at
 from polarnet.benchmark.rows import Context, opened, predictions_of
 from polarnet.benchmark.score import FrameScore, mean_scores, score_sequence
 from polarnet.benchmark.sequences import TestSequence
@@ -30,9 +30,9 @@ from polarnet.events.windows import BIN_EDGES, events_per_pixel
 from polarnet.methods import METHODS
 from polarnet.methods.between import BetweenConfig
 from polarnet.metrics.similarity import correlation, mse, psnr
-from polarnet.runtime.progress import ProgressBar
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
+from polarnet.terminal.progress import ProgressBar
 
 SHOWN = ("mse", "psnr", "ssim", "corr", "skill")
 EVENTS_PER_PIXEL = (0.25, 0.5, 1.0, 2.0)

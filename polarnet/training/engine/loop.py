@@ -18,14 +18,22 @@ from polarnet.runtime.files import check_room
 from polarnet.runtime.machine import precision_on
 from polarnet.runtime.sections import one_of, section
 from polarnet.storage.windows import WindowDataset
-from polarnet.training.calibration import Scene, fitted, joined, weights_for
-from polarnet.training.losses import known_frames
-from polarnet.training.optimizers import OPTIMIZERS
-from polarnet.training.parallel import add_up, place, wait_for_all
-from polarnet.training.recorder import Recorder
-from polarnet.training.replay import Replayed
-from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, loaded_if_it_fits, parts_of, shuffled
-from polarnet.training.task import Split, State, Task
+from polarnet.training.engine.calibration import Scene, fitted, joined, weights_for
+from polarnet.training.engine.losses import known_frames
+from polarnet.training.engine.optimizers import OPTIMIZERS
+from polarnet.training.engine.parallel import add_up, place, wait_for_all
+from polarnet.training.engine.recorder import Recorder
+from polarnet.training.engine.replay import Replayed
+from polarnet.training.engine.sequences import (
+    Batch,
+    ViewConfig,
+    Visits,
+    batches_of,
+    loaded_if_it_fits,
+    parts_of,
+    shuffled,
+)
+from polarnet.training.engine.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
 COPIES_OF_WEIGHTS = 12  # on disk: best, last, and twice (old and new) the running checkpoint with best and two moments
@@ -89,8 +97,8 @@ def train(
 
     All random numbers derive from the seed, the epoch and the sequence's name. A resumed run therefore ends with the
     same weights as an uninterrupted one. The number of workers (processes that read ahead) does not change the weights
-    either. All processes that share a training (polarnet.training.parallel) call this function; their number changes
-    the weights by rounding only. OSError if the disk has no room for the checkpoints.
+    either. All processes that share a training (module `parallel`) call this function; their number changes the weights
+    by rounding only. OSError if the disk has no room for the checkpoints.
     """
     weights = sum(tensor.nbytes for tensor in task.network.state_dict().values())
     check_room(recorder.running, COPIES_OF_WEIGHTS * weights, "the checkpoints")
@@ -249,7 +257,7 @@ def sequences_to_fit(task: Task, dataset: WindowDataset) -> WindowDataset:
 def calibrate(
     task: Task, dataset: WindowDataset, config: LoopConfig, device: torch.device, workers: int
 ) -> dict[str, int | float]:
-    """Fit the network's expected errors to its errors on `dataset` (polarnet.training.calibration).
+    """Fit the network's expected errors to its errors on `dataset` (polarnet.training.engine.calibration).
 
     The fit also includes one frame of each sequence predicted without any events. If the task names the DoLP of real
     scenes, half of its weight is on the pictures, and half on all sequences, with `weights_for` such scenes. Returns a

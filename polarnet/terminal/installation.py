@@ -1,10 +1,11 @@
-"""Extras of pyproject.toml: packages that polarnet needs for some tasks only."""
+"""How polarnet is installed: the settings beside its code, and the extras, packages that only some tasks need."""
 
 import importlib.metadata
 import re
+from pathlib import Path
 
-from polarnet.runtime.files import in_source_tree
-
+PACKAGE = Path(__file__).parents[1]
+INSTALLED = PACKAGE / "config" / "settings"
 EXTRAS = {
     "pipeline": "dvc repro",
     "cluster": "stages on a Dask cluster",
@@ -18,6 +19,16 @@ EXTRAS = {
     "sweep": "sweeps and searches",
 }
 """Task of each extra."""
+
+
+def shipped_settings() -> Path:
+    """Folder of params.yaml and conf/ beside the code: the copy that setup.py puts into a wheel, or the source tree."""
+    return PACKAGE.parent if in_source_tree() else INSTALLED
+
+
+def in_source_tree() -> bool:
+    """Whether the code lies in a clone, and not in a wheel, which has a copy of the settings."""
+    return not INSTALLED.is_dir()
 
 
 def requirements(extra: str) -> list[str]:

@@ -168,7 +168,8 @@ def simulate_video(
     as `simulate`.
 
     >>> import torch
-    >>> from polarnet.simulation import SENSORS, simulate_video
+    >>> from polarnet.clips import simulate_video
+    >>> from polarnet.simulation import SENSORS
     >>> frames = torch.rand(3, 3, 16, 24)
     >>> [channel.height for channel in simulate_video(frames, [0, 1000, 2000], SENSORS["default"], seed=1)]
     [16, 16, 16, 16]

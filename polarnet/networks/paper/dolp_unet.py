@@ -1,7 +1,7 @@
 """The paper's end-to-end DoLP recovery network (section 3.3, Fig. 6)."""
 
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -9,8 +9,8 @@ from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.blocks import ConvGRU, ResidualBlock, UpBlock, compressed, contrasts, conv3x3
-from polarnet.networks.swin import SwinStage
+from polarnet.networks.base.blocks import ConvGRU, ResidualBlock, UpBlock, compressed, contrasts, conv3x3
+from polarnet.networks.paper.swin import SwinStage
 from polarnet.runtime.sections import one_of, section
 from polarnet.stokes import Prediction
 
@@ -42,6 +42,11 @@ class DolpUNetConfig:
         for channels, heads in zip(self.channels[1:], self.swin_heads, strict=True):
             if channels % heads:
                 raise ValueError(f"swin_heads: expected a divisor of {channels} channels, got {heads}")
+
+    @property
+    def network_class(self) -> type[Any]:
+        """Class of the network with these settings."""
+        return DolpUNet
 
 
 class DolpUNet(nn.Module):

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.published import PublishedNetwork
+from polarnet.networks.base.published import PublishedNetwork
 
 HEAD_CHANNELS = 32
 ENCODER_CHANNELS = (64, 128, 256)

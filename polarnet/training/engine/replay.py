@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from polarnet.training.task import State, Task
+from polarnet.training.engine.task import State, Task
 
 
 class _Step(nn.Module):

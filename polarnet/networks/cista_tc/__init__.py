@@ -1,0 +1,1 @@
+"""CISTA-TC, which reconstructs intensities by sparse coding along the motion."""

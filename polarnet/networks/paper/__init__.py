@@ -1,0 +1,1 @@
+"""The paper's network: a recurrent U-Net with Swin blocks (section 3.3)."""

@@ -1,0 +1,1 @@
+"""polarnet's network: Stokes parameters from the panorama and moments of the events of four channels."""

@@ -1,0 +1,1 @@
+"""What all trainings share: loop, losses, sequences, optimizers, recording, calibration."""
