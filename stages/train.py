@@ -4,12 +4,12 @@
 trains a baseline, with the settings of section `baselines.NAME`.
 """
 
+from importlib import import_module
 from pathlib import Path
 
 from polarnet.config.tree import DOLP_TRAINING, Config, hydra_stage, or_exit
 from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.machine import device_of, threads_of
-from polarnet.training.baselines import BASELINES
 from polarnet.training.dolp import dolp_task
 from polarnet.training.engine.loop import LoopConfig, train
 from polarnet.training.engine.parallel import join, launched
@@ -43,7 +43,8 @@ def _task(config: Config) -> tuple[LoopConfig, Task]:
         loss = config.loss
         task = dolp_task(config.network, config.network_config, config.train, loss, lpips(loss.lpips), config.seed)
         return config.train, task
-    baseline, settings = BASELINES[config.baseline], getattr(config.baselines, config.baseline)
+    settings = config.baseline_config(config.baseline)
+    baseline = import_module(f"polarnet.training.{config.baseline}").BASELINE
     largest = max((getattr(settings, key) for key in baseline.lpips), default=0.0)
     return settings, baseline.task(settings, lpips(largest), config.seed)
 

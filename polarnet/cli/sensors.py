@@ -75,7 +75,6 @@ def _fit_sensor(options: argparse.Namespace) -> int:
     from polarnet.characterization.known_light import KnownLight
     from polarnet.characterization.light import Flicker, read_light
     from polarnet.characterization.twin import compare, fitted_parameters, fitted_sensor
-    from polarnet.config.experiments import preset_values
     from polarnet.recordings.recording import read_recording
     from polarnet.reports.realism import FitRow, realism_page
     from polarnet.simulation.presets import SENSORS
@@ -115,10 +114,8 @@ def _fit_sensor(options: argparse.Namespace) -> int:
         )
     for note in notes:
         print(f"note: {note}")
-    base = preset_values(settings_root(), "sensor", "default")
-    values = {k: v for k, v in fitted_parameters(fit).items() if v != base.get(f"emulate.{k}")}
     preset.parent.mkdir(parents=True, exist_ok=True)
-    preset.write_text(preset_text(options.name, values), encoding="utf-8")
+    preset.write_text(preset_text(options.name, fitted_parameters(fit)), encoding="utf-8")
     sensor = fitted_sensor(fit, SENSORS["default"])
     comparisons = [compare(name, events, light, sensor, seed=1) for name, events, light in lights if len(events) > 1]
     for comparison in comparisons:

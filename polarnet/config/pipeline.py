@@ -4,7 +4,6 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from polarnet.benchmark.references import REFERENCES
 from polarnet.benchmark.row_results import RowRecord, write_row
@@ -15,40 +14,43 @@ from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup
 from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.machine import device_of
+from polarnet.simulation.rotating import RotatingConfig
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 
 RECORDINGS = "recordings"  # name of the test set of real targets
 
 
-def context_of(config: Config, train_mean: float | None, weights: Path | None = None) -> Context:
-    """Inputs of the benchmark methods; `weights` replaces the pipeline's trained weights of `ours`."""
+def context_of(
+    config: Config, train_mean: float | None, weights: Path | None = None, rotating: RotatingConfig | None = None
+) -> Context:
+    """Inputs of the benchmark methods.
+
+    `weights` replaces the weights of `ours` in section `rows`, and `rotating` replaces section `rotating`.
+    """
     given = {"ours": weights} if weights else {}
     setups = {
-        method.section: setup_of(config, method, given.get(method.section))
+        method.section: setup_of(config, method, given.get(method.section), rotating)
         for method in METHODS.values()
         if method.wraps is None
     }
     return Context(train_mean, setups, device_of(config.runtime))
 
 
-def setup_of(config: Config, method: Method, weights: Path | None = None) -> Setup:
-    """Inputs of a method, with `weights`, else the weights in its section, else those of its training stage."""
-    section: Any = getattr(config.methods, method.section, None)  # a method without settings has no section
-    if weights is None and method.weights is not None:
-        if section.weights:
-            weights = Path(section.weights)
-        elif method.weights.trained_by:
-            weights = Path(config.paths.train) / method.weights.trained_by / "best.safetensors"
+def setup_of(
+    config: Config, method: Method, weights: Path | None = None, rotating: RotatingConfig | None = None
+) -> Setup:
+    """Inputs of a method, with `weights`, else those that section `rows` names."""
+    rotation = (rotating or config.rotating) if method.rotating else None
     return Setup(
-        config=section,
-        weights=weights,
-        postprocessing=config.baselines.postprocessing,
-        gain=config.baselines.gain,
+        config=getattr(config.methods, method.name, None),
+        weights=weights or (config.weights_of(method.name) if method.weights is not None else None),
+        sharpening=config.methods.sharpening,
+        gain=config.methods.gain,
         device=device_of(config.runtime),
         precision=config.benchmark.precision,
-        rotation_hz=config.rotating.rate_hz,
-        start_angle=math.radians(config.rotating.start_angle_deg),
+        rotation_hz=0.0 if rotation is None else rotation.rate_hz,
+        start_angle=0.0 if rotation is None else math.radians(rotation.start_angle_deg),
     )
 
 
@@ -75,9 +77,8 @@ def rows_of_set(name: str, rows: Sequence[str]) -> list[str]:
 
 
 def set_folder(config: Config, name: str) -> Path:
-    """Folder of a set's results: the benchmark folder for the simulated set, a subfolder for any other."""
-    folder = Path(config.paths.benchmark)
-    return folder if name == "simulated" else folder / "sets" / name
+    """Folder of a set's results."""
+    return Path(config.paths.benchmark) / "sets" / name
 
 
 def row_folder(config: Config, row: str) -> Path:
@@ -96,7 +97,7 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
     A row that cannot run gets a folder with the reason. SystemExit if LPIPS weights are missing.
     """
     needs_mean = any(row in REFERENCES and REFERENCES[row].needs_train_mean for row in rows)
-    context = context_of(config, train_mean_of(config) if needs_mean else None)
+    context = context_of(config, train_mean_of(config) if needs_mean else None, rotating=_rotating_of(config, rows))
     methods, left_out = available(rows, context)
     for row, reason in left_out.items():
         print(f"{row} is left out: {reason}")
@@ -112,6 +113,14 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
     for row in methods:
         own = {name: benchmark for name, benchmark in results.items() if row in benchmark.costs}
         write_row(row_folder(config, row), row, RowRecord(None, weights_used([row], context)), own)
+
+
+def _rotating_of(config: Config, rows: Sequence[str]) -> RotatingConfig | None:
+    """Rotation with which the events behind a rotating polarizer were made; None if no row needs them."""
+    if not any(map(is_rotating, rows)):
+        return None
+    events = EventStore.open(Path(config.paths.rotating) / f"{config.benchmark.sets[0]}.zarr")
+    return RotatingConfig(**events.attributes["rotating"])
 
 
 def lpips_of(config: Config) -> Lpips | None:

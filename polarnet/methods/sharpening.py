@@ -17,8 +17,8 @@ KERNEL_SIZE = 5  # blur kernel of the unsharp mask, pixels
 
 
 @section
-class PostprocessingConfig:
-    """Section `baselines.postprocessing` of params.yaml; the published defaults."""
+class SharpeningConfig:
+    """Section `methods.sharpening` of params.yaml; the published defaults."""
 
     unsharp_amount: NonNegativeFloat
     """Factor on the difference between image and blurred copy, which is added to the image; 0: off."""
@@ -26,7 +26,7 @@ class PostprocessingConfig:
     """Width of the blur, in the units of the published kernel."""
 
 
-def postprocessed(images: Float[Tensor, "t c h w"], config: PostprocessingConfig) -> Float[Tensor, "t c h w"]:
+def sharpened(images: Float[Tensor, "t c h w"], config: SharpeningConfig) -> Float[Tensor, "t c h w"]:
     """Sharpen images and clip them to [0, 1]."""
     return unsharp_masked(images, config.unsharp_amount, config.unsharp_sigma).clamp(0, 1)
 

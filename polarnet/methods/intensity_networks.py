@@ -1,4 +1,9 @@
-"""Networks that reconstruct intensity from events, as methods; the four channels form one batch."""
+"""Networks that reconstruct intensity from events, as methods; the four channels form one batch.
+
+E2VID (Rebecq et al., CVPR 2019 and TPAMI 2021), FireNet (Scheerlinck et al., WACV 2020), FireNet+ (Stoffregen et al.,
+ECCV 2020), which takes voxel grids that are not normalised, and CISTA-TC (Liu and Dragotti, ICASSP 2022), whose images
+its authors do not sharpen. Row `e2v` is the one that the pipeline trains.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,10 +15,14 @@ from torch import Tensor
 
 from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.streaming import EventWindow
+from polarnet.methods import sharpening
 from polarnet.methods.intensities import from_intensities, with_gain
-from polarnet.methods.method import Method, Recoverer, Setup, State, Weights, WeightsConfig, weights_file
-from polarnet.methods.postprocessing import postprocessed
+from polarnet.methods.method import Method, Recoverer, Setup, State, Weights, weights_file
 from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
+from polarnet.networks.cista_tc.network import CistaTc
+from polarnet.networks.e2v import ARCHITECTURES
+from polarnet.networks.e2v.e2vid import E2vid
+from polarnet.networks.e2v.firenet import FireNet
 from polarnet.stokes import Prediction
 
 Networks = Mapping[str, Any]
@@ -39,15 +48,13 @@ def intensity_methods(
     colour: str,
     networks: Networks,
     *,
-    trained_by: str | None = None,
-    remedy: str = "",
     about: str = "",
     normalised: bool = True,
     sharpened: bool = False,
 ) -> tuple[Method, Method]:
     """The method NAME that runs one of `networks`, and NAME+gain.
 
-    `trained_by` and `remedy` are those of `Weights`; see `intensity_network` for `normalised` and `sharpened`.
+    See `intensity_network` for `normalised` and `sharpened`.
     """
 
     def open_network(setup: Setup) -> Recoverer:
@@ -59,8 +66,8 @@ def intensity_methods(
         label=label,
         colour=colour,
         open=open_network,
-        config=WeightsConfig,
-        weights=Weights(tuple(networks), trained_by, remedy),
+        sharpened=sharpened,
+        weights=Weights(tuple(networks)),
         reconstructs=True,
         about=about,
     )
@@ -83,7 +90,7 @@ def intensity_network(network: Any, setup: Setup, *, normalised: bool = True, sh
                 intensity, state = network(normalise_nonzero(grids) if normalised else grids, state)
             images.append(intensity.float())
         raw = torch.stack(images)
-        return state, from_intensities(postprocessed(raw, setup.postprocessing) if sharpened else raw.clamp(0, 1))
+        return state, from_intensities(sharpening.sharpened(raw, setup.sharpening) if sharpened else raw.clamp(0, 1))
 
     return Recoverer(lambda height, width: None, predict, network=network)
 
@@ -91,3 +98,21 @@ def intensity_network(network: Any, setup: Setup, *, normalised: bool = True, sh
 def voxel_grids(window: EventWindow, bins: int) -> Float[Tensor, "c bins h w"]:
     """Voxel grid of each channel."""
     return torch.stack([voxel_grid(events, bins) for events in window.channels])
+
+
+METHODS = (
+    *intensity_methods("e2v", "E2V", "#3d8fd9", ARCHITECTURES, about="Events to video."),
+    *intensity_methods("e2vid_published", "E2VID, published weights", "#2f6fb0", {"e2vid": E2vid}, sharpened=True),
+    *intensity_methods(
+        "firenet_published", "FireNet, published weights", "#3d8fd9", {"firenet": FireNet}, sharpened=True
+    ),
+    *intensity_methods(
+        "firenetplus_published",
+        "FireNet+, published weights",
+        "#3d8fd9",
+        {"firenet": FireNet},
+        normalised=False,
+        sharpened=True,
+    ),
+    *intensity_methods("cista_tc", "CISTA-TC, published weights", "#4aa37c", {"cista_tc": CistaTc}),
+)
