@@ -10,7 +10,7 @@ from polarnet.methods import METHODS
 from polarnet.methods.complementary_filter import FilterConfig
 from polarnet.methods.half_turns import HalfTurnsConfig
 from polarnet.methods.method import Setup
-from polarnet.methods.postprocessing import PostprocessingConfig
+from polarnet.methods.sharpening import SharpeningConfig
 from polarnet.methods.stokes_gain import GainConfig
 from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.networks.cista_tc.network import CistaTc
@@ -99,7 +99,7 @@ def make_setup(checkpoints):
         values = {
             "config": SECTIONS.get(section),
             "weights": checkpoints.get(section),
-            "postprocessing": PostprocessingConfig(0.3, 1.0),
+            "sharpening": SharpeningConfig(0.3, 1.0),
             "gain": GainConfig(10, 5, 20_000, 0.1, 0.0),
             "device": torch.device("cpu"),
             "precision": "fp32",

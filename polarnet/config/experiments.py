@@ -45,8 +45,8 @@ def write_preset(root: Path, name: str) -> list[str]:
     """Write the preset `name` into params.yaml, keeping its comments.
 
     A preset holds only what differs. Keys that other presets of the group set go back to their values in the committed
-    params.yaml (in a project without git: in the one that came with polarnet); all other keys keep their values, so a
-    sensor can be written after an experiment. Returns the changes as "key: old -> new".
+    params.yaml (in a project without git: in the one that came with polarnet); all other keys keep their values. An
+    experiment takes back sensors and polarizers, too. Returns the changes as "key: old -> new".
     """
     yaml = YAML()
     yaml.preserve_quotes = True
@@ -55,7 +55,9 @@ def write_preset(root: Path, name: str) -> list[str]:
     path, group = root / "params.yaml", group_of(root, name)
     params = yaml.load(path)
     changed = []
-    base, others = _original(root), (preset_values(root, group, other) for other in preset_names(root, group))
+    undone = GROUPS if group == "experiment" else (group,)
+    others = (preset_values(root, one, other) for one in undone for other in preset_names(root, one))
+    base = _original(root)
     values = {key: _value(base, key) for other in others for key in other} | preset_values(root, group, name)
     for key, value in values.items():
         *sections, last = key.split(".")

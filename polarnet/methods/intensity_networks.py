@@ -114,5 +114,12 @@ METHODS = (
         normalised=False,
         sharpened=True,
     ),
-    *intensity_methods("cista_tc", "CISTA-TC, published weights", "#4aa37c", {"cista_tc": CistaTc}),
+    *intensity_methods(
+        "cista_tc",
+        "CISTA-TC, published weights",
+        "#4aa37c",
+        {"cista_tc": CistaTc},
+        about="CISTA-TC (Liu and Dragotti 2022), a recurrent network from events to intensity that unrolls sparse "
+        "coding, one polarizer at a time, then DoLP by the Stokes formula.",
+    ),
 )

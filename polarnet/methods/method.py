@@ -86,8 +86,6 @@ class Weights:
 
     networks: tuple[str, ...]
     """Names of the networks that a checkpoint of polarnet may hold, as in its JSON."""
-    remedy: str = ""
-    """Advice in messages on how to obtain weights of such a network, for example by training."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +152,7 @@ def why_absent(method: Method, setup: Setup) -> str | None:
         return f"{path} is not there"
     networks = method.weights.networks
     if path.suffix == ".safetensors" and (network := load_checkpoint(path)[1]["network"]) not in networks:
-        reason = f"{path} holds a {network}, expected {' or '.join(networks)}: set {key} to such a file"
-        return f"{reason}, or {method.weights.remedy}" if method.weights.remedy else reason
+        return f"{path} holds a {network}, expected {' or '.join(networks)}: set {key} to such a file"
     return None
 
 

@@ -1,13 +1,13 @@
 import torch
 
-from polarnet.methods.postprocessing import PostprocessingConfig, blur_kernel, postprocessed, unsharp_masked
+from polarnet.methods.sharpening import SharpeningConfig, blur_kernel, sharpened, unsharp_masked
 
-OFF = PostprocessingConfig(unsharp_amount=0.0, unsharp_sigma=1.0)
+OFF = SharpeningConfig(unsharp_amount=0.0, unsharp_sigma=1.0)
 
 
 def test_switched_off_it_only_clips():
     images = torch.linspace(-1, 2, 4 * 6 * 7).view(1, 4, 6, 7)
-    assert torch.equal(postprocessed(images, OFF), images.clamp(0, 1))
+    assert torch.equal(sharpened(images, OFF), images.clamp(0, 1))
 
 
 def test_the_unsharp_mask_leaves_flat_images_alone_and_overshoots_at_an_edge():

@@ -233,13 +233,13 @@ def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, 
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("method", ["highpass", "firenet"])
+@pytest.mark.parametrize("method", ["highpass", "e2v"])
 def test_a_method_that_reconstructs_intensity_gives_the_video_of_a_camera_without_polarizers(
     method, channels, tmp_path, at_root, capsys
 ):
     file = write_lines(tmp_path / "camera.txt", channels[1])
     weights = []
-    if method == "firenet":
+    if method == "e2v":
         torch.manual_seed(0)
         network, path = FireNet(5), tmp_path / "mine.safetensors"
         save_checkpoint(path, network.state_dict(), {"network": "firenet", "config": {"bins": network.bins}})
