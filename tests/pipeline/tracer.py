@@ -21,6 +21,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def record_to(file: Path) -> None:
     """Record the stage that this process starts next into a JSON file: `files` and `keys`."""
+    from numba.core.dispatcher import Dispatcher
+
     from polarnet.config import tree
 
     codes: set[CodeType] = set()
@@ -36,9 +38,17 @@ def record_to(file: Path) -> None:
         _name_sections(config, "", paths, kept)
         return config
 
+    def compile_unrecorded(dispatcher: Any, signature: Any) -> Any:
+        sys.settrace(None)  # numba's compiler makes millions of calls
+        try:
+            return compile_kernel(dispatcher, signature)
+        finally:
+            sys.settrace(call)
+
     def recorded(work: Callable[[], Any], name: str) -> Any:
         _record_reads(keys, paths, kept)
         threading.settrace(call)
+        Dispatcher.compile = compile_unrecorded
         sys.settrace(call)
         try:
             return original(work, name)
@@ -48,6 +58,7 @@ def record_to(file: Path) -> None:
             files = sorted(_files_of(codes))
             file.write_text(json.dumps({"files": files, "keys": sorted(keys)}))
 
+    compile_kernel = Dispatcher.compile
     original, original_typed = tree.or_refuse, tree.typed
     tree.or_refuse, tree.typed = recorded, typed
 
@@ -134,16 +145,9 @@ def _sources(file: str) -> dict[str, str]:
 
 
 def _imports(tree: ast.Module) -> Iterator[ast.ImportFrom]:
-    typing_only = {
-        id(inner)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
-        for inner in ast.walk(node)
-    }
+    """Imports from polarnet that run."""
+    blocks = [node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)]
+    unused = {id(inner) for block in blocks for inner in ast.walk(block)}
     for node in ast.walk(tree):
-        if (
-            isinstance(node, ast.ImportFrom)
-            and (node.module or "").startswith("polarnet")
-            and id(node) not in typing_only
-        ):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("polarnet") and id(node) not in unused:
             yield node
