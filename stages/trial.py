@@ -23,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from polarnet.config.origins import Run, Stage, digest
 from polarnet.config.sweep import FAILURE, mark_finished, why_unfinished
+from polarnet.config.tables import collect_rows
 from polarnet.config.tree import Config, check_ablation, hydra_command, typed
 from polarnet.runtime.machine import end_with_parent
 
@@ -76,6 +77,7 @@ def _failure_of_point(node: DictConfig, job: Path, overrides: list[str]) -> str 
         failure = _failure([sys.executable, *command, f"--config-dir={job}", f"--config-name={POINT}", logs])
         if failure:
             return f"{name}: {failure}"
+    collect_rows(typed(OmegaConf.create(point)))
     mark_finished(job, record)
     return None
 

@@ -117,7 +117,7 @@ def _inputs(config: Config, weights: Path | None) -> Inputs:
         )
     lpips = with_lpips(config, "benchmark", find_weights)  # the pipeline need not have found them before
     wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
-    context = context_of(config, _train_mean(config), weights or shipped_weights())
+    context = context_of(config, wanted, _train_mean(config), weights or shipped_weights())
     return Inputs(context, *available(wanted, context), lpips)
 
 

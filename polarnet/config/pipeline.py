@@ -2,8 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from polarnet.benchmark.references import REFERENCES
 from polarnet.benchmark.row_results import RowRecord, write_row
@@ -14,44 +15,41 @@ from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup
 from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.machine import device_of
-from polarnet.simulation.rotating import RotatingConfig
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 
 RECORDINGS = "recordings"  # name of the test set of real targets
 
 
-def context_of(
-    config: Config, train_mean: float | None, weights: Path | None = None, rotating: RotatingConfig | None = None
-) -> Context:
-    """Inputs of the benchmark methods.
-
-    `weights` replaces the weights of `ours` in section `rows`, and `rotating` replaces section `rotating`.
-    """
-    given = {"ours": weights} if weights else {}
-    setups = {
-        method.section: setup_of(config, method, given.get(method.section), rotating)
-        for method in METHODS.values()
-        if method.wraps is None
-    }
+def context_of(config: Config, rows: Iterable[str], train_mean: float | None, weights: Path | None = None) -> Context:
+    """Inputs of rows of the benchmark; `weights` replaces the weights of `ours` in section `rows`."""
+    setups: dict[str, Setup] = {}
+    for method in (METHODS[row] for row in rows if row in METHODS):
+        setups.setdefault(method.section, setup_of(config, method, weights if method.section == "ours" else None))
     return Context(train_mean, setups, device_of(config.runtime))
 
 
-def setup_of(
-    config: Config, method: Method, weights: Path | None = None, rotating: RotatingConfig | None = None
-) -> Setup:
+def setup_of(config: Config, method: Method, weights: Path | None = None) -> Setup:
     """Inputs of a method, with `weights`, else those that section `rows` names."""
-    rotation = (rotating or config.rotating) if method.rotating else None
+    rotating = _rotating_of(config) if method.rotating else {"rate_hz": 0.0, "start_angle_deg": 0.0}
     return Setup(
-        config=getattr(config.methods, method.name, None),
+        config=getattr(config.methods, method.section, None),
         weights=weights or (config.weights_of(method.name) if method.weights is not None else None),
         sharpening=config.methods.sharpening,
         gain=config.methods.gain,
         device=device_of(config.runtime),
         precision=config.benchmark.precision,
-        rotation_hz=0.0 if rotation is None else rotation.rate_hz,
-        start_angle=0.0 if rotation is None else math.radians(rotation.start_angle_deg),
+        rotation_hz=rotating["rate_hz"],
+        start_angle=math.radians(rotating["start_angle_deg"]),
     )
+
+
+def _rotating_of(config: Config) -> Mapping[str, Any]:
+    """Section `rotating` that the pipeline's events behind a rotating polarizer were made with; else that of today."""
+    events = Path(config.paths.rotating) / f"{config.benchmark.sets[0]}.zarr"
+    if events.exists():
+        return EventStore.open(events).attributes["rotating"]
+    return dataclasses.asdict(config.rotating)
 
 
 def pipeline_set(config: Config, name: str, rows: Sequence[str] = ()) -> BenchmarkSet:
@@ -97,7 +95,7 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
     A row that cannot run gets a folder with the reason. SystemExit if LPIPS weights are missing.
     """
     needs_mean = any(row in REFERENCES and REFERENCES[row].needs_train_mean for row in rows)
-    context = context_of(config, train_mean_of(config) if needs_mean else None, rotating=_rotating_of(config, rows))
+    context = context_of(config, rows, train_mean_of(config) if needs_mean else None)
     methods, left_out = available(rows, context)
     for row, reason in left_out.items():
         print(f"{row} is left out: {reason}")
@@ -113,14 +111,6 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
     for row in methods:
         own = {name: benchmark for name, benchmark in results.items() if row in benchmark.costs}
         write_row(row_folder(config, row), row, RowRecord(None, weights_used([row], context)), own)
-
-
-def _rotating_of(config: Config, rows: Sequence[str]) -> RotatingConfig | None:
-    """Rotation with which the events behind a rotating polarizer were made; None if no row needs them."""
-    if not any(map(is_rotating, rows)):
-        return None
-    events = EventStore.open(Path(config.paths.rotating) / f"{config.benchmark.sets[0]}.zarr")
-    return RotatingConfig(**events.attributes["rotating"])
 
 
 def lpips_of(config: Config) -> Lpips | None:

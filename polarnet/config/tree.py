@@ -347,6 +347,11 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         logging.captureWarnings(True)
         try:
             run()
+        except PermissionError as error:
+            raise SystemExit(
+                f"{error.filename}: this folder cannot be written; give hydra.run.dir=FOLDER for the logs, "
+                "paths.data and paths.resume for the results"
+            ) from None
         except KeyboardInterrupt:
             print(f"stages.{_file_of(main).stem}: {STOPPED}", file=sys.stderr)
             raise SystemExit(INTERRUPTED) from None

@@ -39,25 +39,27 @@ TINY = [
     "baselines.e2v.crop=null",
     "baselines.e2v.visits=1",
     "baselines.e2v.windows=2",
-    "baselines.trained=[e2v,e2p]",
-    "+rows.e2p={needs: data/train/e2p, settings: benchmark.precision}",
-    "+rows.firenet_published={needs: data/external/firenet_1000.pth.tar, settings: methods.sharpening}",
     "baselines.e2p.epochs=1",
     "baselines.e2p.bptt_windows=2",
     "baselines.e2p.crop=null",
     "baselines.e2p.visits=1",
     "baselines.e2p.windows=2",
-    "benchmark.methods=[zeros,train_mean,oracle_mean,cf,highpass,cf+gain,e2v,firenet_published,e2p,ours]",
     "benchmark.warmup_windows=1",
     "benchmark.bootstrap_samples=20",
     "benchmark.panel_scenes=1",
     "runtime.threads=1",
 ]
+MORE_ROWS = [
+    "baselines.trained=[e2v,e2p]",
+    "+rows.e2p={needs: data/train/e2p, settings: benchmark.precision}",
+    "+rows.firenet_published={needs: data/external/firenet_1000.pth.tar, settings: methods.sharpening}",
+    "benchmark.methods=[zeros,train_mean,oracle_mean,cf,highpass,cf+gain,e2v,firenet_published,e2p,ours]",
+]
 GENERATED = ("images", "scenes.zarr", "frames.zarr", "events.zarr")
 
 
 def run_stage(root: Path, stage: str, data: Path, *overrides: str) -> str:
-    arguments = [*TINY, f"paths.data={data}", f"paths.resume={data / 'resume'}",
+    arguments = [*TINY, *MORE_ROWS, f"paths.data={data}", f"paths.resume={data / 'resume'}",
                  f"hydra.run.dir={data / 'logs' / stage}", *overrides]  # fmt: skip
     done = preloaded.run_stage(root, stage, arguments, save_time)
     assert done.returncode == 0, done.stdout
@@ -66,7 +68,7 @@ def run_stage(root: Path, stage: str, data: Path, *overrides: str) -> str:
 
 def run_pipeline(root: Path, data: Path, *overrides: str) -> None:
     """Run every stage once, with all rows in one pass."""
-    config = load(root, [*TINY, *overrides])
+    config = load(root, [*TINY, *MORE_ROWS, *overrides])
     for stage in pipeline(root, dataclasses.asdict(config)).values():
         unused = stage.script == "train" and stage.overrides and stage.overrides[0][9:] not in config.used_baselines
         if stage.script != "row" and not unused:

@@ -16,6 +16,8 @@ from pathlib import Path
 from types import CodeType, FrameType, ModuleType
 from typing import Any
 
+ENTRY = ("polarnet/config/tree.py", "polarnet/config/origins.py", "polarnet/terminal/")
+"""What starts a stage, and what only says or draws: neither decides an output."""
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -76,12 +78,15 @@ def _name_sections(value: Any, path: str, paths: dict[int, str], kept: list[Any]
 
 def _record_reads(keys: set[str], paths: dict[int, str], kept: list[Any]) -> None:
     """Let the sections note which of their values are read; a changed copy of a section has the section's path."""
+    changed: dict[int, set[str]] = {}
 
     def read(self: Any, name: str) -> Any:
         value = object.__getattribute__(self, name)
         path = paths.get(id(self))
-        if path is not None and name in type(self).__dataclass_fields__ and not dataclasses.is_dataclass(value):
-            keys.add(f"{path}.{name}".strip("."))
+        if path is not None and name in type(self).__dataclass_fields__ and name not in changed.get(id(self), ()):
+            values = value.values() if isinstance(value, dict) else [value]
+            if not any(map(dataclasses.is_dataclass, values)):
+                keys.add(f"{path}.{name}".strip("."))
         return value
 
     for kind in {type(one) for one in kept}:
@@ -95,6 +100,7 @@ def _record_reads(keys: set[str], paths: dict[int, str], kept: list[Any]) -> Non
         if id(section) in paths:
             keys.intersection_update(before)  # what the copy is read for counts, not the copying
             paths[id(copy)] = paths[id(section)]
+            changed[id(copy)] = set(changes) | changed.get(id(section), set())
             kept.append(copy)
         return copy
 
@@ -116,7 +122,10 @@ def _files_of(codes: set[CodeType]) -> set[str]:
         path = Path(code.co_filename)
         if not path.is_relative_to(ROOT) or path.relative_to(ROOT).parts[0] not in ("polarnet", "stages"):
             continue
-        files.add(path.relative_to(ROOT).as_posix())
+        file = path.relative_to(ROOT).as_posix()
+        files.add(file)
+        if file.startswith(ENTRY):
+            continue
         module = by_file.get(code.co_filename)
         sources = _sources(code.co_filename)
         for name in code.co_names:
