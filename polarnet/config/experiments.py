@@ -8,7 +8,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from polarnet.runtime.files import replaced
-from polarnet.terminal.installation import in_source_tree, shipped_settings
+from polarnet.terminal.installation import shipped_settings
 
 MAPPINGS = ("randomise",)
 """Keys whose value is a whole mapping; a preset replaces it."""
@@ -79,7 +79,7 @@ def _original(root: Path) -> Any:
     committed = subprocess.run(["git", "show", "HEAD:./params.yaml"], cwd=root, capture_output=True, text=True)
     if committed.returncode == 0:
         return YAML(typ="safe").load(committed.stdout)
-    return YAML(typ="safe").load((root if in_source_tree() else shipped_settings()) / "params.yaml")
+    return YAML(typ="safe").load(shipped_settings() / "params.yaml")
 
 
 def _value(params: Any, key: str) -> Any:

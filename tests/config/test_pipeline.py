@@ -64,7 +64,6 @@ def test_a_baseline_that_no_row_uses_is_not_trained(project_root):
     ("change", "expected"),
     [
         ("rows.highpass.settings=methods.cf", "rows.highpass.settings: expected methods.highpass, which the row reads"),
-        ("rows.cf+gain.settings=methods.cf", "rows.cf+gain.settings: expected methods, which the row reads"),
         ("~rows.cf.needs", "rows.cf.needs: expected a value, got none; add the key"),
         ("baselines.trained=[]", "rows.e2v.needs: no stage makes data/train/e2v; add e2v to baselines.trained"),
         ("train.start=outputs/a.safetensors", "train.start: expected a file below data/external/start, whose content"),

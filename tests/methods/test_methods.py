@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from polarnet.methods.intensity_network import intensity_network, load_baseline
+from polarnet.methods.intensity_networks import intensity_network, load_baseline
 
 from polarnet.config.tree import load
 from polarnet.events.representations import event_counts, event_tensor, voxel_grid

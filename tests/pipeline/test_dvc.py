@@ -136,6 +136,7 @@ def set_params(project: Path, change: Callable[[Any], None]) -> None:
 
 
 def append(file: Path) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(file.read_text() + "\nCHANGED = True\n" if file.exists() else "NEW = True\n")
 
 
