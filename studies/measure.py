@@ -64,7 +64,7 @@ STUDIES = {
     "robustness": Study(
         "robustness", "robustness", "test", ("photographs", "measured", "work"), ("photographs_large", "published")
     ),
-    "peers": Study("peers", "benchmark", "simulated", ("photographs", "measured", "work"), ("published",)),
+    "peers": Study("peers", "benchmark", "simulated", ("photographs", "work"), ("published",)),
 }
 
 

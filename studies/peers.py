@@ -1,11 +1,11 @@
-"""Train every network on the same photographs, and score every method on held-out and on measured scenes.
+"""Train every network on the same photographs, and score every method on photographs that none of them saw.
 
-python -m studies.peers --photographs FOLDER --measured FOLDER --work FOLDER
+python -m studies.peers --photographs FOLDER --work FOLDER
     [--ours FILE] [--published ROW=FILE ...] [--override ROW:KEY=VALUE ...] [--write]
 
 The study runs the pipeline's stages with experiment=photographs in the folder --work. An interrupted run resumes, and
-finished trainings are reused. No network is trained on measured scenes or on the test split; the split is by source
-picture. --write puts the scores into docs/results/benchmark.json and draws docs/pictures/event_budget.png.
+finished trainings are reused. The split is by source picture. --write puts the scores into docs/results/benchmark.json
+and draws docs/pictures/event_budget.png.
 """
 
 import argparse
@@ -65,31 +65,25 @@ def trained(row: str, arguments: argparse.Namespace) -> Path:
     return weights
 
 
-def benchmarked(arguments: argparse.Namespace, weights: dict[str, Path]) -> dict[str, dict[str, Any]]:
-    """By test set: scores and costs of every row, its comparison with `ours`, and numbers of scenes and frames."""
+def benchmarked(arguments: argparse.Namespace, weights: dict[str, Path]) -> dict[str, Any]:
+    """Scores and costs of every row, its comparison with `ours`, and numbers of scenes and frames."""
     results = arguments.work / "benchmark"
     overrides = [
         *common(arguments),
-        "benchmark.sets=[simulated,measured]",
-        f"sets.measured_root={arguments.measured[0]}",
         f"benchmark.methods=[{','.join(METHODS)}]",
         *(f"methods.{row}.weights={file}" for row, file in weights.items()),
         f"paths.benchmark={results}",
     ]
-    run_stage("sets", *overrides)
     for row in METHODS:
         run_stage("row", *overrides, f"row={row}")
     collect_rows(load(ROOT, overrides))
-    figures = {}
-    for name, folder in (("simulated", results), ("measured", results / "sets" / "measured")):
-        details = json.loads((folder / "details.json").read_text())
-        figures[name] = {
-            "scenes": len(details["scenes"]),
-            "frames": details["frames"],
-            "rows": scores_and_costs(folder),
-            "paired": {row: one["mse"] for row, one in details["paired"].items()},
-        }
-    return figures
+    details = json.loads((results / "details.json").read_text())
+    return {
+        "scenes": len(details["scenes"]),
+        "frames": details["frames"],
+        "rows": scores_and_costs(results),
+        "paired": {row: one["mse"] for row, one in details["paired"].items()},
+    }
 
 
 def draw_event_budget(arguments: argparse.Namespace, weights: Path) -> None:
@@ -105,7 +99,6 @@ def parsed() -> argparse.Namespace:
     """The command line."""
     parser = command_line(__doc__, "docs/results/benchmark.json")
     parser.add_argument("--photographs", type=Path, required=True)
-    parser.add_argument("--measured", type=Path, nargs="+", required=True, help="the first folder is scored")
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--ours", type=Path, help="weights of `ours`, such as the shipped ones, instead of training it")
     parser.add_argument("--published", nargs="+", default=[], metavar="ROW=FILE", help=f"of {', '.join(PUBLISHED)}")
@@ -114,10 +107,8 @@ def parsed() -> argparse.Namespace:
     )
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     arguments = arguments_of(parser)
-    pairs = [given.split("=", 1) for given in arguments.published]
-    if unknown := [pair for pair in pairs if len(pair) != 2 or pair[0] not in PUBLISHED]:
-        parser.error(f"--published {'='.join(unknown[0])}: expected ROW=FILE with ROW one of {', '.join(PUBLISHED)}")
-    arguments.published = {row: Path(file).resolve() for row, file in pairs}
+    pairs = [given.partition("=") for given in arguments.published]
+    arguments.published = {row: Path(file).resolve() for row, _, file in pairs if row in PUBLISHED}
     return arguments
 
 
@@ -132,10 +123,9 @@ def main() -> None:
     weights = {row: trained(row, arguments) for row in TRAININGS if row != "ours" or not arguments.ours}
     weights |= arguments.published | ({"ours": arguments.ours} if arguments.ours else {})
     figures = benchmarked(arguments, weights)
-    print(json.dumps({name: {row: one["mse"] for row, one in of["rows"].items()} for name, of in figures.items()}))
+    print(json.dumps({row: one["mse"] for row, one in figures["rows"].items()}, indent=2))
     if arguments.write:
-        for name, of_set in figures.items():
-            write_section("benchmark", name, of_set, record)
+        write_section("benchmark", "simulated", figures, record)
         draw_event_budget(arguments, weights["ours"])
 
 
