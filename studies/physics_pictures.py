@@ -345,7 +345,7 @@ def malus_figure() -> Figure:
     with matplotlib.rc_context(chart_style(LIGHT)):
         figure = Figure(figsize=(6.4, 3.0), layout="constrained", facecolor=LIGHT.face)
         axes = figure.subplots()
-        for degree, colour in zip(DEGREES, COLOURS, strict=True):
+        for degree, colour in zip(DEGREES, (*COLOURS[:2], COLOURS[3]), strict=True):
             axes.plot(
                 range(181), [_behind(degree, angle) for angle in range(181)], color=colour, label=f"DoLP {degree:g}"
             )
