@@ -13,7 +13,7 @@
 from dataclasses import replace
 
 import matplotlib.pyplot as plt
-from polarnet.networks.checkpoint import load_network
+from polarnet.networks.registry import load_network
 
 from polarnet.events.streaming import WindowCutter, WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer

@@ -1,6 +1,6 @@
 """Damaged files of every format end in events or in a RecordingError, and in nothing else.
 
-tests/conftest.py says how many for each reader; studies/fuzz_recordings.py runs 10 000 and counts them.
+tests/conftest.py says how many for each reader; `python -m studies.faults` runs more and counts them.
 """
 
 from collections import Counter
