@@ -86,7 +86,7 @@ def _add_inspection(commands: Commands) -> None:
         "inspect",
         help="summarise a camera's file and draw its busiest moment",
         description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
-        "camera's file, with signs of a readout at its limit, and draws its busiest moment as a PNG.",
+        "camera's file, with its longest gap and empty rows, and draws its busiest moment as a PNG.",
         epilog="example: polarnet inspect recording.aedat4 --hot-pixels hot.png",
     )
     inspect.add_argument("file", type=Path, help="file of a camera, or an event store with --part")
