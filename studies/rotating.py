@@ -1,9 +1,9 @@
 """Error of the fit to a rotating polarizer's events: python -m studies.rotating [--write]
 
 Still scenes are smooth random maps of S0 from 0.2 to 1, DoLP from 0 to 0.95 and AoLP over half a circle, 60 x 80
-pixels, seen by the sensor of params.yaml. Section `rotating` has three such scenes at one turn a second and the window
-of params.yaml. The curves change one setting each, on one scene. The fit expects the sensor's mean thresholds and
-bandwidth, except in `assumed_threshold`. Moving scenes are compared with the truth at the middle of the window.
+pixels, seen by the sensor of params.yaml. Section `rotating` has three such scenes at one turn a second. The curves
+change one setting each, on one scene. The fit expects the sensor's mean thresholds and bandwidth, except in
+`assumed_threshold`. Moving scenes are compared with the truth at the middle of the half turn.
 `--write` puts the figures into docs/results/camera.json and draws docs/pictures/rotating_polarizer.png.
 """
 
@@ -21,7 +21,7 @@ import torch
 from matplotlib.figure import Figure
 
 from polarnet.config.tree import Config, load
-from polarnet.methods.rotating_polarizer import ModulationConfig, fit_modulation
+from polarnet.methods.rotating_polarizer import RotatingPolarizerConfig, fit_half_turn
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import read_rgb
 from polarnet.reports.figures import LIGHT, chart_style
@@ -47,14 +47,13 @@ HEADROOM = 1.05  # of the axes above the largest value
 LONG_PATH_PX = 1e4  # amplitude of a sine whose beginning is an even motion
 CURVES = {
     "rate_hz": ("rotation rate, turns/s", (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)),
-    "window_turns": ("window, turns", (0.5, 1.0, 2.0, 4.0)),
     "threshold": ("contrast threshold", (0.1, 0.15, 0.2, 0.3, 0.4)),
     "assumed_threshold": ("threshold that the fit expects (true: 0.2)", (0.16, 0.18, 0.2, 0.22, 0.24)),
     "shot_noise_rate_hz": ("shot noise, events/s in the dark", (0.001, 0.1, 1.0, 5.0)),
-    "speed_px_s": ("motion, px/s (5 turns/s, window 1 turn)", (0.0, 5.0, 10.0, 20.0, 40.0)),
+    "speed_px_s": ("motion, px/s (5 turns/s)", (0.0, 5.0, 10.0, 20.0, 40.0)),
 }
 """Label and values of the setting that each curve changes."""
-MOVING_RATE_HZ, MOVING_TURNS = 5.0, 1.0
+MOVING_RATE_HZ = 5.0
 STILL_RATE_HZ, FRAMES_PER_TURN = 1.0, 720
 
 
@@ -64,7 +63,7 @@ class Case(NamedTuple):
     scene: PolarizationScene
     rotating: RotatingConfig
     sensor: EmulatorConfig
-    modulation: ModulationConfig
+    fit: RotatingPolarizerConfig
     speed_px_s: float = 0.0
 
 
@@ -103,13 +102,13 @@ def photograph() -> PolarizationScene:
 
 
 def errors_of(case: Case) -> Errors:
-    """Simulate one window of turns and fit it."""
-    stop_us = round(case.modulation.window_turns / abs(case.rotating.rate_hz) * 1e6)
+    """Simulate one turn and fit its second half."""
+    stop_us = round(1e6 / abs(case.rotating.rate_hz))
     t_us = rotating_times_us(case.rotating, case.sensor, 0, stop_us)
     trajectory = moving_right(case.speed_px_s)
     simulation = emulate_rotating(case.scene, trajectory, t_us, HEIGHT, WIDTH, case.rotating, case.sensor, key=1)
-    prediction, _ = fit_modulation(simulation.events, simulation.rotation, 0, stop_us, case.modulation)
-    (stokes,) = render(case.scene, trajectory, np.array([stop_us * 0.5e-6]), HEIGHT, WIDTH)
+    prediction = Prediction(*fit_half_turn(simulation.events, simulation.rotation, stop_us, case.fit))
+    (stokes,) = render(case.scene, trajectory, np.array([0.75e-6 * stop_us]), HEIGHT, WIDTH)
     return errors_against(stokes, prediction)
 
 
@@ -160,7 +159,7 @@ def _rms(values: np.ndarray) -> float:
 def still_case(config: Config, scene: PolarizationScene) -> Case:
     """A scene at rest, with the sensor and the fit of params.yaml."""
     rotating = replace(config.rotating, rate_hz=STILL_RATE_HZ, frames_per_turn=FRAMES_PER_TURN)
-    return Case(scene, rotating, config.emulate, config.modulation)
+    return Case(scene, rotating, config.emulate, config.methods.rotating_polarizer)
 
 
 def case_of(config: Config, curve: str, value: float) -> Case:
@@ -168,38 +167,28 @@ def case_of(config: Config, curve: str, value: float) -> Case:
     case = still_case(config, smooth_scene(0))
     if curve == "rate_hz":
         return case._replace(rotating=replace(case.rotating, rate_hz=value))
-    if curve == "window_turns":
-        return case._replace(modulation=replace(case.modulation, window_turns=value))
     if curve == "threshold":
-        spread = config.modulation.threshold_spread * value
+        relative = config.emulate.contrast_threshold_sigma_on / config.emulate.contrast_threshold_on
         sensor: Any = {"contrast_threshold_on": value, "contrast_threshold_off": value}
-        sensor |= {"contrast_threshold_sigma_on": spread, "contrast_threshold_sigma_off": spread}
-        modulation = replace(case.modulation, threshold_on=value, threshold_off=value)
-        return case._replace(sensor=replace(case.sensor, **sensor), modulation=modulation)
-    if curve == "assumed_threshold":
-        return case._replace(modulation=replace(case.modulation, threshold_on=value, threshold_off=value))
+        sensor |= dict.fromkeys(("contrast_threshold_sigma_on", "contrast_threshold_sigma_off"), relative * value)
+        case = case._replace(sensor=replace(case.sensor, **sensor))
+    if curve in ("threshold", "assumed_threshold"):
+        return case._replace(fit=replace(case.fit, threshold_on=value, threshold_off=value))
     if curve == "shot_noise_rate_hz":
         return case._replace(sensor=replace(case.sensor, shot_noise_rate_hz=value))
-    rotating = replace(case.rotating, rate_hz=MOVING_RATE_HZ)
-    modulation = replace(case.modulation, window_turns=MOVING_TURNS)
-    return case._replace(rotating=rotating, modulation=modulation, speed_px_s=value)
+    return case._replace(rotating=replace(case.rotating, rate_hz=MOVING_RATE_HZ), speed_px_s=value)
 
 
 def single_cases(config: Config) -> dict[str, Case]:
     """Cases apart from the curves."""
-    still = still_case(config, smooth_scene(0))
-    noisy = SENSORS["noisy"]
-    spread = noisy.contrast_threshold_sigma_on / noisy.contrast_threshold_on
-    prior_config = replace(config.modulation, cutoff_hz=noisy.cutoff_hz, threshold_spread=spread)
+    still, noisy = still_case(config, smooth_scene(0)), SENSORS["noisy"]
+    without_lag = replace(still.fit, cutoff_hz=0.0)
     return {
         "photograph": still._replace(scene=photograph()),
-        "sensor clean": still._replace(sensor=SENSORS["clean"], modulation=replace(config.modulation, cutoff_hz=0.0)),
-        "sensor noisy": still._replace(sensor=noisy, modulation=prior_config),
-        "bandwidth unknown (fit without lag)": still._replace(modulation=replace(config.modulation, cutoff_hz=0.0)),
-        "extinction 100:1, known": still._replace(
-            rotating=replace(still.rotating, extinction_ratio=100.0),
-            modulation=replace(config.modulation, extinction_ratio=100.0),
-        ),
+        "sensor clean": still._replace(sensor=SENSORS["clean"], fit=without_lag),
+        "sensor noisy": still._replace(sensor=noisy, fit=replace(still.fit, cutoff_hz=noisy.cutoff_hz)),
+        "bandwidth unknown (fit without lag)": still._replace(fit=without_lag),
+        "extinction 100:1": still._replace(rotating=replace(still.rotating, extinction_ratio=100.0)),
     }
 
 
@@ -210,7 +199,7 @@ def measure(config: Config) -> tuple[dict[str, Any], dict[str, Any]]:
     figures: dict[str, Any] = {
         **scores(errors),
         "rate_hz": STILL_RATE_HZ,
-        "window_turns": config.modulation.window_turns,
+        "window_turns": 0.5,
     }
     figures |= {"scenes": len(scenes)}
     figures |= {"by_dolp": binned(errors, errors.dolp, DOLP_BINS), "by_s0": binned(errors, errors.s0, S0_BINS)}
@@ -228,7 +217,7 @@ def curves_figure(curves: Mapping[str, list[Mapping[str, float]]]) -> Figure:
     """RMS error of DoLP (left axes) and AoLP error (right axes) by each setting."""
     with matplotlib.rc_context(chart_style(LIGHT)):
         figure = Figure(figsize=(10, 5.4), layout="constrained", facecolor="white")
-        for axes, (curve, (label, _)) in zip(figure.subplots(2, 3).ravel(), CURVES.items(), strict=True):
+        for axes, (curve, (label, _)) in zip(figure.subplots(2, 3).ravel(), CURVES.items(), strict=False):
             x = [point["value"] for point in curves[curve]]
             axes.plot(x, [point["dolp_rms"] for point in curves[curve]], "o-", color="#1f6feb")
             axes.plot(x, [point["expected_rms"] for point in curves[curve]], ":", color="#1f6feb")

@@ -11,6 +11,7 @@ from polarnet.benchmark.row_results import RowRecord, write_row
 from polarnet.benchmark.rows import Context, available, weights_used
 from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp
 from polarnet.config.tree import Config, or_exit
+from polarnet.events.rotation import steady_rotation
 from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup
 from polarnet.metrics.similarity import Lpips
@@ -40,6 +41,7 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
             weights = Path(section.weights)
         elif method.weights.trained_by:
             weights = Path(config.paths.train) / method.weights.trained_by / "best.safetensors"
+    rotation = steady_rotation(config.rotating.rate_hz, math.radians(config.rotating.start_angle_deg))
     return Setup(
         config=section,
         weights=weights,
@@ -47,8 +49,7 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
         gain=config.baselines.gain,
         device=device_of(config.runtime),
         precision=config.benchmark.precision,
-        rotation_hz=config.rotating.rate_hz,
-        start_angle=math.radians(config.rotating.start_angle_deg),
+        rotation=rotation if method.rotating else None,
     )
 
 

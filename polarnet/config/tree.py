@@ -22,7 +22,6 @@ from polarnet.config.overrides import check_overrides
 from polarnet.methods import METHODS, module_of, trained_rows
 from polarnet.methods.between import BetweenConfig
 from polarnet.methods.postprocessing import PostprocessingConfig
-from polarnet.methods.rotating_polarizer import ModulationConfig
 from polarnet.methods.stokes_gain import GainConfig
 from polarnet.metrics.lpips import BACKBONES, PURPOSES, Purpose, is_stored
 from polarnet.metrics.lpips_weights import LpipsConfig, local_source
@@ -143,7 +142,6 @@ class Config:
     sets: SetsConfig
     recordings: RecordingsConfig
     rotating: RotatingConfig
-    modulation: ModulationConfig
     row: RowName | None
     """Row that stage row runs."""
     baseline: BaselineName | None

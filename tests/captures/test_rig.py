@@ -21,8 +21,7 @@ from polarnet.captures.targets import calibrate_targets
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
-from polarnet.recordings.recording import read_recording
-from polarnet.recovery.stream import Arrangement, open_files
+from polarnet.recovery.inputs import Files, open_files
 from polarnet.reports.recordings import draw_calibration
 from polarnet.simulation.scene import scene_from_rgb
 from polarnet.storage.frames import FrameStore
@@ -75,7 +74,7 @@ def calibrated(rig, config, tmp_path_factory):
 
 def test_a_folder_of_captures_goes_into_recover_calibrated(rig, config, project_root, tmp_path):
     root, _ = rig
-    source = open_files([root / "one"], Arrangement(None, None, None), read_recording, None, tmp_path, lambda: config)
+    source = open_files(Files([root / "one"], captures=config), tmp_path)
     (piece,) = source.pieces
     assert (source.height, source.width) == tuple(config.size)
     assert min(map(len, piece.channels)) > 0

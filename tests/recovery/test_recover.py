@@ -1,3 +1,4 @@
+import functools
 import io
 import itertools
 import re
@@ -8,6 +9,7 @@ import torch
 import zarr
 
 from polarnet.cli import main
+from polarnet.config.pipeline import setup_of
 from polarnet.config.tree import load
 from polarnet.events.stream import Events, slice_count, slice_time
 from polarnet.events.streaming import EventWindow, WindowRule
@@ -18,9 +20,9 @@ from polarnet.networks.firenet import FireNet
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines
-from polarnet.recordings.recording import read_recording
-from polarnet.recovery import stream as recovery
-from polarnet.recovery.stream import Arrangement, frames_of, open_files, open_method, replay
+from polarnet.recovery import inputs
+from polarnet.recovery.inputs import Files, open_files
+from polarnet.recovery.stream import ChosenMethod, frames_of, open_method, replay
 from polarnet.runtime import machine as runtime
 from polarnet.storage.events import EventStore
 
@@ -78,10 +80,7 @@ def write_lines(path, events):
 
 def opened(store, size=None):
     """A sequence of a store, for which neither settings nor a folder are needed."""
-    unused = store / "unused"
-    return open_files(
-        [store], Arrangement(None, None, "lake"), read_recording, size, unused, lambda: load(unused).recordings
-    )
+    return open_files(Files([store], sequence="lake"), store / "unused", size)
 
 
 def recovered(out):
@@ -197,15 +196,14 @@ def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channel
         writer.write("target", [slice_count(channel, 0, count) for channel in channels], DURATION_US)
         writer.finish()
 
-    monkeypatch.setattr(recovery, "import_targets", imported)
-    monkeypatch.setattr(recovery, "calibrate_targets", calibrated)
+    monkeypatch.setattr(inputs, "import_targets", imported)
+    monkeypatch.setattr(inputs, "calibrate_targets", calibrated)
     config = load(project_root).recordings
     for parent, count in (("first", 10), ("second", 20), ("first", 10)):
         folder = tmp_path / parent / "target"
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "events_0.bin").write_text(str(count))
-        arrangement = Arrangement(None, None, None)
-        source = open_files([folder], arrangement, read_recording, None, tmp_path / "work", lambda: config)
+        source = open_files(Files([folder], captures=config), tmp_path / "work")
         assert sum(len(events) for piece in source.pieces for events in piece.channels) == 4 * count
 
 
@@ -218,10 +216,12 @@ def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channel
     (("--sequence", "lake", "--method", "cf", "--step", "9ev"), "expected a time such as 0.1ms"),
     (("--sequence", "lake", "--method", "cf", "--step", "1s"), "events between windows would be lost"),
     (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
-    (("--sequence", "lake", "--weights", "nothing.safetensors"), "expected a checkpoint"),
+    (("--sequence", "lake", "--weights", "nothing.safetensors"), "nothing.safetensors is not there"),
     (("--live", "--method", "cf", "--size", 8, 10), "--live: expected no --size"),
     (("--live", "--method", "cf", "--clock-mhz", 70), "--live: expected no --clock-mhz"),
-    (("--sequence", "lake", "--method", "cf", "--height", 8, "--angles", 0, 45, 90, 135), "no --angles, --height"),
+    (("--sequence", "lake", "--method", "cf", "--height", 8), "a store or a folder: expected no --height"),
+    (("--sequence", "lake", "--angles", 0, 45, 90, 135), "one arrangement of polarizers, got --angles, --sequence"),
+    (("--sequence", "lake", "--start-angle", 3), "without --rotating or --triggers: expected no --start-angle"),
 ])  # fmt: skip
 def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, capsys):
     if "cuda:9" in arguments and torch.cuda.is_available():
@@ -324,10 +324,10 @@ def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):
         ([one, one], "four files with --angles, got 2"),
         ([one] * 4, "say the polarizer of each"),
         ([one] * 4 + ["--angles", 0, 45, 90, 90], "four different angles"),
-        ([one] * 4 + ["--sequence", "lake"], "four files: expected no --sequence"),
-        ([one, "--mosaic", "90 45 / 135 0", "--angles", 0, 45, 90, 135], "with --mosaic: expected no --angles"),
+        ([one, "--angles", 0, 45, 90, 135], "four files with --angles, got 1"),
+        ([one, "--mosaic", "90 45 / 135 0", "--angles", 0, 45, 90, 135], "got --angles, --mosaic"),
         ([one, "--live", "--sequence", "lake"], "--live: expected no --sequence"),
-        ([one, one, "--live"], "--live: expected one file or -, got 2"),
+        ([one, one, "--live"], "--live: expected one input, got 2"),
         ([tmp_path / "none.csv"], "there is no such file"),
     ):
         assert run(*files, "--method", "cf+gain", out=tmp_path / "out") == 1
@@ -344,15 +344,20 @@ def test_shipped_weights_are_a_checkpoint_or_say_what_to_do():
         assert isinstance(network, torch.nn.Module)
 
 
+@pytest.fixture
+def setup_of_demo(project_root):
+    return functools.partial(setup_of, load(project_root, ["runtime.device=cpu"]))
+
+
 @pytest.mark.parametrize("option", [{"thresholds": (0.1, 0.1)}, {"binning": 2}])
-def test_options_of_the_network_are_refused_for_a_method_that_does_not_use_them(option):
+def test_options_of_the_network_are_refused_for_a_method_that_does_not_use_them(option, setup_of_demo):
     (name,) = option
     with pytest.raises(ValueError, match=f"--{name} is for the DoLP network, highpass does not use it"):
-        open_method("highpass", None, "cpu", "fp32", lambda method: None, **option)
+        open_method(ChosenMethod("highpass", **option), setup_of_demo)
 
 
-def test_the_shipped_network_takes_the_thresholds_of_the_camera():
-    events = Events.empty(HEIGHT, WIDTH)
-    windows = [EventWindow([events] * 4, 0, 33_333)]
-    recoverer, _ = open_method(None, None, "cpu", "fp32", lambda method: None, thresholds=(0.1, 0.4))
+def test_the_shipped_network_takes_the_thresholds_of_the_camera(setup_of_demo):
+    windows = [EventWindow([Events.empty(HEIGHT, WIDTH)] * 4, 0, 33_333)]
+    recoverer, words = open_method(ChosenMethod("ours", thresholds=(0.1, 0.4)), setup_of_demo)
+    assert words.endswith(str(shipped_weights()))
     assert recoverer.step(recoverer.start(HEIGHT, WIDTH), windows)[1].dolp.shape == (1, HEIGHT, WIDTH)
