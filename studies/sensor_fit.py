@@ -13,16 +13,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from jaxtyping import Float32, Float64
 
 from polarnet.characterization.fit import SensorFit, fit_sensor
 from polarnet.characterization.known_light import KnownLight
 from polarnet.characterization.light import Flicker, MovingLight
-from polarnet.characterization.twin import constant_frames, drifting_leaves, emulated, flicker_light
+from polarnet.characterization.twin import constant_frames, emulated, flicker_light
 from polarnet.events.stream import Events
+from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.runtime.machine import generator_for
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.pixels.light import FULL_SCALE
 from polarnet.simulation.presets import SENSORS
 from studies.measure import arguments_of, command_line, machine_record, write_section
 
@@ -45,6 +49,9 @@ RANGES = {
 MAX_RELATIVE_SIGMA = 0.3  # of the threshold
 STATIC_S, STATIC_LIGHT = 300, 200.0
 MOVING_S, RENDER_HZ, SPEED_PX_S = 10.0, 1000, 60.0
+LEAVES_MARGIN = 80  # pixels that the leaves extend beyond the sensor
+LEAVES_BLUR = 1.0  # pixels, standard deviation of a lens's blur
+DARKEST_LEAF = 0.04
 FLICKERS = {2.0: 4.0, 20.0: 1.0, 60.0: 0.5}
 """Seconds recorded at each frequency (Hz)."""
 CONTRAST, FLICKER_LIGHT = 0.8, 100.0
@@ -92,10 +99,25 @@ def static_recording(sensor: EmulatorConfig, key: int) -> Events:
     return emulated(constant_frames(np.full(len(t_us), STATIC_LIGHT), HEIGHT, WIDTH), t_us, sensor, key)
 
 
+def drifting_leaves(
+    height: int, width: int, t_us: Float64[np.ndarray, " n"], speed_px_s: float, generator: np.random.Generator
+) -> Float32[np.ndarray, "n h w"]:
+    """Light of dead leaves that drift along a slow Lissajous figure, DN."""
+    size = height + 2 * LEAVES_MARGIN, width + 2 * LEAVES_MARGIN
+    scene = cv2.GaussianBlur(dead_leaves(generator, *size).mean(axis=2), (0, 0), LEAVES_BLUR)
+    scene = (FULL_SCALE * np.clip(scene, DARKEST_LEAF, 1)).astype(np.float32)
+    reach = 0.75 * LEAVES_MARGIN
+    angle = t_us * 1e-6 * speed_px_s / reach
+    left = LEAVES_MARGIN + reach * np.sin(angle)
+    top = LEAVES_MARGIN + reach * np.sin(0.77 * angle + 1)
+    moves = (np.array([[1, 0, -x], [0, 1, -y]]) for x, y in zip(left, top, strict=True))
+    return np.stack([np.asarray(cv2.warpAffine(scene, move, (width, height))) for move in moves])
+
+
 def leaves(sensor: EmulatorConfig, key: int, frame_rate_hz: int) -> KnownLight:
     """Drifting dead leaves, and the 8-bit frames of them that the fit gets."""
     t_us = np.arange(round(MOVING_S * RENDER_HZ) + 1) * (1e6 / RENDER_HZ)
-    light = np.concatenate(list(drifting_leaves(HEIGHT, WIDTH, t_us, SPEED_PX_S, generator_for(1, "leaves", "fit"))))
+    light = drifting_leaves(HEIGHT, WIDTH, t_us, SPEED_PX_S, generator_for(1, "leaves", "fit"))
     step = RENDER_HZ // frame_rate_hz
     events = emulated(iter([light]), t_us, sensor, key)
     return KnownLight("moving", events, MovingLight(np.rint(light[::step]), t_us[::step]))

@@ -12,7 +12,6 @@ from polarnet.characterization.refractory import between_shot_noise_us, piled_up
 from polarnet.characterization.twin import (
     compare,
     constant_frames,
-    drifting_leaves,
     emulated,
     fitted_parameters,
     fitted_sensor,
@@ -20,6 +19,7 @@ from polarnet.characterization.twin import (
 )
 from polarnet.recordings.pixels import event_counts
 from polarnet.simulation.presets import SENSORS
+from studies.sensor_fit import drifting_leaves
 
 TRUTH = dataclasses.replace(
     SENSORS["default"],
@@ -46,7 +46,7 @@ def static():
 @pytest.fixture(scope="module")
 def moving() -> KnownLight:
     t_us = np.arange(2501) * 2e3
-    light = np.concatenate(list(drifting_leaves(HEIGHT, WIDTH, t_us, 60.0, np.random.default_rng(1))))
+    light = drifting_leaves(HEIGHT, WIDTH, t_us, 60.0, np.random.default_rng(1))
     return KnownLight("moving", emulated(iter([light]), t_us, TRUTH, 3), MovingLight(light[::2], t_us[::2]))
 
 
@@ -115,12 +115,6 @@ def test_the_twin_of_a_simulated_recording_is_like_it(fit, static, moving):
         assert comparison.interval_distance < 0.05
         assert comparison.ratio["twin"] == pytest.approx(comparison.ratio["recording"], rel=0.1)
         assert "Kolmogorov-Smirnov" in comparison.verdict
-
-
-def test_without_frames_the_twin_has_the_event_rate_of_the_recording(moving):
-    comparison = compare("test", moving.events, None, TRUTH, seed=1)
-    assert not comparison.same_light
-    assert comparison.rate_hz["twin"].mean() == pytest.approx(comparison.rate_hz["recording"].mean(), rel=0.5)
 
 
 def test_the_refractory_period_is_where_intervals_pile_up():
