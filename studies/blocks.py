@@ -16,25 +16,11 @@ from studies.paper import duration_rows, table_rows
 from studies.planning import PLANNING_BLOCKS
 from studies.recorded import RECORDED_BLOCK
 from studies.robustness_blocks import ROBUSTNESS_BLOCKS
-from studies.rotating import CURVES
 from studies.tables import Block, Columns, Results, Row, listed
 
 ROOT = Path(__file__).resolve().parents[1]
 GOLDEN_CASES = 23  # 15 of v2e, 8 of ESIM
 BENCHMARK_COLUMNS = {**COLUMNS, **COSTS}
-ROTATING_COLUMNS = {
-    "DoLP RMS": "{dolp_rms:.4f}", "bias": "{dolp_bias:+.4f}", "AoLP error, degrees": "{aolp_deg:.2f}",
-    "expected RMS": "{expected_rms:.4f}", "errors within the expected": "{within_expected:.0%}",
-    "within twice": "{within_twice_expected:.0%}",
-}  # fmt: skip
-
-
-def _rotating_curve_rows(results: Results) -> Iterator[Row]:
-    for curve, points in results["rotating"]["curves"].items():
-        label, _ = CURVES[curve]
-        for score, about, form in (("dolp_rms", "DoLP RMS", "{:.3f}"), ("aolp_deg", "AoLP, degrees", "{:.1f}")):
-            errors = ", ".join(f"{point['value']:g}: {form.format(point[score])}" for point in points)
-            yield {"label": label, "about": about, "errors": errors}
 
 
 def _formats(readers: Results) -> list[str]:
@@ -231,28 +217,6 @@ BLOCKS = ROBUSTNESS_BLOCKS | NETWORK_BLOCKS | PLANNING_BLOCKS | {
     ),
     "inspection": Block(
         "inspection", "lines", "studies.rig", lambda results: "\n".join(["```", *results["lines"], "```"]), caption=""
-    ),
-    "rotating": Block(
-        "camera", "rotating", "studies.rotating --write", lambda results: [results["rotating"]],
-        {"turns/s": "{rate_hz:g}", "window, turns": "{window_turns:g}", **ROTATING_COLUMNS},
-        "{rotating[scenes]} scenes. {origin}",
-    ),
-    "rotating-dolp": Block(
-        "camera", "rotating", "studies.rotating --write", lambda results: results["rotating"]["by_dolp"],
-        {"DoLP": "{low:g} to {high:g}", "pixels": "{pixels:,}", **ROTATING_COLUMNS}, caption="",
-    ),
-    "rotating-s0": Block(
-        "camera", "rotating", "studies.rotating --write", lambda results: results["rotating"]["by_s0"],
-        {"S0": "{low:g} to {high:g}", "pixels": "{pixels:,}", **ROTATING_COLUMNS}, caption="",
-    ),
-    "rotating-cases": Block(
-        "camera", "rotating", "studies.rotating --write",
-        lambda results: [{"name": name, **one} for name, one in results["rotating"]["cases"].items()],
-        {"case": "{name}", **ROTATING_COLUMNS}, caption="",
-    ),
-    "rotating-curves": Block(
-        "camera", "rotating", "studies.rotating --write", _rotating_curve_rows,
-        {"setting": "{label}", "error": "{about}", "value: error": "{errors}"}, caption="",
     ),
     "faults": Block(
         "reliability", "artefacts", "studies.faults --write", _endings_by_kind("artefacts", "artefacts"),

@@ -35,7 +35,7 @@ def recovered(arguments, out):
     return {name: group[name][:] for name in ("t_us", "dolp", "aolp", "log_variance")}
 
 
-def test_a_recording_gives_dolp_and_aolp_of_each_half_turn_by_rate_or_triggers(
+def test_a_recording_gives_dolp_and_aolp_every_half_turn(
     recording, tmp_path, monkeypatch, project_root
 ):
     monkeypatch.chdir(project_root)
