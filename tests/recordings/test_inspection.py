@@ -37,12 +37,6 @@ def test_the_picture_is_of_the_consecutive_events_that_took_the_least_time(tmp_p
     assert (inspection.busiest_events, inspection.busiest_start_us, inspection.busiest_us) == (30, 50_000, 2900)
 
 
-def test_a_recording_of_few_events_is_shown_whole(tmp_path):
-    (tmp_path / "e.txt").write_text("20 10\n1 2 3 1\n2 2 3 0\n3 4 5 1\n")
-    inspection = inspect_recording(open_recording(tmp_path / "e.txt"), FACTOR)
-    assert np.argwhere(inspection.busiest).tolist() == [[5, 4]]
-
-
 def test_findings_say_what_was_repaired_and_how_often(tmp_path):
     (tmp_path / "e.txt").write_text("20 10\n5 2 3 1\n4 2 3 0\n6 2 x 1\n3000000 4 5 1\n")
     lines = "\n".join(findings(inspect_recording(open_recording(tmp_path / "e.txt"), FACTOR)))
@@ -82,12 +76,6 @@ def test_inspect_of_pictures_shows_the_first(tmp_path, capsys):
     assert main(["inspect", str(tmp_path / "p.bin"), "--picture", str(tmp_path / "p.png")]) == 0
     assert "pictures    2" in capsys.readouterr().out
     assert cv2.imread(str(tmp_path / "p.png"))[400, [10, 1000], 0].tolist() == [0, 255]
-
-
-def test_inspect_of_a_mode_without_polarity_says_what_to_do(tmp_path, capsys):
-    (tmp_path / "e.csv").write_text("10,20,5\n11,21,7\n")
-    assert main(["inspect", str(tmp_path / "e.csv")]) == 1
-    assert "have no polarity" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("chunk_events", [7, 1000])

@@ -213,6 +213,8 @@ def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channel
     (("--sequence", "lake", "--method", "e2vid_published"), "no weights are given"),
     (("--sequence", "lake", "--method", "cf", "--window", "1s"),
      "events.zarr lasts 100 ms, less than one window of 1000 ms: record for longer, or give --window 33.333ms"),
+    (("--sequence", "lake", "--method", "highpass", "--window", "9000ev"),
+     "ends before 9,000 events, one window: record for longer, or give fewer events"),
     (("--sequence", "lake", "--method", "cf", "--step", "9ev"), "expected a time such as 0.1ms"),
     (("--sequence", "lake", "--method", "cf", "--step", "1s"), "events between windows would be lost"),
     (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
@@ -293,17 +295,6 @@ def test_a_mosaic_without_polarizers_is_named_on_the_terminal_and_on_the_page(tm
     assert "was made without polarizers" in (out / "index.html").read_text()
 
 
-@pytest.mark.parametrize(("window", "advice"), [
-    ("1s", "lasts 100 ms, less than one window of 1000 ms: record for longer, or give --window 33.333ms"),
-    ("9000ev", "ends before 9,000 events, one window: record for longer, or give fewer events"),
-])  # fmt: skip
-def test_a_recording_shorter_than_a_window_is_told_what_works(window, advice, store, tmp_path, at_root, capsys):
-    arguments = (store, "--sequence", "lake", "--method", "highpass")
-    assert run(*arguments, "--window", window, out=tmp_path / "out") == 1
-    assert advice in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
 def test_what_a_very_short_recording_is_told_works(channels, tmp_path, at_root, capsys):
     early = [slice_time(events, 0, 8000) for events in channels]
     files = [write_lines(tmp_path / f"{angle}.txt", e) for angle, e in zip(ANGLES, early, strict=True)]
@@ -333,15 +324,6 @@ def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):
         assert run(*files, "--method", "cf+gain", out=tmp_path / "out") == 1
         assert not (tmp_path / "out").exists()
         assert reason in capsys.readouterr().err
-
-
-def test_shipped_weights_are_a_checkpoint_or_say_what_to_do():
-    try:
-        network, _ = load_network(shipped_weights())
-    except FileNotFoundError as absent:
-        assert "--weights FILE" in str(absent)  # noqa: PT017 - a version may ship weights or not
-    else:
-        assert isinstance(network, torch.nn.Module)
 
 
 @pytest.fixture

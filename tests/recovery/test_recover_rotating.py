@@ -35,9 +35,7 @@ def recovered(arguments, out):
     return {name: group[name][:] for name in ("t_us", "dolp", "aolp", "log_variance")}
 
 
-def test_a_recording_gives_dolp_and_aolp_every_half_turn(
-    recording, tmp_path, monkeypatch, project_root
-):
+def test_a_recording_gives_dolp_and_aolp_every_half_turn(recording, tmp_path, monkeypatch, project_root):
     monkeypatch.chdir(project_root)
     frames = recovered([recording, "--rotating", RATE_HZ, "--start-angle", START_DEG], tmp_path / "a")
     assert frames["t_us"][:2].tolist() == [100_000, 200_000]

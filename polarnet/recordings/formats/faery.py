@@ -14,7 +14,7 @@ FAERY = Library("faery", "faery", "recordings", "polarnet.recordings.formats.fae
 
 
 def opener(file_type: str) -> Callable[[Path, Choices], Source]:
-    """Opens the first event stream of AEDAT4 (`aedat`, microseconds since 1970), or the changes in Event Stream (`es`)."""
+    """A function that opens AEDAT4's first event stream (`aedat`, microseconds since 1970), or Event Stream (`es`)."""
 
     def open_file(path: Path, choices: Choices) -> Source:
         height, width = sensor_size(path, choices, *ask_once(FAERY, path, "size", file_type).value)

@@ -1,7 +1,7 @@
 """The process of `isolated.ask`: runs the tasks of format libraries and sends their answers as raw bytes.
 
-It imports nothing else of polarnet, so that it starts quickly. A task is a function in the dictionary TASKS of a module.
-It yields answers: a value for JSON and a list of arrays.
+It imports nothing else of polarnet, so that it starts quickly. A task is a function in the dictionary TASKS of a
+module. It yields answers: a value for JSON and a list of arrays.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ def serve(pipe: Connection, max_mib: int) -> None:
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:
             module, task, *arguments = json.loads(pipe.recv_bytes())
-            end = {"end": True}
+            end: dict[str, Any] = {"end": True}
             try:
                 for value, arrays in importlib.import_module(module).TASKS[task](*arguments):
                     _send(pipe, value, arrays)

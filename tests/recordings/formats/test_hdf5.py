@@ -1,5 +1,3 @@
-import sys
-
 import numpy as np
 import pytest
 
@@ -94,13 +92,6 @@ def test_a_damaged_file_is_refused_with_what_hdf5_says(tmp_path):
     path = write_dsec(tmp_path / "e.h5")
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(RecordingError, match=r"e\.h5: HDF5 cannot read it: .*truncated"):
-        read_recording(path, height=480, width=640)
-
-
-def test_without_h5py_the_error_names_the_extra(tmp_path, monkeypatch):
-    path = write_dsec(tmp_path / "e.h5")
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[hdf5\]' in the clone"):
         read_recording(path, height=480, width=640)
 
 
