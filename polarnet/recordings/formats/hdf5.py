@@ -17,7 +17,7 @@ MAX_WHOLE = 2**53  # largest whole number that a float holds exactly
 E2P_FRAMES, E2P_MAPS = ("frame_ts", "frame"), ("intensity", "dolp", "aolp")
 E2P_WHITE = 255.0  # level in its maps of saturated light, of DoLP 1 and of AoLP 90 degrees; level 0 is AoLP -90 degrees
 SETTINGS = ("t_offset", "height", "width", "sensor_resolution", "geometry")
-"""Attributes or scalars that a file may have: microseconds added to t, and the size of the sensor in three notations."""
+"""Attributes or scalars that a file may have: microseconds added to t, and the sensor's size in three notations."""
 
 HDF5 = Library(
     "HDF5",
@@ -50,9 +50,8 @@ LAYOUTS = {
     "metavision": Layout("Prophesee", [Column("CD/events", name) for name in "txyp"]),
     "dsec": Layout("DSEC", [Column(f"events/{name}") for name in "txyp"]),
 }
-"""E2P: Mei et al. 2023, sensor behind polarizers 90 45 / 135 0; ESfP: Muglikar et al. 2023; Prophesee's Metavision, whose
-own compression, ECF, needs Prophesee's HDF5 plugin; DSEC: Gehrig et al. 2021, sensors of 480 x 640, which it does not
-state (files that polarnet writes do)."""
+"""E2P: Mei et al. 2023, a sensor behind polarizers 90 45 / 135 0. ESfP: Muglikar et al. 2023. Prophesee: Metavision,
+whose compression ECF needs Prophesee's HDF5 plugin. DSEC: Gehrig et al. 2021, whose files do not state 480 x 640."""
 
 
 def matcher(layout: str) -> Callable[[Path, bytes], bool]:
