@@ -39,7 +39,6 @@ SLOWEST_FIRST = (
     "recovery/test_recover.py",
     "training/test_calibration.py",
     "methods/test_methods.py",
-    "recordings/test_recorded_readout.py",
     "reports/test_page.py",
     "methods/test_rotating_polarizer.py",
     "training/test_parallel.py",

@@ -90,13 +90,13 @@ def _fit_sensor(options: argparse.Namespace) -> int:
     static = read(options.static) if options.static else None
     moving = read(options.moving) if options.moving else None
     known: list[KnownLight] = []
-    lights: list[tuple[str, Events, MovingLight | Flicker | float | None]] = []
+    lights: list[tuple[str, Events, MovingLight | Flicker | float]] = []
     if static is not None:
         lights.append((f"static: {options.static.name}", static, static_light))
-    if moving is not None:
-        light = read_light(options.frames, moving.height, moving.width) if options.frames else None
+    if moving is not None and options.frames:
+        light = read_light(options.frames, moving.height, moving.width)
+        known.append(KnownLight("moving", moving, light))
         lights.append((f"moving: {options.moving.name}", moving, light))
-        known += [KnownLight("moving", moving, light)] if light else []
     mean = 127.5 if options.flicker_light is None else options.flicker_light
     for path, frequency_hz in zip(options.flicker or [], options.frequency or [], strict=True):
         flicker = Flicker(mean, options.contrast, frequency_hz)

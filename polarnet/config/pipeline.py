@@ -11,6 +11,7 @@ from polarnet.benchmark.row_results import RowRecord, write_row
 from polarnet.benchmark.rows import Context, available, weights_used
 from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp
 from polarnet.config.tree import Config, or_exit
+from polarnet.events.rotation import steady_rotation
 from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup
 from polarnet.metrics.similarity import Lpips
@@ -31,7 +32,10 @@ def context_of(config: Config, rows: Iterable[str], train_mean: float | None, we
 
 def setup_of(config: Config, method: Method, weights: Path | None = None) -> Setup:
     """Inputs of a method, with `weights`, else those that section `rows` names."""
-    rotating = _rotating_of(config) if method.rotating else {"rate_hz": 0.0, "start_angle_deg": 0.0}
+    rotation = None
+    if method.rotating:
+        rotating = _rotating_of(config)
+        rotation = steady_rotation(rotating["rate_hz"], math.radians(rotating["start_angle_deg"]))
     return Setup(
         config=getattr(config.methods, method.section, None),
         weights=weights or (config.weights_of(method.name) if method.weights is not None else None),
@@ -39,8 +43,7 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
         gain=config.methods.gain,
         device=device_of(config.runtime),
         precision=config.benchmark.precision,
-        rotation_hz=rotating["rate_hz"],
-        start_angle=math.radians(rotating["start_angle_deg"]),
+        rotation=rotation,
     )
 
 

@@ -22,7 +22,6 @@ from polarnet.config.origins import Run
 from polarnet.config.overrides import check_overrides
 from polarnet.methods import METHODS
 from polarnet.methods.between import BetweenConfig
-from polarnet.methods.rotating_polarizer import ModulationConfig
 from polarnet.methods.sharpening import SharpeningConfig
 from polarnet.methods.stokes_gain import GainConfig
 from polarnet.metrics.lpips import BACKBONES, PURPOSES, Purpose, is_stored
@@ -161,7 +160,6 @@ class Config:
     sets: SetsConfig
     recordings: RecordingsConfig
     rotating: RotatingConfig
-    modulation: ModulationConfig
     row: RowName | None
     """Row that stage row runs."""
     baseline: BaselineName | None

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from polarnet.events.rotation import Rotation
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.sharpening import SharpeningConfig
 from polarnet.methods.stokes_gain import GainConfig
@@ -34,10 +35,8 @@ class Setup:
     device: torch.device
     precision: str
     """Precision of networks: fp32, or bf16 autocast."""
-    rotation_hz: float
-    """Turns per second of the polarizer, for methods of one camera behind a rotating polarizer."""
-    start_angle: float
-    """Its angle at time 0, radians."""
+    rotation: Rotation | None
+    """Angle of the polarizer over time, for methods of one camera behind a rotating polarizer."""
 
     def __hash__(self) -> int:
         return hash((self.weights, self.device, self.precision))  # settings may be lists, which have no hash
@@ -86,6 +85,8 @@ class Weights:
 
     networks: tuple[str, ...]
     """Names of the networks that a checkpoint of polarnet may hold, as in its JSON."""
+    shipped: bool = False
+    """Whether the package carries weights, which `polarnet recover` uses if it is given none."""
 
 
 @dataclass(frozen=True)

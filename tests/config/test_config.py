@@ -281,7 +281,10 @@ def test_a_preset_holds_only_what_differs_and_no_sensor_is_called_like_an_experi
         for name in preset_names(project_root, group):
             for key, value in preset_values(project_root, group, name).items():
                 stands = functools.reduce(operator.getitem, key.split("."), whole)
-                undoes = key == "emulate.randomise" or name in ("paper_small", "shipped_whole")  # what another preset set
+                undoes = key == "emulate.randomise" or name in (
+                    "paper_small",
+                    "shipped_whole",
+                )  # what another preset set
                 assert stands != value or undoes, f"{group} {name}: {key}"
     assert not set(preset_names(project_root, "experiment")) & set(preset_names(project_root, "sensor"))
 

@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-from polarnet.methods.intensity_networks import intensity_network, load_baseline
 
 from polarnet.config.tree import load
 from polarnet.events.representations import event_counts, event_tensor, voxel_grid
@@ -16,6 +15,7 @@ from polarnet.events.windows import encode_windows
 from polarnet.methods import METHODS
 from polarnet.methods.dolp_network import dolp_recoverer, told, weighted_counts
 from polarnet.methods.intensities import from_intensities, with_gain
+from polarnet.methods.intensity_networks import intensity_network, load_baseline
 from polarnet.methods.method import Method, Recoverer, weights_record, why_absent
 from polarnet.methods.sharpening import sharpened
 from polarnet.networks.e2p.network import E2p, interleaved
