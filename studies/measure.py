@@ -113,7 +113,7 @@ def measure_pipeline(root: Path = ROOT) -> Path:
         _, again = timed_make("repro", clone)
         if again:
             raise RuntimeError(f"a second make repro ran {', '.join(again)}; everything should have been cached")
-        figures["metrics"] = scores_and_costs(clone / "data" / "benchmark")
+        figures["metrics"] = scores_and_costs(clone / "data" / "benchmark" / "sets" / "simulated")
         shutil.copy(clone / "data" / "report" / "overview.png", root / "docs" / "pictures" / "overview.png")
         (root / DEMO_METRICS).parent.mkdir(parents=True, exist_ok=True)
         for name in ("dvc.lock", DEMO_METRICS):
@@ -171,7 +171,7 @@ def measure_paper_small(data: Path, root: Path = ROOT) -> Path:
 
     ValueError names the rows that the run lacks.
     """
-    scores = scores_and_costs(data / "benchmark")
+    scores = scores_and_costs(data / "benchmark" / "sets" / "simulated")
     if missing := [row for row in SMALL_ROWS if row not in scores]:
         raise ValueError(f"{data}: expected the rows {', '.join(SMALL_ROWS)}; {', '.join(missing)} missing")
     return write_section("paper", "paper_small", {row: scores[row] for row in SMALL_ROWS}, machine_record(root))

@@ -24,6 +24,7 @@ from studies.study import (
     arguments_of,
     command_line,
     machine_record,
+    row_of,
     run_stage,
     scores_and_costs,
     write_section,
@@ -68,20 +69,21 @@ def trained(row: str, arguments: argparse.Namespace) -> Path:
 def benchmarked(arguments: argparse.Namespace, weights: dict[str, Path]) -> dict[str, Any]:
     """Scores and costs of every row, its comparison with `ours`, and numbers of scenes and frames."""
     results = arguments.work / "benchmark"
+    simulated = results / "sets" / "simulated"
     overrides = [
         *common(arguments),
         f"benchmark.methods=[{','.join(METHODS)}]",
-        *(f"methods.{row}.weights={file}" for row, file in weights.items()),
+        *(row_of(row, file) for row, file in weights.items()),
         f"paths.benchmark={results}",
     ]
     for row in METHODS:
         run_stage("row", *overrides, f"row={row}")
     collect_rows(load(ROOT, overrides))
-    details = json.loads((results / "details.json").read_text())
+    details = json.loads((simulated / "details.json").read_text())
     return {
         "scenes": len(details["scenes"]),
         "frames": details["frames"],
-        "rows": scores_and_costs(results),
+        "rows": scores_and_costs(simulated),
         "paired": {row: one["mse"] for row, one in details["paired"].items()},
     }
 

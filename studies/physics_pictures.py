@@ -369,7 +369,7 @@ def gains_figure() -> Figure:
     noise = 1 + NOISE * torch.randn((4, *truth.shape[1:]), generator=torch.Generator().manual_seed(1))
     measured = (intensities_from_stokes(truth) + DARKEST) * noise
     wrong = measured * measured.new_tensor(WRONG_FACTORS)[:, None, None]
-    solved = consistent(wrong[None], load(ROOT).baselines.gain)[0]
+    solved = consistent(wrong[None], load(ROOT).methods.gain)[0]
     panels = {"true": dolp(truth), "factors unknown": _dolp_of(wrong), "factors solved": _dolp_of(solved)}
     with matplotlib.rc_context(chart_style(LIGHT)):
         figure = Figure(figsize=(7.2, 2.0), layout="constrained", facecolor=LIGHT.face)

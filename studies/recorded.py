@@ -25,7 +25,16 @@ from polarnet.simulation.sets import make_folder_set
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from studies.e2p_writer import WHITE, mosaicked, write_e2p
-from studies.study import PICTURES, ROOT, arguments_of, command_line, machine_record, scores_and_costs, write_section
+from studies.study import (
+    PICTURES,
+    ROOT,
+    arguments_of,
+    command_line,
+    machine_record,
+    row_of,
+    scores_and_costs,
+    write_section,
+)
 
 PHOTOGRAPHS = ("astronaut", "coffee", "rocket")
 MOSAIC_TEXT = "90 45 / 135 0"
@@ -81,7 +90,7 @@ def main() -> None:
     given = dict(entry.split("=", 1) for entry in arguments.published)
     rows = ["zeros", "oracle_mean", "cf", "highpass", "cf+gain", "highpass+gain", *given]
     rows += [f"{row}+gain" for row in given if not row.startswith("e2p")]
-    weights = [f"methods.{row}.weights={Path(file).resolve()}" for row, file in given.items()]
+    weights = [row_of(row, Path(file)) for row, file in given.items()]
     photographs = [photo.path for photo in BUILTIN_PHOTOS if photo.path.stem in PHOTOGRAPHS]
     with tempfile.TemporaryDirectory() as folder:
         results = measured(Path(folder), photographs, [*rows, "ours"], weights)

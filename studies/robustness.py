@@ -53,7 +53,7 @@ from polarnet.runtime.machine import configure
 from polarnet.stokes import Prediction
 from polarnet.storage.scenes import SceneStore
 from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
-from studies.study import arguments_of, command_line, machine_record, write_section
+from studies.study import arguments_of, command_line, machine_record, row_of, write_section
 
 OURS = "ours"
 CALIBRATED, BLOCKS = "ours, thresholds given", "ours, 2x2 blocks"
@@ -147,14 +147,14 @@ def contexts_of(
 ) -> dict[str, Context]:
     """Settings of each row of the network under a condition; blocks and known thresholds have the first weights."""
     config = settings(*overrides)
-    contexts = {row: context_of(config, train_mean, file) for row, file in weights.items()}
+    contexts = {row: context_of(config, [*ROWS, OURS], train_mean, file) for row, file in weights.items()}
     variants = {} if condition.startswith(RATED) else {BLOCKS: "methods.ours.binning=2"}
     if condition.startswith("sensors.") and not config.emulate.randomise:
         thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
         variants[CALIBRATED] = f"methods.ours.thresholds={thresholds}"
     first = next(iter(weights.values()))
     return contexts | {
-        row: context_of(settings(*overrides, variant), train_mean, first) for row, variant in variants.items()
+        row: context_of(settings(*overrides, variant), [OURS], train_mean, first) for row, variant in variants.items()
     }
 
 
@@ -317,7 +317,7 @@ def main() -> None:
     arguments, record = parsed(), machine_record()
     common = [f"runtime.threads={arguments.threads}", f"runtime.workers={arguments.workers}"]
     for row, _, file in (given.partition("=") for given in arguments.published):
-        common.append(f"methods.{row}.weights={Path(file).resolve()}")
+        common.append(row_of(row, Path(file)))
     config = settings(*common)
     configure(config.runtime, config.seed)
     arguments.work.mkdir(parents=True, exist_ok=True)

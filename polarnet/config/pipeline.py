@@ -38,13 +38,20 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
         rotation = steady_rotation(rotating["rate_hz"], math.radians(rotating["start_angle_deg"]))
     return Setup(
         config=getattr(config.methods, method.section, None),
-        weights=weights or (config.weights_of(method.name) if method.weights is not None else None),
+        weights=weights or _weights_of(config, method),
         sharpening=config.methods.sharpening,
         gain=config.methods.gain,
         device=device_of(config.runtime),
         precision=config.benchmark.precision,
         rotation=rotation,
     )
+
+
+def _weights_of(config: Config, method: Method) -> Path | None:
+    """File that section `rows` names for a method; a row NAME+gain that is not listed has the weights of NAME."""
+    if method.weights is None:
+        return None
+    return config.weights_of(method.name) or config.weights_of(method.section)
 
 
 def _rotating_of(config: Config) -> Mapping[str, Any]:

@@ -52,7 +52,7 @@ def test_the_loss_between_windows_is_the_larger_of_photographs_and_measured_scen
 
 def test_frames_between_windows_are_scored_sixteen_times_a_window(simulated):
     config, scenes = settings("seed=3", "benchmark.warmup_windows=2", "synthesize.duration_s=0.2"), simulated.scenes
-    contexts = {"ours": context_of(config, 0.3, shipped_weights())}
+    contexts = {"ours": context_of(config, ["oracle_mean", "ours"], 0.3, shipped_weights())}
     rated = rated_sequence("a-0", SceneStore.open(scenes), config, contexts)  # 6 windows, 2 of them warm-up
     numbers = Counter(row.method for row in rated.rows)
     assert numbers == {"oracle_mean": 48, "ours": 48, "ours, held": 48, "ours, window ends": 4}
