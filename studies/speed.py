@@ -218,7 +218,7 @@ def dask(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 def identities(store: Path) -> dict[str, tuple[int, int]]:
     """Inode and time of every finished part of a store: others if it is written again, even with equal bytes."""
-    status = {path.name: path.stat() for path in store.glob("part-?????.zip")}
+    status = {path.name: path.stat() for path in store.glob("part-?????")}
     return {name: (one.st_ino, one.st_mtime_ns) for name, one in status.items()}
 
 

@@ -18,10 +18,10 @@ from polarnet.reports.preview import write_true_video
 from polarnet.runtime.progress import ProgressBar
 from polarnet.simulation.moving_sensor import leave_sensors
 from polarnet.simulation.video import Drawn, Piece
-from polarnet.storage.appended import AppendedFrames
 from polarnet.storage.events import MAX_DURATION_US, EventStore
 from polarnet.storage.exchange import FORMS
-from polarnet.storage.frames import CONVENTIONS, quantise_angle, quantise_fraction
+from polarnet.storage.frames import CONVENTIONS, FRAMES_PER_CHUNK, quantise_angle, quantise_fraction
+from polarnet.storage.groups import GrowingColumns
 from polarnet.storage.spool import EventSpool
 from polarnet.storage.true_frames import APPENDED, open_truth
 
@@ -81,7 +81,7 @@ def write_simulation(
     simulation of more than 71 minutes or without duration.
     """
     started = time.perf_counter()
-    truth = AppendedFrames(folder / TRUTH, TRUTH_CONVENTIONS)
+    truth = GrowingColumns(folder / TRUTH, FRAMES_PER_CHUNK, False, TRUTH_CONVENTIONS)
     duration_us, frames, polarized = 0, 0, False
     with EventSpool(folder / SPOOL) as spool:
         with ProgressBar(total=total, desc="simulate", unit="frame") as bar:

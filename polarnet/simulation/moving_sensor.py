@@ -23,9 +23,8 @@ from polarnet.simulation.rendering import (
     weights_of,
 )
 from polarnet.simulation.scene import PolarizationScene
-from polarnet.stokes import parse_mosaic
+from polarnet.stokes import NUM_CHANNELS, parse_mosaic
 
-CHANNELS = (0, 1, 2, 3)  # behind the polarizers at 0, 45, 90 and 135 degrees
 CHUNK = 16  # frames rendered at once, unless the sensor only drifts behind uniform polarizers
 
 
@@ -113,7 +112,7 @@ def emulate_motion_steps(
         width=columns,
         config=config,
         key=key,
-        channels=CHANNELS,
+        channels=tuple(range(NUM_CHANNELS)),
         threads=threads,
     )
     if drifts(pose) and polarizers.uniform:

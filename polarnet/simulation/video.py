@@ -15,12 +15,13 @@ from polarnet.runtime.machine import generator_for, one_thread, seed_for
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, emulate_lights, events_of
 from polarnet.simulation.motion import SynthesizeConfig, frame_times_us, random_trajectory, render
-from polarnet.simulation.moving_sensor import CHANNELS, emulate_motion_steps, emulation_times_us, leave_sensors
+from polarnet.simulation.moving_sensor import emulate_motion_steps, emulation_times_us, leave_sensors
 from polarnet.simulation.pixels.light import light_of_frames
 from polarnet.simulation.polarizers import channel_size, grid
 from polarnet.simulation.rendering import behind_polarizers, split_channels, weights_of
 from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb
 from polarnet.simulation.upsampling import StokesFrame, upsampled
+from polarnet.stokes import NUM_CHANNELS
 
 MOTION_STEPS = 64  # rendered frames in a piece of a moving sensor's simulation
 PIECE_PIXELS = 2**20  # pixels of all frames in a piece of a video; light and Stokes parameters take 28 bytes each
@@ -134,7 +135,8 @@ def _advance(
     if MODELS[sensor.model].EIGHT_BIT_VIDEO:
         light = (light + np.float32(0.5)).astype(np.uint8)
     lights = [light_of_frames(np.ascontiguousarray(channel)) for channel in light]
-    channels, state = emulate_lights(lights, t_us, rows, columns, sensor, key, state, CHANNELS, threads)
+    numbers = tuple(range(NUM_CHANNELS))
+    channels, state = emulate_lights(lights, t_us, rows, columns, sensor, key, state, numbers, threads)
     return [events_of(channel, rows, columns) for channel in channels], state
 
 

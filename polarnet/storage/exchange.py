@@ -11,12 +11,13 @@ from typing import Any, no_type_check
 
 import numba
 import numpy as np
+import torch
 
 from polarnet.events.stream import Events, slice_count
 from polarnet.runtime.extras import installation
 from polarnet.runtime.progress import ProgressBar
 from polarnet.stokes import POLARIZER_ANGLES_DEG
-from polarnet.storage.events import EventStore, first_at_millisecond
+from polarnet.storage.events import EventStore
 
 HDF5_CHUNK = 2**16  # events
 BLOCK = 2**18  # events converted at once
@@ -35,11 +36,12 @@ def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -
         "t": events.t.numpy().astype(np.uint32),
         "p": (events.p > 0).numpy().astype(np.uint8),
     }
+    milliseconds = torch.arange(-(-duration_us // 1000) + 1)  # from 0 up to the first at or after the end
     compressed = {"chunks": (min(HDF5_CHUNK, len(events)),), "compression": "gzip", "shuffle": True}
     with h5py_module().File(path, "w") as file:
         for name, values in columns.items():
             file.create_dataset(f"events/{name}", data=values, **(compressed if len(events) else {}))
-        file["ms_to_idx"] = first_at_millisecond(events.t, duration_us).astype(np.uint64)
+        file["ms_to_idx"] = torch.searchsorted(events.t, 1000 * milliseconds).numpy().astype(np.uint64)
         file["t_offset"] = np.int64(0)
         file.attrs["height"], file.attrs["width"] = events.height, events.width
 
