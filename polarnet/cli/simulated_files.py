@@ -11,6 +11,7 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from polarnet import stokes
+from polarnet.cli.spool import EventSpool
 from polarnet.events.mosaic import join_mosaic
 from polarnet.events.stream import Events
 from polarnet.reports.maps import encode_png
@@ -22,7 +23,6 @@ from polarnet.storage.events import MAX_DURATION_US, EventStore
 from polarnet.storage.exchange import FORMS
 from polarnet.storage.frames import CONVENTIONS, FRAMES_PER_CHUNK, quantise_angle, quantise_fraction
 from polarnet.storage.groups import GrowingColumns
-from polarnet.storage.spool import EventSpool
 from polarnet.storage.true_frames import APPENDED, open_truth
 
 STORE = "store"

@@ -233,8 +233,12 @@ class Store:
         for leftover in [*folder.glob("*.tmp"), *folder.glob("*.partial")]:  # from processes killed while writing
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         final = folder.with_name(folder.name.removesuffix(".tmp"))
-        shutil.rmtree(final, ignore_errors=True)  # a folder cannot be renamed onto one that is not empty
+        replaced = final.with_name(final.name + ".old")
+        shutil.rmtree(replaced, ignore_errors=True)
+        if final.exists():
+            os.replace(final, replaced)  # a folder cannot be renamed onto one that is not empty
         os.replace(folder, final)
+        shutil.rmtree(replaced, ignore_errors=True)
         self._claim.close()
 
     def record(self, sequence: str) -> Header:

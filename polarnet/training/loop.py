@@ -17,7 +17,6 @@ from polarnet.metrics.similarity import correlation, mse, psnr
 from polarnet.runtime.files import check_room
 from polarnet.runtime.machine import precision_on
 from polarnet.runtime.sections import one_of, section
-from polarnet.storage.windows import WindowDataset
 from polarnet.training.calibration import Scene, fitted, joined, weights_for
 from polarnet.training.losses import known_frames
 from polarnet.training.optimizers import OPTIMIZERS
@@ -26,6 +25,7 @@ from polarnet.training.recorder import Recorder
 from polarnet.training.replay import Replayed
 from polarnet.training.sequences import Batch, ViewConfig, Visits, batches_of, loaded_if_it_fits, parts_of, shuffled
 from polarnet.training.task import Split, State, Task
+from polarnet.training.windows import WindowDataset
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
 COPIES_OF_WEIGHTS = 12  # on disk: best, last, and twice (old and new) the running checkpoint with best and two moments
