@@ -196,7 +196,8 @@ def emulate_lights(
 
 def events_of(columns: Columns, height: int, width: int) -> Events:
     """`Events` that share the memory of the columns."""
-    return Events(*map(torch.from_numpy, columns[:4]), height, width)
+    t, x, y, p = map(torch.from_numpy, columns[:4])
+    return Events(t, x, y, p, height, width)
 
 
 def _check_frames(

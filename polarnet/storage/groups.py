@@ -12,7 +12,7 @@ from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
 from zarr.storage import FsspecStore, LocalStore, WrapperStore
 
 COMPRESSION_LEVEL = 1  # for zstd; higher levels cost 10-100 times the time for 6 % fewer bytes
-SHARD_BYTES = 2**27  # rows of all columns that wait for a full shard, before compression
+SHARD_BYTES = 2**26  # rows of all columns that wait for a full shard, before compression
 SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN)
 NO_THREAD = "can't start new thread"
 REPAIR = "write this store again, or copy it again from where it is whole"
@@ -69,6 +69,7 @@ class GrowingColumns:
         """`chunk` is the number of rows that are compressed together; `conventions` explain the columns to readers."""
         self.path = path
         self._chunk, self._sharded, self._conventions = chunk, sharded, conventions
+        self._group: zarr.Group | None = None
         self._arrays: dict[str, zarr.Array] = {}
         self._waiting: dict[str, list[np.ndarray]] = {}
 
@@ -86,7 +87,7 @@ class GrowingColumns:
 
     def flush(self) -> None:
         """Write the rows that are still in memory."""
-        if self._waiting_rows() or (self._waiting and not self._arrays):
+        if self._waiting_rows() or (self._waiting and self._group is None):
             self._write(self._waiting_rows())
 
     def _waiting_rows(self) -> int:
@@ -97,15 +98,17 @@ class GrowingColumns:
         return self._chunk * (max(1, SHARD_BYTES // (row_bytes * self._chunk)) if self._sharded else 1)
 
     def _write(self, rows: int) -> None:
-        """Write the first `rows` waiting rows; the first call also makes the arrays."""
-        columns = {name: np.concatenate(all_) if len(all_) > 1 else all_[0] for name, all_ in self._waiting.items()}
-        if not self._arrays:
-            conventions = {name: self._conventions[name] for name in columns if name in self._conventions}
-            group = zarr.create_group(self.path, overwrite=True, attributes={"conventions": conventions})
-            self._arrays = {name: self._array(group, name, values, rows) for name, values in columns.items()}
-        for name, values in columns.items():
+        """Write the first `rows` waiting rows; the first call also makes the group and its arrays."""
+        if self._group is None:
+            conventions = {name: self._conventions[name] for name in self._waiting if name in self._conventions}
+            self._group = zarr.create_group(self.path, overwrite=True, attributes={"conventions": conventions})
+        for name, pieces in self._waiting.items():
+            values = np.concatenate(pieces) if len(pieces) > 1 else pieces[0]
+            if name not in self._arrays:
+                self._arrays[name] = self._array(self._group, name, values, rows)
             self._arrays[name].append(values[:rows])
-            self._waiting[name] = [values[rows:]]
+            rest = values[rows:]
+            self._waiting[name] = [rest if len(rest) > rows else rest.copy()]  # a view would hold all of `values`
 
     def _array(self, group: zarr.Group, name: str, values: np.ndarray, rows: int) -> zarr.Array:
         shape = values.shape[1:]

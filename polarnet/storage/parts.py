@@ -62,8 +62,6 @@ class Store:
 
     FORMAT: ClassVar[str]
     VERSION: ClassVar[int]
-    chunk: int
-    """Rows that are compressed together, the smallest unit of reading."""
     sequences: list[str]
     sequences_per_part: int
     attributes: dict[str, Any]
@@ -88,6 +86,11 @@ class Store:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.path, self.header)
+
+    @property
+    def chunk(self) -> int:
+        """Rows that are compressed together, the smallest unit of reading."""
+        raise NotImplementedError
 
     @functools.cached_property
     def columns(self) -> Mapping[str, str]:

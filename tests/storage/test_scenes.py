@@ -80,15 +80,6 @@ def test_a_part_begun_again_holds_its_pictures(finished, tmp_path):
     assert files_of(tmp_path / "scenes.zarr") == files_of(finished)
 
 
-def test_the_store_says_what_it_holds(finished):
-    store = SceneStore.open(finished)
-    assert store.sequences == ["coffee-0", "coffee-1", "leaves-0"]
-    assert (store.sensor_height, store.sensor_width) == (8, 12)
-    assert store.trajectory_names == NAMES
-    assert store.of_split("train") == ["coffee-0", "coffee-1"]
-    assert store.attributes == {"seed": 1}
-
-
 def test_a_picture_and_its_variants_are_never_in_two_splits(tmp_path):
     splits = {"coffee-0": "train", "coffee-1": "test", "leaves-0": "test"}
     with pytest.raises(ValueError, match="picture coffee would be in the splits train and test"):
@@ -97,10 +88,12 @@ def test_a_picture_and_its_variants_are_never_in_two_splits(tmp_path):
         create(tmp_path / "scenes.zarr", variant_of={"leaves-0": "coffee"})
 
 
-def test_the_store_says_which_sequences_show_a_variant_of_which_picture(finished, tmp_path):
+def test_the_store_says_what_it_holds_and_which_sequences_show_a_variant(finished, tmp_path):
+    store = SceneStore.open(finished)
+    assert (store.sensor_height, store.sensor_width, store.trajectory_names) == (8, 12, NAMES)
+    assert (store.of_split("train"), store.attributes) == (["coffee-0", "coffee-1"], {"seed": 1})
     variants = {"coffee-1": "coffee"}
-    store = create(tmp_path / "scenes.zarr", variant_of=variants)
-    assert (store.variant_of, SceneStore.open(finished).variant_of) == (variants, {})
+    assert (create(tmp_path / "s.zarr", variant_of=variants).variant_of, store.variant_of) == (variants, {})
 
 
 def test_what_cannot_be_a_scene_is_refused(tmp_path):
