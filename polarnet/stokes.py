@@ -17,6 +17,7 @@ from torch import Tensor
 from polarnet.runtime.arrays import Array, as_tensor, check_floating, check_same_shape, check_shape
 
 POLARIZER_ANGLES_DEG = (0, 45, 90, 135)
+NUM_CHANNELS = len(POLARIZER_ANGLES_DEG)
 
 Mosaic = tuple[tuple[int, int], tuple[int, int]]
 """Polarizer angles of a 2x2 mosaic: the even row, then the odd row."""

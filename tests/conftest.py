@@ -162,7 +162,7 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     from polarnet.simulation.motion import Trajectory, frame_times_us, random_trajectory
     from polarnet.simulation.scene import scene_from_polarization
     from polarnet.simulation.truth import frames_of
-    from polarnet.storage.frames import FrameStore
+    from polarnet.storage.frames import Contents, FrameStore
     from polarnet.storage.scenes import Scene, SceneStore, as_stored
 
     folder = tmp_path_factory.mktemp("simulated")
@@ -177,15 +177,13 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     window, t_us = (motion.sensor_height, motion.sensor_width), frame_times_us(motion)
     scenes = SceneStore.create(
         folder / "scenes.zarr",
+        Contents(splits, {"layout": "four_sensors"}, sequences_per_part=2),
         {name: name[0] for name in splits},
-        splits,
         largest_picture=(60, 80),
         sensor=window,
         trajectory_names=Trajectory.vector_names(),
-        attributes={"layout": "four_sensors"},
-        sequences_per_part=2,
     )
-    frames = FrameStore.create(folder / "frames.zarr", list(splits), splits, len(t_us), *window, {})
+    frames = FrameStore.create(folder / "frames.zarr", Contents(splits), len(t_us), *window)
     for number, name in enumerate(scenes.sequences):
         generator = np.random.default_rng(number)
         coarse = torch.from_numpy(generator.random((1, 3, 12, 16), dtype=np.float32))

@@ -21,7 +21,7 @@ from polarnet.recordings.source import RecordingError
 from polarnet.recordings.truth import Truth, read_truth, truth_formats
 from polarnet.stokes import Mosaic
 from polarnet.storage.events import EventStore
-from polarnet.storage.frames import FrameStore
+from polarnet.storage.frames import Contents, FrameStore
 
 MAX_WINDOW_RATIO = 1.25  # between the frames' interval and the networks' window, beyond which a warning says so
 MIN_AGREEMENT = 0.1  # correlation of events and frames (`Lag.agreement`); below it their lag is not known
@@ -149,7 +149,7 @@ def _write(folder: Path, recordings: Sequence[Recorded]) -> None:
     events = EventStore.create(folder / "events.zarr", names, height, width, {})
     most = max(len(one.truth.t_us) for one in recordings)
     frames = FrameStore.create(
-        folder / "frames.zarr", names, dict.fromkeys(names, "test"), most, height, width, {}, masked=True
+        folder / "frames.zarr", Contents(dict.fromkeys(names, "test"), masked=True), most, height, width
     )
     for name, channels, truth, _ in recordings:
         events.write(name, channels, int(truth.t_us[-1]))

@@ -30,7 +30,7 @@ from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
 from polarnet.recordings.source import RecordingError
 from polarnet.storage.events import EventStore
-from polarnet.storage.frames import FrameStore
+from polarnet.storage.frames import Contents, FrameStore
 
 WHITE = 255.0  # maximum of reduced pictures
 
@@ -66,8 +66,8 @@ def calibrate_targets(
     start_over(out, enabled=True)
     frames_max = len(frame_times_us(max(source.duration_us(name) for name in names), config))
     events = EventStore.create(out / "events.zarr", names, height, width, about)
-    splits = dict.fromkeys(names, "test")
-    frames = FrameStore.create(out / "frames.zarr", names, splits, frames_max, height, width, about)
+    contents = Contents(dict.fromkeys(names, "test"), about)
+    frames = FrameStore.create(out / "frames.zarr", contents, frames_max, height, width)
     targets = []
     for name in names:
         target = open_target(imported, name)

@@ -26,7 +26,6 @@ from polarnet.pictures.images import (
     write_png,
 )
 from polarnet.pictures.manifest import (
-    SPLITS,
     Manifest,
     ManifestEntry,
     Skipped,
@@ -44,6 +43,7 @@ from polarnet.pictures.polarimetry import (
 from polarnet.runtime.files import claimed, sha256
 from polarnet.runtime.machine import generator_for
 from polarnet.runtime.sections import one_of, section
+from polarnet.runtime.splits import SPLITS
 
 logger = logging.getLogger(__name__)
 

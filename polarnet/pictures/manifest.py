@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from polarnet.runtime.files import check_seal, seal
+from polarnet.runtime.splits import SPLITS
 
 MANIFEST = "manifest.json"
-SPLITS = ("train", "val", "test")
 REASONS_SHOWN = 5
 
 

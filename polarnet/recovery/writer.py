@@ -23,20 +23,23 @@ from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Recoverer, State
 from polarnet.reports.maps import (
     EventScale,
+    angle_bytes,
     angle_image,
     dolp_image,
     encode_png,
     event_image,
+    fraction_bytes,
     intensity_image,
     polarization_hsv,
+    signed_bytes,
 )
 from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map, write_player
 from polarnet.reports.preview import Panel, Sheet, foot_of
 from polarnet.reports.videos import VideoWriter, with_even_sides
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
-from polarnet.storage.appended import AppendedFrames
-from polarnet.storage.film import angle_bytes, fraction_bytes, signed_bytes
+from polarnet.storage.frames import FRAMES_PER_CHUNK
+from polarnet.storage.groups import GrowingColumns
 from polarnet.storage.true_frames import TrueFrames
 
 VIDEO = "recovered.mp4"
@@ -61,7 +64,7 @@ class Picture(NamedTuple):
     t_us: int
     pixels: UInt8[np.ndarray, "h w 3"]
     maps: Mapping[Kind, UInt8[Tensor, "h w"]]
-    """The maps as bytes (`polarnet.storage.film`), for the page."""
+    """The maps as bytes (`polarnet.reports.maps`), for the page."""
 
 
 @dataclass
@@ -102,7 +105,7 @@ class RecoveryWriter:
         self._sample = _Sample([])
         self._scale = EventScale()
         self._sheet: Sheet | None = None
-        self._arrays = AppendedFrames(folder / "recovered.zarr", ZARR_CONVENTIONS)
+        self._arrays = GrowingColumns(folder / "recovered.zarr", FRAMES_PER_CHUNK, False, ZARR_CONVENTIONS)
         self._video = VideoWriter(folder / VIDEO, video_rate_hz)
         # A second thread that computes on several cores would put those of the network to sleep between operations.
         self._thread = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,))

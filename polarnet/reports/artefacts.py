@@ -17,10 +17,11 @@ from torch import Tensor
 
 from polarnet.events.stream import Events
 from polarnet.events.windows import BIN_EDGES, events_per_pixel
-from polarnet.pictures.manifest import SPLITS, Manifest, read_manifest
+from polarnet.pictures.manifest import Manifest, read_manifest
 from polarnet.reports.legend import legend_of
 from polarnet.reports.maps import polarization_hsv
 from polarnet.reports.tables import Table, score_table
+from polarnet.runtime.splits import SPLITS
 from polarnet.simulation.motion import Pose, Trajectory, sensor_to_scene
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from polarnet.methods import METHODS, is_rotating
-from polarnet.pictures.manifest import SPLITS
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, Results, read_artefacts, read_results
 from polarnet.reports.charts import (
     Spec,
@@ -42,6 +41,7 @@ from polarnet.reports.paper import write_paper_files
 from polarnet.reports.player import Film, panel_film, player_data
 from polarnet.reports.provenance import Run
 from polarnet.reports.tables import COLUMNS, COSTS, ERROR_PARTS, SET_TITLES, Scores, Table, paper_table, score_table
+from polarnet.runtime.splits import SPLITS
 
 HEADINGS = {
     "mse": "MSE",

@@ -17,8 +17,7 @@ from jaxtyping import UInt8
 from polarnet.reports.artefacts import Panel
 from polarnet.reports.html import embedded_json, script, template
 from polarnet.reports.legend import Legend, with_structure
-from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, data_uri, event_full_scale, paper_map, table_of
-from polarnet.storage.film import NO_EVENTS
+from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, NO_EVENTS, data_uri, event_full_scale, paper_map, table_of
 
 Kind = Literal["events", "s0", "dolp", "aolp"]
 
@@ -45,7 +44,7 @@ class Map(NamedTuple):
     """Label of its origin: a method, the truth, or a recording."""
     kind: Kind
     frames: UInt8[np.ndarray, "n h w"]
-    """Bytes in the steps of `polarnet.storage.film`."""
+    """Bytes in the steps of `polarnet.reports.maps`."""
 
 
 class Film(NamedTuple):

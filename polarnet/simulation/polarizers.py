@@ -16,14 +16,13 @@ from polarnet.events.mosaic import places_of
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.ranges import RandomisedConfig
-from polarnet.stokes import POLARIZER_ANGLES_DEG, analyzer, parse_mosaic
+from polarnet.stokes import NUM_CHANNELS, POLARIZER_ANGLES_DEG, analyzer, parse_mosaic
 
-CHANNELS = len(POLARIZER_ANGLES_DEG)
 Value = TypeVar("Value")
 MAX_CROSSTALK = 0.8  # share of a pixel's light from its four neighbours; at 0.8 all five count alike
 
 
-FourValues = Annotated[list[Value], Field(min_length=CHANNELS, max_length=CHANNELS)]
+FourValues = Annotated[list[Value], Field(min_length=NUM_CHANNELS, max_length=NUM_CHANNELS)]
 
 
 @section
@@ -67,9 +66,9 @@ class PolarizersConfig(RandomisedConfig):
 IDEAL = PolarizersConfig(
     layout="four_sensors",
     mosaic="90 45 / 135 0",
-    extinction_ratio=[None] * CHANNELS,
-    angle_error_deg=[0.0] * CHANNELS,
-    transmission=[1.0] * CHANNELS,
+    extinction_ratio=[None] * NUM_CHANNELS,
+    angle_error_deg=[0.0] * NUM_CHANNELS,
+    transmission=[1.0] * NUM_CHANNELS,
     extinction_spread=0.0,
     angle_spread_deg=0.0,
     transmission_spread=0.0,
@@ -114,7 +113,7 @@ def analyzer_maps(
     `key` (64 bits) seeds the differences between pixels.
     """
     if polarizers.layout == "four_sensors":
-        channels = np.broadcast_to(np.arange(CHANNELS)[:, None, None], (CHANNELS, height, width))
+        channels = np.broadcast_to(np.arange(NUM_CHANNELS)[:, None, None], (NUM_CHANNELS, height, width))
     else:
         channel_size(polarizers.layout, height, width)
         cell = np.searchsorted(POLARIZER_ANGLES_DEG, parse_mosaic(polarizers.mosaic))

@@ -33,7 +33,8 @@ from polarnet.simulation.polarizers import grid
 from polarnet.simulation.readout import read_out
 from polarnet.simulation.rendering import check_inside
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
-from polarnet.storage.events import CHANNELS, EventStore
+from polarnet.stokes import NUM_CHANNELS
+from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
 
 CHUNK = 64  # frames rendered at once
@@ -170,5 +171,5 @@ def _emulate_part(
         t_us = rotating_times_us(rotating, drawn.sensor, 0, record.duration_us)
         emulation = emulate_rotating(scene, trajectory, t_us, height, width, rotating, drawn.sensor, key, pitch=pitch)
         output, _ = read_out(emulation.events, drawn.readout, key, record.duration_us)
-        channels = [output, *[Events.empty(height, width)] * (CHANNELS - 1)]
+        channels = [output, *[Events.empty(height, width)] * (NUM_CHANNELS - 1)]
         events.write(sequence, channels, record.duration_us, camera.draws(seed, sequence))

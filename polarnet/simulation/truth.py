@@ -28,7 +28,7 @@ from polarnet.simulation.scene import (
     scene_from_polarization,
 )
 from polarnet.simulation.variation import VariationConfig, varied
-from polarnet.storage.frames import FrameStore
+from polarnet.storage.frames import Contents, FrameStore
 from polarnet.storage.scenes import Scene, SceneStore, as_stored
 
 logger = logging.getLogger(__name__)
@@ -164,24 +164,19 @@ def _create(
     splits = {motion.sequence: motion.split for motion in motions}
     variant_of = {motion.sequence: motion.picture for motion in motions if motion.scene != motion.picture}
     masked = any(entry.masked_fraction for entry in entries)  # null for photographs
+    contents = Contents(splits, attributes, variant_of, masked, sequences_per_part)
     sensor = config.sensor_height, config.sensor_width
     scene_store = SceneStore.create(
         scenes,
+        contents,
         scene_of,
-        splits,
         largest_picture=(max(entry.height for entry in entries), max(entry.width for entry in entries)),
         sensor=sensor,
         trajectory_names=Trajectory.vector_names(),
-        attributes=attributes,
-        variant_of=variant_of,
-        masked=masked,
-        sequences_per_part=sequences_per_part,
     )
-    n_frames, attributes = len(frame_times_us(config)), {**attributes, "scenes": scene_of}
+    contents = replace(contents, attributes={**attributes, "scenes": scene_of})
     size = channel_size(attributes["layout"], *sensor)
-    frame_store = FrameStore.create(
-        frames, list(scene_of), splits, n_frames, *size, attributes, masked, sequences_per_part, variant_of
-    )
+    frame_store = FrameStore.create(frames, contents, len(frame_times_us(config)), *size)
     return scene_store, frame_store
 
 

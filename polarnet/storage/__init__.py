@@ -6,6 +6,7 @@ from polarnet.terminal.lazy import attach
 
 if TYPE_CHECKING:
     from polarnet.storage.events import EventStore as EventStore
+    from polarnet.storage.frames import Contents as Contents
     from polarnet.storage.frames import FrameStore as FrameStore
     from polarnet.storage.scenes import SceneStore as SceneStore
     from polarnet.storage.true_frames import open_truth as open_truth

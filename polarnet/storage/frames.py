@@ -4,7 +4,8 @@ import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -21,22 +22,22 @@ from polarnet.runtime.arrays import (
     mask_of,
     whole_numbers,
 )
-from polarnet.storage.groups import Column, Columns
+from polarnet.runtime.splits import SPLITS
 from polarnet.storage.parts import Store
 
-SPLITS = ("train", "val", "test")
 FRACTION_STEPS = 2**16 - 1
 ANGLE_STEPS = 2**16
 FRAMES_PER_CHUNK = 32
 
 CONVENTIONS = {
-    "t_us": "microseconds from the start of the sequence",
+    "t_us": "microseconds from the start of the sequence, in its record",
     "intensity": "behind polarizers at 0, 45, 90 and 135 degrees (third axis), with I0 + I90 = S0: value / 65535",
     "dolp": "degree of linear polarization: value / 65535",
     "aolp": "angle of linear polarization in radians, [0, pi): value * pi / 65536",
+    "valid": "whether the truth of a pixel is known, 8 pixels of a row a byte, the leftmost in the highest bit",
 }
 
-MASK_CONVENTION = "whether the truth of a pixel is known, 8 pixels of a row a byte, the leftmost in the highest bit"
+T = TypeVar("T", bound="SplitStore")
 
 
 class Frames(NamedTuple):
@@ -80,15 +81,55 @@ def unpack_mask(packed: UInt8[np.ndarray, "*b h bytes"], width: int) -> Bool[Ten
     return torch.from_numpy(np.unpackbits(packed, axis=-1, count=width).astype(bool))
 
 
-class SplitStore(Store):
-    """A store whose sequences are each in the split train, val or test."""
+@dataclass(frozen=True)
+class Contents:
+    """The sequences of a store of scenes or frames, and the values that it is made from."""
 
+    splits: Mapping[str, str]
+    """Split (train, val or test) of each sequence, in the store's order."""
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    """Plain JSON: everything that the sequences depend on."""
+    variant_of: Mapping[str, str] = field(default_factory=dict)
+    """Name of the original picture, for each sequence whose scene is a variant."""
+    masked: bool = False
+    """Whether the store marks pixels whose light is unknown."""
+    sequences_per_part: int = 1
+
+    def __post_init__(self):
+        for name, split in self.splits.items():
+            if split not in SPLITS:
+                raise ValueError(f"expected {name} in one of the splits {', '.join(SPLITS)}, got {split!r}")
+
+
+class SplitStore(Store):
+    """A store whose sequences are each in the split train, val or test; a masked one has a column `valid` as well."""
+
+    COLUMNS: ClassVar[Mapping[str, str]]
     splits: dict[str, str]
     """Split of each sequence."""
     variant_of: dict[str, str]
     """Name of the original picture, for each sequence whose scene is a variant."""
     masked: bool
     """Whether the store marks pixels whose light is unknown."""
+
+    @functools.cached_property
+    def columns(self) -> Mapping[str, str]:
+        """Type of each array of a part, by name."""
+        return {name: dtype for name, dtype in self.COLUMNS.items() if self.masked or name != "valid"}
+
+    @classmethod
+    def create_split(cls: type[T], path: str | os.PathLike[str], contents: Contents, **metadata: Any) -> T:
+        """`create_parts` for these contents."""
+        return cls.create_parts(
+            path,
+            list(contents.splits),
+            contents.attributes,
+            contents.sequences_per_part,
+            splits=dict(contents.splits),
+            variant_of=dict(contents.variant_of),
+            masked=contents.masked,
+            **metadata,
+        )
 
     def of_split(self, split: str) -> list[str]:
         """The sequences of `train`, `val` or `test`, in the store's order; ValueError for another split."""
@@ -100,13 +141,21 @@ class SplitStore(Store):
         """The original picture of a sequence or variant; the sequence itself if the store names no pictures."""
         return self.variant_of.get(sequence) or self.attributes.get("scenes", {}).get(sequence, sequence)
 
+    def checked_mask(self, valid: Bool[Array, "*shape"] | None, shape: Sequence[int]) -> Bool[Tensor, "*shape"]:
+        """The mask of a masked store, all pixels valid if it is None; ValueError for another shape or store."""
+        if valid is None:
+            return torch.ones(tuple(shape), dtype=torch.bool)
+        if not self.masked:
+            raise ValueError(f"{self.path}: got a mask for a store without one; create it with masked=True")
+        return mask_of("valid", valid, shape).cpu()
+
 
 class FrameStore(SplitStore):
     """Frames of sequences, each in the split train, val or test; see `create` and `open`.
 
     >>> import torch
-    >>> from polarnet.storage import FrameStore
-    >>> store = FrameStore.create("frames.zarr", ["lake"], {"lake": "test"}, 1, height=12, width=18, attributes={})
+    >>> from polarnet.storage import Contents, FrameStore
+    >>> store = FrameStore.create("frames.zarr", Contents({"lake": "test"}), n_frames=1, height=12, width=18)
     >>> store.write("lake", torch.tensor([0]), torch.full((1, 4, 12, 18), 0.5), *torch.zeros(2, 1, 12, 18))
     >>> store.finish()
     >>> FrameStore.open("frames.zarr").of_split("test")
@@ -114,58 +163,24 @@ class FrameStore(SplitStore):
     """
 
     FORMAT = "polarnet.frames"
-    VERSION = 5
+    VERSION = 6
+    COLUMNS: ClassVar[Mapping[str, str]] = {"intensity": "uint16", "dolp": "uint16", "aolp": "uint16", "valid": "uint8"}
     n_frames: int
     """Maximum number of frames of a sequence."""
     height: int
     width: int
 
-    @functools.cached_property
-    def columns(self) -> Columns:
-        """Times and images of the frames; in a masked store, masks as well."""
-        image, chunk = (self.height, self.width), min(self.n_frames, FRAMES_PER_CHUNK)
-        columns = {
-            "intensity": Column("frames", "uint16", chunk, (4, *image)),
-            "dolp": Column("frames", "uint16", chunk, image),
-            "aolp": Column("frames", "uint16", chunk, image),
-            "t_us": Column("frames", "int64", chunk),
-        }
-        mask = {"valid": Column("frames", "uint8", chunk, (self.height, -(-self.width // 8)))}
-        return columns | mask if self.masked else columns
+    @property
+    def chunk(self) -> int:
+        """Frames that are compressed together."""
+        return min(self.n_frames, FRAMES_PER_CHUNK)
 
     @classmethod
     def create(
-        cls,
-        path: str | os.PathLike[str],
-        sequences: Sequence[str],
-        splits: Mapping[str, str],
-        n_frames: int,
-        height: int,
-        width: int,
-        attributes: Mapping[str, Any],
-        masked: bool = False,
-        sequences_per_part: int = 1,
-        variant_of: Mapping[str, str] | None = None,
+        cls, path: str | os.PathLike[str], contents: Contents, n_frames: int, height: int, width: int
     ) -> "FrameStore":
-        """Create a store for up to `n_frames` per sequence; it lies at PATH.tmp until it is finished.
-
-        `splits` maps each sequence to train, val or test, and `variant_of` each sequence over a variant to the name of
-        the variant's picture. A `masked` store records for every pixel whether its truth is
-        known; other stores have no mask. Resumes as `EventStore.create` does.
-        """
-        return cls.create_parts(
-            path,
-            sequences,
-            attributes,
-            sequences_per_part,
-            splits=splits_of(sequences, splits),
-            variant_of=dict(variant_of or {}),
-            n_frames=n_frames,
-            height=height,
-            width=width,
-            masked=masked,
-            conventions={**CONVENTIONS, "valid": MASK_CONVENTION} if masked else CONVENTIONS,
-        )
+        """Create a store for up to `n_frames` per sequence, or resume it; see `Store.create_parts`."""
+        return cls.create_split(path, contents, n_frames=n_frames, height=height, width=width, conventions=CONVENTIONS)
 
     def write(
         self,
@@ -185,20 +200,19 @@ class FrameStore(SplitStore):
         t_us = self._checked_times(t_us)
         for name, frames, channels in (("intensity", intensity, "4 "), ("dolp", dolp, ""), ("aolp", aolp, "")):
             check_shape(name, as_tensor(name, frames), f"{len(t_us)} {channels}{self.height} {self.width}")
-        known = self._checked_mask(valid, dolp.shape)
+        known = self.checked_mask(valid, dolp.shape)
         columns = {
-            "t_us": t_us.numpy(),
             "intensity": quantise_fraction(intensity, "intensity"),
             "dolp": quantise_fraction(dolp, "dolp"),
             "aolp": quantise_angle(aolp, "aolp"),
-            **({"valid": np.packbits(known.numpy(), axis=-1)} if self.masked else {}),
+            "valid": np.packbits(known.numpy(), axis=-1),
         }
         if not self.is_written(sequence):
-            self.append(sequence, columns, {})
+            self.append(sequence, columns, {"t_us": t_us.tolist()})
 
     def t_us(self, sequence: str) -> Int64[Tensor, " n"]:
         """Times of a sequence's frames, in microseconds from its start."""
-        return torch.from_numpy(self.read_column("t_us", sequence))
+        return torch.tensor(self.record(sequence)["t_us"], dtype=torch.int64)
 
     def intensity(self, sequence: str) -> Float[Tensor, "n 4 h w"]:
         """Intensities behind the polarizers at 0, 45, 90 and 135 degrees."""
@@ -216,12 +230,12 @@ class FrameStore(SplitStore):
         """Where the truth is known; None: everywhere."""
         return unpack_mask(self.read_column("valid", sequence), self.width) if self.masked else None
 
-    def frames(self, sequence: str) -> Frames:
-        """All frames of a sequence."""
-        names = ["t_us", "intensity", "dolp", "aolp", *(["valid"] if self.masked else [])]
-        t_us, intensity, dolp, aolp, *packed = self.read_columns(sequence, [(name, 0, None) for name in names])
+    def frames(self, sequence: str, start: int = 0, stop: int | None = None) -> Frames:
+        """Frames of a sequence from number `start` up to `stop` (None: the end)."""
+        values = self.read_columns(sequence, [(name, start, stop) for name in self.columns])
+        intensity, dolp, aolp, *packed = values
         return Frames(
-            torch.from_numpy(t_us),
+            self.t_us(sequence)[start:stop],
             dequantise_fraction(intensity),
             dequantise_fraction(dolp),
             dequantise_angle(aolp),
@@ -235,18 +249,3 @@ class FrameStore(SplitStore):
                 f"expected 1 to {self.n_frames} frame times, increasing from 0 or later, got {times.tolist()[:40]}"
             )
         return times
-
-    def _checked_mask(self, valid: Bool[Array, "n h w"] | None, shape: Sequence[int]) -> Bool[Tensor, "n h w"]:
-        if valid is None:
-            return torch.ones(tuple(shape), dtype=torch.bool)
-        if not self.masked:
-            raise ValueError(f"{self.path}: got a mask for a store without one; create it with masked=True")
-        return mask_of("valid", valid, shape).cpu()
-
-
-def splits_of(names: Sequence[str], splits: Mapping[str, str]) -> dict[str, str]:
-    """Split of each name; ValueError for the first name without one, or with one that is not train, val or test."""
-    for name in names:
-        if splits.get(name) not in SPLITS:
-            raise ValueError(f"expected {name} in one of the splits {', '.join(SPLITS)}, got {splits.get(name)!r}")
-    return {name: splits[name] for name in names}

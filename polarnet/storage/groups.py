@@ -1,35 +1,21 @@
-"""Zarr groups of stores: columns as compressed arrays, and reading that raises where Zarr would fill gaps."""
+"""Zarr groups of columns: written block by block in bounded memory, and read so that missing data is an error."""
 
 import errno
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
-from zarr.storage import FsspecStore, LocalStore, WrapperStore, ZipStore
+from zarr.storage import FsspecStore, LocalStore, WrapperStore
 
 COMPRESSION_LEVEL = 1  # for zstd; higher levels cost 10-100 times the time for 6 % fewer bytes
+SHARD_BYTES = 2**26  # rows of all columns that wait for a full shard, before compression
 SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN)
+NO_THREAD = "can't start new thread"
 REPAIR = "write this store again, or copy it again from where it is whole"
-
-
-@dataclass(frozen=True)
-class Column:
-    """Layout of an array that every part has. A sequence has as many rows in each column of one `axis`."""
-
-    axis: str
-    dtype: str
-    chunk: int
-    """Rows that are compressed together, the smallest unit of reading."""
-    shape: tuple[int, ...] = ()
-    """Shape of a row."""
-
-
-Columns = Mapping[str, Column]
 
 
 class _WholeStore(WrapperStore[Any]):
@@ -37,7 +23,7 @@ class _WholeStore(WrapperStore[Any]):
 
     async def get(self, key: str, *arguments: Any, **options: Any) -> Any:
         content = await super().get(key, *arguments, **options)
-        if "/c/" in key and not content:
+        if "c/" in key and not content:
             raise FileNotFoundError(f"there is no {key}, or nothing in it")
         return content
 
@@ -48,16 +34,10 @@ def is_url(path: str | os.PathLike[str]) -> bool:
 
 
 def open_group(path: str | os.PathLike[str]) -> zarr.Group:
-    """Open the Zarr group in a local folder, a zip or at an fsspec URL; FileNotFoundError if there is none."""
+    """Open the Zarr group in a local folder or at an fsspec URL; FileNotFoundError if there is none."""
     name = os.fspath(path)
-    store: FsspecStore | ZipStore | LocalStore
     try:
-        if is_url(name):
-            store = FsspecStore.from_url(name, read_only=True)
-        elif Path(name).is_file():
-            store = ZipStore(name, mode="r", read_only=True)
-        else:
-            store = LocalStore(name, read_only=True)
+        store = FsspecStore.from_url(name, read_only=True) if is_url(name) else LocalStore(name, read_only=True)
         return zarr.open_group(_WholeStore(store), mode="r", zarr_format=3)
     except FileNotFoundError:
         unfinished = f" ({name}.tmp is unfinished)" if Path(f"{name}.tmp").exists() else ""
@@ -67,37 +47,81 @@ def open_group(path: str | os.PathLike[str]) -> zarr.Group:
     except ImportError:  # a package for reading URLs is missing
         raise
     except Exception as error:  # Zarr raises many kinds of exceptions for a damaged zarr.json
-        raise_shortage(error, name)
-        raise ValueError(f"{name} is unreadable: {error}; {REPAIR}") from error
+        raise_unreadable(error, name)
 
 
-class Shortage(RuntimeError):
-    """The system gave no more memory, threads or file descriptors."""
-
-
-def raise_shortage(error: Exception, path: str) -> None:
-    """Raise `Shortage` if `error` comes from a lack of memory, threads or file descriptors; otherwise do nothing."""
-    if isinstance(error, Shortage):
+def raise_unreadable(error: Exception, data: str) -> NoReturn:
+    """ValueError about damaged `data`; `error` itself if the system has no more memory, threads or open files."""
+    if isinstance(error, MemoryError) or getattr(error, "errno", None) in SHORTAGES or NO_THREAD in str(error):
         raise error
-    short = isinstance(error, MemoryError) or getattr(error, "errno", None) in SHORTAGES
-    if short or "can't start new thread" in str(error):
-        raise Shortage(
-            f"{path} was not read, because the system gave no more memory, threads or file descriptors "
-            f"({error or 'out of memory'}); lower runtime.workers, or raise the limits (ulimit -n, -u, -v)"
-        ) from error
+    raise ValueError(f"{data} is unreadable: {error}; {REPAIR}") from error
 
 
-def create_array(group: zarr.Group, name: str, column: Column) -> zarr.Array:
-    """An empty array of a group for a column, compressed, with a checksum of each chunk."""
-    dtype = np.dtype(column.dtype)
-    shuffle = BloscShuffle.bitshuffle if dtype.itemsize <= 2 else BloscShuffle.shuffle
-    blosc = BloscCodec(typesize=dtype.itemsize, cname="zstd", clevel=COMPRESSION_LEVEL, shuffle=shuffle)
-    return group.create_array(
-        name,
-        shape=(0, *column.shape),
-        chunks=(column.chunk, *column.shape),
-        dtype=dtype,
-        fill_value=0,
-        compressors=[blosc, Crc32cCodec()],
-        config={"write_empty_chunks": True},  # a missing chunk is a damaged one
-    )
+class GrowingColumns:
+    """Arrays of a Zarr group, of one length, that grow by rows; the first rows decide their names, types and shapes.
+
+    Rows wait in memory until they fill a block, which is then written: `SHARD_BYTES` of chunks if `sharded`, so that
+    each column is one file unless it is large; otherwise one chunk, for readers that follow a running program. The
+    group appears with the first block.
+    """
+
+    def __init__(self, path: Path, chunk: int, sharded: bool, conventions: Mapping[str, str]):
+        """`chunk` is the number of rows that are compressed together; `conventions` explain the columns to readers."""
+        self.path = path
+        self._chunk, self._sharded, self._conventions = chunk, sharded, conventions
+        self._group: zarr.Group | None = None
+        self._arrays: dict[str, zarr.Array] = {}
+        self._waiting: dict[str, list[np.ndarray]] = {}
+
+    def append(self, rows: Mapping[str, np.ndarray]) -> None:
+        """Add rows to every column."""
+        for name, values in rows.items():
+            self._waiting.setdefault(name, []).append(values)
+        block = self._block()
+        while self._waiting_rows() >= block:
+            self._write(block)
+
+    def add(self, row: Mapping[str, np.ndarray]) -> None:
+        """Add one row to every column."""
+        self.append({name: values[None] for name, values in row.items()})
+
+    def flush(self) -> None:
+        """Write the rows that are still in memory."""
+        if self._waiting_rows() or (self._waiting and self._group is None):
+            self._write(self._waiting_rows())
+
+    def _waiting_rows(self) -> int:
+        return sum(map(len, next(iter(self._waiting.values()), [])))
+
+    def _block(self) -> int:
+        row_bytes = sum(values.itemsize * int(np.prod(values.shape[1:])) for values, *_ in self._waiting.values())
+        return self._chunk * (max(1, SHARD_BYTES // (row_bytes * self._chunk)) if self._sharded else 1)
+
+    def _write(self, rows: int) -> None:
+        """Write the first `rows` waiting rows; the first call also makes the group and its arrays."""
+        if self._group is None:
+            conventions = {name: self._conventions[name] for name in self._waiting if name in self._conventions}
+            self._group = zarr.create_group(self.path, overwrite=True, attributes={"conventions": conventions})
+        for name, pieces in self._waiting.items():
+            values = np.concatenate(pieces) if len(pieces) > 1 else pieces[0]
+            if name not in self._arrays:
+                self._arrays[name] = self._array(self._group, name, values, rows)
+            self._arrays[name].append(values[:rows])
+            rest = values[rows:]
+            self._waiting[name] = [rest if len(rest) > rows else rest.copy()]  # a view would hold all of `values`
+
+    def _array(self, group: zarr.Group, name: str, values: np.ndarray, rows: int) -> zarr.Array:
+        shape = values.shape[1:]
+        shuffle = BloscShuffle.bitshuffle if values.itemsize <= 2 else BloscShuffle.shuffle
+        zstd = BloscCodec(typesize=values.itemsize, cname="zstd", clevel=COMPRESSION_LEVEL, shuffle=shuffle)
+        lz4 = BloscCodec(typesize=values.itemsize, cname="lz4", shuffle=BloscShuffle.shuffle)  # keeps up with a camera
+        return group.create_array(
+            name,
+            shape=(0, *shape),
+            chunks=(self._chunk, *shape),
+            shards=(-(-max(rows, 1) // self._chunk) * self._chunk, *shape) if self._sharded else None,
+            dtype=values.dtype,
+            fill_value=0,
+            compressors=[zstd if self._sharded else lz4, Crc32cCodec()],
+            config={"write_empty_chunks": True},  # a missing chunk is a damaged one
+        )

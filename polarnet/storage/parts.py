@@ -1,17 +1,20 @@
 """The layout of every store, a folder of parts: how one is created, resumed, finished, read and verified.
 
-    NAME.zarr/zarr.json            header: format, version, names of the sequences, attributes, SHA-256 of each part
-    NAME.zarr/part-00000.zip       a part: a zip of a Zarr group
-        zarr.json                  record of each sequence of the part: its rows in the columns, its own metadata
-        events/t/...               one column: the rows of these sequences, one sequence after the other
+    NAME.zarr/zarr.json                header: format, version, names of the sequences, attributes, digest of each part
+    NAME.zarr/part-00000/zarr.json     record of each sequence of the part: its rows in the columns, its own metadata;
+                                       SHA-256 of each other file of the part
+    NAME.zarr/part-00000/t/zarr.json   one column: the rows of these sequences, one sequence after the other
+    NAME.zarr/part-00000/t/c/0         its shard; a column of many megabytes has several
 
-The store and each of its parts are Zarr v3 groups, each column is an array. Every sequence starts a chunk of its own,
-so that reading one decodes nothing of its neighbours. Chunks are compressed, so the zip stores them as they are.
+The store and each of its parts are Zarr v3 groups, each column is a sharded array. The digest of a part is the SHA-256
+of its zarr.json, which vouches for the part's other files. Every sequence starts a chunk of its own, so that reading
+one decodes nothing of its neighbours; the rows between two sequences are 0.
 
 A store is written as NAME.zarr.tmp. One process writes a part, under a temporary name, and renames it when it is
 complete; different processes write different parts. After a kill a part is whole or missing, and a rerun makes the
-missing parts. `finish` marks the store complete and renames it. At an fsspec URL nothing is renamed, because an object
-of a bucket appears whole or not at all. The same sequences give the same bytes, in any order of the parts.
+missing parts. `finish` writes the digests into the header, which marks the store complete, and renames it. At an fsspec
+URL nothing is renamed: a part is whole once it has its zarr.json, which is copied last. The same sequences give the
+same bytes, in any order of the parts.
 """
 
 import contextlib
@@ -22,7 +25,6 @@ import os
 import shutil
 import tempfile
 import uuid
-import zipfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -33,15 +35,12 @@ import fsspec
 import numpy as np
 import zarr
 from pydantic import PositiveInt
-from zarr.abc.buffer import Buffer
-from zarr.storage import MemoryStore
 
 from polarnet.runtime.files import check_room, claimed, sha256
 from polarnet.runtime.sections import section
-from polarnet.storage.groups import REPAIR, Columns, create_array, is_url, open_group, raise_shortage
+from polarnet.storage.groups import REPAIR, GrowingColumns, is_url, open_group, raise_unreadable
 
-DIGEST_LENGTH = 64  # characters of a SHA-256
-MAX_OPEN_PARTS = 64  # an open part has a file descriptor and about 2 MB of directory
+METADATA = "zarr.json"
 MAX_LISTED = 8  # names of sequences in a message
 
 Header = dict[str, Any]
@@ -53,8 +52,6 @@ class StorageConfig:
     """Section `storage` of params.yaml."""
 
     sequences_per_part: PositiveInt
-    labels: bool
-    """Store the cause of each simulated event."""
 
 
 class Store:
@@ -68,9 +65,9 @@ class Store:
     sequences: list[str]
     sequences_per_part: int
     attributes: dict[str, Any]
-    """Metadata given by the store's creator."""
+    """Values that the store was made from, given by its creator."""
     digests: Mapping[str, str] = {}
-    """SHA-256 of each part of a finished store, so that a part of another store is refused."""
+    """Digest of each part of a finished store, so that a part of another store is refused."""
 
     def __init__(self, path: str, header: Header):
         self.path = path
@@ -83,17 +80,21 @@ class Store:
         }
         """Names of the sequences in each part."""
         self._part_of = {sequence: part for part, names in self.parts.items() for sequence in names}
-        self._opened = functools.lru_cache(MAX_OPEN_PARTS)(self._open)
-        self._records: dict[str, Header] = {}
+        self._groups: dict[tuple[int, str], tuple[zarr.Group, dict[str, Any], dict[str, Header]]] = {}
         self._unfinished: dict[str, _Part] = {}
         self._claim = contextlib.ExitStack()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.path, self.header)
 
+    @property
+    def chunk(self) -> int:
+        """Rows that are compressed together, the smallest unit of reading."""
+        raise NotImplementedError
+
     @functools.cached_property
-    def columns(self) -> Columns:
-        """The arrays of each part."""
+    def columns(self) -> Mapping[str, str]:
+        """Type of each array of a part, by name."""
         raise NotImplementedError
 
     @classmethod
@@ -107,9 +108,9 @@ class Store:
     ) -> S:
         """Create a store to write at PATH.tmp, or resume the unfinished one there if its header is equal.
 
-        One process creates the store and sends it to the others that write. ValueError while a store that another
-        process created at `path` is unfinished. With an fsspec URL as `path`, the store lies there from the start;
-        ValueError if another store does.
+        `attributes` (plain JSON) must hold everything that the sequences depend on. One process creates the store and
+        sends it to the others that write. ValueError while a store that another process created at `path` is
+        unfinished. With an fsspec URL as `path`, the store lies there from the start; ValueError if another store does.
         """
         if not sequences:
             raise ValueError("expected at least one name, got none")
@@ -132,11 +133,11 @@ class Store:
         store = cls(os.fspath(path) if is_url(path) else str(Path(path).with_name(Path(path).name + ".tmp")), header)
         if not is_url(path):
             store._claim.enter_context(claimed(Path(path)))
-        if (known := _unsigned(store.path)) != header:
+        if (known := _created(store.path)) != header:
             if known is not None and is_url(path):
                 raise ValueError(f"{path}: expected nothing there, or this store unfinished, got another; delete it")
             shutil.rmtree(store.path, ignore_errors=True)
-        zarr.open_group(store.path, mode="a", zarr_format=3).attrs.put(_signed({**header, "complete": False}))
+        zarr.open_group(store.path, mode="a", zarr_format=3).attrs.put(header)
         return store
 
     @classmethod
@@ -156,9 +157,9 @@ class Store:
                 f"{path}: expected version {cls.VERSION} of {cls.FORMAT}, got version {header.get('version')!r} of "
                 "another polarnet; run `dvc repro`, which writes it again"
             )
-        if header.get("complete") is not True:
+        if "digests" not in header:
             raise ValueError(f"{path}: the store was never finished; run the stage that writes it again")
-        if not _is_signed(header):
+        if header.get("checksum") != _checksum(header):
             raise ValueError(f"{path}: the attributes in zarr.json are not what was written; {REPAIR}")
         try:
             store = cls(os.fspath(path), header)
@@ -178,15 +179,54 @@ class Store:
         """Parts that are not written yet."""
         return [part for part in self.parts if not self._is_whole(part)]
 
+    def is_written(self, sequence: str) -> bool:
+        """Whether the part of a sequence is complete."""
+        return self._is_whole(self.part_of(sequence))
+
+    def part_of(self, sequence: str) -> str:
+        """Name of the part that holds a sequence; ValueError if the store lacks the sequence."""
+        if sequence not in self._part_of:
+            raise ValueError(f"{self.path}: {unknown_sequence(sequence, self.sequences)}")
+        return self._part_of[sequence]
+
+    def append(
+        self,
+        sequence: str,
+        columns: Mapping[str, np.ndarray],
+        record: Mapping[str, Any],
+        rows_of: str | None = None,
+    ) -> None:
+        """Add the next sequence to its part: rows of every column, and a `record` of plain JSON.
+
+        With `rows_of`, an earlier sequence of the part, both have the rows of that one, and `columns` is ignored. The
+        sequences of a part come in the store's order, from one process; ValueError for another order. The first one
+        starts the part anew, the last one completes it. OSError after a part if the disk has no room for the missing
+        parts, assumed to be as large as this one.
+        """
+        part = self.part_of(sequence)
+        names = self.parts[part]
+        if sequence == names[0]:
+            self._unfinished[part] = _Part(self._url(part), self.chunk)
+        expected = names[len(self._unfinished[part].records)] if part in self._unfinished else names[0]
+        if sequence != expected:
+            raise ValueError(f"{self.path}: {part} takes its sequences in order, expected {expected}, got {sequence}")
+        if rows_of is None:
+            columns = {name: np.asarray(columns[name], dtype) for name, dtype in self.columns.items()}
+        self._unfinished[part].append(sequence, columns, record, rows_of)
+        if sequence == names[-1]:
+            size = self._unfinished.pop(part).finish()
+            if not is_url(self.path):
+                missing = len(self.parts) - len(list(Path(self.path).glob("part-?????")))
+                check_room(Path(self.path), missing * size, f"the {missing} missing parts")
+
     def finish(self) -> None:
         """Mark the store complete and move it from PATH.tmp to PATH; ValueError where sequences are missing."""
         if missing := self.missing():
             raise ValueError(
                 f"{self.path}: {len(missing)} not written yet: {', '.join(missing[:8])}; write them, then finish"
             )
-        digests = {part: self._written_digest(part) for part in self.parts}
-        group = zarr.open_group(self.path, mode="r+")
-        group.attrs.put(_signed({**self.header, "digests": digests, "complete": True}))
+        header = {**self.header, "digests": {part: _digest(self._url(part, METADATA)) for part in self.parts}}
+        zarr.open_group(self.path, mode="r+").attrs.put({**header, "checksum": _checksum(header)})
         if not is_url(self.path):
             self._rename()
 
@@ -204,202 +244,148 @@ class Store:
         shutil.rmtree(replaced, ignore_errors=True)
         self._claim.close()
 
-    def is_written(self, sequence: str) -> bool:
-        """Whether the part of a sequence is complete."""
-        return self._is_whole(self._part(sequence))
-
-    def append(self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
-        """Add the next sequence to its part: rows of some columns, and a `record` of plain JSON.
-
-        The sequences of a part come in the store's order, from one process; ValueError for another order. The first one
-        starts the part anew, the last one completes it. OSError after a part if the disk has no room for the missing
-        parts, assumed to be as large as the mean of the written ones.
-        """
-        part, written = self._part(sequence), len(self.records_so_far(sequence))
-        names = self.parts[part]
-        if sequence != names[written]:
-            raise ValueError(
-                f"{self.path}: {part} takes its sequences in order, expected {names[written]}, got {sequence}"
-            )
-        if not written:
-            self._unfinished[part] = _Part(self._file(part), self.columns)
-        self._unfinished[part].append(sequence, columns, record)
-        if sequence == names[-1]:
-            self._unfinished.pop(part).finish()
-            if not is_url(self.path):
-                self._check_room()
-
-    def _check_room(self) -> None:
-        sizes = [file.stat().st_size for file in Path(self.path).glob("part-*.zip")]
-        missing = len(self.parts) - len(sizes)
-        check_room(Path(self.path), missing * sum(sizes) // len(sizes), f"the {missing} missing parts")
-
-    def records_so_far(self, sequence: str) -> dict[str, Header]:
-        """Records of the sequences before `sequence` in its part, while this process writes it."""
-        part = self._part(sequence)
-        if part not in self._unfinished or sequence == self.parts[part][0]:
-            return {}
-        return self._unfinished[part].records
-
     def record(self, sequence: str) -> Header:
-        """Record of a stored sequence, with [start, stop] of its rows for each axis; ValueError if unreadable."""
-        part = self._part(sequence)
-        if part not in self._records:
-            try:
-                group, _ = self._opened(os.getpid(), part)
-                written: Any = group.attrs["sequences"]
-                records = {name: dict(written[name]) for name in self.parts[part]}
-            except Exception as error:  # Zarr raises many kinds of exceptions
-                raise_shortage(error, self.path)
-                raise ValueError(f"{self.path}: {sequence}, {part}.zip is unreadable: {error}; {REPAIR}") from error
-            self._records[part] = records
-        return self._records[part][sequence]
+        """Record of a stored sequence, with [start, stop] of its `rows`; ValueError if unreadable."""
+        part = self.part_of(sequence)
+        try:
+            _, _, records = self._opened(part)
+            return records[sequence]
+        except Exception as error:  # Zarr raises many kinds of exceptions
+            raise_unreadable(error, f"{self.path}: {sequence}, {part}")
 
     def read_column(self, name: str, sequence: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows of a sequence from `start` up to `stop` (None: the end); ValueError names an unreadable column."""
-        part, record = self._part(sequence), self.record(sequence)
+        part, record = self.part_of(sequence), self.record(sequence)
         try:
-            first, end = record[self.columns[name].axis]
+            first, end = record["rows"]
             rows = slice(first + start, end if stop is None else min(first + stop, end))
-            group, arrays = self._opened(os.getpid(), part)
+            group, arrays, _ = self._opened(part)
             if name not in arrays:
                 arrays[name] = group[name]
             values = np.asarray(arrays[name][rows])
             if len(values) != max(0, rows.stop - rows.start):
                 raise ValueError(f"expected rows {rows.start} to {rows.stop}, got {len(values)} of them")
         except Exception as error:  # each codec raises its own exceptions
-            raise_shortage(error, self.path)
-            raise ValueError(
-                f"{self.path}: {sequence}, column {name} is unreadable: {part}.zip: {error}; {REPAIR}"
-            ) from error
+            raise_unreadable(error, f"{self.path}: {sequence}, column {name} of {part}")
         return values
 
     def read_columns(self, sequence: str, requests: Sequence[tuple[str, int, int | None]]) -> list[np.ndarray]:
         """`read_column` for several (name, start, stop), at the same time."""
-        try:
-            with ThreadPoolExecutor(len(requests)) as pool:
-                return list(pool.map(lambda request: self.read_column(request[0], sequence, *request[1:]), requests))
-        except RuntimeError as error:  # no thread started
-            raise_shortage(error, self.path)
-            raise
-
-    def problems(self, sequence: str) -> list[str]:
-        """Messages about unreadable or missing data of a sequence."""
-        try:
-            self.record(sequence)
-        except ValueError as error:
-            return [str(error)]
-        problems = []
-        for name in self.columns:
-            try:
-                self.read_column(name, sequence)
-            except ValueError as error:
-                problems.append(str(error))
-        return problems
+        with ThreadPoolExecutor(len(requests)) as pool:
+            return list(pool.map(lambda request: self.read_column(request[0], sequence, *request[1:]), requests))
 
     @classmethod
     def verify(cls, path: str | os.PathLike[str]) -> list[str]:
-        """All problems of a store, each with its sequence and column; empty when every byte is as it was written."""
+        """A message for each damaged file of a store, with its sequences; empty if every byte is as it was written."""
         try:
             store = cls.open(path)
         except (FileNotFoundError, ValueError) as error:
             return [str(error)]
-        problems = [problem for sequence in store.sequences for problem in store.problems(sequence)]
-        for part in store.parts:
-            try:
-                with fsspec.open(store._file(part)) as file:
-                    digest, written = _digests(file)
-            except OSError:
-                digest, written = b"", None
-            if digest != written or digest.decode() != store.digests[part]:
-                problems.append(f"{path}: {part}.zip is not as it was written; {REPAIR}")
-        return problems
+        return [
+            f"{path}: {file} is not as it was written; it holds {', '.join(names)}; {REPAIR}"
+            for part, names in store.parts.items()
+            for file in store._changed_files(part)
+        ]
 
-    def _part(self, sequence: str) -> str:
-        if sequence not in self._part_of:
-            raise ValueError(f"{self.path}: {unknown_sequence(sequence, self.sequences)}")
-        return self._part_of[sequence]
+    def _changed_files(self, part: str) -> list[str]:
+        """Files of a part whose SHA-256 is not the one that was written."""
+        try:
+            group, *_ = self._opened(part)
+        except ValueError:
+            return [f"{part}/{METADATA}"]
+        digests: Any = group.attrs["sha256"]
+        return [f"{part}/{file}" for file, digest in digests.items() if _digest(self._url(part, file)) != digest]
 
     def _is_whole(self, part: str) -> bool:
-        files, name = fsspec.url_to_fs(self._file(part))
+        files, name = fsspec.url_to_fs(self._url(part, METADATA))
         return files.exists(name)
 
-    def _file(self, part: str) -> str:
-        """Path or fsspec URL of a part."""
-        return f"{self.path}/{part}.zip"
+    def _url(self, *names: str) -> str:
+        """Path or fsspec URL of a part, or of a file of a part."""
+        return "/".join((self.path, *names))
 
-    def _open(self, process: int, part: str) -> tuple[zarr.Group, dict[str, Any]]:
-        """Group of a part and a dict for its arrays, cached by process: forks must not share their parent's file."""
-        file = self._file(part)
-        if part in self.digests and self._written_digest(part) != self.digests[part]:
-            raise ValueError("it is not the part that was written into this store")
-        return open_group(f"zip::{file}" if is_url(file) else file), {}
-
-    def _written_digest(self, part: str) -> str:
-        """Digest that `_Part.finish` wrote at the end of a part."""
-        with fsspec.open(self._file(part)) as file:
-            file.seek(-DIGEST_LENGTH, os.SEEK_END)
-            return file.read().decode("ascii", "replace")
+    def _opened(self, part: str) -> tuple[zarr.Group, dict[str, Any], dict[str, Header]]:
+        """Group of a part, a dict for its arrays, and its records; each process opens its own."""
+        key = os.getpid(), part
+        if key not in self._groups:
+            if part in self.digests and _digest(self._url(part, METADATA)) != self.digests[part]:
+                raise ValueError("it is not the part that was written into this store")
+            group = open_group(self._url(part))
+            written: Any = group.attrs["sequences"]
+            self._groups[key] = group, {}, {name: dict(written[name]) for name in self.parts[part]}
+        return self._groups[key]
 
 
 class _Part:
     """A part that one process writes, under a temporary name until it is complete."""
 
-    def __init__(self, path: str, columns: Columns):
+    def __init__(self, path: str, chunk: int):
         self.path = path
         self.records: dict[str, Header] = {}
+        self._chunk = chunk
         folder = tempfile.gettempdir() if is_url(path) else os.path.dirname(path)
         self._temporary = Path(folder, f"{os.path.basename(path)}.{uuid.uuid4().hex}.tmp")
-        self._zip = zipfile.ZipFile(self._temporary, "w")
-        self._entries: dict[str, Buffer] = {}
-        self._group = zarr.create_group(MemoryStore(self._entries))
-        self._columns = columns
-        self._arrays = {name: create_array(self._group, name, column) for name, column in columns.items()}
+        self._columns = GrowingColumns(self._temporary, chunk, sharded=True, conventions={})
+        self._stop = 0
 
-    def append(self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
-        """Write the chunks of a sequence, and hold its record until `finish`."""
-        rows = {}
-        for name, values in columns.items():
-            column, array = self._columns[name], self._arrays[name]
-            start = array.shape[0]
-            rows[column.axis] = [start, start + len(values)]
-            padding = np.zeros((-len(values) % column.chunk, *column.shape), column.dtype)
-            if len(values):
-                array.append(np.concatenate([values, padding]))
-        self.records[sequence] = {**record, **rows}
-        self._pack([entry for entry in self._entries if not entry.endswith("zarr.json")])
+    def append(
+        self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any], rows_of: str | None
+    ) -> None:
+        """Add the rows of a sequence, and hold its record until `finish`."""
+        if rows_of is not None:
+            self.records[sequence] = {**record, "rows": self.records[rows_of]["rows"]}
+            return
+        (rows,) = {len(values) for values in columns.values()}
+        padding = -rows % self._chunk
+        self._columns.append(
+            {
+                name: np.concatenate([values, np.zeros((padding, *values.shape[1:]), values.dtype)])
+                for name, values in columns.items()
+            }
+        )
+        self.records[sequence] = {**record, "rows": [self._stop, self._stop + rows]}
+        self._stop += rows + padding
 
-    def finish(self) -> None:
-        """Write the metadata last, then give the part its name; another process may have given it the same bytes."""
-        self._group.attrs.put({"sequences": self.records})
-        self._pack(list(self._entries))
-        self._zip.comment = bytes(DIGEST_LENGTH)
-        self._zip.close()
-        with self._temporary.open("r+b") as file:
-            digest, _ = _digests(file)
-            file.seek(-DIGEST_LENGTH, os.SEEK_END)
-            file.write(digest)
+    def finish(self) -> int:
+        """Write the metadata, give the part its name and return its size in bytes.
+
+        Another process may have given the name to the same bytes.
+        """
+        self._columns.flush()
+        files = sorted(path for path in self._temporary.rglob("*") if path.is_file())
+        digests = {
+            path.relative_to(self._temporary).as_posix(): sha256(path)
+            for path in files
+            if path != self._temporary / METADATA
+        }
+        group = zarr.open_group(self._temporary, mode="r+")
+        group.attrs.put({"sequences": self.records, "sha256": digests})
+        size = sum(path.stat().st_size for path in files)
         if is_url(self.path):
             bucket, name = fsspec.url_to_fs(self.path)
-            bucket.put_file(str(self._temporary), name)
-            self._temporary.unlink()
+            for file in [*digests, METADATA]:
+                bucket.makedirs(os.path.dirname(f"{name}/{file}"), exist_ok=True)
+                bucket.put_file(str(self._temporary / file), f"{name}/{file}")
         else:
-            os.replace(self._temporary, self.path)
+            try:
+                os.rename(self._temporary, self.path)
+            except OSError:
+                if not Path(self.path, METADATA).exists():
+                    raise
+        shutil.rmtree(self._temporary, ignore_errors=True)
+        return size
 
-    def _pack(self, entries: list[str]) -> None:
-        """Move entries from memory into the zip, in an order and with a date that do not depend on the run."""
-        for entry in sorted(entries):
-            self._zip.writestr(zipfile.ZipInfo(entry), self._entries.pop(entry).to_bytes())
 
-
-def _digests(part: Any) -> tuple[bytes, bytes]:
-    """SHA-256 of an open part up to the comment of its zip, and that comment; they differ if a byte is damaged."""
-    digest, end = hashlib.sha256(), b""
-    while block := part.read(2**20):
-        block = end + block
-        digest.update(block[:-DIGEST_LENGTH])
-        end = block[-DIGEST_LENGTH:]
-    return digest.hexdigest().encode(), end
+def _digest(url: str) -> str | None:
+    """SHA-256 of the file at a path or fsspec URL; None if it cannot be read."""
+    digest = hashlib.sha256()
+    try:
+        with fsspec.open(url) as file:
+            while block := file.read(2**20):
+                digest.update(block)
+    except OSError:
+        return None
+    return digest.hexdigest()
 
 
 def unknown_sequence(sequence: str | None, sequences: list[str]) -> str:
@@ -410,20 +396,17 @@ def unknown_sequence(sequence: str | None, sequences: list[str]) -> str:
     return f"expected a sequence of {listed}; got {sequence!r}"
 
 
-def _signed(header: Header) -> Header:
-    """The header with a checksum of the rest."""
-    return {**header, "checksum": sha256(json.dumps(header, sort_keys=True).encode())}
+def _checksum(header: Header) -> str:
+    """SHA-256 of a finished header without its checksum."""
+    plain = {key: value for key, value in header.items() if key != "checksum"}
+    return sha256(json.dumps(plain, sort_keys=True).encode())
 
 
-def _is_signed(header: Header) -> bool:
-    return _signed({key: value for key, value in header.items() if key != "checksum"}) == header
-
-
-def _unsigned(path: str) -> Header | None:
+def _created(path: str) -> Header | None:
     """The header that `create_parts` gave to a store; None if there is no store."""
     try:
-        with fsspec.open(f"{path}/zarr.json") as file:
+        with fsspec.open(f"{path}/{METADATA}") as file:
             header = json.load(file)["attributes"]
-        return {key: value for key, value in header.items() if key not in ("digests", "complete", "checksum")}
+        return {key: value for key, value in header.items() if key not in ("digests", "checksum")}
     except (OSError, ValueError, KeyError):
         return None

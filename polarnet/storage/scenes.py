@@ -3,26 +3,24 @@
 Rendering starts from the stored, quantised scene, so that truth and events agree to the last bit.
 """
 
-import functools
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from polarnet.runtime.arrays import Array, as_tensor, check_same_shape, check_shape, mask_of
+from polarnet.runtime.arrays import Array, as_tensor, check_same_shape, check_shape
 from polarnet.storage.frames import (
+    Contents,
     SplitStore,
     dequantise_angle,
     dequantise_fraction,
     quantise_angle,
     quantise_fraction,
-    splits_of,
 )
-from polarnet.storage.groups import Column, Columns
 
 CHUNK = 2**18  # pixels
 
@@ -30,6 +28,7 @@ CONVENTIONS = {
     "s0": "intensity of a scene, row by row: value / 65535",
     "dolp": "degree of linear polarization: value / 65535",
     "aolp": "angle of linear polarization in radians, [0, pi): value * pi / 65536",
+    "valid": "1 where the light of a pixel is known, 0 where saturation hid it",
     "picture_size": "height and width of a scene in pixels",
     "trajectory": "how the sensor moves in a sequence: numbers named by the attribute trajectory_names",
     "duration_us": "length of a sequence in microseconds",
@@ -40,8 +39,6 @@ QUANTISERS = {
     "dolp": (quantise_fraction, dequantise_fraction),
     "aolp": (quantise_angle, dequantise_angle),
 }
-
-MASK_CONVENTION = "1 where the light of a pixel is known, 0 where saturation hid it"
 
 
 class SceneRecord(NamedTuple):
@@ -76,10 +73,10 @@ class SceneStore(SplitStore):
 
     >>> import numpy as np
     >>> import torch
-    >>> from polarnet.storage import SceneStore
+    >>> from polarnet.storage import Contents, SceneStore
     >>> from polarnet.storage.scenes import Scene
-    >>> size = {"largest_picture": (12, 18), "sensor": (6, 9), "trajectory_names": ["x"], "attributes": {}}
-    >>> store = SceneStore.create("scenes.zarr", {"lake-00": "lake"}, {"lake-00": "test"}, **size)
+    >>> sizes = {"largest_picture": (12, 18), "sensor": (6, 9), "trajectory_names": ["x"]}
+    >>> store = SceneStore.create("scenes.zarr", Contents({"lake-00": "test"}), {"lake-00": "lake"}, **sizes)
     >>> store.write("lake-00", Scene(*torch.zeros(3, 12, 18)), np.zeros(1), duration_us=1_000_000)
     >>> store.finish()
     >>> SceneStore.open("scenes.zarr").read("lake-00").s0.shape
@@ -87,7 +84,8 @@ class SceneStore(SplitStore):
     """
 
     FORMAT = "polarnet.scenes"
-    VERSION = 5
+    VERSION = 6
+    COLUMNS: ClassVar[Mapping[str, str]] = {"s0": "uint16", "dolp": "uint16", "aolp": "uint16", "valid": "uint8"}
     scene_of: dict[str, str]
     """Name of the scene of each sequence."""
     largest_picture: list[int]
@@ -96,51 +94,41 @@ class SceneStore(SplitStore):
     sensor_width: int
     trajectory_names: list[str]
 
-    @functools.cached_property
-    def columns(self) -> Columns:
-        """S0, DoLP and AoLP of the scenes, pixel by pixel; in a masked store, the mask as well."""
-        types = {"s0": "uint16", "dolp": "uint16", "aolp": "uint16", **({"valid": "uint8"} if self.masked else {})}
-        return {name: Column("pixels", dtype, CHUNK) for name, dtype in types.items()}
+    @property
+    def chunk(self) -> int:
+        """Pixels that are compressed together."""
+        return CHUNK
 
     @classmethod
     def create(
         cls,
         path: str | os.PathLike[str],
+        contents: Contents,
         scene_of: Mapping[str, str],
-        splits: Mapping[str, str],
         *,
         largest_picture: tuple[int, int],
         sensor: tuple[int, int],
         trajectory_names: Sequence[str],
-        attributes: Mapping[str, Any],
-        variant_of: Mapping[str, str] | None = None,
-        masked: bool = False,
-        sequences_per_part: int = 1,
     ) -> "SceneStore":
-        """Create a store to write; it lies at PATH.tmp until it is finished.
+        """Create a store to write, or resume it; see `Store.create_parts`.
 
-        `scene_of` maps each sequence to the name of its scene, `splits` each sequence to train, val or test, and
-        `variant_of` each sequence over a variant to the name of the variant's picture. ValueError if two sequences of
-        one picture or its variants are in different splits. `largest_picture` and `sensor` are (height, width) in
-        pixels. A `masked` store records which pixels have known light. Resumes as `EventStore.create` does.
+        `scene_of` maps each sequence to the name of its scene. `largest_picture` and `sensor` are (height, width) in
+        pixels. ValueError if two sequences of one picture or its variants are in different splits.
         """
-        sequences, variants = list(scene_of), dict(variant_of or {})
-        splits = splits_of(sequences, splits)
-        _check_no_leak({**scene_of, **variants}, splits)
-        return cls.create_parts(
+        if scene_of.keys() != contents.splits.keys():
+            raise ValueError(
+                f"expected a scene for each of {len(contents.splits)} sequences, got {len(scene_of)} scenes"
+            )
+        _check_no_leak({**scene_of, **contents.variant_of}, contents.splits)
+        return cls.create_split(
             path,
-            sequences,
-            attributes,
-            sequences_per_part,
+            contents,
             scene_of=dict(scene_of),
-            splits=splits,
-            variant_of=variants,
             largest_picture=list(largest_picture),
             sensor_height=sensor[0],
             sensor_width=sensor[1],
             trajectory_names=list(trajectory_names),
-            masked=masked,
-            conventions={**CONVENTIONS, "valid": MASK_CONVENTION} if masked else CONVENTIONS,
+            conventions=CONVENTIONS,
         )
 
     def write(self, sequence: str, scene: Scene, trajectory: Float64[Array, " k"], duration_us: int) -> None:
@@ -163,12 +151,9 @@ class SceneStore(SplitStore):
             "duration_us": int(duration_us),
             "picture_size": list(scene.s0.shape),
         }
-        name = self.scene_of[sequence]
-        rows = [one["pixels"] for other, one in self.records_so_far(sequence).items() if self.scene_of[other] == name]
-        if rows:
-            self.append(sequence, {}, {**record, "pixels": rows[0]})
-        else:
-            self.append(sequence, self._pixels(name, scene), record)
+        name, names = self.scene_of[sequence], self.parts[self.part_of(sequence)]
+        same = next((other for other in names[: names.index(sequence)] if self.scene_of[other] == name), None)
+        self.append(sequence, {} if same else self._pixels(name, scene), record, rows_of=same)
 
     def read(self, sequence: str) -> SceneRecord:
         """Scene, trajectory and duration of a sequence; ValueError names the column of damaged data."""
@@ -189,12 +174,7 @@ class SceneStore(SplitStore):
         for plane, values in planes.items():
             check_shape(plane, values, "height width")
         check_same_shape(planes)
-        size, valid = tuple(scene.s0.shape), scene.valid
-        if valid is not None and (not self.masked or valid.shape != size):
-            raise ValueError(
-                f"{name}: expected a mask of {size} in a store created with masked=True, "
-                f"got one of {tuple(valid.shape)}, masked={self.masked}"
-            )
+        size = tuple(scene.s0.shape)
         height, width = self.largest_picture
         if not (self.sensor_height <= size[0] <= height and self.sensor_width <= size[1] <= width):
             raise ValueError(
@@ -202,9 +182,7 @@ class SceneStore(SplitStore):
                 f"{height}x{width} px, got {size[0]}x{size[1]}"
             )
         columns = dict(zip(QUANTISERS, _quantised(scene), strict=True))
-        if self.masked:
-            known = torch.ones(size, dtype=torch.bool) if valid is None else mask_of("valid", valid, size)
-            columns["valid"] = known.cpu().numpy().astype(np.uint8)
+        columns["valid"] = self.checked_mask(scene.valid, size).numpy().astype(np.uint8)
         return {column: values.ravel() for column, values in columns.items()}
 
 

@@ -11,8 +11,7 @@ import zarr
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from polarnet.storage.appended import FRAMES_PER_CHUNK
-from polarnet.storage.frames import FrameStore, dequantise_angle, dequantise_fraction, unpack_mask
+from polarnet.storage.frames import FRAMES_PER_CHUNK, FrameStore, dequantise_angle, dequantise_fraction
 from polarnet.storage.groups import open_group
 
 APPENDED = "truth.zarr"
@@ -73,8 +72,8 @@ def open_truth(path: str | os.PathLike[str], sequence: str) -> TrueFrames:
     """Open the true frames of a sequence; ValueError if a frame store lacks the sequence.
 
     >>> import torch
-    >>> from polarnet.storage import FrameStore, open_truth
-    >>> store = FrameStore.create("truth", ["lake"], {"lake": "test"}, 1, height=12, width=18, attributes={})
+    >>> from polarnet.storage import Contents, FrameStore, open_truth
+    >>> store = FrameStore.create("truth", Contents({"lake": "test"}), n_frames=1, height=12, width=18)
     >>> store.write("lake", torch.tensor([0]), torch.full((1, 4, 12, 18), 0.5), *torch.zeros(2, 1, 12, 18))
     >>> store.finish()
     >>> open_truth("truth", "lake")[0].dolp.shape
@@ -101,10 +100,8 @@ def _appended(group: zarr.Group) -> TrueFrames:
 
 def _stored(store: FrameStore, sequence: str) -> TrueFrames:
     def block(start: int, stop: int) -> list[TrueFrame]:
-        names = ["intensity", "dolp", "aolp", *(["valid"] if store.masked else [])]
-        intensity, dolp, aolp, *packed = store.read_columns(sequence, [(name, start, stop) for name in names])
-        i0, _, i90, _ = dequantise_fraction(intensity).unbind(1)
-        masks = unpack_mask(packed[0], store.width) if packed else [None] * len(dolp)
-        return [*map(TrueFrame, i0 + i90, dequantise_fraction(dolp), dequantise_angle(aolp), masks)]
+        _, intensity, dolp, aolp, valid = store.frames(sequence, start, stop)
+        i0, _, i90, _ = intensity.unbind(1)
+        return [*map(TrueFrame, i0 + i90, dolp, aolp, [None] * len(dolp) if valid is None else valid)]
 
     return TrueFrames(store.t_us(sequence).numpy(), block)

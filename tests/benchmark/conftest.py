@@ -6,7 +6,7 @@ from polarnet.benchmark.run import BenchmarkSet
 from polarnet.events.stream import Events
 from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
 from polarnet.storage.events import EventStore
-from polarnet.storage.frames import FrameStore
+from polarnet.storage.frames import Contents, FrameStore
 
 __all__ = ["checkpoints", "context", "make_context", "make_sequence", "make_setup", "sequence"]
 
@@ -17,7 +17,7 @@ SCENES = {"t1": "photo", "a1": "lake", "a2": "lake", "b1": "wood", "c1": "town"}
 def five_scenes(make_sequence, tmp_path_factory):
     folder = tmp_path_factory.mktemp("five_scenes")
     splits = {name: "train" if name.startswith("t") else "test" for name in SCENES}
-    frames = FrameStore.create(folder / "frames.zarr", list(SCENES), splits, 5, 18, 20, {"scenes": SCENES})
+    frames = FrameStore.create(folder / "frames.zarr", Contents(splits, {"scenes": SCENES}), 5, 18, 20)
     events = EventStore.create(folder / "events.zarr", list(SCENES), 18, 20, {})
     rotating = EventStore.create(folder / "rotating.zarr", list(SCENES), 18, 20, {})
     for seed, name in enumerate(SCENES):

@@ -13,7 +13,7 @@ from polarnet.benchmark.run import BenchmarkSet, at_stored_precision, run_benchm
 from polarnet.benchmark.score import BenchmarkConfig
 from polarnet.runtime.cluster import pmap
 from polarnet.stokes import Prediction
-from polarnet.storage.frames import FrameStore
+from polarnet.storage.frames import Contents, FrameStore
 
 pytestmark = pytest.mark.usefixtures("brief_costs")
 
@@ -132,7 +132,7 @@ def test_all_but_the_time_is_the_same_in_two_runs(five_scenes, context, tmp_path
 
 
 def test_no_test_sequence_is_an_error(five_scenes, context, tmp_path):
-    frames = FrameStore.create(tmp_path / "f.zarr", ["t1"], {"t1": "train"}, 5, 18, 20, {})
+    frames = FrameStore.create(tmp_path / "f.zarr", Contents({"t1": "train"}), 5, 18, 20)
     frames.write("t1", *five_scenes.frames.frames("t1"))
     frames.finish()
     without = BenchmarkSet("simulated", five_scenes.events, FrameStore.open(tmp_path / "f.zarr"))

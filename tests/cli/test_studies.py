@@ -11,7 +11,7 @@ from polarnet.cli import studies
 from polarnet.config.tree import load
 from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
-from polarnet.storage.frames import FrameStore
+from polarnet.storage.frames import Contents, FrameStore
 
 NETWORK = DolpUNetConfig(
     channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[2, 2], residual_blocks=1, input_mixing="contrasts"
@@ -25,7 +25,7 @@ def config(project_root, simulated, tmp_path_factory):
     splits = {name: "test" if name == "d-0" else "train" for name in source.sequences}
     path = tmp_path_factory.mktemp("studied") / "frames.zarr"
     first = source.frames("d-0")
-    frames = FrameStore.create(path, list(splits), splits, *first.dolp.shape, source.attributes)
+    frames = FrameStore.create(path, Contents(splits, source.attributes), *first.dolp.shape)
     for name in splits:
         sequence = source.frames(name)
         frames.write(name, sequence.t_us, sequence.intensity, sequence.dolp, sequence.aolp)

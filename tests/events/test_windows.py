@@ -10,8 +10,8 @@ from polarnet.events.representations import event_tensor, voxel_grid_of_window
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.windows import cut_windows, encode_windows, windows_of
 from polarnet.storage.events import EventStore
-from polarnet.storage.frames import FrameStore
-from polarnet.storage.windows import WindowDataset
+from polarnet.storage.frames import Contents, FrameStore
+from polarnet.training.engine.windows import WindowDataset
 
 HEIGHT, WIDTH = 4, 6
 T_US = torch.tensor([0, 33_333, 66_667, 100_000])
@@ -21,9 +21,7 @@ T_US = torch.tensor([0, 33_333, 66_667, 100_000])
 def stores(tmp_path_factory, make_random_events):
     folder = tmp_path_factory.mktemp("windows")
     events = EventStore.create(folder / "events.zarr", ["a", "b"], HEIGHT, WIDTH, {})
-    frames = FrameStore.create(
-        folder / "frames.zarr", ["a", "b"], {"a": "train", "b": "test"}, len(T_US), HEIGHT, WIDTH, {}
-    )
+    frames = FrameStore.create(folder / "frames.zarr", Contents({"a": "train", "b": "test"}), len(T_US), HEIGHT, WIDTH)
     for i, name in enumerate(["a", "b"]):
         events.write(name, [make_random_events(10 * i + k, 500, 100_000, HEIGHT, WIDTH) for k in range(4)], 100_000)
         truth = torch.rand(len(T_US), 6, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(i))

@@ -46,6 +46,7 @@ def folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     from polarnet.config.tree import load
     from polarnet.simulation.motion import SynthesizeConfig, Trajectory, random_trajectory
     from polarnet.simulation.scene import polarization_from_rgb
+    from polarnet.storage.frames import Contents
     from polarnet.storage.scenes import Scene, SceneStore
 
     motion: SynthesizeConfig = load(
@@ -56,13 +57,11 @@ def folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     names = [f"coffee-{i}" for i in range(SEQUENCES)]
     scenes = SceneStore.create(
         folder / "scenes.zarr",
+        Contents(dict.fromkeys(names, "train"), sequences_per_part=SEQUENCES_PER_PART),
         dict.fromkeys(names, "coffee"),
-        dict.fromkeys(names, "train"),
         largest_picture=(200, 300),
         sensor=(motion.sensor_height, motion.sensor_width),
         trajectory_names=Trajectory.vector_names(),
-        attributes={},
-        sequences_per_part=SEQUENCES_PER_PART,
     )
     for number, name in enumerate(names):
         trajectory = random_trajectory(motion, 200, 300, np.random.default_rng(number))
@@ -126,7 +125,7 @@ def digest(folder: Path) -> dict[str, str]:
 
 def finished(unfinished: Path) -> set[str]:
     """Names of the parts that are whole: a part gets its name last."""
-    return {path.name for path in unfinished.glob("part-[0-9][0-9][0-9][0-9][0-9].zip")}
+    return {path.name for path in unfinished.glob("part-[0-9][0-9][0-9][0-9][0-9]")}
 
 
 def identities(store: Path) -> dict[str, tuple[int, int]]:

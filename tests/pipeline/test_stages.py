@@ -144,7 +144,7 @@ def test_a_row_run_alone_gives_the_scores_of_one_pass_over_all_rows(project_root
 @pytest.mark.thorough
 def test_a_damaged_input_ends_a_stage_with_one_line_that_names_the_file(project_root, data, tmp_path):
     shutil.copytree(data / "scenes.zarr", tmp_path / "scenes.zarr")
-    part = tmp_path / "scenes.zarr" / "part-00000.zip"
+    part = tmp_path / "scenes.zarr" / "part-00000" / "s0" / "c" / "0"
     content = bytearray(part.read_bytes())
     content[len(content) // 2] ^= 1
     part.write_bytes(content)
@@ -153,7 +153,7 @@ def test_a_damaged_input_ends_a_stage_with_one_line_that_names_the_file(project_
     assert done.returncode == 1
     assert "Traceback" not in done.stdout
     assert done.stdout.splitlines()[-1].startswith(f"stage emulate: {tmp_path / 'scenes.zarr'}: ")
-    assert "part-00000.zip" in done.stdout.splitlines()[-1]
+    assert "part-00000" in done.stdout.splitlines()[-1]
 
 
 RIG = RigConfig(

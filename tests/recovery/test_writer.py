@@ -13,7 +13,7 @@ from polarnet.events.streaming import EventWindow
 from polarnet.recovery import writer as recovery
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.stokes import Prediction
-from polarnet.storage.appended import FRAMES_PER_CHUNK
+from polarnet.storage.frames import FRAMES_PER_CHUNK
 
 HEIGHT, WIDTH = 15, 21
 FRAMES = 40

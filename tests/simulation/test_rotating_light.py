@@ -17,6 +17,7 @@ from polarnet.simulation.rotating import (
 )
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.storage.events import EventStore
+from polarnet.storage.frames import Contents
 from polarnet.storage.scenes import Scene, SceneStore
 
 ROTATING = RotatingConfig(rate_hz=2.0, start_angle_deg=0.0, extinction_ratio=None, frames_per_turn=720)
@@ -96,8 +97,8 @@ def test_only_test_sequences_are_stored_and_a_second_run_keeps_the_store(project
     config = load(project_root, ["rotating.frames_per_turn=32"])
     names = {"lake-00": "lake", "wood-00": "wood"}
     store = SceneStore.create(
-        tmp_path / "scenes.zarr", names, {"lake-00": "train", "wood-00": "test"}, largest_picture=(20, 30),
-        sensor=(6, 8), trajectory_names=Trajectory.vector_names(), attributes={"layout": "four_sensors"},
+        tmp_path / "scenes.zarr", Contents({"lake-00": "train", "wood-00": "test"}, {"layout": "four_sensors"}), names,
+        largest_picture=(20, 30), sensor=(6, 8), trajectory_names=Trajectory.vector_names(),
     )  # fmt: skip
     still = Sine(0.0, 0.0, 0.0)
     trajectory = Trajectory(12.0, 10.0, (Sine(2.0, 5.0, 0.0), still, still), (still, still, still), still, still, 10.0)

@@ -24,9 +24,7 @@ SMALL = [
 @pytest.fixture
 def recipe(project_root):
     config = load(project_root, SMALL)
-    return Recipe(
-        config.ingest, config.synthesize, config.camera, config.seed, threads=1, sequences_per_part=2, labels=False
-    )
+    return Recipe(config.ingest, config.synthesize, config.camera, config.seed, threads=1, sequences_per_part=2)
 
 
 @pytest.fixture
@@ -97,7 +95,7 @@ def test_a_set_that_was_interrupted_goes_on(images, tmp_path, recipe):
     assert (folder / "frames.zarr" / "zarr.json").stat().st_mtime_ns == before
 
 
-@pytest.mark.parametrize("file", ["images/held-out.png", "frames.zarr/part-00000.zip", MADE])
+@pytest.mark.parametrize("file", ["images/held-out.png", "frames.zarr/part-00000/dolp/c/0/0/0", MADE])
 def test_a_set_with_a_damaged_file_is_made_again(images, tmp_path, recipe, caplog, file):
     folder = tmp_path / "complex_motion"
     make_complex_motion(images, folder, harder(), recipe, plain)

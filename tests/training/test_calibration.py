@@ -13,7 +13,7 @@ from polarnet.events.representations import event_tensor
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.networks.registry import load_network
 from polarnet.storage.events import EventStore
-from polarnet.storage.frames import FrameStore
+from polarnet.storage.frames import Contents, FrameStore
 from polarnet.training.dolp import dolp_task
 from polarnet.training.engine.calibration import RIDGES, Scene, fitted, weights_for
 from polarnet.training.engine.loop import TrainConfig, calibrate
@@ -160,9 +160,7 @@ def rewritten(frames: Path, path: Path, dolp_factors: Mapping[str, float], varia
     """A copy of a frame store, with DoLP multiplied by the factor of its sequence, and with variants."""
     source = FrameStore.open(frames)
     windows = len(source.t_us(source.sequences[0]))
-    copy = FrameStore.create(
-        path, source.sequences, source.splits, windows, source.height, source.width, {}, variant_of=variant_of
-    )
+    copy = FrameStore.create(path, Contents(source.splits, variant_of=variant_of), windows, source.height, source.width)
     for name in source.sequences:
         t_us, intensity, dolp, aolp, *valid = source.frames(name)
         copy.write(name, t_us, intensity, dolp_factors.get(name, 1.0) * dolp, aolp, *valid)

@@ -11,7 +11,6 @@ from polarnet.events.representations import event_tensor
 from polarnet.runtime.machine import generator_for
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
-from polarnet.storage.windows import WindowDataset, WindowSequence
 from polarnet.training.engine.sequences import (
     MEMORY_SHARE,
     View,
@@ -25,6 +24,7 @@ from polarnet.training.engine.sequences import (
     shuffled,
     stack,
 )
+from polarnet.training.engine.windows import WindowDataset, WindowSequence
 
 
 class Listed(Dataset[WindowSequence]):

@@ -11,7 +11,7 @@ import torch
 
 from polarnet.networks.base.checkpoint import load_checkpoint, save_checkpoint
 from polarnet.networks.paper.dolp_unet import DolpUNetConfig
-from polarnet.storage.frames import FrameStore
+from polarnet.storage.frames import Contents, FrameStore
 from polarnet.training.dolp import dolp_task
 from polarnet.training.e2v import E2vConfig, e2v_task
 from polarnet.training.engine.loop import TrainConfig, train_batch, validate
@@ -146,7 +146,7 @@ def masked(simulated, tmp_path):
     """The simulated sequences with the left third of all frames masked, and all of the first three frames."""
     source = FrameStore.open(simulated.frames)
     frames = FrameStore.create(
-        tmp_path / "masked.zarr", source.sequences, source.splits, 7, source.height, source.width, {}, masked=True
+        tmp_path / "masked.zarr", Contents(source.splits, masked=True), 7, source.height, source.width
     )
     for name in source.sequences:
         truth = source.frames(name)

@@ -17,7 +17,6 @@ from polarnet.metrics.similarity import correlation, mse, psnr
 from polarnet.runtime.files import check_room
 from polarnet.runtime.machine import precision_on
 from polarnet.runtime.sections import one_of, section
-from polarnet.storage.windows import WindowDataset
 from polarnet.training.engine.calibration import Scene, fitted, joined, weights_for
 from polarnet.training.engine.losses import known_frames
 from polarnet.training.engine.optimizers import OPTIMIZERS
@@ -34,6 +33,7 @@ from polarnet.training.engine.sequences import (
     shuffled,
 )
 from polarnet.training.engine.task import Split, State, Task
+from polarnet.training.engine.windows import WindowDataset
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
 COPIES_OF_WEIGHTS = 12  # on disk: best, last, and twice (old and new) the running checkpoint with best and two moments

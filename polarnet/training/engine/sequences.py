@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from polarnet.runtime.machine import generator_for, memory_handed_back, processes_here
 from polarnet.runtime.sections import section
-from polarnet.storage.windows import WindowDataset, WindowSequence
+from polarnet.training.engine.windows import WindowDataset, WindowSequence
 
 Sequences = WindowDataset | list[WindowSequence]
 

@@ -22,9 +22,9 @@ from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.groups import is_url
 from polarnet.storage.scenes import SceneStore
-from polarnet.storage.windows import EventSource, WindowDataset
 from polarnet.training.engine.losses import FrameLoss
 from polarnet.training.engine.sequences import Batch
+from polarnet.training.engine.windows import EventSource, WindowDataset
 
 State = list[Tensor] | None
 Network = TypeVar("Network", bound=nn.Module)

@@ -36,8 +36,8 @@ def test_the_parts_are_named_where_none_is_chosen(store, part):
 
 
 def test_a_damaged_store_is_refused_with_the_sequence(store):
-    flip(store / "part-00001.zip", "events/x/c/0")
-    with pytest.raises(RecordingError, match="wood, column events/x is unreadable"):
+    flip(store / "part-00001" / "x" / "c" / "0")
+    with pytest.raises(RecordingError, match="wood, column x of part-00001 is unreadable"):
         read_recording(store, part="wood/0")
 
 

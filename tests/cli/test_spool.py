@@ -2,8 +2,8 @@
 
 import torch
 
+from polarnet.cli.spool import EventSpool
 from polarnet.events.stream import concatenate
-from polarnet.storage.spool import EventSpool
 
 
 def test_pieces_come_back_joined_and_a_channel_without_events_is_empty(tmp_path, make_random_events, make_events):

@@ -1,0 +1,3 @@
+"""The splits of pictures, scenes and sequences."""
+
+SPLITS = ("train", "val", "test")
