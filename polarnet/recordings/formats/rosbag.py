@@ -13,7 +13,7 @@ import numpy as np
 
 from polarnet.recordings.formats.isolated_worker import gathered
 from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size
-from polarnet.terminal.extras import installation
+from polarnet.terminal.installation import installation
 
 MAGIC = b"#ROSBAG V"
 PACKAGES = ("dvs_msgs", "prophesee_event_msgs")
