@@ -28,8 +28,7 @@ def test_a_history_without_epochs_is_an_error(tmp_path):
 def test_dvc_plots_draw_columns_of_a_history(tmp_path, project_root):
     write_history(tmp_path, [{"epoch": 0, "train": {"total": 1.0}, "val": {"total": 1.0, "psnr": 1.0}}])
     columns = set((tmp_path / HISTORY).read_text().splitlines()[0].split(","))
-    for plot in YAML(typ="safe").load(project_root / "dvc.yaml")["plots"]:
-        (settings,) = plot.values()
-        for path, names in settings["y"].items():
-            assert path.endswith(HISTORY)
-            assert {settings["x"], *([names] if isinstance(names, str) else names)} <= columns
+    curves, psnr = YAML(typ="safe").load(project_root / "dvc.yaml")["plots"]
+    assert {curves["data/benchmark/history"]["x"], *curves["data/benchmark/history"]["y"]} <= columns
+    (settings,) = psnr.values()
+    assert {settings["x"], *settings["y"].values()} <= columns
