@@ -9,9 +9,7 @@ from polarnet.simulation.dataset import emulate_scenes
 def main(config: Config) -> None:
     """Emulate every sequence that is missing from the event store."""
     paths, mapper, threads = config.paths, config.mapper("emulate"), threads_of(config.runtime)
-    count = emulate_scenes(
-        paths.scenes, paths.events, config.camera, config.seed, mapper, threads, config.storage.labels
-    )
+    count = emulate_scenes(paths.scenes, paths.events, config.camera, config.seed, mapper, threads)
     print(f"{count} sequences")
 
 

@@ -11,7 +11,6 @@ from polarnet.reports.tables import COLUMNS, COSTS, as_markdown, score_table
 from studies.comparisons import paired_lines, standing
 from studies.instruction_sets import SETTINGS, VARIABLES
 from studies.network_blocks import NETWORK_BLOCKS
-from studies.noise import NOISE_BLOCK
 from studies.paper import duration_rows, table_rows
 from studies.planning import PLANNING_BLOCKS
 from studies.recorded import RECORDED_BLOCK
@@ -152,7 +151,6 @@ BLOCKS = ROBUSTNESS_BLOCKS | NETWORK_BLOCKS | PLANNING_BLOCKS | {
     ),
     "benchmark-simulated": _benchmark("simulated"),
     "benchmark-measured": _benchmark("measured"),
-    "noise": NOISE_BLOCK,
     "recorded": RECORDED_BLOCK,
     "emulation": Block(
         "emulation", "paper_set", "studies.emulation",

@@ -72,7 +72,6 @@ TESTS: Mapping[str, tuple[str, ...]] = {
     "polarnet/metrics/similarity.py": ("tests/metrics/test_similarity.py",),
     "polarnet/metrics/scores.py": ("tests/metrics/test_scores.py",),
     "polarnet/metrics/reliability.py": ("tests/metrics/test_reliability.py",),
-    "polarnet/metrics/denoising.py": ("tests/metrics/test_denoising.py",),
     "polarnet/events/windows.py": ("tests/events/test_windows.py",),
     "polarnet/events/streaming.py": ("tests/events/test_streaming.py",),
     "polarnet/events/representations.py": ("tests/events/test_representations.py",),

@@ -96,7 +96,7 @@ class _Times(NamedTuple):
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    from polarnet.cli.simulated_files import FORMATS, LABEL_FORMATS, STORE, Outputs
+    from polarnet.cli.simulated_files import FORMATS, STORE, Outputs
     from polarnet.config.tree import load
     from polarnet.pictures.clips import ClipOptions, open_clip
     from polarnet.runtime.machine import configure
@@ -126,17 +126,11 @@ def _simulate(options: argparse.Namespace) -> int:
     folder, out = working_folder(), (options.out or working_folder() / "outputs" / "simulate" / clip.name).resolve()
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
         config = load(settings_root(), overrides, folder)
-    if config.storage.labels and (unable := [form for form in formats if form not in LABEL_FORMATS]):
-        raise ValueError(
-            f"storage.labels=true: expected formats that hold labels ({', '.join(LABEL_FORMATS)}), "
-            f"got {', '.join(unable)}; leave it out, and write it with `polarnet export` from the store, without labels"
-        )
     configure(config.runtime, config.seed)
     outputs = Outputs(
         formats or [STORE],
         None if options.no_preview else options.video_rate,
         2.2 if clip.measured else 1.0,
-        config.storage.labels,
     )
     with run_folder(out, "simulate") as partial:
         try:
@@ -201,19 +195,19 @@ def _run(
     from polarnet.simulation.motion import frame_times_us
     from polarnet.stokes import POLARIZER_ANGLES_DEG
 
-    threads, labels = threads_of(config.runtime), outputs.labels
+    threads = threads_of(config.runtime)
     attributes = {**config.camera.sections, "seed": config.seed}
     attributes |= {"input": clip.name, "kind": clip.words, "upsample": upsample, "polarnet": __version__}
     saturation: list[float] = []
     total: int | None
     if times is None:
         scene = _scene(config, clip, saturation)
-        pieces = moving_pieces(scene, config.synthesize, config.camera, config.seed, threads, labels)
+        pieces = moving_pieces(scene, config.synthesize, config.camera, config.seed, threads)
         attributes["synthesize"] = vars(config.synthesize)
         drawn, total = drawn_camera(config.camera, config.seed, "picture"), len(frame_times_us(config.synthesize))
     else:
         frames = timed_frames(clip, times, saturation)
-        pieces = video_pieces(frames, config.camera, config.seed, upsample, threads, labels)
+        pieces = video_pieces(frames, config.camera, config.seed, upsample, threads)
         drawn, total = drawn_camera(config.camera, config.seed, "video"), clip.count
     written = write_simulation(pieces, drawn, clip.name, folder, outputs, attributes, total)
     counts = zip(POLARIZER_ANGLES_DEG, written.events, strict=True)

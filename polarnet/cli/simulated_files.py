@@ -19,7 +19,7 @@ from polarnet.reports.preview import write_true_video
 from polarnet.simulation.moving_sensor import leave_sensors
 from polarnet.storage.appended import AppendedFrames
 from polarnet.storage.events import MAX_DURATION_US, EventStore
-from polarnet.storage.exchange import FORMS, label_file
+from polarnet.storage.exchange import FORMS
 from polarnet.storage.frames import CONVENTIONS, quantise_angle, quantise_fraction
 from polarnet.storage.spool import EventSpool
 from polarnet.storage.true_frames import APPENDED, open_truth
@@ -27,7 +27,6 @@ from polarnet.terminal.progress import ProgressBar
 
 STORE = "store"
 FORMATS = (STORE, *FORMS)
-LABEL_FORMATS = tuple(form for form in FORMATS if form != "evt3")  # those that hold the label of an event
 EVENTS, TRUTH, VIDEO, PICTURE, SPOOL = "events.zarr", APPENDED, "preview.mp4", "preview.png", "spool"
 TRUTH_CONVENTIONS = {
     "t_us": CONVENTIONS["t_us"],
@@ -46,8 +45,6 @@ class Outputs(NamedTuple):
     """Pictures a second of the preview; None: no preview."""
     gamma: float
     """Gamma of S0 in the preview."""
-    labels: bool
-    """Whether the files of events hold the label of each event, which the pieces must then have."""
 
 
 class Written(NamedTuple):
@@ -86,7 +83,7 @@ def write_simulation(
     started = time.perf_counter()
     truth = AppendedFrames(folder / TRUTH, TRUTH_CONVENTIONS)
     duration_us, frames, polarized = 0, 0, False
-    with EventSpool(folder / SPOOL, outputs.labels) as spool:
+    with EventSpool(folder / SPOOL) as spool:
         with ProgressBar(total=total, desc="simulate", unit="frame") as bar:
             for piece in pieces:
                 duration_us = piece.stop_us
@@ -138,7 +135,7 @@ def _write_events(
     with ProgressBar(total=len(outputs.formats), desc="write", unit="format") as bar:
         if STORE in outputs.formats:
             size = channels[0].height, channels[0].width
-            store = EventStore.create(folder / EVENTS, [name], *size, attributes, labelled=outputs.labels)
+            store = EventStore.create(folder / EVENTS, [name], *size, attributes)
             store.write(name, channels, duration_us)
             store.finish()
             files.append(EVENTS)
@@ -153,8 +150,6 @@ def _write_events(
             for sensor, events in sensors.items():
                 write(folder / f"{sensor}{suffix}", events, duration_us)
                 files.append(f"{sensor}{suffix}")
-                if form == "text" and outputs.labels:
-                    files.append(label_file(Path(f"{sensor}{suffix}")).name)
             bar.update()
     return files
 

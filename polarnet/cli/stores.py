@@ -1,18 +1,16 @@
-"""Commands for stores: view, list, verify, export, video, labels, replay."""
+"""Commands for stores: view, list, verify, export, video, replay."""
 
 import argparse
 import sys
 from pathlib import Path
 
 from polarnet.cli.outputs import run_folder
-from polarnet.cli.parsers import Commands, add_hot_pixel_factor, add_reading, add_stored_sequence, reading_of
-
-PICTURE_US = 33_333
+from polarnet.cli.parsers import Commands, add_reading, add_stored_sequence, reading_of
 
 
 def add_to(commands: Commands) -> None:
-    """Add the commands view, list, verify, export, video, labels and replay."""
-    for add in (_add_view, _add_list, _add_verify, _add_export, _add_video, _add_labels, _add_replay):
+    """Add the commands view, list, verify, export, video and replay."""
+    for add in (_add_view, _add_list, _add_verify, _add_export, _add_video, _add_replay):
         add(commands)
 
 
@@ -95,24 +93,6 @@ def _add_video(commands: Commands) -> None:
         "--video-rate", type=float, default=30.0, metavar="HZ", help="pictures a second of the video (default: 30)"
     )
     video.set_defaults(run=_video)
-
-
-def _add_labels(commands: Commands) -> None:
-    labels = commands.add_parser(
-        "labels",
-        help="count and draw a stored sequence's events by cause, and score the removal of hot pixels",
-        description="Needs an event store that was written with storage.labels=true. Score a denoiser of your own with "
-        "polarnet.metrics.denoising.denoising_scores.",
-        epilog="example: polarnet labels data/events.zarr lake-0 --picture causes.png",
-    )
-    add_stored_sequence(labels)
-    add_hot_pixel_factor(labels)
-    labels.add_argument(
-        "--picture",
-        type=Path,
-        help="PNG of 33 ms in the middle of the sequence, coloured by cause (default: not drawn)",
-    )
-    labels.set_defaults(run=_labels)
 
 
 def _add_replay(commands: Commands) -> None:
@@ -215,35 +195,6 @@ def _export(options: argparse.Namespace) -> int:
     with run_folder(options.folder, "export") as folder:
         export_store(store, folder, options.format, options.sequence)
     print(f"{options.store} -> {options.folder}")
-    return 0
-
-
-def _labels(options: argparse.Namespace) -> int:
-    import torch
-
-    from polarnet.metrics.denoising import denoising_scores
-    from polarnet.recordings.pixels import event_counts, hot_pixels
-    from polarnet.reports.recordings import draw_labels
-    from polarnet.storage.events import EventStore
-
-    store = EventStore.open(options.store)
-    if not store.labelled:
-        raise ValueError(f"{options.store}: expected a store with labels; write it again with storage.labels=true")
-    channels, seconds = store.read(options.sequence), store.duration_us(options.sequence) * 1e-6
-    hot = [torch.from_numpy(hot_pixels(event_counts(e), seconds, options.hot_pixel_factor)) for e in channels]
-    keep = torch.cat([~bad[e.y.long(), e.x.long()] for bad, e in zip(hot, channels, strict=True)])
-    scores = denoising_scores(torch.cat([e.label for e in channels if e.label is not None]), keep)
-    print(f"{'cause':8s}{'events':>12s}{'in hot pixels':>15s}")
-    for label, (removed, events) in scores.removed.items():
-        print(f"{label:8s}{events:12,d}{removed:15,d}")
-    print(
-        f"removal of {sum(int(bad.sum()) for bad in hot)} hot pixels: precision {scores.precision:.4f}, "
-        f"recall {scores.recall:.4f}, signal kept {scores.signal_kept:.4f}"
-    )
-    if options.picture:
-        middle_us = store.duration_us(options.sequence) // 2
-        draw_labels(store.read(options.sequence, middle_us, middle_us + PICTURE_US), options.picture)
-        print(f"picture {options.picture}")
     return 0
 
 

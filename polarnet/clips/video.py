@@ -56,12 +56,8 @@ def moving_pieces(
     camera: Camera,
     seed: int,
     threads: int = 1,
-    labels: bool = False,
 ) -> Iterator[Piece]:
-    """Simulate a moving sensor in pieces; joined and read out (`leave_sensors`), the events are those of `simulate`.
-
-    With `labels`, every event names its cause.
-    """
+    """Simulate a moving sensor in pieces; joined and read out (`leave_sensors`), the events are those of `simulate`."""
     trajectory = random_trajectory(motion, scene.height, scene.width, generator_for(seed, "picture", "motion"))
     key, camera = drawn_camera(camera, seed, "picture")
     size = motion.sensor_height, motion.sensor_width
@@ -72,7 +68,7 @@ def moving_pieces(
     for first in range(0, len(times_us), MOTION_STEPS):
         t_us = times_us[first : first + MOTION_STEPS]
         events, state = emulate_motion_steps(
-            scene, trajectory, t_us, *size, camera.sensor, key, state, threads, camera.polarizers, labels
+            scene, trajectory, t_us, *size, camera.sensor, key, state, threads, camera.polarizers
         )
         here = frames_us[(frames_us <= t_us[-1]) & (frames_us > (times_us[first - 1] if first else -1))]
         with one_thread():
@@ -86,13 +82,12 @@ def video_pieces(
     seed: int,
     upsample: bool = False,
     threads: int = 1,
-    labels: bool = False,
 ) -> Iterator[Piece]:
     """Simulate, in pieces, a camera at rest, each pixel of which sees one pixel of the frames; these are the truth.
 
     The pixels adapt to the first frame. The channels of a DoFP sensor see every second row and column, and their truth
-    is the mean of each 2x2 cell. With `upsample`, the sensor also sees interpolated frames (`upsampled`). With
-    `labels`, every event names its cause. ValueError for frames of different sizes and for times that do not increase.
+    is the mean of each 2x2 cell. With `upsample`, the sensor also sees interpolated frames (`upsampled`).
+    ValueError for frames of different sizes and for times that do not increase.
     """
     key, camera = drawn_camera(camera, seed, "video")
     source = iter(frames)
@@ -117,7 +112,7 @@ def video_pieces(
         t_us = np.array([frame.t_us for frame in chunk], np.float64)
         stokes = torch.stack([frame.stokes for frame in chunk], dim=1).numpy()
         light = split_channels(behind_polarizers(stokes, weights), camera.polarizers)
-        events, state = _advance(light, t_us, rows, columns, camera.sensor, key, state, threads, labels)
+        events, state = _advance(light, t_us, rows, columns, camera.sensor, key, state, threads)
         here = [frame for frame in true if frame.t_us <= chunk[-1].t_us]
         true = true[len(here) :] if len(here) < len(true) else []
         yield Piece(chunk[-1].t_us, events, torch.tensor([frame.t_us for frame in here]), _truth(here, rows, columns))
@@ -132,7 +127,6 @@ def _advance(
     key: int,
     state: SensorState | None,
     threads: int,
-    labels: bool,
 ) -> tuple[list[Events], SensorState]:
     before = t_us if state is None else np.concatenate([[state.t_us], t_us])
     if (np.diff(before) <= 0).any():
@@ -140,8 +134,8 @@ def _advance(
     if MODELS[sensor.model].EIGHT_BIT_VIDEO:
         light = (light + np.float32(0.5)).astype(np.uint8)
     lights = [light_of_frames(np.ascontiguousarray(channel)) for channel in light]
-    channels, state = emulate_lights(lights, t_us, rows, columns, sensor, key, state, CHANNELS, threads, labels)
-    return [events_of(channel, rows, columns, labels) for channel in channels], state
+    channels, state = emulate_lights(lights, t_us, rows, columns, sensor, key, state, CHANNELS, threads)
+    return [events_of(channel, rows, columns) for channel in channels], state
 
 
 def _truth(frames: Sequence[StokesFrame], rows: int, columns: int) -> Float32[Tensor, "n 3 h w"]:

@@ -242,9 +242,8 @@ class Config:
     @property
     def recipe(self) -> Recipe:
         """Settings that make sequences from pictures."""
-        threads, storage = threads_of(self.runtime), self.storage
-        size, labels = storage.sequences_per_part, storage.labels
-        return Recipe(self.ingest, self.synthesize, self.camera, self.seed, threads, size, labels)
+        threads, size = threads_of(self.runtime), self.storage.sequences_per_part
+        return Recipe(self.ingest, self.synthesize, self.camera, self.seed, threads, size)
 
     def mapper(self, label: str) -> functools.partial[list[Any]]:
         """Parallel map with the workers and the cluster of this configuration; `label` names its progress bar."""

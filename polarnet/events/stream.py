@@ -8,7 +8,7 @@ from typing import no_type_check
 import numba
 import numpy as np
 import torch
-from jaxtyping import Bool, Int8, Int16, Int64, Integer, UInt8
+from jaxtyping import Bool, Int8, Int16, Int64, Integer
 from torch import Tensor
 
 from polarnet.runtime.arrays import Array, whole_numbers
@@ -37,12 +37,9 @@ class Events:
     p: Int8[Tensor, " n"]  # +1 brighter, -1 darker; never 0, so sums need no conversion
     height: int
     width: int
-    label: UInt8[Tensor, " n"] | None = None
-    """Number of each event's cause in `polarnet.events.labels.LABELS`; None where causes are not known."""
 
     def __post_init__(self):
-        labels = {} if self.label is None else {"label": torch.uint8}
-        for name, dtype in {**_COLUMNS, **labels}.items():
+        for name, dtype in _COLUMNS.items():
             column = getattr(self, name)
             if column.dtype != dtype or column.shape != self.t.shape or column.ndim != 1:
                 raise ValueError(
@@ -133,10 +130,9 @@ def slice_count(events: Events, start: int, stop: int) -> Events:
 
 
 def select(events: Events, which: slice | Bool[Tensor, " n"] | Int64[Tensor, " m"]) -> Events:
-    """Events chosen by a slice, a mask, or indices in any order, with their labels."""
-    label = None if events.label is None else events.label[which]
+    """Events chosen by a slice, a mask, or indices in any order."""
     t, x, y, p = (getattr(events, name)[which] for name in _COLUMNS)
-    return Events(t, x, y, p, events.height, events.width, label)
+    return Events(t, x, y, p, events.height, events.width)
 
 
 def crop(events: Events, top: int, left: int, height: int, width: int) -> Events:
@@ -194,13 +190,12 @@ def merge(streams: Sequence[Events]) -> Events:
 
 
 def _joined(streams: Sequence[Events]) -> Events:
-    """The events of one stream after the other, with labels if all have them."""
+    """The events of one stream after the other."""
     sizes = {(stream.height, stream.width) for stream in streams}
     if len(sizes) != 1:
         raise ValueError(f"expected streams of one sensor, got sizes {sorted(sizes)} (height, width)")
     t, x, y, p = (torch.cat([getattr(stream, name) for stream in streams]) for name in _COLUMNS)
-    labels = [stream.label for stream in streams if stream.label is not None]
-    return Events(t, x, y, p, *sizes.pop(), torch.cat(labels) if len(labels) == len(streams) else None)
+    return Events(t, x, y, p, *sizes.pop())
 
 
 @numba.njit(nogil=True, cache=True)

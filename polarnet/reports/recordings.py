@@ -12,12 +12,10 @@ from matplotlib.figure import Figure
 
 from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
 from polarnet.captures.targets import Calibrated
-from polarnet.events.labels import LABELS
 from polarnet.events.representations import event_tensor
-from polarnet.events.stream import Events, select, slice_time
+from polarnet.events.stream import Events, slice_time
 from polarnet.recordings.formats.celex5_bin import WHITE
 from polarnet.recordings.inspection import Inspection
-from polarnet.recordings.pixels import event_counts
 from polarnet.reports.maps import (
     DOLP_COLOURS,
     dolp_image,
@@ -32,7 +30,6 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.frames import Frames
 
 COLOURS = ("#d6336c", "#e08a1e", "#3d8fd9", "#4aa37c")
-LABEL_COLOURS = ("#e08a1e", "#3d8fd9", "#d6336c")  # leak, shot noise, hot pixels
 SEQUENCE_COLUMNS = 5
 SPAN_MS = 60.0  # on each side of the start
 
@@ -97,21 +94,6 @@ def draw_hot_pixels(counts: np.ndarray, hot: Bool[np.ndarray, "h w"], path: Path
     axes.scatter(columns, rows, s=60, facecolors="none", edgecolors=COLOURS[0])
     axes.set_title(f"{len(rows)} hot pixels")
     figure.colorbar(image, ax=axes, label="log(1 + events)")
-    path.write_bytes(png(figure))
-
-
-def draw_labels(channels: Sequence[Events], path: Path) -> None:
-    """Write a picture of labelled events behind four polarizers: signal as grey counts, noise as dots by cause."""
-    figure = Figure(figsize=(12, 8), layout="constrained")
-    for axes, angle, events in zip(figure.subplots(2, 2).flat, POLARIZER_ANGLES_DEG, channels, strict=True):
-        assert events.label is not None
-        signal, *noise = (select(events, events.label == number) for number in range(len(LABELS)))
-        axes.imshow(event_counts(signal), cmap="gray")
-        for name, colour, of_cause in zip(LABELS[1:], LABEL_COLOURS, noise, strict=True):
-            axes.scatter(of_cause.x, of_cause.y, s=6, color=colour, label=f"{name}: {len(of_cause):,}")
-        axes.set_title(f"{angle} degrees, {len(signal):,} signal events")
-        axes.set_axis_off()
-        axes.legend(loc="lower right", fontsize=8)
     path.write_bytes(png(figure))
 
 

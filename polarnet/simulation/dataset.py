@@ -24,18 +24,17 @@ def emulate_scenes(
     seed: int,
     mapper: Callable[..., Iterable[Any]],
     threads: int,
-    labels: bool = False,
 ) -> int:
     """Emulate all sequences of a scene store into an event store, and return their number; both may be at a URL.
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks
-    emulates one part on `threads` threads. The event store has the parts of the scene store. With `labels`, it stores
-    the cause of each event. After an interruption, a run of the same scenes, camera and seed makes the missing parts.
+    emulates one part on `threads` threads. The event store has the parts of the scene store. After an interruption, a
+    run of the same scenes, camera and seed makes the missing parts.
     """
     source = SceneStore.open(scenes)
     attributes = origin_of(source, camera, seed)
     size = channel_size(camera.polarizers.layout, source.sensor_height, source.sensor_width)
-    store = EventStore.create(events, source.sequences, *size, attributes, source.sequences_per_part, labels)
+    store = EventStore.create(events, source.sequences, *size, attributes, source.sequences_per_part)
     task = functools.partial(_emulate_part, scenes=source, events=store, camera=camera, seed=seed, threads=threads)
     for _ in mapper(task, store.missing_parts()):
         pass
@@ -53,9 +52,7 @@ def origin_of(scenes: SceneStore, camera: Camera, seed: int) -> dict[str, Any]:
     }
 
 
-def emulate_sequence(
-    scenes: SceneStore, sequence: str, camera: Camera, seed: int, threads: int, labels: bool = False
-) -> list[Events]:
+def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: int, threads: int) -> list[Events]:
     """Events of the four channels of one stored sequence.
 
     Its noise, and with `randomise` its camera, depend only on the seed and the sequence's name.
@@ -73,11 +70,10 @@ def emulate_sequence(
         threads,
         camera.polarizers,
         camera.readout,
-        labels,
     )
 
 
 def _emulate_part(part: str, scenes: SceneStore, events: EventStore, camera: Camera, seed: int, threads: int) -> None:
     for sequence in events.parts[part]:
-        channels = emulate_sequence(scenes, sequence, camera, seed, threads, events.labelled)
+        channels = emulate_sequence(scenes, sequence, camera, seed, threads)
         events.write(sequence, channels, scenes.duration_us(sequence), camera.draws(seed, sequence))

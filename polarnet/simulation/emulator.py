@@ -135,10 +135,9 @@ def emulate_columns(
     state: SensorState | None = None,
     channels: Sequence[int] | None = None,
     threads: int = 1,
-    labels: bool = False,
     unrounded_times: bool = False,
 ) -> tuple[list[Columns], SensorState]:
-    """`emulate` with events as numpy arrays; `labels` adds their causes, `unrounded_times` their times as floats."""
+    """`emulate` with events as numpy arrays; `unrounded_times` adds their times as floats."""
     frames = as_tensor("frames", frames).detach().cpu()
     check_shape("frames", frames, "... channels height width")
     channels = tuple(range(frames.shape[-3])) if channels is None else tuple(channels)
@@ -147,7 +146,7 @@ def emulate_columns(
     clip = frames.numpy() if frames.dtype == torch.uint8 else frames.to(torch.float32).numpy()
     lights = [light_of_frames(np.ascontiguousarray(clip[:, i])) for i in range(len(channels))]
     height, width = frames.shape[2:]
-    return emulate_lights(lights, times, height, width, config, key, state, channels, threads, labels, unrounded_times)
+    return emulate_lights(lights, times, height, width, config, key, state, channels, threads, unrounded_times)
 
 
 def emulate_lights(
@@ -160,7 +159,6 @@ def emulate_lights(
     state: SensorState | None,
     channels: tuple[int, ...],
     threads: int = 1,
-    labels: bool = False,
     unrounded_times: bool = False,
 ) -> tuple[list[Columns], SensorState]:
     """Events of channels under `lights` at times `t_us`, and the state after them; `threads` channels run at once."""
@@ -171,7 +169,7 @@ def emulate_lights(
     first_frame, first_number = (1, 0) if state is None else (0, state.steps)
     room = 1 + int(min(MAX_INITIAL_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
     # allocated here, because glibc returns what other threads allocate to the system as soon as they end
-    empty = [empty_columns(room, labels, unrounded_times) for _ in channels]
+    empty = [empty_columns(room, unrounded_times) for _ in channels]
 
     def emulate_channel(i: int) -> tuple[Columns, Any]:
         steps = Steps(physics, height, width, times, first_frame, first_number, seed, channels[i])
@@ -184,7 +182,7 @@ def emulate_lights(
         if defects := defects_of(config, height * width, seed, channels[i]):
             # v2e stamps an event after the start of its step and up to its end, the others before the end
             span, rounds_up = (float(times[0]), float(times[-1])), model is v2e
-            columns = with_defects(columns, defects, width, *span, rounds_up, labels, unrounded_times)
+            columns = with_defects(columns, defects, width, *span, rounds_up, unrounded_times)
         return columns, pixels
 
     if threads > 1:
@@ -196,10 +194,9 @@ def emulate_lights(
     return list(columns), SensorState(config.model, height, width, channels, pixels, float(times[-1]), steps_taken)
 
 
-def events_of(columns: Columns, height: int, width: int, labels: bool = False) -> Events:
-    """`Events` that share the memory of the columns, with their labels if `labels`."""
-    t, x, y, p, label = (torch.from_numpy(column) for column in columns[:5])
-    return Events(t, x, y, p, height, width, label if labels else None)
+def events_of(columns: Columns, height: int, width: int) -> Events:
+    """`Events` that share the memory of the columns."""
+    return Events(*map(torch.from_numpy, columns[:4]), height, width)
 
 
 def _check_frames(

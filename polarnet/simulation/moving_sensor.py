@@ -40,13 +40,11 @@ def emulate_motion(
     threads: int = 1,
     polarizers: PolarizersConfig = IDEAL,
     readout: ReadoutConfig = PERFECT,
-    labels: bool = False,
 ) -> list[Events]:
     """Events of the four channels of a sensor of height x width pixels that moves over a scene for `duration_us`.
 
     Times count from the start of the motion. `key` (64 bits) seeds the mismatch of the pixels and all noise. The
-    channels of a DoFP sensor (`polarizers.layout`) have half its rows and columns. With `labels`, every event names its
-    cause.
+    channels of a DoFP sensor (`polarizers.layout`) have half its rows and columns.
 
     >>> import numpy as np
     >>> import torch
@@ -57,9 +55,7 @@ def emulate_motion(
     [180, 180, 180, 180]
     """
     t_us = emulation_times_us(trajectory, duration_us, height, width, config)
-    events, _ = emulate_motion_steps(
-        scene, trajectory, t_us, height, width, config, key, None, threads, polarizers, labels
-    )
+    events, _ = emulate_motion_steps(scene, trajectory, t_us, height, width, config, key, None, threads, polarizers)
     return leave_sensors(events, polarizers, readout, key, duration_us)
 
 
@@ -97,7 +93,6 @@ def emulate_motion_steps(
     state: SensorState | None,
     threads: int = 1,
     polarizers: PolarizersConfig = IDEAL,
-    labels: bool = False,
 ) -> tuple[list[Events], SensorState]:
     """As `emulate_motion`, for light rendered at times `t_us`; pass the returned state to continue.
 
@@ -120,12 +115,11 @@ def emulate_motion_steps(
         key=key,
         channels=CHANNELS,
         threads=threads,
-        labels=labels,
     )
     if drifts(pose) and polarizers.uniform:
         lights = lights_of_drift(scene, pose, height, width, weights)
         channels, state = advance(lights, t_us.astype(np.float64), state=state)
-        return [events_of(channel, rows, columns, labels) for channel in channels], state
+        return [events_of(channel, rows, columns) for channel in channels], state
     pieces = []
     for first in range(0, len(t_us), CHUNK):
         chunk = slice(first, first + CHUNK)
@@ -138,4 +132,4 @@ def emulate_motion_steps(
         pieces.append(channels)
     joined = [Columns(*map(np.concatenate, zip(*channel, strict=True))) for channel in zip(*pieces, strict=True)]
     assert state is not None  # there was at least one time
-    return [events_of(channel, rows, columns, labels) for channel in joined], state
+    return [events_of(channel, rows, columns) for channel in joined], state

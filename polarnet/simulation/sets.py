@@ -64,8 +64,6 @@ class Recipe:
     """Threads of each task; changes no result."""
     sequences_per_part: int
     """Sequences in a part of a store; changes no result."""
-    labels: bool
-    """Whether the event store holds the cause of each event."""
 
 
 def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Recipe, mapper: MakeMapper) -> bool:
@@ -114,7 +112,7 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
     complete already. Changes of the code are not noticed: DVC checks them for the pipeline's sets.
     """
     sections = {"ingest": asdict(recipe.ingest), "motion": asdict(recipe.motion), **recipe.camera.sections}
-    settings = sections | {"seed": recipe.seed, "source": source, "labels": recipe.labels}
+    settings = sections | {"seed": recipe.seed, "source": source}
     key = sha256(json.dumps(settings, sort_keys=True).encode())
     note = folder / MADE
     if note.exists():
@@ -135,7 +133,7 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
         layout, size = recipe.camera.polarizers.layout, recipe.sequences_per_part
         synthesize(images, scenes, frames, recipe.motion, recipe.seed, mapper("synthesize"), size, layout=layout)
     if not events.exists():
-        emulate_scenes(scenes, events, recipe.camera, recipe.seed, mapper("emulate"), recipe.threads, recipe.labels)
+        emulate_scenes(scenes, events, recipe.camera, recipe.seed, mapper("emulate"), recipe.threads)
     note.write_text(json.dumps({"key": key, "complete": True}))
     seal(folder)
     return True

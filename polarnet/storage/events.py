@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from polarnet.events.labels import LABELS
 from polarnet.events.stream import MAX_SIDE, Events, slice_count, slice_time, validate
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.groups import Column, Columns
@@ -26,8 +25,7 @@ CHANNELS = len(POLARIZER_ANGLES_DEG)
 MAX_DURATION_US = 2**32 - 1  # 71 minutes: t is uint32
 CHUNK = 2**18  # events; smaller chunks make Zarr slower, for a window as well as for a whole sequence
 MILLISECOND_CHUNK = 2**12
-
-LABEL_CONVENTION = "cause of an event: " + ", ".join(f"{number} {name}" for number, name in enumerate(LABELS))
+NAMES = ("t", "x", "y", "p")
 
 CONVENTIONS = {
     "layout": "a sequence's channels one after the other, from offsets[c] up to offsets[c + 1] of its rows",
@@ -56,14 +54,12 @@ class EventStore(Store):
     VERSION = 4
     height: int
     width: int
-    labelled: bool
-    """Whether the store holds the cause of each event."""
 
     @functools.cached_property
     def columns(self) -> Columns:
         """The events, and the index of their times."""
-        types = {"x": "uint16", "y": "uint16", "t": "uint32", "p": "int8", "label": "uint8"}
-        columns = {f"events/{name}": Column("events", types[name], CHUNK) for name in self._names}
+        types = {"x": "uint16", "y": "uint16", "t": "uint32", "p": "int8"}
+        columns = {f"events/{name}": Column("events", types[name], CHUNK) for name in types}
         return {**columns, "ms_to_idx": Column("milliseconds", "int64", MILLISECOND_CHUNK, (CHANNELS,))}
 
     @classmethod
@@ -75,14 +71,12 @@ class EventStore(Store):
         width: int,
         attributes: Mapping[str, Any],
         sequences_per_part: int = 1,
-        labelled: bool = False,
     ) -> "EventStore":
         """Create a store to write; it lies at PATH.tmp until it is finished.
 
         `attributes` (plain JSON) must hold everything that the events depend on: an unfinished store with equal
         metadata is resumed, one with other metadata is removed. One process creates the store. It can be pickled and
-        sent to other processes, which may write different parts at the same time. A `labelled` store holds the label of
-        each event.
+        sent to other processes, which may write different parts at the same time.
         """
         if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
             raise ValueError(f"expected a sensor with sides of 1 to {MAX_SIDE} px, got {height}x{width}")
@@ -93,9 +87,8 @@ class EventStore(Store):
             sequences_per_part,
             height=height,
             width=width,
-            labelled=labelled,
             polarizer_angles_deg=list(POLARIZER_ANGLES_DEG),
-            conventions={**CONVENTIONS, "events/label": LABEL_CONVENTION} if labelled else CONVENTIONS,
+            conventions=CONVENTIONS,
         )
 
     def write(
@@ -105,15 +98,14 @@ class EventStore(Store):
 
         `drawn` (plain JSON) are the camera parameters drawn for this sequence. A sequence that is already written stays
         unchanged, since the store's attributes determine its events.
-        ValueError, before anything is written, for events out of order, off the sensor or outside [0, duration_us], and
-        for events without labels in a labelled store.
+        ValueError, before anything is written, for events out of order, off the sensor or outside [0, duration_us].
         """
         self._check(channels, duration_us)
         if self.is_written(sequence):
             return
         offsets = np.cumsum([0, *map(len, channels)])
         columns = {}
-        for name in self._names:
+        for name in NAMES:
             pieces = [getattr(channel, name).numpy() for channel in channels]
             dtype = self.columns[f"events/{name}"].dtype  # narrower, but holds every value that `_check` accepts
             columns[f"events/{name}"] = np.concatenate(pieces, dtype=dtype, casting="unsafe")
@@ -172,8 +164,7 @@ class EventStore(Store):
 
     def _events(self, sequence: str, spans: Sequence[tuple[int, int]]) -> list[Events]:
         """The events in each of the spans (start, stop) of a sequence's rows."""
-        names = self._names
-        columns = self.read_columns(sequence, [(f"events/{name}", *span) for span in spans for name in names])
+        columns = self.read_columns(sequence, [(f"events/{name}", *span) for span in spans for name in NAMES])
         return [
             Events(
                 torch.from_numpy(t.astype(np.int64)),
@@ -182,14 +173,9 @@ class EventStore(Store):
                 torch.from_numpy(p),
                 self.height,
                 self.width,
-                *map(torch.from_numpy, label),
             )
-            for t, x, y, p, *label in zip(*(columns[i :: len(names)] for i in range(len(names))), strict=True)
+            for t, x, y, p in zip(*(columns[i :: len(NAMES)] for i in range(len(NAMES))), strict=True)
         ]
-
-    @property
-    def _names(self) -> tuple[str, ...]:
-        return (*"txyp", "label") if self.labelled else (*"txyp",)
 
     def _check(self, channels: Sequence[Events], duration_us: int) -> None:
         if len(channels) != CHANNELS:
@@ -202,8 +188,6 @@ class EventStore(Store):
                     f"polarizer {angle}: expected a sensor of {self.height}x{self.width} px, "
                     f"got {channel.height}x{channel.width}"
                 )
-            if self.labelled and channel.label is None:
-                raise ValueError(f"polarizer {angle}: expected events with labels in a labelled store, got none")
             try:
                 _check_channel(channel, duration_us)
             except ValueError as error:
@@ -227,5 +211,3 @@ def _check_channel(events: Events, duration_us: int) -> None:
             f"expected times from 0 to the duration of {duration_us} us, "
             f"got {int(events.t[0])} to {int(events.t[-1])} us"
         )
-    if events.label is not None and (events.label >= len(LABELS)).any():
-        raise ValueError(f"expected labels from 0 to {len(LABELS) - 1}, got {int(events.label.max())}")

@@ -12,7 +12,6 @@ from typing import Any, no_type_check
 import numba
 import numpy as np
 
-from polarnet.events.labels import LABELS
 from polarnet.events.stream import Events, slice_count
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore, first_at_millisecond
@@ -28,8 +27,7 @@ EVT3_WORDS_PER_EVENT = 3  # at most: row, low bits of the time, column; the high
 def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:
     """Write one channel in DSEC's layout of a camera (Gehrig et al. 2021): events/{x,y,t,p}, ms_to_idx and t_offset.
 
-    Polarity is 1 or 0 there. The attributes height and width add the sensor's size, and events/label the labels of
-    events that have them. Needs h5py.
+    Polarity is 1 or 0 there. The attributes height and width add the sensor's size. Needs h5py.
     """
     columns = {
         "x": events.x.numpy().astype(np.uint16),
@@ -37,8 +35,6 @@ def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -
         "t": events.t.numpy().astype(np.uint32),
         "p": (events.p > 0).numpy().astype(np.uint8),
     }
-    if events.label is not None:
-        columns["label"] = events.label.numpy()
     compressed = {"chunks": (min(HDF5_CHUNK, len(events)),), "compression": "gzip", "shuffle": True}
     with h5py_module().File(path, "w") as file:
         for name, values in columns.items():
@@ -51,8 +47,7 @@ def write_hdf5(path: str | os.PathLike[str], events: Events, duration_us: int) -
 def write_text(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:
     """Write one channel as a line `width height`, then a line `t x y p` per event, the format of E2VID's tools.
 
-    t is in seconds with six decimals; p is 1 or 0. Such a file cannot hold the duration. Labels go to a file of their
-    own, NAME_label.txt with a line per event, because E2VID's tools expect four columns.
+    t is in seconds with six decimals; p is 1 or 0. Such a file cannot hold the duration.
     """
     with Path(path).open("w", encoding="ascii") as file:
         file.write(f"{events.width} {events.height}\n")
@@ -60,14 +55,6 @@ def write_text(path: str | os.PathLike[str], events: Events, duration_us: int) -
             block = slice_count(events, start, start + BLOCK)
             rows = zip(*(column.tolist() for column in (block.t, block.x, block.y, block.p)), strict=True)
             file.writelines(f"{t // 1_000_000}.{t % 1_000_000:06d} {x} {y} {int(p > 0)}\n" for t, x, y, p in rows)
-    if events.label is not None:
-        lines = "".join(f"{label}\n" for label in events.label.tolist())
-        label_file(Path(path)).write_text(lines, encoding="ascii")
-
-
-def label_file(path: Path) -> Path:
-    """The file of the labels that belong to a file of `write_text`."""
-    return path.with_name(f"{path.stem}_label.txt")
 
 
 def write_evt3(path: str | os.PathLike[str], events: Events, duration_us: int) -> None:
@@ -139,7 +126,7 @@ def export_store(
     """Write FOLDER/SEQUENCE/polarizer_{000,045,090,135}.{h5,txt,raw} for every sequence, then FOLDER/store.json.
 
     `sequences` are those to write; None: all. `form` is hdf5, text or evt3. store.json holds the data that these files
-    cannot: durations, sizes, attributes, and the names of the labels in a labelled store.
+    cannot: durations, sizes, attributes.
     """
     folder = Path(folder)
     if form not in FORMS:
@@ -161,7 +148,6 @@ def export_store(
         "sequences_per_part": store.sequences_per_part,
         "duration_us": {sequence: store.duration_us(sequence) for sequence in chosen},
         "attributes": store.attributes,
-        **({"labels": LABELS} if store.labelled else {}),
     }
     (folder / EXPORT_INDEX).write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
 

@@ -53,8 +53,6 @@ class StorageConfig:
     """Section `storage` of params.yaml."""
 
     sequences_per_part: PositiveInt
-    labels: bool
-    """Store the cause of each simulated event."""
 
 
 class Store:

@@ -10,18 +10,14 @@ import torch
 
 from polarnet.events.stream import Events
 
-TYPES: dict[str, type[np.generic]] = {"t": np.int64, "x": np.int16, "y": np.int16, "p": np.int8, "label": np.uint8}
+TYPES: dict[str, type[np.generic]] = {"t": np.int64, "x": np.int16, "y": np.int16, "p": np.int8}
 
 
 class EventSpool:
-    """Writer of consecutive pieces of a sequence's channels to `folder`; as a context manager it closes its files.
+    """Writer of consecutive pieces of a sequence's channels to `folder`; as a context manager it closes its files."""
 
-    With `labels`, the labels are written too, and every piece must have them.
-    """
-
-    def __init__(self, folder: Path, labels: bool = False):
+    def __init__(self, folder: Path):
         self.folder = folder
-        self._types = TYPES if labels else {name: dtype for name, dtype in TYPES.items() if name != "label"}
         self._files: list[dict[str, IO[bytes]]] = []
         self._size = (0, 0)
         folder.mkdir(parents=True)
@@ -40,7 +36,7 @@ class EventSpool:
         """Add a piece of every channel."""
         if not self._files:
             self._size = channels[0].height, channels[0].width
-            self._files = [{name: self._path(k, name).open("wb") for name in self._types} for k in range(len(channels))]
+            self._files = [{name: self._path(k, name).open("wb") for name in TYPES} for k in range(len(channels))]
         for columns, events in zip(self._files, channels, strict=True):
             for name, file in columns.items():
                 file.write(getattr(events, name).numpy().tobytes())
@@ -53,9 +49,7 @@ class EventSpool:
         return [self._channel(k) for k in range(len(self._files))]
 
     def _channel(self, channel: int) -> Events:
-        columns = {
-            name: torch.from_numpy(_mapped(self._path(channel, name), dtype)) for name, dtype in self._types.items()
-        }
+        columns = {name: torch.from_numpy(_mapped(self._path(channel, name), dtype)) for name, dtype in TYPES.items()}
         return Events(**columns, height=self._size[0], width=self._size[1])
 
     def _path(self, channel: int, name: str) -> Path:

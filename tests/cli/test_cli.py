@@ -146,26 +146,6 @@ def test_verify_names_a_sequence_whose_file_is_missing_from_a_bucket(two, capsys
         bucket.rm("/bucket", recursive=True)
 
 
-def test_labels_counts_causes_and_scores_the_removal_of_hot_pixels(store, tmp_path, capsys):
-    """A pixel fires 40 times in a second because it is hot; four others fire once, two of them as signal."""
-    assert main(["labels", str(store), "lake"]) == 1
-    assert "expected a store with labels; write it again with storage.labels=true" in capsys.readouterr().err
-    t = torch.tensor([*range(0, 800_000, 20_000), 850_000, 860_000, 870_000, 880_000])
-    x, y = torch.tensor([9] * 40 + [0, 1, 2, 3]).short(), torch.zeros(44).short()
-    label = torch.tensor([3] * 40 + [0, 0, 1, 2]).to(torch.uint8)
-    events = Events(t, x, y, torch.ones(44).to(torch.int8), 10, 20, label)
-    writer = EventStore.create(tmp_path / "labelled.zarr", ["lake"], 10, 20, {}, labelled=True)
-    writer.write("lake", [events] * 4, 1_000_000)
-    writer.finish()
-    assert main(["labels", str(tmp_path / "labelled.zarr"), "lake", "--picture", str(tmp_path / "l.png")]) == 0
-    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert printed[1:5] == [["signal", "8", "0"], ["leak", "4", "0"], ["shot", "4", "0"], ["hot", "160", "160"]]
-    assert " ".join(printed[5]) == (
-        "removal of 4 hot pixels: precision 1.0000, recall 0.9524, signal kept 1.0000"
-    )  # 160 / 168
-    assert (tmp_path / "l.png").read_bytes().startswith(b"\x89PNG")
-
-
 def test_a_name_that_is_not_utf_8_is_refused_before_any_work(capsys):
     with pytest.raises(SystemExit) as ending:
         main(["recover", "camera\udcff.raw"])

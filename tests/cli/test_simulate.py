@@ -15,22 +15,17 @@ from polarnet.events.stream import Events
 from polarnet.pictures.images import fit, read_rgb
 from polarnet.pictures.polarimetry import demosaic
 from polarnet.recordings.recording import read_recording
-from polarnet.runtime.machine import seed_for
 from polarnet.simulation import (
     MOTIONS,
     POLARIZERS,
     SENSORS,
     Camera,
     scene_from_intensities,
-    scene_from_rgb,
     simulate,
     simulate_video,
     video,
 )
-from polarnet.simulation.emulator import emulate_columns
-from polarnet.simulation.polarizers import IDEAL
 from polarnet.simulation.readout import PERFECT
-from polarnet.simulation.rendering import behind_polarizers, weights_of
 from polarnet.simulation.upsampling import StokesFrame
 from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 from polarnet.storage.events import EventStore
@@ -348,59 +343,3 @@ def test_a_long_clip_does_not_stay_in_memory(monkeypatch):
     for k in range(1, 4):
         assert next(pieces).stop_us == 1000 * (4 * k - 1)
         assert len(read) == 4 * k
-
-
-def labelled(out="out") -> list[Events]:
-    channels = stored(out)
-    assert all(channel.label is not None for channel in channels)
-    return channels
-
-
-def test_labels_are_those_of_python_and_leave_the_events_as_they_are():
-    write_video("walk.mp4", scenery(3))
-    noisy = ["sensor=noisy", "seed=7", "emulate.hot_pixel_share=0.02"]
-    assert main(["simulate", "walk.mp4", "--out", "plain", "--no-preview", *noisy]) == 0
-    assert main(["simulate", "walk.mp4", "--out", "out", *noisy, "storage.labels=true"]) == 0
-    assert all(channel.label is None for channel in stored("plain"))
-    assert_equal(labelled(), stored("plain"))
-    stokes = np.stack([scene_from_rgb(frame).stokes.numpy() for frame in rgb(decoded("walk.mp4"))], axis=1)
-    light = behind_polarizers(stokes, weights_of(IDEAL, HEIGHT, WIDTH, 0)).swapaxes(0, 1)
-    sensor, key = replace(SENSORS["noisy"], hot_pixel_share=0.02), seed_for(7, "video", "emulate")
-    columns, _ = emulate_columns(light, np.array(T_US), sensor, key, labels=True)
-    for channel, expected in zip(labelled(), columns, strict=True):
-        assert channel.label.tolist() == expected.label.tolist()
-    assert {label for channel in labelled() for label in channel.label.tolist()} >= {0, 2, 3}
-
-
-def test_labels_of_a_moving_sensor_do_not_depend_on_pieces(monkeypatch):
-    cv2.imwrite("lake.png", scenery(3, 80, 110)[0])
-    words = ["simulate", "lake.png", *SMALL, "sensor=noisy", "storage.labels=true", "--no-preview"]
-    assert main([*words, "--out", "out"]) == 0
-    monkeypatch.setattr(video, "MOTION_STEPS", 3)
-    assert main([*words, "--out", "pieces"]) == 0
-    for whole, pieces in zip(labelled(), labelled("pieces"), strict=True):
-        assert whole.label.tolist() == pieces.label.tolist()
-        assert len(set(whole.label.tolist())) > 1
-
-
-def test_labels_are_in_hdf5_and_text_also_of_a_sensor_whose_channels_are_joined():
-    h5py = pytest.importorskip("h5py")
-    write_video("walk.mp4", scenery(3))
-    words = ["simulate", "walk.mp4", "--no-preview", "sensor=noisy", "storage.labels=true", "--format", "store", "hdf5"]
-    assert main([*words, "text", "--out", "out"]) == 0
-    for angle, channel in zip(POLARIZER_ANGLES_DEG, labelled(), strict=True):
-        with h5py.File(f"out/polarizer_{angle:03d}.h5") as file:
-            assert file["events/label"][:].tolist() == channel.label.tolist()
-        assert np.loadtxt(f"out/polarizer_{angle:03d}_label.txt", dtype=int).tolist() == channel.label.tolist()
-    assert main([*words, "--out", "dofp", "polarizers.layout=dofp"]) == 0
-    with h5py.File("dofp/sensor.h5") as file:
-        joined = np.bincount(file["events/label"][:], minlength=4)
-    assert joined.tolist() == sum(np.bincount(c.label.numpy(), minlength=4) for c in labelled("dofp")).tolist()
-
-
-def test_a_format_without_room_for_labels_is_refused(capsys):
-    write_video("walk.mp4", scenery(3))
-    words = ["simulate", "walk.mp4", "--format", "store", "evt3", "--out", "out"]
-    assert main([*words, "storage.labels=true"]) != 0
-    assert "expected formats that hold labels (store, hdf5, text), got evt3" in capsys.readouterr().err
-    assert main([*words, "--no-preview"]) == 0

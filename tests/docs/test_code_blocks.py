@@ -106,7 +106,7 @@ PYTHON_PAGES = sorted({block.page for block in blocks("python")} - {ROOT / "docs
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The files that blocks open: a small labelled event store, a text recording, frames and a photograph."""
+    """The files that blocks open: a small event store, a text recording, frames and a photograph."""
     folder = tmp_path_factory.mktemp("documentation")
     picture = np.random.default_rng(1).integers(0, 255, (12, 18, 3), np.uint8)
     picture = cv2.resize(picture, (600, 400), interpolation=cv2.INTER_LINEAR)
@@ -119,12 +119,10 @@ def folder(tmp_path_factory):
     (folder / "capture.csv").write_text("\n".join(["40 30", *lines]) + "\n")
     small = ["synthesize.sensor_height=60", "synthesize.sensor_width=80", "synthesize.duration_s=0.2"]
     with contextlib.chdir(folder):
-        drawn = "emulate.randomise={cutoff_hz: [100.0, 300.0]}"
-        settings = [*small, drawn, "storage.labels=true"]
+        settings = [*small, "emulate.randomise={cutoff_hz: [100.0, 300.0]}"]
         assert main(["simulate", "coffee-00.png", *settings, "--no-preview", "--out", "out"]) == 0
         (folder / "data").mkdir()
-        for name in ("data/events.zarr", "labelled.zarr"):
-            (folder / name).symlink_to(folder / "out" / "events.zarr")
+        (folder / "data/events.zarr").symlink_to(folder / "out" / "events.zarr")
     return folder
 
 

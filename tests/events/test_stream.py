@@ -1,7 +1,5 @@
 """Operations on a stream of events."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +10,6 @@ from polarnet.events.stream import (
     crop,
     downscale,
     merge,
-    select,
     slice_count,
     slice_time,
     validate,
@@ -40,19 +37,6 @@ def test_a_count_slice_shares_the_memory_of_the_stream(make_events):
 def test_a_crop_counts_from_its_own_corner(make_events):
     events = make_events([(0, 4, 3, 1), (1, 5, 3, -1), (2, 7, 5, 1), (3, 8, 3, 1)], 8, 10)
     assert rows(crop(events, top=3, left=5, height=3, width=3)) == [(1, 0, 0, -1), (2, 2, 2, 1)]
-
-
-def test_labels_stay_with_their_events(make_events):
-    """Each label is the event's column."""
-    events = make_events([(2 * k, k, k % 3, 1) for k in range(6)], 3, 6)
-    labelled = dataclasses.replace(events, label=events.x.to(torch.uint8))
-    assert slice_time(labelled, 4, 9).label.tolist() == [2, 3, 4]
-    assert crop(labelled, 0, 2, 3, 3).label.tolist() == [2, 3, 4]
-    assert select(labelled, torch.tensor([5, 0])).label.tolist() == [5, 0]
-    assert downscale(labelled, 1, 2, keep_rate=False).label.tolist() == [0, 1, 2, 3, 4, 5]
-    assert merge([labelled, labelled]).label.tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
-    assert concatenate([slice_count(labelled, 0, 2), slice_count(labelled, 2, 6)]).label.tolist() == [0, 1, 2, 3, 4, 5]
-    assert merge([labelled, events]).label is None
 
 
 def test_a_crop_beyond_the_sensor_is_refused(make_events):

@@ -9,7 +9,6 @@ import torch
 from scipy import stats
 
 from polarnet.simulation.emulator import MODELS, EmulatorConfig, emulate, emulate_columns
-from polarnet.simulation.pixels.columns import HOT, SIGNAL
 from polarnet.simulation.presets import SENSORS
 
 QUIET = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
@@ -18,10 +17,10 @@ CHANNEL = SIDE * SIDE
 
 
 def constant(config: EmulatorConfig, dn: float, seconds: float):
-    """Events of 100 x 100 pixels under constant light, with labels and unrounded times."""
+    """Events of 100 x 100 pixels under constant light, with unrounded times."""
     t_us = torch.linspace(0, seconds * 1e6, 11, dtype=torch.float64)
     frames = torch.full((1, 1, SIDE, SIDE), dn).expand(len(t_us), -1, -1, -1)
-    (columns,), _ = emulate_columns(frames, t_us, config, key=3, labels=True, unrounded_times=True)
+    (columns,), _ = emulate_columns(frames, t_us, config, key=3, unrounded_times=True)
     return columns
 
 
@@ -31,8 +30,16 @@ def bars() -> torch.Tensor:
     return (127.5 + 100 * torch.sin(phase)).expand(-1, 2, 24, -1).contiguous()
 
 
+def places_of(events) -> np.ndarray:
+    return np.asarray(events.y).astype(int) * 1000 + np.asarray(events.x)
+
+
 def places(events) -> np.ndarray:
-    return np.unique(np.asarray(events.y).astype(int) * 1000 + np.asarray(events.x))
+    return np.unique(places_of(events))
+
+
+def rows_of(events, which) -> list[list[int]]:
+    return [getattr(events, name)[which].tolist() for name in "txyp"]
 
 
 def test_hot_pixels_have_the_configured_share_and_rate_and_both_polarities():
@@ -42,7 +49,6 @@ def test_hot_pixels_have_the_configured_share_and_rate_and_both_polarities():
     expected = hot * 50.0 * 4.0
     assert len(columns.t) == pytest.approx(expected, abs=3 * math.sqrt(expected))
     assert columns.p.sum() == pytest.approx(0, abs=3 * math.sqrt(expected))
-    assert (columns.label == HOT).all()
 
 
 def test_a_hot_pixel_is_a_poisson_process():
@@ -64,12 +70,12 @@ def test_hot_pixels_fire_whatever_the_light_and_the_model(model):
     dark, still = constant(config, 1.0, 0.5), constant(config, 240.0, 0.5)
     assert np.array_equal(dark.unrounded_us, still.unrounded_us)
     frames, t_us = bars(), 3333 * torch.arange(12)
-    columns, _ = emulate_columns(frames, t_us, dataclasses.replace(config, model=model), key=7, labels=True)
-    for channel in columns:
-        hot = channel.label == HOT
-        own = channel.y.astype(int) * 40 + channel.x
-        assert hot.any()
-        assert not np.isin(own[~hot], own[hot]).any()  # their light is unseen
+    moving, _ = emulate(frames, t_us, dataclasses.replace(config, model=model), key=7)
+    at_rest, _ = emulate(frames[:1].expand_as(frames), t_us, dataclasses.replace(config, model=model), key=7)
+    for channel, hot in zip(moving, at_rest, strict=True):
+        their_own = torch.from_numpy(np.isin(places_of(channel), places_of(hot)))
+        assert len(hot)
+        assert rows_of(channel, their_own) == rows_of(hot, slice(None))  # their light is unseen
 
 
 @pytest.mark.parametrize("model", list(MODELS))
@@ -91,7 +97,7 @@ def test_dead_pixels_are_silent_and_the_others_fire_as_before(model):
 
 def test_all_pixels_dead_leave_no_event_even_of_hot_ones():
     columns = constant(dataclasses.replace(QUIET, hot_pixel_share=1.0, dead_pixel_share=1.0), 100.0, 1.0)
-    assert len(columns.t) == len(columns.label) == len(columns.unrounded_us) == 0
+    assert len(columns.t) == len(columns.unrounded_us) == 0
 
 
 @pytest.mark.parametrize("model", list(MODELS))
@@ -115,8 +121,7 @@ def test_pieces_threads_and_the_order_of_channels_change_no_event(model):
         assert np.array_equal(order, np.arange(len(events)))
 
 
-def test_labels_and_unrounded_times_stay_with_their_events():
+def test_unrounded_times_stay_with_their_events():
     config = dataclasses.replace(QUIET, hot_pixel_share=0.1, hot_pixel_rate_hz=500.0)
-    (columns, _), _ = emulate_columns(bars(), 3333 * torch.arange(12), config, key=7, labels=True, unrounded_times=True)
-    assert set(columns.label) == {SIGNAL, HOT}
+    (columns, _), _ = emulate_columns(bars(), 3333 * torch.arange(12), config, key=7, unrounded_times=True)
     assert np.array_equal(np.floor(columns.unrounded_us), columns.t)

@@ -1,4 +1,4 @@
-"""Noise has the statistics that the models give it; labels say which process an event came from."""
+"""Noise has the statistics that the models give it."""
 
 import dataclasses
 import math
@@ -9,7 +9,6 @@ import torch
 from scipy import stats
 
 from polarnet.simulation.emulator import EmulatorConfig, emulate_columns
-from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL
 from polarnet.simulation.pixels.randomness import mixed, normal, normal_map, rough_normals, uniform
 from polarnet.simulation.presets import SENSORS
 
@@ -21,7 +20,7 @@ def still(config: EmulatorConfig, dn: float, seconds: float, fps: int, **wanted)
     """Events of 64 x 64 pixels that see a constant light."""
     t_us = torch.from_numpy(np.rint(np.arange(round(seconds * fps) + 1) * 1e6 / fps))
     frames = torch.full((1, 1, SIDE, SIDE), dn).expand(len(t_us), -1, -1, -1)
-    (columns,), _ = emulate_columns(frames, t_us, config, key=5, labels=True, unrounded_times=True, **wanted)
+    (columns,), _ = emulate_columns(frames, t_us, config, key=5, unrounded_times=True, **wanted)
     return columns
 
 
@@ -41,7 +40,6 @@ def test_shot_noise_has_the_rate_of_its_light_and_equal_polarities(model, dn):
     expected = 5.0 * (1 - 0.75 * (dn + 20) / 275) * 2.0 * SIDE**2
     assert len(columns.t) == pytest.approx(expected, abs=3 * math.sqrt(expected))
     assert columns.p.sum() == pytest.approx(0, abs=3 * math.sqrt(expected))
-    assert (columns.label == SHOT).all()
 
 
 def test_shot_noise_of_exact_is_a_poisson_process_at_any_frame_rate():
@@ -58,8 +56,7 @@ def test_rejected_shot_noise_does_not_delay_a_threshold_crossing():
     config = dataclasses.replace(QUIET, shot_noise_rate_hz=40.0)
     t_s = np.arange(101) / 100
     frames = np.float32(50 * 5**t_s).reshape(-1, 1, 1, 1).repeat(SIDE, 2).repeat(SIDE, 3)
-    (columns,), _ = emulate_columns(frames, t_s * 1e6, config, key=5, labels=True, unrounded_times=True)
-    assert (columns.label == SHOT).mean() > 0.5
+    (columns,), _ = emulate_columns(frames, t_s * 1e6, config, key=5, unrounded_times=True)
     between, first = intervals_s(columns)
     until_crossing_s = config.contrast_threshold_on / math.log(5)  # in log light that rises steadily
     assert max(between.max(), first.max()) == pytest.approx(until_crossing_s, abs=2e-6)
@@ -83,7 +80,6 @@ def test_leak_of_v2e_has_its_rate_and_a_jitter_that_shrinks_with_the_frame_rate(
     columns = still(dataclasses.replace(QUIET, model="v2e", leak_rate_hz=1.0, leak_jitter=0.1), 100.0, 5.0, fps)
     intervals, first = intervals_s(columns)
     assert (columns.p == 1).all()
-    assert (columns.label == LEAK).all()
     # the jitter of the frames adds up to 0.1 sqrt(dt / R); events are stamped at frames
     spread = math.sqrt(0.01 / fps + 1 / 6 / fps**2)
     assert intervals.mean() == pytest.approx(1.0, abs=4 * spread / math.sqrt(len(intervals)) + 0.1 / fps)
@@ -96,7 +92,6 @@ def test_leak_of_exact_has_its_rate_a_random_phase_and_the_same_jitter_at_any_fr
     columns = still(dataclasses.replace(QUIET, leak_rate_hz=1.0, leak_jitter=0.1), 100.0, 5.0, fps)
     intervals, first = intervals_s(columns)
     assert (columns.p == 1).all()
-    assert (columns.label == LEAK).all()
     # an interval lasts 1 / (1 - 0.1 n): mean 1 + 0.01, standard deviation 0.1 and a little
     assert intervals.mean() == pytest.approx(1.01, abs=0.005)
     assert intervals.std() == pytest.approx(0.104, abs=0.004)
@@ -119,15 +114,6 @@ def test_leak_rates_spread_over_pixels_by_a_power_of_ten():
     decades = np.log10(state.pixels[0].leak_nominal / (1e-6 * 0.2))
     assert decades.mean() == pytest.approx(0, abs=3 * 0.1 / 100)
     assert decades.std() == pytest.approx(0.1, abs=3 * 0.1 / math.sqrt(2) / 100)
-
-
-@pytest.mark.parametrize("model", ["v2e", "exact", "esim"])
-def test_events_of_a_changing_light_are_labelled_as_signal(model):
-    ramp = torch.linspace(3.5, 5.5, 21).exp().view(-1, 1, 1, 1)
-    config = dataclasses.replace(QUIET, model=model)
-    (columns,), _ = emulate_columns(ramp, 3333 * torch.arange(21), config, key=1, labels=True)
-    assert len(columns.t) >= 9
-    assert (columns.label == SIGNAL).all()
 
 
 def test_uniform_numbers_are_uniform_and_neighbours_are_independent():

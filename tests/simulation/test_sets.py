@@ -24,9 +24,7 @@ SMALL = [
 @pytest.fixture
 def recipe(project_root):
     config = load(project_root, SMALL)
-    return Recipe(
-        config.ingest, config.synthesize, config.camera, config.seed, threads=1, sequences_per_part=2, labels=False
-    )
+    return Recipe(config.ingest, config.synthesize, config.camera, config.seed, threads=1, sequences_per_part=2)
 
 
 @pytest.fixture

@@ -493,7 +493,7 @@ def test_a_part_holds_at_least_one_sequence(tmp_path):
     with pytest.raises(ValueError, match="at least one sequence per part, got 0"):
         Numbers.create_parts(tmp_path / "store.zarr", NAMES, {}, 0)
     with pytest.raises(ValueError, match="sequences_per_part: expected > 0, got 0"):
-        StorageConfig(sequences_per_part=0, labels=False)
+        StorageConfig(sequences_per_part=0)
 
 
 @pytest.mark.parametrize("content", ["6", "[]", "{"])

@@ -6,12 +6,11 @@ import numpy as np
 
 from polarnet.simulation.compilation import compiled, inlined
 
-SIGNAL, LEAK, SHOT, HOT = range(4)
-TIME_SHIFT, ROW_SHIFT, COLUMN_SHIFT, POLARITY_SHIFT = np.int64(33), np.int64(18), np.int64(3), np.int64(2)
+TIME_SHIFT, ROW_SHIFT, COLUMN_SHIFT = np.int64(31), np.int64(16), np.int64(1)
 
 
 class Columns(NamedTuple):
-    """Events of one channel, one array per field. `label` and `unrounded_us` are empty unless requested."""
+    """Events of one channel, one array per field. `unrounded_us` is empty unless requested."""
 
     t: np.ndarray
     """int64, microseconds"""
@@ -21,8 +20,6 @@ class Columns(NamedTuple):
     """int16, row"""
     p: np.ndarray
     """int8, +1 or -1"""
-    label: np.ndarray
-    """uint8, the process behind the event: SIGNAL, LEAK, SHOT or HOT"""
     unrounded_us: np.ndarray
     """float64, microseconds before rounding to t"""
 
@@ -30,7 +27,7 @@ class Columns(NamedTuple):
 EVENT_BYTES = 8 + 2 + 2 + 1
 
 
-def empty_columns(capacity: int, labels: bool, unrounded_times: bool) -> Columns:
+def empty_columns(capacity: int, unrounded_times: bool) -> Columns:
     """Uninitialised arrays for up to `capacity` events of a channel."""
     # One allocation for all four: the system gives large blocks as huge pages, which costs far fewer page faults.
     block = np.empty(capacity * EVENT_BYTES, np.uint8)
@@ -39,7 +36,6 @@ def empty_columns(capacity: int, labels: bool, unrounded_times: bool) -> Columns
         block[8 * capacity : 10 * capacity].view(np.int16),
         block[10 * capacity : 12 * capacity].view(np.int16),
         block[12 * capacity :].view(np.int8),
-        np.empty(capacity if labels else 0, np.uint8),
         np.empty(capacity if unrounded_times else 0, np.float64),
     )
 
@@ -67,7 +63,6 @@ def with_room(columns, used, more):
         _grown_column(columns.x, used, capacity),
         _grown_column(columns.y, used, capacity),
         _grown_column(columns.p, used, capacity),
-        _grown_column(columns.label, used, capacity) if columns.label.size else columns.label,
         _grown_column(columns.unrounded_us, used, capacity) if columns.unrounded_us.size else columns.unrounded_us,
     )
 
@@ -79,12 +74,12 @@ def place_of(y, x):
 
 
 @inlined
-def event_of(offset_us, place, on, label):
+def event_of(offset_us, place, on):
     """Pack an event into an int64, so that integers sort by (t, y, x, p).
 
-    From the highest bits: microseconds since a base time (31 bits), row (15), column (15), 1 for ON (1), label (2).
+    From the highest bits: microseconds since a base time (32 bits), row (15), column (15), 1 for ON (1).
     """
-    return np.int64(offset_us) << TIME_SHIFT | place | np.int64(on) << POLARITY_SHIFT | np.int64(label)
+    return np.int64(offset_us) << TIME_SHIFT | place | np.int64(on)
 
 
 @compiled
@@ -93,11 +88,9 @@ def sort_ties(columns, start, stop):
     events = np.empty(stop - start, np.int64)
     for i in range(events.size):
         t_us, place = columns.t[start + i] - columns.t[start], place_of(columns.y[start + i], columns.x[start + i])
-        events[i] = event_of(t_us, place, columns.p[start + i] > 0, 0)
+        events[i] = event_of(t_us, place, columns.p[start + i] > 0)
     order = start + np.argsort(events, kind="mergesort")
     columns.t[start:stop], columns.x[start:stop] = columns.t[order], columns.x[order]
     columns.y[start:stop], columns.p[start:stop] = columns.y[order], columns.p[order]
-    if columns.label.size:
-        columns.label[start:stop] = columns.label[order]
     if columns.unrounded_us.size:
         columns.unrounded_us[start:stop] = columns.unrounded_us[order]

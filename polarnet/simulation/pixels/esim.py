@@ -13,7 +13,7 @@ from pydantic import PositiveFloat
 
 from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import ZERO, compiled
-from polarnet.simulation.pixels.columns import SIGNAL, event_of, place_of
+from polarnet.simulation.pixels.columns import event_of, place_of
 from polarnet.simulation.pixels.light import FULL_SCALE, intensity_rows, ln
 from polarnet.simulation.pixels.pending import pending_events, roomier, write_in_order
 from polarnet.simulation.pixels.physics import PixelConfig
@@ -145,7 +145,7 @@ def _fire(pixels, physics, y, logarithm, start_us, stop_us, pending, n):
             waited = event_us - pixels.last_event_us[i]
             if waited > physics.refractory_us or (waited == physics.refractory_us and not physics.gpu):
                 offset_us = min(np.int64(event_us), np.int64(math.ceil(stop_us)) - 1) - base_us
-                pending.events[n] = event_of(offset_us, place, on, SIGNAL)
+                pending.events[n] = event_of(offset_us, place, on)
                 if pending.unrounded_us.size:
                     pending.unrounded_us[n] = event_us
                 pixels.last_event_us[i] = event_us

@@ -14,7 +14,7 @@ import numpy as np
 from polarnet.simulation.compilation import ZERO, borrowing, compiled, inlined
 from polarnet.simulation.pixels import physics, randomness
 from polarnet.simulation.pixels.active import empty_active, gather, keep_continuing, scatter
-from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL, event_of, place_of
+from polarnet.simulation.pixels.columns import event_of, place_of
 from polarnet.simulation.pixels.light import intensity_rows, linlog
 from polarnet.simulation.pixels.pending import pending_events, roomier, write_in_order
 from polarnet.simulation.pixels.physics import (
@@ -318,9 +318,8 @@ def _next_crossing(active, count, refractory_us, duration_us):
         event = ready + (0.0 if excess >= 0 else wait)
         left = max(excess, 0.0)  # a crossing leaves nothing of the change; after waiting, the excess remains
         left = left if on else -left
-        leaked = on & (leak * (event - last) > 0.5 * threshold_on)
         fires = event < duration_us
-        active.event[a] = event_of(0, 0, on, LEAK if leaked else SIGNAL)
+        active.event[a] = event_of(0, 0, on)
         active.fires[a] = fires
         active.next_change[a], active.next_now[a] = left if fires else change, event if fires else now
 
@@ -341,7 +340,7 @@ def _insert_shots(pixels, step, active, count):
             accepted, is_on = _shot(step.physics, step.shot_key, i, shot_us, on, off, pixels.dn[i])
             pixels.next_shot_us[i] += _until_next_shot(step.physics, step.shot_key, i, shot_us, on, off)
             if accepted and shot >= active.last_event[a] + step.refractory_us:
-                active.event[a], active.fires[a] = event_of(0, 0, is_on, SHOT), 1
+                active.event[a], active.fires[a] = event_of(0, 0, is_on), 1
                 active.next_change[a], active.next_now[a] = 0.0, shot
                 replaced = True
             shot = pixels.next_shot_us[i] - step.start_us
@@ -374,7 +373,7 @@ def _append_events(active, count, width, start_us, pending, n):
     for a in range(count):
         y = np.int64((active.pixel[a] + 0.5) * per_row)
         place = place_of(y, active.pixel[a] - y * width)
-        active.event[a] |= event_of(since_whole_us + active.next_now[a], place, 0, 0)
+        active.event[a] |= event_of(since_whole_us + active.next_now[a], place, 0)
     for a in range(count):
         at = np.uint64(n)  # the entry of a pixel that does not fire is overwritten by the next
         pending.events[at] = active.event[a]

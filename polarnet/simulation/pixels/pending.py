@@ -9,16 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from polarnet.simulation.compilation import compiled
-from polarnet.simulation.pixels.columns import (
-    COLUMN_SHIFT,
-    POLARITY_SHIFT,
-    ROW_SHIFT,
-    TIME_SHIFT,
-    sort_ties,
-    with_room,
-)
+from polarnet.simulation.pixels.columns import COLUMN_SHIFT, ROW_SHIFT, TIME_SHIFT, sort_ties, with_room
 
-PLACE_MASK, LABEL_MASK = np.int64(0x7FFF), np.int64(3)
+PLACE_MASK = np.int64(0x7FFF)
 MAX_BUCKETS = 4096  # buckets of the counting sort; a step shorter than 4096 us has one bucket per microsecond
 
 
@@ -71,10 +64,7 @@ def write_in_order(pending, n, start_us, stop_us, columns, used):
         t[i] = base_us + (event >> TIME_SHIFT)
         x[i] = event >> COLUMN_SHIFT & PLACE_MASK
         y[i] = event >> ROW_SHIFT & PLACE_MASK
-        p[i] = (event >> POLARITY_SHIFT & np.int64(1)) * np.int64(2) - np.int64(1)
-    if columns.label.size:
-        for i in range(n):
-            columns.label[used + i] = pending.in_order[i] & LABEL_MASK
+        p[i] = (event & np.int64(1)) * np.int64(2) - np.int64(1)
     tied = used  # a step that does not start at a whole microsecond can share one with the step before it
     while n > 0 and tied > 0 and columns.t[tied - 1] >= columns.t[used]:
         tied -= 1

@@ -11,7 +11,7 @@ import numpy as np
 
 from polarnet.simulation.compilation import ONE, ZERO, borrowing, compiled
 from polarnet.simulation.pixels import physics, randomness
-from polarnet.simulation.pixels.columns import LEAK, SHOT, SIGNAL, sort_ties, with_room
+from polarnet.simulation.pixels.columns import sort_ties, with_room
 from polarnet.simulation.pixels.light import intensity_rows, linlog_8bit, linlog_as_v2e
 from polarnet.simulation.pixels.physics import (
     DARK_OFFSET,
@@ -46,8 +46,6 @@ class Pixels(NamedTuple):
     """Leak rate relative to the nominal rate, frozen per pixel."""
     refractory_since: np.ndarray
     """Time in seconds of the last event that started a refractory period."""
-    last_event_us: np.ndarray
-    """float64, kept while events are labelled: the leak since then tells a leak event from a signal event."""
 
 
 class Step(NamedTuple):
@@ -89,7 +87,6 @@ def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: 
         threshold_off=threshold_off,
         leak_factor=leak_factor_map(physics, n, key, channel),
         refractory_since=np.full(n, -physics.refractory_s, np.float32),
-        last_event_us=np.zeros(n, np.float64),
     )
 
 
@@ -111,7 +108,6 @@ def start(light, pixels, steps):
     if pixels.photoreceptor.size:
         pixels.photoreceptor[:] = linlog
     pixels.memory[:] = linlog
-    pixels.last_event_us[:] = steps.times_us[0]
 
 
 @compiled
@@ -257,7 +253,7 @@ def _emit(pixels, step, firing, n, most, columns, used):
         )
         columns = with_room(columns, used, active + 1)
         written, active = _emit_slot(
-            pixels, physics, firing, active, slot, unrounded_us, stamp, least, refractory, columns, used
+            pixels, firing, active, slot, unrounded_us, stamp, least, refractory, columns, used
         )
         used += written
     _consume(pixels, firing.entries, n)
@@ -265,7 +261,7 @@ def _emit(pixels, step, firing, n, most, columns, used):
 
 
 @borrowing
-def _emit_slot(pixels, physics, firing, active, slot, unrounded_us, stamp, least, refractory, columns, used):
+def _emit_slot(pixels, firing, active, slot, unrounded_us, stamp, least, refractory, columns, used):
     """Append the events of one slot; returns their number, and how many pixels have events left.
 
     The columns have room for one event more than there are active pixels.
@@ -282,8 +278,6 @@ def _emit_slot(pixels, physics, firing, active, slot, unrounded_us, stamp, least
         polarity = np.int32(1) if crossed > 0 else np.int32(-1)
         t[at], x[at], y[at], p[at] = t_us, place & 0xFFFF, place >> 16, polarity
         entries[e, ACCEPTED] += polarity if accepted else np.int32(0)
-        if columns.label.size and accepted:
-            columns.label[used + written] = _label(pixels, physics, i, unrounded_us, polarity)
         if columns.unrounded_us.size:
             columns.unrounded_us[used + written] = unrounded_us
         written += int(accepted)
@@ -299,14 +293,6 @@ def _consume(pixels, entries, n):
         i, accepted = np.uint64(entries[a, PIXEL]), entries[a, ACCEPTED]
         on, off = pixels.threshold_on[i], pixels.threshold_off[i]
         pixels.memory[i] += (on if accepted > 0 else off) * np.float32(accepted)
-
-
-@borrowing
-def _label(pixels, physics, i, time_us, polarity):
-    """Label of an event, whose time is remembered: LEAK for ON after a leak of over half a threshold, else SIGNAL."""
-    leaked = physics.leak_rate_hz * pixels.leak_factor[i] * (time_us - pixels.last_event_us[i]) * 1e-6
-    pixels.last_event_us[i] = time_us
-    return LEAK if polarity > 0 and leaked > 0.5 else SIGNAL
 
 
 @compiled
@@ -339,9 +325,6 @@ def _emit_shots(light, frame, pixels, step, w, columns, used):
         columns = with_room(columns, used, ONE)
         columns.t[used], columns.x[used], columns.y[used] = np.int64(np.rint(step.stop_us)), i - row * w, row
         columns.p[used] = 1 if u < on else -1
-        if columns.label.size:
-            columns.label[used] = SHOT
-            pixels.last_event_us[i] = step.stop_us
         if columns.unrounded_us.size:
             columns.unrounded_us[used] = step.stop_us
         pixels.memory[i] = pixels.filtered[i]

@@ -12,7 +12,7 @@ import numpy as np
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.compilation import ZERO, compiled
 from polarnet.simulation.pixels import randomness
-from polarnet.simulation.pixels.columns import SIGNAL, event_of, place_of
+from polarnet.simulation.pixels.columns import event_of, place_of
 from polarnet.simulation.pixels.light import intensity_rows
 from polarnet.simulation.pixels.pending import pending_events, roomier, write_in_order
 from polarnet.simulation.pixels.randomness import key_for, mixed, normal, uniform
@@ -126,7 +126,7 @@ def _walk(pixels, step, y, dn, pending, n):
             now, voltage = now + wait, 0.0
             if n == pending.events.size:
                 pending = roomier(pending)
-            pending.events[n] = event_of(np.int64(start_us - base_us + now), place, on, SIGNAL)
+            pending.events[n] = event_of(np.int64(start_us - base_us + now), place, on)
             if pending.unrounded_us.size:
                 pending.unrounded_us[n] = start_us + now
             n += 1
