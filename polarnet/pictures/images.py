@@ -1,5 +1,6 @@
 """RGB pictures from any file that OpenImageIO reads: upright, without alpha, in sRGB, cut and scaled to one size."""
 
+import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,43 +11,25 @@ import cv2
 import numpy as np
 import OpenImageIO as oiio
 import torch
-from jaxtyping import Float, Float32, Shaped
+from jaxtyping import Float, Float32, Shaped, UInt8
+from PIL import Image, ImageCms
 from torch import Tensor
 
-from polarnet.pictures.icc import srgb_from_profile
 from polarnet.runtime.files import sha256
 
 MAX_PIXELS = 2**28  # limit for one picture, which takes 3 GiB as float32 RGB
 SRGB = "srgb_rec709_scene"  # OpenImageIO's name
 TAKEN_AS_SRGB = {"", SRGB, "g22_rec709_scene"}  # a PNG that says gamma 1/2.2 is how older programs wrote sRGB
 LINEAR_FORMATS = {"openexr", "hdr"}  # hold linear light unless they say otherwise
-CAMERA_RAW = frozenset(
-    [
-        "dng",
-        "nef",
-        "nrw",
-        "cr2",
-        "cr3",
-        "crw",
-        "arw",
-        "srf",
-        "sr2",
-        "raf",
-        "orf",
-        "rw2",
-        "pef",
-        "srw",
-        "3fr",
-        "iiq",
-        "erf",
-        "mrw",
-        "x3f",
-    ]
-)
+CAMERA_RAW = frozenset([
+    "dng", "nef", "nrw", "cr2", "cr3", "crw", "arw", "srf", "sr2", "raf", "orf", "rw2", "pef", "srw", "3fr", "iiq",
+    "erf", "mrw", "x3f",
+])  # fmt: skip
 NOT_IN_THE_WHEEL = frozenset(["heic", "heif", "avif"])
-NO_PICTURES = frozenset(
-    ["null", "nul", "term", "zfile", "z", "env", "sm", "tx", "vsm", "int", "inta"]
-)  # extensions OpenImageIO lists as well
+NO_PICTURES = frozenset(["null", "nul", "term", "zfile", "z", "env", "sm", "tx", "vsm", "int", "inta"])
+"""Extensions that OpenImageIO lists as well."""
+LEVELS = np.linspace(0, 255, 18).astype(np.uint8)
+SRGB_LATTICE = np.stack(np.meshgrid(LEVELS, LEVELS, LEVELS), axis=-1).reshape(18, -1, 3)
 
 
 class UnreadablePicture(ValueError):
@@ -124,20 +107,39 @@ def upright(pixels: Shaped[np.ndarray, "h w c"], orientation: int) -> Shaped[np.
 def srgb_of(pixels: Float32[np.ndarray, "h w 3"], picture: Picture) -> Float32[np.ndarray, "h w 3"]:
     """Pixels in the colours of `picture` as sRGB code values in [0, 1], out of range clipped.
 
-    The embedded profile decides; without one, the encoding that the file names (linear light, a gamma, Display P3).
-    Pixels with neither are sRGB already. UnreadablePicture if the profile or encoding cannot be used.
+    The embedded profile decides, in 8 bits; without one, the encoding that the file names (linear light, a gamma,
+    Display P3). Pixels with neither are sRGB already. UnreadablePicture if the profile or encoding cannot be used.
     """
+    pixels = np.clip(pixels, 0, 1)
     if picture.profile is not None:
-        try:
-            return srgb_from_profile(np.clip(pixels, 0, 1), picture.profile)
-        except ValueError as error:
-            raise UnreadablePicture(str(error)) from error
+        return _from_profile(pixels, picture.profile)
     if picture.colour_space in TAKEN_AS_SRGB:
-        return np.clip(pixels, 0, 1)
+        return pixels
     converted = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(pixels), picture.colour_space, SRGB)
     if converted.has_error:
         raise UnreadablePicture(f"encoding {picture.colour_space}: {converted.geterror().strip()}")
     return np.clip(np.asarray(converted.get_pixels("float")), 0, 1)
+
+
+def _from_profile(rgb: Float32[np.ndarray, "h w 3"], profile: bytes) -> Float32[np.ndarray, "h w 3"]:
+    """Code values of a device with this ICC profile as sRGB, in 8 bits; unchanged if the profile is sRGB's own.
+
+    Eight bits are what Pillow's Little CMS converts. The scenes' polarization is random colour anyway.
+    """
+    try:
+        device = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        transform = ImageCms.buildTransform(device, ImageCms.createProfile("sRGB"), "RGB", "RGB")
+    except (ImageCms.PyCMSError, OSError) as error:
+        raise UnreadablePicture(
+            f"the embedded colour profile cannot be used ({error}); convert the file to sRGB first"
+        ) from error
+
+    def converted(levels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        return np.asarray(ImageCms.applyTransform(Image.fromarray(levels), transform))
+
+    if np.abs(converted(SRGB_LATTICE).astype(int) - SRGB_LATTICE).max() <= 1:  # sRGB, maybe by another name
+        return rgb
+    return converted(np.round(255 * rgb).astype(np.uint8)).astype(np.float32) / 255
 
 
 def fit(
