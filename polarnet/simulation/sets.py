@@ -16,7 +16,7 @@ from typing import Annotated, Any
 from pydantic import Field, PositiveFloat
 
 from polarnet.pictures.images import picture_extensions
-from polarnet.pictures.ingest import IngestConfig, ingest
+from polarnet.pictures.ingest import IngestConfig, files_under, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.pictures.polarimetry import group_by_measurement
 from polarnet.runtime.files import changed_files, seal, sha256
@@ -97,7 +97,7 @@ def kind_of(root: Path) -> str:
 
     Raw mosaics look like photographs: name their kind.
     """
-    files = sorted(path for path in root.rglob("*") if path.is_file())
+    files = [path for path in files_under(root) if path.is_file()]
     if any(path.suffix.lower() == ".npz" for path in files):
         return "polarization"
     pictures = [path for path in files if path.suffix.lower().lstrip(".") in picture_extensions()]
@@ -149,7 +149,7 @@ def _progress(note: Path) -> dict[str, Any]:
 
 def _content(folder: Path) -> str:
     """Hash of the names and bytes of all files in a folder."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    files = [path for path in files_under(folder) if path.is_file()]
     return sha256(*(f"{path.relative_to(folder)} {sha256(path)}\n".encode() for path in files))
 
 
