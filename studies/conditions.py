@@ -25,7 +25,6 @@ SENSORS: dict[str, tuple[str, ...]] = {
     "260x346": ("synthesize.sensor_height=260", "synthesize.sensor_width=346"),
     "v2e": ("emulate.model=v2e",),
     "esim": ("emulate.model=esim",),
-    "esim_gpu": ("emulate.model=esim_gpu",),
     "dvs_voltmeter": ("emulate.model=dvs_voltmeter",),
     "imperfect_polarizers": (
         "polarizers.extinction_ratio=[100,100,100,100]", "polarizers.angle_error_deg=[2,-2,-2,2]",

@@ -43,6 +43,7 @@ from skimage import data
 from polarnet.events.stream import Events
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.runtime.machine import tune
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion, emulate_motion_steps
 from polarnet.simulation.presets import SENSORS
@@ -100,7 +101,7 @@ def measure_one(name: str, threads: int, repeats: int) -> dict[str, Any]:
     seconds = []
     for _ in range(repeats + 1):  # the first compiles
         start = time.perf_counter()
-        events = emulate_motion(scene, path, DURATION_US, HEIGHT, WIDTH, MODELS[name], 1, threads)
+        events = emulate_motion(Camera(MODELS[name], key=1), scene, path, DURATION_US, (HEIGHT, WIDTH), threads)
         seconds.append(time.perf_counter() - start)
     return {
         "seconds": seconds[1:],
@@ -166,12 +167,12 @@ def measure_timing() -> dict[str, dict[str, float]]:
 
     def at(model: str, rate: float) -> list[Events]:
         config = replace(NOISELESS, model=model, render_rate_hz=rate)
-        return emulate_motion(scene, path, DURATION_US, HEIGHT, WIDTH, config, 1)
+        return emulate_motion(Camera(config, key=1), scene, path, DURATION_US, (HEIGHT, WIDTH))
 
     def at_regular_frames(rate: float) -> list[Events]:
         t_us = np.rint(np.arange(int(rate) + 1) * 1e6 / rate).astype(np.int64)
         config = replace(NOISELESS, model="exact")
-        return emulate_motion_steps(scene, path, t_us, HEIGHT, WIDTH, config, 1, None)[0]
+        return emulate_motion_steps(Camera(config, key=1), scene, path, t_us, (HEIGHT, WIDTH))[0]
 
     reference = at("exact", 4800.0)
     figures: dict[str, dict[str, float]] = {"exact": {}, "v2e_default": {}}

@@ -7,22 +7,23 @@ channels by Eq. 1 to 3, without calibration.
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from polarnet.events.mosaic import places_of
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import read_rgb
 from polarnet.pictures.polarimetry import demosaic
-from polarnet.simulation.motion import Pose
-from polarnet.simulation.polarizers import PolarizersConfig, analyzer_maps
+from polarnet.simulation.motion import render, resting_trajectory
+from polarnet.simulation.polarizers import PolarizersConfig, weights_of
 from polarnet.simulation.presets import POLARIZERS
-from polarnet.simulation.rendering import render_intensities, split_channels
+from polarnet.simulation.rendering import channel_light
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, scene_from_rgb
 from polarnet.stokes import aolp, dolp, parse_mosaic, stokes_from_intensities
 from studies.measure import arguments_of, command_line, machine_record, write_section
@@ -53,9 +54,14 @@ def measured_stokes(scene: PolarizationScene, polarizers: PolarizersConfig) -> F
 
 def channels_of(scene: PolarizationScene, polarizers: PolarizersConfig) -> Float64[np.ndarray, "4 h2 w2"]:
     """Light of the four channels, in [0, 1], of a still sensor in the middle of the scene."""
-    middle = Pose(*(np.array([value]) for value in ((scene.width - 1) / 2, (scene.height - 1) / 2, 0.0, 1.0)))
-    weights = analyzer_maps(polarizers, *SIZE, key=1)
-    return split_channels(render_intensities(scene, middle, *SIZE, weights), polarizers)[:, 0].astype(np.float64) / 255
+    weights = weights_of(polarizers, *SIZE, key=1)
+    return channel_light(_stokes(scene), polarizers, weights)[:, 0].astype(np.float64) / 255
+
+
+def _stokes(scene: PolarizationScene) -> Float32[np.ndarray, "3 1 h w"]:
+    """Stokes parameters of the scene on the still sensor in its middle."""
+    middle = replace(resting_trajectory(*SIZE), x=(scene.width - 1) / 2, y=(scene.height - 1) / 2)
+    return render(scene, middle, np.zeros(1), *SIZE).numpy().transpose(1, 0, 2, 3)
 
 
 def true_stokes(scene: PolarizationScene) -> Float64[Tensor, "3 h w"]:

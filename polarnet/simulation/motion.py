@@ -132,6 +132,13 @@ class Trajectory:
         return cls(x, y, x_sines, y_sines, sines[-2], sines[-1], speed_px_s)
 
 
+def resting_trajectory(height: int, width: int) -> Trajectory:
+    """A sensor of this size that rests on the scene's upper left corner."""
+    still = Sine(0.0, 0.0, 0.0)
+    axis = (still,) * HARMONICS
+    return Trajectory((width - 1) / 2, (height - 1) / 2, axis, axis, roll=still, zoom=still, speed_px_s=0.0)
+
+
 def random_trajectory(
     config: SynthesizeConfig, scene_height: int, scene_width: int, generator: np.random.Generator
 ) -> Trajectory:

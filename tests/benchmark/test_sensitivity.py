@@ -91,7 +91,7 @@ def test_twice_the_speed_is_twice_the_speed(stores, config, monkeypatch):
     speeds = []
 
     def noting(*arguments):
-        trajectory = arguments[1]
+        trajectory = arguments[2]
         speeds.append(trajectory.speed_px_s)
         return list(stores[2].read("leaf-00"))
 

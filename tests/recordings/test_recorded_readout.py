@@ -15,6 +15,7 @@ from polarnet.recordings.inspection import Inspection, inspect_recording
 from polarnet.recordings.readout import Readout, ReadoutSigns, readout_findings
 from polarnet.recordings.recording import open_recording
 from polarnet.simulation import BUILTIN_PHOTOS, SENSORS, read_rgb, scene_from_rgb
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import emulate
 from polarnet.simulation.motion import Sine, Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
@@ -36,7 +37,7 @@ def moving(model: str) -> Events:
     """A sensor that swings over a photograph: its event rate rises and falls."""
     path = Trajectory(300.0, 200.0, (Sine(60.0, 8.0, 0.0),), (Sine(30.0, 5.0, 1.0),), STILL, STILL, 630.0)
     config = replace(SENSORS["default"], model=model)
-    return emulate_motion(photograph(), path, DURATION_US, HEIGHT, WIDTH, config, key=1)[0]
+    return emulate_motion(Camera(config, key=1), photograph(), path, DURATION_US, (HEIGHT, WIDTH))[0]
 
 
 @functools.cache
@@ -97,7 +98,7 @@ def test_a_readout_that_is_fast_enough_shows_no_limit(scene, model):
 @pytest.mark.parametrize("sensor", ["clean", "noisy"])
 def test_motion_at_constant_speed_shows_no_limit(sensor):
     line = Trajectory(300.0, 200.0, (Sine(2000.0, 0.1, 0.0),), (Sine(0.0, 0.0, 0.0),), STILL, STILL, 200.0)
-    events = emulate_motion(photograph(), line, DURATION_US, HEIGHT, WIDTH, SENSORS[sensor], key=1)[0]
+    events = emulate_motion(Camera(SENSORS[sensor], key=1), photograph(), line, DURATION_US, (HEIGHT, WIDTH))[0]
     signs = signs_of(events)
     assert signs.limits_judged
     assert (signs.limit, signs.lost_rows, signs.sweep) == (None, None, None)

@@ -14,9 +14,8 @@ import numpy as np
 from polarnet.simulation.compilation import ZERO, borrowing, compiled, inlined
 from polarnet.simulation.pixels import physics, randomness
 from polarnet.simulation.pixels.active import empty_active, gather, keep_continuing, scatter
-from polarnet.simulation.pixels.columns import event_of, place_of
+from polarnet.simulation.pixels.columns import event_of, pending_events, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.light import intensity_rows, linlog
-from polarnet.simulation.pixels.pending import pending_events, roomier, write_in_order
 from polarnet.simulation.pixels.physics import (
     DARK_OFFSET,
     DARK_SHOT_NOISE,
@@ -139,7 +138,7 @@ def advance(light, pixels, steps, columns):
     leak_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
     shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
     jitter = physics.leak_jitter if physics.leak_rate_hz > 0 else 0.0
-    pending = pending_events(h * w, columns.unrounded_us.size > 0)
+    pending = pending_events(h * w)
     soonest_us = np.array([pixels.next_shot_us[y * w : (y + rows) * w].min() for y in range(0, h, rows)])
     used = ZERO
     for k in range(times_us.size - 1):
@@ -375,10 +374,7 @@ def _append_events(active, count, width, start_us, pending, n):
         place = place_of(y, active.pixel[a] - y * width)
         active.event[a] |= event_of(since_whole_us + active.next_now[a], place, 0)
     for a in range(count):
-        at = np.uint64(n)  # the entry of a pixel that does not fire is overwritten by the next
-        pending.events[at] = active.event[a]
-        if pending.unrounded_us.size:
-            pending.unrounded_us[at] = start_us + active.next_now[a]
+        pending.events[np.uint64(n)] = active.event[a]  # overwritten by the next if the pixel does not fire
         n += active.fires[a]
     return n
 

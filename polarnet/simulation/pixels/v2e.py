@@ -11,7 +11,7 @@ import numpy as np
 
 from polarnet.simulation.compilation import ONE, ZERO, borrowing, compiled
 from polarnet.simulation.pixels import physics, randomness
-from polarnet.simulation.pixels.columns import sort_ties, with_room
+from polarnet.simulation.pixels.columns import first_tied, sort_ties, with_room
 from polarnet.simulation.pixels.light import intensity_rows, linlog_8bit, linlog_as_v2e
 from polarnet.simulation.pixels.physics import (
     DARK_OFFSET,
@@ -246,29 +246,27 @@ def _emit(pixels, step, firing, n, most, columns, used):
         order[a] = a
     active = n
     for slot in range(1, most + 1):
-        unrounded_us = start_us + (stop_us - start_us) * slot / most
+        t_us = np.int64(np.rint(start_us + (stop_us - start_us) * slot / most))
         # torch.linspace, which v2e calls, counts from both ends
         stamp = (
             first + interval * np.float32(slot - 1) if slot <= most // 2 else last - interval * np.float32(most - slot)
         )
         columns = with_room(columns, used, active + 1)
-        written, active = _emit_slot(
-            pixels, firing, active, slot, unrounded_us, stamp, least, refractory, columns, used
-        )
+        written, active = _emit_slot(pixels, firing, active, slot, t_us, stamp, least, refractory, columns, used)
         used += written
     _consume(pixels, firing.entries, n)
     return columns, used
 
 
 @borrowing
-def _emit_slot(pixels, firing, active, slot, unrounded_us, stamp, least, refractory, columns, used):
+def _emit_slot(pixels, firing, active, slot, t_us, stamp, least, refractory, columns, used):
     """Append the events of one slot; returns their number, and how many pixels have events left.
 
     The columns have room for one event more than there are active pixels.
     """
     entries, order, since = firing.entries, firing.order, pixels.refractory_since
     t, x, y, p = columns.t[used:], columns.x[used:], columns.y[used:], columns.p[used:]
-    t_us, written, remaining = np.int64(np.rint(unrounded_us)), 0, 0
+    written, remaining = 0, 0
     for a in range(active):  # without branches: an event that is suppressed is overwritten by the next
         e, at = np.uint64(order[a]), np.uint64(written)
         i, place, crossed = np.uint64(entries[e, PIXEL]), entries[e, PLACE], entries[e, CROSSED]
@@ -278,8 +276,6 @@ def _emit_slot(pixels, firing, active, slot, unrounded_us, stamp, least, refract
         polarity = np.int32(1) if crossed > 0 else np.int32(-1)
         t[at], x[at], y[at], p[at] = t_us, place & 0xFFFF, place >> 16, polarity
         entries[e, ACCEPTED] += polarity if accepted else np.int32(0)
-        if columns.unrounded_us.size:
-            columns.unrounded_us[used + written] = unrounded_us
         written += int(accepted)
         order[np.uint64(remaining)] = e
         remaining += abs(crossed) > slot
@@ -325,12 +321,7 @@ def _emit_shots(light, frame, pixels, step, w, columns, used):
         columns = with_room(columns, used, ONE)
         columns.t[used], columns.x[used], columns.y[used] = np.int64(np.rint(step.stop_us)), i - row * w, row
         columns.p[used] = 1 if u < on else -1
-        if columns.unrounded_us.size:
-            columns.unrounded_us[used] = step.stop_us
         pixels.memory[i] = pixels.filtered[i]
         used += 1
-    tied = before
-    while used > before and tied > 0 and columns.t[tied - 1] >= columns.t[before]:
-        tied -= 1
-    sort_ties(columns, tied, used)
+    sort_ties(columns, first_tied(columns, before, used), used)
     return columns, used
