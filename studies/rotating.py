@@ -25,10 +25,12 @@ from polarnet.methods.rotating_polarizer import ModulationConfig, fit_modulation
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import read_rgb
 from polarnet.reports.figures import LIGHT, chart_style
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import Sine, Trajectory, render
+from polarnet.simulation.polarizers import Grid
 from polarnet.simulation.presets import SENSORS
-from polarnet.simulation.rotating import RotatingConfig, emulate_rotating, rotating_times_us
+from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, scene_from_rgb
 from polarnet.stokes import Prediction, aolp, dolp
 from studies.measure import arguments_of, command_line, machine_record, write_section
@@ -105,10 +107,10 @@ def photograph() -> PolarizationScene:
 def errors_of(case: Case) -> Errors:
     """Simulate one window of turns and fit it."""
     stop_us = round(case.modulation.window_turns / abs(case.rotating.rate_hz) * 1e6)
-    t_us = rotating_times_us(case.rotating, case.sensor, 0, stop_us)
     trajectory = moving_right(case.speed_px_s)
-    simulation = emulate_rotating(case.scene, trajectory, t_us, HEIGHT, WIDTH, case.rotating, case.sensor, key=1)
-    prediction, _ = fit_modulation(simulation.events, simulation.rotation, 0, stop_us, case.modulation)
+    camera, pixels = Camera(case.sensor, key=1), Grid(HEIGHT, WIDTH)
+    events = emulate_rotating(case.rotating, camera, case.scene, trajectory, stop_us, pixels)
+    prediction, _ = fit_modulation(events, case.rotating.rotation, 0, stop_us, case.modulation)
     (stokes,) = render(case.scene, trajectory, np.array([stop_us * 0.5e-6]), HEIGHT, WIDTH)
     return errors_against(stokes, prediction)
 

@@ -13,8 +13,10 @@ from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.half_turns import HalfTurnsConfig, fit_half_turn, half_turns_recoverer, local_variance
 from polarnet.methods.rotating_polarizer import fit_modulation
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.motion import Sine, Trajectory
-from polarnet.simulation.rotating import emulate_rotating, rotating_times_us
+from polarnet.simulation.polarizers import Grid
+from polarnet.simulation.rotating import emulate_rotating
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.simulation.truth import frames_of
 
@@ -105,13 +107,11 @@ def test_on_a_moving_scene_it_is_more_accurate_than_the_fit_to_a_still_one_and_e
     scene = scene_from_polarization(0.3 + 0.7 * s0, dolp, 3 * aolp)
     still, path = Sine(0.0, 0.0, 0.0), Sine(1e4, 40.0 / 1e4, 0.0)  # 40 px/s along a line
     trajectory = Trajectory(20.0, 20.0, (path,), (still,), still, still, 40.0)
-    t_us = rotating_times_us(config.rotating, config.emulate, 0, 200_000)
-    simulation = emulate_rotating(scene, trajectory, t_us, 32, 32, config.rotating, config.emulate, 1)
+    camera, rotation = Camera(config.emulate, key=1), config.rotating.rotation
+    events = emulate_rotating(config.rotating, camera, scene, trajectory, 200_000, Grid(32, 32))
     _, (truth,), _ = frames_of(scene, trajectory, [200_000], 32, 32)
-    quick, _, log_variance = fit_half_turn(
-        simulation.events, simulation.rotation, 200_000, config.methods.rotating_polarizer
-    )
-    slow, _ = fit_modulation(simulation.events, simulation.rotation, 166_667, 200_000, config.modulation)
+    quick, _, log_variance = fit_half_turn(events, rotation, 200_000, config.methods.rotating_polarizer)
+    slow, _ = fit_modulation(events, rotation, 166_667, 200_000, config.modulation)
     squared = (quick - truth).square()
     assert squared.mean() < (slow.dolp - truth).square().mean()
     assert 0.25 < squared.mean() / log_variance.exp().mean() < 4  # right within a factor of two

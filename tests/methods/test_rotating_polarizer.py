@@ -17,9 +17,11 @@ from polarnet.methods.rotating_polarizer import (
     rotating_recoverer,
     silent_dolp,
 )
-from polarnet.simulation.motion import Sine, Trajectory, render
+from polarnet.simulation.camera import Camera
+from polarnet.simulation.motion import Sine, Trajectory, render, resting_trajectory
+from polarnet.simulation.polarizers import Grid
 from polarnet.simulation.presets import SENSORS
-from polarnet.simulation.rotating import RotatingConfig, emulate_rotating, rotating_times_us
+from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.stokes import dolp as polarization_degree
 
@@ -78,12 +80,16 @@ def test_events_late_by_2_ms_turn_aolp_by_the_polarizers_angle_in_2_ms():
     assert angle_error_deg(prediction.aolp, AOLP) == pytest.approx(np.full((2, 3), 360 * 4 * 0.002), abs=0.05)
 
 
+def still_events(rotating, sensor, scene, stop_us):
+    size = scene.height, scene.width
+    return emulate_rotating(rotating, Camera(sensor, key=1), scene, resting_trajectory(*size), stop_us, Grid(*size))
+
+
 def simulated(dolp, sensor, turns=2, rate_hz=4.0, s0=1.0, aolp=0.7, size=(6, 8)):
     maps = (torch.full(size, float(value)) for value in (s0, dolp, aolp))
     rotating = RotatingConfig(rate_hz=rate_hz, start_angle_deg=0.0, extinction_ratio=None, frames_per_turn=720)
     stop_us = round(turns / rate_hz * 1e6)
-    t_us = rotating_times_us(rotating, sensor, 0, stop_us)
-    return emulate_rotating(scene_from_polarization(*maps), None, t_us, *size, rotating, sensor, 1), stop_us
+    return still_events(rotating, sensor, scene_from_polarization(*maps), stop_us), rotating.rotation, stop_us
 
 
 def test_the_photoreceptor_delays_aolp_by_its_time_constant_and_the_fit_knows_it():
@@ -95,11 +101,10 @@ def test_the_photoreceptor_delays_aolp_by_its_time_constant_and_the_fit_knows_it
         contrast_threshold_sigma_off=0.0,
         contrast_threshold_on=0.05,
     )
-    simulation, stop_us = simulated(0.2, replace(sensor, contrast_threshold_off=0.05))
+    events, rotation, stop_us = simulated(0.2, replace(sensor, contrast_threshold_off=0.05))
     config = replace(IDEAL, threshold_on=0.05, threshold_off=0.05, level_dn=127.5, level_spread=0.05, knee_dn=20.0)
     unaware, aware = (
-        fit_modulation(simulation.events, simulation.rotation, 0, stop_us, replace(config, cutoff_hz=cutoff))[0]
-        for cutoff in (0.0, 60.0)
+        fit_modulation(events, rotation, 0, stop_us, replace(config, cutoff_hz=cutoff))[0] for cutoff in (0.0, 60.0)
     )
     phase = math.degrees(math.atan(8 * math.pi * 2 * 0.00495)) / 2
     assert angle_error_deg(unaware.aolp, 0.7).mean() == pytest.approx(phase, rel=0.05)
@@ -152,11 +157,10 @@ def test_expected_errors_are_of_the_size_of_the_errors():
     scene = scene_from_polarization(*map(torch.from_numpy, (s0, dolp, generator.uniform(0, math.pi, size))))
     rotating = RotatingConfig(rate_hz=1.0, start_angle_deg=0.0, extinction_ratio=None, frames_per_turn=720)
     sensor = SENSORS["default"]
-    t_us = rotating_times_us(rotating, sensor, 0, 2_000_000)
-    simulation = emulate_rotating(scene, None, t_us, *size, rotating, sensor, 1)
+    events = still_events(rotating, sensor, scene, 2_000_000)
     config = replace(IDEAL, threshold_spread=0.15, cutoff_hz=300.0, knee_dn=20.0, noise=0.03, variance_scale=0.3)
     config = replace(config, variance_floor=1e-4)
-    prediction, _ = fit_modulation(simulation.events, simulation.rotation, 0, 2_000_000, config)
+    prediction, _ = fit_modulation(events, rotating.rotation, 0, 2_000_000, config)
     squared = (prediction.dolp.numpy() - dolp) ** 2
     expected = prediction.log_variance.exp().numpy()
     assert np.sqrt(squared.mean()) < 0.03
@@ -177,9 +181,9 @@ def test_expected_errors_grow_where_a_moving_scene_does_not_fit_the_model(projec
     for speed in (0.0, 40.0):
         path = Sine(1e4, speed / 1e4, 0.0)
         trajectory = Trajectory(16.0, 16.0, (path,), (still,), still, still, speed)
-        t_us = rotating_times_us(config.rotating, config.emulate, 0, 200_000)
-        events = emulate_rotating(scene, trajectory, t_us, 24, 24, config.rotating, config.emulate, 1)
-        prediction, _ = fit_modulation(events.events, events.rotation, 0, 200_000, config.modulation)
+        camera, rotation = Camera(config.emulate, key=1), config.rotating.rotation
+        events = emulate_rotating(config.rotating, camera, scene, trajectory, 200_000, Grid(24, 24))
+        prediction, _ = fit_modulation(events, rotation, 0, 200_000, config.modulation)
         (stokes,) = render(scene, trajectory, np.array([0.1]), 24, 24)
         errors.append((prediction.dolp - polarization_degree(stokes)).square().mean().sqrt().item())
         ratios.append(prediction.log_variance.exp().mean().sqrt().item() / errors[-1])
