@@ -18,7 +18,7 @@ from polarnet.pictures.ingest import ingest
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import configure, threads_of
 from polarnet.simulation.dataset import emulate_scenes
-from polarnet.simulation.truth import synthesize
+from polarnet.simulation.truth import Synthesis, synthesize
 from studies.faults import STORES, digest
 from studies.instruction_sets import SETTINGS, checked_levels
 from studies.measure import arguments_of, command_line, machine_record, write_section
@@ -36,8 +36,8 @@ def make(data: str, workers: int) -> None:
     paths, seed, per_part = config.paths, config.seed, config.storage.sequences_per_part
     images, scenes, frames, events = (Path(path) for path in (paths.images, paths.scenes, paths.frames, paths.events))
     ingest(config.ingest, seed, images, config.mapper("ingest"))
-    mapper, layout = config.mapper("synthesize"), config.polarizers.layout
-    synthesize(images, scenes, frames, config.synthesize, seed, mapper, per_part, config.variation, layout)
+    synthesis = Synthesis(images, config.synthesize, seed, per_part, config.variation, config.polarizers.layout)
+    synthesize(synthesis, scenes, frames, config.mapper("synthesize"))
     emulate_scenes(scenes, events, config.camera, seed, config.mapper("emulate"), threads_of(config.runtime))
 
 

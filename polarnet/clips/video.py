@@ -29,12 +29,10 @@ MAX_PIECE_FRAMES = 64
 class Piece(NamedTuple):
     """A stretch of a simulation: events of the four channels before their readout, and the true frames in it."""
 
-    stop_us: int
-    """Time up to which events are complete."""
+    stop_us: int  # time up to which events are complete
     events: list[Events]
     t_us: Int64[Tensor, " n"]
-    stokes: Float32[Tensor, "n 3 h w"]
-    """True (S0, S1, S2) on the pixels of a channel."""
+    stokes: Float32[Tensor, "n 3 h w"]  # true (S0, S1, S2) on the pixels of a channel
 
 
 def moving_pieces(

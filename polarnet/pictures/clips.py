@@ -38,24 +38,20 @@ class ClipFrame(NamedTuple):
 
     pixels: Float32[np.ndarray, "h w channels"]
     """RGB code values in [0, 1], or linear intensities at 0, 45, 90 and 135 degrees with I0 + I90 in [0, 1]."""
-    t_us: float | None
-    """Time that the video states."""
-    saturated: float
-    """Share of pixels with a saturated angle; 0 for RGB."""
+    t_us: float | None  # time that the video states
+    saturated: float  # share of pixels with a saturated angle; 0 for RGB
 
 
 @dataclass(frozen=True)
 class ClipOptions:
     """How to read a clip."""
 
-    mosaic: Mosaic | None = None
-    """Angles over 2x2 pixels if the frames are raw mosaics."""
+    mosaic: Mosaic | None = None  # angles over 2x2 pixels if the frames are raw mosaics
     angles: Sequence[int] | None = None
     """Angles of four videos, in their order; None: from their names, NAME_0, NAME_45, ..."""
     white: float | None = None
     """Level at which the values of a polarization camera saturate; None: from the first frame."""
-    grey: bool = False
-    """Take colour frames as grey, without polarization."""
+    grey: bool = False  # take colour frames as grey, without polarization
     size: Size | None = None
     """Height and width to scale to, after a centred cut to this aspect ratio; None: as they are."""
 
@@ -65,14 +61,10 @@ class Clip:
     """Frames in the order of time. `frames` starts from the first frame at each call."""
 
     name: str
-    words: str
-    """Kind of the frames, for messages."""
-    measured: bool
-    """Whether the channels of a frame are four polarizers, not RGB."""
-    count: int | None
-    """Number of frames; None: not known before the end."""
-    still: bool
-    """Whether the clip is a single picture or measurement; False for a video of one frame."""
+    words: str  # kind of the frames, for messages
+    measured: bool  # whether the channels of a frame are four polarizers, not RGB
+    count: int | None  # number of frames; None: not known before the end
+    still: bool  # whether the clip is a single picture or measurement; False for a video of one frame
     frames: Callable[[], Iterator[ClipFrame]]
 
 

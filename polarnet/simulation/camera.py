@@ -22,8 +22,7 @@ class Camera:
     sensor: EmulatorConfig
     polarizers: PolarizersConfig = IDEAL
     readout: ReadoutConfig = PERFECT
-    key: int = 0
-    """64 bits that seed mismatch and noise: two cameras of one kind differ in it. `drawn` sets it."""
+    key: int = 0  # 64 bits that seed mismatch and noise: two cameras of one kind differ in it. `drawn` sets it.
 
     @property
     def sections(self) -> dict[str, Any]:

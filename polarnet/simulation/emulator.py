@@ -95,12 +95,9 @@ class SensorState:
     height: int
     width: int
     channels: tuple[int, ...]
-    pixels: tuple[Any, ...]
-    """State arrays of each channel, as the model's module defines them."""
-    t_us: float
-    """Time of the last frame."""
-    steps: int
-    """Number of frames after the first; random draws are numbered by it."""
+    pixels: tuple[Any, ...]  # state arrays of each channel, as the model's module defines them
+    t_us: float  # time of the last frame
+    steps: int  # number of frames after the first; random draws are numbered by it
 
 
 class Channels(NamedTuple):
@@ -110,8 +107,7 @@ class Channels(NamedTuple):
     height: int
     width: int
     sensor: EmulatorConfig
-    key: int
-    """64 bits that seed all noise; each channel draws its mismatch and noise by its number."""
+    key: int  # 64 bits that seed all noise; each channel draws its mismatch and noise by its number
 
 
 def emulate(

@@ -24,7 +24,7 @@ from polarnet.runtime.sections import section
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.dataset import emulate_scenes
 from polarnet.simulation.motion import SynthesizeConfig
-from polarnet.simulation.truth import synthesize
+from polarnet.simulation.truth import Synthesis, synthesize
 
 MADE = "made.json"
 
@@ -60,10 +60,8 @@ class Recipe:
     motion: SynthesizeConfig
     camera: Camera
     seed: int
-    threads: int
-    """Threads of each task; changes no result."""
-    sequences_per_part: int
-    """Sequences in a part of a store; changes no result."""
+    threads: int  # threads of each task; changes no result
+    sequences_per_part: int  # sequences in a part of a store; changes no result
 
 
 def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Recipe, mapper: MakeMapper) -> bool:
@@ -131,7 +129,8 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
         fill(images)
     if not (scenes.exists() and frames.exists()):
         layout, size = recipe.camera.polarizers.layout, recipe.sequences_per_part
-        synthesize(images, scenes, frames, recipe.motion, recipe.seed, mapper("synthesize"), size, layout=layout)
+        synthesis = Synthesis(images, recipe.motion, recipe.seed, size, layout=layout)
+        synthesize(synthesis, scenes, frames, mapper("synthesize"))
     if not events.exists():
         emulate_scenes(scenes, events, recipe.camera, recipe.seed, mapper("emulate"), recipe.threads)
     note.write_text(json.dumps({"key": key, "complete": True}))

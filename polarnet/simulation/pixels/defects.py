@@ -37,13 +37,10 @@ class DefectsConfig:
 class Defects(NamedTuple):
     """Defective pixels of a channel."""
 
-    hot: np.ndarray
-    """int64, indices of the hot pixels, rising."""
-    silent: np.ndarray
-    """bool [h * w], whether a pixel's own events are dropped."""
+    hot: np.ndarray  # int64, indices of the hot pixels, rising
+    silent: np.ndarray  # bool [h * w], whether a pixel's own events are dropped
     rate_hz: float
-    key: np.uint64
-    """Seed of all noise of the sensor."""
+    key: np.uint64  # seed of all noise of the sensor
     channel: int
 
 

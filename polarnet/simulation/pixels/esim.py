@@ -42,12 +42,9 @@ class Physics(NamedTuple):
 class Pixels(NamedTuple):
     """State of one channel, one array [h * w] per quantity."""
 
-    reference: np.ndarray
-    """float32, log intensity of the last level crossed."""
-    logarithm: np.ndarray
-    """float32, log intensity of the last frame."""
-    last_event_us: np.ndarray
-    """float64"""
+    reference: np.ndarray  # float32, log intensity of the last level crossed
+    logarithm: np.ndarray  # float32, log intensity of the last frame
+    last_event_us: np.ndarray  # float64
 
 
 def physics_of(config: EsimConfig) -> Physics:
@@ -74,29 +71,29 @@ def _table(physics):
 
 
 @compiled
-def _respond(light, frame, y, w, physics, table, dn, logarithm):
-    intensity_rows(light, frame, y, w, dn)
+def _respond(light, frame, steps, y, table, dn, logarithm):
+    intensity_rows(light, frame, y, steps.width, dn)
     if light.images.itemsize == 1:
         for j in range(dn.size):
             logarithm[j] = table[np.int32(dn[j])]
     else:
         for j in range(dn.size):
-            logarithm[j] = ln(dn[j] / np.float32(FULL_SCALE) + np.float32(physics.log_eps))
+            logarithm[j] = ln(dn[j] / np.float32(FULL_SCALE) + np.float32(steps.physics.log_eps))
 
 
 @compiled
 def start(light, pixels, steps):
     """Set the reference to the first frame; nothing fires."""
     dn, table = np.empty(pixels.logarithm.size, np.float32), _table(steps.physics)
-    _respond(light, ZERO, ZERO, steps.width, steps.physics, table, dn, pixels.logarithm)
+    _respond(light, ZERO, steps, ZERO, table, dn, pixels.logarithm)
     pixels.reference[:] = pixels.logarithm
 
 
 @compiled
 def advance(light, pixels, steps, columns):
     """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
-    physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
-    rows, table, used = rows_of_strip(h, w), _table(physics), ZERO
+    times_us, h, w = steps.times_us, steps.height, steps.width
+    rows, table, used = rows_of_strip(h, w), _table(steps.physics), ZERO
     strip = np.empty((2, rows * w), np.float32)
     pending = pending_events(h * w)
     for k in range(times_us.size - 1):
@@ -104,18 +101,19 @@ def advance(light, pixels, steps, columns):
         for y in range(0, h, rows):
             first, stop = y * w, min(y + rows, h) * w
             dn, logarithm = strip[0, : stop - first], strip[1, : stop - first]
-            _respond(light, steps.first_frame + k, y, w, physics, table, dn, logarithm)
+            _respond(light, steps.first_frame + k, steps, y, table, dn, logarithm)
             for r in range(y, min(y + rows, h)):
                 here = slice((r - y) * w, (r - y + 1) * w)
-                pending, n = _fire(pixels, physics, r, logarithm[here], times_us[k], times_us[k + 1], pending, n)
+                pending, n = _fire(pixels, steps, k, r, logarithm[here], pending, n)
             pixels.logarithm[first:stop] = logarithm
         columns, used = write_in_order(pending, n, times_us[k], times_us[k + 1], columns, used)
     return columns, used
 
 
 @compiled
-def _fire(pixels, physics, y, logarithm, start_us, stop_us, pending, n):
-    """Append the events of row y between two frames to the n pending ones; returns both."""
+def _fire(pixels, steps, k, y, logarithm, pending, n):
+    """Append the events of row y in step k to the n pending ones; returns both."""
+    physics, start_us, stop_us = steps.physics, steps.times_us[k], steps.times_us[k + 1]
     w, dt, base_us = logarithm.size, stop_us - start_us, math.floor(start_us)
     for x in range(w):
         i = y * w + x

@@ -43,28 +43,19 @@ physics_of = physics.physics_of
 class Pixels(NamedTuple):
     """State of one channel, one array [h * w] per quantity; float32 unless stated."""
 
-    change: np.ndarray
-    """Filtered log intensity since the last event, leak included."""
-    dn: np.ndarray
-    """Light of the last frame, DN."""
-    linlog: np.ndarray
-    """Response to that light: linear up to 20 DN, logarithmic above."""
-    lag: np.ndarray
-    """Output of the photoreceptor minus response."""
+    change: np.ndarray  # filtered log intensity since the last event, leak included
+    dn: np.ndarray  # light of the last frame, DN
+    linlog: np.ndarray  # response to that light: linear up to 20 DN, logarithmic above
+    lag: np.ndarray  # output of the photoreceptor minus response
     buffer_lag: np.ndarray
     """Output of the source follower minus that of the photoreceptor; empty without a source follower."""
     threshold_on: np.ndarray
     threshold_off: np.ndarray
-    leak_nominal: np.ndarray
-    """Log intensity per microsecond, frozen per pixel."""
-    leak: np.ndarray
-    """Leak until the next event, jitter included."""
-    last_event_us: np.ndarray
-    """float64"""
-    events: np.ndarray
-    """int32, number of events so far; numbers the draws of the leak's jitter."""
-    next_shot_us: np.ndarray
-    """float64, time of the next candidate for a shot-noise event."""
+    leak_nominal: np.ndarray  # log intensity per microsecond, frozen per pixel
+    leak: np.ndarray  # leak until the next event, jitter included
+    last_event_us: np.ndarray  # float64
+    events: np.ndarray  # int32, number of events so far; numbers the draws of the leak's jitter
+    next_shot_us: np.ndarray  # float64, time of the next candidate for a shot-noise event
 
 
 class Step(NamedTuple):
@@ -75,12 +66,10 @@ class Step(NamedTuple):
     stop_us: float
     duration_us: float
     refractory_us: float
-    jitter: float
-    """Relative standard deviation of the leak; 0 where nothing leaks."""
+    jitter: float  # relative standard deviation of the leak; 0 where nothing leaks
     leak_key: np.uint64
     shot_key: np.uint64
-    has_shots: bool
-    """Whether a shot-noise candidate of any pixel falls into the step."""
+    has_shots: bool  # whether a shot-noise candidate of any pixel falls into the step
 
 
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:

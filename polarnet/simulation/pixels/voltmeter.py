@@ -23,18 +23,12 @@ DRAWS = 3  # random numbers for the way from one event to the next
 class Physics(NamedTuple):
     """k1 to k6 of the paper's Eq. 10, fitted to one camera."""
 
-    k1: float
-    """Drift per relative change of light."""
-    k2: float
-    """Dark offset, DN."""
-    k3: float
-    """Photon noise."""
-    k4: float
-    """Leak in the dark, per microsecond."""
-    k5: float
-    """Leak per DN."""
-    k6: float
-    """Noise that does not depend on light."""
+    k1: float  # drift per relative change of light
+    k2: float  # dark offset, DN
+    k3: float  # photon noise
+    k4: float  # leak in the dark, per microsecond
+    k5: float  # leak per DN
+    k6: float  # noise that does not depend on light
 
 
 CAMERAS = {
@@ -54,10 +48,8 @@ class VoltmeterConfig:
 class Pixels(NamedTuple):
     """State of one channel, one array [h * w] per quantity."""
 
-    dn: np.ndarray
-    """float32, light of the last frame, DN."""
-    voltage: np.ndarray
-    """float64, change since the last event, in thresholds."""
+    dn: np.ndarray  # float32, light of the last frame, DN
+    voltage: np.ndarray  # float64, change since the last event, in thresholds
 
 
 class Step(NamedTuple):
