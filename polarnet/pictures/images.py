@@ -59,10 +59,15 @@ class Picture:
         return sha256(f"{pixels.dtype}{pixels.shape}".encode(), pixels.data)
 
 
+def extension(path: Path) -> str:
+    """Lower-case extension of a file, without the dot."""
+    return path.suffix.lower().lstrip(".")
+
+
 def picture_extensions() -> frozenset[str]:
     """Lower-case extensions, without the dot, of picture files, including formats that cannot be read here."""
     formats = oiio.get_string_attribute("extension_list").split(";")
-    known = {extension for entry in formats for extension in entry.partition(":")[2].split(",")}
+    known = {name for entry in formats for name in entry.partition(":")[2].split(",")}
     return frozenset(known - NO_PICTURES) | CAMERA_RAW | NOT_IN_THE_WHEEL
 
 
@@ -142,6 +147,12 @@ def _from_profile(rgb: Float32[np.ndarray, "h w 3"], profile: bytes) -> Float32[
     return converted(np.round(255 * rgb).astype(np.uint8)).astype(np.float32) / 255
 
 
+def code_fractions(pixels: Shaped[np.ndarray, "h w c"]) -> Float32[np.ndarray, "h w c"]:
+    """Code values as fractions of white: integers become [0, 1]."""
+    white = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1
+    return pixels.astype(np.float32) / np.float32(white)
+
+
 def fit(
     pixels: Shaped[np.ndarray, "h w c"], height: int, width: int, max_upscale: float
 ) -> Float32[np.ndarray, "height width c"]:
@@ -161,8 +172,7 @@ def fit(
         )
     top, left = (rows - part_height) // 2, (columns - part_width) // 2
     part = pixels[top : top + part_height, left : left + part_width]
-    white = np.iinfo(part.dtype).max if np.issubdtype(part.dtype, np.integer) else 1
-    values = part.astype(np.float32) / np.float32(white)
+    values = code_fractions(part)
     if (part_height, part_width) == (height, width):
         return values
     method = cv2.INTER_CUBIC if enlargement > 1 else cv2.INTER_AREA
@@ -196,8 +206,10 @@ def read_rgb(path: str | os.PathLike[str]) -> Float[Tensor, "3 h w"]:
 def _read(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
     """Upright pixels of all channels, OpenImageIO's description of them, and the name of the format."""
     _refuse_by_extension(path)
-    if not is_unicode(path):
-        raise UnreadablePicture("cannot be read: the name of the file is not UTF-8; rename it")
+    try:
+        str(path).encode("utf-8")
+    except UnicodeEncodeError:
+        raise UnreadablePicture("cannot be read: the name of the file is not UTF-8; rename it") from None
     as_stored = oiio.ImageSpec()
     as_stored["oiio:UnassociatedAlpha"] = 1  # otherwise the reader multiplies the colours by alpha
     file = oiio.ImageInput.open(str(path), as_stored)
@@ -218,15 +230,6 @@ def _read(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
     return upright(_plain(pixels), spec.get_int_attribute("Orientation", 1)), spec, file.format_name()
 
 
-def is_unicode(path: Path) -> bool:
-    """Whether a path can be written as UTF-8, which a name of arbitrary bytes cannot."""
-    try:
-        str(path).encode("utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
 def _names_profile(png: Path) -> bool:
     """Whether a PNG has a colour profile before its pixels; OpenImageIO ignores a damaged one."""
     with png.open("rb") as file:
@@ -234,11 +237,11 @@ def _names_profile(png: Path) -> bool:
 
 
 def _refuse_by_extension(path: Path) -> None:
-    extension = path.suffix.lower().lstrip(".")
-    if extension in CAMERA_RAW:
+    kind = extension(path)
+    if kind in CAMERA_RAW:
         raise UnreadablePicture("camera raw: only a preview in it can be read; develop it to 16-bit TIFF first")
-    if extension in NOT_IN_THE_WHEEL:
-        raise UnreadablePicture(f"OpenImageIO's wheel has no reader for .{extension}; convert it to PNG or TIFF first")
+    if kind in NOT_IN_THE_WHEEL:
+        raise UnreadablePicture(f"OpenImageIO's wheel has no reader for .{kind}; convert it to PNG or TIFF first")
 
 
 def _rgb_channels(names: Sequence[str], alpha: int) -> list[int]:

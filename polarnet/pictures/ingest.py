@@ -20,6 +20,7 @@ from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import (
     UnreadablePicture,
+    extension,
     fit,
     picture_extensions,
     read_picture,
@@ -170,7 +171,7 @@ def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int, list[Skipp
         for path in paths
         if path.is_symlink() and not path.exists()
     ]
-    pictures = [path for path in files if path.suffix.lower().lstrip(".") in _extensions(kind)]
+    pictures = [path for path in files if extension(path) in _extensions(kind)]
     groups = group_by_measurement(pictures) if kind == "polarization" else [(path,) for path in pictures]
     sources = [
         Source(

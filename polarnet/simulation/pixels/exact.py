@@ -72,6 +72,15 @@ class Step(NamedTuple):
     has_shots: bool  # whether a shot-noise candidate of any pixel falls into the step
 
 
+class Moved(NamedTuple):
+    """A strip of pixels that moved through a step as if nothing fired."""
+
+    first: int  # number of the strip's first pixel
+    before: np.ndarray  # float32, change at the start of the step
+    rise: np.ndarray  # float32, rise of the filtered log intensity
+    words: np.ndarray  # uint64, flags of the pixels that may fire
+
+
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
     """State of the pixels before the first frame, with the thresholds and leak rates drawn for this channel."""
     n = height * width
@@ -155,13 +164,11 @@ def advance(light, pixels, steps, columns):
                 _buffer(
                     rise, pixels.buffer_lag[first:stop], 2e-6 * math.pi * physics.source_follower_hz * step.duration_us
                 )
-            change, leak = pixels.change[first:stop], pixels.leak[first:stop]
-            threshold_on, threshold_off = pixels.threshold_on[first:stop], pixels.threshold_off[first:stop]
             fires = flags_of(words, stop - first)
-            _move(change, leak, rise, np.float32(stop_us - start_us), before, threshold_on, threshold_off, fires)
+            _move(pixels, first, rise, np.float32(stop_us - start_us), before, fires)
             if soonest_us[y // rows] < stop_us:
                 _flag_shots(pixels.next_shot_us[first:stop], stop_us, fires)
-            count = _activate(words, first, before, rise, pixels, step, active, count)
+            count = _activate(pixels, Moved(first, before, rise, words), step, active, count)
             if count >= BATCH or y + rows >= h:
                 pending, n = _fire(pixels, step, active, count, w, pending, n)
                 count = ZERO
@@ -221,8 +228,11 @@ def _buffer(rise, lag, a):
 
 
 @borrowing
-def _move(change, leak, rise, dt_us, before, threshold_on, threshold_off, fires):
+def _move(pixels, first, rise, dt_us, before, fires):
     """Advance each change by its rise and leak as if nothing fired; flag pixels beyond a threshold at either end."""
+    strip = slice(first, first + rise.size)
+    change, leak = pixels.change[strip], pixels.leak[strip]
+    threshold_on, threshold_off = pixels.threshold_on[strip], pixels.threshold_off[strip]
     for j in range(rise.size):
         start = change[j]
         stop = start + (rise[j] + leak[j] * dt_us)
@@ -237,18 +247,15 @@ def _flag_shots(next_shot_us, stop_us, fires):
 
 
 @borrowing
-def _activate(words, first, before, rise, pixels, step, active, count):
-    """Append the flagged pixels of a strip to the `count` active ones; returns their new number.
-
-    `first` is the strip's first pixel.
-    """
+def _activate(pixels, strip, step, active, count):
+    """Append the flagged pixels of a strip to the `count` active ones; returns their new number."""
     pixel, index = active.pixel[count:], active.scratch[count:]
-    stop = count + flagged(words, before.size, index, pixel)
+    stop = count + flagged(strip.words, strip.before.size, index, pixel)
     pixel, index = active.pixel[count:stop], active.scratch[count:stop]
     for a in range(stop - count):
-        pixel[a] = first + index[a]
-    gather(before, index, active.change[count:stop])
-    gather(rise, index, active.slope[count:stop])
+        pixel[a] = strip.first + index[a]
+    gather(strip.before, index, active.change[count:stop])
+    gather(strip.rise, index, active.slope[count:stop])
     gather(pixels.threshold_on, pixel, active.threshold_on[count:stop])
     gather(pixels.threshold_off, pixel, active.threshold_off[count:stop])
     gather(pixels.leak, pixel, active.leak[count:stop])
