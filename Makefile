@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help setup repro test thorough lint docs smoke clean
+.PHONY: help setup repro test thorough lint docs clean
 
 help:
 	@echo "make repro     set up and run the whole pipeline; the page is data/report/index.html"
@@ -13,7 +13,6 @@ help:
 	@echo "make thorough  the slow tests that make test leaves out"
 	@echo "make lint      ruff, mypy, import-linter, tables up to date"
 	@echo "make docs      the documentation site, in outputs/site"
-	@echo "make smoke     the pipeline at CI size, in outputs/run/smoke"
 	@echo "make clean     remove the virtual environment and caches (data/ stays)"
 
 setup: $(READY)
@@ -42,9 +41,6 @@ lint: setup
 
 docs: setup
 	NO_MKDOCS_2_WARNING=1 mkdocs build
-
-smoke: setup
-	polarnet run experiment=smoke
 
 clean:
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis build *.egg-info

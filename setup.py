@@ -6,7 +6,7 @@ from pathlib import Path
 from setuptools import setup
 from setuptools.command.build_py import build_py
 
-SETTINGS = ("params.yaml", "dvc.yaml", "conf/**/*.yaml", "stages/*.py", "data/*/README.md")
+SETTINGS = ("params.yaml", "dvc.yaml", "conf/**/*.yaml", "stages/*.py", "data/**/README.md")
 INSTALLED = Path("polarnet", "config", "settings")  # polarnet.terminal.installation.shipped_settings reads it
 
 

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from polarnet.config.pipeline import set_folder
-from polarnet.config.tables import collect_rows
+from polarnet.config.tables import collect_rows, copy_histories
 from polarnet.config.tree import Config, hydra_stage
 from polarnet.reports.artefacts import ReportPaths, read_results, results_table
 from polarnet.reports.page import write_report
@@ -23,12 +23,14 @@ def main(config: Config) -> None:
         tables = collect_rows(config)
     except FileNotFoundError as error:
         raise SystemExit(str(error)) from None
+    copy_histories(config)
     for name in tables:
         print(f"\ntest set {name}\n" + as_plain(results_table(read_results(set_folder(config, name)))))
     paths = ReportPaths(**{f.name: Path(getattr(config.paths, f.name)) for f in dataclasses.fields(ReportPaths)})
     parameters = {name: value for name, value in dataclasses.asdict(config).items() if name not in PLUMBING}
+    parameters["networks"] = {config.network: parameters["networks"][config.network]}
     overrides = [override for override in sys.argv[1:] if not override.startswith("hydra.")]
-    command = "dvc repro" if "DVC_STAGE" in os.environ else " ".join(["polarnet run", *overrides])
+    command = "dvc repro" if "DVC_STAGE" in os.environ else " ".join(["python -m stages.report", *overrides])
     run = Run(command, parameters, {"seed": str(config.seed)} | facts(Path(__file__).resolve().parent.parent))
     print(f"the report: {write_report(paths, config.used_baselines, run, Path(config.paths.report))}")
 

@@ -4,13 +4,12 @@
 trains a baseline, with the settings of section `baselines.NAME`.
 """
 
+from importlib import import_module
 from pathlib import Path
 
 from polarnet.config.tree import DOLP_TRAINING, Config, hydra_stage, or_exit
 from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.machine import device_of, threads_of
-from polarnet.training.baselines import BASELINES
-from polarnet.training.dolp import dolp_task
 from polarnet.training.engine.loop import LoopConfig, train
 from polarnet.training.engine.parallel import join, launched
 from polarnet.training.engine.recorder import Recorder
@@ -39,13 +38,15 @@ def _task(config: Config) -> tuple[LoopConfig, Task]:
     def lpips(weight: float) -> Lpips | None:
         return Lpips.load(config.paths.weights, "loss", config.lpips.backbone) if weight > 0 else None
 
+    tasks = import_module(f"polarnet.training.{config.baseline or 'dolp'}")
     if config.baseline is None:
-        loss = config.loss
-        task = dolp_task(config.network, config.network_config, config.train, loss, lpips(loss.lpips), config.seed)
-        return config.train, task
-    baseline, settings = BASELINES[config.baseline], getattr(config.baselines, config.baseline)
-    largest = max((getattr(settings, key) for key in baseline.lpips), default=0.0)
-    return settings, baseline.task(settings, lpips(largest), config.seed)
+        network, loss = config.network_config, config.loss
+        return config.train, tasks.dolp_task(
+            config.network, network, config.train, loss, lpips(loss.lpips), config.seed
+        )
+    settings = config.baseline_config(config.baseline)
+    largest = max((getattr(settings, key) for key in tasks.BASELINE.lpips), default=0.0)
+    return settings, tasks.BASELINE.task(settings, lpips(largest), config.seed)
 
 
 if __name__ == "__main__":

@@ -1,56 +1,166 @@
-"""Write the result blocks of README.md and docs/*.md from docs/results/NAME.json: python -m studies.docs [--check].
+"""Write the result blocks of README.md and docs/*.md from docs/results: python -m studies.docs [--check].
 
-A block lies between `<!-- results:NAME -->` and `<!-- /results:NAME -->`; studies/blocks.py lists the names.
+A block lies between `<!-- results:NAME -->` and `<!-- /results:NAME -->`. docs/tables.yaml describes each block:
+
+- `file`: NAME of docs/results/NAME.json, or a YAML file below docs/ (its list is `entries`);
+- `section`: the part of the file whose machine and commit the block names (the whole file if it is left out);
+- `rows`: a path such as `test/tables` to a mapping (a row for each entry, whose key is `name`) or to a list; or a
+  mapping from `label` to `name`, for rows that are chosen by hand;
+- `columns`: a format string for each heading, over the row's values and the whole file. `$name` and `$label` are
+  replaced before, so `{test[$name][mse]:.4f}` looks into the file. A missing value is printed as "-";
+- `caption`: a format string over the whole file; `{origin}` names machine, versions and commit.
 """
 
 import argparse
+import json
 import re
 import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from string import Template
+from typing import Any
 
-from studies.blocks import BLOCKS
+from ruamel.yaml import YAML
 
+ROOT = Path(__file__).resolve().parents[1]
 MARKER = re.compile(r"<!-- (?P<end>/?)results:(?P<name>[\w-]+) -->")
+KEYS = {"file", "section", "rows", "columns", "caption"}
+
+Results = Mapping[str, Any]
 
 
-def update_results_blocks(root: Path, check: bool) -> list[Path]:
+class Value:
+    """A value as a format string prints it: "-" if missing; lists and mappings are joined by commas."""
+
+    def __init__(self, value: Any):
+        self.value = value
+
+    def __getitem__(self, key: str) -> "Value":
+        return Value(self.value.get(key) if isinstance(self.value, Mapping) else None)
+
+    def __format__(self, form: str) -> str:
+        value = self.value
+        if isinstance(value, Mapping):
+            return ", ".join(f"`{key}: {Value(one)}`" for key, one in value.items())
+        if isinstance(value, list):
+            return ", ".join(format(Value(one), form) for one in value)
+        if value is None:
+            return "-"
+        return str(value).lower() if isinstance(value, bool) else format(value, form)
+
+    def __str__(self) -> str:
+        return format(self)
+
+
+class Values(dict[str, Any]):
+    """Values by name for `str.format_map`; a name that is not there is a missing value."""
+
+    def __getitem__(self, key: str) -> Value:
+        return Value(self.get(key))
+
+
+def read_tables(root: Path) -> dict[str, dict[str, Any]]:
+    """The blocks of docs/tables.yaml by name; ValueError for one with an unknown key or without a file."""
+    tables = YAML(typ="safe").load(root / "docs" / "tables.yaml")
+    for name, table in tables.items():
+        if unknown := set(table) - KEYS:
+            raise ValueError(f"docs/tables.yaml, {name}: expected keys of {', '.join(sorted(KEYS))}, got {unknown}")
+        if "file" not in table:
+            raise ValueError(f"docs/tables.yaml, {name}: expected the key file, the name of a file in docs/results")
+    return tables
+
+
+def read_file(root: Path, name: str) -> dict[str, Any]:
+    """Content of docs/results/NAME.json, or the list `entries` of a YAML file below docs/; empty if there is none."""
+    if name.endswith(".yaml"):
+        return {"entries": YAML(typ="safe").load(root / "docs" / name)}
+    path = root / "docs" / "results" / f"{name}.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+
+def block_text(table: Mapping[str, Any], results: Results) -> str:
+    """Markdown of a block for the content of its file."""
+    section = table.get("section")
+    if not results or (section and section not in results):
+        return "Not measured yet; `python -m studies.measure` measures it."
+    parts = []
+    if "columns" in table:
+        parts.append(markdown(table["columns"], list(rows_of(table["rows"], results)), results))
+    record = results.get("records", {}).get(section) or results
+    origin = origin_of(record) if "machine" in record else ""
+    if caption := table.get("caption", "{origin}").format_map(Values({**results, "origin": origin})):
+        parts.append(caption.strip())
+    return "\n\n".join(parts)
+
+
+def rows_of(rows: str | Mapping[str, str], results: Results) -> Iterator[dict[str, Any]]:
+    """The rows of a table, each with `name` and `label`; KeyError for a path that leads nowhere."""
+    if isinstance(rows, Mapping):
+        yield from ({"label": label, "name": name} for label, name in rows.items())
+        return
+    place: Any = results
+    for key in rows.split("/"):
+        place = place[key]
+    named = place.items() if isinstance(place, Mapping) else enumerate(place, start=1)
+    yield from ({"name": str(key), "label": str(key), **one} for key, one in named)
+
+
+def markdown(columns: Mapping[str, str], rows: list[dict[str, Any]], results: Results) -> str:
+    """A GitHub table with numbers aligned to the right and text to the left."""
+    cells = [[_cell(form, row, results) for form in columns.values()] for row in rows]
+    numeric = [all(row[k][:1] in "+-0123456789" for row in cells) for k in range(len(columns))]
+    rule = "|".join("---:" if right else "---" for right in numeric)
+    return "\n".join([f"| {' | '.join(columns)} |", f"|{rule}|", *(f"| {' | '.join(row)} |" for row in cells)])
+
+
+def _cell(form: str, row: Mapping[str, Any], results: Results) -> str:
+    named = Template(form).safe_substitute(name=row["name"], label=row["label"])
+    text = " ".join(named.format_map(Values({**results, **row})).split())
+    return "-" if text.startswith("- ") else text  # a unit behind a missing value says nothing
+
+
+def origin_of(record: Mapping[str, Any]) -> str:
+    """The sentence below a table: number of cores, machine, load, versions and commit of a measurement.
+
+    `record` is that of `studies.study.machine_record`.
+    """
+    cores = "one core" if record["cores"] == 1 else f"{record['cores']} cores"
+    versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
+    units = " and ".join(record.get("bf16_units", ()))  # older records do not have them
+    where = f"{record['machine']}{units and f' with {units}'}, load {record['load']:.1f} before the start"
+    return f"On {cores} ({where}; {versions}; commit `{record['commit'][:10]}`)."
+
+
+def update_pages(root: Path, check: bool) -> list[Path]:
     """Rewrite every block from its committed results, and return the changed files.
 
-    With `check` nothing is written, and the list names the outdated files. ValueError for a block that is not closed or
-    is not in studies/blocks.py.
+    With `check` nothing is written, and the list names the outdated files. ValueError for a block that is not closed
+    or that docs/tables.yaml does not describe.
     """
+    tables = read_tables(root)
+    pages = [root / "README.md", root / "CONTRIBUTING.md", *sorted((root / "docs").glob("*.md"))]
     changed = []
-    for path in [root / "README.md", root / "CONTRIBUTING.md", *sorted((root / "docs").glob("*.md"))]:
-        if not path.exists():
-            continue
-        old = path.read_text(encoding="utf-8")
-        new = _with_blocks(old, path, root / "docs" / "results")
+    for page in filter(Path.exists, pages):
+        old = page.read_text(encoding="utf-8")
+        new = _with_blocks(old, page, tables, root)
         if new != old:
-            changed.append(path)
+            changed.append(page)
             if not check:
-                path.write_text(new, encoding="utf-8")
+                page.write_text(new, encoding="utf-8")
     return changed
 
 
-def block_text(name: str, results: Path) -> str:
-    """Markdown of the block NAME; the command that measures it while its figures are missing."""
-    block = BLOCKS[name]
-    known = block.results(results)
-    if block.section not in known:
-        return f"Not measured yet; `python -m {block.module}` measures it."
-    return block.text(known)
-
-
-def _with_blocks(text: str, path: Path, results: Path) -> str:
+def _with_blocks(text: str, page: Path, tables: Mapping[str, Mapping[str, Any]], root: Path) -> str:
     parts, position = [], 0
     markers = list(MARKER.finditer(text))
     for start, stop in zip(markers[::2], [*markers[1::2], None], strict=False):
         name = start["name"]
         if start["end"] or stop is None or not stop["end"] or stop["name"] != name:
-            raise ValueError(f"{path}: expected <!-- results:{name} --> ... <!-- /results:{name} -->; close each block")
-        if name not in BLOCKS:
-            raise ValueError(f"{path}: there is no block results:{name}; expected one of {', '.join(BLOCKS)}")
-        parts += [text[position : start.end()], "\n\n", block_text(name, results), "\n\n"]
+            raise ValueError(f"{page}: expected <!-- results:{name} --> ... <!-- /results:{name} -->; close each block")
+        if name not in tables:
+            raise ValueError(f"{page}: docs/tables.yaml has no block {name}; expected one of {', '.join(tables)}")
+        block = block_text(tables[name], read_file(root, tables[name]["file"]))
+        parts += [text[position : start.end()], "\n\n", block, "\n\n"]
         position = stop.start()
     return "".join([*parts, text[position:]])
 
@@ -60,7 +170,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m studies.docs", description=(__doc__ or "").split(":")[0])
     parser.add_argument("--check", action="store_true", help="change nothing; fail if a table is out of date")
     check = parser.parse_args().check
-    changed = update_results_blocks(Path(__file__).resolve().parents[1], check)
+    changed = update_pages(ROOT, check)
     for path in changed:
         print(f"{path}: {'out of date; run `python -m studies.docs`' if check else 'updated'}")
     return 1 if changed and check else 0

@@ -1,8 +1,9 @@
-"""The pictures of docs/physics.md: python -m studies.physics_pictures [FOLDER]
+"""The pictures of docs/physics.md and docs/theory-*.md: python -m studies.physics_pictures [FOLDER]
 
 Every point, line and event in them comes from the simulation itself; where a formula is drawn, its label says so.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -12,35 +13,49 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from torch import Tensor
 
+from polarnet.config.tree import load
 from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events
+from polarnet.methods.stokes_gain import consistent
 from polarnet.reports.figures import LIGHT, chart_style, show_picture
 from polarnet.reports.maps import dolp_image, intensity_image
 from polarnet.reports.overview import OFF, ON
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig, emulate
-from polarnet.simulation.motion import Sine, Trajectory, frame_times_us
+from polarnet.simulation.motion import Pose, Sine, Trajectory, frame_times_us, render_poses
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.pixels.light import KNEE, linlog
 from polarnet.simulation.polarizers import PolarizersConfig, weights_of
 from polarnet.simulation.presets import MOTIONS, POLARIZERS, SENSORS
 from polarnet.simulation.readout import PERFECT, read_out
+from polarnet.simulation.rendering import channel_light
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
-from polarnet.stokes import POLARIZER_ANGLES_DEG, dolp, parse_mosaic
-from studies.polarizer_presets import channels_of, inside, measured_stokes, photograph, true_stokes
-from studies.simulation_pictures import LINE, QUIET, write_pictures
+from polarnet.stokes import (
+    POLARIZER_ANGLES_DEG,
+    dolp,
+    intensities_from_stokes,
+    intensity_behind_polarizer,
+    parse_mosaic,
+    stokes_from_intensities,
+    stokes_from_polarization,
+)
+from studies.simulation_pictures import LINE, QUIET, photograph, write_pictures
+from studies.study import ROOT
 
 COLOURS = ("#1c2330", "#2f7fc1", "#3f9c6d", "#e08a1e")
+DEGREES, AOLP_DEG = (0.2, 0.6, 1.0), 30.0  # of the light behind a turning polarizer
+WRONG_FACTORS = (1.0, 0.7, 1.4, 1.1)  # of the intensities behind 0, 45, 90 and 135 degrees
+NOISE = 0.02  # relative standard deviation of the intensities
+DARKEST = 0.004  # of white; added behind every polarizer, as stray light
 STILL = Sine(0.0, 0.0, 0.0)
 PALETTE = 256  # colours of a picture on disk
-ERROR_SCALE = 0.1  # DoLP error of the strongest red and blue
 CONSTANT_SPEED_PX_S = 97.3
 FLAT_HEIGHT, FLAT_WIDTH = 40, 200
 SETTLING_FRAMES = 6  # until each pixel has fired, and its memory is that of an endless motion
+SIZE = (200, 300)  # rows and columns of the sensor behind the presets
 LIGHTS_DN = (0, 15, 30, 60, 90, 120, 150, 180, 210, 240, 255)
 
 
@@ -207,32 +222,17 @@ def _draw_mosaic(figure: Any, polarizers: PolarizersConfig) -> None:
         axes.set_title(f"{angle}°", loc="left", fontsize=9)
 
 
-def presets_figure() -> Figure:
-    """Draw the DoLP that each preset measures on a photograph, and its error."""
-    scene = photograph()
-    truth = dolp(inside(true_stokes(scene))).float()
-    with matplotlib.rc_context(chart_style(LIGHT)):
-        figure = Figure(figsize=(9.0, 2.9), layout="constrained", facecolor=LIGHT.face)
-        tiles = figure.subplots(2, 1 + len(POLARIZERS))
-        show_picture(tiles[0, 0], dolp_image(truth), LIGHT)
-        tiles[0, 0].set_title("true DoLP", loc="left", fontsize=9)
-        tiles[1, 0].set_axis_off()
-        for (above, below), (name, polarizers) in zip(tiles.T[1:], POLARIZERS.items(), strict=True):
-            measured = dolp(inside(measured_stokes(scene, polarizers))).clamp(0, 1).float()
-            show_picture(above, dolp_image(measured), LIGHT)
-            above.set_title(name.replace("_", " "), loc="left", fontsize=9)
-            below.imshow((measured - truth).numpy(), cmap="RdBu_r", vmin=-ERROR_SCALE, vmax=ERROR_SCALE)
-            below.set_xticks([])
-            below.set_yticks([])
-            below.grid(visible=False)
-            below.set_xlabel(
-                f"RMS {float((measured - truth).square().mean().sqrt()):.4f}", color=LIGHT.quiet, fontsize=8
-            )
-        scale = ScalarMappable(Normalize(-ERROR_SCALE, ERROR_SCALE), "RdBu_r")
-        bar = figure.colorbar(scale, cax=tiles[1, 0].inset_axes((0.05, 0.55, 0.9, 0.12)), orientation="horizontal")
-        bar.set_label("measured - true DoLP", fontsize=8)
-        bar.ax.tick_params(labelsize=7)
-    return figure
+def channels_of(scene: PolarizationScene, polarizers: PolarizersConfig) -> Float64[np.ndarray, "4 h2 w2"]:
+    """Light of the four channels, in [0, 1], of a still sensor in the middle of the scene."""
+    middle = Pose(*(np.array([value]) for value in ((scene.width - 1) / 2, (scene.height - 1) / 2, 0.0, 1.0)))
+    light = render_poses(scene, middle, *SIZE).transpose(1, 0, 2, 3)
+    return channel_light(light, polarizers, weights_of(polarizers, *SIZE, key=1))[:, 0].astype(np.float64) / 255
+
+
+def true_stokes(scene: PolarizationScene) -> Float64[Tensor, "3 h w"]:
+    """Stokes parameters of the scene under the same sensor."""
+    top, left = (scene.height - SIZE[0]) // 2, (scene.width - SIZE[1]) // 2
+    return scene.stokes[:, top : top + SIZE[0], left : left + SIZE[1]].double()
 
 
 def readout_figure() -> Figure:
@@ -341,14 +341,59 @@ def rate_figure() -> Figure:
     return figure
 
 
+def malus_figure() -> Figure:
+    """Draw intensity behind a polarizer against its angle, with the four measured angles marked."""
+    with matplotlib.rc_context(chart_style(LIGHT)):
+        figure = Figure(figsize=(6.4, 3.0), layout="constrained", facecolor=LIGHT.face)
+        axes = figure.subplots()
+        for degree, colour in zip(DEGREES, (*COLOURS[:2], COLOURS[3]), strict=True):
+            axes.plot(
+                range(181), [_behind(degree, angle) for angle in range(181)], color=colour, label=f"DoLP {degree:g}"
+            )
+            marked = [_behind(degree, angle) for angle in POLARIZER_ANGLES_DEG]
+            axes.plot(POLARIZER_ANGLES_DEG, marked, "o", color=colour)
+        axes.axvline(AOLP_DEG, color=LIGHT.quiet, linestyle=":", label=f"AoLP {AOLP_DEG:g}°")
+        axes.set(xlabel="angle of the polarizer, degrees", ylabel="intensity / S0", xticks=range(0, 181, 45))
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    return figure
+
+
+def _behind(degree: float, angle_deg: float) -> float:
+    plane = torch.ones(1, 1, dtype=torch.float64)
+    stokes = stokes_from_polarization(plane, degree * plane, math.radians(AOLP_DEG) * plane)
+    return float(intensity_behind_polarizer(stokes, math.radians(angle_deg)))
+
+
+def gains_figure() -> Figure:
+    """Draw true DoLP, DoLP with wrong factors of the polarizers, and DoLP with factors from the redundancy."""
+    truth = true_stokes(photograph())
+    noise = 1 + NOISE * torch.randn((4, *truth.shape[1:]), generator=torch.Generator().manual_seed(1))
+    measured = (intensities_from_stokes(truth) + DARKEST) * noise
+    wrong = measured * measured.new_tensor(WRONG_FACTORS)[:, None, None]
+    solved = consistent(wrong[None], load(ROOT).methods.gain)[0]
+    panels = {"true": dolp(truth), "factors unknown": _dolp_of(wrong), "factors solved": _dolp_of(solved)}
+    with matplotlib.rc_context(chart_style(LIGHT)):
+        figure = Figure(figsize=(7.2, 2.0), layout="constrained", facecolor=LIGHT.face)
+        for axes, (name, degree) in zip(figure.subplots(1, 3), panels.items(), strict=True):
+            show_picture(axes, dolp_image(degree), LIGHT)
+            rms = float((degree.clamp(0, 1) - panels["true"]).square().mean().sqrt())
+            axes.set_title("true DoLP" if name == "true" else f"{name}: RMS error {rms:.3f}", fontsize=9)
+    return figure
+
+
+def _dolp_of(intensities: Float64[Tensor, "4 h w"]) -> Float64[Tensor, "h w"]:
+    return dolp(stokes_from_intensities(intensities))
+
+
 FIGURES = {
+    "theory_malus": malus_figure,
+    "theory_gains": gains_figure,
     "physics_pixel": pixel_figure,
     "physics_polarizers": polarizers_figure,
-    "physics_presets": presets_figure,
     "physics_readout": readout_figure,
     "physics_rate": rate_figure,
 }
 
 
 if __name__ == "__main__":
-    write_pictures(FIGURES, "Draw the pictures of docs/physics.md.", PALETTE)
+    write_pictures(FIGURES, "Draw the pictures of docs/physics.md and docs/theory-*.md.", PALETTE)

@@ -4,20 +4,18 @@ Each target is another picture: photographs of scikit-image and dead leaves. Its
 files with random delays, sensor noise and hot pixels, and then imported and calibrated as in the stages. The study
 prints errors of the start times from the landmark (in camera frames) and refined (in ms). The refined errors exclude
 the part common to all eight captures, because the zero of their clock is a convention; `clock_zero_ms_max` is that
-part. It also prints the RMS difference between the DoLP and the scene's own, the thresholds, and the benchmark's
-table, with the networks that `--data` has in train.
+part. It also prints the RMS difference between the DoLP and the scene's own.
 
 The sensor is a quarter of a CeleX-5 in each direction (200 x 320 pixels, images of 30 x 45); with --full it is a whole
-one (800 x 1280, images of 120 x 180). `--write` merges the figures into docs/results/recordings.json as section `rig`
-or `rig_full`. `--docs` draws the pictures of docs/recordings.md and docs/recordings-dot.md instead.
+one. `--write` puts the figures into docs/results/recordings.json, what `polarnet inspect` says of a capture into
+docs/results/inspection.json, and draws the pictures of docs/recordings.md and docs/recordings-dot.md.
 """
 
 import json
 import shutil
 import tempfile
-import time
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,31 +23,25 @@ import numpy as np
 import torch
 from skimage import data
 
-from polarnet.benchmark.rows import available
-from polarnet.benchmark.run import run_benchmark
-from polarnet.benchmark.score import FrameScore, summary
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig, read_event_capture
 from polarnet.captures.imported import import_targets
 from polarnet.captures.targets import Calibrated, calibrate_targets
-from polarnet.config.pipeline import RECORDINGS, context_of, made_set, rows_of_set
-from polarnet.config.tree import Config, load
+from polarnet.config.tree import load
 from polarnet.events.stream import Events, slice_time
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.recording import open_recording
 from polarnet.reports.recordings import draw_calibration, draw_hot_pixels, recording_picture
-from polarnet.reports.tables import as_plain, score_table
 from polarnet.runtime.machine import generator_for
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.storage.exchange import write_hdf5
 from polarnet.storage.frames import FrameStore
-from studies.measure import BENCHMARK_KEYS, arguments_of, command_line, machine_record, write_section
 from studies.simulated_rig import RigConfig, RigTruth, spread_us, true_dolp, write_rig
 from studies.simulation_pictures import few_colours
+from studies.study import PICTURES, ROOT, arguments_of, command_line, machine_record, write_section
 
-ROOT = Path(__file__).resolve().parents[1]
 PHOTOGRAPHS = (data.coffee, data.chelsea, data.astronaut, data.rocket)
 QUARTER: dict[str, Any] = {"sensor": [200, 320], "region": [45, 2], "crop": [120, 180], "size": [30, 45]}
 RIG = RigConfig(
@@ -63,6 +55,7 @@ RIG = RigConfig(
     file_type="bin",
 )
 FULL_RIG = replace(RIG, speed_px_s=240.0, picture_rate_hz=100.0)
+CUTOFF_HZ = 3000.0  # of the photoreceptor; a low one adds a delay
 
 
 def scene_of(k: int) -> PolarizationScene:
@@ -75,95 +68,58 @@ def scene_of(k: int) -> PolarizationScene:
 
 
 def measured(
-    folder: Path, count: int, rig: RigConfig, recordings: RecordingsConfig, emulator: EmulatorConfig, pictures: Path
-) -> Iterator[tuple[RigTruth, Calibrated, float]]:
-    """Truth, calibration and squared DoLP error of each target; one at a time on disk, stores of all in `folder`."""
+    folder: Path, count: int, rig: RigConfig, recordings: RecordingsConfig, emulator: EmulatorConfig
+) -> Iterator[dict[str, float]]:
+    """Errors of each target; one at a time on disk."""
     for k in range(count):
         name = f"target-{k:02d}"
         raw, imported, out = folder / "raw", folder / "imported", folder / name
         truth = write_rig(raw / name, scene_of(k), rig, recordings, emulator, seed=1, threads=2)
-        start = time.perf_counter()
         import_targets(raw, imported, recordings)
         (found,) = calibrate_targets(imported, out, recordings, {})
-        seconds = time.perf_counter() - start
-        draw_calibration(found, recordings, pictures / f"{name}.png")
-        frames = FrameStore.open(out / "frames.zarr")
-        expected = true_dolp(truth, frames.t_us(name).numpy() + round(clock_zero_us(truth, found)), recordings)
-        squared = float((frames.dolp(name) - expected).pow(2).mean())
-        for left in (raw, imported):
+        yield errors_of(name, truth, found, rig, recordings, out)
+        for left in (raw, imported, out):
             shutil.rmtree(left)
-        report(name, truth, found, rig, squared, seconds)
-        yield truth, found, squared
 
 
-def report(name: str, truth: RigTruth, found: Calibrated, rig: RigConfig, squared: float, seconds: float) -> None:
-    """A line of figures."""
-    assert found.alignment is not None
-    refined_ms = np.abs(spread_us(found.start_us, truth.start_us)).max() / 1000
-    thresholds = [f"{lag.thresholds.on:.3f}/{lag.thresholds.off:.3f}" for lag in found.alignment.lags]
-    print(
-        f"{name}: landmark {landmark_frames(truth, found, rig):.2f} pictures, refined {refined_ms:.2f} ms, "
-        f"DoLP {squared**0.5:.4f}, thresholds {' '.join(thresholds)}, hot {list(found.hot.values())}, "
-        f"imported and calibrated in {seconds:.1f} s",
-        flush=True,
-    )
+def errors_of(
+    name: str, truth: RigTruth, found: Calibrated, rig: RigConfig, recordings: RecordingsConfig, out: Path
+) -> dict[str, float]:
+    """Errors of a target's start times, and the squared error of its DoLP."""
+    landmark_us = max(abs(found.landmark_us[capture] - start) for capture, start in truth.start_us.items())
+    zero_us = float(np.mean([found.start_us[capture] - start for capture, start in truth.start_us.items()]))
+    frames = FrameStore.open(out / "frames.zarr")
+    expected = true_dolp(truth, frames.t_us(name).numpy() + round(zero_us), recordings)
+    errors = {
+        "start_frames": landmark_us * 1e-6 * rig.picture_rate_hz,
+        "refined_ms": float(np.abs(spread_us(found.start_us, truth.start_us)).max()) / 1000,
+        "zero_ms": abs(zero_us) / 1000,
+        "squared_dolp": float((frames.dolp(name) - expected).pow(2).mean()),
+    }
+    print(name, {key: round(value, 4) for key, value in errors.items()}, flush=True)
+    return errors
 
 
-def landmark_frames(truth: RigTruth, found: Calibrated, rig: RigConfig) -> float:
-    """The largest error of the landmark's start times, in pictures."""
-    errors = [abs(found.landmark_us[capture] - start) for capture, start in truth.start_us.items()]
-    return max(errors) * 1e-6 * rig.picture_rate_hz
-
-
-def clock_zero_us(truth: RigTruth, found: Calibrated) -> float:
-    """How much later the captures' common clock begins than the landmark."""
-    return float(np.mean([found.start_us[capture] - start for capture, start in truth.start_us.items()]))
-
-
-def benchmarked(folder: Path, names: list[str], config: Config) -> dict[str, dict[str, Any]]:
-    """The benchmark's scores over all targets, each in a store of its own, printed as a table."""
-    context = context_of(config, train_mean=None)
-    methods, absent = available(rows_of_set(RECORDINGS, config.benchmark.methods), context)
-    benchmark = replace(config.benchmark, methods=methods, panel_scenes=0)
-    rows: list[FrameScore] = []
-    costs: dict[str, dict[str, Any]] = {}
-    for name in names:
-        one = run_benchmark(made_set(name, folder / name), context, benchmark, None)
-        rows += one.rows
-        costs = {method: asdict(cost) for method, cost in one.costs.items()}
-    scores = {m: {**s, **costs[m]} for m, s in summary(rows, benchmark.bootstrap_samples, config.seed).items()}
-    print(as_plain(score_table(scores)))
-    for method, reason in absent.items():
-        print(f"{method} is left out: {reason}")
-    return {method: {key: scores[method].get(key) for key in BENCHMARK_KEYS} for method in scores}
-
-
-def draw_documentation(
-    scratch: Path, rig: RigConfig, recordings: RecordingsConfig, emulator: EmulatorConfig
-) -> list[Path]:
-    """The pictures of the pages on recordings and what `polarnet inspect` says, of one target; where they are."""
-    name, pictures = "coffee", ROOT / "docs" / "pictures"
-    truth = write_rig(scratch / "raw" / name, scene_of(0), rig, recordings, emulator, seed=1, threads=2)
+def draw_documentation(scratch: Path, recordings: RecordingsConfig, emulator: EmulatorConfig) -> None:
+    """The pictures of the pages on recordings, and what `polarnet inspect` says, of one target."""
+    name = "coffee"
+    truth = write_rig(scratch / "raw" / name, scene_of(0), RIG, recordings, emulator, seed=1, threads=2)
     import_targets(scratch / "raw", scratch / "imported", recordings)
     (found,) = calibrate_targets(scratch / "imported", scratch / "calibrated", recordings, {})
-    draw_calibration(found, recordings, pictures / "recordings_calibration.png")
-
+    draw_calibration(found, recordings, PICTURES / "recordings_calibration.png")
     first = EVENT_CAPTURES[0]
     events = read_event_capture(scratch / "raw" / name / f"{first}.bin", recordings)
     capture = scratch / "events_0.h5"
     write_hdf5(capture, since_landmark(events, first, found), found.duration_us)
     assert recordings.hot_pixel_factor is not None
     inspection = inspect_recording(open_recording(capture), recordings.hot_pixel_factor)
-    (pictures / "recordings_inspect.png").write_bytes(recording_picture(inspection))
-    draw_hot_pixels(inspection.counts, inspection.hot, pictures / "recordings_hot_pixels.png")
+    (PICTURES / "recordings_inspect.png").write_bytes(recording_picture(inspection))
+    draw_hot_pixels(inspection.counts, inspection.hot, PICTURES / "recordings_hot_pixels.png")
     assert int(inspection.hot.sum()) == len(truth.hot)
     lines = [f"$ polarnet inspect {capture.name}", *findings(inspection), f"picture     {capture.name}.png"]
-    (ROOT / "docs" / "results" / "inspection.json").write_text(json.dumps({"lines": lines}, indent=2) + "\n")
-
-    drawn = sorted(pictures.glob("recordings_*.png"))
-    for path in drawn:
+    (ROOT / "docs" / "results" / "inspection.json").write_text(json.dumps({"text": "\n".join(lines)}, indent=2) + "\n")
+    for path in PICTURES.glob("recordings_*.png"):
         path.write_bytes(few_colours(path.read_bytes()))
-    return drawn
 
 
 def since_landmark(events: Events, capture: str, found: Calibrated) -> Events:
@@ -174,50 +130,32 @@ def since_landmark(events: Events, capture: str, found: Calibrated) -> Events:
 
 def main() -> None:
     """The command line."""
-    parser = command_line(__doc__, "docs/results/recordings.json")
+    parser = command_line(__doc__, "docs/results/recordings.json, inspection.json and the pictures")
     parser.add_argument("--targets", type=int, default=8, help="number of targets, with eight captures each")
     parser.add_argument("--full", action="store_true", help="the whole sensor")
-    parser.add_argument(
-        "--cutoff-hz", type=float, default=3000.0, help="cutoff of the photoreceptor; a low one adds a delay"
-    )
-    parser.add_argument("--data", type=Path, default=ROOT / "data", help="data folder with trained networks")
-    parser.add_argument(
-        "--pictures", type=Path, default=ROOT / "outputs" / "rig", help="folder for diagnostic pictures"
-    )
-    parser.add_argument("--docs", action="store_true", help="only draw the pictures of the pages on recordings")
     arguments = arguments_of(parser)
-    config = load(ROOT, [f"paths.data={arguments.data.absolute()}"])
-    recordings = replace(config.recordings, enabled=True, **({} if arguments.full else QUARTER))
-    rig = FULL_RIG if arguments.full else RIG
-    emulator = replace(config.emulate, model="exact", cutoff_hz=arguments.cutoff_hz)
-    if arguments.docs:
-        with tempfile.TemporaryDirectory() as scratch:
-            for path in draw_documentation(Path(scratch), rig, recordings, emulator):
-                print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1024:.0f} kB")
-        return
-    arguments.pictures.mkdir(parents=True, exist_ok=True)
-    record: dict[str, Any] = machine_record(ROOT)
+    record, config = machine_record(), load(ROOT)
+    quarter = replace(config.recordings, enabled=True, **QUARTER)
+    recordings = replace(config.recordings, enabled=True) if arguments.full else quarter
+    emulator = replace(config.emulate, model="exact", cutoff_hz=CUTOFF_HZ)
     with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        results = list(measured(folder, arguments.targets, rig, recordings, emulator, arguments.pictures))
-        scores = benchmarked(folder, [one.name for _, one, _ in results], config)
+        rig = FULL_RIG if arguments.full else RIG
+        errors = list(measured(Path(scratch), arguments.targets, rig, recordings, emulator))
+        if arguments.write:
+            draw_documentation(Path(scratch), quarter, emulator)
+    squared = [one["squared_dolp"] for one in errors]
     figures = {
-        "captures": 8 * len(results),
+        "captures": 8 * len(errors),
         "sensor": list(recordings.sensor),
-        "photoreceptor_cutoff_hz": arguments.cutoff_hz,
-        "start_error_frames_max": round(max(landmark_frames(truth, one, rig) for truth, one, _ in results), 3),
-        "refined_error_ms_max": round(
-            max(float(np.abs(spread_us(one.start_us, truth.start_us)).max()) for truth, one, _ in results) / 1000, 3
-        ),
-        "clock_zero_ms_max": round(max(abs(clock_zero_us(truth, one)) for truth, one, _ in results) / 1000, 3),
-        "dolp_rms": round(float(np.mean([squared for _, _, squared in results])) ** 0.5, 5),
-        "dolp_rms_max": round(max(squared for _, _, squared in results) ** 0.5, 5),
-        "benchmark": scores,
+        "start_error_frames_max": round(max(one["start_frames"] for one in errors), 3),
+        "refined_error_ms_max": round(max(one["refined_ms"] for one in errors), 3),
+        "clock_zero_ms_max": round(max(one["zero_ms"] for one in errors), 3),
+        "dolp_rms": round(float(np.mean(squared)) ** 0.5, 5),
+        "dolp_rms_max": round(max(squared) ** 0.5, 5),
     }
     print(json.dumps(figures, indent=2))
     if arguments.write:
-        path = write_section(ROOT, "recordings", "rig_full" if arguments.full else "rig", figures, record)
-        print(f"written to {path.relative_to(ROOT)}")
+        write_section("recordings", "rig_full" if arguments.full else "rig", figures, record)
 
 
 if __name__ == "__main__":

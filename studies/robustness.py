@@ -1,27 +1,27 @@
 """Methods on photographs, on measured scenes and on other sensors, in one table.
 
 python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] --measured FOLDER ... --work FOLDER
-    [--weights [NAME=]FILE ...] [--firenet FILE] [--split test|val|train] [--conditions NAME ...] [--limit N] [--write]
+    [--weights [NAME=]FILE ...] [--published firenet_published=FILE] [--split test|val] [--conditions NAME ...]
+    [--limit N] [--write]
 python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] --work FOLDER --training FOLDER
 
 - `photographs`: a split of the pipeline's (`experiment=photographs`) of the folder --photographs.
 - `photographs_large`: the same splits of --photographs and of --photographs-large together.
 - `measured.SOURCE`: all measured scenes of one source. A folder with a manifest.csv (columns file, repo) has one source
   for each repo; any other folder is one source.
-- `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS (`studies.conditions`).
-  `ours, thresholds given` is told the contrast thresholds of the sensor (`methods.ours.thresholds`).
+- `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS. `ours, thresholds given` is told the contrast
+  thresholds of the sensor (`methods.ours.thresholds`).
 - `time.5ms`: the scenes of the sensors with windows of 5 ms.
-- `time.2000hz.photographs`, `time.2000hz.measured`: frames between windows (`polarnet recover --rate 2000`), on the
-  pictures of the sensors and on all measured scenes, at 16 times between the ends of two windows (`studies.rate`).
+- `time.2000hz.photographs`, `time.2000hz.measured`: frames between windows (`polarnet recover --rate 2000`), at 16
+  times between the ends of two windows: `ours`, carried on by motion and events; `ours, held`, the last frame of a
+  window unchanged; `ours, window ends`, the frames of the windows themselves.
 
 Under each condition but the last two, `ours, 2x2 blocks` is the network on blocks of pixels (`methods.ours.binning=2`).
 
 Nothing is trained, except the constants: `train_mean` is the mean DoLP of the training photographs, and `constant_real`
 the mean DoLP of the measured scenes of all sources but the one that is scored. --split val is for choices and --split
-test for figures; --split train shows how well a network knows the photographs that it was trained on. --limit takes the
-first N pictures of each set; --sensor-limit of the sensors alone. Events are simulated in memory, and pictures are kept
-in --work. --write puts the scores into docs/results/robustness.json, and those of the test split also into
-docs/pictures.
+test for figures. --limit takes the first N pictures of each set; --sensor-limit of the sensors alone. Events are
+simulated in memory, and pictures are kept in --work. --write puts the scores into docs/results/robustness.json.
 
 The second command scores nothing. It fills --training with links to the training photographs of both folders. A
 network trained on them (`ingest.root`) has seen no photograph of --split val and --split test.
@@ -29,6 +29,7 @@ network trained on them (`ingest.root`) has seen no photograph of --split val an
 
 import argparse
 import functools
+import itertools
 import json
 import statistics
 from collections.abc import Callable, Mapping, Sequence
@@ -38,43 +39,63 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from polarnet.analysis.resimulate import resimulated
-from polarnet.benchmark.rows import Context, available, predictions_of
+from polarnet.analysis.between_windows import frames_between
+from polarnet.analysis.resimulate import resimulated, sequence_at
+from polarnet.benchmark.rows import Context, available, opened, predictions_of
 from polarnet.benchmark.score import FrameScore, scene_means, score_sequence, scored_windows
 from polarnet.config.pipeline import context_of
 from polarnet.config.tree import Config
+from polarnet.methods import METHODS
 from polarnet.metrics.reliability import Reliability, reliability
 from polarnet.networks.weights import shipped_weights
-from polarnet.reports.figures import LIGHT
-from polarnet.reports.maps import png
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import configure
-from polarnet.simulation.camera import Camera
-from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.stokes import Prediction
 from polarnet.storage.scenes import SceneStore
-from studies.conditions import BINNING, conditions_of, selected
-from studies.figures import robustness_figure
-from studies.measure import arguments_of, command_line, machine_record, write_section
-from studies.rate import (
-    ENDS,
-    FRAME_RATE_HZ,
-    OURS,
-    RATE_HZ,
-    RATED,
-    rated_scores,
-)
-from studies.scored_pictures import ingested, link_training, mean_dolp, scenes_of, settings
+from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
+from studies.study import arguments_of, command_line, machine_record, row_of, write_section
 
-ROOT = Path(__file__).resolve().parents[1]
-CALIBRATED = "ours, thresholds given"
-BLOCKS = "ours, 2x2 blocks"
+OURS = "ours"
+CALIBRATED, BLOCKS = "ours, thresholds given", "ours, 2x2 blocks"
+HELD, ENDS = ", held", ", window ends"
 CONSTANT = "constant_real"
-METHODS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
+ROWS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
 NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published+gain")
 """Rows that need no truth, against which ours is compared on measured scenes."""
-BANDS = {"below_0.06": (0.0, 0.06), "0.06_to_0.2": (0.06, 0.2), "above_0.2": (0.2, 1.0)}
-"""Mean DoLP of a scene."""
+RATE_HZ = 2000
+RATED = f"time.{RATE_HZ}hz"
+TIMES_BETWEEN = 16
+"""Times between the ends of two windows at which the frames of a rate are scored."""
+FRAME_RATE_HZ = 30.0  # of the windows that `benchmark.warmup_windows` counts
+SENSORS: dict[str, tuple[str, ...]] = {
+    "default": (),
+    "noisy": ("sensor=noisy",),
+    "noisy_300_hz": ("sensor=noisy", "emulate.cutoff_hz=300"),  # the default sensor's bandwidth
+    "thresholds_0.1": ("emulate.contrast_threshold_on=0.1", "emulate.contrast_threshold_off=0.1"),
+    "thresholds_0.4": ("emulate.contrast_threshold_on=0.4", "emulate.contrast_threshold_off=0.4"),
+    "off_1.4_times_on": ("emulate.contrast_threshold_off=0.28",),
+    "mismatch_0.06": ("emulate.contrast_threshold_sigma_on=0.06", "emulate.contrast_threshold_sigma_off=0.06"),
+    "mismatch_half": ("emulate.contrast_threshold_sigma_on=0.1", "emulate.contrast_threshold_sigma_off=0.1"),
+    "slow": ("synthesize.speed_min_px_s=10", "synthesize.speed_max_px_s=40"),
+    "fast": (
+        "synthesize.speed_min_px_s=160", "synthesize.speed_max_px_s=320", "synthesize.acceleration_max_px_s2=3200",
+    ),
+    "60_hz": ("synthesize.frame_rate_hz=60",),
+    "260x346": ("synthesize.sensor_height=260", "synthesize.sensor_width=346"),
+    "v2e": ("emulate.model=v2e",),
+    "esim": ("emulate.model=esim",),
+    "dvs_voltmeter": ("emulate.model=dvs_voltmeter",),
+    "imperfect_polarizers": (
+        "polarizers.extinction_ratio=[100,100,100,100]", "polarizers.angle_error_deg=[2,-2,-2,2]",
+        "polarizers.transmission=[1,0.95,1,0.95]",
+    ),
+    "dofp": ("polarizers.layout=dofp", "synthesize.sensor_height=240", "synthesize.sensor_width=360"),
+    "saturating_readout": ("readout.max_events_per_s=300000",),  # a sensor fires 500,000 a second on average
+    "randomised": ("sensor=random",),
+}  # fmt: skip
+"""Overrides of params.yaml by name; the scenes are the same, at the same places where the sensor has the same size."""
+Condition = list[tuple[Path, tuple[str, ...]]]
+"""Folders of pictures, each with its overrides."""
 
 
 class Scores(NamedTuple):
@@ -91,24 +112,65 @@ class Scores(NamedTuple):
         return Scores(self.rows + other.rows, self.dolp | other.dolp, sums)
 
 
+def conditions_of(images: Mapping[str, Path], arguments: argparse.Namespace) -> dict[str, Condition]:
+    """Pictures and overrides by condition; `images` are the ingested photographs."""
+    work, limit = arguments.work, arguments.limit
+    parts = {name: part_of(folder, work / name, arguments.split, limit) for name, folder in images.items()}
+    conditions: dict[str, Condition] = {"photographs": [(parts["rgb"], ())]}
+    if "more" in parts:
+        conditions["photographs_large"] = [(part, ()) for part in parts.values()]
+    for folder in arguments.measured:
+        for name, root in sources_of(folder, work).items():
+            all_test = ("ingest.source=polarization", "ingest.val_fraction=0", "ingest.test_fraction=1")
+            measured = ingested(root, work / name, *all_test)
+            conditions[f"measured.{name}"] = [(part_of(measured, work / name, "test", limit), ())]
+    small = part_of(images["rgb"], work / "rgb", arguments.split, arguments.sensor_limit or limit)
+    scenes = [part for name, of in conditions.items() if name.startswith("measured.") for part in of]
+    conditions[f"{RATED}.photographs"] = [(small, ())]
+    if scenes:
+        conditions[f"{RATED}.measured"] = scenes
+    conditions |= {f"sensors.{name}": [(small, overrides)] for name, overrides in SENSORS.items()}
+    return conditions | {"time.5ms": [(small, ("synthesize.frame_rate_hz=200",))]}
+
+
+def selected(conditions: Mapping[str, Condition], wanted: Sequence[str] | None) -> dict[str, Condition]:
+    """The conditions whose names, or the beginnings of whose names, are `wanted`; None: all."""
+    return {
+        name: parts
+        for name, parts in conditions.items()
+        if wanted is None or any(name == one or name.startswith(f"{one}.") for one in wanted)
+    }
+
+
+def contexts_of(
+    condition: str, overrides: Sequence[str], train_mean: float, weights: Mapping[str, Path]
+) -> dict[str, Context]:
+    """Settings of each row of the network under a condition; blocks and known thresholds have the first weights."""
+    config = settings(*overrides)
+    contexts = {row: context_of(config, [*ROWS, OURS], train_mean, file) for row, file in weights.items()}
+    variants = {} if condition.startswith(RATED) else {BLOCKS: "methods.ours.binning=2"}
+    if condition.startswith("sensors.") and not config.emulate.randomise:
+        thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
+        variants[CALIBRATED] = f"methods.ours.thresholds={thresholds}"
+    first = next(iter(weights.values()))
+    return contexts | {
+        row: context_of(settings(*overrides, variant), [OURS], train_mean, first) for row, variant in variants.items()
+    }
+
+
 def scored_sequence(
-    name: str,
-    scenes: SceneStore,
-    motion: SynthesizeConfig,
-    camera: Camera,
-    seed: int,
-    warmup: int,
-    contexts: Mapping[str, Context],
-    constant: float,
+    name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context], constant: float
 ) -> Scores:
-    """Scores of all methods on one sequence; the first `warmup` windows are not scored."""
-    test = resimulated(scenes, name, motion, [camera] * 4, seed)
-    baselines, _ = available(METHODS, next(iter(contexts.values())))
-    predictions = predictions_of(baselines, test, next(iter(contexts.values())))
+    """Scores of all methods on one sequence, without the windows of the warm-up."""
+    test = resimulated(scenes, name, config.synthesize, [config.camera] * 4, config.seed)
+    first_context = next(iter(contexts.values()))
+    rows, _ = available(ROWS, first_context)
+    predictions = predictions_of(rows, test, first_context)
     predictions[CONSTANT] = Prediction(torch.full_like(test.dolp, constant))
     for row, context in contexts.items():
         predictions[row] = predictions_of([OURS], test, context)[OURS]
-    rows = score_sequence(test, predictions, warmup, None, torch.device("cpu"))
+    warmup = warmup_windows(config)
+    scores = score_sequence(test, predictions, warmup, None, torch.device("cpu"))
     first = scored_windows(test, warmup).start
     valid = None if test.valid is None else test.valid[first:]
     errors = {
@@ -117,55 +179,48 @@ def scored_sequence(
         if one.log_variance is not None
     }
     truth = test.dolp[first:] if valid is None else test.dolp[first:][valid]
-    return Scores(rows, {test.scene: float(truth.mean())}, errors)
+    return Scores(scores, {test.scene: float(truth.mean())}, errors)
 
 
-def rated_sequence(name: str, **settings: Any) -> Scores:
-    """Scores of the frames between the windows of one sequence (`studies.rate.rated_scores`)."""
-    rows, degree = rated_scores(name, **settings)
-    return Scores(rows, {rows[0].scene: degree}, {})
+def rated_sequence(name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context]) -> Scores:
+    """Scores of the frames between windows and at their ends, without the windows of the warm-up."""
+    test = resimulated(scenes, name, config.synthesize, [config.camera] * 4, config.seed)
+    warmup, cpu = warmup_windows(config), torch.device("cpu")
+    spans = list(itertools.pairwise(test.t_us.tolist()))[warmup + 1 :]
+    times = [
+        round(start + (stop - start) * (k + 0.5) / TIMES_BETWEEN) for start, stop in spans for k in range(TIMES_BETWEEN)
+    ]
+    later = sequence_at(scenes, name, test.events, torch.tensor([0, *times]))
+    predictions = predictions_of(["oracle_mean"], later, next(iter(contexts.values())))
+    at_ends = {}
+    for row, context in contexts.items():
+        frames = frames_between(test, times, opened(METHODS[OURS], context), config.between)
+        predictions |= {row: frames.carried, row + HELD: frames.held}
+        at_ends[row + ENDS] = frames.at_ends
+    rows = score_sequence(later, predictions, 0, None, cpu) + score_sequence(test, at_ends, warmup, None, cpu)
+    truth = later.dolp if later.valid is None else later.dolp[later.valid]
+    return Scores(rows, {rows[0].scene: float(truth.mean())}, {})
 
 
-def scored(
-    images: Path, config: Config, contexts: Mapping[str, Context], constant: float, rated: bool = False
-) -> Scores:
-    """Scores of all methods on the pictures of a folder under one condition; `rated`: of frames between windows."""
-    scenes = scenes_of(images, config)
-    warmup = round(config.benchmark.warmup_windows * config.synthesize.frame_rate_hz / FRAME_RATE_HZ)
-    common: dict[str, Any] = {
-        "scenes": scenes, "motion": config.synthesize, "camera": config.camera, "seed": config.seed,
-        "warmup": warmup, "contexts": contexts,
-    }  # fmt: skip
-    task: Callable[[str], Scores] = functools.partial(scored_sequence, **common, constant=constant)
-    if rated:
-        task = functools.partial(rated_sequence, **common, between=config.between)
-    results = config.mapper("sequences")(task, list(scenes.sequences))
-    return functools.reduce(Scores.__add__, results)
+def warmup_windows(config: Config) -> int:
+    """Windows that are not scored: as much time as the benchmark's at 30 windows a second."""
+    return round(config.benchmark.warmup_windows * config.synthesize.frame_rate_hz / FRAME_RATE_HZ)
 
 
 def table_of(scores: Scores) -> dict[str, Any]:
-    """Mean and median over scenes of each row's errors, also relative to the oracle mean's, and by mean DoLP."""
+    """Means over scenes of each row's scores, MSE and median MSE also relative to the oracle mean's."""
     errors, psnr, level, corr = (scene_means(scores.rows, metric) for metric in ("mse", "psnr", "level_mse", "corr"))
     oracle = errors["oracle_mean"]
-    counts = {name: sum(low <= mean < high for mean in scores.dolp.values()) for name, (low, high) in BANDS.items()}
-    mean = statistics.fmean(scores.dolp.values())
-    table: dict[str, Any] = {"scenes": len(oracle), "scenes_by_dolp": counts, "mean_dolp": mean, "rows": {}}
+    table: dict[str, Any] = {"scenes": len(oracle), "mean_dolp": statistics.fmean(scores.dolp.values()), "rows": {}}
     for row, of_scene in errors.items():
         mse, median = statistics.fmean(of_scene.values()), statistics.median(of_scene.values())
-        bands = {
-            name: statistics.fmean(inside)
-            for name, (low, high) in BANDS.items()
-            if (inside := [of_scene[scene] for scene, mean in scores.dolp.items() if low <= mean < high])
-        }
         table["rows"][row] = {
             "mse": mse,
-            "median_mse": median,
             "mse_over_oracle_mean": mse / statistics.fmean(oracle.values()),
             "median_over_oracle_mean": median / statistics.median(oracle.values()),
             "level_mse": statistics.fmean(level[row].values()),
             "psnr": statistics.fmean(psnr[row].values()),
             "corr": statistics.fmean(corr[row].values()),
-            "mse_by_dolp": bands,
         }
         if row in scores.reliability:
             table["rows"][row]["error_factor"] = float(np.exp(scores.reliability[row].log_error()))
@@ -181,92 +236,28 @@ def headlines(tables: Mapping[str, Any], row: str) -> dict[str, Any]:
     if "measured" in tables:
         rows = tables["measured"]["rows"]
         best = min(rows[name]["mse"] for name in NO_TRUTH if name in rows)
-        figures["measured"] = {
-            "mse_over_best_baseline": rows[row]["mse"] / best,
-            "mse_over_oracle_mean": rows[row]["mse_over_oracle_mean"],
-            "median_over_oracle_mean": rows[row]["median_over_oracle_mean"],
+        keys = ("mse_over_oracle_mean", "median_over_oracle_mean")
+        figures["measured"] = {"mse_over_best_baseline": rows[row]["mse"] / best} | {
+            key: rows[row][key] for key in keys
         }
         figures["calibration"] = {"measured_factor": rows[row]["error_factor"]}
     if "sensors.default" in tables:
         default = tables["sensors.default"]["rows"][row]["mse"]
-        of_sensor = {
-            name.removeprefix("sensors."): {
-                "mse_over_default": table["rows"][row]["mse"] / default,
-                "mse_over_oracle_mean": table["rows"][row]["mse_over_oracle_mean"],
-            }
+        relative = {
+            name.removeprefix("sensors."): table["rows"][row]["mse"] / default
             for name, table in tables.items()
             if name.startswith("sensors.")
         }
-        worst = max(one["mse_over_default"] for one in of_sensor.values())
-        figures["sensors"] = {**of_sensor, "worst_over_default": worst}
-        if "time.5ms" in tables:
-            psnr = [tables[name]["rows"][row]["psnr"] for name in ("sensors.default", "time.5ms")]
-            figures["time"] = {"db_lost_5ms": psnr[0] - psnr[1]}
+        figures["sensors"] = {"worst_over_default": max(relative.values())}
     rated = [table["rows"] for name, table in tables.items() if name.startswith(RATED)]
     if rated:
         lost = max(rows[row + ENDS]["psnr"] - rows[row]["psnr"] for rows in rated)
-        figures["time"] = figures.get("time", {}) | {f"db_lost_{RATE_HZ}hz": lost}
+        figures["time"] = {f"db_lost_{RATE_HZ}hz": lost}
     return figures
 
 
-def printed(tables: Mapping[str, Any], key: str) -> str:
-    """The table of one figure: a row for each method, a column for each condition."""
-    rows = list(dict.fromkeys(row for table in tables.values() for row in table["rows"]))
-    lines = [f"{key}", "condition," + ",".join(rows) + ",scenes,mean DoLP"]
-    for name, table in tables.items():
-        values = [table["rows"].get(row, {}).get(key) for row in rows]
-        cells = ["-" if value is None else f"{value:.4g}" for value in values]
-        lines.append(",".join([name, *cells, str(table["scenes"]), f"{table['mean_dolp']:.3f}"]))
-    return "\n".join(lines)
-
-
-def parsed() -> argparse.Namespace:
-    """The command line, with paths as every working directory understands them."""
-    parser = command_line(__doc__, "docs/results/robustness.json")
-    parser.add_argument("--photographs", type=Path, required=True)
-    parser.add_argument("--photographs-large", type=Path, help="further photographs")
-    parser.add_argument("--measured", type=Path, nargs="+", default=[], help="as ingest.source=polarization takes them")
-    parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument(
-        "--weights", nargs="+", default=[], metavar="[NAME=]FILE", help="checkpoints; default: the shipped one"
-    )
-    parser.add_argument("--training", type=Path, help="folder for links to the training photographs")
-    parser.add_argument("--firenet", type=Path, help="published weights of FireNet")
-    parser.add_argument("--split", choices=("test", "val", "train"), default="test", help="split of the photographs")
-    parser.add_argument("--section", help="name of the figures of --split val or train in the file; default: the split")
-    parser.add_argument("--conditions", nargs="+", help="only these, such as photographs measured sensors.noisy")
-    parser.add_argument("--limit", type=int, help="pictures of each set")
-    parser.add_argument("--sensor-limit", type=int, help="pictures of each sensor; default: as --limit")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--workers", type=int, default=1, help="processes that share the sequences")
-    arguments = arguments_of(parser)
-    for name in ("photographs", "photographs_large", "work", "firenet", "training"):
-        if path := getattr(arguments, name):
-            setattr(arguments, name, path.resolve())
-    arguments.measured = [folder.resolve() for folder in arguments.measured]
-    pairs = [given.rpartition("=") for given in arguments.weights]
-    arguments.weights = {name or OURS: Path(file).resolve() for name, _, file in pairs} or {OURS: shipped_weights()}
-    return arguments
-
-
-def contexts_of(
-    condition: str, overrides: Sequence[str], train_mean: float, weights: Mapping[str, Path]
-) -> dict[str, Context]:
-    """Settings of each row of the network under a condition; blocks and known thresholds have the first weights."""
-    config = settings(*overrides)
-    contexts = {row: context_of(config, train_mean, file) for row, file in weights.items()}
-    variants = {} if condition.startswith(RATED) else {BLOCKS: f"methods.ours.binning={BINNING}"}
-    if condition.startswith("sensors.") and not config.emulate.randomise:
-        thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
-        variants[CALIBRATED] = f"methods.ours.thresholds={thresholds}"
-    first = next(iter(weights.values()))
-    return contexts | {
-        row: context_of(settings(*overrides, variant), train_mean, first) for row, variant in variants.items()
-    }
-
-
 def tables_of(
-    conditions: Mapping[str, list[tuple[Path, tuple[str, ...]]]],
+    conditions: Mapping[str, Condition],
     means: Mapping[str, list[float]],
     train_mean: float,
     weights: Mapping[str, Path],
@@ -278,10 +269,18 @@ def tables_of(
     for name, parts in conditions.items():
         others = [mean for source, of_source in means.items() if source != name for mean in of_source]
         constant = statistics.fmean(others) if others else train_mean
-        for part, overrides in parts:
-            given = (*common, *overrides)
-            contexts = contexts_of(name, given, train_mean, weights)
-            one = scored(part, settings(*given), contexts, constant, rated=name.startswith(RATED))
+        for images, overrides in parts:
+            config, contexts = (
+                settings(*common, *overrides),
+                contexts_of(name, (*common, *overrides), train_mean, weights),
+            )
+            scenes = scenes_of(images, config)
+            task: Callable[[str], Scores] = functools.partial(
+                scored_sequence, scenes=scenes, config=config, contexts=contexts, constant=constant
+            )
+            if name.startswith(RATED):
+                task = functools.partial(rated_sequence, scenes=scenes, config=config, contexts=contexts)
+            one = functools.reduce(Scores.__add__, config.mapper("sequences")(task, list(scenes.sequences)))
             results[name] = results[name] + one if name in results else one
         tables[name] = table_of(results[name])
         ratios = {row: round(one["mse_over_oracle_mean"], 3) for row, one in tables[name]["rows"].items()}
@@ -291,33 +290,34 @@ def tables_of(
     return tables
 
 
-def write_tables(tables: Mapping[str, Any], arguments: argparse.Namespace, record: Mapping[str, Any]) -> None:
-    """Print the tables and keep them in --work; with --write also in docs."""
-    for key in ("mse", "median_mse", "mse_over_oracle_mean", "median_over_oracle_mean", "level_mse", "psnr", "corr"):
-        print(printed(tables, key), end="\n\n")
-    figures = headlines(tables, next(iter(arguments.weights)))
-    print(json.dumps(figures, indent=1))
-    section = {
-        "split": arguments.split, "limit": arguments.limit, "sensor_limit": arguments.sensor_limit,
-        "weights": {row: sha256(file) for row, file in arguments.weights.items()}, "tables": tables,
-    }  # fmt: skip
-    (arguments.work / f"robustness_{arguments.split}.json").write_text(json.dumps(section, indent=2) + "\n")
-    if arguments.write:
-        of_test = arguments.split == "test"
-        name = arguments.split if of_test else arguments.section or arguments.split
-        print(write_section(ROOT, "robustness", name, section, record, figures if of_test else None))
-        if of_test:
-            picture = ROOT / "docs" / "pictures" / "robustness_test.png"
-            picture.write_bytes(png(robustness_figure(tables, LIGHT)))
+def parsed() -> argparse.Namespace:
+    """The command line."""
+    parser = command_line(__doc__, "docs/results/robustness.json")
+    parser.add_argument("--photographs", type=Path, required=True)
+    parser.add_argument("--photographs-large", type=Path, help="further photographs")
+    parser.add_argument("--measured", type=Path, nargs="+", default=[], help="as ingest.source=polarization takes them")
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--weights", nargs="+", default=[], metavar="[NAME=]FILE", help="default: the shipped weights")
+    parser.add_argument("--published", nargs="+", default=[], metavar="ROW=FILE", help="published weights of rows")
+    parser.add_argument("--training", type=Path, help="folder for links to the training photographs")
+    parser.add_argument("--split", choices=("test", "val"), default="test", help="split of the photographs")
+    parser.add_argument("--conditions", nargs="+", help="only these, such as photographs measured sensors.noisy")
+    parser.add_argument("--limit", type=int, help="pictures of each set")
+    parser.add_argument("--sensor-limit", type=int, help="pictures of each sensor; default: as --limit")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=1, help="processes that share the sequences")
+    arguments = arguments_of(parser)
+    pairs = [given.rpartition("=") for given in arguments.weights]
+    arguments.weights = {name or OURS: Path(file).resolve() for name, _, file in pairs} or {OURS: shipped_weights()}
+    return arguments
 
 
 def main() -> None:
     """Score, print and perhaps write."""
-    arguments = parsed()
-    record = machine_record(ROOT)
+    arguments, record = parsed(), machine_record()
     common = [f"runtime.threads={arguments.threads}", f"runtime.workers={arguments.workers}"]
-    if arguments.firenet:
-        common.append(f"methods.firenet_published.weights={arguments.firenet}")
+    for row, _, file in (given.partition("=") for given in arguments.published):
+        common.append(row_of(row, Path(file)))
     config = settings(*common)
     configure(config.runtime, config.seed)
     arguments.work.mkdir(parents=True, exist_ok=True)
@@ -334,8 +334,14 @@ def main() -> None:
         if name.startswith("measured.")
     }
     train_mean = statistics.fmean(mean_dolp(images["rgb"], "train"))
-    chosen = selected(conditions, arguments.conditions)
-    write_tables(tables_of(chosen, means, train_mean, arguments.weights, common), arguments, record)
+    tables = tables_of(selected(conditions, arguments.conditions), means, train_mean, arguments.weights, common)
+    figures = headlines(tables, next(iter(arguments.weights)))
+    print(json.dumps(figures, indent=1))
+    weights = {row: sha256(file) for row, file in arguments.weights.items()}
+    section = {"limit": arguments.limit, "sensor_limit": arguments.sensor_limit, "weights": weights, "tables": tables}
+    (arguments.work / f"robustness_{arguments.split}.json").write_text(json.dumps(section, indent=2) + "\n")
+    if arguments.write:
+        write_section("robustness", arguments.split, section, record, figures if arguments.split == "test" else None)
 
 
 if __name__ == "__main__":

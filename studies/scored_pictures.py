@@ -17,9 +17,7 @@ from polarnet.simulation.scene import polarization_from_rgb
 from polarnet.simulation.truth import Synthesis, synthesize
 from polarnet.stokes import dolp, stokes_from_intensities
 from polarnet.storage.scenes import SceneStore
-from studies.measure import run_stage
-
-ROOT = Path(__file__).resolve().parents[1]
+from studies.study import ROOT, run_stage
 
 
 def settings(*overrides: str) -> Config:

@@ -30,7 +30,7 @@ from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, random_trajectory, sensor_to_scene
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.presets import MOTIONS, SENSORS
-from polarnet.simulation.scene import scene_from_rgb
+from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 
 FOLDER = Path("docs") / "pictures"
 PHOTO = "coffee.png"
@@ -160,7 +160,7 @@ def crossings_figure() -> Figure:
 
 def window_figure() -> Figure:
     """Draw one thirtieth of a second of the coffee photograph's events, behind the polarizer at 0 degrees."""
-    scene = scene_from_rgb(read_rgb(_photo()))
+    scene = photograph()
     motion = replace(MOTIONS["default"], sensor_height=100, sensor_width=150, speed_min_px_s=150.0)
     trajectory = random_trajectory(motion, scene.height, scene.width, np.random.default_rng(4))
     columns, rows = 4, 3
@@ -251,6 +251,11 @@ def _with(config: EmulatorConfig, name: str, value: float) -> EmulatorConfig:
 
 def _photo() -> Path:
     return next(photo.path for photo in BUILTIN_PHOTOS if photo.file == PHOTO)
+
+
+def photograph() -> PolarizationScene:
+    """The scene of the pictures: a built-in photograph."""
+    return scene_from_rgb(read_rgb(_photo()))
 
 
 def few_colours(content: bytes, colours: int = COLOURS) -> bytes:

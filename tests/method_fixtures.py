@@ -5,12 +5,13 @@ import torch
 
 from polarnet.benchmark.rows import Context
 from polarnet.benchmark.sequences import TestSequence
+from polarnet.events.rotation import steady_rotation
 from polarnet.events.stream import Events
 from polarnet.methods import METHODS
 from polarnet.methods.complementary_filter import FilterConfig
-from polarnet.methods.half_turns import HalfTurnsConfig
 from polarnet.methods.method import Setup
-from polarnet.methods.postprocessing import PostprocessingConfig
+from polarnet.methods.rotating_polarizer import RotatingPolarizerConfig
+from polarnet.methods.sharpening import SharpeningConfig
 from polarnet.methods.stokes_gain import GainConfig
 from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.networks.cista_tc.network import CistaTc
@@ -32,7 +33,7 @@ NETWORK = {
 SECTIONS = {
     "cf": FilterConfig(0.5, 0.0, 0.1, -0.1, [-0.1, 1.2]),
     "highpass": FilterConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5]),
-    "rotating_polarizer": HalfTurnsConfig(0.2, 0.2, 300.0, 60.0, 0.01, 0.1, 5, 1.3, 0.0026),
+    "rotating_polarizer": RotatingPolarizerConfig(0.2, 0.2, 300.0, 60.0, 0.01, 0.1, 5, 1.3, 0.0026),
 }
 
 
@@ -99,12 +100,11 @@ def make_setup(checkpoints):
         values = {
             "config": SECTIONS.get(section),
             "weights": checkpoints.get(section),
-            "postprocessing": PostprocessingConfig(0.3, 1.0),
+            "sharpening": SharpeningConfig(0.3, 1.0),
             "gain": GainConfig(10, 5, 20_000, 0.1, 0.0),
             "device": torch.device("cpu"),
             "precision": "fp32",
-            "rotation_hz": 500.0,
-            "start_angle": 0.0,
+            "rotation": steady_rotation(500.0),
         }
         return Setup(**{**values, **changes})
 

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 from skimage.data import coffee
 
-from studies.site import NOT_LIBRARY, ROOT
-
+ROOT = Path(__file__).resolve().parents[1]
+NOT_LIBRARY = ("cli", "config")
+"""Folders of polarnet that are the command line and the configuration."""
 ROOMS = ("events", "metrics", "networks", "pictures", "recordings", "recovery", "reports", "simulation", "storage")
 
 

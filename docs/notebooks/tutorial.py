@@ -13,11 +13,11 @@
 from dataclasses import replace
 
 import matplotlib.pyplot as plt
-from polarnet.networks.checkpoint import load_network
 
 from polarnet.events.streaming import WindowCutter, WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.methods.overlap import advance, begin
+from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.simulation import BUILTIN_PHOTOS, MOTIONS, SENSORS, read_rgb, simulate
 

@@ -20,7 +20,7 @@ from polarnet.benchmark.score import Cost, FrameScore
 from polarnet.metrics.reliability import Reliability
 from polarnet.runtime.files import check_seal, seal
 
-MADE_BY = "run `dvc repro`, or `python -m stages.benchmark` for all rows"
+MADE_BY = "run `dvc repro`, or `python -m stages.row` for all rows"
 
 
 class RowRecord(NamedTuple):

@@ -56,7 +56,8 @@ class Lag(NamedTuple):
 
 def steps(events: Events, corner: tuple[int, int], crop: tuple[int, int], start_us: int, stop_us: int) -> Steps:
     """Pairs within a crop (size and upper left corner as row, column) and [start_us, stop_us), thinned to 300,000."""
-    pairs = Steps(*_steps(events.t.numpy(), events.x.numpy(), events.y.numpy(), events.p.numpy(), *corner, *crop))
+    columns = tuple(column.numpy() for column in (events.t, events.x, events.y, events.p))
+    pairs = Steps(*_steps(columns, corner, crop))
     sample = np.flatnonzero((pairs.before_us >= start_us) & (pairs.after_us < stop_us))
     sample = sample[:: max(1, -(-len(sample) // MAX_STEPS))]
     return Steps(*(column[sample] for column in pairs))
@@ -135,7 +136,9 @@ def best_lag(
 
 @numba.njit(nogil=True, cache=True)
 @no_type_check
-def _steps(t, x, y, p, top, left, height, width):
+def _steps(columns, corner, crop):
+    t, x, y, p = columns
+    (top, left), (height, width) = corner, crop
     last = np.full(height * width, -1, np.int64)
     before, after, pixel = (np.empty(len(t), np.int64), np.empty(len(t), np.int64), np.empty(len(t), np.int64))
     polarity = np.empty(len(t), np.int8)

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
 
+from polarnet.pictures.clips import TIMES_FILE, check_times, times_from_file
 from polarnet.pictures.images import picture_extensions, read_channels
 from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels.light import FULL_SCALE, KNEE
 from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION
 
-TIMES_FILE = "timestamps.txt"
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of sRGB's primaries (IEC 61966-2-1)
 STEPS_PER_CYCLE = 256  # linear pieces of a flicker's cycle: 3e-4 of the contrast off at most
 PIECES = 4  # linear pieces of the response between two frames
@@ -65,14 +65,13 @@ def read_light(folder: Path, height: int, width: int) -> MovingLight:
         raise FileNotFoundError(f"{folder}: there is no such folder; name the folder of the frames")
     kinds = picture_extensions() | {"npy"}
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower().lstrip(".") in kinds)
-    t_us = _times(folder / TIMES_FILE)
+    t_us = times_from_file(folder / TIMES_FILE, "us")
     if len(paths) != len(t_us) or len(paths) < 2:
         raise ValueError(
             f"{folder}: expected at least two frames and one time for each, got {len(paths)} frames and "
             f"{len(t_us)} times; {TIMES_FILE} needs one line per frame, in the order of the names"
         )
-    if not (np.diff(t_us) > 0).all():
-        raise ValueError(f"{folder / TIMES_FILE}: expected increasing times in microseconds; sort frames and times")
+    check_times(t_us, TIMES_FILE)
     frames = np.empty((len(paths), height, width), np.float32)
     for frame, path in zip(frames, paths, strict=True):
         light = _read_frame(path)
@@ -83,16 +82,6 @@ def read_light(folder: Path, height: int, width: int) -> MovingLight:
             )
         frame[:] = light
     return MovingLight(frames, t_us)
-
-
-def _times(path: Path) -> Float64[np.ndarray, " n"]:
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file; write the time of each frame in microseconds into it")
-    lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
-    try:
-        return np.array([float(words[0]) for words in lines if words and not words[0].startswith("#")])
-    except ValueError as error:
-        raise ValueError(f"{path}: expected a time in microseconds at the start of each line: {error}") from error
 
 
 def _read_frame(path: Path) -> Float[np.ndarray, "h w"]:

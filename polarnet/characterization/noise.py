@@ -12,12 +12,14 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.optimize import minimize
 
+from polarnet.characterization.estimates import Estimate
 from polarnet.characterization.increments import PixelEvents, chosen_pixels, intervals_of
+from polarnet.events.stream import Events
+from polarnet.recordings.pixels import event_counts, hot_pixels
 from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels.physics import shot_noise_fraction
 
-HOT_FACTOR = 10.0  # times the median number of events of a pixel
-FEWEST_HOT_EVENTS = 10
+NOISE_HOT_FACTOR = 10.0  # of `hot_pixels` under constant light: thresholds alone make no pixel so busy
 NODES = np.linspace(-3, 3, 61)  # leaks of the pixels, standard deviations from the median
 NODE_WEIGHTS = np.exp(-(NODES**2) / 2) / np.exp(-(NODES**2) / 2).sum()
 MAX_LEAKS, MAX_AGES = 20_000, 250_000  # in the fit of the leak, which uses fewer pixels if there are more
@@ -29,15 +31,13 @@ SWING_PARTS = 20
 
 
 class Noise(NamedTuple):
-    """Noise of a sensor under constant light, events per pixel and second; errors are standard errors."""
+    """Noise of a sensor under constant light, events per pixel and second."""
 
-    leak_hz: float
+    leak: Estimate
     """Median over the pixels."""
-    leak_error_hz: float
-    leak_spread_decades: float
-    leak_spread_error: float
-    leak_jitter: float
-    leak_jitter_error: float
+    leak_spread: Estimate
+    """Standard deviation over the pixels, decades."""
+    leak_jitter: Estimate
     shot_on_hz: float
     """Mean over the pixels."""
     shot_off_hz: float
@@ -59,35 +59,35 @@ class _Ages(NamedTuple):
     on: Bool[np.ndarray, " n"]
 
 
-def hot_under_constant_light(counts: Int64[np.ndarray, " pixels"]) -> Bool[np.ndarray, " pixels"]:
-    """Pixels with more events than ten times the median number of a pixel, plus ten."""
-    return counts > HOT_FACTOR * np.median(counts) + FEWEST_HOT_EVENTS
+def hot_under_constant_light(events: Events) -> Bool[np.ndarray, " pixels"]:
+    """Hot pixels, however slow: those with more than ten times the events of the pixels around them."""
+    return hot_pixels(event_counts(events), 1.0, NOISE_HOT_FACTOR, min_hz=0.0).ravel()
 
 
-def estimate_noise(events: PixelEvents) -> Noise:
-    """Noise from a recording of constant light; ValueError with fewer than 100 events."""
+def estimate_noise(events: PixelEvents, hot: Bool[np.ndarray, " pixels"]) -> Noise:
+    """Noise from a recording of constant light, with its hot pixels; ValueError with fewer than 100 events."""
     if len(events.t_us) < 100:
         raise ValueError(
             f"expected at least 100 events under constant light, got {len(events.t_us)}; record for longer"
         )
     counts = np.bincount(events.pixel, minlength=events.pixels)
-    hot = hot_under_constant_light(counts)
     good = int((~hot).sum())
     duration_s = float(np.ptp(events.t_us)) * 1e-6
     ordinary = chosen_pixels(events, ~hot)
     off = np.bincount(ordinary.pixel[~ordinary.on], minlength=events.pixels)[~hot] / duration_s
     shot_off = float(off.mean())
     fit, error = _fit_leak(_ages(_few_enough(ordinary)), max(shot_off, 1 / (good * duration_s)))
+    leak, spread, jitter = (
+        Estimate(math.exp(x), math.exp(x) * relative, "ages of ON events under constant light")
+        for x, relative in zip(fit[1:].tolist(), error[1:].tolist(), strict=True)
+    )
     shot_on = _rate_of_young(_ages(ordinary), YOUNG * math.exp(-fit[1]))
     poisson = math.sqrt((shot_on + shot_off) / (good * duration_s))
     between = float(off.std()) / math.sqrt(good)
     return Noise(
-        leak_hz=math.exp(fit[1]),
-        leak_error_hz=math.exp(fit[1]) * error[1],
-        leak_spread_decades=math.exp(fit[2]),
-        leak_spread_error=math.exp(fit[2]) * error[2],
-        leak_jitter=math.exp(fit[3]),
-        leak_jitter_error=math.exp(fit[3]) * error[3],
+        leak=leak,
+        leak_spread=spread,
+        leak_jitter=jitter,
         shot_on_hz=shot_on,
         shot_off_hz=shot_off,
         shot_error_hz=max(poisson, between),
@@ -124,7 +124,7 @@ def mean_inverse(relative_deviation: float) -> float:
     """Mean of 1 / x over normally distributed x of mean 1, without x below 0.1: those pixels are hot."""
     z = np.linspace(-5, 5, 2001)
     x = 1 + relative_deviation * z
-    z, x = z[x >= 1 / HOT_FACTOR], x[x >= 1 / HOT_FACTOR]
+    z, x = z[x >= 1 / NOISE_HOT_FACTOR], x[x >= 1 / NOISE_HOT_FACTOR]
     density = np.exp(-z * z / 2)
     return float((density / x).sum() / density.sum())
 

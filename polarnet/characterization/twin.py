@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.stats import ks_2samp
@@ -14,28 +13,15 @@ from polarnet.characterization.fit import SensorFit
 from polarnet.characterization.increments import by_pixel, intervals_of
 from polarnet.characterization.light import Flicker, MovingLight
 from polarnet.events.stream import Events, concatenate, crop, slice_time
-from polarnet.pictures.dead_leaves import dead_leaves
-from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
-from polarnet.runtime.machine import generator_for, seed_for
+from polarnet.recordings.pixels import HOT_FACTOR, event_counts, hot_pixels, without_pixels
+from polarnet.runtime.machine import seed_for
 from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate
-from polarnet.simulation.pixels.light import FULL_SCALE
 
 MAX_SIDE = 240  # pixels of the part that is compared
 MAX_DURATION_US = 20_000_000
 CHUNK_PIXELS = 1 << 22  # frames times pixels of one piece of simulated light
 STATIC_STEP_US = 1_000_000
 STEPS_PER_CYCLE = 64
-LEAVES_RATE_HZ = 300.0  # frames a second, at least; faster motion gets a frame for each pixel
-MAX_SPEED_PX_S = 3000.0
-WARM_UP_US = 100_000  # of the pixels before a stand-in scene is compared
-LEAVES_MARGIN = 80  # pixels that the stand-in scene extends beyond the sensor
-LEAVES_BLUR = 1.0  # pixels, standard deviation of a lens's blur
-DARKEST_LEAF = 0.04
-FIRST_SPEED_PX_S = 60.0
-SPEED_ROUNDS = 4
-SPEED_TRIAL_US = 1_000_000
-HOT_PIXEL_FACTOR = 4.0  # as `polarnet inspect`
-MIN_RATIO = 1e-3
 RATE_BINS = 100
 INTERVAL_EDGES_US = np.geomspace(50, 1e8, 64)
 
@@ -44,8 +30,6 @@ class Comparison(NamedTuple):
     """Statistics of a recording and of its twin, over the same pixels and the same time."""
 
     name: str
-    same_light: bool
-    """False: the light of the recording is not known, and its twin sees another scene."""
     height: int
     width: int
     duration_s: float
@@ -89,13 +73,12 @@ def fitted_sensor(fit: SensorFit, default: EmulatorConfig) -> EmulatorConfig:
 
 
 def compare(
-    name: str, recording: Events, light: MovingLight | Flicker | float | None, sensor: EmulatorConfig, seed: int
+    name: str, recording: Events, light: MovingLight | Flicker | float, sensor: EmulatorConfig, seed: int
 ) -> Comparison:
-    """Simulate the twin of `recording` under `light` and compare the two.
+    """Simulate the twin of `recording` under its light (a number is constant light in DN) and compare the two.
 
-    A number is constant light in DN. None: the light is not known, and the twin sees drifting dead leaves whose speed
-    gives the recording's event rate. At most the first 20 seconds and the middle 240 x 240 pixels are compared, without
-    the recording's hot pixels; the twin has none. ValueError for fewer than two events.
+    At most the first 20 seconds and the middle 240 x 240 pixels are compared, without the recording's hot pixels; the
+    twin has none. ValueError for fewer than two events.
     """
     if len(recording) < 2:
         raise ValueError(f"{name}: expected events to compare, got {len(recording)}; record for longer")
@@ -105,21 +88,26 @@ def compare(
         if start_us >= stop_us:
             raise ValueError(f"{name}: expected frames at the times of the events; put both on one clock")
     stop_us = min(stop_us, start_us + MAX_DURATION_US)
-    part = _middle(slice_time(recording, start_us, stop_us))
-    counts = event_counts(part)
-    hot = hot_pixels(counts, (stop_us - start_us) * 1e-6, HOT_PIXEL_FACTOR)
-    twin = _twin(part, recording, light, start_us, stop_us, replace(sensor, hot_pixel_share=0.0), seed)
+    duration_s = (stop_us - start_us) * 1e-6
+    height, width = min(recording.height, MAX_SIDE), min(recording.width, MAX_SIDE)
+    top, left = (recording.height - height) // 2, (recording.width - width) // 2
+    part = crop(slice_time(recording, start_us, stop_us), top, left, height, width)
+    if isinstance(light, MovingLight):
+        within = (light.t_us >= start_us) & (light.t_us <= stop_us)
+        light = MovingLight(light.frames[within, top : top + height, left : left + width], light.t_us[within])
+    frames, t_us = _frames_of(light, start_us, stop_us, height, width)
+    twin = emulated(frames, t_us, replace(sensor, hot_pixel_share=0.0), seed_for(seed, "twin", "sensor"))
+    hot = hot_pixels(event_counts(part), duration_s, HOT_FACTOR)
     pair = {"recording": without_pixels(part, hot), "twin": without_pixels(twin, hot)}
     intervals_us = {key: intervals_of(by_pixel(events)).duration_us for key, events in pair.items()}
-    rates = {key: event_counts(events)[~hot] * (1e6 / (stop_us - start_us)) for key, events in pair.items()}
+    rates = {key: event_counts(events)[~hot] / duration_s for key, events in pair.items()}
     edges = np.linspace(start_us, stop_us, RATE_BINS + 1)
-    per_bin = RATE_BINS * 1e6 / (stop_us - start_us) / max(int((~hot).sum()), 1)
+    per_bin = RATE_BINS / duration_s / max(int((~hot).sum()), 1)
     return Comparison(
         name=name,
-        same_light=light is not None,
-        height=part.height,
-        width=part.width,
-        duration_s=(stop_us - start_us) * 1e-6,
+        height=height,
+        width=width,
+        duration_s=duration_s,
         hot=int(hot.sum()),
         tick_us=int(np.gcd.reduce(np.diff(part.t.numpy()))),
         time_s=(0.5 * (edges[1:] + edges[:-1]) - start_us) * 1e-6,
@@ -130,24 +118,6 @@ def compare(
         interval_distance=_distance(intervals_us["recording"], intervals_us["twin"]),
         pixel_rate_distance=_distance(rates["recording"], rates["twin"]),
     )
-
-
-def drifting_leaves(
-    height: int, width: int, t_us: Float64[np.ndarray, " n"], speed_px_s: float, generator: np.random.Generator
-) -> Iterator[Float32[np.ndarray, "k h w"]]:
-    """Light of dead leaves that drift along a slow Lissajous figure, in pieces of consecutive frames, DN."""
-    size = height + 2 * LEAVES_MARGIN, width + 2 * LEAVES_MARGIN
-    scene = cv2.GaussianBlur(dead_leaves(generator, *size).mean(axis=2), (0, 0), LEAVES_BLUR)
-    scene = (FULL_SCALE * np.clip(scene, DARKEST_LEAF, 1)).astype(np.float32)
-    reach = 0.75 * LEAVES_MARGIN
-    angle = t_us * 1e-6 * speed_px_s / reach
-    left = LEAVES_MARGIN + reach * np.sin(angle)
-    top = LEAVES_MARGIN + reach * np.sin(0.77 * angle + 1)
-    step = max(2, CHUNK_PIXELS // (height * width))
-    for k in range(0, len(t_us), step):
-        shifts = zip(left[k : k + step], top[k : k + step], strict=True)
-        moved = (np.array([[1, 0, -x], [0, 1, -y]]) for x, y in shifts)
-        yield np.stack([np.asarray(cv2.warpAffine(scene, matrix, (width, height))) for matrix in moved])
 
 
 def emulated(
@@ -184,55 +154,19 @@ def flicker_light(
     return t_us, flicker.level * (1 + flicker.contrast * np.sin(phase))
 
 
-def _twin(
-    part: Events,
-    recording: Events,
-    light: MovingLight | Flicker | float | None,
-    start_us: int,
-    stop_us: int,
-    sensor: EmulatorConfig,
-    seed: int,
-) -> Events:
-    h, w, key = part.height, part.width, seed_for(seed, "twin", "sensor")
+def _frames_of(
+    light: MovingLight | Flicker | float, start_us: int, stop_us: int, height: int, width: int
+) -> tuple[Iterator[Float32[np.ndarray, "k h w"]], Float64[np.ndarray, " n"]]:
+    """Frames of the light on the pixels, in pieces, and their times."""
     if isinstance(light, MovingLight):
-        top, left = _corner(recording)
-        within = (light.t_us >= start_us) & (light.t_us <= stop_us)
-        frames, t_us = light.frames[within, top : top + h, left : left + w], light.t_us[within]
-        step = max(2, CHUNK_PIXELS // (h * w))
-        return emulated((frames[k : k + step] for k in range(0, len(frames), step)), t_us, sensor, key)
+        frames, step = light.frames, max(2, CHUNK_PIXELS // (height * width))
+        return (frames[k : k + step] for k in range(0, len(frames), step)), light.t_us
     if isinstance(light, Flicker):
         t_us, values = flicker_light(light, start_us, stop_us)
-        return emulated(constant_frames(values, h, w), t_us, sensor, key)
-    if light is not None:
+    else:
         t_us = np.append(np.arange(start_us, stop_us, STATIC_STEP_US, dtype=np.float64), stop_us)
-        return emulated(constant_frames(np.full(len(t_us), light), h, w), t_us, sensor, key)
-    return _stand_in(part, start_us, stop_us, sensor, seed)
-
-
-def _stand_in(part: Events, start_us: int, stop_us: int, sensor: EmulatorConfig, seed: int) -> Events:
-    """Twin under drifting leaves, whose speed gives the recording's rate; the rate grows with the speed."""
-    wanted = len(part) / (stop_us - start_us)
-
-    def under_leaves(speed_px_s: float, until_us: int) -> Events:
-        first_us, step_us = start_us - WARM_UP_US, 1e6 / max(LEAVES_RATE_HZ, speed_px_s)
-        t_us = np.linspace(first_us, until_us, 2 + math.ceil((until_us - first_us) / step_us))
-        pieces = drifting_leaves(part.height, part.width, t_us, speed_px_s, generator_for(seed, "twin", "picture"))
-        return slice_time(emulated(pieces, t_us, sensor, seed_for(seed, "twin", "sensor")), start_us, until_us)
-
-    speed, trial_us = FIRST_SPEED_PX_S, min(stop_us, start_us + SPEED_TRIAL_US)
-    for _ in range(SPEED_ROUNDS):
-        rate = len(under_leaves(speed, trial_us)) / (trial_us - start_us)
-        speed = min(speed * min(max(wanted / max(rate, MIN_RATIO * wanted), 0.1), 10.0), MAX_SPEED_PX_S)
-    return under_leaves(speed, stop_us)
-
-
-def _middle(events: Events) -> Events:
-    top, left = _corner(events)
-    return crop(events, top, left, min(events.height, MAX_SIDE), min(events.width, MAX_SIDE))
-
-
-def _corner(events: Events) -> tuple[int, int]:
-    return max(0, (events.height - MAX_SIDE) // 2), max(0, (events.width - MAX_SIDE) // 2)
+        values = np.full(len(t_us), light)
+    return constant_frames(values, height, width), t_us
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> float:

@@ -56,7 +56,7 @@ def rows_for(file: Path) -> Iterator[str]:
             continue
         matches += 1
         count = sum(one.numel() for one in recoverer.network.parameters()) if recoverer.network else 0
-        yield f"{file.name}: methods.{method.name}.weights ({method.label}), {count:,} parameters"
+        yield f"{file.name}: row {method.name} ({method.label}), {count:,} parameters"
     if not matches:
         raise ValueError(f"{file}: no method can use it; " + "; ".join(f"{n}: {text}" for n, text in reasons.items()))
 

@@ -6,12 +6,19 @@ from pathlib import Path
 from polarnet import __version__
 from polarnet.cli.parsers import Commands
 
-COPIED = ("params.yaml", "conf/**/*.yaml", "stages/*.py", "data/*/README.md")
-CODE = ("polarnet/", "${item.module}")
+COPIED = ("params.yaml", "conf/**/*.yaml", "stages/*.py", "data/**/README.md")
+CODE = "polarnet/"
 """Dependencies in dvc.yaml on the code of polarnet, which a project replaces by `REQUIREMENTS`."""
 REQUIREMENTS = "requirements.txt"
-FILTERS = "needs: *filters"  # in the entries of rows without weights, which need their own code alone
-IGNORED = "/data/*\n!/data/*/\n/data/*/*\n!/data/*/README.md\n/outputs/\n__pycache__/\n"
+IGNORED = """/data/*
+!/data/*/
+/data/*/*
+!/data/external/*/
+/data/external/*/*
+!/data/**/README.md
+/outputs/
+__pycache__/
+"""
 DVC = "[core]\n    analytics = false\n    no_scm = true\n"  # `dvc init --force` in a Git repository replaces it
 
 
@@ -48,8 +55,6 @@ def write_project(folder: Path) -> None:
         target = folder / path.relative_to(source)
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
-    params = folder / "params.yaml"
-    params.write_text(params.read_text(encoding="utf-8").replace(FILTERS, f"needs: {REQUIREMENTS}"), encoding="utf-8")
     _write_pipeline(source / "dvc.yaml", folder / "dvc.yaml")
     (folder / ".dvc").mkdir()
     for name, text in ((REQUIREMENTS, f"polarnet=={__version__}\n"), (".gitignore", IGNORED), (".dvc/config", DVC)):

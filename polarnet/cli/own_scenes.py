@@ -13,7 +13,7 @@ from polarnet.benchmark.rows import Context, available, metadata_used, weights_u
 from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, with_lpips
-from polarnet.methods import METHODS, is_rotating
+from polarnet.methods import is_rotating
 from polarnet.metrics.lpips import NO_RECORD
 from polarnet.metrics.lpips_weights import Weights, find_weights
 from polarnet.metrics.similarity import Lpips
@@ -117,7 +117,7 @@ def _inputs(config: Config, weights: Path | None) -> Inputs:
         )
     lpips = with_lpips(config, "benchmark", find_weights)  # the pipeline need not have found them before
     wanted = [*config.benchmark.methods, *(["ours"] if weights and "ours" not in config.benchmark.methods else [])]
-    context = context_of(config, _train_mean(config), weights or shipped_weights())
+    context = context_of(config, wanted, _train_mean(config), weights or shipped_weights())
     return Inputs(context, *available(wanted, context), lpips)
 
 
@@ -169,7 +169,4 @@ def _train_mean(config: Config) -> float | None:
 
 def _left_out(row: str, reason: str) -> str:
     """One line for a method that cannot run."""
-    weights = METHODS[row].weights if row in METHODS else None
-    trained = weights is not None and weights.trained_by is not None
-    advice = "; name it in benchmark.methods of params.yaml and run `dvc repro`" if trained else ""
-    return f"{row} was left out: {reason}{advice}."
+    return f"{row} was left out: {reason}."

@@ -4,7 +4,7 @@ import argparse
 import contextlib
 import functools
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,10 +22,9 @@ from polarnet.cli.parsers import (
 from polarnet.cli.project import settings_root
 
 if TYPE_CHECKING:
-    from polarnet.captures.dot import RecordingsConfig
-    from polarnet.methods.method import Method, Setup
-    from polarnet.recordings.live import LiveLines
-    from polarnet.recordings.live_camera import LiveCamera
+    from polarnet.config.tree import Config
+    from polarnet.events.rotation import Rotation
+    from polarnet.events.streaming import WindowRule
     from polarnet.recordings.noise import Cleaner
     from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recovery.stream import Input
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
 CLEANING_OPTIONS = ("hot_pixels", "background")
 """Options that remove noise before recovery."""
 
+DEFAULT_METHOD, ROTATING_METHOD = "ours", "rotating_polarizer"
 RECONSTRUCT = "highpass"
 """Method whose intensities are the S0 of the video."""
 
@@ -43,16 +43,14 @@ BESIDE = ""
 
 NETWORK_WINDOW = "33.333ms"
 
-OPTIONS_BY_INPUT = {
-    "--live": {"mosaic", "rate", "rerun", *CLEANING_OPTIONS},
-    "four files": {"angles", "size", "rate", "rerun", *CLEANING_OPTIONS, *READING_OPTIONS},
-    "one file with --mosaic": {"mosaic", "size", "rate", "rerun", *CLEANING_OPTIONS, *READING_OPTIONS},
-    "one file with --rotating or --triggers": {"rotating", "triggers", "start_angle", "size", *READING_OPTIONS},
-    "one file without polarizers": {"size", "rerun", *CLEANING_OPTIONS, *READING_OPTIONS},
-    "an event store or a folder": {"sequence", "truth", "size", "rate", "rerun", *CLEANING_OPTIONS},
-}
-"""Options of `polarnet recover` that apply to each kind of input."""
-
+ARRANGEMENTS = ("angles", "mosaic", "rotating", "triggers", "sequence")
+"""Options that say where the polarizers are."""
+NOT_LIVE = ("angles", "rotating", "triggers", "sequence", "truth", "size", *READING_OPTIONS)
+NOT_ROTATING = (
+    "angles", "mosaic", "sequence", "truth", "rate", "method", "weights", "thresholds", "binning", "window",
+    *CLEANING_OPTIONS,
+)  # fmt: skip
+"""Options without a meaning for live input, and for one camera behind a rotating polarizer."""
 
 RECOVER_DESCRIPTION = """\
 Writes frames, pictures, a video and a page. INPUT is one of:
@@ -86,7 +84,7 @@ def _add_inspection(commands: Commands) -> None:
         "inspect",
         help="summarise a camera's file and draw its busiest moment",
         description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
-        "camera's file, with signs of a readout at its limit, and draws its busiest moment as a PNG.",
+        "camera's file, with its longest gap and empty rows, and draws its busiest moment as a PNG.",
         epilog="example: polarnet inspect recording.aedat4 --hot-pixels hot.png",
     )
     inspect.add_argument("file", type=Path, help="file of a camera, or an event store with --part")
@@ -162,12 +160,12 @@ def _add_method(recover: argparse.ArgumentParser) -> None:
     recover.add_argument(
         "--window",
         help="length of a window: a time (33.3ms) or a number of events of all channels (20000ev); networks are "
-        "trained on windows of 1/30 s (default: 33.333ms; with --rotating: modulation.window_turns)",
+        "trained on windows of 1/30 s (default: 33.333ms)",
     )  # fmt: skip
     recover.add_argument(
         "--step",
-        help="time between the ends of overlapping windows, at least 0.1ms (default: no overlap; with "
-        "--rotating: half a turn)",
+        help="time between the ends of overlapping windows, at least 0.1ms (default: no overlap); with --rotating, "
+        "time between frames (default: half a turn)",
     )
     recover.add_argument(
         "--rate",
@@ -244,43 +242,42 @@ def _inspect(options: argparse.Namespace) -> int:
 def _recover(options: argparse.Namespace) -> int:
     from polarnet.config.pipeline import setup_of
     from polarnet.config.tree import load
-    from polarnet.events.streaming import WindowRule, parse_window
     from polarnet.methods import METHODS
     from polarnet.recordings.noise import Cleaner
     from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
-    from polarnet.recovery.stream import facts_of, frames_of, open_method, recover
+    from polarnet.recovery.stream import ChosenMethod, facts_of, frames_of, open_method, recover
     from polarnet.recovery.watching import TruthScores, logged
     from polarnet.recovery.writer import RecoveryWriter
     from polarnet.reports.rerun_log import RerunLog
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
-    refuse_unused_options(options)
-    cleaning = cleaning_of(options)
-    if options.rotating is not None or options.triggers is not None:
-        return _recover_rotating(options)
-    config = functools.cache(lambda: load(settings_root()))
-
-    def setup(method: "Method") -> "Setup":
-        return setup_of(config(), method)
-
-    rule = WindowRule(*parse_window(options.window or NETWORK_WINDOW), duration_us(options, "step", "0.1ms"))
-    recoverer, words = open_method(
-        options.method, options.weights, options.device, options.precision, setup, options.thresholds, options.binning
+    check_options(options)
+    config = load(settings_root(), [f"runtime.device={options.device}"])
+    setup = functools.partial(setup_of, config)
+    source, rotation, rule = _rotating(options)
+    chosen = ChosenMethod(
+        options.method or (ROTATING_METHOD if rotation else DEFAULT_METHOD),
+        options.weights,
+        options.precision,
+        options.thresholds,
+        options.binning,
+        rotation,
     )
+    recoverer, words = open_method(chosen, setup)
     rate = None
     if options.rate is not None:
         check_rate(options.rate, rule, recoverer)
-        rate = Rate(options.rate, config().between.with_thresholds(options.thresholds))
+        rate = Rate(options.rate, config.between.with_thresholds(options.thresholds))
     truth = _truth_of(options)
     scores = TruthScores(truth) if truth else None
     out = options.out or Path("outputs") / "recover" / ("live" if options.live else Path(options.input[0]).stem)
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
-    cleaner = Cleaner(cleaning, mosaic)
+    cleaner = Cleaner(cleaning_of(options), mosaic)
     with run_folder(out, "recover") as folder, contextlib.ExitStack() as stack:
         if options.live:
             print(f"writing frames to {folder}; the folder becomes {out} at the end", file=sys.stderr)
-        source, lines = _input(options, mosaic, cleaner, folder / WORK, lambda: config().recordings)
+        source = source or _input(options, mosaic, cleaner, folder / WORK, config)
         check, polarized = None, source.channels == len(POLARIZER_ANGLES_DEG)
         if polarized:
             check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
@@ -296,15 +293,34 @@ def _recover(options: argparse.Namespace) -> int:
         facts = facts_of(source, rule, words, recover(source, rule, recoverer, writer, frames))
         facts |= _further_facts(options.rate, check)
         if scores:
-            facts["scores"] = scores.sentence(config().benchmark.warmup_windows)
+            facts["scores"] = scores.sentence(config.benchmark.warmup_windows)
         if any(getattr(options, option) for option in CLEANING_OPTIONS):
             facts["removed"] = cleaner.sentence()
         notes = check.findings() if check else []
-        if left_out := {kind: count for kind, count in lines.counts.items() if count} if lines else {}:
+        if left_out := {kind: count for kind, count in (source.left_out or {}).items() if count}:
             notes.append(f"Unusable lines were left out: {left_out}.")
         page = writer.write_page(source.name, facts, notes)
-    _print_run(facts, notes, out / page.name)
+    for key, value in facts.items():
+        print(f"{key:11s} {value}")
+    for note in notes:
+        print(f"polarnet recover: warning: {note}", file=sys.stderr)
+    print(f"page        {out / page.name}")
     return 0
+
+
+def _rotating(options: argparse.Namespace) -> "tuple[Input | None, Rotation | None, WindowRule]":
+    """Input and rotation of one camera behind a rotating polarizer, None for any other input; and the windows."""
+    from polarnet.events.streaming import WindowRule, parse_window
+    from polarnet.recordings.recording import read_recording
+    from polarnet.recovery.inputs import half_turn_rule, open_rotating, rotation_of
+
+    step_us = duration_us(options, "step", "0.1ms")
+    if options.rotating is None and options.triggers is None:
+        return None, None, WindowRule(*parse_window(options.window or NETWORK_WINDOW), step_us)
+    rotation = rotation_of(options.rotating, options.triggers, options.start_angle or 0.0)
+    read = functools.partial(read_recording, **reading_of(options))
+    source, rotation = open_rotating(Path(options.input[0]), rotation, read, options.size)
+    return source, rotation, half_turn_rule(rotation, step_us)
 
 
 def _further_facts(rate_hz: float | None, check: "ChannelCheck | None") -> dict[str, str]:
@@ -321,31 +337,25 @@ def _further_facts(rate_hz: float | None, check: "ChannelCheck | None") -> dict[
 
 
 def _input(
-    options: argparse.Namespace,
-    mosaic: "Mosaic | None",
-    cleaner: "Cleaner",
-    work: Path,
-    captures: "Callable[[], RecordingsConfig]",
-) -> "tuple[Input, LiveLines | LiveCamera | None]":
-    """Cleaned events of the input; for live input also its reader, which counts the unusable lines."""
+    options: argparse.Namespace, mosaic: "Mosaic | None", cleaner: "Cleaner", work: Path, config: "Config"
+) -> "Input":
+    """Cleaned events of live input, or of files with the arrangement that the options state."""
     from polarnet.recordings.recording import read_recording
-    from polarnet.recovery.stream import Arrangement, open_files, open_live
+    from polarnet.recovery.inputs import Files, open_files, open_live
 
     if options.live:
-        source, lines = open_live(options.input[0], mosaic, options.idle)
-        return source._replace(pieces=cleaner.live(source.pieces)), lines
-    read = functools.partial(read_recording, **reading_of(options))
-    arrangement = Arrangement(options.angles, mosaic, options.sequence)
-    files, size = [Path(path) for path in options.input], options.size and tuple(options.size)
-    return open_files(files, arrangement, read, size, work, captures, _reconstructs(options.method), cleaner), None
-
-
-def _print_run(facts: Mapping[str, str], notes: Sequence[str], page: Path) -> None:
-    for key, value in facts.items():
-        print(f"{key:11s} {value}")
-    for note in notes:
-        print(f"polarnet recover: warning: {note}", file=sys.stderr)
-    print(f"page        {page}")
+        source = open_live(options.input[0], mosaic, options.idle)
+        return source._replace(pieces=cleaner.live(source.pieces))
+    files = Files(
+        [Path(path) for path in options.input],
+        options.angles,
+        mosaic,
+        options.sequence,
+        _reconstructs(options.method),
+        functools.partial(read_recording, **reading_of(options)),
+        config.recordings,
+    )
+    return open_files(files, work, options.size, cleaner)
 
 
 def _truth_of(options: argparse.Namespace) -> "TrueFrames | None":
@@ -372,62 +382,29 @@ def _reconstructs(method: str | None) -> bool:
     return method in METHODS and METHODS[method].reconstructs and METHODS[method].wraps is None
 
 
-def _recover_rotating(options: argparse.Namespace) -> int:
-    from polarnet.config.tree import load
-    from polarnet.methods.half_turns import half_turns_recoverer
-    from polarnet.methods.rotating_polarizer import rotating_recoverer
-    from polarnet.recordings.recording import read_recording
-    from polarnet.recovery.rotating import half_turn_rule, open_rotating, rotation_of
-    from polarnet.recovery.stream import facts_of, recover
-    from polarnet.recovery.writer import RecoveryWriter
-
-    if options.method not in (None, "rotating_polarizer") or options.weights or options.thresholds or options.binning:
-        raise ValueError(
-            "--rotating: expected no --method but rotating_polarizer (for moving scenes), and no --weights, "
-            "--thresholds or --binning, because a fit recovers DoLP without a network, with the thresholds of "
-            "params.yaml; leave it out"
-        )
-    settings = load(settings_root())
-    config, moving = settings.modulation, options.method is not None
-    file, size = Path(options.input[0]), options.size and tuple(options.size)
-    rotation = rotation_of(options.rotating, options.triggers, options.start_angle or 0.0)
-    length_us, step_us = (duration_us(options, name, "500ms") for name in ("window", "step"))
-    rule = half_turn_rule(rotation, 0.5 if moving else config.window_turns, length_us, step_us)
-    out = options.out or Path("outputs") / "recover" / file.stem
-    with run_folder(out, "recover") as folder:
-        source, rotation = open_rotating(file, rotation, functools.partial(read_recording, **reading_of(options)), size)
-        writer = RecoveryWriter(folder, options.write, options.video_rate)
-        if moving:
-            recoverer = half_turns_recoverer(settings.methods.rotating_polarizer, rotation)
-        else:
-            recoverer = rotating_recoverer(config, rotation)
-        fitted = "each half turn of" if moving else "the modulation by"
-        words = f"fit to {fitted} a polarizer at {rotation.rate_hz:g} turns/s"
-        facts = facts_of(source, rule, words, recover(source, rule, recoverer, writer))
-        page = writer.write_page(source.name, facts, [])
-    _print_run(facts, [], out / page.name)
-    return 0
-
-
-def refuse_unused_options(options: argparse.Namespace) -> None:
-    """ValueError for an option that does not apply to the given kind of input."""
-    if options.live and len(options.input) != 1:
-        raise ValueError(f"--live: expected one file or -, got {len(options.input)}")
+def check_options(options: argparse.Namespace) -> None:
+    """ValueError for options that do not belong together, or that the input would not use."""
+    stated = [name for name in ARRANGEMENTS if getattr(options, name) is not None]
+    if len(stated) > 1 and stated != ["rotating", "triggers"]:
+        raise ValueError(f"expected one arrangement of polarizers, got {_listed(stated)}")
+    rotating = "rotating" in stated or "triggers" in stated
     if options.live:
-        kind = "--live"
-    elif len(options.input) > 1:
-        kind = "four files"
-    elif options.rotating is not None or options.triggers is not None:
-        kind = "one file with --rotating or --triggers"
-    elif options.mosaic is not None:
-        kind = "one file with --mosaic"
-    elif Path(options.input[0]).is_dir():
-        kind = "an event store or a folder"
-    elif _reconstructs(options.method):
-        kind = "one file without polarizers"
-    else:
-        return  # reading the input will name the missing option
-    unused = set().union(*OPTIONS_BY_INPUT.values()) - OPTIONS_BY_INPUT[kind]
-    given = [f"--{name.replace('_', '-')}" for name in sorted(unused) if getattr(options, name) is not None]
+        _refuse(options, "--live", NOT_LIVE)
+    if rotating:
+        _refuse(options, "--rotating", NOT_ROTATING)
+    if (options.live or rotating) and len(options.input) != 1:
+        raise ValueError(f"{'--live' if options.live else '--rotating'}: expected one input, got {len(options.input)}")
+    if not rotating:
+        _refuse(options, "without --rotating or --triggers", ("start_angle",))
+    if Path(options.input[0]).is_dir():
+        _refuse(options, "a store or a folder", READING_OPTIONS)
+
+
+def _refuse(options: argparse.Namespace, kind: str, names: Sequence[str]) -> None:
+    given = [name for name in names if getattr(options, name) is not None]
     if given:
-        raise ValueError(f"{kind}: expected no {', '.join(given)}, which does not apply to this input; leave it out")
+        raise ValueError(f"{kind}: expected no {_listed(given)}, which does not apply to this input; leave it out")
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(f"--{name.replace('_', '-')}" for name in names)

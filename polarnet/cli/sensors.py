@@ -75,7 +75,6 @@ def _fit_sensor(options: argparse.Namespace) -> int:
     from polarnet.characterization.known_light import KnownLight
     from polarnet.characterization.light import Flicker, read_light
     from polarnet.characterization.twin import compare, fitted_parameters, fitted_sensor
-    from polarnet.config.experiments import preset_values
     from polarnet.recordings.recording import read_recording
     from polarnet.reports.realism import FitRow, realism_page
     from polarnet.simulation.presets import SENSORS
@@ -91,13 +90,13 @@ def _fit_sensor(options: argparse.Namespace) -> int:
     static = read(options.static) if options.static else None
     moving = read(options.moving) if options.moving else None
     known: list[KnownLight] = []
-    lights: list[tuple[str, Events, MovingLight | Flicker | float | None]] = []
+    lights: list[tuple[str, Events, MovingLight | Flicker | float]] = []
     if static is not None:
         lights.append((f"static: {options.static.name}", static, static_light))
-    if moving is not None:
-        light = read_light(options.frames, moving.height, moving.width) if options.frames else None
+    if moving is not None and options.frames:
+        light = read_light(options.frames, moving.height, moving.width)
+        known.append(KnownLight("moving", moving, light))
         lights.append((f"moving: {options.moving.name}", moving, light))
-        known += [KnownLight("moving", moving, light)] if light else []
     mean = 127.5 if options.flicker_light is None else options.flicker_light
     for path, frequency_hz in zip(options.flicker or [], options.frequency or [], strict=True):
         flicker = Flicker(mean, options.contrast, frequency_hz)
@@ -115,10 +114,8 @@ def _fit_sensor(options: argparse.Namespace) -> int:
         )
     for note in notes:
         print(f"note: {note}")
-    base = preset_values(settings_root(), "sensor", "default")
-    values = {k: v for k, v in fitted_parameters(fit).items() if v != base.get(f"emulate.{k}")}
     preset.parent.mkdir(parents=True, exist_ok=True)
-    preset.write_text(preset_text(options.name, values), encoding="utf-8")
+    preset.write_text(preset_text(options.name, fitted_parameters(fit)), encoding="utf-8")
     sensor = fitted_sensor(fit, SENSORS["default"])
     comparisons = [compare(name, events, light, sensor, seed=1) for name, events, light in lights if len(events) > 1]
     for comparison in comparisons:

@@ -130,7 +130,7 @@ def _prepared(config: Config, methods: Sequence[str], limit: int | None, weights
         raise ValueError(f"--methods: expected some of {', '.join(ROWS)}, got {', '.join(unknown) or 'none'}")
     tests = pipeline_set(config, "simulated")
     scenes = SceneStore.open(config.paths.scenes)
-    context = context_of(config, train_mean_dolp(tests.frames, config.benchmark.warmup_windows), weights)
+    context = context_of(config, methods, train_mean_dolp(tests.frames, config.benchmark.warmup_windows), weights)
     return tests.sequences[:limit], context, tests, scenes
 
 

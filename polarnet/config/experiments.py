@@ -1,7 +1,6 @@
 """Named presets in conf/: overrides that Hydra reads directly and DVC reads through params.yaml."""
 
-import functools
-import operator
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -9,32 +8,13 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from polarnet.runtime.files import replaced
+from polarnet.terminal.installation import shipped_settings
 
 MAPPINGS = ("randomise",)
 """Keys whose value is a whole mapping; a preset replaces it."""
 
-BASE = {"experiment": "demo", "sensor": "default", "polarizers": "ideal"}
-"""Base preset of each group (a folder of conf/).
-
-It sets every value that another preset of the group changes, so no value of an earlier preset remains.
-"""
-
-
-def stage_names(root: Path) -> list[str]:
-    """Names of the stages in dvc.yaml, in the order of the file, which is the order of execution.
-
-    A stage with `foreach` gives one name, STAGE@ITEM, for each key or item of its section of params.yaml.
-    """
-    yaml = YAML(typ="safe")
-    params = yaml.load(root / "params.yaml")
-    names = []
-    for stage, content in yaml.load(root / "dvc.yaml")["stages"].items():
-        if "foreach" not in content:
-            names.append(stage)
-            continue
-        keys = content["foreach"].removeprefix("${").removesuffix("}").split(".")
-        names += [f"{stage}@{item}" for item in functools.reduce(operator.getitem, keys, params)]
-    return names
+GROUPS = ("experiment", "sensor", "polarizers")
+"""Folders of conf/ whose presets can be written into params.yaml."""
 
 
 def preset_names(root: Path, group: str) -> list[str]:
@@ -53,7 +33,7 @@ def preset_values(root: Path, group: str, name: str) -> dict[str, Any]:
 
 def group_of(root: Path, name: str) -> str:
     """Group that contains a preset of this name; a ValueError lists the existing presets."""
-    names = {group: preset_names(root, group) for group in BASE}
+    names = {group: preset_names(root, group) for group in GROUPS}
     for group, of_group in names.items():
         if name in of_group:
             return group
@@ -62,10 +42,11 @@ def group_of(root: Path, name: str) -> str:
 
 
 def write_preset(root: Path, name: str) -> list[str]:
-    """Write the base preset of the group and then the preset `name` into params.yaml, keeping its comments.
+    """Write the preset `name` into params.yaml, keeping its comments.
 
-    Returns the changes as "key: old -> new". Keys outside the presets of the group keep their values, so a sensor can
-    be written after an experiment.
+    A preset holds only what differs. Keys that other presets of the group set go back to their values in the committed
+    params.yaml (in a project without git: in the one that came with polarnet); all other keys keep their values. An
+    experiment takes back sensors and polarizers, too. Returns the changes as "key: old -> new".
     """
     yaml = YAML()
     yaml.preserve_quotes = True
@@ -74,7 +55,11 @@ def write_preset(root: Path, name: str) -> list[str]:
     path, group = root / "params.yaml", group_of(root, name)
     params = yaml.load(path)
     changed = []
-    for key, value in {**preset_values(root, group, BASE[group]), **preset_values(root, group, name)}.items():
+    undone = GROUPS if group == "experiment" else (group,)
+    others = (preset_values(root, one, other) for one in undone for other in preset_names(root, one))
+    base = _original(root)
+    values = {key: _value(base, key) for other in others for key in other} | preset_values(root, group, name)
+    for key, value in values.items():
         *sections, last = key.split(".")
         node = params
         for section in sections:
@@ -87,6 +72,21 @@ def write_preset(root: Path, name: str) -> list[str]:
     with replaced(path) as temporary:
         yaml.dump(params, temporary)
     return changed
+
+
+def _original(root: Path) -> Any:
+    """params.yaml as last committed, or as it came with polarnet."""
+    committed = subprocess.run(["git", "show", "HEAD:./params.yaml"], cwd=root, capture_output=True, text=True)
+    if committed.returncode == 0:
+        return YAML(typ="safe").load(committed.stdout)
+    return YAML(typ="safe").load(shipped_settings() / "params.yaml")
+
+
+def _value(params: Any, key: str) -> Any:
+    """Value of a dotted key; None if there is none."""
+    for part in key.split("."):
+        params = params.get(part) if isinstance(params, dict) else None
+    return params
 
 
 def _in_style(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from polarnet.benchmark.row_results import RowRecord, write_row
 from polarnet.benchmark.rows import Context, available, weights_used
 from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp
 from polarnet.config.tree import Config, or_exit
+from polarnet.events.rotation import steady_rotation
 from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup
 from polarnet.metrics.similarity import Lpips
@@ -21,35 +22,44 @@ from polarnet.storage.frames import FrameStore
 RECORDINGS = "recordings"  # name of the test set of real targets
 
 
-def context_of(config: Config, train_mean: float | None, weights: Path | None = None) -> Context:
-    """Inputs of the benchmark methods; `weights` replaces the pipeline's trained weights of `ours`."""
-    given = {"ours": weights} if weights else {}
-    setups = {
-        method.section: setup_of(config, method, given.get(method.section))
-        for method in METHODS.values()
-        if method.wraps is None
-    }
+def context_of(config: Config, rows: Iterable[str], train_mean: float | None, weights: Path | None = None) -> Context:
+    """Inputs of rows of the benchmark; `weights` replaces the weights of `ours` in section `rows`."""
+    setups: dict[str, Setup] = {}
+    for method in (METHODS[row] for row in rows if row in METHODS):
+        setups.setdefault(method.section, setup_of(config, method, weights if method.section == "ours" else None))
     return Context(train_mean, setups, device_of(config.runtime))
 
 
 def setup_of(config: Config, method: Method, weights: Path | None = None) -> Setup:
-    """Inputs of a method, with `weights`, else the weights in its section, else those of its training stage."""
-    section: Any = getattr(config.methods, method.section, None)  # a method without settings has no section
-    if weights is None and method.weights is not None:
-        if section.weights:
-            weights = Path(section.weights)
-        elif method.weights.trained_by:
-            weights = Path(config.paths.train) / method.weights.trained_by / "best.safetensors"
+    """Inputs of a method, with `weights`, else those that section `rows` names."""
+    rotation = None
+    if method.rotating:
+        rotating = _rotating_of(config)
+        rotation = steady_rotation(rotating["rate_hz"], math.radians(rotating["start_angle_deg"]))
     return Setup(
-        config=section,
-        weights=weights,
-        postprocessing=config.baselines.postprocessing,
-        gain=config.baselines.gain,
+        config=getattr(config.methods, method.section, None),
+        weights=weights or _weights_of(config, method),
+        sharpening=config.methods.sharpening,
+        gain=config.methods.gain,
         device=device_of(config.runtime),
         precision=config.benchmark.precision,
-        rotation_hz=config.rotating.rate_hz,
-        start_angle=math.radians(config.rotating.start_angle_deg),
+        rotation=rotation,
     )
+
+
+def _weights_of(config: Config, method: Method) -> Path | None:
+    """File that section `rows` names for a method; a row NAME+gain that is not listed has the weights of NAME."""
+    if method.weights is None:
+        return None
+    return config.weights_of(method.name) or config.weights_of(method.section)
+
+
+def _rotating_of(config: Config) -> Mapping[str, Any]:
+    """Section `rotating` that the pipeline's events behind a rotating polarizer were made with; else that of today."""
+    events = Path(config.paths.rotating) / f"{config.benchmark.sets[0]}.zarr"
+    if events.exists():
+        return EventStore.open(events).attributes["rotating"]
+    return dataclasses.asdict(config.rotating)
 
 
 def pipeline_set(config: Config, name: str, rows: Sequence[str] = ()) -> BenchmarkSet:
@@ -75,9 +85,8 @@ def rows_of_set(name: str, rows: Sequence[str]) -> list[str]:
 
 
 def set_folder(config: Config, name: str) -> Path:
-    """Folder of a set's results: the benchmark folder for the simulated set, a subfolder for any other."""
-    folder = Path(config.paths.benchmark)
-    return folder if name == "simulated" else folder / "sets" / name
+    """Folder of a set's results."""
+    return Path(config.paths.benchmark) / "sets" / name
 
 
 def row_folder(config: Config, row: str) -> Path:
@@ -96,7 +105,7 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
     A row that cannot run gets a folder with the reason. SystemExit if LPIPS weights are missing.
     """
     needs_mean = any(row in REFERENCES and REFERENCES[row].needs_train_mean for row in rows)
-    context = context_of(config, train_mean_of(config) if needs_mean else None)
+    context = context_of(config, rows, train_mean_of(config) if needs_mean else None)
     methods, left_out = available(rows, context)
     for row, reason in left_out.items():
         print(f"{row} is left out: {reason}")

@@ -11,12 +11,13 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
+from polarnet.config.origins import first_difference
 from polarnet.training.engine.history import HISTORY, best_row, read_history
 
 FAILURE = "failure.txt"
 """File in the folder of a failed job with the reason in one line."""
 FINISHED = "finished.json"
-"""File in the folder of a finished job with its overrides."""
+"""File in the folder of a finished job with all of its values, and hashes of its inputs."""
 COLUMNS = {
     "validation": {"mse": "validation MSE ↓", "psnr": "validation PSNR ↑"},
     "test": {
@@ -68,14 +69,18 @@ def write_comparison(folder: Path) -> str:
     return f"{table}\nwritten to {folder / 'comparison.md'}, {kinds}"
 
 
-def finished(job: Path, overrides: Sequence[str]) -> bool:
-    """Whether the folder of a job holds the results of these overrides."""
-    return _read(job / FINISHED) == list(overrides)
+def why_unfinished(job: Path, record: Mapping[str, Any]) -> str | None:
+    """Why the folder of a job does not hold the results of `record`, its values and inputs; None if it does."""
+    before = _read(job / FINISHED)
+    if before is None:
+        return "it has not finished"
+    change = first_difference(before, json.loads(json.dumps(record)), "")
+    return change and f"{change[0]} was {change[1]}, is {change[2]}"
 
 
-def mark_finished(job: Path, overrides: Sequence[str]) -> None:
-    """Record that the folder of a job holds the results of these overrides."""
-    (job / FINISHED).write_text(json.dumps(list(overrides)) + "\n")
+def mark_finished(job: Path, record: Mapping[str, Any]) -> None:
+    """Record that the folder of a job holds the results of these values and inputs."""
+    (job / FINISHED).write_text(json.dumps(record) + "\n")
 
 
 def best_point(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -106,9 +111,9 @@ def sweep_points(folder: Path) -> list[dict[str, Any]]:
 
     `validation` holds the scores of the best epoch, and `test` holds those of `ours`; null if a trial has none.
     """
-    jobs = [path.parent.parent for path in folder.glob("*/.hydra/overrides.yaml")]
+    jobs = [path.parent.parent for path in folder.glob("**/.hydra/overrides.yaml")]
     trials = [job for job in jobs if (job / "train").exists() or (job / FAILURE).exists()]
-    return [_point(job) for job in sorted(trials, key=lambda job: (len(job.name), job.name))]
+    return [_point(folder, job) for job in sorted(trials, key=lambda job: (len(job.name), job.name))]
 
 
 def sweep_rows(points: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -195,7 +200,7 @@ def _plot(axes: tuple[dict[str, list[str]], list[float], str]) -> bytes:
     return png(parallel_coordinates(*axes, LIGHT))
 
 
-def _point(job: Path) -> dict[str, Any]:
+def _point(folder: Path, job: Path) -> dict[str, Any]:
     config: Any = OmegaConf.load(job / ".hydra" / "config.yaml")
     training = job / "train" / "ours"
     history = read_history(training) if (training / HISTORY).exists() else []
@@ -204,13 +209,13 @@ def _point(job: Path) -> dict[str, Any]:
     failure = (job / FAILURE).read_text().strip() if (job / FAILURE).exists() else unfinished
     weights = OmegaConf.to_container(config.loss)
     return {
-        "job": job.name,
+        "job": job.relative_to(folder).as_posix(),
         "overrides": list(OmegaConf.load(job / ".hydra" / "overrides.yaml")),
         "seed": config.seed,
         "weights": weights,
         "lpips_backbone": config.benchmark.get("lpips_backbone") or config.lpips.backbone,
         "validation": best_row(history)["val"] if history else None,
-        "test": metrics["ours"] if metrics else None,
+        "test": metrics["simulated"]["ours"] if metrics else None,
         "notes": [*(_dropped_terms(weights, history[-1]["train"]) if history else []), *_warnings(job / "logs")],
         "failure": failure,
     }

@@ -1,6 +1,7 @@
 """The tables of a configuration, put together from the results of its rows."""
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -8,13 +9,15 @@ from typing import Any
 from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.row_results import read_record, read_rows
 from polarnet.config.pipeline import row_folder, rows_of_set, set_folder, set_names, train_mean_of
-from polarnet.config.tree import Config
+from polarnet.config.tree import DOLP_TRAINING, Config
 from polarnet.metrics.lpips import NO_RECORD, stored_record
+from polarnet.training.engine.history import HISTORY
 
 
 def collect_rows(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
     """Put the table of each set together from the folders of `benchmark.methods`, whatever other folders exist.
 
+    metrics.json in the benchmark's folder holds the scores of all sets, for `dvc metrics`.
     Returns scores and costs by set and row. FileNotFoundError names a row that was not run; ValueError if every row
     was left out.
     """
@@ -29,13 +32,23 @@ def collect_rows(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
         "train_mean": train_mean_of(config),
         "left_out": left_out,
         "weights": {section: file for record in records.values() for section, file in record.weights.items()},
-        "postprocessing": dataclasses.asdict(config.baselines.postprocessing),
     }
-    shutil.rmtree(Path(config.paths.benchmark) / "sets", ignore_errors=True)  # an earlier run may have had other sets
-    (Path(config.paths.benchmark) / "sets").mkdir(parents=True)
+    benchmark = Path(config.paths.benchmark)
+    shutil.rmtree(benchmark / "sets", ignore_errors=True)  # an earlier run may have had other sets
     tables = {}
     for name in set_names(config):
         here = {row: folders[row] for row in rows_of_set(name, list(folders))}
         settings, of_set = dataclasses.replace(config.benchmark, methods=list(here)), {"set": name, **about}
         tables[name] = write_benchmark(set_folder(config, name), read_rows(here, name), settings, config.seed, of_set)
+    scores = {name: json.loads((set_folder(config, name) / "metrics.json").read_text()) for name in tables}
+    (benchmark / "metrics.json").write_text(json.dumps(scores, indent=2) + "\n")
     return tables
+
+
+def copy_histories(config: Config) -> None:
+    """Copy the history of each training in use to history/NAME.csv in the benchmark's folder, for `dvc plots`."""
+    folder = Path(config.paths.benchmark) / "history"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for name in (DOLP_TRAINING, *config.used_baselines):
+        shutil.copy(Path(config.paths.train) / name / HISTORY, folder / f"{name}.csv")

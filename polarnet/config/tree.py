@@ -18,11 +18,11 @@ from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.score import BenchmarkConfig
 from polarnet.captures.dot import RecordingsConfig
 from polarnet.config.experiments import preset_values
+from polarnet.config.origins import Run
 from polarnet.config.overrides import check_overrides
-from polarnet.methods import METHODS, module_of, trained_rows
+from polarnet.methods import METHODS
 from polarnet.methods.between import BetweenConfig
-from polarnet.methods.postprocessing import PostprocessingConfig
-from polarnet.methods.rotating_polarizer import ModulationConfig
+from polarnet.methods.sharpening import SharpeningConfig
 from polarnet.methods.stokes_gain import GainConfig
 from polarnet.metrics.lpips import BACKBONES, PURPOSES, Purpose, is_stored
 from polarnet.metrics.lpips_weights import LpipsConfig, local_source
@@ -42,11 +42,12 @@ from polarnet.simulation.variation import VariationConfig
 from polarnet.storage.parts import StorageConfig
 from polarnet.terminal.environment import INTERRUPTED, STOPPED
 from polarnet.training.baselines import BASELINES
-from polarnet.training.engine.loop import TrainConfig
+from polarnet.training.engine.loop import LoopConfig, TrainConfig
 from polarnet.training.engine.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
 EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # subfolder of the project in which DVC runs queued experiments
+BEST = "best.safetensors"
 DOLP_TRAINING = "ours"
 """Training of the DoLP network, in data/train beside the baselines."""
 
@@ -54,6 +55,8 @@ Stage = Callable[["Config"], None]
 T = TypeVar("T")
 RowName = Annotated[str, one_of(ROWS)]
 BaselineName = Annotated[str, one_of(BASELINES)]
+OWN_KEYS = ("epochs", "crop", "visits", "windows", "bptt_windows", "precision")
+"""Keys of a training that each baseline has in its own section; the others stand in `baselines.training`."""
 
 
 if typing.TYPE_CHECKING:
@@ -67,24 +70,38 @@ else:
 
     NetworksConfig = _assembled("NetworksConfig", NETWORKS)
     """Section `networks` of params.yaml: one section for each network; `network` names the network in use."""
-    MethodsConfig = _assembled("MethodsConfig", {m.name: m.config for m in METHODS.values() if m.config is not None})
-    """Section `methods` of params.yaml: one section for each method whose record declares settings."""
+    MethodsConfig = _assembled(
+        "MethodsConfig",
+        {m.name: m.config for m in METHODS.values() if m.config is not None}
+        | {"sharpening": SharpeningConfig, "gain": GainConfig},
+    )
+    """Section `methods` of params.yaml: one section for each method with settings, and two that methods share."""
+    _OF_LOOP = typing.get_type_hints(LoopConfig, include_extras=True)
+    SharedTrainingConfig = _assembled(
+        "SharedTrainingConfig", {name: hint for name, hint in _OF_LOOP.items() if name not in OWN_KEYS}
+    )
+
+    def _own_section(config: type) -> type:
+        hints = typing.get_type_hints(config, include_extras=True)
+        return _assembled(
+            config.__name__, {name: hint for name, hint in hints.items() if name in OWN_KEYS or name not in _OF_LOOP}
+        )
+
     BaselinesConfig = _assembled(
         "BaselinesConfig",
-        {"trained": list[BaselineName], "postprocessing": PostprocessingConfig, "gain": GainConfig}
-        | {name: record.config for name, record in BASELINES.items()},
+        {"trained": list[BaselineName], "training": SharedTrainingConfig}
+        | {name: _own_section(record.config) for name, record in BASELINES.items()},
     )
-    """Section `baselines` of params.yaml: those to train, and one section for each."""
+    """Section `baselines` of params.yaml: those to train, the settings that they share, and one section for each."""
 
 
 @section
 class RowConfig:
     """Entry of section `rows` of params.yaml, from which dvc.yaml makes the stage of a row."""
 
-    module: str
-    """File of the row's method."""
     needs: str
-    """Path of a further input of the row: the folder of its training, another artefact, or a file of code."""
+    """Path of a further input: the weights of the row's network (a file, or the folder of a training), other events,
+    or a file that every row has."""
     settings: str
     """Section of params.yaml that the row depends on."""
 
@@ -143,7 +160,6 @@ class Config:
     sets: SetsConfig
     recordings: RecordingsConfig
     rotating: RotatingConfig
-    modulation: ModulationConfig
     row: RowName | None
     """Row that stage row runs."""
     baseline: BaselineName | None
@@ -154,6 +170,7 @@ class Config:
 
     def __post_init__(self):
         self._check_rows()
+        self._check_files()
         self._check_baseline()
         self._check_sizes()
 
@@ -161,8 +178,9 @@ class Config:
         """ValueError for a DoFP sensor of odd size, a crop larger than a channel, and images too small for LPIPS."""
         size = self.synthesize.sensor_height, self.synthesize.sensor_width
         channel = list(channel_size(self.polarizers.layout, *size))
-        crops = {f"baselines.{name}": getattr(self.baselines, name).crop for name in BASELINES}
-        for training, crop in {"train": self.train.crop, **crops}.items():
+        crops = {"train": self.train.crop}
+        crops |= {f"baselines.{name}": self.baseline_config(name).crop for name in self.baselines.trained}
+        for training, crop in crops.items():
             if crop is not None and (crop[0] > channel[0] or crop[1] > channel[1]):
                 raise ValueError(
                     f"{training}.crop: expected at most a channel of section synthesize's sensor, {channel}, got {crop}"
@@ -180,29 +198,24 @@ class Config:
                 raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {image}")
 
     def _check_rows(self) -> None:
-        """ValueError for a row whose entry in `rows` differs from the record of its method."""
+        """ValueError for a row that reads another section than its entry names, or whose training no stage makes."""
         for row, entry in self.rows.items():
-            for key, value in self._row_entry(row).items():
-                if getattr(entry, key) != value:
-                    raise ValueError(
-                        f"rows.{row}.{key}: expected {value}, as in the row's record, got {getattr(entry, key)}"
-                    )
+            read = METHODS[row].settings if row in METHODS else None
+            if read is not None and entry.settings not in (read, "methods"):
+                raise ValueError(f"rows.{row}.settings: expected {read}, which the row reads, got {entry.settings}")
             needs = PurePath(entry.needs)
             if needs.parent == PurePath("data/train") and needs.name not in (DOLP_TRAINING, *self.baselines.trained):
                 raise ValueError(f"rows.{row}.needs: no stage makes {needs}; add {needs.name} to baselines.trained")
 
-    def _row_entry(self, row: str) -> dict[str, str]:
-        """Keys of a row's entry in `rows` that its record decides."""
-        if row not in METHODS:
-            return {"module": _file_of_module(type(ROWS[row]).__module__)}
-        method = METHODS[row].wraps or METHODS[row]
-        entry = {"module": _file_of_module(module_of(row))}
-        if method.config is not None:
-            entry["settings"] = f"methods.{method.section}"
-            given = getattr(getattr(self.methods, method.section), "weights", None)
-            if given is None and method.weights is not None and method.weights.trained_by:
-                entry["needs"] = f"data/train/{method.weights.trained_by}"
-        return entry
+    def _check_files(self) -> None:
+        """ValueError for a file outside the folder of data/external that the stage which reads it depends on."""
+        for key, file, folder in (("train.start", self.train.start, "start"), ("lpips.path", self.lpips.path, "lpips")):
+            watched = Path(self.paths.data, "external", folder)
+            if file is not None and not Path(file).absolute().is_relative_to(watched.absolute()):
+                raise ValueError(
+                    f"{key}: expected a file below {watched}, whose content `dvc repro` follows, got {file}; copy it "
+                    "there (of a checkpoint, the .safetensors and the .json)"
+                )
 
     def _check_baseline(self) -> None:
         """ValueError for a baseline to train whose weights no row uses."""
@@ -210,23 +223,41 @@ class Config:
         if name is not None and name not in self.used_baselines:
             raise ValueError(
                 f"baseline: no row of benchmark.methods uses the weights of baselines.{name}, so it is not trained; "
-                f"add {' or '.join(trained_rows(name))} to the rows, or remove {name} from baselines.trained"
+                f"add a row with needs: data/train/{name}, or remove {name} from baselines.trained"
             )
 
     @property
     def used_baselines(self) -> list[str]:
-        """Baselines whose training a row of `benchmark.methods` uses: the row has no file of weights in `methods`."""
-        sections = {METHODS[row].section for row in self.benchmark.methods if row in METHODS}
-        given = {one for one in sections if getattr(getattr(self.methods, one, None), "weights", None)}
-        return [name for name in BASELINES if (sections - given).intersection(trained_rows(name))]
+        """Baselines whose training a row of `benchmark.methods` needs."""
+        needed = {self.rows[row].needs for row in self.benchmark.methods if row in self.rows}
+        return [name for name in BASELINES if f"data/train/{name}" in needed]
+
+    def baseline_config(self, name: str) -> LoopConfig:
+        """All settings of a baseline's training: its own, and those that all baselines share."""
+        settings = dataclasses.asdict(self.baselines.training) | dataclasses.asdict(getattr(self.baselines, name))
+        return BASELINES[name].config(**settings)
+
+    def place(self, artefact: str) -> Path:
+        """Location of an artefact, for which dvc.yaml and section `rows` say data/NAME."""
+        folder, *parts = PurePath(artefact).parts
+        if folder != "data" or not parts or not hasattr(self.paths, name := parts[0].removesuffix(".zarr")):
+            return Path(artefact)
+        return Path(getattr(self.paths, name), *parts[1:])
+
+    def weights_of(self, row: str) -> Path | None:
+        """File of the weights that a row of the tables needs; None if `rows` has no such row."""
+        if row not in self.rows:
+            return None
+        path, trained = self.place(self.rows[row].needs), self.rows[row].needs.startswith("data/train/")
+        return path / BEST if trained or path.is_dir() else path
 
     @property
     def lpips_losses(self) -> dict[str, float]:
         """Weights of LPIPS in the losses of all trainings, by key."""
         return {"loss.lpips": self.loss.lpips} | {
             f"baselines.{name}.{key}": getattr(getattr(self.baselines, name), key)
-            for name, baseline in BASELINES.items()
-            for key in baseline.lpips
+            for name in self.baselines.trained
+            for key in BASELINES[name].lpips
         }
 
     @property
@@ -269,7 +300,7 @@ def load(root: Path, overrides: list[str] | None = None, presets: Path | None = 
         overrides = [*overrides, f"hydra.searchpath=['file://{root}','file://{presets / 'conf'}']"]
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(root / "conf")):
         config = typed(hydra.compose("config", overrides=overrides))
-        _check_ablation(root, config, overrides)
+        check_ablation(root, config, overrides)
     return config
 
 
@@ -277,18 +308,23 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
     """Make `main(config)` a Hydra command line that checks the configuration and sets up the runtime first.
 
     The command refuses an unknown key or choice, a wrong type, a value out of range and an ablation that changes
-    nothing. It also refuses a configuration with LPIPS on a machine without the weights.
+    nothing. It also refuses a configuration with LPIPS on a machine without the weights, and inputs that were made with
+    other values (`polarnet.config.origins`).
     """
-    root = _root_of(main)
+    root, script = _root_of(main), _file_of(main).stem
 
     @functools.wraps(main)
     def checked(node: DictConfig) -> None:
         config = or_exit(lambda: typed(node))
-        or_exit(lambda: _check_ablation(root, config, list(HydraConfig.get().overrides.task)))
-        if _file_of(main).stem != "weights":  # that stage searches for weights and may download them
+        or_exit(lambda: check_ablation(root, config, list(HydraConfig.get().overrides.task)))
+        if script != "weights":  # that stage searches for weights and may download them
             or_exit(lambda: _check_lpips(config))
+        run = Run(root, config, script)
+        or_exit(run.check_inputs)
         configure(config.runtime, config.seed)
-        or_refuse(lambda: main(config), f"stage {_file_of(main).stem}")
+        or_refuse(lambda: main(config), f"stage {script}")
+        if os.environ.get("RANK", "0") == "0":  # the first process of a training that several share
+            run.write_origins()
 
     return hydra_command(checked)
 
@@ -308,6 +344,11 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         logging.captureWarnings(True)
         try:
             run()
+        except PermissionError as error:
+            raise SystemExit(
+                f"{error.filename}: this folder cannot be written; give hydra.run.dir=FOLDER for the logs, "
+                "paths.data and paths.resume for the results"
+            ) from None
         except KeyboardInterrupt:
             print(f"stages.{_file_of(main).stem}: {STOPPED}", file=sys.stderr)
             raise SystemExit(INTERRUPTED) from None
@@ -373,7 +414,7 @@ def _check_lpips(config: Config) -> None:
         with_lpips(config, purpose, functools.partial(look, purpose))
 
 
-def _check_ablation(root: Path, config: Config, overrides: list[str]) -> None:
+def check_ablation(root: Path, config: Config, overrides: list[str]) -> None:
     """Raise ValueError if the chosen ablation changes no setting in use.
 
     The exception is `nothing`, the baseline of a sweep. Hydra must be initialised before the call.
@@ -401,11 +442,6 @@ def _in_use(config: Config) -> tuple[Any, ...]:
     """All settings except the sections of networks that are not in use."""
     sections = [getattr(config, field.name) for field in dataclasses.fields(config) if field.name != "networks"]
     return (*sections, config.network_config)
-
-
-def _file_of_module(module: str) -> str:
-    """Path of a module's file from the root of the project."""
-    return f"{module.replace('.', '/')}.py"
 
 
 def or_exit(check: Callable[[], T]) -> T:

@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int64, Shaped
 MIN_TRIGGERS = 2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # arrays have no single answer to ==
 class Rotation:
     """Angle of the polarizer's axis at known times, interpolated linearly between them and extrapolated outside."""
 

@@ -41,28 +41,3 @@ def is_rotating(row: str) -> bool:
     (True, False)
     """
     return row in METHODS and METHODS[row].rotating
-
-
-def module_of(method: str) -> str:
-    """Full name of the module whose `METHODS` holds the record of a method.
-
-    >>> from polarnet.methods import module_of
-    >>> module_of("highpass")
-    'polarnet.methods.complementary_filter'
-    """
-    return next(
-        module.__name__ for module in _modules() if any(one.name == method for one in getattr(module, "METHODS", ()))
-    )
-
-
-def trained_rows(training: str) -> tuple[str, ...]:
-    """Rows, without `+gain`, that use the weights of a training unless their section names a file.
-
-    >>> from polarnet.methods import trained_rows
-    >>> trained_rows("ours")
-    ('ours',)
-    """
-    return tuple(
-        name for name, method in METHODS.items() if method.wraps is None and method.weights is not None
-        and method.weights.trained_by == training
-    )  # fmt: skip

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from polarnet.events.representations import REPRESENTATIONS, Encode, event_counts
 from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
-from polarnet.methods.method import Recoverer, Setup, State, WeightsConfig, each_map, weights_file
+from polarnet.methods.method import Recoverer, Setup, State, each_map, weights_file
 from polarnet.methods.two_threads import Sharing
 from polarnet.methods.window_length import of_any_length
 from polarnet.networks.base.checkpoint import trained_window_us
@@ -26,7 +26,7 @@ DOLP_NETWORKS = tuple(NETWORKS)
 
 
 @section
-class DolpNetworkConfig(WeightsConfig):
+class DolpNetworkConfig:
     """Section `methods.ours` of params.yaml."""
 
     thresholds: Annotated[list[PositiveFloat], Field(min_length=2, max_length=2)] | None

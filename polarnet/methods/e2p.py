@@ -9,8 +9,8 @@ from torch import Tensor
 from polarnet.events.mosaic import join_mosaic
 from polarnet.events.representations import voxel_grid
 from polarnet.events.streaming import EventWindow
-from polarnet.methods.intensity_network import load_baseline, voxel_grids
-from polarnet.methods.method import Method, Recoverer, Setup, State, Weights, WeightsConfig, weights_file
+from polarnet.methods.intensity_networks import load_baseline, voxel_grids
+from polarnet.methods.method import Method, Recoverer, Setup, State, Weights, weights_file
 from polarnet.networks.e2p.network import MOSAIC, E2p, angle_of, interleaved
 from polarnet.stokes import Prediction
 
@@ -51,8 +51,7 @@ METHODS = (
         label="E2P",
         colour="#7a5cc4",
         open=open_e2p,
-        config=WeightsConfig,
-        weights=Weights(("e2p",), trained_by="e2p"),
+        weights=Weights(("e2p",)),
         about="E2P (Mei et al. 2023), a published network from events to polarization.",
     ),
     Method(
@@ -60,7 +59,6 @@ METHODS = (
         label="E2P, published weights",
         colour="#7a5cc4",
         open=open_published,
-        config=WeightsConfig,
         weights=Weights(("e2p",)),
     ),
 )

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from polarnet.events.rotation import Rotation
 from polarnet.events.streaming import EventWindow
-from polarnet.methods.postprocessing import PostprocessingConfig
+from polarnet.methods.sharpening import SharpeningConfig
 from polarnet.methods.stokes_gain import GainConfig
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.runtime.files import sha256
-from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
 PIXELS_AT_ONCE = 4 * 120 * 180  # total over the windows that a method processes at once; bounds the memory of a network
@@ -22,35 +22,21 @@ State = Any
 """State of a method before a window: tensors, or None at the start."""
 
 
-@section
-class WeightsConfig:
-    """Section `methods.NAME` of params.yaml for a method whose only setting is its weights."""
-
-    weights: str | None
-    """A .safetensors checkpoint of polarnet or a published weights file; null: the default in the method's record."""
-
-    def __post_init__(self):
-        if self.weights is not None and not self.weights.strip():
-            raise ValueError(f"weights: expected the path of a file or null, got {self.weights!r}")
-
-
 @dataclass(frozen=True)
 class Setup:
     """Inputs of a method besides events."""
 
     config: Any
-    """Section `methods.NAME` of params.yaml."""
+    """Section `methods.NAME` of params.yaml; None for a method without settings."""
     weights: Path | None
     """Weights file; None if the method needs none or none is configured."""
-    postprocessing: PostprocessingConfig
+    sharpening: SharpeningConfig
     gain: GainConfig
     device: torch.device
     precision: str
     """Precision of networks: fp32, or bf16 autocast."""
-    rotation_hz: float
-    """Turns per second of the polarizer, for methods of one camera behind a rotating polarizer."""
-    start_angle: float
-    """Its angle at time 0, radians."""
+    rotation: Rotation | None
+    """Angle of the polarizer over time, for methods of one camera behind a rotating polarizer."""
 
     def __hash__(self) -> int:
         return hash((self.weights, self.device, self.precision))  # settings may be lists, which have no hash
@@ -99,10 +85,8 @@ class Weights:
 
     networks: tuple[str, ...]
     """Names of the networks that a checkpoint of polarnet may hold, as in its JSON."""
-    trained_by: str | None = None
-    """Training whose best.safetensors is used if `methods.NAME.weights` is null; None: no training."""
-    remedy: str = ""
-    """Advice in messages on how to obtain weights without a file, for example by training."""
+    shipped: bool = False
+    """Whether the package carries weights, which `polarnet recover` uses if it is given none."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +94,7 @@ class Method:
     """Record of a way from events to DoLP."""
 
     name: str
-    """Key of the method: benchmark row, `--method` of recover, section of `methods` in params.yaml."""
+    """Key of the method: row of the benchmark, `--method` of recover."""
     label: str
     """Name in tables and figures."""
     colour: str
@@ -119,6 +103,8 @@ class Method:
     """Load the method. FileNotFoundError or ValueError if the weights are missing or of another network."""
     config: type | None = None
     """Class of the section `methods.NAME`; None: no section."""
+    sharpened: bool = False
+    """Whether the method reads section `methods.sharpening`."""
     weights: Weights | None = None
     """Weights that the method needs; None: no weights."""
     rotating: bool = False
@@ -135,8 +121,17 @@ class Method:
 
     @property
     def section(self) -> str:
-        """Key in section `methods` of params.yaml: the name of the method, or of the method it wraps."""
+        """Name of the method, or of the method it wraps, under which settings and weights are found."""
         return self.wraps.section if self.wraps else self.name
+
+    @property
+    def settings(self) -> str | None:
+        """Section of params.yaml that the method reads; None if it reads none."""
+        if self.wraps is not None:
+            return "methods"  # the section of the wrapped method and `methods.gain`
+        if self.sharpened:
+            return "methods.sharpening"
+        return None if self.config is None else f"methods.{self.name}"
 
 
 def weights_file(setup: Setup) -> Path:
@@ -151,15 +146,14 @@ def why_absent(method: Method, setup: Setup) -> str | None:
     """Reason why a method cannot run; None if it can."""
     if method.weights is None:
         return None
-    key, path = f"methods.{method.section}.weights", setup.weights
+    key, path = f"rows.{method.name}.needs", setup.weights
     if path is None:
-        return f"no weights are given: set {key} to their file"
+        return f"no weights are given: add the row to section `rows` of params.yaml, with their file as {key}"
     if not path.exists():
         return f"{path} is not there"
     networks = method.weights.networks
     if path.suffix == ".safetensors" and (network := load_checkpoint(path)[1]["network"]) not in networks:
-        reason = f"{path} holds a {network}, expected {' or '.join(networks)}: set {key} to such a file"
-        return f"{reason}, or {method.weights.remedy}" if method.weights.remedy else reason
+        return f"{path} holds a {network}, expected {' or '.join(networks)}: set {key} to such a file"
     return None
 
 

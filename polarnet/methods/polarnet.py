@@ -10,7 +10,7 @@ METHODS = (
         colour="#d6336c",
         open=open_dolp_network,
         config=DolpNetworkConfig,
-        weights=Weights(DOLP_NETWORKS, trained_by="ours"),
+        weights=Weights(DOLP_NETWORKS, shipped=True),
         about="The DoLP network in use.",
     ),
 )

@@ -23,7 +23,7 @@ RIDGE = 1e-9  # keeps the system solvable if all channels are equal
 
 @section
 class GainConfig:
-    """Section `baselines.gain` of params.yaml."""
+    """Section `methods.gain` of params.yaml."""
 
     window_frames: PositiveInt
     """Number of frames that determine the gains of a frame: the frame and those before it."""

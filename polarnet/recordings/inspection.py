@@ -1,4 +1,4 @@
-"""Summarise a recording: events, rates, duration, hot pixels, signs of the readout, an image of the busiest part."""
+"""Summarise a recording: events, rates, duration, hot pixels, gaps, empty rows, an image of the busiest part."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -7,18 +7,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int64, UInt16
 
-from polarnet.events.stream import Events, concatenate
+from polarnet.events.stream import Events, concatenate, slice_count
 from polarnet.recordings.formats.celex5_bin import celex5_pictures
 from polarnet.recordings.pixels import hot_pixels
-from polarnet.recordings.readout import Readout, ReadoutSigns, readout_findings
+from polarnet.recordings.readout import Gap, Silences, readout_findings
 from polarnet.recordings.recording import FORMATS, RecordingReader
-from polarnet.recordings.source import REPAIRS, RecordingError
+from polarnet.recordings.source import REPAIRS
 
-MAX_PIXELS = 2**25
 EVENTS_PER_PIXEL = 0.15  # in the part shown: enough to see edges, few enough not to smear them
 PEAK_US = (1_000, 10_000, 100_000)  # intervals of the peak rate; the first that holds MIN_STEPS of the clock is taken
 MIN_STEPS = 10
 START_SHARE = 0.5  # of all pixels: more events at the first time mean that a camera or a simulator started
+WORST_PIXELS = 4  # hot pixels named in the findings
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,8 @@ class Inspection:
     peak_us: int
     start_events: int
     """Events at the first time if more than half the pixels fired then, else 0; left out of peak and busiest part."""
-    readout: Readout
+    gap: Gap | None
+    """The longest time without events; None if all events have the same time."""
     repairs: Mapping[str, int]
     pictures: int
     """Number of full pictures between events, or in a file without events."""
@@ -57,42 +58,35 @@ class Inspection:
 def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) -> Inspection:
     """Read a recording once, in memory that does not grow with it unless millions of events have the same time.
 
-    `hot_pixel_factor` is the `factor` of `polarnet.recordings.pixels.hot_pixels`. RecordingError if reading fails, or
-    if no sensor is as large as the stated size.
+    `hot_pixel_factor` is the `factor` of `polarnet.recordings.pixels.hot_pixels`. RecordingError if reading fails.
     """
-    pixels = reader.height * reader.width
-    if pixels > MAX_PIXELS:
-        raise RecordingError(
-            f"{reader.path.name}: no event camera has {reader.height} x {reader.width} px (height x width): the "
-            f"given size is wrong, or the file is damaged"
-        )
+    shape, pixels = (reader.height, reader.width), reader.height * reader.width
     counts = np.zeros(pixels, np.int64)
-    busiest, peak, signs = _Busiest(pixels), _Peak(), ReadoutSigns(reader.height, reader.width)
+    busiest, peak, silences = _Busiest(pixels), _Peak(), Silences()
     on = off = start_events = 0
     start_us = stop_us = None
     for events in _whole_times(reader):
         pixel = events.y.numpy().astype(np.int64) * reader.width + events.x.numpy()
         counts += np.bincount(pixel, minlength=pixels)
-        on += int((events.p > 0).sum())
-        off += int((events.p < 0).sum())
+        rising = int((events.p > 0).sum())
+        on, off = on + rising, off + len(events) - rising
+        stop_us = int(events.t[-1])
         if start_us is None:
             start_us = int(events.t[0])
             at_first = int((events.t == start_us).sum())
             start_events = at_first if at_first > START_SHARE * pixels else 0
-            events, pixel = _from(events, start_events), pixel[start_events:]
-        stop_us = int(events.t[-1]) if len(events) else start_us
+            events, pixel = slice_count(events, start_events, len(events)), pixel[start_events:]
         if len(events):
             busiest.add(events, pixel)
             peak.add(events.t.numpy())
-            signs.add(events)
+            silences.add(events.t.numpy())
     pictures, first_picture = 0, None
     if reader.format == "celex5_bin":
         for picture in celex5_pictures(reader.path):
             first_picture = picture.intensity if pictures == 0 else first_picture
             pictures += 1
-    shape = reader.height, reader.width
-    part, readout = busiest.result(), signs.result(counts.reshape(shape))
-    peak_us = next((us for us in PEAK_US if us >= MIN_STEPS * readout.clock_step_us), PEAK_US[-1])
+    part = busiest.result()
+    peak_us = next((us for us in PEAK_US if us >= MIN_STEPS * silences.clock_step_us), PEAK_US[-1])
     return Inspection(
         format=reader.format,
         height=reader.height,
@@ -110,7 +104,7 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
         peak_rate_hz=peak.rate_hz(peak_us),
         peak_us=peak_us,
         start_events=start_events,
-        readout=readout,
+        gap=silences.gap(),
         repairs={kind: count for kind, count in reader.repairs.items() if count},
         pictures=pictures,
         first_picture=first_picture,
@@ -119,38 +113,41 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
 
 def findings(inspection: Inspection) -> Iterator[str]:
     """The summary as lines of text."""
-    events = inspection.on + inspection.off
     yield f"format      {inspection.format}: {FORMATS[inspection.format].words}"
     yield f"sensor      {inspection.height} x {inspection.width} px (height x width)"
     if inspection.pictures:
         yield f"pictures    {inspection.pictures}"
-    yield f"events      {events:,}: {inspection.on:,} ON, {inspection.off:,} OFF"
+    yield f"events      {inspection.on + inspection.off:,}: {inspection.on:,} ON, {inspection.off:,} OFF"
     if inspection.start_us is not None and inspection.stop_us is not None:
-        seconds = (inspection.stop_us - inspection.start_us) / 1e6
-        yield f"time        {inspection.start_us:,} to {inspection.stop_us:,} us, {seconds:.6f} s"
-        if seconds > 0:
-            peak_hz = inspection.peak_rate_hz
-            yield f"rate        {_rate(inspection.on / seconds)} ON, {_rate(inspection.off / seconds)} OFF" + (
-                f"; at most {_rate(peak_hz)} together over {inspection.peak_us // 1000} ms" if peak_hz else ""
-            )
-        if inspection.start_events:
-            yield (
-                f"start       {inspection.start_events:,} events at the first time, when the camera or its simulation "
-                f"started: not in the peak and the picture"
-            )
-        yield (
-            f"busiest     {inspection.busiest_events:,} events in {inspection.busiest_us / 1000:,.1f} ms from "
-            f"{inspection.busiest_start_us:,} us"
-        )
-        yield from readout_findings(inspection.readout, inspection.height)
+        yield from _timing(inspection, inspection.start_us, inspection.stop_us)
+        yield from readout_findings(inspection.gap, inspection.counts)
     yield f"hot pixels  {_hot(inspection)}"
-    pauses = inspection.repairs.get("pauses", 0)
+    repairs = dict(inspection.repairs)
+    pauses = repairs.pop("pauses", 0)
     yield f"time jumps  {pauses} {REPAIRS['pauses']}" if pauses else "time jumps  none"
-    repairs = {kind: count for kind, count in inspection.repairs.items() if kind != "pauses"}
     for kind, count in repairs.items():
         yield f"repaired    {count:,} {REPAIRS[kind]}"
     if not repairs:
         yield "repaired    nothing"
+
+
+def _timing(inspection: Inspection, start_us: int, stop_us: int) -> Iterator[str]:
+    """Lines about the duration, the rates, the start and the busiest part."""
+    seconds = (stop_us - start_us) / 1e6
+    yield f"time        {start_us:,} to {stop_us:,} us, {seconds:.6f} s"
+    if seconds > 0:
+        peak_hz = inspection.peak_rate_hz
+        peak = f"; at most {_rate(peak_hz)} together over {inspection.peak_us // 1000} ms" if peak_hz else ""
+        yield f"rate        {_rate(inspection.on / seconds)} ON, {_rate(inspection.off / seconds)} OFF{peak}"
+    if inspection.start_events:
+        yield (
+            f"start       {inspection.start_events:,} events at the first time, when the camera or its simulation "
+            f"started: not in the peak and the picture"
+        )
+    yield (
+        f"busiest     {inspection.busiest_events:,} events in {inspection.busiest_us / 1000:,.1f} ms from "
+        f"{inspection.busiest_start_us:,} us"
+    )
 
 
 def _rate(rate_hz: float) -> str:
@@ -165,7 +162,7 @@ def _hot(inspection: Inspection) -> str:
     if not len(rows):
         return "none"
     counts = inspection.counts[rows, columns]
-    order = np.argsort(-counts, kind="stable")[:4]
+    order = np.argsort(-counts, kind="stable")[:WORST_PIXELS]
     share = counts.sum() / max(1, inspection.counts.sum())
     worst = ", ".join(f"x {columns[i]} y {rows[i]}: {counts[i]:,}" for i in order)
     return f"{len(rows)} with {share:.1%} of the events ({worst}{', ...' if len(rows) > len(order) else ''})"
@@ -177,19 +174,11 @@ def _whole_times(reader: RecordingReader) -> Iterator[Events]:
     for events in reader:
         complete = int((events.t < events.t[-1]).sum())
         if complete:
-            yield concatenate([*waiting, _until(events, complete)])
+            yield concatenate([*waiting, slice_count(events, 0, complete)])
             waiting = []
-        waiting.append(_from(events, complete))
+        waiting.append(slice_count(events, complete, len(events)))
     if waiting:
         yield concatenate(waiting)
-
-
-def _from(events: Events, start: int) -> Events:
-    return Events(events.t[start:], events.x[start:], events.y[start:], events.p[start:], events.height, events.width)
-
-
-def _until(events: Events, stop: int) -> Events:
-    return Events(events.t[:stop], events.x[:stop], events.y[:stop], events.p[:stop], events.height, events.width)
 
 
 class _Peak:
@@ -197,21 +186,23 @@ class _Peak:
 
     def __init__(self) -> None:
         self._start_us: int | None = None
-        self._number = dict.fromkeys(PEAK_US, 0)
-        self._count = dict.fromkeys(PEAK_US, 0)
+        self._current = dict.fromkeys(PEAK_US, (0, 0))  # number of the interval and its events so far
         self._highest: dict[int, int | None] = dict.fromkeys(PEAK_US)
 
     def add(self, t: Int64[np.ndarray, " n"]) -> None:
         self._start_us = int(t[0]) if self._start_us is None else self._start_us
         for us in PEAK_US:
-            numbers, counts = np.unique((t - self._start_us) // us, return_counts=True)
-            if numbers[0] == self._number[us]:
-                counts[0] += self._count[us]
+            numbers = (t - self._start_us) // us
+            first = np.flatnonzero(np.r_[True, numbers[1:] != numbers[:-1]])
+            counts = np.diff(np.r_[first, len(t)])
+            number, count = self._current[us]
+            if numbers[0] == number:
+                counts[0] += count
             else:
-                self._complete(us, self._count[us])
+                self._complete(us, count)
             if len(counts) > 1:
                 self._complete(us, int(counts[:-1].max()))
-            self._number[us], self._count[us] = int(numbers[-1]), int(counts[-1])
+            self._current[us] = int(numbers[-1]), int(counts[-1])
 
     def _complete(self, us: int, count: int) -> None:
         self._highest[us] = max(count, self._highest[us] or 0)
@@ -230,6 +221,11 @@ class _Part(NamedTuple):
     events: int
     start_us: int
     duration_us: int
+
+    @property
+    def density(self) -> float:
+        """Events per microsecond."""
+        return self.events / max(1, self.duration_us)
 
 
 class _Busiest:
@@ -253,14 +249,10 @@ class _Busiest:
             self._current = _Part(image, count + stop - start, start_us, int(t[stop - 1]) - start_us)
             start = stop
             if self._current.events >= self._size:
-                if self._best is None or _density(self._current) > _density(self._best):
+                if self._best is None or self._current.density > self._best.density:
                     self._best = self._current
                 self._current = _Part(np.zeros_like(image), 0, 0, 0)
 
     def result(self) -> _Part:
         """The busiest part, or all events if they are too few for one."""
         return self._best or self._current
-
-
-def _density(part: _Part) -> float:
-    return part.events / max(1, part.duration_us)

@@ -5,6 +5,7 @@ commas; t in whole microseconds, p 1 or 0 (or -1), angle the polarizer's, 0, 45,
 polarizers gives `t x y p`. # starts a comment.
 """
 
+import itertools
 import os
 import stat
 import sys
@@ -16,7 +17,7 @@ from threading import Thread
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 
 from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import MAX_SIDE, Events
@@ -48,6 +49,22 @@ class Piece(NamedTuple):
     """When its first data arrived, by `time.perf_counter`."""
 
 
+class StreamClock:
+    """Time of a stream, which counts from its first event; events older than those of an earlier piece are late."""
+
+    def __init__(self) -> None:
+        self.until_us = 0
+        self._origin_us: int | None = None
+
+    def on_time(self, t: Int64[np.ndarray, " n"]) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        """Times of the next n >= 1 events by this clock, and which events are not late; moves `until_us` on."""
+        self._origin_us = int(t[0]) if self._origin_us is None else self._origin_us
+        times_us = t - self._origin_us
+        current = times_us >= self.until_us
+        self.until_us = max(self.until_us, int(times_us.max()))
+        return times_us, current
+
+
 class LiveLines:
     """Read lines as they arrive, in pieces; ends with the input, or once a file has not grown for `idle_s`.
 
@@ -59,69 +76,58 @@ class LiveLines:
     def __init__(self, source: BinaryIO, name: str, mosaic: Mosaic | None, idle_s: float):
         self.name, self.mosaic = name, mosaic
         self.counts: Counter[str] = Counter()
-        self.lines = 0
         self._source, self._idle_s = source, idle_s
         self._grows = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
-        self._rest, self._started_with, self._read_at = b"", b"", 0.0
         self._queue: Queue[tuple[bytes, float] | None] = Queue(MAX_READ_AHEAD if self._grows else 0)
         own = os.dup(source.fileno())  # a duplicate, so that a file opened later cannot get its number
         Thread(target=self._read, args=[own], daemon=True).start()
+        self._blocks = self._whole_lines()
         self._sensor = self._first_line()
         self.height, self.width = (side // 2 if mosaic else side for side in self._sensor)
 
     def __iter__(self) -> Iterator[Piece]:
         columns = "t x y p" if self.mosaic else "t x y p angle"
         shift = np.zeros(len(columns.split()), np.int64)
-        origin_us, until_us = None, 0
-        for data, read_at in self._whole_lines():
+        clock, lines = StreamClock(), 0
+        for data, read_at in self._blocks:
             rows = [*rows_of(data, shift, self.counts, "unreadable_lines")]
             table = self._usable(np.concatenate(rows)) if rows else np.empty((0, len(shift)), np.int64)
-            self.lines += data.count(b"\n")
-            self._refuse_damage(columns)
+            lines += data.count(b"\n")
+            self._refuse_damage(columns, lines)
             if len(table) == 0:
                 continue
             table = table[np.argsort(table[:, 0], kind="stable")]
-            if origin_us is None:
-                origin_us = int(table[0, 0])
-            table[:, 0] -= origin_us
-            late = int(np.searchsorted(table[:, 0], until_us))
-            self.counts["late"] += late
-            if late == len(table):
-                continue
-            table, until_us = table[late:], int(table[-1, 0])
-            yield Piece(self._channels(table), until_us, read_at)
+            table[:, 0], current = clock.on_time(table[:, 0])
+            self.counts["late"] += int(np.count_nonzero(~current))
+            if current.any():
+                yield Piece(self._channels(table[current]), clock.until_us, read_at)
 
     def _first_line(self) -> tuple[int, int]:
-        for data, _ in self._whole_lines():
-            line, _, rest = data.partition(b"\n")
-            words = [word for one in numbers_of(line) for word in one.words]
-            if len(words) != 2 or not all(w.isdigit() and 0 < int(w) <= MAX_SIDE for w in words):
-                break
-            self._started_with = rest
-            return int(words[1]), int(words[0])
-        raise RecordingError(f"{self.name}: expected a first line `width height` of the sensor, such as `346 260`")
+        """Height and width; the rest of what has arrived stays in `_blocks`."""
+        data, read_at = next(self._blocks, (b"", 0.0))
+        line, _, rest = data.partition(b"\n")
+        words = [word for one in numbers_of(line) for word in one.words]
+        if len(words) != 2 or not all(w.isdigit() and 0 < int(w) <= MAX_SIDE for w in words):
+            raise RecordingError(f"{self.name}: expected a first line `width height` of the sensor, such as `346 260`")
+        if rest:
+            self._blocks = itertools.chain([(rest, read_at)], self._blocks)
+        return int(words[1]), int(words[0])
 
     def _whole_lines(self) -> Iterator[tuple[bytes, float]]:
         """Complete lines with their time of arrival; at the end of the input, also an incomplete last line."""
-        if self._started_with:
-            data, self._started_with = self._started_with, b""
-            yield data, self._read_at
-        while (come := self._queue.get()) is not None:
-            data, self._read_at = come
+        rest, read_at = b"", 0.0
+        while (arrived := self._queue.get()) is not None:
+            data, read_at = arrived
             while len(data) < READ_BYTES and not self._queue.empty():  # data already waiting joins this piece
                 if (more := self._queue.get()) is None:
                     self._queue.put(None)
                     break
                 data += more[0]
-            data = self._rest + data
-            end = data.rfind(b"\n") + 1
-            self._rest = data[end:]
+            lines, end, rest = (rest + data).rpartition(b"\n")
             if end:
-                yield data[:end], self._read_at
-        self._queue.put(None)  # for any later caller
-        if self._rest.strip():
-            data, self._rest = self._rest + b"\n", b""
-            yield data, self._read_at
+                yield lines + end, read_at
+        if rest.strip():
+            yield rest + b"\n", read_at
 
     def _read(self, descriptor: int) -> None:
         """Queue incoming data with its time of arrival, in a separate thread, since recovery may be busy meanwhile."""
@@ -157,11 +163,11 @@ class LiveLines:
             usable &= good
         return table[usable]
 
-    def _refuse_damage(self, columns: str) -> None:
+    def _refuse_damage(self, columns: str, lines: int) -> None:
         for kind, words in DAMAGE.items():
-            if kind != "late" and self.counts[kind] > max(TOLERATED_COUNT, TOLERATED_SHARE * self.lines):
+            if kind != "late" and self.counts[kind] > max(TOLERATED_COUNT, TOLERATED_SHARE * lines):
                 raise RecordingError(
-                    f"{self.name}: {self.counts[kind]} of the first {self.lines} lines are "
+                    f"{self.name}: {self.counts[kind]} of the first {lines} lines are "
                     f"{words.format(columns=f'`{columns}`')}; is the format right, and the size in the first line?"
                 )
 

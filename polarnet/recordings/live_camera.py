@@ -14,7 +14,7 @@ import numpy as np
 
 from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import Events
-from polarnet.recordings.live import POLL_S, Piece
+from polarnet.recordings.live import POLL_S, Piece, StreamClock
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import Mosaic
 from polarnet.terminal.installation import installation
@@ -40,7 +40,7 @@ class LiveCamera:
         self.height, self.width = height // 2, width // 2
 
     def __iter__(self) -> Iterator[Piece]:
-        origin_us, until_us, quiet_since = None, 0, time.monotonic()
+        clock, quiet_since = StreamClock(), time.monotonic()
         while time.monotonic() - quiet_since < self._idle_s:
             batch = self._reader.getNextEventBatch()
             if batch is None or batch.isEmpty():
@@ -49,18 +49,13 @@ class LiveCamera:
                 time.sleep(POLL_S)
                 continue
             read_at, quiet_since = time.perf_counter(), time.monotonic()
-            t = np.array(batch.timestamps(), np.int64).ravel()
             x, y = np.array(batch.coordinates(), np.int64).reshape(-1, 2).T
             p = np.where(np.array(batch.polarities()).ravel() > 0, 1, -1)
-            origin_us = int(t[0]) if origin_us is None else origin_us
-            t = t - origin_us
-            current = t >= until_us
+            t, current = clock.on_time(np.array(batch.timestamps(), np.int64).ravel())
             self.counts["late"] += int(np.count_nonzero(~current))
-            if not current.any():
-                continue
-            events = Events.from_columns(t[current], x[current], y[current], p[current], *self._sensor)
-            until_us = int(events.t[-1])
-            yield Piece(split_mosaic(events, self._mosaic), until_us, read_at)
+            if current.any():
+                events = Events.from_columns(t[current], x[current], y[current], p[current], *self._sensor)
+                yield Piece(split_mosaic(events, self._mosaic), clock.until_us, read_at)
 
 
 def _opened(address: str) -> Any:

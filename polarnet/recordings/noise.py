@@ -56,14 +56,14 @@ class Cleaner:
             self.hot = sum(int(bad.sum()) for bad in self._bad)
         clean = [without_pixels(events, bad) for events, bad in zip(channels, self._bad, strict=True)]
         self.removed["hot pixels"] += sum(map(len, channels)) - sum(map(len, clean))
-        if self._cleaning.background_us is not None:
-            before = sum(map(len, clean))
-            clean = [
-                without_background(events, self._cleaning.background_us, last)
-                for events, last in zip(clean, self._last, strict=True)
-            ]
-            self.removed["background activity"] += before - sum(map(len, clean))
-        return clean
+        if self._cleaning.background_us is None:
+            return clean
+        quiet = [
+            without_background(events, self._cleaning.background_us, last)
+            for events, last in zip(clean, self._last, strict=True)
+        ]
+        self.removed["background activity"] += sum(map(len, clean)) - sum(map(len, quiet))
+        return quiet
 
     def live(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
         """Clean pieces as they arrive."""

@@ -15,14 +15,13 @@ from jaxtyping import Bool, Float64, Int64
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
 from polarnet.recordings.live import Piece
-from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
+from polarnet.recordings.pixels import HOT_FACTOR, event_counts, hot_pixels, without_pixels
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 WINDOW_US = 33_333
 WINDOWS = 30  # the first second
 BLOCK = 4  # pixels, square; single pixels have too few events to compare
 MIN_BLOCKS = 1000  # blocks with events: the ratio of two misfits is then known to about 1 / sqrt(1000), 3 %
-HOT_PIXEL_FACTOR = 4.0
 DISTURBING_HZ = 10_000.0  # events a second of a pixel; more change the shipped network's DoLP far from the pixel
 
 # Limits of misfits and counts: measured by studies/polarizers.py (docs/recover.md, section Checks).
@@ -152,7 +151,7 @@ def _counts_and_hot_pixels(
 ) -> tuple[Int64[np.ndarray, "channels h w"], list[Bool[np.ndarray, "h w"]]]:
     """Number of events of each pixel of the channels, and which of these pixels are hot."""
     counts = np.sum([[event_counts(events) for events in window.channels] for window in windows], axis=0)
-    return counts, [hot_pixels(count, len(windows) * WINDOW_US * 1e-6, HOT_PIXEL_FACTOR) for count in counts]
+    return counts, [hot_pixels(count, len(windows) * WINDOW_US * 1e-6, HOT_FACTOR) for count in counts]
 
 
 def _block(events: Events, columns: int) -> Int64[np.ndarray, " n"]:

@@ -33,16 +33,21 @@ class Format(NamedTuple):
     """Read the frames that the camera recorded beside its events; None for formats without frames."""
 
 
+def signature(start: bytes) -> Callable[[Path, bytes], bool]:
+    """A check of whether a file starts with these bytes."""
+    return lambda path, head: head.startswith(start)
+
+
 FORMATS = {
     "store": Format("our own event store", store.matches, store.open_store),
-    "e2p": Format("HDF5 of E2P, for the PDAVIS", hdf5.matches_e2p, hdf5.open_e2p, hdf5.e2p_frames),
-    "esfp": Format("HDF5 of ESfP, one sensor behind a rotating polarizer", hdf5.matches_esfp, hdf5.open_esfp),
-    "metavision": Format("HDF5 of Prophesee", hdf5.matches_metavision, hdf5.open_metavision),
+    "e2p": Format("HDF5 of E2P, for the PDAVIS", hdf5.matcher("e2p"), hdf5.opener("e2p"), hdf5.e2p_frames),
+    "esfp": Format("HDF5 of ESfP, one sensor behind a rotating polarizer", hdf5.matcher("esfp"), hdf5.opener("esfp")),
+    "metavision": Format("HDF5 of Prophesee", hdf5.matcher("metavision"), hdf5.opener("metavision")),
     "rosbag": Format("bags of ROS 1 and ROS 2", rosbag.matches, rosbag.open_rosbag),
-    "dsec": Format("HDF5 of DSEC", hdf5.matches_dsec, hdf5.open_dsec),
-    "aedat4": Format("AEDAT4 of iniVation", faery.matches_aedat4, faery.open_aedat4, faery.aedat4_frames),
-    "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", aedat2.matches, aedat2.open_aedat2, aedat2.aedat2_frames),
-    "event_stream": Format("Event Stream (.es)", faery.matches_event_stream, faery.open_event_stream),
+    "dsec": Format("HDF5 of DSEC", hdf5.matcher("dsec"), hdf5.opener("dsec")),
+    "aedat4": Format("AEDAT4 of iniVation", signature(b"#!AER-DAT4"), faery.opener("aedat"), faery.aedat4_frames),
+    "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", signature(aedat2.MAGIC), aedat2.open_aedat2, aedat2.aedat2_frames),
+    "event_stream": Format("Event Stream (.es)", signature(b"Event Stream"), faery.opener("es")),
     "evt": Format("EVT2, EVT2.1 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
     "dat": Format("DAT of Prophesee", prophesee.matches_dat, prophesee.open_dat),
     "text": Format("lines `t x y p`", text.matches, text.open_text),

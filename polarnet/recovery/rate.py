@@ -14,6 +14,9 @@ from polarnet.methods.method import Recoverer, each_map
 from polarnet.methods.overlap import advance, begin, warm_up
 from polarnet.recordings.live import Piece
 from polarnet.recovery.stream import Frame, Input, runs_of
+from polarnet.stokes import POLARIZER_ANGLES_DEG
+
+POLARIZERS = len(POLARIZER_ANGLES_DEG)
 
 
 class Rate(NamedTuple):
@@ -60,11 +63,15 @@ def frames_at_rate(source: Input, rule: WindowRule, recoverer: Recoverer, rate: 
     The method runs once a window, as in `frames_of`. The window of a frame, whose events the pictures show, ends at the
     time of the frame and is as long as the method's last window.
     """
+    if source.channels != POLARIZERS:
+        raise ValueError(
+            f"--rate: expected the events behind four polarizers, {source.name} has one channel; leave it out"
+        )
     warm_up(recoverer, source.height, source.width)
     cutter = WindowCutter(rule, source.height, source.width)
     history = begin(recoverer, source.height, source.width)
     most = recoverer.at_once(source.height, source.width)
-    held: Sequence[Events] = [Events.empty(source.height, source.width)] * 4
+    held: Sequence[Events] = [Events.empty(source.height, source.width)] * POLARIZERS
     state, number = None, 0
     for piece in source.pieces:
         held = [concatenate([old, new]) for old, new in zip(held, piece.channels, strict=True)]

@@ -1,58 +1,32 @@
 """`polarnet recover`: frames of DoLP and AoLP from event-camera files or a running camera."""
 
-import dataclasses
 import itertools
 import operator
-import shutil
 import statistics
-import sys
 import time
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 from torch import Tensor
 
-from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
-from polarnet.captures.imported import import_targets
-from polarnet.captures.targets import calibrate_targets
-from polarnet.events.stream import Events, downscale
+from polarnet.events.rotation import Rotation
 from polarnet.events.streaming import SHORTEST_STEP_US, TRAINED_WINDOW_US, EventWindow, WindowCutter, WindowRule
 from polarnet.methods import METHODS
-from polarnet.methods.dolp_network import dolp_recoverer
-from polarnet.methods.method import Method, Recoverer, Setup, each_map, why_absent
+from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_record, why_absent
 from polarnet.methods.overlap import advance, begin, warm_up
-from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
-from polarnet.recordings.arrangements import read_four, read_mosaic, read_plain
-from polarnet.recordings.live import LiveLines, Piece, live_lines
-from polarnet.recordings.live_camera import SCHEME, LiveCamera
-from polarnet.recordings.noise import Cleaner
-from polarnet.recordings.recording import Recording, detect_format
+from polarnet.recordings.live import Piece, live_lines
 from polarnet.recovery.writer import RecoveryWriter
-from polarnet.runtime.machine import RuntimeConfig, device_of, precision_on, tune
-from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, Prediction
+from polarnet.runtime.machine import precision_on, tune
+from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore
-from polarnet.storage.exchange import EXPORT_INDEX
-from polarnet.storage.parts import unknown_sequence
 from polarnet.terminal.progress import ProgressBar
 
-STANDARD_INPUT = "-"
 BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}{postfix}]"
 LIVE_BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
-
-
-@dataclass(frozen=True)
-class Arrangement:
-    """Arrangement of the polarizers in front of the sensor, as given by the user."""
-
-    angles: Sequence[int] | None
-    """Polarizer angle of each of four files, in degrees and in the order of the files."""
-    mosaic: Mosaic | None
-    sequence: str | None
-    """Sequence to read from an event store that holds several."""
 
 
 class Input(NamedTuple):
@@ -65,7 +39,9 @@ class Input(NamedTuple):
     duration_us: int | None
     """None for live input, whose duration is unknown."""
     channels: int = 4
-    """4, or 1 for a camera without polarizers, of which only intensity can be recovered."""
+    """4, or 1 for a camera behind a rotating polarizer or none."""
+    left_out: Mapping[str, int] | None = None
+    """Unusable and late lines of live input by kind, counted while `pieces` are read; None for files."""
 
 
 class Frame(NamedTuple):
@@ -100,174 +76,49 @@ class Summary:
         return self.stream_s / self.run_s
 
 
-def open_files(
-    paths: Sequence[Path],
-    arrangement: Arrangement,
-    read: Callable[[Path], Recording],
-    size: tuple[int, int] | None,
-    work: Path,
-    captures: Callable[[], RecordingsConfig],
-    plain: bool = False,
-    clean: Cleaner | None = None,
-) -> Input:
-    """Read channels from files, starting at time 0 and reduced to `size` (height, width) if given.
+@dataclass(frozen=True)
+class ChosenMethod:
+    """Method and its settings, as the user gives them."""
 
-    Four files hold one channel each, in the order of `arrangement.angles`, and are read by `read`. A single path is a
-    recording of a camera with a mosaic, an event store, a folder that `polarnet export` wrote, or a folder of
-    division-of-time captures, which are calibrated in `work` with the settings that `captures` returns. With `plain`,
-    any other file is one channel, of a camera without polarizers. `clean` removes noise before the size is reduced.
+    name: str
+    weights: Path | None = None
+    """None: the shipped weights, else those of the method's section."""
+    precision: str = "auto"
+    """Number format of a network: fp32, bf16, or auto, which selects bf16 if the device has units for it."""
+    thresholds: Sequence[float] | None = None
+    """Contrast thresholds of the camera, ON and OFF; None: those of the method's section."""
+    binning: int | None = None
+    """Side in pixels of the blocks that the network sees; None: that of the method's section."""
+    rotation: Rotation | None = None
+    """Angle of the rotating polarizer before the camera, by the clock of the events."""
+
+
+def open_method(chosen: ChosenMethod, setup_of: Callable[[Method], Setup]) -> tuple[Recoverer, str]:
+    """Open a method with the inputs of `setup_of` and the user's changes, and describe it in words.
+
     A ValueError or FileNotFoundError says what is missing.
     """
-    missing = [str(path) for path in paths if not path.exists()]
-    if missing:
-        raise FileNotFoundError(f"{', '.join(missing)}: there is no such file")
-    name = paths[0].name if len(paths) == 1 else ", ".join(path.name for path in paths)
-    channels = _channels(paths, arrangement, read, work, captures, plain)
-    duration_us = max((int(events.t[-1]) + 1 for events in channels if len(events)), default=0)
-    if clean is not None:
-        channels = clean(channels, duration_us)
-    if size is not None:
-        channels = [downscale(events, *size, keep_rate=True) for events in channels]
-    pieces = [Piece(channels, duration_us, time.perf_counter())]
-    return Input(name, channels[0].height, channels[0].width, pieces, duration_us, len(channels))
-
-
-def _channels(
-    paths: Sequence[Path],
-    arrangement: Arrangement,
-    read: Callable[[Path], Recording],
-    work: Path,
-    captures: Callable[[], RecordingsConfig],
-    plain: bool,
-) -> Sequence[Events]:
-    if len(paths) == 4:
-        if arrangement.angles is None:
-            raise ValueError("four files: say the polarizer of each, in their order, such as --angles 0 45 90 135")
-        if len(set(arrangement.angles)) < 4:
-            raise ValueError(f"four files: expected four different angles, got {list(arrangement.angles)}")
-        return read_four(dict(zip(arrangement.angles, paths, strict=True)), read=read)
-    if len(paths) != 1:
-        raise ValueError(f"expected one file or folder, or four files with --angles, got {len(paths)}")
-    (path,) = paths
-    if arrangement.mosaic is not None:
-        return read_mosaic(path, arrangement.mosaic, read)
-    if path.is_dir() and any(path.glob(f"{EVENT_CAPTURES[0]}.*")):
-        return _captures(path, work, captures())
-    if path.is_dir() and (exported := _exported(path, arrangement.sequence)):
-        return read_four(exported, dict.fromkeys(exported, 0), read)  # their times count from the start of the sequence
-    if detect_format(path) == "store":
-        return _sequence(EventStore.open(path), path, arrangement.sequence)
-    if plain:
-        return read_plain(path, read)
-    raise ValueError(
-        f"{path.name} is one file of events: say where the polarizers of its pixels are, such as --mosaic "
-        f"'90 45 / 135 0', or give four files with --angles, an event store, or a folder of {EVENT_CAPTURES[0]}.*, "
-        f"...; for its intensity alone, give a --method that reconstructs it, such as firenet or highpass"
-    )
-
-
-def _exported(folder: Path, sequence: str | None) -> dict[int, Path]:
-    """Files by angle in a folder that `polarnet export` or `polarnet simulate` wrote; empty for any other folder."""
-    if (folder / EXPORT_INDEX).is_file():
-        names = sorted(path.name for path in folder.iterdir() if path.is_dir())
-        name = names[0] if sequence is None and len(names) == 1 else sequence
-        if name not in names:
-            raise ValueError(f"{folder.name}: --sequence: {unknown_sequence(name, names)}")
-        folder = folder / name
-    files = {angle: sorted(folder.glob(f"polarizer_{angle:03d}.*")) for angle in POLARIZER_ANGLES_DEG}
-    if not all(files.values()):
-        return {}
-    if several := next((paths for paths in files.values() if len(paths) > 1), None):
-        raise ValueError(
-            f"{folder}: expected one file for each polarizer, got {', '.join(path.name for path in several)}; "
-            f"name the four files, with --angles 0 45 90 135"
-        )
-    return {angle: path for angle, (path,) in files.items()}
-
-
-def _sequence(store: EventStore, path: Path, sequence: str | None) -> Sequence[Events]:
-    if sequence is None and len(store.sequences) == 1:
-        (sequence,) = store.sequences
-    if sequence not in store.sequences:
-        raise ValueError(f"{path.name}: --sequence: {unknown_sequence(sequence, store.sequences)}")
-    return store.read(sequence)
-
-
-def _captures(folder: Path, work: Path, config: RecordingsConfig) -> Sequence[Events]:
-    root = work / "targets"
-    shutil.rmtree(root, ignore_errors=True)  # of a run on another folder, maybe of the same name
-    root.mkdir(parents=True)
-    target = root / folder.resolve().name
-    target.symlink_to(folder.resolve(), target_is_directory=True)
-    import_targets(root, work / "imported", config)
-    calibrate_targets(work / "imported", work / "calibrated", config, {})
-    return EventStore.open(work / "calibrated" / "events.zarr").read(target.name)
-
-
-def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> tuple[Input, LiveLines | LiveCamera]:
-    """Read live from standard input (-), a growing file or a camera (dv://...), until `idle_s` seconds without data.
-
-    ValueError for a camera without a mosaic.
-    """
-    if path.startswith(SCHEME):
-        if mosaic is None:
-            raise ValueError(f"{path}: expected --mosaic, the polarizers of the camera's pixels, with a camera")
-        camera = LiveCamera(path, mosaic, idle_s)
-        return Input(path, camera.height, camera.width, camera, None), camera
-    if path != STANDARD_INPUT and not Path(path).is_file():
-        raise FileNotFoundError(f"{path}: there is no such file; - reads standard input")
-    source = sys.stdin.buffer if path == STANDARD_INPUT else open(path, "rb")  # noqa: SIM115 - read until the end
-    name = "standard input" if path == STANDARD_INPUT else Path(path).name
-    lines = LiveLines(source, name, mosaic, idle_s)
-    return Input(name, lines.height, lines.width, lines, None), lines
-
-
-def open_method(
-    name: str | None,
-    weights: Path | None,
-    device: str,
-    precision: str,
-    setup_of: Callable[[Method], Setup],
-    thresholds: Sequence[float] | None = None,
-    binning: int | None = None,
-) -> tuple[Recoverer, str]:
-    """Open a method for `recover` and describe it in words.
-
-    Without a `name` the method is the DoLP network with `weights`, else the shipped weights. Any other method runs
-    with the settings of `setup_of`, and with `weights` if given. `precision` applies to networks: fp32, bf16,
-    or auto, which selects bf16 if the device has units for it. `thresholds` are the camera's contrast thresholds, ON
-    and OFF, and `binning` is the side in pixels of the blocks that the network sees; both are for the DoLP network. A
-    ValueError or FileNotFoundError says what is missing.
-    """
     tune()
-    place = device_of(RuntimeConfig(device, threads=0, workers=1, devices=1, nodes=1, rendezvous=""))
-    precision = precision_on(place, precision)
-    if name in (None, "ours"):
-        file = weights or shipped_weights()
-        if not file.is_file():
-            raise FileNotFoundError(f"--weights {file}: expected a checkpoint (NAME.safetensors), there is none")
-        network, metadata = load_network(file)
-        words = f"network {metadata['network']} ({precision}), {file}"
-        return dolp_recoverer(network, metadata, place, precision, thresholds, binning), words
-    assert name is not None
-    if name not in METHODS:
-        raise ValueError(f"--method: expected a method of {', '.join(METHODS)}, got {name!r}")
-    method = METHODS[name]
-    if method.rotating:
-        raise ValueError(
-            f"--method {name}: expected the rotation of the polarizer too: --rotating HZ or --triggers FILE"
-        )
-    for option, value in (("--thresholds", thresholds), ("--binning", binning)):
+    if chosen.name not in METHODS:
+        raise ValueError(f"--method: expected a method of {', '.join(METHODS)}, got {chosen.name!r}")
+    method = METHODS[chosen.name]
+    setup = setup_of(method)
+    setup = replace(setup, precision=precision_on(setup.device, chosen.precision), rotation=chosen.rotation)
+    for option, value in (("thresholds", chosen.thresholds), ("binning", chosen.binning)):
+        if value is not None and not hasattr(setup.config, option):
+            raise ValueError(f"--{option} is for the DoLP network, {method.name} does not use it")
         if value is not None:
-            raise ValueError(f"{option} is for the DoLP network, {name} does not use it")
-    if weights is not None and method.weights is None:
-        raise ValueError(f"--weights: {name} has no weights; leave it out")
-    setup = dataclasses.replace(setup_of(method), device=place, precision=precision)
-    if weights is not None:
-        setup = dataclasses.replace(setup, weights=weights)
+            setup = replace(setup, config=replace(setup.config, **{option: value}))
+    if method.weights is None:
+        if chosen.weights is not None:
+            raise ValueError(f"--weights: {method.name} has no weights; leave it out")
+        turns = f", {setup.rotation.rate_hz:g} turns/s" if setup.rotation else ""
+        return method.open(setup), f"{method.name}{turns}"
+    weights = chosen.weights or (shipped_weights() if method.weights.shipped else setup.weights)
+    setup = replace(setup, weights=weights)
     if reason := why_absent(method, setup):
-        raise ValueError(f"--method {name}: {reason}")
-    return method.open(setup), name
+        raise ValueError(f"--method {method.name}: {reason}")
+    return method.open(setup), f"network {weights_record(method, setup)['network']} ({setup.precision}), {weights}"
 
 
 def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: int | None = None) -> Iterator[Frame]:

@@ -27,6 +27,7 @@ from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.history import HISTORY, best_row, read_history
 
+SIMULATED = "simulated"  # name of the pipeline's own test set
 OURS = "ours"  # folder of the DoLP network's training
 THUMBNAIL_WIDTH = 208  # pixels, twice the displayed size
 MAX_THUMBNAILS = 24  # per split
@@ -44,6 +45,11 @@ class ReportPaths:
     """Holds a folder for each trained network."""
     benchmark: Path
 
+    @property
+    def simulated(self) -> Path:
+        """Results on the simulated test set."""
+        return self.benchmark / "sets" / SIMULATED
+
     def check(self, baselines: Sequence[str]) -> None:
         """FileNotFoundError that names each missing artefact and the stage that makes it; `baselines` were trained."""
         needed = {
@@ -53,9 +59,9 @@ class ReportPaths:
             self.events: "emulate",
             self.train / OURS / HISTORY: "train",
             **{self.train / name / HISTORY: f"train_baseline@{name}" for name in baselines},
-            self.benchmark / "metrics.json": "benchmark",
-            self.benchmark / "cost.json": "benchmark",
-            self.benchmark / "details.json": "benchmark",
+            self.simulated / "metrics.json": "report",
+            self.simulated / "cost.json": "report",
+            self.simulated / "details.json": "report",
         }
         missing = [f"{path} (stage {stage})" for path, stage in needed.items() if not path.exists()]
         if missing:
@@ -167,7 +173,7 @@ def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
     paths.check(baselines)
     scenes, frames = SceneStore.open(paths.scenes), FrameStore.open(paths.frames)
     events = EventStore.open(paths.events)
-    manifest, results = read_manifest(paths.images), read_results(paths.benchmark)
+    manifest, results = read_manifest(paths.images), read_results(paths.simulated)
     names = set(scenes.scene_of.values())
     pictures = [entry for entry in manifest.pictures if entry.name in names]  # others are too small for the sensor
     pictures.sort(key=lambda entry: entry.source == "dead_leaves")  # photographs first
@@ -178,11 +184,11 @@ def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
     return Artefacts(
         manifest=manifest,
         results=results._replace(panels=panels),
-        sets=[read_results(folder) for folder in sorted(paths.benchmark.glob("sets/*")) if folder.is_dir()],
+        sets=[read_results(one) for one in sorted(paths.benchmark.glob("sets/*")) if one.name != SIMULATED],
         ours=training_history(paths.train / OURS),
         baselines={name: training_history(paths.train / name) for name in baselines},
         rates=event_rates(events, frames),
-        budget=event_budget(paths.benchmark / "frames.csv", events),
+        budget=event_budget(paths.simulated / "frames.csv", events),
         overview=_overview(panels, scenes, frames, events),
         thumbnails={
             split: thumbnails([entry.name for entry in pictures if entry.split == split], scenes) for split in SPLITS

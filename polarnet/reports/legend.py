@@ -57,14 +57,19 @@ POLARNET = Network(
     "Polarnet's own network: event counts of the four polarizers in, DoLP, AoLP and the expected error of DoLP out. It "
     "solves the redundancy of the four polarizers and refines the answer with a small recurrent U-Net.",
 )
-NETWORKS = {"polarnet": POLARNET} | {
-    name: Network(METHODS[name].label, METHODS[name].colour, METHODS[name].about)
-    for method in METHODS.values()
-    if method.weights is not None
-    for name in method.weights.networks
-    if name in METHODS
+RECONSTRUCTS = "a recurrent network from events to intensity, one polarizer at a time, then DoLP by the Stokes formula."
+NETWORKS = {
+    "polarnet": POLARNET,
+    **{
+        name: Network(METHODS[name].label, METHODS[name].colour, METHODS[name].about)
+        for name in ("paper", "e2p", "cista_tc")
+    },
+    "e2vid": Network("E2VID", METHODS["e2vid_published"].colour, f"E2VID (Rebecq et al. 2019), {RECONSTRUCTS}"),
+    "firenet": Network(
+        "FireNet", METHODS["firenet_published"].colour, f"FireNet (Scheerlinck et al. 2020), {RECONSTRUCTS}"
+    ),
 }
-"""Networks by their name in a checkpoint; all but polarnet's use the label of the method of that name."""
+"""Networks by their name in a checkpoint."""
 
 NAMED_BY_NETWORK = ("e2v", "paper", "ours")
 """Rows whose key does not name their network."""

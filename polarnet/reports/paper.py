@@ -15,7 +15,7 @@ from polarnet.reports.legend import Legend
 from polarnet.reports.maps import dolp_image, event_full_scale, event_image, write_figure
 from polarnet.reports.tables import COLUMNS, Row, Scores, Table, as_csv, as_latex, as_markdown, score_table
 
-METHODS = ("cf", "e2v", "e2vid", "e2vid_published", "paper", "ours")
+METHODS = ("cf", "e2v", "e2vid_published", "paper", "ours")
 """Rows of Table 2 and columns of figures 9 and 10, if they were run; the paper has CF, E2V and its network."""
 METRICS = ("mse", "psnr", "ssim", "lpips")
 EXPERIMENTS = {"recordings": "Real", "simulated": "Simulated"}

@@ -1,6 +1,6 @@
-"""Ready-made sensors and motions for callers from Python, from the conf/ that came with the package.
+"""Ready-made sensors and motions for callers from Python, from the settings beside the code.
 
-They do not follow a params.yaml that a user has edited.
+A program installed from a wheel has the settings of the wheel, a clone those of its params.yaml.
 """
 
 from dataclasses import replace
@@ -15,15 +15,15 @@ from polarnet.terminal.installation import shipped_settings
 
 
 def _preset(group: str, name: str) -> dict[str, Any]:
-    return YAML(typ="safe").load(shipped_settings() / "conf" / group / f"{name}.yaml")
+    """Values of the one section that a sensor or polarizers set."""
+    content = YAML(typ="safe").load(shipped_settings() / "conf" / group / f"{name}.yaml") or {}
+    return next(iter(content.values()), {})
 
 
-_DEMO = _preset("experiment", "demo")
-_SENSOR = EmulatorConfig(**_DEMO["emulate"])
+_PARAMS = YAML(typ="safe").load(shipped_settings() / "params.yaml")
+_SENSOR = EmulatorConfig(**_PARAMS["emulate"])
 
-SENSORS = {
-    name: replace(_SENSOR, **_preset("sensor", name)["emulate"]) for name in ("default", "clean", "noisy", "random")
-}
+SENSORS = {name: replace(_SENSOR, **_preset("sensor", name)) for name in ("default", "clean", "noisy", "random")}
 """v2e's command-line defaults, its options `clean` and `noisy`, and `random`, which differs from sequence to sequence.
 
 Derive others with `dataclasses.replace`.
@@ -34,8 +34,7 @@ Derive others with `dataclasses.replace`.
 """
 
 POLARIZERS = {
-    name: replace(IDEAL, **_preset("polarizers", name)["polarizers"])
-    for name in ("ideal", "film", "wire_grid", "micropolarizers")
+    name: replace(IDEAL, **_preset("polarizers", name)) for name in ("ideal", "film", "wire_grid", "micropolarizers")
 }
 """Polarizers of a `Camera`, as in conf/polarizers.
 
@@ -44,7 +43,7 @@ POLARIZERS = {
 'dofp'
 """
 
-MOTIONS = {"default": SynthesizeConfig(**_DEMO["synthesize"])}
+MOTIONS = {"default": SynthesizeConfig(**_PARAMS["synthesize"])}
 """One second of a 120 x 180 px sensor that drifts at up to 160 px/s.
 
 >>> from polarnet.simulation import MOTIONS

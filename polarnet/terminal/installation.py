@@ -16,7 +16,7 @@ EXTRAS = {
     "remote": "stores in a bucket",
     "export": "polarnet onnx",
     "rerun": "polarnet view --rerun",
-    "sweep": "sweeps and searches",
+    "sweep": "sweeps",
 }
 """Task of each extra."""
 

@@ -70,8 +70,9 @@ def test_every_kind_of_method_has_its_row_and_the_truth_is_that_of_the_files(
 ):
     (made / "recordings" / "notes.txt").write_text("no recording at all")
     monkeypatch.chdir(project_root)
-    weights = [f"methods.{row}.weights={file}" for row, file in checkpoints.items() if row != "ours"]
-    rows = ["cf", "firenet", "firenet+gain", "e2p", "paper", "ours", "rotating_polarizer", "zeros", "oracle_mean"]
+    weights = [f"+rows.{row}={{needs: {checkpoints[row]}, settings: benchmark.precision}}" for row in ("e2p", "paper")]
+    weights.append(f"rows.e2v.needs={checkpoints['e2v']}")
+    rows = ["cf", "e2v", "e2p", "paper", "ours", "rotating_polarizer", "zeros", "oracle_mean"]
     arguments = ["--methods", ",".join(rows), "--weights", str(checkpoints["ours"]), "--out", str(tmp_path / "out")]
     paths = [f"paths.data={tmp_path / 'nothing'}"]
     assert main(["benchmark", "--recordings", str(made / "recordings"), *arguments, *TINY, *paths, *weights]) == 0

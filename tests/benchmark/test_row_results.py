@@ -53,7 +53,7 @@ def test_a_table_holds_the_rows_it_is_asked_for_whatever_else_lies_in_the_folder
 
 
 def test_a_row_that_was_left_out_says_why(tmp_path):
-    record = RowRecord("no weights are given: set methods.e2p.weights to their file", {})
+    record = RowRecord("no weights are given", {})
     write_row(tmp_path / "e2p", "e2p", record, {})
     assert read_record(tmp_path / "e2p") == record
 

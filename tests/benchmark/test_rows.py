@@ -67,11 +67,11 @@ def test_a_method_and_its_gains_share_one_run(sequence, context, monkeypatch):
 def test_a_row_that_cannot_run_is_left_out_with_the_reason(make_context, tmp_path):
     missing = tmp_path / "none.safetensors"
     context = make_context(None, firenet_published={"weights": None}, paper={"weights": missing})
-    wanted = ["zeros", "train_mean", "cf+gain", "firenet", "firenet_published+gain", "paper", "ours"]
+    wanted = ["zeros", "train_mean", "cf+gain", "e2v", "firenet_published+gain", "paper", "ours"]
     there, left_out = available(wanted, context)
-    assert there == ["zeros", "cf+gain", "firenet", "ours"]
+    assert there == ["zeros", "cf+gain", "e2v", "ours"]
     assert left_out["train_mean"] == "the training split is not there; run `dvc repro synthesize`"
-    assert "set methods.firenet_published.weights" in left_out["firenet_published+gain"]
+    assert "rows.firenet_published+gain.needs" in left_out["firenet_published+gain"]
     assert left_out["paper"] == f"{missing} is not there"
     assert available(list(ROWS), make_context()) == (list(ROWS), {})
 
@@ -84,8 +84,8 @@ def test_weights_that_are_not_there_are_missed_by_their_methods_alone(sequence, 
 
 
 def test_the_weights_behind_a_table_are_named_once_a_section(context):
-    used = weights_used(["zeros", "cf", "firenet", "firenet+gain"], context)
-    assert {section: one["file"] for section, one in used.items()} == {"firenet": "firenet.safetensors"}
+    used = weights_used(["zeros", "cf", "e2v", "e2v+gain"], context)
+    assert {section: one["file"] for section, one in used.items()} == {"e2v": "firenet.safetensors"}
 
 
 def test_checkpoints_of_polarnet_say_what_they_are_and_files_of_other_authors_say_nothing(context):

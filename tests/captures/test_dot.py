@@ -84,13 +84,6 @@ def test_frames_of_a_folder_are_an_intensity_capture_with_the_times_of_its_text(
         read_intensity_capture(folder, config)
 
 
-def test_a_16_bit_frame_has_the_values_of_its_8_bit_twin(config, grey_pictures, tmp_path):
-    rate = replace(config, picture_rate_hz=50.0)
-    eight = read_intensity_capture(write_frames(tmp_path / "eight", grey_pictures), rate)
-    sixteen = read_intensity_capture(write_frames(tmp_path / "sixteen", grey_pictures.astype(np.uint16) * 257), rate)
-    assert np.array_equal(eight.pictures, sixteen.pictures)
-
-
 def test_a_video_is_an_intensity_capture_with_its_own_times_or_those_beside_it(config, tmp_path):
     frames = np.linspace(60, 200, 12).astype(np.uint8)
     video = cv2.VideoWriter(str(tmp_path / "intensity_0.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 50.0, (WIDTH, HEIGHT))

@@ -13,16 +13,13 @@ from polarnet.captures.dot import (
     INTENSITY_CAPTURES,
     RecordingsConfig,
     find_captures,
-    read_event_capture,
-    read_intensity_capture,
 )
 from polarnet.captures.imported import import_targets
 from polarnet.captures.targets import calibrate_targets
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
-from polarnet.recordings.recording import read_recording
-from polarnet.recovery.stream import Arrangement, open_files
+from polarnet.recovery.inputs import Files, open_files
 from polarnet.reports.recordings import draw_calibration
 from polarnet.simulation.scene import scene_from_rgb
 from polarnet.storage.frames import FrameStore
@@ -75,7 +72,7 @@ def calibrated(rig, config, tmp_path_factory):
 
 def test_a_folder_of_captures_goes_into_recover_calibrated(rig, config, project_root, tmp_path):
     root, _ = rig
-    source = open_files([root / "one"], Arrangement(None, None, None), read_recording, None, tmp_path, lambda: config)
+    source = open_files(Files([root / "one"], captures=config), tmp_path)
     (piece,) = source.pieces
     assert (source.height, source.width) == tuple(config.size)
     assert min(map(len, piece.channels)) > 0
@@ -92,19 +89,6 @@ def test_the_rig_writes_eight_captures_and_says_what_is_true_of_them(rig):
     with np.load(root / "one" / "truth.npz") as frames:
         assert frames["dolp"].shape == (10, 16, 24)
         assert frames["dolp"].mean() == pytest.approx(written["mean_dolp"], abs=1e-6)
-
-
-def test_the_landmark_darkens_the_region_at_the_true_start_and_fires_negative_events(rig, config):
-    root, truth = rig
-    files = find_captures(root / "one")
-    pictures = read_intensity_capture(files["intensity_90"], config)
-    before = pictures.t_us < truth.start_us["intensity_90"]
-    assert (pictures.region[before] > config.dark_level).all()
-    assert (pictures.region[~before] < config.dark_level).all()
-    events = read_event_capture(files["events_90"], config)
-    region = (events.x >= 158) & (events.y < 24) & (events.p < 0)
-    near = (events.t - truth.start_us["events_90"]).abs() < 50_000
-    assert int((region & near).sum()) > 10 * int((region & ~near).sum())
 
 
 def test_start_times_by_the_landmark_are_right_within_one_picture(calibrated):

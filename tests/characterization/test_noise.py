@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from event_fixtures import events_of
 
 from polarnet.characterization.increments import PixelEvents
 from polarnet.characterization.noise import (
@@ -13,6 +14,7 @@ from polarnet.characterization.noise import (
 )
 
 PIXELS, DURATION_S = 600, 60.0
+NO_HOT = np.zeros(PIXELS, bool)
 
 
 def recorded(times_s, on) -> PixelEvents:
@@ -28,10 +30,10 @@ def poisson(rate_hz: float, generator) -> tuple[list, list]:
 
 @pytest.mark.thorough
 def test_a_poisson_process_of_2_hz_gives_1_hz_of_each_polarity():
-    noise = estimate_noise(recorded(*poisson(2.0, np.random.default_rng(3))))
+    noise = estimate_noise(recorded(*poisson(2.0, np.random.default_rng(3))), NO_HOT)
     assert noise.shot_off_hz == pytest.approx(1.0, abs=0.03)  # 36,000 events: standard error 0.005
     assert noise.shot_on_hz == pytest.approx(1.0, abs=0.03)
-    assert noise.leak_error_hz > 0.5 * noise.leak_hz or noise.leak_hz < 0.05
+    assert noise.leak.error > 0.5 * noise.leak.value or noise.leak.value < 0.05
 
 
 @pytest.mark.thorough
@@ -39,10 +41,10 @@ def test_on_events_about_every_4_seconds_are_a_leak_of_a_quarter_hertz():
     generator = np.random.default_rng(4)
     ages = 4 / (1 - 0.1 * generator.standard_normal((PIXELS, 30)))
     times = [t[t < DURATION_S] for t in np.cumsum(ages, axis=1) - generator.uniform(0, 4, (PIXELS, 1))]
-    noise = estimate_noise(recorded(times, [np.ones(len(t), bool) for t in times]))
-    assert noise.leak_hz == pytest.approx(0.25, rel=0.02)
+    noise = estimate_noise(recorded(times, [np.ones(len(t), bool) for t in times]), NO_HOT)
+    assert noise.leak.value == pytest.approx(0.25, rel=0.02)
     assert noise.shot_off_hz == 0
-    assert noise.leak_error_hz < 0.01
+    assert noise.leak.error < 0.01
 
 
 def test_shot_noise_is_referred_to_a_dark_pixel_of_nominal_threshold():
@@ -55,13 +57,14 @@ def test_the_mean_inverse_exceeds_1_by_the_squared_deviation():
     assert mean_inverse(0.1) == pytest.approx(1 + 0.1**2 + 3 * 0.1**4, abs=2e-5)
 
 
-def test_a_pixel_is_hot_above_ten_times_the_median_and_ten_events():
-    assert hot_under_constant_light(np.array([2, 2, 2, 29, 31])).tolist() == [False, False, False, False, True]
+def test_a_slow_pixel_is_hot_under_constant_light_above_ten_times_its_neighbours_events():
+    rows = [(k, x, y, 1) for y in range(8) for x in range(8) for k in range(31 if (x, y) == (3, 4) else 3)]
+    assert np.flatnonzero(hot_under_constant_light(events_of(sorted(rows), 8, 8))).tolist() == [8 * 4 + 3]
 
 
 def test_too_few_events_are_refused():
     with pytest.raises(ValueError, match="record for longer"):
-        estimate_noise(recorded([np.arange(5.0)], [np.ones(5, bool)]))
+        estimate_noise(recorded([np.arange(5.0)], [np.ones(5, bool)]), NO_HOT[:1])
 
 
 def test_the_rate_of_a_poisson_process_does_not_swing_and_that_of_a_passing_edge_does():

@@ -1,6 +1,5 @@
 import re
 import shlex
-import subprocess
 from pathlib import Path
 
 import fsspec
@@ -9,7 +8,6 @@ import torch
 from part_fixtures import flip
 
 from polarnet.cli import _options, _parser, main
-from polarnet.cli.project import unlocked
 from polarnet.events.stream import Events
 from polarnet.storage.events import EventStore
 
@@ -51,7 +49,7 @@ def test_doctor_names_the_rows_that_can_use_a_file_of_weights(tmp_path, capsys):
     torch.save({"state_dict": E2p(5, aolp_channels=2).state_dict()}, tmp_path / "e2p.pth")
     assert main(["doctor", "--weights", str(tmp_path / "e2p.pth")]) == 0
     printed = capsys.readouterr().out
-    assert "e2p.pth: methods.e2p_published.weights (E2P, published weights), 512,790 parameters" in printed
+    assert "e2p.pth: row e2p_published (E2P, published weights), 512,790 parameters" in printed
     assert "firenet" not in printed
     (tmp_path / "x.pth").write_bytes(b"nothing")
     assert main(["doctor", "--weights", str(tmp_path / "x.pth")]) == 1
@@ -63,27 +61,6 @@ def test_doctor_names_versions_device_and_what_to_do_about_missing_weights(capsy
     printed = capsys.readouterr().out
     for word in ("polarnet", "torch", "device", "threads", "bf16", "LPIPS      vgg", "memory", "disk"):
         assert word in printed
-
-
-def test_the_stages_come_in_the_order_they_run_in(capsys, project_root, monkeypatch):
-    monkeypatch.chdir(project_root / "tests")
-    assert main(["stages"]) == 0
-    assert capsys.readouterr().out.split() == [
-        "ingest", "synthesize", "emulate", "weights", "train", "train_baseline@e2v", "import_recordings", "calibrate",
-        "sets", "emulate_rotating", "benchmark@zeros", "benchmark@train_mean", "benchmark@oracle_mean", "benchmark@cf",
-        "benchmark@highpass", "benchmark@cf+gain", "benchmark@highpass+gain", "benchmark@e2v",
-        "benchmark@rotating_polarizer", "benchmark@ours", "report",
-    ]  # fmt: skip
-
-
-def test_a_stage_is_unlocked_by_its_code_and_settings_but_not_by_missing_data():
-    changes = {"data/images": "deleted", "polarnet/events": "modified", "params.yaml": {"seed": "modified"}}
-    status = {
-        "emulate": [{"changed deps": changes}, {"changed outs": {"data/events.zarr": "not in cache"}}],
-        "sets": [{"changed deps": {"data/images": "modified"}}],
-        "weights": ["changed command"],
-    }
-    assert unlocked(status) == {"emulate": ["polarnet/events", "params.yaml"], "weights": ["changed command"]}
 
 
 def test_verify_finds_a_flipped_byte_and_names_the_sequence(store, capsys):
@@ -158,28 +135,8 @@ def test_verify_of_something_else_says_what_was_expected(tmp_path, capsys):
     assert "there is no Zarr v3 group" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("command", [["preset", "smoke"], ["run"], ["stages"], ["benchmark", "--event-budget"]])
+@pytest.mark.parametrize("command", [["preset", "smoke"], ["benchmark", "--event-budget"]])
 def test_a_command_on_a_clone_says_so_elsewhere(tmp_path, monkeypatch, capsys, command):
     monkeypatch.chdir(tmp_path)
     assert main(command) == 1
     assert "run this command inside a clone" in capsys.readouterr().err
-
-
-def test_a_run_with_another_sensor_has_a_folder_of_its_own(project_root, monkeypatch, capsys):
-    calls = []
-
-    def ran(command, **options):
-        calls.append(command)
-        return subprocess.CompletedProcess(command, 0)
-
-    monkeypatch.setattr("polarnet.cli.project.subprocess.run", ran)
-    monkeypatch.chdir(project_root)
-    assert main(["run", "experiment=smoke", "sensor=noisy"]) == 0
-    assert calls[0][2:] == ["stages.ingest", "experiment=smoke", "sensor=noisy", "paths.data=outputs/run/smoke-noisy"]
-    assert [call[2] for call in calls] == [
-        f"stages.{name}"
-        for name in ("ingest", "synthesize", "emulate", "weights", "train", "train", "import_recordings", "calibrate",
-                     "sets", "emulate_rotating", "benchmark", "report")
-    ]  # fmt: skip
-    assert [call[-1] for call in calls if call[2] == "stages.train"] == [calls[0][-1], "baseline=e2v"]
-    assert "outputs/run/smoke-noisy/report/index.html" in capsys.readouterr().out

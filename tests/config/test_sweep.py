@@ -8,12 +8,12 @@ from omegaconf import OmegaConf
 
 from polarnet.config.sweep import (
     SweepTable,
-    finished,
     mark_finished,
     sweep_points,
     sweep_rows,
     sweep_table,
     swept_axes,
+    why_unfinished,
 )
 
 
@@ -104,11 +104,13 @@ def test_the_axes_of_the_plot_are_the_keys_that_differ_and_only_finished_points_
     assert scores == pytest.approx([0.04, 0.08])
 
 
-def test_a_job_is_finished_for_its_own_overrides_alone(tmp_path):
-    assert not finished(tmp_path, ["seed=1"])
-    mark_finished(tmp_path, ["seed=1"])
-    assert finished(tmp_path, ["seed=1"])
-    assert not finished(tmp_path, ["seed=2"])
+def test_a_job_is_finished_for_its_own_values_and_inputs_alone_and_says_what_changed(tmp_path):
+    record = {"values": {"loss": {"mse": 10.0}}, "inputs": {"data/events.zarr": "ab"}}
+    assert why_unfinished(tmp_path, record) == "it has not finished"
+    mark_finished(tmp_path, record)
+    assert why_unfinished(tmp_path, record) is None
+    assert why_unfinished(tmp_path, record | {"values": {"loss": {"mse": 12.0}}}) == "values.loss.mse was 10.0, is 12.0"
+    assert why_unfinished(tmp_path, record | {"inputs": {"data/events.zarr": "cd"}}).startswith("inputs.data/events")
 
 
 @pytest.mark.thorough
@@ -120,5 +122,5 @@ def test_a_refused_point_is_a_row_with_its_reason_and_stops_no_other(project_roo
     assert "Traceback" not in done.stdout
     rows = json.loads((tmp_path / "comparison.json").read_text())["rows"]
     assert [row["notes"] for row in rows] == [
-        [f"seed 1 failed: train: configuration error: train.epochs: expected > 0, got {epochs}"] for epochs in (0, -1)
+        [f"seed 1 failed: train.epochs: expected > 0, got {epochs}"] for epochs in (0, -1)
     ]

@@ -124,12 +124,6 @@ def test_validate_finds_one_wrong_event_wherever_it_is(make_events, place, colum
         validate(events)
 
 
-def test_validate_hands_back_good_events(make_random_events):
-    events = make_random_events(2, 100, 1000, 5, 5)
-    assert validate(events) is events
-    assert len(validate(Events.empty(1, 1))) == 0
-
-
 def test_columns_of_a_wrong_type_or_length_are_refused(make_events):
     events = make_events([(0, 0, 0, 1)], 1, 1)
     with pytest.raises(Exception, match="p"):

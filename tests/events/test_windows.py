@@ -101,11 +101,6 @@ def test_stores_of_different_sensors_are_refused(stores, tmp_path, make_random_e
         WindowDataset(EventStore.open(tmp_path / "small.zarr"), stores[1], ["a"], event_tensor)
 
 
-def test_one_frame_makes_no_window(stores):
-    with pytest.raises(ValueError, match="at least two frame times"):
-        encode_windows(stores[0].read("a"), T_US[:1], event_tensor)
-
-
 def test_two_frame_times_a_microsecond_apart_make_one_window_and_equal_ones_none():
     assert encode_windows([Events.empty(2, 3)], torch.tensor([5, 6]), event_tensor).shape == (1, 1, 2, 3)
     for times in ([5, 5], [5, 6, 6], [5]):

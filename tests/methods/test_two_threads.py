@@ -6,7 +6,7 @@ from polarnet.methods.two_threads import PARTS
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.machine import torch_threads
-from studies.network_speed import random_channels, windows_of
+from studies.speed_of_network import random_channels, windows_of
 
 HEIGHT, WIDTH = 24, 36
 

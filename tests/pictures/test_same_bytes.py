@@ -13,7 +13,7 @@ from skimage import data
 
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.simulation.scene import polarization_from_rgb
-from studies import instruction_sets
+from studies.faults import OLD_PROCESSOR, older_processor
 
 REFERENCE = "9869284915ce1dd18a56fc4ec597740599d363e501ed495aeb257b6b2cc06773"
 
@@ -37,10 +37,8 @@ def x86_64():
 
 @pytest.mark.thorough
 def test_the_bytes_are_the_same_on_a_processor_without_avx_and_fma(tmp_path, x86_64):
-    setting = instruction_sets.SETTINGS["everything without AVX and FMA"]
-    assert set(instruction_sets.checked_levels(setting).values()) == {"SSE"}
     script = "import test_same_bytes; print(test_same_bytes.hash_of_values())"
-    variables = instruction_sets.environment(setting) | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    variables = older_processor() | {"NUMBA_CACHE_DIR": str(tmp_path)}
     variables["PYTHONPATH"] += os.pathsep + os.path.dirname(__file__)
     done = subprocess.run([sys.executable, "-c", script], env=variables, stdout=subprocess.PIPE, text=True, check=True)
     assert done.stdout.strip() == REFERENCE
@@ -48,9 +46,6 @@ def test_the_bytes_are_the_same_on_a_processor_without_avx_and_fma(tmp_path, x86
 
 @pytest.mark.thorough
 def test_a_setting_without_effect_is_noticed(monkeypatch, x86_64):
-    if instruction_sets.default_levels()["numpy"] == "SSE":
-        pytest.skip("this processor has no instructions that a setting could switch off")
-    old_names = {"NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3 AVX512F"}  # of numpy before 2.4
-    monkeypatch.setitem(instruction_sets.VARIABLES["numpy"], "SSE", old_names)
-    with pytest.raises(RuntimeError, match=r"expected the levels .'numpy': 'SSE'.+got .'numpy': 'AVX"):
-        instruction_sets.checked_levels({"numpy": "SSE"})
+    monkeypatch.setitem(OLD_PROCESSOR, "NPY_DISABLE_CPU_FEATURES", "AVX2 FMA3 AVX512F")  # names of numpy before 2.4
+    with pytest.raises(RuntimeError, match=r"expected no library with AVX or FMA.+'numpy'"):
+        older_processor()

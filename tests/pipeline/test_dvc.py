@@ -1,4 +1,4 @@
-"""dvc.yaml: a stage depends on the code that makes its outputs; a row of the tables on no other row's."""
+"""dvc.yaml, with real DVC and stand-ins for the stages: which stages an edit of code, values or files runs again."""
 
 import contextlib
 import functools
@@ -10,138 +10,38 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import grimp
 import pytest
 from ruamel.yaml import YAML
 
-from polarnet.config.experiments import stage_names
-from polarnet.methods import METHODS, module_of
-from polarnet.training.baselines import BASELINES
+from polarnet.config.origins import pipeline
 
-# Code that starts a stage and checks its values decides no output; listed, it would re-run all at each new setting.
-PLUMBING = {"polarnet", "polarnet.config.tree", "polarnet.runtime.cluster"}
-ASSEMBLED = {"polarnet.methods", "polarnet.training.baselines", "polarnet.benchmark.references"}
-"""Modules that collect entries by name; a row or a training depends on its own entry alone."""
 SIMULATION = ("ingest", "synthesize", "emulate")
-REPORT_OUTS = ("metrics.json", "cost.json", "details.json", "frames.csv", "panels", "sets")
+REPORT_OUTS = ("metrics.json", "history", "sets")
+ROWS = {
+    f"benchmark@{row}" for row in YAML(typ="safe").load(Path(__file__).parents[2] / "params.yaml")["rows"]
+}  # all rows
+TRAININGS = {"train", "train_baseline@e2v"}
 
 
-@pytest.fixture(scope="module")
-def imports() -> grimp.ImportGraph:
-    return grimp.build_graph("polarnet", "stages", cache_dir=None)
-
-
-@pytest.fixture(scope="module")
-def stages(project_root: Path) -> dict[str, dict[str, Any]]:
-    """Stages by name, as DVC resolves dvc.yaml and params.yaml."""
+def test_the_stages_of_a_run_by_hand_are_those_of_dvc(project_root: Path):
     from dvc.repo import Repo
 
+    own = pipeline(project_root, YAML(typ="safe").load(project_root / "params.yaml"))
     with Repo(str(project_root)) as repo:
-        return {
-            stage.name: {
-                "cmd": stage.cmd,
-                "deps": [dep.def_path for dep in stage.deps if not hasattr(dep, "params")],
-                "params": {key for dep in stage.deps if hasattr(dep, "params") for key in dep.params},
-                "outs": [out.def_path for out in stage.outs],
-            }
-            for stage in repo.index.stages
-        }
+        stages = {stage.name: stage for stage in repo.index.stages}
+    assert set(own) == set(stages)
+    for name, stage in stages.items():
+        deps = {dep.def_path for dep in stage.deps if not hasattr(dep, "params")}
+        params = {key for dep in stage.deps if hasattr(dep, "params") for key in dep.params}
+        assert (set(own[name].deps), set(own[name].params)) == (deps, params), name
+        assert (" ".join(own[name].command), set(own[name].outs)) == (stage.cmd, {out.def_path for out in stage.outs})
 
 
-def reached(starts: list[str], imports: grimp.ImportGraph, ends: set[str] = frozenset()) -> set[str]:
-    """Modules that `starts` import, directly or not, with those in `ends` but not what these import."""
-    modules: set[str] = set()
-    waiting = list(starts)
-    while waiting:
-        module = waiting.pop()
-        if module not in modules | PLUMBING:
-            modules.add(module)
-            if module not in ends:
-                waiting += imports.find_modules_directly_imported_by(module)
-    return modules
-
-
-def modules_behind(stage: str, cmd: str, imports: grimp.ImportGraph) -> set[str]:
-    """Modules that decide the outputs of a stage."""
-    script = cmd.split()[2]
-    if stage.startswith("benchmark@"):
-        return reached([script], imports, ASSEMBLED | {"polarnet.networks.registry"}) - ASSEMBLED | {"polarnet.methods"}
-    if stage.startswith("train_baseline@"):
-        own = [f"polarnet.training.{stage.partition('@')[2]}"]
-        return reached([script, *own], imports, {"polarnet.training.dolp", "polarnet.networks.registry"})
-    if stage == "report":
-        return reached([script, *imports.find_children("polarnet.methods")], imports)
-    return reached([script], imports)
-
-
-def listed(root: Path, deps: list[str]) -> set[str]:
-    """Modules in the files and folders of code among the dependencies."""
-    names: set[str] = set()
-    for dep in deps:
-        if dep.startswith(("polarnet/", "stages/")):
-            path = root / dep
-            files = list(path.rglob("*.py")) if path.is_dir() else [path]
-            assert files, f"{dep} holds no module"
-            assert all(file.exists() for file in files), f"{dep} is not there"
-            names |= {".".join(file.relative_to(root).with_suffix("").parts) for file in files}
-    return {name.removesuffix(".__init__") for name in names}
-
-
-def test_every_module_that_a_stage_imports_is_in_a_file_or_folder_among_its_dependencies(project_root, stages, imports):
-    entries = {"polarnet.training.dolp", "polarnet.networks.registry"}  # of other trainings and rows than this one's
-    for stage, content in stages.items():
-        missing = modules_behind(stage, content["cmd"], imports) - listed(project_root, content["deps"])
-        if "@" in stage:
-            missing -= entries
-        assert not missing, f"{stage}: dvc.yaml lacks {sorted(missing)}"
-
-
-def test_a_folder_or_file_that_a_stage_lists_is_imported_by_it(project_root, stages, imports):
-    for stage, content in stages.items():
-        behind = modules_behind(stage, content["cmd"], imports)
-        for dep in content["deps"]:
-            if dep.startswith(("polarnet/", "stages/")) and "@" not in stage:
-                assert listed(project_root, [dep]) & behind, f"{stage} needs nothing of {dep}"
-
-
-def test_a_change_of_network_loss_metric_or_figure_never_reruns_the_simulation(stages):
-    for stage in SIMULATION:
-        rooms = {Path(dep).parts[1] for dep in stages[stage]["deps"] if dep.startswith("polarnet/")}
-        assert not rooms & {"networks", "training", "metrics", "methods", "benchmark", "reports"}, stage
-
-
-def test_a_row_depends_on_the_file_of_its_method_on_its_settings_and_on_its_training(stages, project_root):
-    rows = YAML(typ="safe").load(project_root / "params.yaml")["rows"]
-    for row in rows:
-        stage = stages[f"benchmark@{row}"]
-        if row not in METHODS:
-            assert "polarnet/benchmark/references.py" in stage["deps"]
-            continue
-        method = METHODS[row]
-        assert f"{module_of(row).replace('.', '/')}.py" in stage["deps"]
-        assert f"methods.{method.section}" in stage["params"]
-        if method.weights is not None and method.weights.trained_by:
-            assert f"data/train/{method.weights.trained_by}" in stage["deps"]
-
-
-def test_no_row_depends_on_the_file_settings_or_training_of_another(stages, project_root):
-    rows = YAML(typ="safe").load(project_root / "params.yaml")["rows"]
-    modules = {keys["module"] for keys in rows.values()}
-    for row, keys in rows.items():
-        stage = stages[f"benchmark@{row}"]
-        assert modules & set(stage["deps"]) == {keys["module"]}
-        assert {key for key in stage["params"] if key.startswith("methods")} <= {keys["settings"]}
-        assert {dep for dep in stage["deps"] if dep.startswith("data/train")} <= {keys["needs"]}
-        assert not {"rows", "methods", "benchmark", "benchmark.methods"} & stage["params"]
-        assert not {"polarnet/methods", "polarnet/networks", "polarnet/benchmark"} & set(stage["deps"])
-
-
-def test_a_training_depends_on_no_file_or_setting_of_a_row_or_of_another_training(stages):
-    for stage in ("train", *(f"train_baseline@{name}" for name in BASELINES if f"train_baseline@{name}" in stages)):
-        content = stages[stage]
-        assert not any(dep.startswith(("polarnet/methods", "polarnet/benchmark")) for dep in content["deps"])
-        assert not {"polarnet/training", "polarnet/networks"} & set(content["deps"])
-        assert not any(key.startswith(("rows", "methods", "benchmark")) for key in content["params"])
+def test_a_change_of_network_loss_metric_or_figure_never_reruns_the_simulation(project_root: Path):
+    stages = pipeline(project_root, YAML(typ="safe").load(project_root / "params.yaml"))
+    for name in SIMULATION:
+        rooms = {Path(dep).parts[1] for dep in stages[name].deps if dep.startswith("polarnet/")}
+        assert not rooms & {"networks", "training", "metrics", "methods", "benchmark", "reports"}, name
 
 
 STAND_IN = """
@@ -168,6 +68,8 @@ def finished(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     for name in ("measured", "photographs", "recordings"):
         (folder / "data" / name).mkdir(parents=True)
         (folder / "data" / name / "README.md").touch()
+    for name in ("start", "lpips"):
+        (folder / "data" / "external" / name).mkdir(parents=True)
     outs = {
         "ingest": ["images"], "synthesize": ["scenes.zarr", "frames.zarr"], "emulate": ["events.zarr"],
         "weights": ["weights/loss.json", "weights/benchmark.json"], "train": ["train/NAME"], "sets": ["sets"],
@@ -183,7 +85,7 @@ def finished(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     Repo.init(str(folder), no_scm=True).close()
     with pytest.MonkeyPatch.context() as monkeypatch:
         enter(folder, monkeypatch)
-        assert repro() == set(stage_names(folder))
+        assert repro() == set(pipeline(folder, YAML(typ="safe").load(folder / "params.yaml")))
     return folder
 
 
@@ -234,6 +136,7 @@ def set_params(project: Path, change: Callable[[Any], None]) -> None:
 
 
 def append(file: Path) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(file.read_text() + "\nCHANGED = True\n" if file.exists() else "NEW = True\n")
 
 
@@ -241,70 +144,99 @@ def test_a_second_run_has_nothing_to_do(project):
     assert repro() == set()
 
 
-def test_a_new_method_runs_itself_and_the_report_and_nothing_else(project):
+def test_a_new_trained_baseline_trains_itself_and_no_other_training(project):
     def add(params):
-        params["methods"]["sobel"] = {"weights": None}
-        params["rows"]["sobel"] = {
-            "module": "polarnet/methods/sobel.py", "needs": "polarnet/networks/sobel.py", "settings": "methods.sobel"
-        }  # fmt: skip
-
-    for room in ("methods", "networks"):
-        append(project / "polarnet" / room / "sobel.py")
-    set_params(project, add)
-    assert repro() == {"benchmark@sobel", "report"}
-
-
-def test_a_new_trained_baseline_trains_itself_and_runs_itself_and_no_other_training_or_row(project):
-    def add(params):
-        params["methods"]["sobel"] = {"weights": None}
         params["baselines"]["sobel"] = {"epochs": 1}
         params["baselines"]["trained"].append("sobel")
-        params["rows"]["sobel"] = {
-            "module": "polarnet/methods/sobel.py", "needs": "data/train/sobel", "settings": "methods.sobel"
-        }  # fmt: skip
+        params["rows"]["sobel"] = {"needs": "data/train/sobel", "settings": "benchmark.precision"}
 
-    for room in ("methods", "networks", "training"):
-        append(project / "polarnet" / room / "sobel.py")
+    for file in ("methods/sobel.py", "networks/sobel/network.py", "training/sobel.py"):
+        append(project / "polarnet" / file)
     set_params(project, add)
-    weights = {"weights"}  # looks whether the new loss needs LPIPS; what it writes stays the same
-    assert repro() == weights | {"train_baseline@sobel", "benchmark@sobel", "report"}
-
-
-@pytest.mark.thorough
-def test_a_changed_setting_of_a_method_runs_its_rows_and_the_report(project):
-    set_params(project, lambda params: params["methods"]["cf"].update(cutoff_hz=1.0))
-    assert repro() == {"benchmark@cf", "benchmark@cf+gain", "report"}
-
-
-@pytest.mark.thorough
-def test_a_row_that_is_added_or_removed_runs_no_other_row(project):
-    removed: dict[str, Any] = {}
-    set_params(project, lambda params: removed.update(params["rows"].pop("highpass")))
-    assert repro() == {"report"}
-    set_params(project, lambda params: params["rows"].update(firenet_published=removed))
-    assert repro() == {"benchmark@firenet_published", "report"}
+    others = {"weights", "emulate_rotating"}  # they look whether they are needed; what they write stays the same
+    assert repro() == {"train_baseline@sobel", "benchmark@sobel", "report"} | ROWS | others
 
 
 thorough = functools.partial(pytest.param, marks=pytest.mark.thorough)
+FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
 
 
 @pytest.mark.parametrize(
     ("file", "stages"),
     [
-        ("methods/e2v.py", {"benchmark@e2v", "report"}),
-        ("networks/firenet.py", {"train_baseline@e2v", "report"}),
-        ("cli/recordings.py", set()),
-        thorough("methods/complementary_filter.py", {"benchmark@cf", "benchmark@highpass", "benchmark@cf+gain",
-                                                     "benchmark@highpass+gain", "report"}),
-        thorough("networks/stokes_unet.py", {"train", "report"}),
-        thorough("networks/cista_tc.py", {"report"}),
-        thorough("reports/figures.py", {"report"}),
-        thorough("benchmark/paired.py", {"report"}),
+        ("methods/window_length.py", ROWS | {"report"}),
+        ("terminal/progress.py", set()),
+        ("networks/polarnet/panorama.py", {"train", "report"} | ROWS),
+        thorough("methods/overlap.py", ROWS | {"report"}),
+        thorough("methods/two_threads.py", ROWS | {"report"}),
+        thorough("networks/polarnet/stokes_unet.py", {"train", "report"} | ROWS),
+        thorough("networks/paper/dolp_unet.py", {"report"} | ROWS),
+        thorough("networks/e2v/firenet.py", {"train_baseline@e2v", "report"} | ROWS),
+        thorough("networks/registry.py", {"report"} | ROWS),
+        thorough("training/dolp.py", {"train"}),
+        thorough("clips/video.py", set()),
+        thorough("simulation/pixels/exact.py", (FROM_SIMULATION | TRAININGS) - {"ingest"}),
+        thorough("metrics/similarity.py", {"weights", "report"} | TRAININGS | ROWS),
+        thorough("reports/charts.py", {"calibrate", "report"}),
+        thorough("benchmark/paired.py", {"report"} | ROWS),
+        thorough("cli/doctor.py", set()),
     ],
-)  # fmt: skip
-def test_a_changed_file_runs_what_it_decides_and_weights_that_stay_the_same_run_no_row(
-    edited, monkeypatch, file, stages
-):
+)
+def test_a_changed_file_runs_what_it_can_change(edited, monkeypatch, file, stages):
     enter(edited, monkeypatch)
     append(edited / "polarnet" / file)
     assert repro() == stages
+
+
+def put(section: str, **values: Any) -> Callable[[Any], None]:
+    """An edit of some keys of a section."""
+
+    def change(params: Any) -> None:
+        for part in section.split("."):
+            params = params[part]
+        params.update(values)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "stages"),
+    [
+        (put("networks.paper", swin_depth=3), set()),
+        (put("methods.sharpening", unsharp_amount=0.5), {"benchmark@cf+gain", "benchmark@highpass+gain", "report"}),
+        thorough(put("baselines.e2p", epochs=2), {"weights", "report"}),
+        thorough(put("baselines.e2v", epochs=2), {"weights", "train_baseline@e2v", "report"}),
+        thorough(put("methods.cf", cutoff_hz=1.0), {"benchmark@cf", "benchmark@cf+gain", "benchmark@highpass+gain",
+                                                    "report"}),
+        thorough(put("loss", mse=12.0), {"train", "report"}),
+        thorough(put("benchmark", bootstrap_samples=100), {"report"}),
+        thorough(put("emulate", cutoff_hz=200.0), {"emulate", "sets", "emulate_rotating", "report"} | TRAININGS),
+    ],
+)  # fmt: skip
+def test_a_changed_value_runs_what_it_can_change(project, change, stages):
+    set_params(project, change)
+    assert repro() == stages
+
+
+@pytest.mark.parametrize(
+    ("file", "values", "stages"),
+    [
+        ("data/external/start/net.safetensors", put("train", start="data/external/start/net.safetensors"), {"train"}),
+        thorough("data/external/lpips/alex.pth", put("lpips", path="data/external/lpips/alex.pth"), {"weights"}),
+        thorough("weights/e2v.pth", put("rows.e2v", needs="weights/e2v.pth"), {"benchmark@e2v"}),
+    ],
+)
+def test_new_content_of_a_file_that_a_value_names_runs_the_stage_that_reads_it(project, file, values, stages):
+    (project / file).parent.mkdir(parents=True, exist_ok=True)
+    (project / file).write_text("one")
+    set_params(project, values)
+    repro()
+    assert repro() == set()
+    (project / file).write_text("another")
+    assert repro() == stages
+
+
+@pytest.mark.thorough
+def test_a_row_that_is_removed_runs_no_other_row(project):
+    set_params(project, lambda params: params["rows"].pop("highpass"))
+    assert repro() == {"emulate_rotating", "report"}

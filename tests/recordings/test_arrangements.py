@@ -56,15 +56,3 @@ def test_a_mosaic_file_starts_with_its_first_event(tmp_path):
     channels = read_mosaic(tmp_path / "a.csv", parse_mosaic("90 45 / 135 0"))
     assert min(int(c.t[0]) for c in channels) == 0
     assert sum(map(len, channels)) == len(events)
-
-
-def test_paths_may_be_text(tmp_path):
-    path = str(tmp_path / "a.csv")
-    write_celex5_csv(tmp_path / "a.csv", some_events(1))
-    mosaic = parse_mosaic("90 45 / 135 0")
-    channels = read_mosaic(path, mosaic)
-    expected = read_mosaic(tmp_path / "a.csv", mosaic)
-    assert all(torch.equal(a.t, b.t) for a, b in zip(channels, expected, strict=True))
-    assert all(len(channel) == 200 for channel in read_four(dict.fromkeys(ANGLES, path)))
-    write_store(str(tmp_path / "events.zarr"), {"a": channels})
-    assert EventStore.open(str(tmp_path / "events.zarr")).sequences == ["a"]

@@ -45,24 +45,7 @@ REPAIRED = {
         2000,
         {"unreadable_lines": 1},
     ),
-    "a pixel off the sensor": (lambda r: changed(r, 700, 1, "1290"), "\n", 1999, {"out_of_range": 1}),
-    "a polarity of 3": (lambda r: changed(r, 700, 3, "3"), "\n", 1999, {"bad_polarity": 1}),
-    "polarity 0": (lambda r: changed(r, 700, 3, "0"), "\n", 1999, {"no_change": 1}),
-    "one time of another year": (lambda r: changed(r, 700, 4, "31536000000000"), "\n", 1999, {"time_glitches": 1}),
-    "one time of zero": (lambda r: changed(r, 700, 4, "0"), "\n", 1999, {"time_glitches": 1}),
     "a time larger than 64 bits": (lambda r: changed(r, 700, 4, "9" * 20), "\n", 1999, {"unreadable_lines": 1}),
-    "two packets that overtook each other": (
-        lambda r: [*r[:700], *r[705:710], *r[700:705], *r[710:]],
-        "\n",
-        2000,
-        {"unsorted": 5},
-    ),
-    "a minute without events": (
-        lambda r: [*r[:700], *([*row[:4], str(int(row[4]) + 60_000_000)] for row in r[700:])],
-        "\n",
-        2000,
-        {"pauses": 1},
-    ),
 }
 
 
@@ -88,16 +71,10 @@ REFUSED = {
         "\n",
         "after event 1000, time goes back by .* us, and stays there",
     ),
-    "in random order": (lambda r: sorted(r, key=lambda row: row[2:]), "\n", "time goes back|far from the time"),
     "with a tenth of its lines unreadable": (
         lambda r: [["?", *row[1:]] if i % 10 == 5 else row for i, row in enumerate(r)],
         "\n",
         "200 among the first 1800 events: lines that are not the numbers",
-    ),
-    "with a tenth of its polarities wrong": (
-        lambda r: [[*row[:3], "9", row[4]] if i % 10 == 5 else row for i, row in enumerate(r)],
-        "\n",
-        "200 among the first 2000 events: events of a polarity that is neither",
     ),
 }
 

@@ -37,12 +37,6 @@ def test_the_picture_is_of_the_consecutive_events_that_took_the_least_time(tmp_p
     assert (inspection.busiest_events, inspection.busiest_start_us, inspection.busiest_us) == (30, 50_000, 2900)
 
 
-def test_a_recording_of_few_events_is_shown_whole(tmp_path):
-    (tmp_path / "e.txt").write_text("20 10\n1 2 3 1\n2 2 3 0\n3 4 5 1\n")
-    inspection = inspect_recording(open_recording(tmp_path / "e.txt"), FACTOR)
-    assert np.argwhere(inspection.busiest).tolist() == [[5, 4]]
-
-
 def test_findings_say_what_was_repaired_and_how_often(tmp_path):
     (tmp_path / "e.txt").write_text("20 10\n5 2 3 1\n4 2 3 0\n6 2 x 1\n3000000 4 5 1\n")
     lines = "\n".join(findings(inspect_recording(open_recording(tmp_path / "e.txt"), FACTOR)))
@@ -84,10 +78,28 @@ def test_inspect_of_pictures_shows_the_first(tmp_path, capsys):
     assert cv2.imread(str(tmp_path / "p.png"))[400, [10, 1000], 0].tolist() == [0, 255]
 
 
-def test_inspect_of_a_mode_without_polarity_says_what_to_do(tmp_path, capsys):
-    (tmp_path / "e.csv").write_text("10,20,5\n11,21,7\n")
-    assert main(["inspect", str(tmp_path / "e.csv")]) == 1
-    assert "have no polarity" in capsys.readouterr().err
+@pytest.mark.parametrize("chunk_events", [7, 1000])
+def test_empty_rows_and_a_silence_far_longer_than_the_others_are_named(tmp_path, chunk_events):
+    times = [100 * k + (40_000 if k >= 3000 else 0) for k in range(6000)]
+    rows = [0, 1, 2, 5, 7]
+    lines = "".join(f"{t} {k % 20} {rows[k % 5]} 1\n" for k, t in enumerate(times))
+    (tmp_path / "e.txt").write_text("20 8\n" + lines)
+    inspection = inspect_recording(open_recording(tmp_path / "e.txt", chunk_events=chunk_events), FACTOR)
+    assert inspection.gap == (299_900, 40_100, True)
+    text = "\n".join(findings(inspection))
+    assert "empty rows  3 of 8 without any event: 3-4, 6" in text
+    assert "gap         40,100 us without events from 299,900 us, far longer than the others" in text
+
+
+def test_the_start_of_a_simulated_camera_is_not_its_busiest_moment(shared):
+    """Nearly all 76,800 pixels of this file fire ON at time 0; its times are whole milliseconds."""
+    path = shared / "data" / "recordings" / "event_stream" / "dvs.es"
+    inspection = inspect_recording(open_recording(path, chunk_events=100_000), FACTOR)
+    assert inspection.start_events == 76_785
+    assert inspection.peak_us == 10_000
+    assert inspection.peak_rate_hz == pytest.approx(470e3, rel=0.01)
+    assert (inspection.busiest != 0).any(axis=1).sum() > 80
+    assert not inspection.gap.unusual
 
 
 def test_a_sensor_larger_than_any_is_refused(tmp_path):

@@ -115,12 +115,6 @@ def test_what_is_no_such_stream_is_refused(tmp_path, text, reason):
         read(tmp_path, text)
 
 
-def test_a_size_and_nothing_else_is_a_stream_without_events(tmp_path):
-    for text in ("4 3", "4 3\n"):
-        live, pieces = read(tmp_path, text)
-        assert (live.height, live.width, pieces) == (3, 4, [])
-
-
 def test_lines_keep_the_time_at_which_they_came_while_nobody_reads():
     reader, writer = os.pipe()
     with os.fdopen(reader, "rb") as source, os.fdopen(writer, "wb", buffering=0) as camera:

@@ -35,18 +35,6 @@ def test_a_pixel_that_fires_much_more_than_those_around_it_is_hot_and_an_edge_is
     assert (clean.t.diff() >= 0).all()
 
 
-def test_nothing_is_hot_where_nothing_fires():
-    empty = Events.empty(20, 30)
-    assert not hot_of(empty).any()
-    assert len(without_pixels(empty, hot_of(empty))) == 0
-
-
-def test_a_pixel_that_fires_now_and_then_in_a_quiet_recording_is_not_hot():
-    t = torch.arange(10) * 100_000
-    x = torch.full((10,), 7, dtype=torch.int16)
-    assert not hot_of(Events(t, x, x, torch.ones(10, dtype=torch.int8), 20, 30)).any()
-
-
 def test_one_factor_more_than_the_third_busiest_around_is_hot_and_thin_lines_are_not():
     counts = np.ones((40, 60), np.int64)
     counts[10:13] = 50  # an edge that passes

@@ -92,19 +92,6 @@ def test_pieces_of_any_length_give_the_same_frames(channels, rule):
         assert [len(events) for events in one.window.channels] == [len(events) for events in other.window.channels]
 
 
-def test_frames_come_before_their_window_is_complete(channels):
-    assert at_rate(1000, channels, ends=(25_000,))[-1].window.stop_us == 25_000
-
-
-def test_later_events_change_no_frame(channels):
-    early = [slice_time(events, 0, 50_000) for events in channels]
-    frames = at_rate(1000, channels)
-    for one, other in zip(frames, at_rate(1000, early), strict=True):
-        if one.window.stop_us <= 50_000:
-            assert torch.equal(one.prediction.dolp, other.prediction.dolp)
-    assert not torch.equal(frames[-1].prediction.dolp, at_rate(1000, early)[-1].prediction.dolp)
-
-
 def test_the_pictures_of_a_frame_show_the_events_of_a_window_that_ends_with_it(channels):
     frame = at_rate(1000, channels)[7]
     assert (frame.window.start_us, frame.window.stop_us) == (7000, 27_000)

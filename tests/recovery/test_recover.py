@@ -1,3 +1,4 @@
+import functools
 import io
 import itertools
 import re
@@ -8,6 +9,7 @@ import torch
 import zarr
 
 from polarnet.cli import main
+from polarnet.config.pipeline import setup_of
 from polarnet.config.tree import load
 from polarnet.events.stream import Events, slice_count, slice_time
 from polarnet.events.streaming import EventWindow, WindowRule
@@ -19,9 +21,9 @@ from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines
-from polarnet.recordings.recording import read_recording
-from polarnet.recovery import stream as recovery
-from polarnet.recovery.stream import Arrangement, frames_of, open_files, open_method, replay
+from polarnet.recovery import inputs
+from polarnet.recovery.inputs import Files, open_files
+from polarnet.recovery.stream import ChosenMethod, frames_of, open_method, replay
 from polarnet.runtime import machine as runtime
 from polarnet.storage.events import EventStore
 
@@ -79,10 +81,7 @@ def write_lines(path, events):
 
 def opened(store, size=None):
     """A sequence of a store, for which neither settings nor a folder are needed."""
-    unused = store / "unused"
-    return open_files(
-        [store], Arrangement(None, None, "lake"), read_recording, size, unused, lambda: load(unused).recordings
-    )
+    return open_files(Files([store], sequence="lake"), store / "unused", size)
 
 
 def recovered(out):
@@ -198,15 +197,14 @@ def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channel
         writer.write("target", [slice_count(channel, 0, count) for channel in channels], DURATION_US)
         writer.finish()
 
-    monkeypatch.setattr(recovery, "import_targets", imported)
-    monkeypatch.setattr(recovery, "calibrate_targets", calibrated)
+    monkeypatch.setattr(inputs, "import_targets", imported)
+    monkeypatch.setattr(inputs, "calibrate_targets", calibrated)
     config = load(project_root).recordings
     for parent, count in (("first", 10), ("second", 20), ("first", 10)):
         folder = tmp_path / parent / "target"
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "events_0.bin").write_text(str(count))
-        arrangement = Arrangement(None, None, None)
-        source = open_files([folder], arrangement, read_recording, None, tmp_path / "work", lambda: config)
+        source = open_files(Files([folder], captures=config), tmp_path / "work")
         assert sum(len(events) for piece in source.pieces for events in piece.channels) == 4 * count
 
 
@@ -216,13 +214,17 @@ def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channel
     (("--sequence", "lake", "--method", "e2vid_published"), "no weights are given"),
     (("--sequence", "lake", "--method", "cf", "--window", "1s"),
      "events.zarr lasts 100 ms, less than one window of 1000 ms: record for longer, or give --window 33.333ms"),
+    (("--sequence", "lake", "--method", "highpass", "--window", "9000ev"),
+     "ends before 9,000 events, one window: record for longer, or give fewer events"),
     (("--sequence", "lake", "--method", "cf", "--step", "9ev"), "expected a time such as 0.1ms"),
     (("--sequence", "lake", "--method", "cf", "--step", "1s"), "events between windows would be lost"),
     (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
-    (("--sequence", "lake", "--weights", "nothing.safetensors"), "expected a checkpoint"),
+    (("--sequence", "lake", "--weights", "nothing.safetensors"), "nothing.safetensors is not there"),
     (("--live", "--method", "cf", "--size", 8, 10), "--live: expected no --size"),
     (("--live", "--method", "cf", "--clock-mhz", 70), "--live: expected no --clock-mhz"),
-    (("--sequence", "lake", "--method", "cf", "--height", 8, "--angles", 0, 45, 90, 135), "no --angles, --height"),
+    (("--sequence", "lake", "--method", "cf", "--height", 8), "a store or a folder: expected no --height"),
+    (("--sequence", "lake", "--angles", 0, 45, 90, 135), "one arrangement of polarizers, got --angles, --sequence"),
+    (("--sequence", "lake", "--start-angle", 3), "without --rotating or --triggers: expected no --start-angle"),
 ])  # fmt: skip
 def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, capsys):
     if "cuda:9" in arguments and torch.cuda.is_available():
@@ -233,13 +235,13 @@ def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, 
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("method", ["highpass", "firenet"])
+@pytest.mark.parametrize("method", ["highpass", "e2v"])
 def test_a_method_that_reconstructs_intensity_gives_the_video_of_a_camera_without_polarizers(
     method, channels, tmp_path, at_root, capsys
 ):
     file = write_lines(tmp_path / "camera.txt", channels[1])
     weights = []
-    if method == "firenet":
+    if method == "e2v":
         torch.manual_seed(0)
         network, path = FireNet(5), tmp_path / "mine.safetensors"
         save_checkpoint(path, network.state_dict(), {"network": "firenet", "config": {"bins": network.bins}})
@@ -294,17 +296,6 @@ def test_a_mosaic_without_polarizers_is_named_on_the_terminal_and_on_the_page(tm
     assert "was made without polarizers" in (out / "index.html").read_text()
 
 
-@pytest.mark.parametrize(("window", "advice"), [
-    ("1s", "lasts 100 ms, less than one window of 1000 ms: record for longer, or give --window 33.333ms"),
-    ("9000ev", "ends before 9,000 events, one window: record for longer, or give fewer events"),
-])  # fmt: skip
-def test_a_recording_shorter_than_a_window_is_told_what_works(window, advice, store, tmp_path, at_root, capsys):
-    arguments = (store, "--sequence", "lake", "--method", "highpass")
-    assert run(*arguments, "--window", window, out=tmp_path / "out") == 1
-    assert advice in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
 def test_what_a_very_short_recording_is_told_works(channels, tmp_path, at_root, capsys):
     early = [slice_time(events, 0, 8000) for events in channels]
     files = [write_lines(tmp_path / f"{angle}.txt", e) for angle, e in zip(ANGLES, early, strict=True)]
@@ -325,10 +316,10 @@ def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):
         ([one, one], "four files with --angles, got 2"),
         ([one] * 4, "say the polarizer of each"),
         ([one] * 4 + ["--angles", 0, 45, 90, 90], "four different angles"),
-        ([one] * 4 + ["--sequence", "lake"], "four files: expected no --sequence"),
-        ([one, "--mosaic", "90 45 / 135 0", "--angles", 0, 45, 90, 135], "with --mosaic: expected no --angles"),
+        ([one, "--angles", 0, 45, 90, 135], "four files with --angles, got 1"),
+        ([one, "--mosaic", "90 45 / 135 0", "--angles", 0, 45, 90, 135], "got --angles, --mosaic"),
         ([one, "--live", "--sequence", "lake"], "--live: expected no --sequence"),
-        ([one, one, "--live"], "--live: expected one file or -, got 2"),
+        ([one, one, "--live"], "--live: expected one input, got 2"),
         ([tmp_path / "none.csv"], "there is no such file"),
     ):
         assert run(*files, "--method", "cf+gain", out=tmp_path / "out") == 1
@@ -336,24 +327,20 @@ def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):
         assert reason in capsys.readouterr().err
 
 
-def test_shipped_weights_are_a_checkpoint_or_say_what_to_do():
-    try:
-        network, _ = load_network(shipped_weights())
-    except FileNotFoundError as absent:
-        assert "--weights FILE" in str(absent)  # noqa: PT017 - a version may ship weights or not
-    else:
-        assert isinstance(network, torch.nn.Module)
+@pytest.fixture
+def setup_of_demo(project_root):
+    return functools.partial(setup_of, load(project_root, ["runtime.device=cpu"]))
 
 
 @pytest.mark.parametrize("option", [{"thresholds": (0.1, 0.1)}, {"binning": 2}])
-def test_options_of_the_network_are_refused_for_a_method_that_does_not_use_them(option):
+def test_options_of_the_network_are_refused_for_a_method_that_does_not_use_them(option, setup_of_demo):
     (name,) = option
     with pytest.raises(ValueError, match=f"--{name} is for the DoLP network, highpass does not use it"):
-        open_method("highpass", None, "cpu", "fp32", lambda method: None, **option)
+        open_method(ChosenMethod("highpass", **option), setup_of_demo)
 
 
-def test_the_shipped_network_takes_the_thresholds_of_the_camera():
-    events = Events.empty(HEIGHT, WIDTH)
-    windows = [EventWindow([events] * 4, 0, 33_333)]
-    recoverer, _ = open_method(None, None, "cpu", "fp32", lambda method: None, thresholds=(0.1, 0.4))
+def test_the_shipped_network_takes_the_thresholds_of_the_camera(setup_of_demo):
+    windows = [EventWindow([Events.empty(HEIGHT, WIDTH)] * 4, 0, 33_333)]
+    recoverer, words = open_method(ChosenMethod("ours", thresholds=(0.1, 0.4)), setup_of_demo)
+    assert words.endswith(str(shipped_weights()))
     assert recoverer.step(recoverer.start(HEIGHT, WIDTH), windows)[1].dolp.shape == (1, HEIGHT, WIDTH)

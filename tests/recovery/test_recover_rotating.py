@@ -6,8 +6,9 @@ import torch
 import zarr
 
 from polarnet.cli import main
+from polarnet.events.streaming import WindowRule
 from polarnet.recordings.source import RecordingError
-from polarnet.recovery.rotating import half_turn_rule, rotation_of
+from polarnet.recovery.inputs import half_turn_rule, rotation_of
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.motion import resting_trajectory
 from polarnet.simulation.polarizers import Grid
@@ -39,44 +40,32 @@ def recovered(arguments, out):
 
 def test_a_recording_gives_dolp_and_aolp_every_half_turn(recording, tmp_path, monkeypatch, project_root):
     monkeypatch.chdir(project_root)
-    frames = recovered([recording, "--rotating", RATE_HZ, "--start-angle", START_DEG], tmp_path / "out")
-    assert np.diff(frames["t_us"]).tolist() == [100_000] * (len(frames["t_us"]) - 1)
-    assert frames["dolp"][-1].mean() / 65535 == pytest.approx(0.5, abs=0.01)
-    assert frames["aolp"][-1].mean() * 180 / 65536 == pytest.approx(60, abs=0.5)
-    assert (tmp_path / "out" / "index.html").exists()
-
-
-def test_the_fit_for_moving_scenes_gives_a_frame_each_half_turn_from_that_half_turn(
-    recording, tmp_path, monkeypatch, project_root, capsys
-):
-    monkeypatch.chdir(project_root)
-    options = [recording, "--rotating", RATE_HZ, "--start-angle", START_DEG, "--method", "rotating_polarizer"]
-    frames = recovered(options, tmp_path / "out")
+    frames = recovered([recording, "--rotating", RATE_HZ, "--start-angle", START_DEG], tmp_path / "a")
     assert frames["t_us"][:2].tolist() == [100_000, 200_000]
     assert frames["dolp"][-1].mean() / 65535 == pytest.approx(0.5, abs=0.05)
     assert frames["aolp"][-1].mean() * 180 / 65536 == pytest.approx(60, abs=3)
-    assert main(["recover", str(recording), "--method", "rotating_polarizer"]) == 1
-    assert "expected the rotation of the polarizer too: --rotating HZ" in capsys.readouterr().err
-
-
-def test_triggers_replace_the_rate(recording, tmp_path, monkeypatch, project_root):
-    monkeypatch.chdir(project_root)
+    assert (tmp_path / "a" / "index.html").exists()
     (tmp_path / "triggers.txt").write_text("0\n200000\n400000\n600000\n")
-    options = [recording, "--start-angle", START_DEG, "--window", "200ms"]
-    by_rate = recovered([*options, "--rotating", RATE_HZ], tmp_path / "a")
-    by_trigger = recovered([*options, "--triggers", tmp_path / "triggers.txt"], tmp_path / "b")
-    assert (by_rate["dolp"] == by_trigger["dolp"]).all()
-    assert (by_rate["aolp"] == by_trigger["aolp"]).all()
+    triggers = [recording, "--triggers", tmp_path / "triggers.txt", "--start-angle", START_DEG, "--step", "50ms"]
+    by_trigger = recovered(triggers, tmp_path / "b")
+    assert by_trigger["t_us"][:3].tolist() == [50_000, 100_000, 150_000]
+    assert (by_trigger["dolp"][1::2] == frames["dolp"]).all()
+    assert (by_trigger["aolp"][1::2] == frames["aolp"]).all()
 
 
-def test_options_of_other_inputs_are_refused(recording, capsys, monkeypatch, project_root):
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--rotating", "5", "--mosaic", "90 45 / 135 0"], "one arrangement of polarizers, got --mosaic, --rotating"),
+        (["--rotating", "5", "--method", "cf"], "--rotating: expected no --method"),
+        (["--rotating", "5", "--window", "20ms"], "--rotating: expected no --window"),
+        (["--method", "rotating_polarizer"], "expected the rotation of the polarizer too: --rotating HZ"),
+    ],
+)
+def test_options_of_other_inputs_are_refused(recording, arguments, reason, capsys, monkeypatch, project_root):
     monkeypatch.chdir(project_root)
-    assert main(["recover", str(recording), "--rotating", "5", "--mosaic", "90 45 / 135 0"]) == 1
-    assert "one file with --rotating or --triggers: expected no --mosaic" in capsys.readouterr().err
-    assert main(["recover", str(recording), "--rotating", "5", "--method", "cf"]) == 1
-    assert "--rotating: expected no --method" in capsys.readouterr().err
-    assert main(["recover", str(recording), "--rotating", "5", "--window", "20000ev"]) == 1
-    assert "--window: expected a time such as 500ms" in capsys.readouterr().err
+    assert main(["recover", str(recording), *arguments]) == 1
+    assert reason in capsys.readouterr().err
 
 
 def test_a_rate_beside_triggers_gives_the_sense_of_rotation(tmp_path):
@@ -88,6 +77,7 @@ def test_a_rate_beside_triggers_gives_the_sense_of_rotation(tmp_path):
         rotation_of(None, tmp_path / "t.txt", 0.0)
 
 
-def test_windows_end_every_half_turn():
-    rule = half_turn_rule(rotation_of(5.0, None, 0.0), 2.0)
-    assert (rule.length_us, rule.step_us) == (400_000, 100_000)
+def test_windows_follow_each_other_every_half_turn_or_step():
+    rotation = rotation_of(5.0, None, 0.0)
+    assert half_turn_rule(rotation) == WindowRule(100_000, None, None)
+    assert half_turn_rule(rotation, 50_000) == WindowRule(50_000, None, None)

@@ -1,12 +1,12 @@
 """The pages in headless Chromium: they work, show everything, and ask for nothing outside."""
 
 import pytest
+from browser_fixtures import axe_serious, chromium_path, cut_off, opened, settle, wear
 
 from polarnet.reports.page import write_report
 from polarnet.reports.player import write_player
 from polarnet.reports.provenance import Run
 from polarnet.reports.viewing import films_of
-from studies.browser import axe_serious, chromium_path, cut_off, opened, settle, wear
 
 pytest.importorskip("playwright", reason="playwright is not installed: pip install 'polarnet[dev]'")
 if chromium_path() is None:

@@ -1,5 +1,8 @@
 """The campaign of studies.faults at a size of seconds: a careful reader refuses, a careless one is found out."""
 
+import multiprocessing
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -47,15 +50,38 @@ def data(tmp_path):
 
 def test_no_fault_is_used_silently_and_every_refusal_names_the_file(data):
     counts, bad = faults.inject(data, FAULTS, seed=1)
-    figures = faults.figures_of(counts)
     assert not bad
-    assert figures["faults_injected"] == FAULTS
-    assert figures["refused"] > FAULTS / 2
-    assert set(figures["artefacts"]) == {"images", "store", "training"}
+    assert set(counts) == {"images", "store", "training"}
+    assert sum(sum(of_kind.values()) for of_kind in counts.values()) == FAULTS
+    assert sum(of_kind["refused"] for of_kind in counts.values()) > FAULTS / 2
 
 
 def test_without_checksums_silent_uses_are_counted(data):
     (data / "images" / SUMS).unlink()
     (data / "train" / "ours" / SUMS).unlink()
     counts, bad = faults.inject(data, FAULTS, seed=1)
-    assert faults.figures_of(counts)["silent"] == sum(line.startswith("silent") for line in bad) > 0
+    silent = sum(of_kind["silent"] for of_kind in counts.values())
+    assert silent == sum(line.startswith("silent") for line in bad) > 0
+
+
+def test_damaged_inputs_are_counted_by_how_they_end():
+    endings = faults.endings_of("checkpoints", 40)
+    assert endings["read"] + endings["refused"] == 40
+    assert min(endings["read"], endings["refused"]) > 0
+
+
+def end_process(folder):
+    def case(generator):
+        if generator.integers(5) == 0:
+            os._exit(1)
+
+    return case
+
+
+def test_a_process_that_ends_is_a_crash_and_the_next_case_runs(monkeypatch):
+    monkeypatch.setitem(faults.KINDS, "ended", end_process)
+    fork = multiprocessing.get_context("fork")  # whose process knows this function
+    monkeypatch.setattr(faults.multiprocessing, "get_context", lambda _: fork)
+    endings = faults.endings_of("ended", 30)
+    assert endings["crash"] > 0
+    assert endings["crash"] + endings["read"] == 30

@@ -38,11 +38,6 @@ SENSORS = {b"346": (260, 346), b"240": (180, 240), b"128": None}
 """Height and width by the number in the camera's class name in the header; the DVS128 uses another address layout."""
 
 
-def matches(path: Path, head: bytes) -> bool:
-    """Whether the file starts with the format's signature."""
-    return head.startswith(MAGIC)
-
-
 def open_aedat2(path: Path, choices: Choices) -> Source:
     """Open the events of a DAVIS; times that wrap after 71 minutes are unwrapped."""
     start, height, width = _described(path, choices)

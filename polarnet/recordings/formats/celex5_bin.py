@@ -212,22 +212,22 @@ def _decoded(
     data: UInt8[np.ndarray, " bytes"], state: Int64[np.ndarray, " 3"], last_adc: np.ndarray, counts: Counter[str]
 ) -> list[np.ndarray]:
     """Ticks, columns, rows and polarities of the events in a package; `state` and `last_adc` are updated."""
-    groups = len(data) // 7
     counts["unreadable_packages"] += len(data) % 7 != 0
-    columns = [np.empty(2 * groups, dtype) for dtype in (np.int64, np.int16, np.int16, np.int8)]
-    events, orphans, unchanged = _decode(data, groups, state, last_adc, *columns)
+    columns = tuple(np.empty(2 * (len(data) // 7), dtype) for dtype in (np.int64, np.int16, np.int16, np.int8))
+    events, orphans, unchanged = _decode(data, state, last_adc, columns)
     counts.update({"orphans": orphans, "no_change": unchanged})
     return [column[:events] for column in columns]
 
 
 @numba.njit(nogil=True, cache=True)
 @no_type_check
-def _decode(data, groups, state, last_adc, t, x, y, p):
+def _decode(data, state, last_adc, columns):
     """Decode items of 28 bits: row and time stamp, or intensity and column."""
     row, stamp, now = state
+    t, x, y, p = columns
     n, orphans, unchanged = 0, 0, 0
     height, width = last_adc.shape
-    for i in range(groups):
+    for i in range(len(data) // 7):
         a, b, c, d = data[7 * i], data[7 * i + 1], data[7 * i + 2], data[7 * i + 3]
         low = np.int64(data[7 * i + 4]) | np.int64(data[7 * i + 5]) << 8 | np.int64(data[7 * i + 6]) << 16
         first = np.int64(b) << 20 | (low >> 6 & 63) << 14 | np.int64(a) << 6 | low & 63

@@ -4,58 +4,35 @@ Its EVT3 decoder holds times back where the sensor's clock steps back, so `proph
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
-
-from polarnet.recordings.formats.isolated import IsolatedLibrary
+from polarnet.recordings.formats.isolated import Library, ask, ask_once
 from polarnet.recordings.source import Block, CameraFrames, Choices, RecordingError, Source, sensor_size
 
-AEDAT4 = b"#!AER-DAT4"
-EVENT_STREAM = b"Event Stream"
-
-_library = IsolatedLibrary(
-    "faery", "faery", "recordings", Path(__file__).with_name("faery_tasks.py"), "the file is damaged"
-)
+FAERY = Library("faery", "faery", "recordings", "polarnet.recordings.formats.faery_tasks", "the file is damaged")
 
 
-def matches_aedat4(path: Path, head: bytes) -> bool:
-    """Whether the file starts with the signature of AEDAT4."""
-    return head.startswith(AEDAT4)
+def opener(file_type: str) -> Callable[[Path, Choices], Source]:
+    """A function that opens AEDAT4's first event stream (`aedat`, microseconds since 1970), or Event Stream (`es`)."""
 
+    def open_file(path: Path, choices: Choices) -> Source:
+        height, width = sensor_size(path, choices, *ask_once(FAERY, path, "size", file_type).value)
 
-def matches_event_stream(path: Path, head: bytes) -> bool:
-    """Whether the file starts with the signature of Event Stream."""
-    return head.startswith(EVENT_STREAM)
+        def blocks(counts: Counter[str]) -> Iterator[Block]:
+            for answer in ask(FAERY, path, "events", file_type):
+                yield Block(*answer.arrays)
 
+        return Source(height, width, blocks)
 
-def open_aedat4(path: Path, choices: Choices) -> Source:
-    """Open the first event stream of the file; its times are microseconds since 1970."""
-    return _source(path, choices, "aedat")
-
-
-def open_event_stream(path: Path, choices: Choices) -> Source:
-    """Open the change events of a DVS or ATIS."""
-    return _source(path, choices, "es")
+    return open_file
 
 
 def aedat4_frames(path: Path) -> CameraFrames:
     """Grey frames, timed by the middle of their exposure, or by their time stamp where the file has no exposure."""
-    answer = _library.ask(path, "frames")
-    if answer is None:
+    arrays = ask_once(FAERY, path, "frames").arrays
+    if not arrays:
         raise RecordingError(
             f"{path.name}: expected raw frames of one size and one channel as true polarization, there are none"
         )
-    return CameraFrames(*answer)
-
-
-def _source(path: Path, choices: Choices, file_type: str) -> Source:
-    height, width = sensor_size(path, choices, *_library.ask(path, "size", file_type))
-
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
-        for table in _library.blocks(path, file_type):
-            t, x, y, on = (np.ascontiguousarray(table[name]) for name in ("t", "x", "y", "on"))
-            yield Block(t, x, y, on.view(np.uint8))
-
-    return Source(height, width, blocks)
+    return CameraFrames(*arrays)  # type: ignore[arg-type]

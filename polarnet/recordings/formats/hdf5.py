@@ -1,128 +1,107 @@
-"""HDF5 files in four layouts: columns of DSEC and of ESfP, E2P's table from a polarization camera, and Prophesee's."""
+"""HDF5 files in the layouts of `LAYOUTS`: where their columns t (whole microseconds), x, y and p (1 or 0) are."""
 
-import contextlib
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from polarnet.recordings.formats.isolated import IsolatedLibrary
+from polarnet.recordings.formats.isolated import Library, ask, ask_once
 from polarnet.recordings.source import BLOCK_EVENTS, Block, CameraFrames, Choices, RecordingError, Source, sensor_size
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
-DSEC_COLUMNS = ("events/t", "events/x", "events/y", "events/p")
-ESFP_COLUMNS = ("t", "x", "y", "p")
-METAVISION = "CD/events"
 TRIGGERS = "triggers"  # times of a trigger signal in microseconds
 MAX_WHOLE = 2**53  # largest whole number that a float holds exactly
-E2P_COLUMNS = 4  # columns of /events: t in microseconds, x, y, p of 0 or 1
 E2P_FRAMES, E2P_MAPS = ("frame_ts", "frame"), ("intensity", "dolp", "aolp")
 E2P_WHITE = 255.0  # level in its maps of saturated light, of DoLP 1 and of AoLP 90 degrees; level 0 is AoLP -90 degrees
+SETTINGS = ("t_offset", "height", "width", "sensor_resolution", "geometry")
+"""Attributes or scalars that a file may have: microseconds added to t, and the sensor's size in three notations."""
 
-Description = dict[str, Any]
-
-_library = IsolatedLibrary(
+HDF5 = Library(
     "HDF5",
     "h5py",
     "hdf5",
-    Path(__file__).with_name("hdf5_tasks.py"),
+    "polarnet.recordings.formats.hdf5_tasks",
     "the file is damaged, or compressed with a filter that is not installed: pip install hdf5plugin; for Prophesee's "
     "ECF install the HDF5 plugin of Metavision or OpenEB and name its folder in HDF5_PLUGIN_PATH",
 )
 
 
-def matching(*tables: str) -> Callable[[Path, bytes], bool]:
-    """A check of whether a file is HDF5 with these tables."""
+class Column(NamedTuple):
+    """A column of numbers: a table of its own, a field of a table of records, or a column of a table by number."""
+
+    table: str
+    part: str | int | None = None
+
+
+class Layout(NamedTuple):
+    """Where a kind of HDF5 file holds its events."""
+
+    owner: str
+    columns: Sequence[Column]
+    """t, x, y, p."""
+
+
+LAYOUTS = {
+    "e2p": Layout("E2P", [Column("events", number) for number in range(4)]),
+    "esfp": Layout("ESfP", [Column(name) for name in "txyp"]),
+    "metavision": Layout("Prophesee", [Column("CD/events", name) for name in "txyp"]),
+    "dsec": Layout("DSEC", [Column(f"events/{name}") for name in "txyp"]),
+}
+"""E2P: Mei et al. 2023, a sensor behind polarizers 90 45 / 135 0. ESfP: Muglikar et al. 2023. Prophesee: Metavision,
+whose compression ECF needs Prophesee's HDF5 plugin. DSEC: Gehrig et al. 2021, whose files do not state 480 x 640."""
+
+
+def matcher(layout: str) -> Callable[[Path, bytes], bool]:
+    """A check of whether a file is HDF5 with the tables of a layout; for DSEC's, the last one tried, any HDF5."""
+    tables = {column.table for column in LAYOUTS[layout].columns}
 
     def matches(path: Path, head: bytes) -> bool:
-        if not head.startswith(MAGIC):
-            return False
+        if not head.startswith(MAGIC) or layout == "dsec":
+            return head.startswith(MAGIC)
         try:
-            return set(tables) <= set(_described(path)["tables"])
+            return tables <= set(_described(path)["tables"])
         except (RecordingError, RuntimeError):
-            return False  # `open_dsec` reports the reason
+            return False  # the opener of DSEC's layout reports the reason
 
     return matches
 
 
-matches_e2p, matches_esfp, matches_metavision = matching("events"), matching(*ESFP_COLUMNS), matching(METAVISION)
+def opener(layout: str) -> Callable[[Path, Choices], Source]:
+    """A function that opens the events of a file of a layout."""
+    owner, columns = LAYOUTS[layout]
 
+    def open_file(path: Path, choices: Choices) -> Source:
+        description = _described(path)
+        absent = dict.fromkeys(column.table for column in columns if column.table not in description["tables"])
+        if absent:
+            raise RecordingError(
+                f"{path.name}: expected HDF5 in the layout of {owner}, there is no {', '.join(absent)}"
+            )
+        lengths = [_length(path, description, column) for column in columns]
+        if len(set(lengths)) > 1:
+            raise RecordingError(f"{path.name}: its columns t, x, y, p have different lengths, {lengths}")
+        offset_us = _whole(path, description, "t_offset") or 0
 
-def matches_dsec(path: Path, head: bytes) -> bool:
-    """Whether it is an HDF5 file, whatever its content."""
-    return head.startswith(MAGIC)
+        def blocks(counts: Counter[str]) -> Iterator[Block]:
+            for t, x, y, p in _read(path, columns):
+                yield Block(_microseconds(path, t) + offset_us, x, y, p)
 
+        return Source(*sensor_size(path, choices, *_stated_size(path, description)), blocks)
 
-def open_dsec(path: Path, choices: Choices) -> Source:
-    """Open columns events/{t,x,y,p} (Gehrig et al. 2021), at times t + t_offset; p is 1 or 0.
-
-    DSEC does not state the size of its sensors, 480 x 640; files that polarnet writes do.
-    """
-    return _open_columns(path, choices, DSEC_COLUMNS, "DSEC's")
-
-
-def open_esfp(path: Path, choices: Choices) -> Source:
-    """Open the columns t, x, y, p of ESfP (Muglikar et al. 2023), in microseconds and p of 1 or 0."""
-    return _open_columns(path, choices, ESFP_COLUMNS, "ESfP's")
+    return open_file
 
 
 def trigger_times_us(path: Path) -> np.ndarray:
     """Times in the table /triggers; RecordingError if there is none."""
-    description = _described(path)
+    description, column = _described(path), Column(TRIGGERS)
     if TRIGGERS not in description["tables"]:
         raise RecordingError(f"{path.name}: expected a table /{TRIGGERS} of times in microseconds, there is none")
-    length = _length(path, description, TRIGGERS, 1)
-    blocks = [_microseconds(path, t) for (t,) in _read(path, (TRIGGERS,), length)]
+    _length(path, description, column)
+    blocks = [_microseconds(path, t) for (t,) in _read(path, [column])]
     return np.concatenate(blocks) if blocks else np.empty(0, np.int64)
-
-
-def _open_columns(path: Path, choices: Choices, columns: tuple[str, ...], layout: str) -> Source:
-    description = _described(path)
-    absent = [name for name in columns if name not in description["tables"]]
-    if absent:
-        raise RecordingError(f"{path.name}: expected {layout} HDF5, there is no {', '.join(absent)}")
-    lengths = [_length(path, description, name, 1) for name in columns]
-    if len(set(lengths)) > 1:
-        raise RecordingError(f"{path.name}: its columns t, x, y, p have different lengths, {lengths}")
-    offset_us = _whole(path, description, "t_offset") or 0
-    height, width = (_whole(path, description, name) for name in ("height", "width"))
-
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
-        for t, x, y, p in _read(path, columns, lengths[0]):
-            yield Block(_microseconds(path, t) + offset_us, x, y, p)
-
-    return Source(*sensor_size(path, choices, height, width), blocks)
-
-
-def open_e2p(path: Path, choices: Choices) -> Source:
-    """Open the table /events of E2P (Mei et al. 2023): rows t, x, y, p.
-
-    The attribute sensor_resolution is width, height. The pixels lie behind polarizers, rows 90 45 / 135 0 degrees from
-    the upper left; the events cover all four angles.
-    """
-    description = _described(path)
-    if "events" not in description["tables"]:
-        raise RecordingError(f"{path.name}: expected E2P's HDF5, there is no table /events")
-    length = _length(path, description, "events", 2)
-    columns = description["tables"]["events"][0][1]
-    if columns != E2P_COLUMNS:
-        raise RecordingError(f"{path.name}: expected the four columns t, x, y, p of /events, got {columns}")
-    size = description["values"].get("sensor_resolution")
-    if size is not None and not (isinstance(size, list) and len(size) == 2):
-        raise RecordingError(f"{path.name}: expected width and height as sensor_resolution, got {size}")
-    height = width = None
-    if size is not None:
-        width, height = (_number(path, "sensor_resolution", side) for side in size)
-
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
-        for (table,) in _read(path, ("events",), length):
-            t, x, y, p = np.ascontiguousarray(table.T)
-            yield Block(_microseconds(path, t), x, y, p)
-
-    return Source(*sensor_size(path, choices, height, width), blocks)
 
 
 def e2p_frames(path: Path) -> CameraFrames:
@@ -137,10 +116,10 @@ def e2p_frames(path: Path) -> CameraFrames:
     lengths = {name: tables[name][0][0] for name in names}
     if len(set(lengths.values())) > 1:
         raise RecordingError(f"{path.name}: expected one length of all tables of frames, got {lengths}")
-    blocks = [*_read(path, tuple(names), lengths["frame_ts"])]
-    values = {name: np.concatenate([block[k] for block in blocks]) for k, name in enumerate(names)} if blocks else {}
-    if not values:
+    blocks = [*_read(path, [Column(name) for name in names])]
+    if not blocks:
         raise RecordingError(f"{path.name}: expected frames as true polarization, there are 0")
+    values = {name: np.concatenate(parts) for name, parts in zip(names, zip(*blocks, strict=True), strict=True)}
     maps = None
     if set(E2P_MAPS) <= set(names):
         s0, dolp, aolp = (values[name] / np.float32(E2P_WHITE) for name in E2P_MAPS)
@@ -148,55 +127,46 @@ def e2p_frames(path: Path) -> CameraFrames:
     return CameraFrames(_microseconds(path, values["frame_ts"]), values.get("frame"), maps)
 
 
-def open_metavision(path: Path, choices: Choices) -> Source:
-    """Open the table CD/events of Prophesee: records of x, y, p of 1 or 0, and t in microseconds.
-
-    The attribute geometry is "WIDTHxHEIGHT". Its own compression, ECF, needs Prophesee's HDF5 plugin.
-    """
-    description = _described(path)
-    if METAVISION not in description["tables"]:
-        raise RecordingError(
-            f"{path.name}: expected a table {METAVISION}, got {', '.join(description['tables']) or 'none'}"
-        )
-    (length, *_), kind = description["tables"][METAVISION]
-    if kind != "V":
-        raise RecordingError(f"{path.name}: expected records of x, y, p, t in {METAVISION}, got type {kind!r}")
-    stated = re.fullmatch(r"(\d{1,5})x(\d{1,5})", str(description["values"].get("geometry")))
-    width, height = map(int, stated.groups()) if stated else (None, None)
-
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
-        for (table,) in _read(path, (METAVISION,), length):
-            if missing := set("txyp") - set(table.dtype.names or ()):
-                raise RecordingError(f"{path.name}: expected x, y, p, t in {METAVISION}, there is no {min(missing)}")
-            yield Block(_microseconds(path, table["t"]), table["x"], table["y"], table["p"])
-
-    return Source(*sensor_size(path, choices, height, width), blocks)
+def _described(path: Path) -> dict[str, Any]:
+    """Shape, number kind and fields of the tables of all layouts that the file has, and its `SETTINGS`."""
+    tables = [column.table for layout in LAYOUTS.values() for column in layout.columns]
+    return ask_once(HDF5, path, "describe", [*tables, TRIGGERS, *E2P_FRAMES, *E2P_MAPS], SETTINGS).value
 
 
-def _described(path: Path) -> Description:
-    tables = [*DSEC_COLUMNS, *ESFP_COLUMNS, "events", TRIGGERS, METAVISION, *E2P_FRAMES, *E2P_MAPS]
-    return _library.ask(path, "describe", tables, ["t_offset", "height", "width", "sensor_resolution", "geometry"])
+def _read(path: Path, columns: Sequence[Column]) -> Iterator[list[np.ndarray]]:
+    for answer in ask(HDF5, path, "read", columns, BLOCK_EVENTS):
+        yield answer.arrays
 
 
-def _read(path: Path, tables: tuple[str, ...], length: int) -> Iterator[list[np.ndarray]]:
-    try:
-        for start in range(0, length, BLOCK_EVENTS):
-            yield _library.ask(path, "read", tables, start, start + BLOCK_EVENTS)
-    finally:
-        with contextlib.suppress(RecordingError, RuntimeError):
-            _library.ask(path, "close")
-
-
-def _length(path: Path, description: Description, name: str, dimensions: int) -> int:
-    shape, kind = description["tables"][name]
-    if len(shape) != dimensions:
-        raise RecordingError(f"{path.name}: expected {name} as a table of {dimensions} dimensions, got {len(shape)}")
-    if kind not in "iufb":
+def _length(path: Path, description: dict[str, Any], column: Column) -> int:
+    """Number of rows; RecordingError if the table is not as the column needs it."""
+    (shape, kind, fields), (name, part) = description["tables"][column.table], column
+    if len(shape) != (2 if isinstance(part, int) else 1):
+        raise RecordingError(f"{path.name}: expected {name} as a table of another shape, got {shape}")
+    if isinstance(part, str):
+        if part not in fields:
+            raise RecordingError(f"{path.name}: expected records of x, y, p, t in {name}, there is no {part}")
+    elif kind not in "iufb":
         raise RecordingError(f"{path.name}: expected numbers in {name}, got type {kind!r}")
+    elif isinstance(part, int) and shape[1] != 4:
+        raise RecordingError(f"{path.name}: expected the four columns t, x, y, p of {name}, got {shape[1]}")
     return shape[0]
 
 
-def _whole(path: Path, description: Description, name: str) -> int | None:
+def _stated_size(path: Path, description: dict[str, Any]) -> tuple[int | None, int | None]:
+    """Height and width as the file states them: height and width, [width, height], or "WIDTHxHEIGHT"."""
+    values = description["values"]
+    if geometry := re.fullmatch(r"(\d{1,5})x(\d{1,5})", str(values.get("geometry"))):
+        return int(geometry[2]), int(geometry[1])
+    if (size := values.get("sensor_resolution")) is not None:
+        if not (isinstance(size, list) and len(size) == 2):
+            raise RecordingError(f"{path.name}: expected width and height as sensor_resolution, got {size}")
+        width, height = (_number(path, "sensor_resolution", side) for side in size)
+        return height, width
+    return _whole(path, description, "height"), _whole(path, description, "width")
+
+
+def _whole(path: Path, description: dict[str, Any], name: str) -> int | None:
     value = description["values"].get(name)
     return None if value is None else _number(path, name, value)
 

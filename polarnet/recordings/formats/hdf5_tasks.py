@@ -1,7 +1,7 @@
-"""Tasks of the HDF5 process; see `isolated_worker`."""
+"""Tasks of HDF5; see `isolated_worker`."""
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import h5py
@@ -11,41 +11,38 @@ with contextlib.suppress(ImportError):
     import hdf5plugin  # noqa: F401  # the compression of DSEC's own files
 
 
-files: dict[str, h5py.File] = {}
-"""Open files by name."""
-
-
-def describe(name: str, tables: list[str], attributes: list[str]) -> dict[str, Any]:
-    """Shape and number kind of each existing table, and values of existing scalars and attributes."""
+def describe(path: str, tables: Sequence[str], attributes: Sequence[str]) -> Iterator[tuple[dict[str, Any], list]]:
+    """Shape, number kind and field names of each existing table, and values of existing scalars and attributes."""
     shapes, values = {}, {}
-    with h5py.File(name, "r") as file:
+    with h5py.File(path, "r") as file:
         for key in tables:
             if isinstance(table := file.get(key), h5py.Dataset) and table.shape is not None:
-                shapes[key] = (tuple(map(int, table.shape)), table.dtype.kind)
+                shapes[key] = (tuple(map(int, table.shape)), table.dtype.kind, table.dtype.names or ())
         for key in attributes:
             if key in file.attrs:
-                values[key] = plain(np.asarray(file.attrs[key]))
+                values[key] = _plain(np.asarray(file.attrs[key]))
             elif isinstance(scalar := file.get(key), h5py.Dataset) and scalar.shape == ():
-                values[key] = plain(np.asarray(scalar[()]))
-    return {"tables": shapes, "values": values}
+                values[key] = _plain(np.asarray(scalar[()]))
+    yield {"tables": shapes, "values": values}, []
 
 
-def read(name: str, tables: list[str], start: int, stop: int) -> list[np.ndarray]:
-    """Rows from start to stop of each table; the file stays open."""
-    if name not in files:
-        files[name] = h5py.File(name, "r")
-    return [files[name][table][start:stop] for table in tables]
+def read(
+    path: str, columns: Sequence[tuple[str, str | int | None]], block_rows: int
+) -> Iterator[tuple[None, list[np.ndarray]]]:
+    """Columns in blocks of rows: of each table the whole, a field of its records, or a column by number."""
+    with h5py.File(path, "r") as file:
+        for start in range(0, len(file[columns[0][0]]), block_rows):
+            rows = {name: file[name][start : start + block_rows] for name in dict(columns)}
+            yield None, [_column(rows[name], part) for name, part in columns]
 
 
-def close(name: str) -> None:
-    """Close the file."""
-    if name in files:
-        files.pop(name).close()
+def _column(rows: np.ndarray, part: str | int | None) -> np.ndarray:
+    return rows if part is None else rows[part] if isinstance(part, str) else rows[:, part]
 
 
-TASKS: dict[str, Callable[..., Any]] = {"describe": describe, "read": read, "close": close}
-
-
-def plain(value: np.ndarray) -> Any:
+def _plain(value: np.ndarray) -> Any:
     """Python numbers for short numeric arrays, text for anything else."""
     return value.tolist() if value.dtype.kind in "iuf" and value.size <= 8 else str(value)[:80]
+
+
+TASKS = {"describe": describe, "read": read}

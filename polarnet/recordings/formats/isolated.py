@@ -1,112 +1,131 @@
 """Run format libraries in separate processes, so that a crash on a damaged file does not end the main process."""
 
-import atexit
 import contextlib
 import importlib.util
-import itertools
+import json
+import multiprocessing
 import os
-import pickle
-import subprocess
 import sys
-import threading
 from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from polarnet.recordings.formats.isolated_worker import serve
 from polarnet.recordings.source import RecordingError
 from polarnet.terminal.installation import installation
 
 PATIENCE_S = 60  # limit for an answer; a damaged file can put a library into an endless loop
-MAX_MIB = 8192  # address space of the process; a damaged file can state any size
-WORKER = Path(__file__).with_name("isolated_worker.py")
+MAX_MIB = 8192  # address space of a process; a damaged file can state any size
 
-_readers = itertools.count()
+SPAWN = multiprocessing.get_context("spawn")  # a forked process would hold torch's threads and memory
 
 
-class IsolatedLibrary:
-    """A library and its process, which starts on first use and again after a crash.
+class Library(NamedTuple):
+    """A library that reads files, and the module of its tasks (see `isolated_worker`)."""
 
-    The process answers the TASKS of the file `tasks`, one request at a time. `package` is the package they import, and
-    `extra` is polarnet's extra that installs it. `advice` ends the message about an unreadable file.
+    name: str
+    package: str
+    """Package that the tasks import."""
+    extra: str
+    """polarnet's extra that installs the package."""
+    tasks: str
+    advice: str
+    """End of the message about an unreadable file."""
+
+
+class Answer(NamedTuple):
+    """One answer of a task."""
+
+    value: Any
+    """Numbers, text, lists and dictionaries."""
+    arrays: list[np.ndarray]
+
+
+class _Worker(NamedTuple):
+    process: SpawnProcess
+    pipe: Connection
+
+    def end(self) -> None:
+        self.process.terminate()
+        self.process.join()
+        self.pipe.close()
+
+
+_idle: list[_Worker] = []
+os.register_at_fork(after_in_child=_idle.clear)  # a forked process must not share its parent's workers
+
+
+def ask(library: Library, path: Path, task: str, *arguments: Any) -> Iterator[Answer]:
+    """The answers of a task about a file; RecordingError with the library's message, or if it crashed or took too long.
+
+    A process answers one task at a time; it starts on first use and serves later tasks, whichever their library.
+    RuntimeError names the package to install where the library is missing.
     """
-
-    def __init__(self, name: str, package: str, extra: str, tasks: Path, advice: str):
-        self._name = name
-        self._package = package
-        self._extra = extra
-        self._tasks = tasks
-        self._advice = advice
-        self._process: subprocess.Popen[bytes] | None = None
-        self._owner = 0
-        self._lock = threading.Lock()
-
-    def ask(self, path: Path, task: str, *arguments: Any) -> Any:
-        """The answer to a task; RecordingError with the library's message, or if it crashed or took too long.
-
-        RuntimeError names the package to install where the library is missing.
-        """
-        if sys.modules.get(self._package, True) is None or importlib.util.find_spec(self._package) is None:
-            raise RuntimeError(f"{path.name}: this format needs {self._package}: {installation(self._extra)}")
-        with self._lock:
-            process = self._running()
-            assert process.stdin is not None
-            assert process.stdout is not None
-            deadline = threading.Timer(PATIENCE_S, process.kill)
-            deadline.start()
-            try:
-                pickle.dump((task, str(path.absolute()), *arguments), process.stdin)
-                process.stdin.flush()
-                kind, answer = pickle.load(process.stdout)
-            except (EOFError, BrokenPipeError, pickle.UnpicklingError):
-                self._stop(process)
+    if sys.modules.get(library.package, True) is None or importlib.util.find_spec(library.package) is None:
+        raise RuntimeError(f"{path.name}: this format needs {library.package}: {installation(library.extra)}")
+    worker, done = _ready_worker(), False
+    try:
+        with contextlib.suppress(OSError):  # a process that has ended has no answer either
+            worker.pipe.send_bytes(json.dumps([library.tasks, task, str(path.absolute()), *arguments]).encode())
+        while not done:
+            answer = _received(worker.pipe)
+            if answer is None:
                 raise RecordingError(
-                    f"{path.name}: {self._name} cannot read it: the library crashed or took over {PATIENCE_S} s; the "
-                    f"file is damaged"
-                ) from None
-            except BaseException:  # interrupted before the answer, which must not reach the next request
-                self._stop(process)
-                raise
-            finally:
-                deadline.cancel()
-        if kind == "error":
-            raise RecordingError(f"{path.name}: {self._name} cannot read it: {answer}; {self._advice}")
-        return answer
+                    f"{path.name}: {library.name} cannot read it: the library crashed or took over {PATIENCE_S} s; "
+                    f"the file is damaged"
+                )
+            done = not isinstance(answer, Answer)
+            if isinstance(answer, str):
+                raise RecordingError(f"{path.name}: {library.name} cannot read it: {answer}; {library.advice}")
+            if isinstance(answer, Answer):
+                yield answer
+    finally:
+        if done:
+            _idle.append(worker)
+        else:
+            worker.end()
 
-    def blocks(self, path: Path, *arguments: Any) -> Iterator[np.ndarray]:
-        """The tables that the task `pieces` yields, joined to blocks."""
-        reader, numbers = next(_readers), itertools.count()
-        try:
-            while (table := self.ask(path, "block", reader, next(numbers), *arguments)) is not None:
-                yield table
-        finally:
-            with contextlib.suppress(RecordingError, RuntimeError):
-                self.ask(path, "release", reader)
 
-    def _running(self) -> "subprocess.Popen[bytes]":
-        if self._owner != os.getpid() or self._process is None or self._process.poll() is not None:
-            self._owner = os.getpid()  # a forked process must not share its parent's worker
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", str(WORKER), str(self._tasks), str(MAX_MIB)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-            )
-            atexit.unregister(self._end)
-            atexit.register(self._end)
-        return self._process
+def ask_once(library: Library, path: Path, task: str, *arguments: Any) -> Answer:
+    """The one answer of a task, with the errors of `ask`."""
+    (answer,) = ask(library, path, task, *arguments)
+    return answer
 
-    def _end(self) -> None:
-        """Stop this process's own worker."""
-        if self._process is not None and self._owner == os.getpid():
-            self._stop(self._process)
 
-    def _stop(self, process: "subprocess.Popen[bytes]") -> None:
-        process.kill()
-        process.wait()
-        for pipe in (process.stdin, process.stdout):
-            with contextlib.suppress(OSError):
-                if pipe is not None:
-                    pipe.close()
-        self._process = None
+def _received(pipe: Connection) -> "Answer | str | bool | None":
+    """The next answer, the error that ends the task, True at its end; None if the process gives no sound answer."""
+    try:
+        if not pipe.poll(PATIENCE_S):
+            return None
+        head = json.loads(pipe.recv_bytes())
+        if "end" in head:
+            return head.get("error", True)
+        arrays = [
+            np.frombuffer(pipe.recv_bytes(), np.dtype(kind)).reshape(shape).copy() for kind, shape in head["arrays"]
+        ]
+        return Answer(head["value"], arrays)
+    except (EOFError, OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _ready_worker() -> _Worker:
+    while _idle:
+        worker = _idle.pop()
+        if worker.process.is_alive():
+            return worker
+        worker.end()
+    ours, theirs = SPAWN.Pipe()
+    process = SPAWN.Process(target=serve, args=(theirs, MAX_MIB), daemon=True)
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")  # the process would run the user's script again
+    try:
+        process.start()
+    finally:
+        sys.modules["__main__"] = main
+    theirs.close()
+    return _Worker(process, ours)

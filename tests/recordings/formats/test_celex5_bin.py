@@ -28,15 +28,6 @@ def test_what_is_written_reads_back_equal(tmp_path, make_random_events, same_eve
         assert (getattr(written, name)[-5000:] == getattr(events, name)).all()
 
 
-def test_events_on_the_clocks_own_steps_read_back_equal_to_what_was_given(tmp_path, make_events, same_events):
-    rows = [(0, 5, 7, 1), (10, 5, 7, -1), (10, 1279, 799, 1), (1024, 5, 7, 1), (5_000_192, 5, 7, -1)]
-    events = make_events(rows, 800, 1280)
-    write_celex5_bin(tmp_path / "e.bin", events)
-    recording = read_recording(tmp_path / "e.bin")
-    assert same_events(recording.events, events)
-    assert recording.repairs == {"pauses": 1}
-
-
 def test_an_event_in_bytes_worked_out_by_hand(tmp_path):
     """Row 5 at time stamp 3, then column 9 with intensity 1000 (stored as 3095).
 
@@ -72,13 +63,6 @@ def test_pictures_read_back_equal_but_for_the_pixel_that_holds_the_mode(tmp_path
     for before, after in zip(pictures, read, strict=True):
         assert np.flatnonzero(before != after.intensity).tolist() in ([], [0])
     assert len(read_recording(tmp_path / "p.bin").events) == 0
-
-
-def test_pictures_without_the_computers_time_say_so(tmp_path):
-    write_celex5_pictures(tmp_path / "p.bin", [np.full((800, 1280), 7, np.uint16)])
-    (picture,) = celex5_pictures(tmp_path / "p.bin")
-    assert picture.t_us is None
-    assert np.unique(picture.intensity).tolist() == [7]
 
 
 def test_imu_samples_after_a_package_are_passed_over(tmp_path, make_events):
@@ -118,17 +102,3 @@ def test_a_picture_of_another_size_is_refused(tmp_path):
     (tmp_path / "p.bin").write_bytes(header(loop_a=3) + package(bytes(300), last=0))
     with pytest.raises(RecordingError, match="expected 1536001 bytes of a full picture, got 301"):
         list(celex5_pictures(tmp_path / "p.bin"))
-
-
-def test_what_the_sensor_cannot_send_is_not_written(tmp_path, make_events):
-    path = tmp_path / "e.bin"
-    for rows, size, message in (
-        ([(-1, 1, 1, 1)], (800, 1280), "times from 0 on, got -1 us"),
-        ([(0, 1, 1, 1)] * 4096, (800, 1280), "up to 4095 events of one polarity in a row"),
-        ([(0, 1, 1, 1)], (801, 1280), "of a sensor of 800x1280"),
-        ([(1, 1, 1, 1), (0, 1, 1, 1)], (800, 1280), "a time no earlier"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            write_celex5_bin(path, make_events(rows, *size))
-    with pytest.raises(ValueError, match="pictures of 800x1280 up to 4095"):
-        write_celex5_pictures(path, [np.full((800, 1280), 4096, np.uint16)])

@@ -1,4 +1,3 @@
-import numpy as np
 import pytest
 
 from polarnet.recordings.recording import read_recording
@@ -20,11 +19,6 @@ def test_what_is_written_reads_back_equal(tmp_path, make_random_events, same_eve
     assert recording.format == "celex5_csv"
     assert same_events(recording.events, events)
     assert recording.repairs == {}
-
-
-def test_the_row_stands_first_and_the_intensity_third(tmp_path, make_events):
-    write_celex5_csv(tmp_path / "e.csv", make_events([(5, 20, 10, 1)], 800, 1280), np.array([4000]))
-    assert (tmp_path / "e.csv").read_text() == "10,20,4000,1,5\n"
 
 
 def test_events_whose_pixel_did_not_change_are_dropped_and_counted(tmp_path):
@@ -57,16 +51,3 @@ def test_other_columns_are_refused_with_those_of_every_mode(tmp_path):
 def test_time_stamps_of_old_converters_become_microseconds_at_the_clock_that_is_given(tmp_path):
     path = write(tmp_path / "e.csv", [(1, 1, 7, 1, 0), (1, 1, 8, 1, 1), (1, 1, 9, 1, 100)])
     assert read_recording(path, clock_mhz=100).events.t.tolist() == [0, 10, 1024]
-
-
-def test_columns_in_the_order_of_other_cameras_are_refused(tmp_path):
-    rows = [(1000 + k, 500, 2000, 1, k) for k in range(50)]
-    with pytest.raises(RecordingError, match="50 among the first 50 events: events that are not on the sensor"):
-        read_recording(write(tmp_path / "e.csv", rows))
-
-
-def test_events_of_a_larger_sensor_and_wrong_intensities_are_not_written(tmp_path, make_events):
-    with pytest.raises(ValueError, match="of a sensor of 800x1280, got 900x1280"):
-        write_celex5_csv(tmp_path / "e.csv", make_events([], 900, 1280))
-    with pytest.raises(ValueError, match="an intensity of 0 to 4095 for each of 1 events"):
-        write_celex5_csv(tmp_path / "e.csv", make_events([(0, 1, 1, 1)], 800, 1280), np.array([4096]))

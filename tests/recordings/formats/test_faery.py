@@ -1,9 +1,7 @@
-import sys
-
 import numpy as np
 import pytest
 
-from polarnet.recordings.recording import open_recording, read_recording
+from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
 
 ROWS = [(5, 1, 2, True), (9, 345, 259, False), (9, 3, 4, True)]
@@ -54,17 +52,3 @@ def test_damage_that_crashes_the_library_ends_in_events_or_in_the_reason(tmp_pat
             reasons.append(str(error))
     assert len(reasons) > 20
     assert all(reason.startswith("damaged.aedat4: ") for reason in reasons)
-
-
-def test_two_readers_of_one_file_do_not_disturb_each_other(tmp_path):
-    path = write(tmp_path / "e.es")
-    one, two = iter(open_recording(path, chunk_events=1)), iter(open_recording(path, chunk_events=1))
-    columns = [int(next(reader).x[0]) for reader in (one, two, two, one, one, two)]
-    assert columns == [1, 1, 345, 345, 3, 3]
-
-
-def test_without_the_library_the_error_names_the_extra(tmp_path, monkeypatch):
-    (tmp_path / "e.aedat4").write_bytes(b"#!AER-DAT4.0\r\n" + bytes(100))
-    monkeypatch.setitem(sys.modules, "faery", None)
-    with pytest.raises(RuntimeError, match=r"e\.aedat4: .*run pip install -e '\.\[recordings\]' in the clone"):
-        read_recording(tmp_path / "e.aedat4")

@@ -1,5 +1,3 @@
-import sys
-
 import numpy as np
 import pytest
 
@@ -68,7 +66,7 @@ def test_e2p_is_a_table_of_t_x_y_p_with_width_before_height(tmp_path):
     [
         ({"x": None}, "there is no events/x"),
         ({"x": [1, 2, 3]}, "different lengths"),
-        ({"y": [[1, 2]]}, "expected events/y as a table of 1 dimensions"),
+        ({"y": [[1, 2]]}, "expected events/y as a table of another shape"),
         ({"p": np.array([b"a", b"b"])}, "expected numbers in events/p"),
         ({"t": [0.5, 1.0]}, "expected whole microseconds"),
         ({"x": [0.5, 1.0]}, "x and y to be whole numbers"),
@@ -82,11 +80,11 @@ def test_other_columns_are_refused_by_name(tmp_path, columns, message):
 
 
 def test_e2p_of_another_shape_is_refused(tmp_path):
-    with pytest.raises(RecordingError, match="the four columns t, x, y, p of /events, got 3"):
+    with pytest.raises(RecordingError, match="the four columns t, x, y, p of events, got 3"):
         read_recording(write_e2p(tmp_path / "a.h5", [[1, 2, 3]]))
     with pytest.raises(RecordingError, match="expected width and height as sensor_resolution"):
         read_recording(write_e2p(tmp_path / "b.h5", [[1, 2, 3, 1]], (1, 2, 3)))
-    with pytest.raises(RecordingError, match="there is no table /events"):
+    with pytest.raises(RecordingError, match="in the layout of E2P, there is no events"):
         read_recording(write_dsec(tmp_path / "c.h5"), "e2p")
 
 
@@ -94,13 +92,6 @@ def test_a_damaged_file_is_refused_with_what_hdf5_says(tmp_path):
     path = write_dsec(tmp_path / "e.h5")
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(RecordingError, match=r"e\.h5: HDF5 cannot read it: .*truncated"):
-        read_recording(path, height=480, width=640)
-
-
-def test_without_h5py_the_error_names_the_extra(tmp_path, monkeypatch):
-    path = write_dsec(tmp_path / "e.h5")
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[hdf5\]' in the clone"):
         read_recording(path, height=480, width=640)
 
 
@@ -154,9 +145,9 @@ def test_prophesees_table_has_records_of_x_y_p_t_and_its_geometry(tmp_path):
     with pytest.raises(RecordingError, match="the file does not say how large the sensor is"):
         read_recording(write_metavision(tmp_path / "f.hdf5", [(1, 2, 1, 5)], None))
     other = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2")])
-    with pytest.raises(RecordingError, match="expected x, y, p, t in CD/events, there is no t"):
+    with pytest.raises(RecordingError, match="expected records of x, y, p, t in CD/events, there is no t"):
         read_recording(write_metavision(tmp_path / "g.hdf5", [(1, 2, 1)], dtype=other))
-    with pytest.raises(RecordingError, match="expected a table CD/events, got events/t, events/x, events/y, events/p"):
+    with pytest.raises(RecordingError, match="expected HDF5 in the layout of Prophesee, there is no CD/events"):
         read_recording(write_dsec(tmp_path / "h.h5"), "metavision")
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from polarnet.recordings.formats import isolated
-from polarnet.recordings.formats.isolated import IsolatedLibrary
+from polarnet.recordings.formats.isolated import Library, ask, ask_once
 from polarnet.recordings.source import RecordingError
 
 TASKS = """
@@ -15,81 +15,102 @@ import os, time
 import numpy as np
 
 
-
 class Panic(BaseException):
     pass
 
 
+def answers(path, count):
+    for k in range(count):
+        yield {"size": os.path.getsize(path), "process": os.getpid()}, [np.arange(k), np.ones((k, 2), np.int8)]
+
+
 def panic(path):
+    yield None, []
     raise Panic("out of bounds")
 
 
 TASKS = {
-    "size": lambda path, more: os.path.getsize(path) + more,
-    "process": lambda path: os.getpid(),
+    "answers": answers,
+    "panic": panic,
     "crash": lambda path: os.abort(),
     "circle": lambda path: time.sleep(1000),
-    "claim": lambda path, size: np.zeros(size, np.uint8).shape,
-    "panic": panic,
+    "claim": lambda path, size: [(None, [np.zeros(size, np.uint8)[:1]])],
 }
 """
 FILE = Path("file.bin")
+LIBRARY = Library("Fragile", "numpy", "recordings", "fragile_tasks", "the file is damaged")
 
 
-@pytest.fixture
-def library(tmp_path, monkeypatch):
+@pytest.fixture(autouse=True)
+def file_and_tasks(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(isolated, "_idle", [])
     FILE.write_bytes(bytes(5))
-    (tmp_path / "tasks.py").write_text(TASKS)
-    return IsolatedLibrary("Fragile", "numpy", "recordings", tmp_path / "tasks.py", "the file is damaged")
+    (tmp_path / "fragile_tasks.py").write_text(TASKS)
 
 
-def test_requests_are_answered_by_one_process_that_is_not_ours(library):
-    assert library.ask(FILE, "size", 2) == 7
-    assert library.ask(FILE, "process") == library.ask(FILE, "process") != os.getpid()
+def process_of():
+    return ask_once(LIBRARY, FILE, "answers", 1).value["process"]
 
 
-def test_a_program_that_ends_leaves_no_process_and_no_pipe_open(library, project_root):
-    script = "from pathlib import Path; from polarnet.recordings.formats.isolated import IsolatedLibrary as Library; "
-    script += "library = Library('Fragile', 'numpy', 'recordings', Path('tasks.py'), ''); "
-    script += "print(library.ask(Path('file.bin'), 'size', 2))"
-    command = [sys.executable, "-X", "dev", "-c", script]
+def test_values_and_arrays_come_from_one_process_that_is_not_ours():
+    first, second = ask(LIBRARY, FILE, "answers", 2)
+    assert first.value == second.value
+    assert first.value["size"] == 5
+    assert [array.tolist() for array in second.arrays] == [[0], [[1, 1]]]
+    assert second.arrays[1].dtype == "int8"
+    assert first.value["process"] == process_of() != os.getpid()
+
+
+def test_two_tasks_at_a_time_do_not_disturb_each_other():
+    one, two = (ask(LIBRARY, FILE, "answers", 3) for _ in range(2))
+    sizes = [len(next(answers).arrays[0]) for answers in (one, two, two, one, one, two)]
+    assert sizes == [0, 0, 1, 1, 2, 2]
+
+
+def test_a_script_without_a_guard_runs_once_and_leaves_no_process_and_no_pipe_open(project_root):
+    Path("script.py").write_text(
+        "from pathlib import Path\n"
+        "from polarnet.recordings.formats.isolated import Library, ask_once\n"
+        "library = Library('Fragile', 'numpy', 'recordings', 'fragile_tasks', '')\n"
+        "print(ask_once(library, Path('file.bin'), 'answers', 1).value['size'])\n"
+    )
     environment = os.environ | {"PYTHONPATH": str(project_root)}
+    command = [sys.executable, "-X", "dev", "script.py"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    assert (done.stdout, done.stderr) == ("7\n", "")
+    assert (done.stdout, done.stderr) == ("5\n", "")
 
 
-def test_a_crash_ends_in_a_reason_and_the_next_request_in_a_new_process(library):
-    before = library.ask(FILE, "process")
+def test_a_crash_ends_in_a_reason_and_the_next_task_in_a_new_process():
+    before = process_of()
     with pytest.raises(RecordingError, match=r"file\.bin: Fragile cannot read it: the library crashed"):
-        library.ask(FILE, "crash")
-    assert library.ask(FILE, "process") != before
+        ask_once(LIBRARY, FILE, "crash")
+    assert process_of() != before
 
 
-def test_a_file_that_sends_the_library_round_in_circles_is_given_up(library, monkeypatch):
+def test_a_file_that_sends_the_library_round_in_circles_is_given_up(monkeypatch):
+    process_of()  # the start of a process takes longer
     monkeypatch.setattr(isolated, "PATIENCE_S", 0.2)
     with pytest.raises(RecordingError, match=r"file\.bin: .* took over 0\.2 s"):
-        library.ask(FILE, "circle")
+        ask_once(LIBRARY, FILE, "circle")
 
 
-@pytest.mark.parametrize(
-    ("task", "arguments", "message"),
-    [("panic", (), "Panic: out of bounds; the file is damaged"), ("claim", (2**44,), "MemoryError")],
-)
-def test_what_the_library_raises_is_the_reason(library, task, arguments, message):
-    with pytest.raises(RecordingError, match=rf"file\.bin: Fragile cannot read it: .*{message}"):
-        library.ask(FILE, task, *arguments)
+def test_what_the_library_raises_is_the_reason_and_the_process_stays():
+    before = process_of()
+    with pytest.raises(RecordingError, match=r"file\.bin: Fragile cannot read it: Panic: out of bounds; the file is"):
+        list(ask(LIBRARY, FILE, "panic"))
+    assert process_of() == before
 
 
 def test_a_library_that_is_not_there_is_asked_for():
-    library = IsolatedLibrary("None", "no_such_package", "recordings", FILE, "")
     with pytest.raises(RuntimeError, match=r"file\.bin: .* no_such_package: run pip install -e '\.\[recordings\]'"):
-        library.ask(FILE, "size")
+        ask_once(LIBRARY._replace(package="no_such_package"), FILE, "answers", 1)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the memory of a process")
-def test_a_claim_beyond_the_limit_of_memory_is_refused(library, monkeypatch):
+def test_a_claim_beyond_the_limit_of_memory_is_refused(monkeypatch):
     monkeypatch.setattr(isolated, "MAX_MIB", 2048)
-    assert library.ask(FILE, "claim", 2**20) == (2**20,)
+    assert ask_once(LIBRARY, FILE, "claim", 2**20).arrays[0].tolist() == [0]
     with pytest.raises(RecordingError, match="MemoryError"):
-        library.ask(FILE, "claim", 2**32)
+        ask_once(LIBRARY, FILE, "claim", 2**32)

@@ -1,0 +1,107 @@
+"""Values that an artefact was made with, compared with those of the run that reads it."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from polarnet.config.origins import ORIGIN, Run, digest
+from polarnet.config.tree import Config, load
+
+
+@pytest.fixture
+def run(project_root: Path, tmp_path: Path):
+    """Builds the run of a script with overrides, on artefacts in a folder of the test's own."""
+
+    def build(script: str, *overrides: str) -> Run:
+        return Run(project_root, config(*overrides), script)
+
+    def config(*overrides: str) -> Config:
+        return load(project_root, [f"paths.data={tmp_path / 'data'}", *overrides])
+
+    return build
+
+
+def make(run: Run) -> None:
+    """Stand-in for the stages of a run: the folders of their outputs, with origins."""
+    for stage in run.stages:
+        for out in stage.outs:
+            run.config.place(out).mkdir(parents=True, exist_ok=True)
+    run.check_inputs()
+    run.write_origins()
+
+
+def make_all(run, *scripts: str) -> None:
+    for script in scripts:
+        make(run(script))
+
+
+SIMULATION = ("ingest", "synthesize", "emulate", "weights")
+
+
+def test_equal_values_are_accepted_and_a_changed_one_names_key_both_values_and_the_command(run, tmp_path):
+    make_all(run, *SIMULATION)
+    run("train").check_inputs()
+    run("train", "loss.mse=3.0", "train.epochs=4").check_inputs()  # its own values
+    with pytest.raises(ValueError) as refusal:
+        run("train", "emulate.contrast_threshold_on=0.4").check_inputs()
+    text = str(refusal.value)
+    assert text.startswith(f"emulate.contrast_threshold_on: {tmp_path / 'data' / 'events.zarr'} was made with 0.2")
+    assert "this run has 0.4" in text
+    assert "`dvc repro emulate`" in text
+    assert "`python -m stages.emulate emulate.contrast_threshold_on=0.4`" in text
+
+
+@pytest.mark.parametrize(
+    ("override", "key"),
+    [
+        ("emulate.model=v2e", "emulate.model"),
+        ("polarizers.extinction_ratio=[5,5,5,5]", "polarizers.extinction_ratio"),
+        ("emulate.randomise={cutoff_hz:[30,300]}", "emulate.randomise"),
+        ("ingest.dead_leaves=3", "ingest.dead_leaves"),  # two stages before
+        ("seed=2", "seed"),
+        ("synthesize.duration_s=2.0", "synthesize.duration_s"),
+    ],
+)
+def test_no_value_of_the_simulation_is_ignored_by_a_training(run, override, key):
+    make_all(run, *SIMULATION)
+    with pytest.raises(ValueError, match=f"^{key}: "):
+        run("train", override).check_inputs()
+
+
+def test_a_row_refuses_a_network_that_was_trained_with_other_values(run):
+    make_all(run, *SIMULATION, "train")
+    run("row", "row=ours", "methods.ours.binning=2").check_inputs()
+    run("row", "row=cf", "loss.mse=3.0").check_inputs()  # does not read the network
+    with pytest.raises(ValueError, match=r"^loss.mse: .*ours was made with 10.0, this run has 3.0; .*dvc repro train"):
+        run("row", "row=ours", "loss.mse=3.0").check_inputs()
+
+
+def test_files_of_a_user_have_no_origin_and_are_accepted(run, tmp_path):
+    make_all(run, *SIMULATION)
+    run("row", "row=e2v", f"rows.e2v.needs={tmp_path / 'mine.pth'}").check_inputs()
+
+
+def test_an_artefact_is_stale_if_it_is_missing_or_of_other_values(run):
+    emulate = run("emulate").pipeline["emulate"]
+    assert run("emulate").is_stale(emulate)
+    make_all(run, *SIMULATION)
+    assert not run("train", "loss.mse=2.0").is_stale(emulate)
+    assert run("train", "emulate.cutoff_hz=30.0").is_stale(emulate)
+
+
+def test_the_origin_of_an_artefact_holds_its_own_values_and_those_of_its_inputs(run, tmp_path):
+    make_all(run, *SIMULATION)
+    origin = json.loads((tmp_path / "data" / "events.zarr" / ORIGIN).read_text())
+    assert {"ingest", "synthesize", "emulate", "polarizers", "readout", "seed"} <= set(origin)
+    assert not {"loss", "train", "runtime", "paths"} & set(origin)
+
+
+def test_a_digest_changes_with_a_header_a_name_and_a_size(tmp_path):
+    (tmp_path / "a").write_text("1")
+    first = digest([tmp_path])
+    assert first == digest([tmp_path])
+    (tmp_path / "a").write_text("2")
+    second = digest([tmp_path])
+    (tmp_path / "b").touch()
+    assert len({first, second, digest([tmp_path])}) == 3
