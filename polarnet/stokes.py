@@ -7,11 +7,11 @@ including NaN.
 
 import math
 import re
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from polarnet.runtime.arrays import Array, as_tensor, check_floating, check_same_shape, check_shape
@@ -58,33 +58,33 @@ def stokes_from_polarization(
     return torch.stack([s0, polarized * torch.cos(2 * aolp), polarized * torch.sin(2 * aolp)], dim=-3)
 
 
-Plane = TypeVar("Plane", Tensor, np.ndarray)
+Values = float | Float64[np.ndarray, "..."]
 
 
-def analyzer(angle: float, extinction_ratio: float = math.inf, transmission: float = 1.0) -> tuple[float, float, float]:
-    """First row of the Mueller matrix of a linear polarizer, without circular polarization: weights of S0, S1 and S2.
+def analyzer(
+    angle: Values, extinction_ratio: Values = math.inf, transmission: Values = 1.0
+) -> Float64[np.ndarray, "3 ..."]:
+    """Weights of S0, S1 and S2 behind linear polarizers, whose weighted sum is the intensity (paper Eq. 4).
 
-    The intensity behind the polarizer is the weighted sum. `angle` of the transmission axis in radians;
-    `transmission` for light polarized along the axis, and `extinction_ratio` times less across it (infinite: ideal).
+    This is the first row of a polarizer's Mueller matrix, without circular polarization. `angle` of the transmission
+    axis in radians; `transmission` for light polarized along the axis, and `extinction_ratio` times less across it
+    (infinite: ideal). Numbers, or arrays that broadcast.
     """
-    along, across = transmission, transmission / extinction_ratio
+    along, twice = np.asarray(transmission, np.float64), np.multiply(2.0, angle)
+    across = along / extinction_ratio
     polarized = (along - across) / 2
-    return (along + across) / 2, polarized * math.cos(2 * angle), polarized * math.sin(2 * angle)
-
-
-def behind_polarizer(s0: Plane, s1: Plane, s2: Plane, angle: float) -> Plane:
-    """Intensity behind an ideal linear polarizer at `angle` radians (paper Eq. 4, written in Stokes parameters).
-
-    S0 (1 - DoLP) / 2 + S0 DoLP cos^2(angle - AoLP) = (S0 + S1 cos(2 angle) + S2 sin(2 angle)) / 2.
-    """
-    a, b, c = analyzer(angle)
-    return a * s0 + b * s1 + c * s2
+    weights = (along + across) / 2, polarized * np.cos(twice), polarized * np.sin(twice)
+    return np.stack(np.broadcast_arrays(*weights))
 
 
 def intensity_behind_polarizer(stokes: Float[Array, "*b 3 h w"], angle: float) -> Float[Tensor, "*b h w"]:
-    """Intensity behind an ideal linear polarizer at `angle` radians, from Stokes vectors."""
+    """Intensity behind an ideal linear polarizer at `angle` radians, from Stokes vectors.
+
+    S0 (1 - DoLP) / 2 + S0 DoLP cos^2(angle - AoLP) = (S0 + S1 cos(2 angle) + S2 sin(2 angle)) / 2.
+    """
     s0, s1, s2 = _planes("stokes", stokes, "... 3 height width").unbind(-3)
-    return behind_polarizer(s0, s1, s2, angle)
+    a, b, c = analyzer(angle).tolist()
+    return a * s0 + b * s1 + c * s2
 
 
 def intensities_from_stokes(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b 4 h w"]:

@@ -3,16 +3,15 @@
 from pathlib import Path
 
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.simulation.truth import synthesize
+from polarnet.simulation.truth import Synthesis, synthesize
 
 
 @hydra_stage
 def main(config: Config) -> None:
     """Make a scene from every picture and move the sensor over it."""
-    images, scenes, frames = Path(config.paths.images), config.paths.scenes, config.paths.frames
-    mapper, size = config.mapper("synthesize"), config.storage.sequences_per_part
-    layout = config.polarizers.layout
-    count = synthesize(images, scenes, frames, config.synthesize, config.seed, mapper, size, config.variation, layout)
+    size, layout = config.storage.sequences_per_part, config.polarizers.layout
+    synthesis = Synthesis(Path(config.paths.images), config.synthesize, config.seed, size, config.variation, layout)
+    count = synthesize(synthesis, config.paths.scenes, config.paths.frames, config.mapper("synthesize"))
     print(f"{count} sequences")
 
 

@@ -23,14 +23,15 @@ from polarnet.methods.stokes_gain import consistent
 from polarnet.reports.figures import LIGHT, chart_style, show_picture
 from polarnet.reports.maps import dolp_image, intensity_image
 from polarnet.reports.overview import OFF, ON
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig, emulate
-from polarnet.simulation.motion import Pose, Sine, Trajectory, frame_times_us
+from polarnet.simulation.motion import Pose, Sine, Trajectory, frame_times_us, render_poses
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.pixels.light import KNEE, linlog
-from polarnet.simulation.polarizers import PolarizersConfig, analyzer_maps, analyzers
+from polarnet.simulation.polarizers import PolarizersConfig, weights_of
 from polarnet.simulation.presets import MOTIONS, POLARIZERS, SENSORS
 from polarnet.simulation.readout import PERFECT, read_out
-from polarnet.simulation.rendering import render_intensities, split_channels
+from polarnet.simulation.rendering import channel_light
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.stokes import (
     POLARIZER_ANGLES_DEG,
@@ -191,7 +192,7 @@ def polarizers_figure() -> Figure:
         axes = curves.subplots()
         angles = np.radians(np.linspace(-90, 90, 361))
         for (name, polarizers), colour in zip(POLARIZERS.items(), COLOURS, strict=True):
-            weights = analyzers(replace(polarizers, angle_error_deg=[0.0] * 4))[0].astype(np.float64)
+            weights = weights_of(replace(polarizers, angle_error_deg=[0.0] * 4), 1, 1, 0)[0].astype(np.float64)
             through = weights @ np.stack([np.ones_like(angles), np.cos(2 * angles), np.sin(2 * angles)])
             axes.semilogy(np.degrees(angles), through.clip(1e-6), color=colour, linewidth=1.4,
                           label=name.replace("_", " "))  # fmt: skip
@@ -224,8 +225,8 @@ def _draw_mosaic(figure: Any, polarizers: PolarizersConfig) -> None:
 def channels_of(scene: PolarizationScene, polarizers: PolarizersConfig) -> Float64[np.ndarray, "4 h2 w2"]:
     """Light of the four channels, in [0, 1], of a still sensor in the middle of the scene."""
     middle = Pose(*(np.array([value]) for value in ((scene.width - 1) / 2, (scene.height - 1) / 2, 0.0, 1.0)))
-    weights = analyzer_maps(polarizers, *SIZE, key=1)
-    return split_channels(render_intensities(scene, middle, *SIZE, weights), polarizers)[:, 0].astype(np.float64) / 255
+    light = render_poses(scene, middle, *SIZE).transpose(1, 0, 2, 3)
+    return channel_light(light, polarizers, weights_of(polarizers, *SIZE, key=1))[:, 0].astype(np.float64) / 255
 
 
 def true_stokes(scene: PolarizationScene) -> Float64[Tensor, "3 h w"]:
@@ -289,7 +290,7 @@ def _flash() -> Events:
 
 def _swing() -> Events:
     path = Trajectory(300.0, 200.0, (Sine(60.0, 8.0, 0.0),), (Sine(30.0, 5.0, 1.0),), STILL, STILL, 630.0)
-    return emulate_motion(photograph(), path, 1_000_000, 60, 80, SENSORS["default"], key=1)[0]
+    return emulate_motion(Camera(SENSORS["default"], key=1), photograph(), path, 1_000_000, (60, 80))[0]
 
 
 def periodic_scene(columns: int) -> PolarizationScene:
@@ -314,7 +315,7 @@ def events_per_frame(config: EmulatorConfig, speed_px_s: float, duration_s: floa
     path = Trajectory(FLAT_WIDTH / 2 + 1, (FLAT_HEIGHT + 1) / 2, (line,), (STILL,), STILL, STILL, speed_px_s)
     edges_us = frame_times_us(replace(MOTIONS["default"], duration_s=duration_s))
     scene = periodic_scene(int(speed_px_s * duration_s) + FLAT_WIDTH + 8)
-    events = emulate_motion(scene, path, int(edges_us[-1]), FLAT_HEIGHT, FLAT_WIDTH, config, key=1)[0]
+    events = emulate_motion(Camera(config, key=1), scene, path, int(edges_us[-1]), (FLAT_HEIGHT, FLAT_WIDTH))[0]
     return np.diff(np.searchsorted(events.t.numpy(), edges_us))[SETTLING_FRAMES:]
 
 

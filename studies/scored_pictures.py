@@ -14,7 +14,7 @@ from polarnet.pictures.manifest import MANIFEST, ManifestEntry, read_manifest, w
 from polarnet.pictures.polarimetry import read_intensities
 from polarnet.runtime.files import sha256
 from polarnet.simulation.scene import polarization_from_rgb
-from polarnet.simulation.truth import synthesize
+from polarnet.simulation.truth import Synthesis, synthesize
 from polarnet.stokes import dolp, stokes_from_intensities
 from polarnet.storage.scenes import SceneStore
 from studies.study import ROOT, run_stage
@@ -80,10 +80,8 @@ def scenes_of(images: Path, config: Config) -> SceneStore:
     folder = images.with_name(f"{images.name}_{sha256(made_with)[:12]}")
     if not (folder / "frames.zarr").exists():
         folder.mkdir(exist_ok=True)
-        synthesize(
-            images, folder / "scenes.zarr", folder / "frames.zarr", config.synthesize, config.seed,
-            config.mapper("scenes"), size, layout=layout,
-        )  # fmt: skip
+        synthesis = Synthesis(images, config.synthesize, config.seed, size, layout=layout)
+        synthesize(synthesis, folder / "scenes.zarr", folder / "frames.zarr", config.mapper("scenes"))
     return SceneStore.open(folder / "scenes.zarr")
 
 

@@ -28,6 +28,7 @@ from polarnet.events.stream import Events, merge
 from polarnet.recordings.formats.celex5_bin import HEIGHT, WHITE, WIDTH
 from polarnet.runtime.machine import generator_for, seed_for
 from polarnet.runtime.sections import one_of, section
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory, render
 from polarnet.simulation.moving_sensor import emulate_motion
@@ -110,7 +111,8 @@ def write_rig(
     delays_s = generator.uniform(SHORTEST_DELAY_S, config.longest_delay_s, len(captures))
     start_us = {capture: round(delay * 1e6) for capture, delay in zip(captures, delays_s, strict=True)}
 
-    channels = emulate_motion(scene, path, total_us, height, width, emulator, seed_for(seed, name, "emulate"), threads)
+    camera = Camera(emulator, key=seed_for(seed, name, "emulate"))
+    channels = emulate_motion(camera, scene, path, total_us, (height, width), threads)
     hot = _random_pixels(config.hot_pixels, recordings, generator)
     for capture, events in zip(EVENT_CAPTURES, channels, strict=True):
         noisy = merge([events, _hot_events(hot, total_us, height, width, generator)])

@@ -25,6 +25,7 @@ from polarnet.pictures.images import read_rgb
 from polarnet.reports.figures import LIGHT, chart_style, show_picture
 from polarnet.reports.maps import event_image, png
 from polarnet.reports.overview import OFF, ON
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, random_trajectory, sensor_to_scene
 from polarnet.simulation.moving_sensor import emulate_motion
@@ -168,7 +169,7 @@ def window_figure() -> Figure:
         panels = figure.subplots(rows, columns).ravel()
         for axes, (label, changes) in zip(panels, SETTINGS.items(), strict=True):
             config = replace(QUIET, **changes)
-            events = emulate_motion(scene, trajectory, WINDOW_US[1], 100, 150, config, key=1)[0]
+            events = emulate_motion(Camera(config, key=1), scene, trajectory, WINDOW_US[1], (100, 150))[0]
             window = slice_time(events, *WINDOW_US)
             show_picture(axes, event_image(_counts(window), 3.0), LIGHT)
             axes.set_title(label, loc="left", fontsize=9)

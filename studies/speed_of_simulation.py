@@ -29,6 +29,7 @@ from skimage import data
 from polarnet.events.stream import Events
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.runtime.machine import tune
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.motion import HARMONICS, Sine, Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.presets import SENSORS
@@ -70,7 +71,7 @@ def measure_one(model: str, threads: int) -> dict[str, Any]:
     config, seconds = replace(DEFAULT, model=model), []
     for _ in range(REPEATS + 1):  # the first compiles
         start = time.perf_counter()
-        events = emulate_motion(scene, path, DURATION_US, HEIGHT, WIDTH, config, 1, threads)
+        events = emulate_motion(Camera(config, key=1), scene, path, DURATION_US, (HEIGHT, WIDTH), threads)
         seconds.append(time.perf_counter() - start)
     peak_mib = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
     return {"seconds": seconds[1:], "events": sum(map(len, events)), "peak_mib": peak_mib}
@@ -100,7 +101,7 @@ def timing_errors_ms() -> dict[str, float]:
 
     def events_of(model: str, rate_hz: float) -> list[Events]:
         config = replace(NOISELESS, model=model, render_rate_hz=rate_hz)
-        return list(emulate_motion(scene, path, DURATION_US, HEIGHT, WIDTH, config, 1))
+        return list(emulate_motion(Camera(config, key=1), scene, path, DURATION_US, (HEIGHT, WIDTH)))
 
     reference = events_of("exact", REFERENCE_HZ)
     return {model: round(timing_error_ms(events_of(model, TIMED_HZ), reference), 3) for model in TIMED_MODELS}

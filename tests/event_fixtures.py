@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from polarnet.events.stream import Events
+from polarnet.simulation.pixels.columns import Columns
 
 MakeEvents = Callable[..., Events]
 
@@ -44,3 +45,8 @@ def make_events() -> MakeEvents:
 @pytest.fixture(scope="session")
 def make_random_events() -> MakeEvents:
     return random_events
+
+
+def arrays_of(events: Events) -> Columns:
+    """The columns of events as numpy arrays."""
+    return Columns(*(getattr(events, name).numpy() for name in "txyp"))

@@ -9,7 +9,7 @@ from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.ranges import NAMES
 
 NOT_COMPARED = ("synthesize.sequences_per_picture",)
-MODEL_ALONE = {"esim_log_eps": ("esim", "esim_gpu"), "voltmeter_camera": ("dvs_voltmeter",)}
+MODEL_ALONE = {"esim_log_eps": ("esim",), "voltmeter_camera": ("dvs_voltmeter",)}
 """Parameters that exist only in the pixel models listed."""
 SPEEDS = ("synthesize.speed_min_px_s", "synthesize.speed_max_px_s")
 

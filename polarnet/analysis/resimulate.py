@@ -9,7 +9,7 @@ from torch import Tensor
 
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import Events
-from polarnet.runtime.machine import generator_for, seed_for
+from polarnet.runtime.machine import generator_for
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
@@ -55,11 +55,8 @@ def resimulated(
     t_us = torch.tensor(frame_times_us(motion))
     drawn = [camera.drawn(seed, sequence) for camera in cameras]
     distinct = [camera for i, camera in enumerate(drawn) if camera not in drawn[:i]]
-    size, key = (scenes.sensor_height, scenes.sensor_width), seed_for(seed, sequence, "emulate")
-    channels = [
-        emulate_motion(scene, trajectory, int(t_us[-1]), *size, one.sensor, key, threads, one.polarizers, one.readout)
-        for one in distinct
-    ]
+    size = scenes.sensor_height, scenes.sensor_width
+    channels = [emulate_motion(one, scene, trajectory, int(t_us[-1]), size, threads) for one in distinct]
     events = [channels[distinct.index(camera)][channel] for channel, camera in enumerate(drawn)]
     return _test_sequence(scenes, record, scene, trajectory, events, t_us)
 

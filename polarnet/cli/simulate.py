@@ -190,7 +190,7 @@ def _run(
     """Simulate into `folder` and return the facts to print."""
     from polarnet import __version__
     from polarnet.cli.simulated_files import write_simulation
-    from polarnet.clips.video import drawn_camera, moving_pieces, video_pieces
+    from polarnet.clips.video import moving_pieces, video_pieces
     from polarnet.runtime.machine import threads_of
     from polarnet.simulation.motion import frame_times_us
     from polarnet.stokes import POLARIZER_ANGLES_DEG
@@ -204,17 +204,17 @@ def _run(
         scene = _scene(config, clip, saturation)
         pieces = moving_pieces(scene, config.synthesize, config.camera, config.seed, threads)
         attributes["synthesize"] = vars(config.synthesize)
-        drawn, total = drawn_camera(config.camera, config.seed, "picture"), len(frame_times_us(config.synthesize))
+        drawn, total = config.camera.drawn(config.seed, "picture"), len(frame_times_us(config.synthesize))
     else:
         frames = timed_frames(clip, times, saturation)
         pieces = video_pieces(frames, config.camera, config.seed, upsample, threads)
-        drawn, total = drawn_camera(config.camera, config.seed, "video"), clip.count
+        drawn, total = config.camera.drawn(config.seed, "video"), clip.count
     written = write_simulation(pieces, drawn, clip.name, folder, outputs, attributes, total)
     counts = zip(POLARIZER_ANGLES_DEG, written.events, strict=True)
     seconds, events = written.duration_us * 1e-6, sum(written.events)
     facts = {
         "input": f"{clip.name}: {clip.words}, {'under a moving sensor' if times is None else 'seen pixel by pixel'}",
-        "channels": f"4 of {written.height} x {written.width} px, {drawn.camera.polarizers.layout}",
+        "channels": f"4 of {written.height} x {written.width} px, {drawn.polarizers.layout}",
         "duration": f"{seconds:.3f} s, {written.frames:,} true frames",
         "events": f"{events:,} ({events / seconds:,.0f}/s): "
         + ", ".join(f"{count:,} at {angle}" for angle, count in counts)

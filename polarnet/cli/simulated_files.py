@@ -12,11 +12,12 @@ from torch import Tensor
 
 from polarnet import stokes
 from polarnet.cli.spool import EventSpool
-from polarnet.clips.video import Drawn, Piece
+from polarnet.clips.video import Piece
 from polarnet.events.mosaic import join_mosaic
 from polarnet.events.stream import Events
 from polarnet.reports.maps import encode_png
 from polarnet.reports.preview import write_true_video
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.moving_sensor import leave_sensors
 from polarnet.storage.events import MAX_DURATION_US, EventStore
 from polarnet.storage.exchange import FORMS
@@ -67,7 +68,7 @@ class Written(NamedTuple):
 
 def write_simulation(
     pieces: Iterable[Piece],
-    drawn: Drawn,
+    camera: Camera,
     name: str,
     folder: Path,
     outputs: Outputs,
@@ -99,10 +100,9 @@ def write_simulation(
         truth.flush()
         if duration_us == 0:
             raise ValueError("expected at least two frames, got one: nothing changes, so no pixel fires")
-        camera = drawn.camera
-        channels = leave_sensors(spool.channels(), camera.polarizers, camera.readout, drawn.key, duration_us)
+        channels = leave_sensors(spool.channels(), camera, duration_us)
         run_s = time.perf_counter() - started
-        files = _write_events(folder, name, channels, drawn, duration_us, outputs, attributes)
+        files = _write_events(folder, name, channels, camera, duration_us, outputs, attributes)
         if outputs.video_rate_hz is not None:
             files += _write_preview(folder, channels, outputs.video_rate_hz, outputs.gamma)
         size, counts = (channels[0].height, channels[0].width), tuple(map(len, channels))
@@ -123,13 +123,13 @@ def _write_events(
     folder: Path,
     name: str,
     channels: Sequence[Events],
-    drawn: Drawn,
+    camera: Camera,
     duration_us: int,
     outputs: Outputs,
     attributes: dict[str, Any],
 ) -> list[str]:
     """Files of the events: one for each sensor of the camera in formats of cameras, and all channels in the store."""
-    polarizers = drawn.camera.polarizers
+    polarizers = camera.polarizers
     others = [form for form in FORMS if form in outputs.formats]
     files = []
     with ProgressBar(total=len(outputs.formats), desc="write", unit="format") as bar:

@@ -11,17 +11,15 @@ from torch import Tensor
 
 from polarnet.events.stream import Events, concatenate
 from polarnet.runtime.arrays import Array
-from polarnet.runtime.machine import generator_for, one_thread, seed_for
+from polarnet.runtime.machine import generator_for, one_thread
 from polarnet.simulation.camera import Camera
-from polarnet.simulation.emulator import MODELS, EmulatorConfig, SensorState, emulate_lights, events_of
+from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate_frames
 from polarnet.simulation.motion import SynthesizeConfig, frame_times_us, random_trajectory, render
-from polarnet.simulation.moving_sensor import emulate_motion_steps, emulation_times_us, leave_sensors
-from polarnet.simulation.pixels.light import light_of_frames
-from polarnet.simulation.polarizers import channel_size, grid
-from polarnet.simulation.rendering import behind_polarizers, split_channels, weights_of
+from polarnet.simulation.moving_sensor import channels_of, emulate_motion_steps, leave_sensors
+from polarnet.simulation.polarizers import grid, weights_of
+from polarnet.simulation.rendering import channel_light, render_times_us
 from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb
 from polarnet.simulation.upsampling import StokesFrame, upsampled
-from polarnet.stokes import NUM_CHANNELS
 
 MOTION_STEPS = 64  # rendered frames in a piece of a moving sensor's simulation
 PIECE_PIXELS = 2**20  # pixels of all frames in a piece of a video; light and Stokes parameters take 28 bytes each
@@ -31,46 +29,26 @@ MAX_PIECE_FRAMES = 64
 class Piece(NamedTuple):
     """A stretch of a simulation: events of the four channels before their readout, and the true frames in it."""
 
-    stop_us: int
-    """Time up to which events are complete."""
+    stop_us: int  # time up to which events are complete
     events: list[Events]
     t_us: Int64[Tensor, " n"]
-    stokes: Float32[Tensor, "n 3 h w"]
-    """True (S0, S1, S2) on the pixels of a channel."""
-
-
-class Drawn(NamedTuple):
-    """Random choices of one simulation: the key of its noise, and its camera."""
-
-    key: int
-    camera: Camera
-
-
-def drawn_camera(camera: Camera, seed: int, name: str) -> Drawn:
-    """The camera with the values that it draws from its ranges, and the key of mismatch and noise."""
-    return Drawn(seed_for(seed, name, "emulate"), camera.drawn(seed, name))
+    stokes: Float32[Tensor, "n 3 h w"]  # true (S0, S1, S2) on the pixels of a channel
 
 
 def moving_pieces(
-    scene: PolarizationScene,
-    motion: SynthesizeConfig,
-    camera: Camera,
-    seed: int,
-    threads: int = 1,
+    scene: PolarizationScene, motion: SynthesizeConfig, camera: Camera, seed: int, threads: int = 1
 ) -> Iterator[Piece]:
     """Simulate a moving sensor in pieces; joined and read out (`leave_sensors`), the events are those of `simulate`."""
     trajectory = random_trajectory(motion, scene.height, scene.width, generator_for(seed, "picture", "motion"))
-    key, camera = drawn_camera(camera, seed, "picture")
+    camera = camera.drawn(seed, "picture")
     size = motion.sensor_height, motion.sensor_width
     pixels = grid(camera.polarizers.layout, *size)
     frames_us = np.array(frame_times_us(motion))
-    times_us = emulation_times_us(trajectory, int(frames_us[-1]), *size, camera.sensor)
+    times_us = render_times_us(trajectory, int(frames_us[-1]), *size, camera.sensor)
     state: SensorState | None = None
     for first in range(0, len(times_us), MOTION_STEPS):
         t_us = times_us[first : first + MOTION_STEPS]
-        events, state = emulate_motion_steps(
-            scene, trajectory, t_us, *size, camera.sensor, key, state, threads, camera.polarizers
-        )
+        events, state = emulate_motion_steps(camera, scene, trajectory, t_us, size, state, threads)
         here = frames_us[(frames_us <= t_us[-1]) & (frames_us > (times_us[first - 1] if first else -1))]
         with one_thread():
             stokes = render(scene, trajectory, here * 1e-6, *pixels)
@@ -78,11 +56,7 @@ def moving_pieces(
 
 
 def video_pieces(
-    frames: Iterable[StokesFrame],
-    camera: Camera,
-    seed: int,
-    upsample: bool = False,
-    threads: int = 1,
+    frames: Iterable[StokesFrame], camera: Camera, seed: int, upsample: bool = False, threads: int = 1
 ) -> Iterator[Piece]:
     """Simulate, in pieces, a camera at rest, each pixel of which sees one pixel of the frames; these are the truth.
 
@@ -90,54 +64,37 @@ def video_pieces(
     is the mean of each 2x2 cell. With `upsample`, the sensor also sees interpolated frames (`upsampled`).
     ValueError for frames of different sizes and for times that do not increase.
     """
-    key, camera = drawn_camera(camera, seed, "video")
-    source = iter(frames)
+    camera, source = camera.drawn(seed, "video"), iter(frames)
     head = next(source, None)
     if head is None:
         raise ValueError("expected at least one frame, got none")
     height, width = head.stokes.shape[1:]
-    weights = weights_of(camera.polarizers, height, width, key)
-    rows, columns = channel_size(camera.polarizers.layout, height, width)
+    weights = weights_of(camera.polarizers, height, width, camera.key)
+    channels = channels_of(camera, (height, width))
     true: list[StokesFrame] = []
 
     def watched() -> Iterator[StokesFrame]:
+        before_us = -1
         for frame in itertools.chain([head], source):
             if frame.stokes.shape != head.stokes.shape:
                 raise ValueError(f"expected frames of {height}x{width} px, got {tuple(frame.stokes.shape[1:])}")
+            if frame.t_us <= before_us:
+                raise ValueError(f"expected times of frames that increase, got {before_us} and {frame.t_us} us")
+            before_us = frame.t_us
             true.append(frame)
             yield frame
 
     length = max(1, min(MAX_PIECE_FRAMES, PIECE_PIXELS // (height * width)))
-    seen, state = upsampled(watched()) if upsample else watched(), None
+    seen = upsampled(watched()) if upsample else watched()
+    state: SensorState | None = None
     while chunk := list(itertools.islice(seen, length)):
-        t_us = np.array([frame.t_us for frame in chunk], np.float64)
         stokes = torch.stack([frame.stokes for frame in chunk], dim=1).numpy()
-        light = split_channels(behind_polarizers(stokes, weights), camera.polarizers)
-        events, state = _advance(light, t_us, rows, columns, camera.sensor, key, state, threads)
+        light = np.array([frame.t_us for frame in chunk]), channel_light(stokes, camera.polarizers, weights)
+        events, state = emulate_frames(channels, [light], state, threads)
         here = [frame for frame in true if frame.t_us <= chunk[-1].t_us]
-        true = true[len(here) :] if len(here) < len(true) else []
-        yield Piece(chunk[-1].t_us, events, torch.tensor([frame.t_us for frame in here]), _truth(here, rows, columns))
-
-
-def _advance(
-    light: Float32[np.ndarray, "4 n h w"],
-    t_us: np.ndarray,
-    rows: int,
-    columns: int,
-    sensor: EmulatorConfig,
-    key: int,
-    state: SensorState | None,
-    threads: int,
-) -> tuple[list[Events], SensorState]:
-    before = t_us if state is None else np.concatenate([[state.t_us], t_us])
-    if (np.diff(before) <= 0).any():
-        raise ValueError(f"expected times of frames that increase, got {before[:5].tolist()}... us")
-    if MODELS[sensor.model].EIGHT_BIT_VIDEO:
-        light = (light + np.float32(0.5)).astype(np.uint8)
-    lights = [light_of_frames(np.ascontiguousarray(channel)) for channel in light]
-    numbers = tuple(range(NUM_CHANNELS))
-    channels, state = emulate_lights(lights, t_us, rows, columns, sensor, key, state, numbers, threads)
-    return [events_of(channel, rows, columns) for channel in channels], state
+        true = true[len(here) :]
+        t_us = torch.tensor([frame.t_us for frame in here])
+        yield Piece(chunk[-1].t_us, events, t_us, _truth(here, channels.height, channels.width))
 
 
 def _truth(frames: Sequence[StokesFrame], rows: int, columns: int) -> Float32[Tensor, "n 3 h w"]:
@@ -174,9 +131,8 @@ def simulate_video(
     if len(t_us) == 0 or t_us[0] != 0:
         raise ValueError(f"t_us: expected one time a frame, starting at 0, got {list(t_us[:5])}")
     pieces = list(video_pieces(stokes_frames(frames, t_us), camera, seed, upsample, threads))
-    key, camera = drawn_camera(camera, seed, "video")
     channels = [concatenate(channel) for channel in zip(*(piece.events for piece in pieces), strict=True)]
-    return leave_sensors(channels, camera.polarizers, camera.readout, key, int(t_us[-1]))
+    return leave_sensors(channels, camera.drawn(seed, "video"), int(t_us[-1]))
 
 
 def stokes_frames(

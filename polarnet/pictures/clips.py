@@ -11,9 +11,19 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, Shaped
 
-from polarnet.pictures.images import UnreadablePicture, fit, picture_extensions, read_channels, read_picture, srgb_of
+from polarnet.pictures.images import (
+    UnreadablePicture,
+    code_fractions,
+    extension,
+    fit,
+    picture_extensions,
+    read_channels,
+    read_picture,
+    srgb_of,
+)
 from polarnet.pictures.polarimetry import (
     ANGLE_SUFFIX,
+    MIN_MOSAIC_SIDE,
     group_by_measurement,
     levels_at_angles,
     read_levels,
@@ -27,7 +37,6 @@ VIDEOS = frozenset(["mp4", "m4v", "mov", "avi", "mkv", "webm", "mpg", "mpeg", "w
 TIMES_FILE = "timestamps.txt"
 TIME_UNITS = {"us": 1.0, "ms": 1e3, "s": 1e6}
 GREEN = 1  # polarization differs between colours, and this channel has the least noise
-MIN_MOSAIC_SIDE = 6  # pixels; demosaicking leaves out the cells on the rim
 
 Size = tuple[int, int]
 Levels = Shaped[np.ndarray, "channels h w"]
@@ -38,24 +47,20 @@ class ClipFrame(NamedTuple):
 
     pixels: Float32[np.ndarray, "h w channels"]
     """RGB code values in [0, 1], or linear intensities at 0, 45, 90 and 135 degrees with I0 + I90 in [0, 1]."""
-    t_us: float | None
-    """Time that the video states."""
-    saturated: float
-    """Share of pixels with a saturated angle; 0 for RGB."""
+    t_us: float | None  # time that the video states
+    saturated: float  # share of pixels with a saturated angle; 0 for RGB
 
 
 @dataclass(frozen=True)
 class ClipOptions:
     """How to read a clip."""
 
-    mosaic: Mosaic | None = None
-    """Angles over 2x2 pixels if the frames are raw mosaics."""
+    mosaic: Mosaic | None = None  # angles over 2x2 pixels if the frames are raw mosaics
     angles: Sequence[int] | None = None
     """Angles of four videos, in their order; None: from their names, NAME_0, NAME_45, ..."""
     white: float | None = None
     """Level at which the values of a polarization camera saturate; None: from the first frame."""
-    grey: bool = False
-    """Take colour frames as grey, without polarization."""
+    grey: bool = False  # take colour frames as grey, without polarization
     size: Size | None = None
     """Height and width to scale to, after a centred cut to this aspect ratio; None: as they are."""
 
@@ -65,14 +70,10 @@ class Clip:
     """Frames in the order of time. `frames` starts from the first frame at each call."""
 
     name: str
-    words: str
-    """Kind of the frames, for messages."""
-    measured: bool
-    """Whether the channels of a frame are four polarizers, not RGB."""
-    count: int | None
-    """Number of frames; None: not known before the end."""
-    still: bool
-    """Whether the clip is a single picture or measurement; False for a video of one frame."""
+    words: str  # kind of the frames, for messages
+    measured: bool  # whether the channels of a frame are four polarizers, not RGB
+    count: int | None  # number of frames; None: not known before the end
+    still: bool  # whether the clip is a single picture or measurement; False for a video of one frame
     frames: Callable[[], Iterator[ClipFrame]]
 
 
@@ -88,7 +89,7 @@ def open_clip(paths: Sequence[Path], options: ClipOptions) -> Clip:
     if missing:
         raise FileNotFoundError(f"{', '.join(missing)}: there is no such file or folder")
     name = paths[0].stem if paths[0].is_file() else paths[0].resolve().name
-    if len(paths) == 4 and all(_extension(path) not in VIDEOS for path in paths):
+    if len(paths) == 4 and all(extension(path) not in VIDEOS for path in paths):
         return _open_files([tuple(paths)], ANGLE_SUFFIX.sub(r"\g<name>", name), options)
     if len(paths) == 4:
         videos = _videos_by_angle(paths, options.angles)
@@ -98,12 +99,10 @@ def open_clip(paths: Sequence[Path], options: ClipOptions) -> Clip:
     (path,) = paths
     if path.is_dir():
         return _open_folder(path, name, options)
-    if _extension(path) in VIDEOS:
+    if extension(path) in VIDEOS:
         if options.mosaic is not None:
-            return _measured(name, "raw mosaics", _from_videos([path], mosaic=True), options)
-        return _coloured(
-            name, "grey video" if options.grey else "RGB video", _from_videos([path], colour=True), options
-        )
+            return _measured(name, "raw mosaics", _from_videos([path]), options)
+        return _coloured(name, "video", _from_videos([path], colour=True), options)
     return _open_files([(path,)], name, options)
 
 
@@ -120,10 +119,10 @@ class _Files:
 def _open_folder(folder: Path, name: str, options: ClipOptions) -> Clip:
     kinds = picture_extensions() | {"npz"}
     visible = (path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    files = sorted((path for path in visible if _extension(path) in kinds), key=_in_order)
+    files = sorted((path for path in visible if extension(path) in kinds), key=_in_order)
     if not files:
         raise UnreadablePicture(f"{folder}: expected the pictures of a clip, found none; videos are given as files")
-    measured = all(_extension(file) == "npz" or ANGLE_SUFFIX.fullmatch(file.stem) for file in files)
+    measured = all(extension(file) == "npz" or ANGLE_SUFFIX.fullmatch(file.stem) for file in files)
     if options.mosaic is None and measured:
         return _open_files(group_by_measurement(files), name, options)
     return _open_files([(file,) for file in files], name, options)
@@ -131,48 +130,36 @@ def _open_folder(folder: Path, name: str, options: ClipOptions) -> Clip:
 
 def _open_files(groups: Sequence[tuple[Path, ...]], name: str, options: ClipOptions) -> Clip:
     first = groups[0][0]
-    measured = _extension(first) == "npz" or len(groups[0]) > 1
+    measured = extension(first) == "npz" or len(groups[0]) > 1
     if not measured and options.mosaic is None:
         kind = "photograph" if len(groups) == 1 else "frames"
-        return _coloured(name, f"{'grey' if options.grey else 'RGB'} {kind}", _from_pictures(groups), options)
+        return _coloured(name, kind, _from_files(groups, _rgb), options)
 
+    return _measured(name, "four polarizers" if measured else "raw mosaics", _from_files(groups, read_levels), options)
+
+
+def _from_files(groups: Sequence[tuple[Path, ...]], read: Callable[[tuple[Path, ...]], Levels]) -> _Files:
     def levels() -> Iterator[tuple[str, Levels, float | None]]:
         for group in groups:
             try:
-                yield group[0].name, read_levels(group), None
+                yield group[0].name, read(group), None
             except UnreadablePicture as error:
                 raise UnreadablePicture(f"{group[0].name}: {error}") from error
-
-    files = _Files(len(groups), len(groups) == 1, levels)
-    return _measured(name, "four polarizers" if measured else "raw mosaics", files, options)
-
-
-def _from_pictures(groups: Sequence[tuple[Path, ...]]) -> _Files:
-    def levels() -> Iterator[tuple[str, Levels, float | None]]:
-        for (path,) in groups:
-            try:
-                yield path.name, _rgb(path), None
-            except UnreadablePicture as error:
-                raise UnreadablePicture(f"{path.name}: {error}") from error
 
     return _Files(len(groups), len(groups) == 1, levels)
 
 
-def _rgb(path: Path) -> Float32[np.ndarray, "3 h w"]:
+def _rgb(paths: tuple[Path, ...]) -> Float32[np.ndarray, "3 h w"]:
     """sRGB code values; a picture with one channel is grey."""
+    (path,) = paths
     channels = read_channels(path)
     if channels.shape[2] == 1:
-        return np.repeat(_unit(channels).transpose(2, 0, 1), 3, axis=0)
+        return np.repeat(code_fractions(channels).transpose(2, 0, 1), 3, axis=0)
     picture = read_picture(path)
-    return srgb_of(_unit(picture.pixels), picture).transpose(2, 0, 1)
+    return srgb_of(code_fractions(picture.pixels), picture).transpose(2, 0, 1)
 
 
-def _unit(pixels: Shaped[np.ndarray, "h w c"]) -> Float32[np.ndarray, "h w c"]:
-    white = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1
-    return pixels.astype(np.float32) / np.float32(white)
-
-
-def _from_videos(paths: Sequence[Path], *, colour: bool = False, mosaic: bool = False) -> _Files:
+def _from_videos(paths: Sequence[Path], colour: bool = False) -> _Files:
     """Frames of one video, or of four that advance together: RGB in [0, 1] if `colour`, else green 8-bit levels."""
     captures = [_capture(path) for path in paths]
     stated = [max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT))) for capture in captures]
@@ -243,7 +230,7 @@ def _videos_by_angle(paths: Sequence[Path], angles: Sequence[int] | None) -> lis
     return [path for _, path in sorted(zip(angles, paths, strict=True))]
 
 
-def _coloured(name: str, words: str, files: _Files, options: ClipOptions) -> Clip:
+def _coloured(name: str, kind: str, files: _Files, options: ClipOptions) -> Clip:
     def frames() -> Iterator[ClipFrame]:
         for rgb, t_us in _of_one_size(files):
             pixels = np.ascontiguousarray(rgb.transpose(1, 2, 0))
@@ -251,7 +238,7 @@ def _coloured(name: str, words: str, files: _Files, options: ClipOptions) -> Cli
                 pixels = np.repeat(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=-1)
             yield ClipFrame(_scaled(pixels, options.size), t_us, 0.0)
 
-    return Clip(name, words, False, files.count, files.still, frames)
+    return Clip(name, f"{'grey' if options.grey else 'RGB'} {kind}", False, files.count, files.still, frames)
 
 
 def _measured(name: str, words: str, files: _Files, options: ClipOptions) -> Clip:
@@ -301,10 +288,6 @@ def _scaled(pixels: Float32[np.ndarray, "h w c"], size: Size | None) -> Float32[
             f"--size: expected at most the frames' {pixels.shape[0]} {pixels.shape[1]}, got {size[0]} {size[1]}"
         )
     return fit(pixels, *size, max_upscale=1.0)
-
-
-def _extension(path: Path) -> str:
-    return path.suffix.lower().lstrip(".")
 
 
 def _in_order(path: Path) -> list[tuple[int, str]]:

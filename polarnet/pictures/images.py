@@ -1,5 +1,6 @@
 """RGB pictures from any file that OpenImageIO reads: upright, without alpha, in sRGB, cut and scaled to one size."""
 
+import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,43 +11,25 @@ import cv2
 import numpy as np
 import OpenImageIO as oiio
 import torch
-from jaxtyping import Float, Float32, Shaped
+from jaxtyping import Float, Float32, Shaped, UInt8
+from PIL import Image, ImageCms
 from torch import Tensor
 
-from polarnet.pictures.icc import srgb_from_profile
 from polarnet.runtime.files import sha256
 
 MAX_PIXELS = 2**28  # limit for one picture, which takes 3 GiB as float32 RGB
 SRGB = "srgb_rec709_scene"  # OpenImageIO's name
 TAKEN_AS_SRGB = {"", SRGB, "g22_rec709_scene"}  # a PNG that says gamma 1/2.2 is how older programs wrote sRGB
 LINEAR_FORMATS = {"openexr", "hdr"}  # hold linear light unless they say otherwise
-CAMERA_RAW = frozenset(
-    [
-        "dng",
-        "nef",
-        "nrw",
-        "cr2",
-        "cr3",
-        "crw",
-        "arw",
-        "srf",
-        "sr2",
-        "raf",
-        "orf",
-        "rw2",
-        "pef",
-        "srw",
-        "3fr",
-        "iiq",
-        "erf",
-        "mrw",
-        "x3f",
-    ]
-)
+CAMERA_RAW = frozenset([
+    "dng", "nef", "nrw", "cr2", "cr3", "crw", "arw", "srf", "sr2", "raf", "orf", "rw2", "pef", "srw", "3fr", "iiq",
+    "erf", "mrw", "x3f",
+])  # fmt: skip
 NOT_IN_THE_WHEEL = frozenset(["heic", "heif", "avif"])
-NO_PICTURES = frozenset(
-    ["null", "nul", "term", "zfile", "z", "env", "sm", "tx", "vsm", "int", "inta"]
-)  # extensions OpenImageIO lists as well
+NO_PICTURES = frozenset(["null", "nul", "term", "zfile", "z", "env", "sm", "tx", "vsm", "int", "inta"])
+"""Extensions that OpenImageIO lists as well."""
+LEVELS = np.linspace(0, 255, 18).astype(np.uint8)
+SRGB_LATTICE = np.stack(np.meshgrid(LEVELS, LEVELS, LEVELS), axis=-1).reshape(18, -1, 3)
 
 
 class UnreadablePicture(ValueError):
@@ -76,10 +59,15 @@ class Picture:
         return sha256(f"{pixels.dtype}{pixels.shape}".encode(), pixels.data)
 
 
+def extension(path: Path) -> str:
+    """Lower-case extension of a file, without the dot."""
+    return path.suffix.lower().lstrip(".")
+
+
 def picture_extensions() -> frozenset[str]:
     """Lower-case extensions, without the dot, of picture files, including formats that cannot be read here."""
     formats = oiio.get_string_attribute("extension_list").split(";")
-    known = {extension for entry in formats for extension in entry.partition(":")[2].split(",")}
+    known = {name for entry in formats for name in entry.partition(":")[2].split(",")}
     return frozenset(known - NO_PICTURES) | CAMERA_RAW | NOT_IN_THE_WHEEL
 
 
@@ -124,20 +112,45 @@ def upright(pixels: Shaped[np.ndarray, "h w c"], orientation: int) -> Shaped[np.
 def srgb_of(pixels: Float32[np.ndarray, "h w 3"], picture: Picture) -> Float32[np.ndarray, "h w 3"]:
     """Pixels in the colours of `picture` as sRGB code values in [0, 1], out of range clipped.
 
-    The embedded profile decides; without one, the encoding that the file names (linear light, a gamma, Display P3).
-    Pixels with neither are sRGB already. UnreadablePicture if the profile or encoding cannot be used.
+    The embedded profile decides, in 8 bits; without one, the encoding that the file names (linear light, a gamma,
+    Display P3). Pixels with neither are sRGB already. UnreadablePicture if the profile or encoding cannot be used.
     """
+    pixels = np.clip(pixels, 0, 1)
     if picture.profile is not None:
-        try:
-            return srgb_from_profile(np.clip(pixels, 0, 1), picture.profile)
-        except ValueError as error:
-            raise UnreadablePicture(str(error)) from error
+        return _from_profile(pixels, picture.profile)
     if picture.colour_space in TAKEN_AS_SRGB:
-        return np.clip(pixels, 0, 1)
+        return pixels
     converted = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(pixels), picture.colour_space, SRGB)
     if converted.has_error:
         raise UnreadablePicture(f"encoding {picture.colour_space}: {converted.geterror().strip()}")
     return np.clip(np.asarray(converted.get_pixels("float")), 0, 1)
+
+
+def _from_profile(rgb: Float32[np.ndarray, "h w 3"], profile: bytes) -> Float32[np.ndarray, "h w 3"]:
+    """Code values of a device with this ICC profile as sRGB, in 8 bits; unchanged if the profile is sRGB's own.
+
+    Eight bits are what Pillow's Little CMS converts. The scenes' polarization is random colour anyway.
+    """
+    try:
+        device = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        transform = ImageCms.buildTransform(device, ImageCms.createProfile("sRGB"), "RGB", "RGB")
+    except (ImageCms.PyCMSError, OSError) as error:
+        raise UnreadablePicture(
+            f"the embedded colour profile cannot be used ({error}); convert the file to sRGB first"
+        ) from error
+
+    def converted(levels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        return np.asarray(ImageCms.applyTransform(Image.fromarray(levels), transform))
+
+    if np.abs(converted(SRGB_LATTICE).astype(int) - SRGB_LATTICE).max() <= 1:  # sRGB, maybe by another name
+        return rgb
+    return converted(np.round(255 * rgb).astype(np.uint8)).astype(np.float32) / 255
+
+
+def code_fractions(pixels: Shaped[np.ndarray, "h w c"]) -> Float32[np.ndarray, "h w c"]:
+    """Code values as fractions of white: integers become [0, 1]."""
+    white = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1
+    return pixels.astype(np.float32) / np.float32(white)
 
 
 def fit(
@@ -159,8 +172,7 @@ def fit(
         )
     top, left = (rows - part_height) // 2, (columns - part_width) // 2
     part = pixels[top : top + part_height, left : left + part_width]
-    white = np.iinfo(part.dtype).max if np.issubdtype(part.dtype, np.integer) else 1
-    values = part.astype(np.float32) / np.float32(white)
+    values = code_fractions(part)
     if (part_height, part_width) == (height, width):
         return values
     method = cv2.INTER_CUBIC if enlargement > 1 else cv2.INTER_AREA
@@ -194,8 +206,10 @@ def read_rgb(path: str | os.PathLike[str]) -> Float[Tensor, "3 h w"]:
 def _read(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
     """Upright pixels of all channels, OpenImageIO's description of them, and the name of the format."""
     _refuse_by_extension(path)
-    if not is_unicode(path):
-        raise UnreadablePicture("cannot be read: the name of the file is not UTF-8; rename it")
+    try:
+        str(path).encode("utf-8")
+    except UnicodeEncodeError:
+        raise UnreadablePicture("cannot be read: the name of the file is not UTF-8; rename it") from None
     as_stored = oiio.ImageSpec()
     as_stored["oiio:UnassociatedAlpha"] = 1  # otherwise the reader multiplies the colours by alpha
     file = oiio.ImageInput.open(str(path), as_stored)
@@ -216,15 +230,6 @@ def _read(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
     return upright(_plain(pixels), spec.get_int_attribute("Orientation", 1)), spec, file.format_name()
 
 
-def is_unicode(path: Path) -> bool:
-    """Whether a path can be written as UTF-8, which a name of arbitrary bytes cannot."""
-    try:
-        str(path).encode("utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
 def _names_profile(png: Path) -> bool:
     """Whether a PNG has a colour profile before its pixels; OpenImageIO ignores a damaged one."""
     with png.open("rb") as file:
@@ -232,11 +237,11 @@ def _names_profile(png: Path) -> bool:
 
 
 def _refuse_by_extension(path: Path) -> None:
-    extension = path.suffix.lower().lstrip(".")
-    if extension in CAMERA_RAW:
+    kind = extension(path)
+    if kind in CAMERA_RAW:
         raise UnreadablePicture("camera raw: only a preview in it can be read; develop it to 16-bit TIFF first")
-    if extension in NOT_IN_THE_WHEEL:
-        raise UnreadablePicture(f"OpenImageIO's wheel has no reader for .{extension}; convert it to PNG or TIFF first")
+    if kind in NOT_IN_THE_WHEEL:
+        raise UnreadablePicture(f"OpenImageIO's wheel has no reader for .{kind}; convert it to PNG or TIFF first")
 
 
 def _rgb_channels(names: Sequence[str], alpha: int) -> list[int]:

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import hashlib
+import itertools
 import logging
 import os
 import re
@@ -10,7 +11,7 @@ import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
@@ -19,6 +20,7 @@ from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import (
     UnreadablePicture,
+    extension,
     fit,
     picture_extensions,
     read_picture,
@@ -136,11 +138,12 @@ def _ingest_builtin(config: IngestConfig, seed: int, folder: Path, mapper: Mappe
 
 def _ingest_folder(config: IngestConfig, folder: Path, mapper: Mapper) -> Manifest:
     """Read all pictures, or with a `limit` that many, in the order of the hashes of their files."""
-    sources, ignored = _find_pictures(Path(config.root), config.source)
+    sources, ignored, dead = _find_pictures(Path(config.root), config.source)
     if config.limit is not None:
         sources.sort(key=lambda source: _edge_hash(source.files))
     convert = functools.partial(_CONVERTERS[config.source], config=config, folder=folder)
     entries: list[ManifestEntry] = []
+    skipped: list[Skipped] = []
     outcomes: list[ManifestEntry | Skipped] = []
     while len(outcomes) < len(sources) and (config.limit is None or len(entries) < config.limit):
         wanted = len(sources) if config.limit is None else config.limit - len(entries)
@@ -148,32 +151,65 @@ def _ingest_folder(config: IngestConfig, folder: Path, mapper: Mapper) -> Manife
         outcomes.extend(mapper(convert, batch))
         entries, skipped = _without_duplicates(outcomes)
     if not entries:
-        _refuse_folder(config, len(sources), ignored, [o for o in outcomes if isinstance(o, Skipped)])
-    manifest = _manifest(_split(config, entries), skipped, folder)
+        raise ValueError(
+            f"ingest.root={config.root}: no picture could be used. Looked, in all subfolders, for files that end in "
+            f"{', '.join(sorted(_extensions(config.source)))}: found {len(sources)} pictures and {ignored} other files."
+            f"{listed([*skipped, *dead])}"
+        )
+    manifest = _manifest(_split(config, entries), [*skipped, *dead], folder)
     return dataclasses.replace(manifest, ignored_files=ignored, unread_files=len(sources) - len(outcomes))
 
 
-def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int]:
-    """Files under `root` with a picture's extension, by path, and the number of other files."""
+def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int, list[Skipped]]:
+    """Files under `root` with a picture's extension, by path, the number of other files, and the dead links."""
     if not root.is_dir():
         raise ValueError(f"ingest.root: expected a folder with pictures, got {root}; see ingest.source")
-    files = sorted(path for path in root.rglob("*") if path.is_file())
-    pictures = [path for path in files if path.suffix.lower().lstrip(".") in _extensions(kind)]
+    paths = files_under(root)
+    files = [path for path in paths if path.is_file()]
+    dead = [
+        Skipped(_relative(path, root), "a dead link: its target does not exist; restore it or remove the link")
+        for path in paths
+        if path.is_symlink() and not path.exists()
+    ]
+    pictures = [path for path in files if extension(path) in _extensions(kind)]
     groups = group_by_measurement(pictures) if kind == "polarization" else [(path,) for path in pictures]
     sources = [
         Source(
             files=group,
             kind=kind,
             stem=group[0].stem if len(group) == 1 else group[0].stem.rpartition("_")[0],
-            origin=", ".join(_printable(path.relative_to(root).as_posix()) for path in group),
+            origin=", ".join(_relative(path, root) for path in group),
         )
         for group in groups
     ]
-    return sources, len(files) - len(pictures)
+    return sources, len(files) - len(pictures), dead
 
 
-def _printable(name: str) -> str:
-    """A file name in which bytes that are not UTF-8 are escaped."""
+def files_under(root: Path) -> list[Path]:
+    """Files and dead links in a folder and all its subfolders, sorted.
+
+    Links to folders are followed once the folders themselves are read; no folder is read twice, so links may form
+    cycles.
+    """
+    files: list[Path] = []
+    read: set[str] = set()
+    folders = [root]
+    while folders:
+        links = []
+        for folder, subfolders, names in itertools.chain.from_iterable(map(os.walk, folders)):
+            if os.path.realpath(folder) in read:
+                subfolders.clear()
+                continue
+            read.add(os.path.realpath(folder))
+            files += [Path(folder, name) for name in names]
+            links += [path for path in (Path(folder, name) for name in subfolders) if path.is_symlink()]
+        folders = sorted(links)
+    return sorted(files)
+
+
+def _relative(path: Path, root: Path) -> str:
+    """Path below `root`, in which bytes that are not UTF-8 are escaped."""
+    name = path.relative_to(root).as_posix()
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
@@ -333,14 +369,6 @@ def _check_not_empty(config: IngestConfig, manifest: Manifest) -> None:
             "ingest.limit=%d: the folder has only %d usable pictures, split into %s; for other numbers change "
             "ingest.val_fraction and ingest.test_fraction", config.limit, len(manifest.pictures), counts,
         )  # fmt: skip
-
-
-def _refuse_folder(config: IngestConfig, found: int, ignored: int, skipped: Sequence[Skipped]) -> NoReturn:
-    raise ValueError(
-        f"ingest.root={config.root}: no picture could be used. Looked, in all subfolders, for files that end in "
-        f"{', '.join(sorted(_extensions(config.source)))}: found {found} pictures and {ignored} other files."
-        f"{listed(skipped)}"
-    )
 
 
 def _slug(stem: str) -> str:

@@ -17,31 +17,23 @@ REASONS_SHOWN = 5
 class ManifestEntry:
     """One picture of data/images."""
 
-    name: str
-    """Name of the source and the first 8 digits of `sha256`; sequence names begin with it."""
-    file: str
-    """Name of the picture's file in the folder of the manifest."""
-    split: str = ""
-    """train, val or test, once it is drawn; every sequence made of this picture belongs to it."""
-    source: str
-    """photograph, dead_leaves, folder or polarization."""
+    name: str  # name of the source and the first 8 digits of `sha256`; sequence names begin with it
+    file: str  # name of the picture's file in the folder of the manifest
+    split: str = ""  # train, val or test, once it is drawn; every sequence made of this picture belongs to it
+    source: str  # photograph, dead_leaves, folder or polarization
     origin: str
     """Where the picture comes from: an address, a file relative to ingest.root, or the seed it was made from."""
     licence: str | None = None
     author: str | None = None
-    sha256: str
-    """Hash of the source's upright pixels, before cropping, scaling and conversion."""
+    sha256: str  # hash of the source's upright pixels, before cropping, scaling and conversion
     bits: int
     height: int
     width: int
     source_height: int
     source_width: int
-    colour_profile: str | None = None
-    """Colour space of the source, if it was converted to sRGB."""
-    residual: float | None = None
-    """Median of |I0 + I90 - I45 - I135| / S0 (measured polarization)."""
-    saturated_fraction: float | None = None
-    """Share of source pixels with a saturated angle (measured polarization)."""
+    colour_profile: str | None = None  # colour space of the source, if it was converted to sRGB
+    residual: float | None = None  # median of |I0 + I90 - I45 - I135| / S0 (measured polarization)
+    saturated_fraction: float | None = None  # share of source pixels with a saturated angle (measured polarization)
     masked_fraction: float | None = None
     """Share of pixels with unknown light (measured polarization); `valid` in the file marks the others."""
 
@@ -50,8 +42,7 @@ class ManifestEntry:
 class Skipped:
     """A file that gave no picture."""
 
-    file: str
-    """Relative to ingest.root."""
+    file: str  # relative to ingest.root
     reason: str
 
 
@@ -61,10 +52,8 @@ class Manifest:
 
     pictures: tuple[ManifestEntry, ...]
     skipped: tuple[Skipped, ...]
-    ignored_files: int
-    """Files without the extension of a picture."""
-    unread_files: int
-    """Pictures beyond ingest.limit."""
+    ignored_files: int  # files without the extension of a picture
+    unread_files: int  # pictures beyond ingest.limit
 
     @property
     def counts(self) -> dict[str, int]:

@@ -23,6 +23,7 @@ ANGLE_SUFFIX = re.compile(r"(?P<name>.+)_0*(?P<angle>0|45|90|135)")
 WHITE_LEVELS = (2**10 - 1, 2**12 - 1, 2**14 - 1, 2**16 - 1)  # possible saturation levels in 16-bit files
 STEPS = 2**16 - 1  # code value of an intensity of 1 in the files written here
 COLOURS = ("RGGB", "BGGR", "GRBG", "GBRG")  # order of the four 2x2 blocks in a colour sensor's 4x4 (Sony IMX250MYR)
+MIN_MOSAIC_SIDE = 6  # pixels; demosaicking leaves out the cells on the rim
 NPZ_KEYS = tuple(f"I{angle}" for angle in POLARIZER_ANGLES_DEG)
 
 
@@ -239,7 +240,7 @@ def _read_raw(path: Path) -> Shaped[np.ndarray, "1 h w"]:
         raise UnreadablePicture(
             f"{pixels.shape[2]} channels: neither a raw mosaic nor one of NAME_0, NAME_45, NAME_90, NAME_135"
         )
-    if min(pixels.shape[:2]) < 6:
+    if min(pixels.shape[:2]) < MIN_MOSAIC_SIDE:
         raise UnreadablePicture(f"too small for a mosaic: {pixels.shape[1]}x{pixels.shape[0]} pixels")
     return pixels[..., 0][None]
 

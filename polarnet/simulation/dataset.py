@@ -7,7 +7,6 @@ from typing import Any
 
 from polarnet import __version__
 from polarnet.events.stream import Events
-from polarnet.runtime.machine import seed_for
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
@@ -57,20 +56,10 @@ def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: in
 
     Its noise, and with `randomise` its camera, depend only on the seed and the sequence's name.
     """
-    camera = camera.drawn(seed, sequence)
-    record = scenes.read(sequence)
-    return emulate_motion(
-        scene_from_polarization(record.s0, record.dolp, record.aolp),
-        Trajectory.from_vector(record.trajectory.numpy()),
-        record.duration_us,
-        scenes.sensor_height,
-        scenes.sensor_width,
-        camera.sensor,
-        seed_for(seed, sequence, "emulate"),
-        threads,
-        camera.polarizers,
-        camera.readout,
-    )
+    record, size = scenes.read(sequence), (scenes.sensor_height, scenes.sensor_width)
+    scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
+    trajectory = Trajectory.from_vector(record.trajectory.numpy())
+    return emulate_motion(camera.drawn(seed, sequence), scene, trajectory, record.duration_us, size, threads)
 
 
 def _emulate_part(part: str, scenes: SceneStore, events: EventStore, camera: Camera, seed: int, threads: int) -> None:

@@ -1,31 +1,43 @@
 """Event-camera emulation: light on the channels of one sensor in, events and the sensor's state out."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64, Shaped
+from jaxtyping import Float32, Float64, Int64, Shaped
 from pydantic import PositiveFloat
 from torch import Tensor
 
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, concatenate
 from polarnet.runtime.arrays import Array, as_tensor, check_range, check_shape
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.compilation import forget_stale_code
-from polarnet.simulation.pixels import esim, esim_gpu, exact, v2e, voltmeter
+from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
 from polarnet.simulation.pixels.columns import Columns, empty_columns, trimmed
 from polarnet.simulation.pixels.defects import DefectsConfig, defects_of, with_defects
 from polarnet.simulation.pixels.esim import EsimConfig
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
-from polarnet.simulation.pixels.steps import Steps
 from polarnet.simulation.pixels.voltmeter import VoltmeterConfig
 from polarnet.simulation.ranges import RandomisedConfig
 
 EVENTS_PER_PIXEL_AND_STEP = 0.5  # initial room, far more than usual: untouched pages cost no memory
 MAX_INITIAL_ROOM = 1 << 22  # events; columns grow where a scene is busier
+
+
+class Steps(NamedTuple):
+    """A span of time of one channel. Step k lasts from times_us[k] to times_us[k + 1] and ends with one frame."""
+
+    physics: Any  # parameters of the pixel model, as its `physics_of` returns them
+    height: int
+    width: int
+    times_us: np.ndarray  # float64 [steps + 1], strictly increasing
+    first_frame: int  # index into the light of the frame at times_us[1]
+    first_number: int  # steps that the channel has taken before; random draws are numbered by it
+    key: np.uint64  # seed of all noise of the sensor
+    channel: int  # each channel has its own mismatch and noise
 
 
 class PixelModel(Protocol):
@@ -47,13 +59,7 @@ class PixelModel(Protocol):
         """Advance the pixels through the steps, in place; return the columns with the events, and their number."""
 
 
-MODELS: dict[str, PixelModel] = {
-    "v2e": v2e,
-    "exact": exact,
-    "esim": esim,
-    "esim_gpu": esim_gpu,
-    "dvs_voltmeter": voltmeter,
-}
+MODELS: dict[str, PixelModel] = {"v2e": v2e, "exact": exact, "esim": esim, "dvs_voltmeter": voltmeter}
 
 
 @section
@@ -89,12 +95,19 @@ class SensorState:
     height: int
     width: int
     channels: tuple[int, ...]
-    pixels: tuple[Any, ...]
-    """State arrays of each channel, as the model's module defines them."""
-    t_us: float
-    """Time of the last frame."""
-    steps: int
-    """Number of frames after the first; random draws are numbered by it."""
+    pixels: tuple[Any, ...]  # state arrays of each channel, as the model's module defines them
+    t_us: float  # time of the last frame
+    steps: int  # number of frames after the first; random draws are numbered by it
+
+
+class Channels(NamedTuple):
+    """Channels of one kind of sensor."""
+
+    numbers: tuple[int, ...]
+    height: int
+    width: int
+    sensor: EmulatorConfig
+    key: int  # 64 bits that seed all noise; each channel draws its mismatch and noise by its number
 
 
 def emulate(
@@ -123,81 +136,72 @@ def emulate(
     >>> events[0].p.unique()
     tensor([1], dtype=torch.int8)
     """
-    columns, state = emulate_columns(frames, t_us, config, key, state, channels, threads)
-    return [events_of(c, state.height, state.width) for c in columns], state
-
-
-def emulate_columns(
-    frames: Shaped[Array, "n channels h w"],
-    t_us: Int64[Array, " m"] | Float64[Array, " m"],
-    config: EmulatorConfig,
-    key: int,
-    state: SensorState | None = None,
-    channels: Sequence[int] | None = None,
-    threads: int = 1,
-    unrounded_times: bool = False,
-) -> tuple[list[Columns], SensorState]:
-    """`emulate` with events as numpy arrays; `unrounded_times` adds their times as floats."""
     frames = as_tensor("frames", frames).detach().cpu()
     check_shape("frames", frames, "... channels height width")
-    channels = tuple(range(frames.shape[-3])) if channels is None else tuple(channels)
+    numbers = tuple(range(frames.shape[-3])) if channels is None else tuple(channels)
     times = np.asarray(t_us, dtype=np.float64)
-    _check_frames(frames, times, channels, state, config.model)
+    _check_frames(frames, times, numbers, state, config.model)
     clip = frames.numpy() if frames.dtype == torch.uint8 else frames.to(torch.float32).numpy()
-    lights = [light_of_frames(np.ascontiguousarray(clip[:, i])) for i in range(len(channels))]
-    height, width = frames.shape[2:]
-    return emulate_lights(lights, times, height, width, config, key, state, channels, threads, unrounded_times)
+    lights = [light_of_frames(np.ascontiguousarray(clip[:, i])) for i in range(len(numbers))]
+    height, width = clip.shape[2:]
+    return emulate_lights(Channels(numbers, height, width, config, key), lights, times, state, threads)
+
+
+def emulate_frames(
+    channels: Channels,
+    pieces: Iterable[tuple[Int64[np.ndarray, " n"], Float32[np.ndarray, "channels n h w"]]],
+    state: SensorState | None = None,
+    threads: int = 1,
+) -> tuple[list[Events], SensorState]:
+    """As `emulate`, for times and light in DN that come in pieces; models of 8-bit video see it rounded."""
+    parts = []
+    for t_us, light in pieces:
+        if MODELS[channels.sensor.model].EIGHT_BIT_VIDEO:
+            light = (light + np.float32(0.5)).astype(np.uint8)
+        lights = [light_of_frames(np.ascontiguousarray(channel)) for channel in light]
+        events, state = emulate_lights(channels, lights, t_us.astype(np.float64), state, threads)
+        parts.append(events)
+    assert state is not None  # there was at least one piece
+    return [concatenate(channel) for channel in zip(*parts, strict=True)], state
 
 
 def emulate_lights(
+    channels: Channels,
     lights: Sequence[Light],
     t_us: Float64[np.ndarray, " n"],
-    height: int,
-    width: int,
-    config: EmulatorConfig,
-    key: int,
-    state: SensorState | None,
-    channels: tuple[int, ...],
+    state: SensorState | None = None,
     threads: int = 1,
-    unrounded_times: bool = False,
-) -> tuple[list[Columns], SensorState]:
+) -> tuple[list[Events], SensorState]:
     """Events of channels under `lights` at times `t_us`, and the state after them; `threads` channels run at once."""
     forget_stale_code()
+    numbers, height, width, config, key = channels
     model = MODELS[config.model]
     physics, seed = model.physics_of(config), np.uint64(key)
     times = t_us if state is None else np.concatenate([[state.t_us], t_us])
     first_frame, first_number = (1, 0) if state is None else (0, state.steps)
     room = 1 + int(min(MAX_INITIAL_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
     # allocated here, because glibc returns what other threads allocate to the system as soon as they end
-    empty = [empty_columns(room, unrounded_times) for _ in channels]
+    empty = [empty_columns(room) for _ in numbers]
 
     def emulate_channel(i: int) -> tuple[Columns, Any]:
-        steps = Steps(physics, height, width, times, first_frame, first_number, seed, channels[i])
+        steps = Steps(physics, height, width, times, first_frame, first_number, seed, numbers[i])
         if state is None:
-            pixels = model.initial(height, width, physics, seed, channels[i])
+            pixels = model.initial(height, width, physics, seed, numbers[i])
             model.start(lights[i], pixels, steps)
         else:
             pixels = type(state.pixels[i])(*(array.copy() for array in state.pixels[i]))
         columns = trimmed(*model.advance(lights[i], pixels, steps, empty[i]))
-        if defects := defects_of(config, height * width, seed, channels[i]):
+        if defects := defects_of(config, height * width, seed, numbers[i]):
             # v2e stamps an event after the start of its step and up to its end, the others before the end
-            span, rounds_up = (float(times[0]), float(times[-1])), model is v2e
-            columns = with_defects(columns, defects, width, *span, rounds_up, unrounded_times)
+            columns = with_defects(columns, defects, width, float(times[0]), float(times[-1]), model is v2e)
         return columns, pixels
 
-    if threads > 1:
-        with ThreadPoolExecutor(threads) as pool:
-            columns, pixels = zip(*pool.map(emulate_channel, range(len(channels))), strict=True)
-    else:
-        columns, pixels = zip(*map(emulate_channel, range(len(channels))), strict=True)
+    with ThreadPoolExecutor(threads) as pool:
+        channel_map = pool.map if threads > 1 else map
+        columns, pixels = zip(*channel_map(emulate_channel, range(len(numbers))), strict=True)
+    events = [Events(*map(torch.from_numpy, channel), height=height, width=width) for channel in columns]
     steps_taken = first_number + len(times) - 1
-    return list(columns), SensorState(config.model, height, width, channels, pixels, float(times[-1]), steps_taken)
-
-
-def events_of(columns: Columns, height: int, width: int) -> Events:
-    """`Events` that share the memory of the columns."""
-    t, x, y, p = map(torch.from_numpy, columns[:4])
-    return Events(t, x, y, p, height, width)
+    return events, SensorState(config.model, height, width, numbers, pixels, float(times[-1]), steps_taken)
 
 
 def _check_frames(

@@ -132,6 +132,13 @@ class Trajectory:
         return cls(x, y, x_sines, y_sines, sines[-2], sines[-1], speed_px_s)
 
 
+def resting_trajectory(height: int, width: int) -> Trajectory:
+    """A sensor of this size that rests on the scene's upper left corner."""
+    still = Sine(0.0, 0.0, 0.0)
+    axis = (still,) * HARMONICS
+    return Trajectory((width - 1) / 2, (height - 1) / 2, axis, axis, roll=still, zoom=still, speed_px_s=0.0)
+
+
 def random_trajectory(
     config: SynthesizeConfig, scene_height: int, scene_width: int, generator: np.random.Generator
 ) -> Trajectory:
@@ -155,8 +162,7 @@ def random_trajectory(
             f"more than {2 * reach_y + 1:.0f}x{2 * reach_x + 1:.0f}; use larger pictures or a smaller sensor"
         )
     speed = generator.uniform(config.speed_min_px_s, config.speed_max_px_s)
-    turns = (config.rotation_max_deg > 0) + (config.zoom_max > 1)
-    drift = 1 - TURN_SHARE * turns  # share of speed and acceleration left for the sensor's centre
+    drift = _drift_share(config)
     for _ in range(ATTEMPTS):
         shape = _random_shape(generator)
         crowding = max(shape.extent / room)  # per pixel
@@ -177,7 +183,7 @@ def random_trajectory(
     slowest = drift * speed * crowding
     quickest = min(config.acceleration_max_px_s2 / (speed * shape.acceleration), FASTEST_OVER_SLOWEST * slowest)
     rate = slowest * max(quickest / slowest, 1.0) ** generator.random()
-    return _placed(config, shape, rate, speed, drift, (reach_x, reach_y), room, generator)
+    return _placed(config, shape, rate, speed, room, generator)
 
 
 @dataclass(frozen=True)
@@ -217,18 +223,16 @@ def _placed(
     shape: _Shape,
     rate: float,
     speed: float,
-    drift: float,
-    reach: tuple[float, float],
     room: Float64[np.ndarray, " 2"],
     generator: np.random.Generator,
 ) -> Trajectory:
     """Trajectory along the shape at `rate` radians per second, at a random place within `room`, with roll and zoom."""
     order = np.arange(1, HARMONICS + 1)
-    size = drift * speed / rate  # pixels per unit of the shape
+    size = _drift_share(config) * speed / rate  # pixels per unit of the shape
     peak_time = generator.uniform(0, config.duration_s)
     phases = shape.phases + order * (shape.peak_phase - rate * peak_time)
     spare = np.maximum(room - size * shape.extent, 0)
-    x, y = np.array(reach) + BORDER_SLACK_PX - size * shape.lowest + spare * generator.random(2)
+    x, y = np.array(_reach(config)) + BORDER_SLACK_PX - size * shape.lowest + spare * generator.random(2)
     amplitudes, rates = size * shape.speeds / order, np.broadcast_to(rate * order, (2, HARMONICS))
     sines = np.stack([amplitudes, rates, phases % (2 * math.pi)], axis=-1).tolist()
     x_sines, y_sines = (tuple(Sine(*sine) for sine in axis) for axis in sines)
@@ -243,6 +247,11 @@ def _placed(
         zoom=_turn(zoom, 3.0, config, speed, generator),
         speed_px_s=speed,
     )
+
+
+def _drift_share(config: SynthesizeConfig) -> float:
+    """Share of speed and acceleration left for the sensor's centre by roll and zoom."""
+    return 1 - TURN_SHARE * ((config.rotation_max_deg > 0) + (config.zoom_max > 1))
 
 
 def _turn(

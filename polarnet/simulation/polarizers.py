@@ -6,7 +6,7 @@ pixel, and a pixel receives some of its neighbours' light.
 """
 
 import math
-from typing import Annotated, TypeVar
+from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -77,64 +77,59 @@ IDEAL = PolarizersConfig(
 )
 
 
-def channel_size(layout: str, height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of a channel of a sensor; ValueError for a DoFP sensor with an odd side."""
+class Grid(NamedTuple):
+    """Pixels of a channel; they see points of the scene that lie `pitch` pixels apart: 1, or 2 for a DoFP sensor."""
+
+    height: int
+    width: int
+    pitch: int = 1
+
+
+def grid(layout: str, height: int, width: int) -> Grid:
+    """The pixels of each channel of a sensor; ValueError for a DoFP sensor with an odd side."""
     if layout == "four_sensors":
-        return height, width
+        return Grid(height, width)
     if height % 2 or width % 2:
         raise ValueError(
             f"polarizers.layout dofp: expected a sensor with even sides, for whole 2x2 cells, got {height}x{width}"
         )
-    return height // 2, width // 2
+    return Grid(height // 2, width // 2, 2)
 
 
-def grid(layout: str, height: int, width: int) -> tuple[int, int, int]:
-    """(rows, columns, pitch) of a sensor's channel; its pixels are `pitch` sensor pixels apart: 1, or 2 for DoFP."""
-    rows, columns = channel_size(layout, height, width)
-    return rows, columns, height // rows
+def channel_size(layout: str, height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of a channel of a sensor; ValueError as `grid`."""
+    return grid(layout, height, width)[:2]
 
 
-def analyzers(polarizers: PolarizersConfig) -> Float32[np.ndarray, "4 3"]:
-    """Weights of (S0, S1, S2) of each channel, without differences between pixels."""
-    angles = np.radians(np.add(POLARIZER_ANGLES_DEG, polarizers.angle_error_deg))
-    weights = list(map(analyzer, angles.tolist(), _ratios(polarizers), polarizers.transmission))
-    return np.array(weights, np.float32)
-
-
-def _ratios(polarizers: PolarizersConfig) -> list[float]:
-    return [math.inf if ratio is None else ratio for ratio in polarizers.extinction_ratio]
-
-
-def analyzer_maps(
+def weights_of(
     polarizers: PolarizersConfig, height: int, width: int, key: int
-) -> Float32[np.ndarray, "sensors 3 h w"]:
-    """Weights of (S0, S1, S2) at every pixel of the four sensors, or of the one DoFP sensor.
+) -> Float32[np.ndarray, "sensors 3 *pixels"]:
+    """Weights of S0, S1 and S2 at each of the four sensors, or the one DoFP sensor: for each pixel if pixels differ.
 
     `key` (64 bits) seeds the differences between pixels.
     """
-    if polarizers.layout == "four_sensors":
-        channels = np.broadcast_to(np.arange(NUM_CHANNELS)[:, None, None], (NUM_CHANNELS, height, width))
-    else:
-        channel_size(polarizers.layout, height, width)
+    channels = np.arange(NUM_CHANNELS)
+    if polarizers.layout == "dofp":
+        grid(polarizers.layout, height, width)
         cell = np.searchsorted(POLARIZER_ANGLES_DEG, parse_mosaic(polarizers.mosaic))
         channels = np.tile(cell, (1, height // 2, width // 2))
+    elif not polarizers.uniform:
+        channels = np.broadcast_to(channels[:, None, None], (NUM_CHANNELS, height, width))
+
+    def spread(purpose: int, deviation: float) -> Float64[np.ndarray, "*pixels"]:
+        """Normally distributed differences between pixels."""
+        if deviation == 0:
+            return np.zeros(channels.shape)
+        maps = [randomness.normal_map(np.uint64(key), purpose, i, channels[i].size) for i in range(len(channels))]
+        return deviation * np.stack(maps).reshape(channels.shape).astype(np.float64)
+
     angles = np.radians(np.add(POLARIZER_ANGLES_DEG, polarizers.angle_error_deg))[channels]
-    angles = angles + math.radians(polarizers.angle_spread_deg) * _normal(randomness.POLARIZER_ANGLE, channels, key)
+    angles = angles + spread(randomness.POLARIZER_ANGLE, math.radians(polarizers.angle_spread_deg))
     along = np.array(polarizers.transmission)[channels]
-    along = along * (1 + polarizers.transmission_spread * _normal(randomness.TRANSMISSION, channels, key))
-    along = along.clip(0, 1)
-    exponents = polarizers.extinction_spread * _normal(randomness.EXTINCTION, channels, key)
-    across = along / np.maximum(np.array(_ratios(polarizers))[channels] * np.exp(exponents), 1)
-    polarized = (along - across) / 2
-    weights = ((along + across) / 2, polarized * np.cos(2 * angles), polarized * np.sin(2 * angles))
-    return np.stack(weights, axis=1).astype(np.float32)
-
-
-def _normal(purpose: int, channels: np.ndarray, key: int) -> Float64[np.ndarray, "sensors h w"]:
-    """Standard normal values for the pixels of each sensor."""
-    pixels = channels[0].size
-    maps = [randomness.normal_map(np.uint64(key), purpose, sensor, pixels) for sensor in range(len(channels))]
-    return np.stack(maps).reshape(channels.shape).astype(np.float64)
+    along = (along * (1 + spread(randomness.TRANSMISSION, polarizers.transmission_spread))).clip(0, 1)
+    ratios = np.array([math.inf if ratio is None else ratio for ratio in polarizers.extinction_ratio])[channels]
+    ratios = np.maximum(ratios * np.exp(spread(randomness.EXTINCTION, polarizers.extinction_spread)), 1)
+    return analyzer(angles, ratios, along).swapaxes(0, 1).astype(np.float32)
 
 
 def mixed_with_neighbours(frames: Float32[np.ndarray, "n h w"], crosstalk: float) -> Float32[np.ndarray, "n h w"]:

@@ -6,15 +6,10 @@ import math
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from polarnet.simulation.motion import Pose, Trajectory, render_poses
+from polarnet.simulation.emulator import MODELS, EmulatorConfig
+from polarnet.simulation.motion import Pose, Trajectory
 from polarnet.simulation.pixels.light import FULL_SCALE, Light
-from polarnet.simulation.polarizers import (
-    PolarizersConfig,
-    analyzer_maps,
-    analyzers,
-    mixed_with_neighbours,
-    split_cells,
-)
+from polarnet.simulation.polarizers import PolarizersConfig, mixed_with_neighbours, split_cells
 from polarnet.simulation.scene import PolarizationScene
 
 MIN_RATE_HZ = 30.0  # minimum of the adaptive rate, for a sensor at rest
@@ -23,21 +18,30 @@ STEP_SLACK = 1e-3  # pixels by which a step may exceed one pixel
 
 
 def render_times_us(
-    trajectory: Trajectory, duration_us: int, height: int, width: int, rate_hz: float | None, regular: bool
+    trajectory: Trajectory,
+    duration_us: int,
+    height: int,
+    width: int,
+    sensor: EmulatorConfig,
+    rotation_rate_hz: float = 0.0,
 ) -> Int64[np.ndarray, " n"]:
-    """Times of the rendered frames, from 0 to `duration_us`, `rate_hz` a second.
+    """Times of the rendered frames, from 0 to `duration_us`, `sensor.render_rate_hz` a second.
 
-    Without a rate, there is one frame for each pixel of motion, and at least MIN_RATE_HZ a second.
+    Without a rate, there is one frame for each pixel of motion, and at least MIN_RATE_HZ a second. Light that also
+    changes with a rotation is rendered at least `rotation_rate_hz` times a second.
     Light changes smoothly between two pixels of the scene, and its slope jumps at each pixel. All pixels of a drifting
-    sensor reach these jumps at once. Unless `regular`, each jump gets a frame: an extra one, or the nearest at a rate.
+    sensor reach these jumps at once. Unless the times must be regular, for the video of v2e or a rotation, each jump
+    gets a frame: an extra one, or the nearest at a rate.
     """
+    regular = MODELS[sensor.model].EIGHT_BIT_VIDEO or rotation_rate_hz > 0
     samples = 2 + math.ceil(SAMPLES_PER_STEP * duration_us * 1e-6 * max(trajectory.speed_px_s, MIN_RATE_HZ))
     sampled_us = np.linspace(0, duration_us, samples)
     pose = trajectory.pose(sampled_us * 1e-6)
     kinks_us = np.empty(0) if regular else _pixel_crossings(pose, sampled_us, height, width)
-    if rate_hz is None:
-        times = _adaptive_times(pose, sampled_us, kinks_us, height, width)
+    if sensor.render_rate_hz is None:
+        times = _adaptive_times(pose, sampled_us, kinks_us, _corners(pose, height, width), rotation_rate_hz)
     else:
+        rate_hz = max(sensor.render_rate_hz, rotation_rate_hz)
         even = np.arange(math.ceil(duration_us * 1e-6 * rate_hz) + 1) * (1e6 / rate_hz)
         times, nearest = even.copy(), np.rint(kinks_us * 1e-6 * rate_hz).astype(int)
         inner = (nearest > 0) & (nearest < len(even) - 1)
@@ -50,12 +54,13 @@ def _adaptive_times(
     pose: Pose,
     sampled_us: Float64[np.ndarray, " n"],
     kinks_us: Float64[np.ndarray, " k"],
-    height: int,
-    width: int,
+    corners: tuple[Float64[np.ndarray, "4 n"], Float64[np.ndarray, "4 n"]],
+    min_rate_hz: float,
 ) -> Float64[np.ndarray, " m"]:
     """Times that include all `kinks_us`; between two of them no corner moves by more than one sensor pixel."""
-    moved = np.hypot(*np.diff(np.stack(_corners(pose, height, width)), axis=-1)).max(axis=0)
-    steps = np.maximum(moved * np.maximum(pose.zoom[1:], pose.zoom[:-1]), MIN_RATE_HZ * 1e-6 * np.diff(sampled_us))
+    moved = np.hypot(*np.diff(np.stack(corners), axis=-1)).max(axis=0)
+    least = max(MIN_RATE_HZ, min_rate_hz) * 1e-6 * np.diff(sampled_us)
+    steps = np.maximum(moved * np.maximum(pose.zoom[1:], pose.zoom[:-1]), least)
     progress = np.concatenate([[0], np.cumsum(steps)])
     anchors = np.unique(np.concatenate([[0, progress[-1]], np.interp(kinks_us, sampled_us, progress)]))
     pieces = [np.linspace(a, b, 1 + math.ceil(b - a - STEP_SLACK)) for a, b in itertools.pairwise(anchors)]
@@ -84,33 +89,22 @@ def drifts(pose: Pose) -> bool:
     return bool((pose.angle == 0).all() and (pose.zoom == 1).all())
 
 
-def render_intensities(
-    scene: PolarizationScene, pose: Pose, height: int, width: int, weights: Float32[np.ndarray, "sensors 3 *pixels"]
-) -> Float32[np.ndarray, "sensors n h w"]:
-    """Light in DN behind polarizers of these `weights` for a sensor in n poses; the polarizers turn with it."""
-    return behind_polarizers(render_poses(scene, pose, height, width).transpose(1, 0, 2, 3), weights)
-
-
-def split_channels(
-    frames: Float32[np.ndarray, "sensors n h w"], polarizers: PolarizersConfig
+def channel_light(
+    stokes: Float32[np.ndarray, "3 n h w"],
+    polarizers: PolarizersConfig,
+    weights: Float32[np.ndarray, "sensors 3 *pixels"],
 ) -> Float32[np.ndarray, "4 n h2 w2"]:
-    """Light of the four channels: that of four sensors unchanged, or a DoFP sensor's with crosstalk, split by cells."""
+    """Light in DN on the four channels, behind `polarizers` with these weights: a DoFP sensor's split by cells."""
+    light = behind_polarizers(stokes, weights)
     if polarizers.layout == "dofp":
-        return split_cells(mixed_with_neighbours(frames[0], polarizers.crosstalk), polarizers.mosaic)
-    return frames
-
-
-def weights_of(
-    polarizers: PolarizersConfig, height: int, width: int, key: int
-) -> Float32[np.ndarray, "sensors 3 *pixels"]:
-    """Weights of S0, S1 and S2 of each channel, or of each pixel if the pixels differ; `key` seeds the differences."""
-    return analyzers(polarizers) if polarizers.uniform else analyzer_maps(polarizers, height, width, key)
+        return split_cells(mixed_with_neighbours(light[0], polarizers.crosstalk), polarizers.mosaic)
+    return light
 
 
 def behind_polarizers(
     stokes: Float32[np.ndarray, " 3 *shape"], weights: Float32[np.ndarray, "sensors 3 *pixels"]
 ) -> Float32[np.ndarray, " sensors *shape"]:
-    """Light in DN behind polarizers that weight S0, S1 and S2; the weights are those of a sensor, or of each pixel."""
+    """Light in DN behind polarizers that weight S0, S1 and S2: alike for a sensor, or for each pixel or frame."""
     s0, s1, s2 = stokes
     return np.maximum(np.stack([a * s0 + b * s1 + c * s2 for a, b, c in weights]), 0) * FULL_SCALE
 

@@ -1,9 +1,4 @@
-"""Events of one sensor behind a polarizer that rotates in front of it, on a still or moving scene.
-
-The light behind a polarizer at angle theta is, with e = 1 / extinction ratio (Malus' law of an imperfect polarizer):
-
-    I = ((1 + e) S0 + (1 - e) (S1 cos 2 theta + S2 sin 2 theta)) / 2
-"""
+"""Events of one sensor behind a polarizer that rotates in front of it: one channel with weights in time."""
 
 import functools
 import json
@@ -12,32 +7,27 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
-import torch
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float32, Int64
 from pydantic import Field
-from torch import Tensor
 
 from polarnet.events.rotation import Rotation, steady_rotation
-from polarnet.events.stream import Events, concatenate
-from polarnet.runtime.machine import seed_for
+from polarnet.events.stream import Events
 from polarnet.runtime.sections import section
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.dataset import origin_of
-from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate
-from polarnet.simulation.motion import Trajectory, render
-from polarnet.simulation.pixels.light import FULL_SCALE
-from polarnet.simulation.polarizers import grid
+from polarnet.simulation.emulator import Channels, emulate_frames
+from polarnet.simulation.motion import Trajectory
+from polarnet.simulation.moving_sensor import checked_pose, rendered_chunks
+from polarnet.simulation.polarizers import Grid, grid
 from polarnet.simulation.readout import read_out
-from polarnet.simulation.rendering import check_inside
+from polarnet.simulation.rendering import behind_polarizers, render_times_us
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
-from polarnet.stokes import NUM_CHANNELS
+from polarnet.stokes import NUM_CHANNELS, analyzer
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
-
-CHUNK = 64  # frames rendered at once
 
 
 @section
@@ -61,72 +51,32 @@ class RotatingConfig:
         """The polarizer's angle over time."""
         return steady_rotation(self.rate_hz, math.radians(self.start_angle_deg))
 
-
-class RotatingSimulation(NamedTuple):
-    """Events of the one sensor, and the polarizer's angle over time."""
-
-    events: Events
-    rotation: Rotation
-    state: SensorState
-    """The sensor after the last frame; hand it back to continue."""
-
-
-def behind_rotating_polarizer(
-    stokes: Float32[Tensor, "n 3 h w"], angles: Float64[np.ndarray, " n"], extinction_ratio: float | None
-) -> Float32[Tensor, "n h w"]:
-    """Intensity behind a polarizer at angle `angles[k]` (radians) in frame k; a ratio of None means infinite."""
-    leakage = 0.0 if extinction_ratio is None else 1 / extinction_ratio
-    cos, sin = (torch.from_numpy(f(2 * angles)).float()[:, None, None] for f in (np.cos, np.sin))
-    s0, s1, s2 = stokes.unbind(1)
-    return (((1 + leakage) * s0 + (1 - leakage) * (s1 * cos + s2 * sin)) / 2).clamp(min=0)
-
-
-def rotating_times_us(
-    config: RotatingConfig, emulator: EmulatorConfig, start_us: int, stop_us: int
-) -> Int64[np.ndarray, " n"]:
-    """Times of rendered light from `start_us` to `stop_us`, both included."""
-    rate_hz = max(abs(config.rate_hz) * config.frames_per_turn, emulator.render_rate_hz or 0)
-    steps = max(1, math.ceil((stop_us - start_us) * 1e-6 * rate_hz))
-    return np.unique(np.rint(np.linspace(start_us, stop_us, steps + 1)).astype(np.int64))
+    def weights(self, t_us: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "1 3 n 1 1"]:
+        """Weights of S0, S1 and S2 behind the polarizer in each frame."""
+        weights = analyzer(self.rotation.at(t_us), self.extinction_ratio or math.inf)
+        return weights.astype(np.float32)[None, ..., None, None]
 
 
 def emulate_rotating(
-    scene: PolarizationScene,
-    trajectory: Trajectory | None,
-    t_us: Int64[np.ndarray, " n"],
-    height: int,
-    width: int,
     rotating: RotatingConfig,
-    emulator: EmulatorConfig,
-    key: int,
-    state: SensorState | None = None,
-    pitch: int = 1,
-) -> RotatingSimulation:
-    """Events of a sensor of height x width pixels under light rendered at times `t_us` (`rotating_times_us`).
+    camera: Camera,
+    scene: PolarizationScene,
+    trajectory: Trajectory,
+    duration_us: int,
+    pixels: Grid,
+    threads: int = 1,
+) -> Events:
+    """Events of one sensor of a camera, behind the rotating polarizer, that moves over a scene for `duration_us`.
 
-    Without a trajectory the sensor rests on the scene's upper left corner. `key` (64 bits) seeds mismatch and noise.
-    The pixels of a moving sensor lie `pitch` pixels of the scene apart (`polarizers.grid`).
-    A span cut into pieces, each given the state that the previous piece returned and times after it, gives the events
-    of the whole span. ValueError if the sensor leaves the scene.
+    The camera's own polarizers count for nothing. ValueError if the sensor leaves the scene.
     """
-    if trajectory is not None:
-        check_inside(scene, trajectory.pose(t_us * 1e-6), t_us, pitch * height, pitch * width)
-    elif height > scene.height or width > scene.width:
-        raise ValueError(f"a sensor of {height}x{width} px exceeds the scene of {scene.height}x{scene.width}")
-    rotation, pieces = rotating.rotation, []
-    for first in range(0, len(t_us), CHUNK):
-        times = t_us[first : first + CHUNK]
-        if trajectory is None:
-            stokes = scene.stokes[None, :, :height, :width].expand(len(times), -1, -1, -1)
-        else:
-            stokes = render(scene, trajectory, times * 1e-6, height, width, pitch)
-        light = behind_rotating_polarizer(stokes, rotation.at(times), rotating.extinction_ratio)
-        frames = (FULL_SCALE * light).clamp(max=FULL_SCALE)[:, None]
-        (events,), state = emulate(frames, times, emulator, key, state)
-        pieces.append(events)
-    if state is None:
-        raise ValueError("expected at least one time to render the light at, got none")
-    return RotatingSimulation(concatenate(pieces), rotation, state)
+    size, sensor = (pixels.height, pixels.width), camera.sensor
+    t_us = render_times_us(trajectory, duration_us, *size, sensor, abs(rotating.rate_hz) * rotating.frames_per_turn)
+    pose = checked_pose(scene, trajectory, t_us, size, pixels.pitch)
+    rendered = rendered_chunks(scene, pose, t_us, size)
+    frames = ((times, behind_polarizers(stokes, rotating.weights(times))) for times, stokes in rendered)
+    (events,), _ = emulate_frames(Channels((0,), *size, sensor, camera.key), frames, threads=threads)
+    return read_out(events, camera.readout, camera.key, duration_us)[0]
 
 
 def emulate_rotating_scenes(
@@ -162,14 +112,11 @@ def emulate_rotating_scenes(
 def _emulate_part(
     part: str, scenes: SceneStore, events: EventStore, rotating: RotatingConfig, camera: Camera, seed: int
 ) -> None:
-    height, width, pitch = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
+    pixels = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
+    others = [Events.empty(pixels.height, pixels.width)] * (NUM_CHANNELS - 1)
     for sequence in events.parts[part]:
-        record, key = scenes.read(sequence), seed_for(seed, sequence, "rotating")
-        drawn = camera.drawn(seed, sequence)
+        record, drawn = scenes.read(sequence), camera.drawn(seed, sequence, "rotating")
         scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
         trajectory = Trajectory.from_vector(record.trajectory.numpy())
-        t_us = rotating_times_us(rotating, drawn.sensor, 0, record.duration_us)
-        emulation = emulate_rotating(scene, trajectory, t_us, height, width, rotating, drawn.sensor, key, pitch=pitch)
-        output, _ = read_out(emulation.events, drawn.readout, key, record.duration_us)
-        channels = [output, *[Events.empty(height, width)] * (NUM_CHANNELS - 1)]
-        events.write(sequence, channels, record.duration_us, camera.draws(seed, sequence))
+        output = emulate_rotating(rotating, drawn, scene, trajectory, record.duration_us, pixels)
+        events.write(sequence, [output, *others], record.duration_us, camera.draws(seed, sequence))

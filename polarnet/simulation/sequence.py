@@ -8,7 +8,7 @@ from torch import Tensor, tensor
 
 from polarnet.events.stream import Events
 from polarnet.runtime.arrays import Array
-from polarnet.runtime.machine import generator_for, seed_for
+from polarnet.runtime.machine import generator_for
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory
@@ -83,9 +83,6 @@ def simulate(
     trajectory = random_trajectory(motion, scene.height, scene.width, generator_for(seed, "picture", "motion"))
     camera = (sensor if isinstance(sensor, Camera) else Camera(sensor)).drawn(seed, "picture")
     t_us, size = frame_times_us(motion), (motion.sensor_height, motion.sensor_width)
-    key = seed_for(seed, "picture", "emulate")
-    events = emulate_motion(
-        scene, trajectory, t_us[-1], *size, camera.sensor, key, polarizers=camera.polarizers, readout=camera.readout
-    )
+    events = emulate_motion(camera, scene, trajectory, t_us[-1], size)
     pixels = grid(camera.polarizers.layout, *size)
     return Simulation(events, tensor(t_us), *frames_of(scene, trajectory, t_us, *pixels), trajectory, camera)

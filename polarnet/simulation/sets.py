@@ -16,7 +16,7 @@ from typing import Annotated, Any
 from pydantic import Field, PositiveFloat
 
 from polarnet.pictures.images import picture_extensions
-from polarnet.pictures.ingest import IngestConfig, ingest
+from polarnet.pictures.ingest import IngestConfig, files_under, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.pictures.polarimetry import group_by_measurement
 from polarnet.runtime.files import changed_files, seal, sha256
@@ -24,7 +24,7 @@ from polarnet.runtime.sections import section
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.dataset import emulate_scenes
 from polarnet.simulation.motion import SynthesizeConfig
-from polarnet.simulation.truth import synthesize
+from polarnet.simulation.truth import Synthesis, synthesize
 
 MADE = "made.json"
 
@@ -60,10 +60,8 @@ class Recipe:
     motion: SynthesizeConfig
     camera: Camera
     seed: int
-    threads: int
-    """Threads of each task; changes no result."""
-    sequences_per_part: int
-    """Sequences in a part of a store; changes no result."""
+    threads: int  # threads of each task; changes no result
+    sequences_per_part: int  # sequences in a part of a store; changes no result
 
 
 def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Recipe, mapper: MakeMapper) -> bool:
@@ -97,7 +95,7 @@ def kind_of(root: Path) -> str:
 
     Raw mosaics look like photographs: name their kind.
     """
-    files = sorted(path for path in root.rglob("*") if path.is_file())
+    files = [path for path in files_under(root) if path.is_file()]
     if any(path.suffix.lower() == ".npz" for path in files):
         return "polarization"
     pictures = [path for path in files if path.suffix.lower().lstrip(".") in picture_extensions()]
@@ -131,7 +129,8 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
         fill(images)
     if not (scenes.exists() and frames.exists()):
         layout, size = recipe.camera.polarizers.layout, recipe.sequences_per_part
-        synthesize(images, scenes, frames, recipe.motion, recipe.seed, mapper("synthesize"), size, layout=layout)
+        synthesis = Synthesis(images, recipe.motion, recipe.seed, size, layout=layout)
+        synthesize(synthesis, scenes, frames, mapper("synthesize"))
     if not events.exists():
         emulate_scenes(scenes, events, recipe.camera, recipe.seed, mapper("emulate"), recipe.threads)
     note.write_text(json.dumps({"key": key, "complete": True}))
@@ -149,7 +148,7 @@ def _progress(note: Path) -> dict[str, Any]:
 
 def _content(folder: Path) -> str:
     """Hash of the names and bytes of all files in a folder."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    files = [path for path in files_under(folder) if path.is_file()]
     return sha256(*(f"{path.relative_to(folder)} {sha256(path)}\n".encode() for path in files))
 
 

@@ -3,8 +3,8 @@
 import functools
 import itertools
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,8 +39,7 @@ class Motion(NamedTuple):
 
     sequence: str
     scene: str
-    picture: str
-    """Name of the picture that the scene is made from."""
+    picture: str  # name of the picture that the scene is made from
     split: str
     trajectory: Trajectory
 
@@ -75,47 +74,42 @@ def valid_frames(
     return rendered[:, 0] == 0
 
 
+@dataclass(frozen=True)
+class Synthesis:
+    """Everything that determines the sequences made of a folder of pictures, and their number in a part of a store."""
+
+    images: Path
+    motion: SynthesizeConfig
+    seed: int
+    sequences_per_part: int
+    variation: VariationConfig | None = None  # variants of training pictures; None: no variants
+    layout: str = IDEAL.layout  # section `polarizers`: the frames are those of the channels of such a camera
+
+
 def synthesize(
-    images: Path,
-    scenes: str | Path,
-    frames: str | Path,
-    config: SynthesizeConfig,
-    seed: int,
-    mapper: Callable[..., Iterable[Any]],
-    sequences_per_part: int,
-    variation: VariationConfig | None = None,
-    layout: str = IDEAL.layout,
+    synthesis: Synthesis, scenes: str | Path, frames: str | Path, mapper: Callable[..., Iterable[Any]]
 ) -> int:
     """Fill both stores with `sequences_per_picture` sequences of every scene, and return the number of sequences.
 
-    A scene is a picture of `images`, or a variant of a training picture; without `variation` there are no variants.
-    The frames are those of the channels of a camera of this `layout` (section `polarizers`).
-
-    `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks makes
-    one part of the stores, `sequences_per_part` sequences. Every trajectory depends only on the seed and the sequence's
-    name. A run after an interruption makes the missing parts.
+    A scene is a picture of `synthesis.images`, or a variant of a training picture. `mapper` is
+    `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks makes one part of
+    the stores. Every trajectory depends only on the seed and the sequence's name. A run after an interruption makes the
+    missing parts.
 
     Skips every picture too small for the sensor and its motion, with a warning. Raises ValueError if none is left.
     """
-    manifest = read_manifest(images)
-    motions, skipped = motions_of(manifest, config, seed, variation)
+    manifest = read_manifest(synthesis.images)
+    motions, skipped = motions_of(manifest, synthesis.motion, synthesis.seed, synthesis.variation)
     for picture in skipped:
         logger.warning("skipped %s: %s", picture.file, picture.reason)
     if not motions:
         raise ValueError(f"none of {len(skipped)} pictures can be used:{listed(skipped)}")
     used = {motion.picture for motion in motions}
     entries = [entry for entry in manifest.pictures if entry.name in used]
-    attributes = {
-        "synthesize": asdict(config),
-        "variation": asdict(variation) if variation else None,
-        "layout": layout,
-        "seed": seed,
-        "images_sha256": _digest(entries, images),
-    }
-    scene_store, frame_store = _create(scenes, frames, entries, motions, config, attributes, sequences_per_part)
+    scene_store, frame_store = _create(scenes, frames, entries, motions, synthesis)
     motion_of = {motion.sequence: motion for motion in motions}
     missing = sorted({*scene_store.missing_parts(), *frame_store.missing_parts()})
-    task = functools.partial(_synthesize_part, scene_store, frame_store, images, config, variation, layout, seed)
+    task = functools.partial(_synthesize_part, scene_store, frame_store, synthesis)
     for _ in mapper(task, [[motion_of[sequence] for sequence in scene_store.parts[part]] for part in missing]):
         pass
     scene_store.finish()
@@ -155,16 +149,22 @@ def _create(
     frames: str | Path,
     entries: Sequence[ManifestEntry],
     motions: Sequence[Motion],
-    config: SynthesizeConfig,
-    attributes: Mapping[str, Any],
-    sequences_per_part: int,
+    synthesis: Synthesis,
 ) -> tuple[SceneStore, FrameStore]:
     """Two unfinished stores; their attributes record all inputs, so that only an equal run resumes them."""
+    config, variation, per_part = synthesis.motion, synthesis.variation, synthesis.sequences_per_part
+    attributes = {
+        "synthesize": asdict(config),
+        "variation": asdict(variation) if variation else None,
+        "layout": synthesis.layout,
+        "seed": synthesis.seed,
+        "images_sha256": _digest(entries, synthesis.images),
+    }
     scene_of = {motion.sequence: motion.scene for motion in motions}
     splits = {motion.sequence: motion.split for motion in motions}
     variant_of = {motion.sequence: motion.picture for motion in motions if motion.scene != motion.picture}
     masked = any(entry.masked_fraction for entry in entries)  # null for photographs
-    contents = Contents(splits, attributes, variant_of, masked, sequences_per_part)
+    contents = Contents(splits, attributes, variant_of, masked, per_part)
     sensor = config.sensor_height, config.sensor_width
     scene_store = SceneStore.create(
         scenes,
@@ -175,26 +175,18 @@ def _create(
         trajectory_names=Trajectory.vector_names(),
     )
     contents = replace(contents, attributes={**attributes, "scenes": scene_of})
-    size = channel_size(attributes["layout"], *sensor)
+    size = channel_size(synthesis.layout, *sensor)
     frame_store = FrameStore.create(frames, contents, len(frame_times_us(config)), *size)
     return scene_store, frame_store
 
 
 @one_thread()
-def _synthesize_part(
-    scenes: SceneStore,
-    frames: FrameStore,
-    images: Path,
-    config: SynthesizeConfig,
-    variation: VariationConfig | None,
-    layout: str,
-    seed: int,
-    motions: Sequence[Motion],
-) -> None:
+def _synthesize_part(scenes: SceneStore, frames: FrameStore, synthesis: Synthesis, motions: Sequence[Motion]) -> None:
     """Write the part of both stores that holds the sequences of these motions."""
-    t_us, pixels = frame_times_us(config), grid(layout, config.sensor_height, config.sensor_width)
+    config = synthesis.motion
+    t_us, pixels = frame_times_us(config), grid(synthesis.layout, config.sensor_height, config.sensor_width)
     for (name, picture), over_scene in itertools.groupby(motions, lambda motion: (motion.scene, motion.picture)):
-        planes = _planes_of(name, picture, images, variation, seed)
+        planes = _planes_of(name, picture, synthesis)
         if not scenes.masked:
             planes = planes._replace(valid=None)
         scene = scene_from_polarization(planes.s0, planes.dolp, planes.aolp)
@@ -204,13 +196,14 @@ def _synthesize_part(
             frames.write(sequence, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *pixels), valid)
 
 
-def _planes_of(scene: str, picture: str, images: Path, variation: VariationConfig | None, seed: int) -> Scene:
+def _planes_of(scene: str, picture: str, synthesis: Synthesis) -> Scene:
     """Scene made from a picture, quantised as stored, so that events and truth are rendered from the same values."""
-    polarization, valid = _read_polarization(images, picture)
+    polarization, valid = _read_polarization(synthesis.images, picture)
+    variation = synthesis.variation
     if variation and scene != picture:
         if valid is not None:  # unknown polarization must not move to known pixels
             variation = replace(variation, mirrored_share=0.0)
-        polarization = varied(polarization, variation, generator_for(seed, scene, "variation"))
+        polarization = varied(polarization, variation, generator_for(synthesis.seed, scene, "variation"))
     s0, dolp, aolp = polarization
     return as_stored(Scene(s0, dolp, aolp, valid))
 

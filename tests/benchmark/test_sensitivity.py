@@ -13,7 +13,7 @@ from polarnet.runtime.machine import generator_for
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.dataset import emulate_scenes
 from polarnet.simulation.motion import Trajectory
-from polarnet.simulation.truth import synthesize
+from polarnet.simulation.truth import Synthesis, synthesize
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
@@ -50,7 +50,7 @@ def stores(tmp_path_factory, config):
         source_width=300,
     )
     write_manifest(Manifest((entry,), (), 0, 0), images)
-    synthesize(images, root / "scenes.zarr", root / "frames.zarr", config.synthesize, config.seed, map, 2)
+    synthesize(Synthesis(images, config.synthesize, config.seed, 2), root / "scenes.zarr", root / "frames.zarr", map)
     emulate_scenes(root / "scenes.zarr", root / "events.zarr", config.camera, config.seed, map, 1)
     opened = SceneStore.open(root / "scenes.zarr"), FrameStore.open(root / "frames.zarr")
     return *opened, EventStore.open(root / "events.zarr")
@@ -91,7 +91,7 @@ def test_twice_the_speed_is_twice_the_speed(stores, config, monkeypatch):
     speeds = []
 
     def noting(*arguments):
-        trajectory = arguments[1]
+        trajectory = arguments[2]
         speeds.append(trajectory.speed_px_s)
         return list(stores[2].read("leaf-00"))
 

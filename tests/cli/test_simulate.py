@@ -10,6 +10,7 @@ import torch
 import zarr
 
 from polarnet.cli import main, simulated_files
+from polarnet.clips import simulate_video, video
 from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import Events
 from polarnet.pictures.images import fit, read_rgb
@@ -22,8 +23,6 @@ from polarnet.simulation import (
     Camera,
     scene_from_intensities,
     simulate,
-    simulate_video,
-    video,
 )
 from polarnet.simulation.readout import PERFECT
 from polarnet.simulation.upsampling import StokesFrame

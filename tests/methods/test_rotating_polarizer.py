@@ -17,8 +17,10 @@ from polarnet.methods.rotating_polarizer import (
     local_variance,
     rotating_recoverer,
 )
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.motion import Sine, Trajectory
-from polarnet.simulation.rotating import emulate_rotating, rotating_times_us
+from polarnet.simulation.polarizers import Grid
+from polarnet.simulation.rotating import emulate_rotating
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.simulation.truth import frames_of
 
@@ -111,12 +113,10 @@ def test_the_error_on_a_still_and_on_a_moving_scene_is_small_and_is_the_expected
     scene = scene_from_polarization(0.3 + 0.7 * s0, dolp, 3 * aolp)
     still, path = Sine(0.0, 0.0, 0.0), Sine(1e4, speed_px_s / 1e4, 0.0)  # along a line
     trajectory = Trajectory(20.0, 20.0, (path,), (still,), still, still, speed_px_s)
-    t_us = rotating_times_us(config.rotating, config.emulate, 0, 200_000)
-    simulation = emulate_rotating(scene, trajectory, t_us, 32, 32, config.rotating, config.emulate, 1)
+    camera, rotation = Camera(config.emulate, key=1), config.rotating.rotation
+    events = emulate_rotating(config.rotating, camera, scene, trajectory, 200_000, Grid(32, 32))
     _, (truth,), _ = frames_of(scene, trajectory, [200_000], 32, 32)
-    estimate, _, log_variance = fit_half_turn(
-        simulation.events, simulation.rotation, 200_000, config.methods.rotating_polarizer
-    )
+    estimate, _, log_variance = fit_half_turn(events, rotation, 200_000, config.methods.rotating_polarizer)
     squared = (estimate - truth).square()
     assert squared.mean() < limit
     assert 0.2 < squared.mean() / log_variance.exp().mean() < 4

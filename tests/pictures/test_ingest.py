@@ -263,3 +263,19 @@ def test_no_fraction_means_no_picture():
 def test_a_bad_setting_is_refused_by_name(changes, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(CONFIG, **changes)
+
+
+def test_links_to_folders_are_followed_and_dead_links_are_named(tmp_path):
+    root, elsewhere = tmp_path / "pictures", tmp_path / "elsewhere"
+    for folder, number in ((root / "own", 0), (elsewhere / "deeper", 1)):
+        folder.mkdir(parents=True)
+        Image.fromarray(photograph(number)).save(folder / f"{number}.png")
+    (root / "linked").symlink_to(elsewhere)
+    (elsewhere / "deeper" / "cycle").symlink_to(root)
+    (root / "again").symlink_to(root / "own")  # read already
+    (root / "lost.png").symlink_to("nowhere.png")
+    (root / "lost").symlink_to(tmp_path / "gone")
+    manifest = ingest(dataclasses.replace(CONFIG, root=str(root)), 1, tmp_path / "images", map)
+    assert sorted(entry.origin for entry in manifest.pictures) == ["linked/deeper/1.png", "own/0.png"]
+    assert [skipped.file for skipped in manifest.skipped] == ["lost", "lost.png"]
+    assert all(skipped.reason.startswith("a dead link: its target does not exist") for skipped in manifest.skipped)

@@ -24,7 +24,7 @@ from polarnet.pictures.polarimetry import (
 )
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.scene import scene_from_intensities
-from polarnet.simulation.truth import synthesize
+from polarnet.simulation.truth import Synthesis, synthesize
 from polarnet.stokes import aolp, dolp, parse_mosaic
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
@@ -232,7 +232,7 @@ def test_saturated_pixels_stay_masked_down_to_the_frames(tmp_path):
     manifest = ingest(dataclasses.replace(CONFIG, root=str(tmp_path / "measured")), 1, tmp_path / "images", map)
     share = {entry.origin: entry.masked_fraction for entry in manifest.pictures}
     assert sorted(share.values()) == [0, pytest.approx(64 / (40 * 60), abs=1e-6)]
-    synthesize(tmp_path / "images", tmp_path / "scenes.zarr", tmp_path / "frames.zarr", MOTION, 1, map, 2)
+    synthesize(Synthesis(tmp_path / "images", MOTION, 1, 2), tmp_path / "scenes.zarr", tmp_path / "frames.zarr", map)
     scenes, frames = SceneStore.open(tmp_path / "scenes.zarr"), FrameStore.open(tmp_path / "frames.zarr")
     masked = {name: ~frames.valid(name) for name in frames.sequences}
     (shown,) = (name for name in masked if masked[name].any())
@@ -260,7 +260,7 @@ def test_a_measurement_becomes_a_scene_whose_frames_show_its_polarization(tmp_pa
     # I45 + I90 - I0 - I135 over S0, for 30 degrees: 0.6 (cos 30 + cos 120 - cos 60 - cos 210) / 2 = 0.22
     assert "the angles do not fit: the median of |I0 + I90 - I45 - I135| / S0 is 0.2" in skipped.reason
 
-    synthesize(tmp_path / "images", tmp_path / "scenes.zarr", tmp_path / "frames.zarr", MOTION, 1, map, 2)
+    synthesize(Synthesis(tmp_path / "images", MOTION, 1, 2), tmp_path / "scenes.zarr", tmp_path / "frames.zarr", map)
     frames = FrameStore.open(tmp_path / "frames.zarr")
     assert not frames.masked
     assert frames.dolp(frames.sequences[0]).mean().item() == pytest.approx(0.6, abs=0.005)

@@ -9,8 +9,11 @@ from polarnet.cli import main
 from polarnet.events.streaming import WindowRule
 from polarnet.recordings.source import RecordingError
 from polarnet.recovery.inputs import half_turn_rule, rotation_of
+from polarnet.simulation.camera import Camera
+from polarnet.simulation.motion import resting_trajectory
+from polarnet.simulation.polarizers import Grid
 from polarnet.simulation.presets import SENSORS
-from polarnet.simulation.rotating import RotatingConfig, emulate_rotating, rotating_times_us
+from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.storage.exchange import write_hdf5
 
@@ -22,9 +25,9 @@ def recording(tmp_path):
     """DoLP 0.5 at 60 degrees; the polarizer starts at 20 degrees."""
     maps = (torch.full((HEIGHT, WIDTH), value) for value in (0.9, 0.5, math.pi / 3))
     rotating = RotatingConfig(rate_hz=RATE_HZ, start_angle_deg=START_DEG, extinction_ratio=None, frames_per_turn=720)
-    t_us = rotating_times_us(rotating, SENSORS["default"], 0, 900_000)
     scene = scene_from_polarization(*maps)
-    events = emulate_rotating(scene, None, t_us, HEIGHT, WIDTH, rotating, SENSORS["default"], 1).events
+    camera, size = Camera(SENSORS["default"], key=1), (HEIGHT, WIDTH)
+    events = emulate_rotating(rotating, camera, scene, resting_trajectory(*size), 900_000, Grid(*size))
     write_hdf5(tmp_path / "e.h5", events, 900_000)
     return tmp_path / "e.h5"
 

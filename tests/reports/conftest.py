@@ -15,7 +15,7 @@ from polarnet.pictures.images import write_png
 from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, write_manifest
 from polarnet.reports.artefacts import ReportPaths
 from polarnet.simulation.motion import SynthesizeConfig
-from polarnet.simulation.truth import synthesize
+from polarnet.simulation.truth import Synthesis, synthesize
 from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
@@ -116,7 +116,7 @@ def paths(tmp_path_factory):
         sequences_per_picture=1, duration_s=0.2, frame_rate_hz=30.0, sensor_height=24, sensor_width=36,
         speed_min_px_s=10.0, speed_max_px_s=20.0, acceleration_max_px_s2=800.0, rotation_max_deg=0.0, zoom_max=1.0,
     )  # fmt: skip
-    synthesize(paths.images, paths.scenes, paths.frames, motion, 1, map, 2)
+    synthesize(Synthesis(paths.images, motion, 1, 2), paths.scenes, paths.frames, map)
     frames = FrameStore.open(paths.frames)
     write_events(paths.events, frames)
     run_methods(EventStore.open(paths.events), frames, paths.benchmark)

@@ -6,9 +6,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from event_fixtures import arrays_of
 from scipy import stats
 
-from polarnet.simulation.emulator import MODELS, EmulatorConfig, emulate, emulate_columns
+from polarnet.simulation.emulator import MODELS, EmulatorConfig, emulate
 from polarnet.simulation.presets import SENSORS
 
 QUIET = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
@@ -17,11 +18,11 @@ CHANNEL = SIDE * SIDE
 
 
 def constant(config: EmulatorConfig, dn: float, seconds: float):
-    """Events of 100 x 100 pixels under constant light, with unrounded times."""
+    """Events of 100 x 100 pixels under constant light."""
     t_us = torch.linspace(0, seconds * 1e6, 11, dtype=torch.float64)
     frames = torch.full((1, 1, SIDE, SIDE), dn).expand(len(t_us), -1, -1, -1)
-    (columns,), _ = emulate_columns(frames, t_us, config, key=3, unrounded_times=True)
-    return columns
+    (events,), _ = emulate(frames, t_us, config, key=3)
+    return arrays_of(events)
 
 
 def bars() -> torch.Tensor:
@@ -54,13 +55,13 @@ def test_hot_pixels_have_the_configured_share_and_rate_and_both_polarities():
 def test_a_hot_pixel_is_a_poisson_process():
     columns = constant(dataclasses.replace(QUIET, hot_pixel_share=0.02, hot_pixel_rate_hz=20.0), 100.0, 10.0)
     pixel = columns.y.astype(int) * SIDE + columns.x
-    order = np.lexsort((columns.unrounded_us, pixel))
+    order = np.lexsort((columns.t, pixel))
     following = pixel[order][1:] == pixel[order][:-1]
-    gaps_s = np.diff(columns.unrounded_us[order])[following] * 1e-6
+    gaps_s = np.diff(columns.t[order])[following] * 1e-6
     assert gaps_s.mean() == pytest.approx(1 / 20.0, rel=0.03)
     assert gaps_s.std() == pytest.approx(gaps_s.mean(), rel=0.03)  # an exponential distribution, but for its cut end
     counts = np.bincount(np.unique(pixel, return_inverse=True)[1])
-    assert stats.kstest((columns.unrounded_us % (1 << 16)) / (1 << 16), "uniform").pvalue > 0.001
+    assert stats.kstest((columns.t % (1 << 16)) / (1 << 16), "uniform").pvalue > 0.001
     assert counts.var() == pytest.approx(200, rel=0.35)  # equal to the mean
 
 
@@ -68,7 +69,7 @@ def test_a_hot_pixel_is_a_poisson_process():
 def test_hot_pixels_fire_whatever_the_light_and_the_model(model):
     config = dataclasses.replace(QUIET, hot_pixel_share=0.05, hot_pixel_rate_hz=80.0)
     dark, still = constant(config, 1.0, 0.5), constant(config, 240.0, 0.5)
-    assert np.array_equal(dark.unrounded_us, still.unrounded_us)
+    assert np.array_equal(dark.t, still.t)
     frames, t_us = bars(), 3333 * torch.arange(12)
     moving, _ = emulate(frames, t_us, dataclasses.replace(config, model=model), key=7)
     at_rest, _ = emulate(frames[:1].expand_as(frames), t_us, dataclasses.replace(config, model=model), key=7)
@@ -97,7 +98,7 @@ def test_dead_pixels_are_silent_and_the_others_fire_as_before(model):
 
 def test_all_pixels_dead_leave_no_event_even_of_hot_ones():
     columns = constant(dataclasses.replace(QUIET, hot_pixel_share=1.0, dead_pixel_share=1.0), 100.0, 1.0)
-    assert len(columns.t) == len(columns.unrounded_us) == 0
+    assert len(columns.t) == 0
 
 
 @pytest.mark.parametrize("model", list(MODELS))
@@ -119,9 +120,3 @@ def test_pieces_threads_and_the_order_of_channels_change_no_event(model):
             assert torch.equal(getattr(turned[1 - channel], name), values)
         order = np.lexsort((events.p, events.x, events.y, events.t))
         assert np.array_equal(order, np.arange(len(events)))
-
-
-def test_unrounded_times_stay_with_their_events():
-    config = dataclasses.replace(QUIET, hot_pixel_share=0.1, hot_pixel_rate_hz=500.0)
-    (columns, _), _ = emulate_columns(bars(), 3333 * torch.arange(12), config, key=7, unrounded_times=True)
-    assert np.array_equal(np.floor(columns.unrounded_us), columns.t)

@@ -6,9 +6,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from event_fixtures import arrays_of
 from scipy import stats
 
-from polarnet.simulation.emulator import EmulatorConfig, emulate_columns
+from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.pixels.randomness import mixed, normal, normal_map, rough_normals, uniform
 from polarnet.simulation.presets import SENSORS
 
@@ -16,19 +17,19 @@ QUIET = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, c
 SIDE = 64  # pixels
 
 
-def still(config: EmulatorConfig, dn: float, seconds: float, fps: int, **wanted):
+def still(config: EmulatorConfig, dn: float, seconds: float, fps: int):
     """Events of 64 x 64 pixels that see a constant light."""
     t_us = torch.from_numpy(np.rint(np.arange(round(seconds * fps) + 1) * 1e6 / fps))
     frames = torch.full((1, 1, SIDE, SIDE), dn).expand(len(t_us), -1, -1, -1)
-    (columns,), _ = emulate_columns(frames, t_us, config, key=5, unrounded_times=True, **wanted)
-    return columns
+    (events,), _ = emulate(frames, t_us, config, key=5)
+    return arrays_of(events)
 
 
 def intervals_s(columns) -> tuple[np.ndarray, np.ndarray]:
     """Seconds between successive events of a pixel, and to the first event of each pixel."""
     pixel = columns.y.astype(int) * SIDE + columns.x
-    order = np.lexsort((columns.unrounded_us, pixel))
-    pixel, t_s = pixel[order], columns.unrounded_us[order] * 1e-6
+    order = np.lexsort((columns.t, pixel))
+    pixel, t_s = pixel[order], columns.t[order] * 1e-6
     following = pixel[1:] == pixel[:-1]
     return np.diff(t_s)[following], t_s[np.concatenate([[True], ~following])]
 
@@ -45,7 +46,7 @@ def test_shot_noise_has_the_rate_of_its_light_and_equal_polarities(model, dn):
 def test_shot_noise_of_exact_is_a_poisson_process_at_any_frame_rate():
     config = dataclasses.replace(QUIET, shot_noise_rate_hz=5.0)
     fast, slow = still(config, 0.0, 2.0, 300), still(config, 0.0, 2.0, 10)
-    assert np.array_equal(fast.unrounded_us, slow.unrounded_us)
+    assert np.array_equal(fast.t, slow.t)
     rate = 5.0 * (1 - 0.75 * 20 / 275)
     first = intervals_s(fast)[1]  # of the pixels that fired within two seconds
     law = stats.truncexpon(2.0 * rate, scale=1 / rate)
@@ -56,8 +57,8 @@ def test_rejected_shot_noise_does_not_delay_a_threshold_crossing():
     config = dataclasses.replace(QUIET, shot_noise_rate_hz=40.0)
     t_s = np.arange(101) / 100
     frames = np.float32(50 * 5**t_s).reshape(-1, 1, 1, 1).repeat(SIDE, 2).repeat(SIDE, 3)
-    (columns,), _ = emulate_columns(frames, t_s * 1e6, config, key=5, unrounded_times=True)
-    between, first = intervals_s(columns)
+    (events,), _ = emulate(frames, t_s * 1e6, config, key=5)
+    between, first = intervals_s(arrays_of(events))
     until_crossing_s = config.contrast_threshold_on / math.log(5)  # in log light that rises steadily
     assert max(between.max(), first.max()) == pytest.approx(until_crossing_s, abs=2e-6)
 
@@ -69,10 +70,10 @@ def test_thresholds_tilt_shot_noise_towards_the_lower_one():
     for model in ("v2e", "exact"):
         t_us = 1e4 * torch.arange(201, dtype=torch.float64)
         frames = torch.zeros(1, 1, SIDE, SIDE).expand(201, -1, -1, -1)
-        (columns,), state = emulate_columns(frames, t_us, dataclasses.replace(config, model=model), key=5)
+        (events,), state = emulate(frames, t_us, dataclasses.replace(config, model=model), key=5)
         inverse = 0.2 / state.pixels[0].threshold_on
         expected = 2.5 * (1 - 0.75 * 20 / 275) * 2.0 * inverse.sum()
-        assert (columns.p == 1).sum() == pytest.approx(expected, abs=3 * math.sqrt(expected))
+        assert int((events.p == 1).sum()) == pytest.approx(expected, abs=3 * math.sqrt(expected))
 
 
 @pytest.mark.parametrize("fps", [30, 300])
@@ -110,7 +111,7 @@ def test_leak_of_exact_is_the_same_event_for_event_at_any_frame_rate():
 
 def test_leak_rates_spread_over_pixels_by_a_power_of_ten():
     config = dataclasses.replace(QUIET, leak_rate_hz=1.0, noise_rate_cov_decades=0.1)
-    _, state = emulate_columns(torch.full((1, 1, 100, 100), 9.0), torch.tensor([0]), config, key=5)
+    _, state = emulate(torch.full((1, 1, 100, 100), 9.0), torch.tensor([0]), config, key=5)
     decades = np.log10(state.pixels[0].leak_nominal / (1e-6 * 0.2))
     assert decades.mean() == pytest.approx(0, abs=3 * 0.1 / 100)
     assert decades.std() == pytest.approx(0.1, abs=3 * 0.1 / math.sqrt(2) / 100)

@@ -8,13 +8,14 @@ import torch
 from skimage import data
 
 from polarnet.events.stream import validate
+from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import emulate
-from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory, render
-from polarnet.simulation.moving_sensor import emulate_motion, emulate_motion_steps, emulation_times_us
+from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory, render, resting_trajectory
+from polarnet.simulation.moving_sensor import emulate_motion, emulate_motion_steps
 from polarnet.simulation.pixels.light import intensity_rows
-from polarnet.simulation.polarizers import IDEAL, analyzers
+from polarnet.simulation.polarizers import IDEAL, weights_of
 from polarnet.simulation.presets import SENSORS
-from polarnet.simulation.rendering import check_inside, lights_of_drift, render_intensities, render_times_us
+from polarnet.simulation.rendering import channel_light, check_inside, lights_of_drift, render_times_us
 from polarnet.simulation.scene import scene_from_rgb
 from polarnet.stokes import intensities_from_stokes
 
@@ -55,7 +56,7 @@ def test_a_drifting_sensor_sees_what_render_sees(scene):
     t_us = times_us()
     expected = 255 * intensities_from_stokes(render(scene, trajectory(), t_us * 1e-6, H, W))
     pose = trajectory().pose(t_us * 1e-6)
-    for polarizer, light in enumerate(lights_of_drift(scene, pose, H, W, analyzers(IDEAL))):
+    for polarizer, light in enumerate(lights_of_drift(scene, pose, H, W, weights_of(IDEAL, H, W, 0))):
         rendered = np.empty((len(t_us), H * W), np.float32)
         for k in range(len(t_us)):
             intensity_rows(light, k, 0, W, rendered[k])
@@ -64,8 +65,9 @@ def test_a_drifting_sensor_sees_what_render_sees(scene):
 
 def test_a_turning_sensor_sees_what_render_sees_with_polarizers_that_turn_along(scene):
     t_us, turning = times_us(31), trajectory(roll=0.3, zoom=0.2)
-    expected = 255 * intensities_from_stokes(render(scene, turning, t_us * 1e-6, H, W)).transpose(0, 1).numpy()
-    light = render_intensities(scene, turning.pose(t_us * 1e-6), H, W, analyzers(IDEAL))
+    stokes = render(scene, turning, t_us * 1e-6, H, W)
+    expected = 255 * intensities_from_stokes(stokes).transpose(0, 1).numpy()
+    light = channel_light(stokes.transpose(0, 1).numpy(), IDEAL, weights_of(IDEAL, H, W, 0))
     assert light == pytest.approx(np.maximum(expected, 0), abs=255e-5)
 
 
@@ -77,7 +79,7 @@ def test_events_are_those_of_the_rendered_clip(scene, model, turning):
     if model == "v2e":
         frames = (frames + 0.5).to(torch.uint8)
     expected, _ = emulate(frames, torch.from_numpy(times_us()), config, key=5)
-    events, _ = emulate_motion_steps(scene, path, times_us(), H, W, config, key=5, state=None)
+    events, _ = emulate_motion_steps(Camera(config, key=5), scene, path, times_us(), (H, W))
     for ours, theirs in zip(events, expected, strict=True):
         validate(ours)
         assert len(theirs) > 1000
@@ -91,12 +93,13 @@ def test_events_are_those_of_the_rendered_clip(scene, model, turning):
 @pytest.mark.parametrize("turning", [False, True])
 def test_a_sequence_in_pieces_or_on_two_threads_has_the_same_bytes(scene, model, turning):
     path, config = trajectory(roll=0.3 * turning, zoom=0.2 * turning), dataclasses.replace(CONFIG, model=model)
-    whole = emulate_motion(scene, path, 200_000, H, W, config, key=5)
-    threaded = emulate_motion(scene, path, 200_000, H, W, config, key=5, threads=2)
+    camera = Camera(config, key=5)
+    whole = emulate_motion(camera, scene, path, 200_000, (H, W))
+    threaded = emulate_motion(camera, scene, path, 200_000, (H, W), threads=2)
     assert all(same(a, b) for a, b in zip(whole, threaded, strict=True))
-    t_us, state, pieces = emulation_times_us(path, 200_000, H, W, config), None, []
+    t_us, state, pieces = render_times_us(path, 200_000, H, W, config), None, []
     for first in range(0, len(t_us), 23):
-        events, state = emulate_motion_steps(scene, path, t_us[first : first + 23], H, W, config, 5, state)
+        events, state = emulate_motion_steps(camera, scene, path, t_us[first : first + 23], (H, W), state)
         pieces.append(events)
     for polarizer in range(4):
         for name in ("t", "x", "y", "p"):
@@ -105,17 +108,17 @@ def test_a_sequence_in_pieces_or_on_two_threads_has_the_same_bytes(scene, model,
 
 
 def test_v2e_renders_at_regular_times():
-    t_us = emulation_times_us(trajectory(), 100_000, H, W, dataclasses.replace(CONFIG, model="v2e"))
+    t_us = render_times_us(trajectory(), 100_000, H, W, dataclasses.replace(CONFIG, model="v2e"))
     assert t_us.tolist() == [round(k * 1e6 / 300) for k in range(31)]
 
 
 def test_a_rate_that_does_not_divide_the_duration_ends_with_it():
     config = dataclasses.replace(CONFIG, model="v2e", render_rate_hz=100.0)
-    assert emulation_times_us(trajectory(), 25_000, H, W, config).tolist() == [0, 10_000, 20_000, 25_000]
+    assert render_times_us(trajectory(), 25_000, H, W, config).tolist() == [0, 10_000, 20_000, 25_000]
 
 
 def test_exact_renders_as_often_but_when_pixels_meet():
-    t_us = emulation_times_us(trajectory(), 200_000, H, W, CONFIG)
+    t_us = render_times_us(trajectory(), 200_000, H, W, CONFIG)
     assert len(t_us) == 61
     assert (t_us[0], t_us[-1]) == (0, 200_000)
     assert abs(t_us - times_us()).max() <= 1e6 / 300 / 2
@@ -129,7 +132,7 @@ def test_exact_renders_as_often_but_when_pixels_meet():
 def test_the_second_frame_moves_to_a_crossing_nearby():
     """4 sin(10 t) from 59.5 - 15.5 = 44 columns on: the next column is reached after 25 ms, frames are 20 ms apart."""
     drift = Trajectory(59.5, 40.5, (Sine(4.0, 10.0, 0.0),), (STILL,), STILL, STILL, speed_px_s=40.0)
-    t_us = render_times_us(drift, 100_000, H, W, 50.0, regular=False)
+    t_us = render_times_us(drift, 100_000, H, W, dataclasses.replace(CONFIG, render_rate_hz=50.0))
     crossing_us = 1e6 * np.arcsin(1 / 4) / 10
     assert t_us.tolist()[:2] == pytest.approx([0, crossing_us], abs=10)
 
@@ -139,7 +142,7 @@ def test_an_adaptive_rate_takes_steps_of_at_most_a_pixel(model):
     config = dataclasses.replace(CONFIG, model=model, render_rate_hz=None)
     path = trajectory(roll=0.3, zoom=0.2, speed=250.0)
     for motion in (path, trajectory()):
-        t_us = emulation_times_us(motion, 500_000, H, W, config)
+        t_us = render_times_us(motion, 500_000, H, W, config)
         pose = motion.pose(t_us * 1e-6)
         corner = np.hypot(H - 1, W - 1) / 2
         moved = np.hypot(np.diff(pose.x), np.diff(pose.y)) * pose.zoom[1:]
@@ -149,15 +152,14 @@ def test_an_adaptive_rate_takes_steps_of_at_most_a_pixel(model):
 
 
 def test_a_sensor_that_stands_still_is_rendered_thirty_times_a_second():
-    still = Trajectory(60.0, 40.0, (STILL,) * HARMONICS, (STILL,) * HARMONICS, STILL, STILL, speed_px_s=0.0)
-    t_us = emulation_times_us(still, 1_000_000, H, W, dataclasses.replace(CONFIG, render_rate_hz=None))
+    t_us = render_times_us(resting_trajectory(H, W), 1_000_000, H, W, dataclasses.replace(CONFIG, render_rate_hz=None))
     assert np.diff(t_us) == pytest.approx(1e6 / 30, abs=1)
 
 
 def test_a_sensor_that_leaves_the_scene_is_refused_with_its_place(scene):
     far = dataclasses.replace(trajectory(), x=100.0)
     with pytest.raises(ValueError, match=r"reaches rows .* of a scene of 80x120; use a trajectory made for this scene"):
-        emulate_motion(scene, far, 200_000, H, W, CONFIG, key=5)
+        emulate_motion(Camera(CONFIG), scene, far, 200_000, (H, W))
 
 
 def test_a_sensor_as_large_as_the_scene_fits_into_it(scene):
@@ -175,7 +177,7 @@ def test_exact_needs_few_frames_for_the_times_of_many(scene):
         refractory_period_us=0.0,
     )  # fmt: skip
     many, few = (
-        emulate_motion(scene, trajectory(), 200_000, H, W, dataclasses.replace(config, render_rate_hz=rate), key=5)
+        emulate_motion(Camera(dataclasses.replace(config, render_rate_hz=rate)), scene, trajectory(), 200_000, (H, W))
         for rate in (4800.0, 300.0)
     )
     errors = []

@@ -67,9 +67,11 @@ def test_a_pixel_model_is_drawn_among_names_as_often_as_each_stands_in_the_list(
     assert drawn.count("exact") + drawn.count("dvs_voltmeter") == 400
 
 
-def test_without_ranges_the_camera_stays_itself():
+def test_without_ranges_only_the_key_of_the_noise_is_drawn():
     camera = Camera(SENSOR)
-    assert camera.drawn(1, "a") is camera
+    drawn = camera.drawn(1, "a")
+    assert drawn == Camera(SENSOR, key=drawn.key)
+    assert len({drawn.key, camera.drawn(2, "a").key, camera.drawn(1, "b").key}) == 3
     assert camera.draws(1, "a") == {}
 
 

@@ -6,85 +6,88 @@ import pytest
 import torch
 
 from polarnet.config.tree import load
-from polarnet.simulation.motion import Sine, Trajectory
+from polarnet.simulation.camera import Camera
+from polarnet.simulation.emulator import emulate
+from polarnet.simulation.motion import Sine, Trajectory, resting_trajectory
+from polarnet.simulation.polarizers import Grid
 from polarnet.simulation.presets import SENSORS
-from polarnet.simulation.rotating import (
-    RotatingConfig,
-    behind_rotating_polarizer,
-    emulate_rotating,
-    emulate_rotating_scenes,
-    rotating_times_us,
-)
+from polarnet.simulation.rendering import behind_polarizers, render_times_us
+from polarnet.simulation.rotating import RotatingConfig, emulate_rotating, emulate_rotating_scenes
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import Contents
 from polarnet.storage.scenes import Scene, SceneStore
 
 ROTATING = RotatingConfig(rate_hz=2.0, start_angle_deg=0.0, extinction_ratio=None, frames_per_turn=720)
+STILL = Sine(0.0, 0.0, 0.0)
 
 
 def uniform_scene(s0=0.8, dolp=0.5, aolp=0.0, height=4, width=6):
     return scene_from_polarization(*(torch.full((height, width), value) for value in (s0, dolp, aolp)))
 
 
-def columns(events):
-    return [getattr(events, name).tolist() for name in ("t", "x", "y", "p")]
+def still_events(sensor, scene, duration_us, rotating=ROTATING, height=4, width=6):
+    path = resting_trajectory(height, width)
+    return emulate_rotating(rotating, Camera(sensor, key=1), scene, path, duration_us, Grid(height, width))
+
+
+def light_at(times_s, rotating, scene):
+    stokes = scene.stokes.numpy()[:, None].repeat(len(times_s), axis=1)
+    return (
+        behind_polarizers(stokes, rotating.weights(np.rint(1e6 * np.array(times_s)).astype(np.int64)))[0, :, 0, 0] / 255
+    )
 
 
 def test_malus_law_along_at_45_degrees_and_across_the_axis():
-    stokes = uniform_scene(1.0, 1.0, math.radians(30)).stokes.expand(3, -1, -1, -1)
-    light = behind_rotating_polarizer(stokes, np.radians([30.0, 75.0, 120.0]), None)
-    assert light[:, 0, 0].tolist() == pytest.approx([1.0, 0.5, 0.0], abs=1e-6)
+    rotating = replace(ROTATING, rate_hz=0.125, start_angle_deg=30.0)  # 45 degrees a second
+    light = light_at([0, 1, 2], rotating, uniform_scene(1.0, 1.0, math.radians(30)))
+    assert light == pytest.approx([1.0, 0.5, 0.0], abs=1e-6)
 
 
 def test_a_100_to_1_film_shows_99_of_101_parts_of_full_polarization():
-    stokes = uniform_scene(1.0, 1.0).stokes.expand(2, -1, -1, -1)
-    along, across = behind_rotating_polarizer(stokes, np.radians([0.0, 90.0]), 100.0)[:, 0, 0].tolist()
+    along, across = light_at([0, 1], replace(ROTATING, rate_hz=0.25, extinction_ratio=100.0), uniform_scene(1.0, 1.0))
     assert (along - across) / (along + across) == pytest.approx(99 / 101, abs=1e-6)
 
 
 def test_unpolarized_light_fires_nothing_behind_a_rotating_polarizer():
-    t_us = rotating_times_us(ROTATING, SENSORS["clean"], 0, 1_000_000)
-    assert len(emulate_rotating(uniform_scene(dolp=0.0), None, t_us, 4, 6, ROTATING, SENSORS["clean"], 1).events) == 0
+    assert len(still_events(SENSORS["clean"], uniform_scene(dolp=0.0), 1_000_000)) == 0
 
 
 def test_dolp_one_half_fires_three_events_down_from_its_mean_and_five_on_each_way_between_its_extremes():
     """ln(1 + 0.5 cos x) falls from 0 to -0.693 and rises to 0.405; thresholds of 0.2 lie at -0.6 and 0.4."""
     sensor = replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
     rotating = replace(ROTATING, start_angle_deg=45.0)
-    t_us = rotating_times_us(rotating, sensor, 0, 450_000)  # a little less than one turn, two periods of the light
-    p = emulate_rotating(uniform_scene(), None, t_us, 1, 1, rotating, sensor, 1).events.p.tolist()
-    assert p == [-1] * 3 + [1] * 5 + [-1] * 5 + [1] * 5
+    events = still_events(sensor, uniform_scene(), 450_000, rotating, 1, 1)  # almost a turn, two periods of the light
+    assert events.p.tolist() == [-1] * 3 + [1] * 5 + [-1] * 5 + [1] * 5
 
 
-def test_a_span_in_pieces_gives_the_events_of_the_whole_span():
-    sensor, scene = SENSORS["noisy"], uniform_scene()
-    t_us = rotating_times_us(ROTATING, sensor, 0, 300_000)
-    whole = emulate_rotating(scene, None, t_us, 4, 6, ROTATING, sensor, 3).events
-    first = emulate_rotating(scene, None, t_us[:150], 4, 6, ROTATING, sensor, 3)
-    second = emulate_rotating(scene, None, t_us[150:], 4, 6, ROTATING, sensor, 3, first.state)
-    pieces = [a + b for a, b in zip(columns(first.events), columns(second.events), strict=True)]
-    assert pieces == columns(whole)
+def test_v2e_sees_eight_bits_of_the_light():
+    sensor, scene = replace(SENSORS["clean"], model="v2e"), uniform_scene(0.1, 0.5)
+    t_us = render_times_us(resting_trajectory(4, 6), 200_000, 4, 6, sensor, 1440.0)
+    light = behind_polarizers(scene.stokes.numpy()[:, None].repeat(len(t_us), axis=1), ROTATING.weights(t_us))
+    (expected,), _ = emulate((light[0, :, None] + 0.5).astype(np.uint8), t_us, sensor, key=1)
+    events = still_events(sensor, scene, 200_000)
+    assert len(events) > 100
+    assert all(torch.equal(getattr(events, name), getattr(expected, name)) for name in "txyp")
 
 
-def test_light_is_rendered_as_often_as_the_polarizer_and_the_sensor_need():
-    slow = RotatingConfig(rate_hz=-0.1, start_angle_deg=0.0, extinction_ratio=None, frames_per_turn=720)
-    assert len(rotating_times_us(slow, SENSORS["clean"], 0, 1_000_000)) == 301  # render_rate_hz is 300
-    assert len(rotating_times_us(ROTATING, SENSORS["clean"], 0, 1_000_000)) == 1441
+def test_light_is_rendered_as_often_as_the_polarizer_the_sensor_and_the_motion_need():
+    def times(rotation_hz, path, **changes):
+        return render_times_us(path, 1_000_000, 4, 6, replace(SENSORS["clean"], **changes), rotation_hz)
+
+    rest = resting_trajectory(4, 6)
+    moving = Trajectory(600.0, 20.0, (Sine(500.0, 4.0, 0.0),), (STILL,), STILL, STILL, 2000.0)
+    assert len(times(72.0, rest)) == 301  # render_rate_hz is 300
+    assert len(times(1440.0, rest)) == 1441
+    assert len(times(72.0, rest, render_rate_hz=None)) == pytest.approx(73, abs=1)
+    adaptive = times(72.0, moving, render_rate_hz=None)
+    assert np.abs(np.diff(moving.pose(adaptive * 1e-6).x)).max() < 1.01  # a pixel a step
+    assert np.diff(adaptive).max() <= 1e6 / 72 + 1
 
 
-def test_a_resting_trajectory_equals_none_and_leaving_the_scene_is_refused():
-    still, sensor = Sine(0.0, 0.0, 0.0), SENSORS["clean"]
-    t_us = rotating_times_us(ROTATING, sensor, 0, 100_000)
-    rest = Trajectory(2.5, 1.5, (still,), (still,), still, still, 0.0)
-    with_rest, without = (
-        emulate_rotating(uniform_scene(), path, t_us, 4, 6, ROTATING, sensor, 1).events for path in (rest, None)
-    )
-    assert columns(with_rest) == columns(without)
+def test_leaving_the_scene_is_refused():
     with pytest.raises(ValueError, match="reaches rows"):
-        emulate_rotating(uniform_scene(), replace(rest, x=9.0), t_us, 4, 6, ROTATING, sensor, 1)
-    with pytest.raises(ValueError, match="exceeds the scene"):
-        emulate_rotating(uniform_scene(), None, t_us, 5, 6, ROTATING, sensor, 1)
+        still_events(SENSORS["clean"], uniform_scene(), 100_000, height=5)
 
 
 def test_a_rate_of_0_is_refused():
@@ -100,8 +103,7 @@ def test_only_test_sequences_are_stored_and_a_second_run_keeps_the_store(project
         tmp_path / "scenes.zarr", Contents({"lake-00": "train", "wood-00": "test"}, {"layout": "four_sensors"}), names,
         largest_picture=(20, 30), sensor=(6, 8), trajectory_names=Trajectory.vector_names(),
     )  # fmt: skip
-    still = Sine(0.0, 0.0, 0.0)
-    trajectory = Trajectory(12.0, 10.0, (Sine(2.0, 5.0, 0.0), still, still), (still, still, still), still, still, 10.0)
+    trajectory = Trajectory(12.0, 10.0, (Sine(2.0, 5.0, 0.0), STILL, STILL), (STILL,) * 3, STILL, STILL, 10.0)
     maps = torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(1))
     for name in names:
         store.write(name, Scene(maps[0], maps[1], 3 * maps[2]), trajectory.to_vector(), 100_000)

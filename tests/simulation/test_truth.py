@@ -26,7 +26,7 @@ from polarnet.simulation.motion import (
 )
 from polarnet.simulation.polarizers import grid
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
-from polarnet.simulation.truth import frames_of, synthesize, valid_frames
+from polarnet.simulation.truth import Synthesis, frames_of, synthesize, valid_frames
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
@@ -80,7 +80,7 @@ def images(tmp_path_factory) -> Path:
 
 
 def run(images: Path, folder: Path, config: SynthesizeConfig = CONFIG, mapper=map) -> tuple[SceneStore, FrameStore]:
-    synthesize(images, folder / "scenes.zarr", folder / "frames.zarr", config, 1, mapper, SEQUENCES_PER_PART)
+    synthesize(Synthesis(images, config, 1, SEQUENCES_PER_PART), folder / "scenes.zarr", folder / "frames.zarr", mapper)
     return SceneStore.open(folder / "scenes.zarr"), FrameStore.open(folder / "frames.zarr")
 
 
@@ -104,7 +104,7 @@ def test_every_picture_gets_its_sequences_and_all_of_them_its_split(stores):
 def test_each_training_sequence_over_a_variant_names_its_picture(images, stores, tmp_path, project_root):
     variation = dataclasses.replace(load(project_root).variation, scenes_per_picture=1)
     paths = tmp_path / "scenes.zarr", tmp_path / "frames.zarr"
-    synthesize(images, *paths, CONFIG, 1, map, SEQUENCES_PER_PART, variation)
+    synthesize(Synthesis(images, CONFIG, 1, SEQUENCES_PER_PART, variation), *paths, map)
     scenes, frames = SceneStore.open(paths[0]), FrameStore.open(paths[1])
     assert frames.variant_of == scenes.variant_of
     assert sorted(scenes.variant_of.values()) == sorted(
@@ -130,7 +130,7 @@ def test_variants_of_photographs_are_mirrored_and_those_of_measured_scenes_are_n
             load(project_root).variation, scenes_per_picture=1, mirrored_share=mirrored_share
         )
         paths = [tmp_path / f"{kind}-{mirrored_share}.zarr" for kind in ("scenes", "frames")]
-        synthesize(folder, *paths, CONFIG, 1, map, SEQUENCES_PER_PART, variation)
+        synthesize(Synthesis(folder, CONFIG, 1, SEQUENCES_PER_PART, variation), *paths, map)
         store = SceneStore.open(paths[0])
         return {entry.name: store.read(f"{entry.name}-variant01-00").dolp for entry in (first, second)}
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from polarnet.clips import simulate_video
 from polarnet.clips import video as video_module
 from polarnet.clips.video import moving_pieces, video_pieces
 from polarnet.events.stream import concatenate
@@ -18,7 +19,6 @@ from polarnet.simulation import (
     PolarizationScene,
     emulate,
     simulate,
-    simulate_video,
 )
 from polarnet.simulation.scene import check_scene, scene_from_polarization, scene_from_rgb
 from polarnet.simulation.upsampling import StokesFrame, upsampled

@@ -6,9 +6,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from event_fixtures import arrays_of
 from scipy import stats
 
-from polarnet.simulation.emulator import emulate_columns
+from polarnet.simulation.emulator import emulate
 from polarnet.simulation.pixels.voltmeter import CAMERAS, chance_of_on
 from polarnet.simulation.presets import SENSORS
 
@@ -30,12 +31,13 @@ def first_events(before: float, after: float, dt_us: int, camera: str) -> tuple[
     """Microseconds and polarity of the first event of each of 2500 pixels in one long step."""
     frames = torch.tensor([before, after]).view(2, 1, 1, 1).expand(-1, -1, SIDE, SIDE)
     config = dataclasses.replace(CONFIG, voltmeter_camera=camera)
-    (columns,), _ = emulate_columns(frames, torch.tensor([0, dt_us]), config, key=11, unrounded_times=True)
+    (events,), _ = emulate(frames, torch.tensor([0, dt_us]), config, key=11)
+    columns = arrays_of(events)
     pixel = columns.y.astype(int) * SIDE + columns.x
-    firsts = np.unique(pixel[np.argsort(columns.unrounded_us, kind="stable")], return_index=True)
+    firsts = np.unique(pixel[np.argsort(columns.t, kind="stable")], return_index=True)
     assert len(firsts[0]) == SIDE**2
-    order = np.argsort(columns.unrounded_us, kind="stable")[firsts[1]]
-    return columns.unrounded_us[order], columns.p[order]
+    order = np.argsort(columns.t, kind="stable")[firsts[1]]
+    return columns.t[order], columns.p[order]
 
 
 @pytest.mark.parametrize(
@@ -67,6 +69,6 @@ def test_a_still_bright_scene_leaks_on_events_at_the_rate_of_its_light():
     # k4 + k5 * 200 = 1.1e-6 thresholds per microsecond: 1.1 ON events a second
     frames = torch.full((1, 1, SIDE, SIDE), 200.0).expand(91, -1, -1, -1)
     t_us = torch.from_numpy(np.rint(np.arange(91) * 1e6 / 30))
-    (columns,), _ = emulate_columns(frames, t_us, CONFIG, key=11)
-    assert (columns.p == 1).mean() > 0.99
-    assert len(columns.t) == pytest.approx(1.1 * 3 * SIDE**2, rel=0.12)  # an event may be under way at both ends
+    (events,), _ = emulate(frames, t_us, CONFIG, key=11)
+    assert (events.p == 1).float().mean() > 0.99
+    assert len(events) == pytest.approx(1.1 * 3 * SIDE**2, rel=0.12)  # an event may be under way at both ends

@@ -10,37 +10,23 @@ from polarnet.simulation.compilation import compiled, inlined
 class Active(NamedTuple):
     """One entry per pixel that may fire. Times are float64, in microseconds since the start of the step."""
 
-    pixel: np.ndarray
-    """int32, index into the channel"""
-    scratch: np.ndarray
-    """int32, working memory"""
-    change: np.ndarray
-    """float64, log intensity since the last event, at time `now`"""
-    now: np.ndarray
-    """time up to which the pixel has been followed"""
-    slope: np.ndarray
-    """float64, log intensity per microsecond from the light alone"""
-    last_event: np.ndarray
-    """time of the last event"""
-    next_change: np.ndarray
-    """float64, change right after this round's event, or `change` if there is none"""
-    next_now: np.ndarray
-    """time of this round's event, or `now` if there is none"""
-    final_change: np.ndarray
-    """float64, change at the end of the step if no event follows"""
-    event: np.ndarray
-    """int64, this round's event as `columns.event_of` encodes it"""
+    pixel: np.ndarray  # int32, index into the channel
+    scratch: np.ndarray  # int32, working memory
+    change: np.ndarray  # float64, log intensity since the last event, at time `now`
+    now: np.ndarray  # time up to which the pixel has been followed
+    slope: np.ndarray  # float64, log intensity per microsecond from the light alone
+    last_event: np.ndarray  # time of the last event
+    next_change: np.ndarray  # float64, change right after this round's event, or `change` if there is none
+    next_now: np.ndarray  # time of this round's event, or `now` if there is none
+    final_change: np.ndarray  # float64, change at the end of the step if no event follows
+    event: np.ndarray  # int64, this round's event as `columns.event_of` encodes it
     threshold_on: np.ndarray
     threshold_off: np.ndarray
-    leak: np.ndarray
-    """float32, log intensity per microsecond until the next event"""
+    leak: np.ndarray  # float32, log intensity per microsecond until the next event
     leak_nominal: np.ndarray
-    events: np.ndarray
-    """int32, number of events so far"""
-    fires: np.ndarray
-    """uint8, 1 if the pixel fires in this round"""
-    continues: np.ndarray
-    """uint8, 1 if the pixel may fire in the next round"""
+    events: np.ndarray  # int32, number of events so far
+    fires: np.ndarray  # uint8, 1 if the pixel fires in this round
+    continues: np.ndarray  # uint8, 1 if the pixel may fire in the next round
 
 
 @compiled

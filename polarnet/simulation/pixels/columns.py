@@ -1,43 +1,43 @@
-"""Growing columns for the events of one channel, and the order (t, y, x, p) of events."""
+"""Events of one channel as growing columns, and those of one step, brought into the order (t, y, x, p).
 
+The kernels collect the events of a step pixel by pixel, each as one integer (`event_of`), with its time in whole
+microseconds since the step's start.
+"""
+
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from polarnet.simulation.compilation import compiled, inlined
 
-TIME_SHIFT, ROW_SHIFT, COLUMN_SHIFT = np.int64(31), np.int64(16), np.int64(1)
+TIME_SHIFT, ROW_SHIFT, COLUMN_SHIFT, PLACE_MASK = np.int64(31), np.int64(16), np.int64(1), np.int64(0x7FFF)
+EVENT_BYTES = 8 + 2 + 2 + 1
+MAX_BUCKETS = 4096  # buckets of the counting sort; a step shorter than 4096 us has one bucket per microsecond
 
 
 class Columns(NamedTuple):
-    """Events of one channel, one array per field. `unrounded_us` is empty unless requested."""
+    """Events of one channel, one array per field."""
 
-    t: np.ndarray
-    """int64, microseconds"""
-    x: np.ndarray
-    """int16, column"""
-    y: np.ndarray
-    """int16, row"""
-    p: np.ndarray
-    """int8, +1 or -1"""
-    unrounded_us: np.ndarray
-    """float64, microseconds before rounding to t"""
+    t: np.ndarray  # int64, microseconds
+    x: np.ndarray  # int16, column
+    y: np.ndarray  # int16, row
+    p: np.ndarray  # int8, +1 or -1
 
 
-EVENT_BYTES = 8 + 2 + 2 + 1
+class Pending(NamedTuple):
+    """Events of one step in any order."""
+
+    events: np.ndarray  # int64, see `event_of`
+    in_order: np.ndarray  # int64, scratch
 
 
-def empty_columns(capacity: int, unrounded_times: bool) -> Columns:
+def empty_columns(capacity: int) -> Columns:
     """Uninitialised arrays for up to `capacity` events of a channel."""
     # One allocation for all four: the system gives large blocks as huge pages, which costs far fewer page faults.
     block = np.empty(capacity * EVENT_BYTES, np.uint8)
-    return Columns(
-        block[: 8 * capacity].view(np.int64),
-        block[8 * capacity : 10 * capacity].view(np.int16),
-        block[10 * capacity : 12 * capacity].view(np.int16),
-        block[12 * capacity :].view(np.int8),
-        np.empty(capacity if unrounded_times else 0, np.float64),
-    )
+    t, x, y, p = np.split(block, [8 * capacity, 10 * capacity, 12 * capacity])
+    return Columns(t.view(np.int64), x.view(np.int16), y.view(np.int16), p.view(np.int8))
 
 
 def trimmed(columns: Columns, count: int) -> Columns:
@@ -46,7 +46,7 @@ def trimmed(columns: Columns, count: int) -> Columns:
 
 
 @compiled
-def _grown_column(column, used, capacity):
+def _grown(column, used, capacity):
     larger = np.empty(capacity, column.dtype)
     larger[:used] = column[:used]
     return larger
@@ -59,12 +59,24 @@ def with_room(columns, used, more):
         return columns
     capacity = max(2 * columns.t.size, used + more)
     return Columns(
-        _grown_column(columns.t, used, capacity),
-        _grown_column(columns.x, used, capacity),
-        _grown_column(columns.y, used, capacity),
-        _grown_column(columns.p, used, capacity),
-        _grown_column(columns.unrounded_us, used, capacity) if columns.unrounded_us.size else columns.unrounded_us,
+        _grown(columns.t, used, capacity),
+        _grown(columns.x, used, capacity),
+        _grown(columns.y, used, capacity),
+        _grown(columns.p, used, capacity),
     )
+
+
+@compiled
+def pending_events(capacity):
+    """Uninitialised arrays for up to `capacity` events of a step."""
+    return Pending(np.empty(capacity, np.int64), np.empty(capacity, np.int64))
+
+
+@compiled
+def roomier(pending):
+    """The same pending events with room for twice as many."""
+    n = pending.events.size
+    return Pending(_grown(pending.events, n, 2 * n), np.empty(2 * n, np.int64))
 
 
 @inlined
@@ -83,6 +95,38 @@ def event_of(offset_us, place, on):
 
 
 @compiled
+def write_in_order(pending, n, start_us, stop_us, columns, used):
+    """Append the n pending events of a step to the first `used` of the columns, in the order (t, y, x, p).
+
+    Returns the columns, enlarged where necessary, and the new number of events.
+    """
+    base_us = np.int64(math.floor(start_us))
+    columns = with_room(columns, used, n)
+    _sort(pending.events[:n], np.int64(math.ceil(stop_us)) - base_us, pending.in_order[:n])
+    t, x, y, p = columns.t[used : used + n], columns.x[used:], columns.y[used:], columns.p[used:]
+    for i in range(n):
+        event = pending.in_order[i]
+        t[i] = base_us + (event >> TIME_SHIFT)
+        x[i] = event >> COLUMN_SHIFT & PLACE_MASK
+        y[i] = event >> ROW_SHIFT & PLACE_MASK
+        p[i] = (event & np.int64(1)) * np.int64(2) - np.int64(1)
+    # a step that does not start at a whole microsecond can share one with the step before it
+    tied = first_tied(columns, used, used + n)
+    if tied < used:
+        sort_ties(columns, tied, used + n)
+    return columns, used + n
+
+
+@compiled
+def first_tied(columns, used, stop):
+    """Index of the first event that is not before event `used`; `used` itself if no event was added up to `stop`."""
+    tied = used
+    while stop > used and tied > 0 and columns.t[tied - 1] >= columns.t[used]:
+        tied -= 1
+    return tied
+
+
+@compiled
 def sort_ties(columns, start, stop):
     """Sort the events from `start` up to `stop` by (t, y, x, p), in place."""
     events = np.empty(stop - start, np.int64)
@@ -92,5 +136,29 @@ def sort_ties(columns, start, stop):
     order = start + np.argsort(events, kind="mergesort")
     columns.t[start:stop], columns.x[start:stop] = columns.t[order], columns.x[order]
     columns.y[start:stop], columns.p[start:stop] = columns.y[order], columns.p[order]
-    if columns.unrounded_us.size:
-        columns.unrounded_us[start:stop] = columns.unrounded_us[order]
+
+
+@compiled
+def _sort(events, longest_us, in_order):
+    """Sort `events` into `in_order`: by counting over buckets of time, then by insertion within each bucket."""
+    shift = TIME_SHIFT
+    while longest_us >> (shift - TIME_SHIFT) >= MAX_BUCKETS:
+        shift += 1
+    starts = np.zeros((longest_us >> (shift - TIME_SHIFT)) + 2, np.int32)
+    for i in range(events.size):
+        starts[np.uint64((events[i] >> shift) + 1)] += 1  # unsigned: numba checks other indices for being negative
+    total = np.int32(0)
+    for b in range(starts.size):
+        total += starts[b]
+        starts[b] = total
+    for i in range(events.size):
+        bucket = np.uint64(events[i] >> shift)
+        in_order[np.uint64(starts[bucket])] = events[i]
+        starts[bucket] += 1
+    for i in range(1, events.size):
+        event, j = in_order[np.uint64(i)], i
+        if in_order[np.uint64(i - 1)] > event:
+            while j > 0 and in_order[j - 1] > event:
+                in_order[j] = in_order[j - 1]
+                j -= 1
+            in_order[j] = event

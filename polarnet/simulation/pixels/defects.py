@@ -37,13 +37,10 @@ class DefectsConfig:
 class Defects(NamedTuple):
     """Defective pixels of a channel."""
 
-    hot: np.ndarray
-    """int64, indices of the hot pixels, rising."""
-    silent: np.ndarray
-    """bool [h * w], whether a pixel's own events are dropped."""
+    hot: np.ndarray  # int64, indices of the hot pixels, rising
+    silent: np.ndarray  # bool [h * w], whether a pixel's own events are dropped
     rate_hz: float
-    key: np.uint64
-    """Seed of all noise of the sensor."""
+    key: np.uint64  # seed of all noise of the sensor
     channel: int
 
 
@@ -72,23 +69,18 @@ def with_defects(
     start_us: float,
     stop_us: float,
     rounds_up: bool,
-    unrounded_times: bool,
 ) -> Columns:
     """The events of a channel without those of its defective pixels and with hot events, in the order (t, y, x, p).
 
     Hot pixels fire at times start <= t < stop, rounded down to whole microseconds, or up if `rounds_up`.
     """
     expected = len(defects.hot) * defects.rate_hz * 1e-6 * (stop_us - start_us)
-    room = empty_columns(16 + int(1.5 * expected), unrounded_times=True)
+    room = empty_columns(16 + int(1.5 * expected))
     hot = trimmed(*_hot_events(defects, width, start_us, stop_us, rounds_up, room))
     in_order = np.lexsort((hot.p, hot.x, hot.y, hot.t))
     hot = Columns(*(column[in_order] for column in hot))
     order = _merged_order(columns, hot, defects.silent, width)
-    t, x, y, p = (np.concatenate(pair)[order] for pair in zip(columns[:4], hot[:4], strict=True))
-    return Columns(
-        t, x, y, p,
-        np.concatenate([columns.unrounded_us, hot.unrounded_us])[order] if unrounded_times else columns.unrounded_us,
-    )  # fmt: skip
+    return Columns(*(np.concatenate(pair)[order] for pair in zip(columns, hot, strict=True)))
 
 
 @compiled
@@ -112,7 +104,6 @@ def _hot_events(defects, width, start_us, stop_us, rounds_up, columns):
                 columns.t[used] = math.ceil(time_us) if rounds_up else math.floor(time_us)
                 columns.y[used], columns.x[used] = i // width, i % width
                 columns.p[used] = 1 if mixed(span_key, draw - 1) >> np.uint64(63) else -1
-                columns.unrounded_us[used] = time_us
                 used += 1
     return columns, used
 

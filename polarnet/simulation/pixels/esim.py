@@ -1,8 +1,7 @@
 """The pixel model `esim` (Rebecq et al., CoRL 2018): log intensity is linear in time between frames.
 
-The published code has two variants that differ where a level is met exactly. The CPU variant looks for levels between
-the values of two frames; the GPU variant (model `esim_gpu`) looks between its reference and the new value. Both keep
-log intensity and reference in float32. The model has no noise, mismatch or low-pass.
+As in the published code for a CPU, log intensity and reference are float32, and levels are looked for between the
+values of two frames. The model has no noise, mismatch or low-pass.
 """
 
 import math
@@ -13,14 +12,13 @@ from pydantic import PositiveFloat
 
 from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import ZERO, compiled
-from polarnet.simulation.pixels.columns import event_of, place_of
+from polarnet.simulation.pixels.columns import event_of, pending_events, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.light import FULL_SCALE, intensity_rows, ln
-from polarnet.simulation.pixels.pending import pending_events, roomier, write_in_order
 from polarnet.simulation.pixels.physics import PixelConfig
 from polarnet.simulation.pixels.strips import rows_of_strip
 
 EIGHT_BIT_VIDEO = False
-NO_CHANGE = 1e-6  # log intensity; the CPU variant ignores smaller changes
+NO_CHANGE = 1e-6  # log intensity; smaller changes are ignored
 NEARLY = np.float32(0.99999)  # lowers thresholds by more than rounding in a first test; `_levels` then counts exactly
 
 
@@ -39,29 +37,20 @@ class Physics(NamedTuple):
     threshold_off: float
     refractory_us: float
     log_eps: float
-    gpu: bool
 
 
 class Pixels(NamedTuple):
     """State of one channel, one array [h * w] per quantity."""
 
-    reference: np.ndarray
-    """float32, log intensity of the last level crossed."""
-    logarithm: np.ndarray
-    """float32, log intensity of the last frame."""
-    last_event_us: np.ndarray
-    """float64"""
+    reference: np.ndarray  # float32, log intensity of the last level crossed
+    logarithm: np.ndarray  # float32, log intensity of the last frame
+    last_event_us: np.ndarray  # float64
 
 
-def physics_of(config: EsimConfig, gpu: bool = False) -> Physics:
-    """Parameters for the kernels, of the GPU variant if `gpu`, else of the CPU variant."""
-    return Physics(
-        config.contrast_threshold_on,
-        config.contrast_threshold_off,
-        config.refractory_period_us,
-        config.esim_log_eps,
-        gpu,
-    )
+def physics_of(config: EsimConfig) -> Physics:
+    """The parameters for the kernels."""
+    on, off = config.contrast_threshold_on, config.contrast_threshold_off
+    return Physics(on, off, config.refractory_period_us, config.esim_log_eps)
 
 
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
@@ -82,85 +71,77 @@ def _table(physics):
 
 
 @compiled
-def _respond(light, frame, y, w, physics, table, dn, logarithm):
-    intensity_rows(light, frame, y, w, dn)
+def _respond(light, frame, steps, y, table, dn, logarithm):
+    intensity_rows(light, frame, y, steps.width, dn)
     if light.images.itemsize == 1:
         for j in range(dn.size):
             logarithm[j] = table[np.int32(dn[j])]
     else:
         for j in range(dn.size):
-            logarithm[j] = ln(dn[j] / np.float32(FULL_SCALE) + np.float32(physics.log_eps))
+            logarithm[j] = ln(dn[j] / np.float32(FULL_SCALE) + np.float32(steps.physics.log_eps))
 
 
 @compiled
 def start(light, pixels, steps):
     """Set the reference to the first frame; nothing fires."""
     dn, table = np.empty(pixels.logarithm.size, np.float32), _table(steps.physics)
-    _respond(light, ZERO, ZERO, steps.width, steps.physics, table, dn, pixels.logarithm)
+    _respond(light, ZERO, steps, ZERO, table, dn, pixels.logarithm)
     pixels.reference[:] = pixels.logarithm
 
 
 @compiled
 def advance(light, pixels, steps, columns):
     """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
-    physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
-    rows, table, used = rows_of_strip(h, w), _table(physics), ZERO
+    times_us, h, w = steps.times_us, steps.height, steps.width
+    rows, table, used = rows_of_strip(h, w), _table(steps.physics), ZERO
     strip = np.empty((2, rows * w), np.float32)
-    pending = pending_events(h * w, columns.unrounded_us.size > 0)
+    pending = pending_events(h * w)
     for k in range(times_us.size - 1):
         n = ZERO
         for y in range(0, h, rows):
             first, stop = y * w, min(y + rows, h) * w
             dn, logarithm = strip[0, : stop - first], strip[1, : stop - first]
-            _respond(light, steps.first_frame + k, y, w, physics, table, dn, logarithm)
+            _respond(light, steps.first_frame + k, steps, y, table, dn, logarithm)
             for r in range(y, min(y + rows, h)):
                 here = slice((r - y) * w, (r - y + 1) * w)
-                pending, n = _fire(pixels, physics, r, logarithm[here], times_us[k], times_us[k + 1], pending, n)
+                pending, n = _fire(pixels, steps, k, r, logarithm[here], pending, n)
             pixels.logarithm[first:stop] = logarithm
         columns, used = write_in_order(pending, n, times_us[k], times_us[k + 1], columns, used)
     return columns, used
 
 
 @compiled
-def _fire(pixels, physics, y, logarithm, start_us, stop_us, pending, n):
-    """Append the events of row y between two frames to the n pending ones; returns both."""
+def _fire(pixels, steps, k, y, logarithm, pending, n):
+    """Append the events of row y in step k to the n pending ones; returns both."""
+    physics, start_us, stop_us = steps.physics, steps.times_us[k], steps.times_us[k + 1]
     w, dt, base_us = logarithm.size, stop_us - start_us, math.floor(start_us)
     for x in range(w):
         i = y * w + x
         before, after, reference = pixels.logarithm[i], logarithm[x], pixels.reference[i]
-        on = after > reference if physics.gpu else after >= before
+        on = after >= before
         sign = np.float32(1 if on else -1)
         threshold = np.float32(physics.threshold_on if on else physics.threshold_off)
         if (after - reference) * sign < threshold * NEARLY:
             continue
-        crossed = _levels(physics, before, after, reference, sign, threshold)
+        crossed = _levels(before, after, reference, sign, threshold)
         while n + crossed > pending.events.size:
             pending = roomier(pending)
         place, level = place_of(y, x), reference
         for _ in range(crossed):
             level += sign * threshold
             event_us = start_us + dt * _crossing(before, after, level)
-            if physics.gpu:
-                event_us = np.floor(event_us * 1e3) * 1e-3  # this variant counts whole nanoseconds
-            waited = event_us - pixels.last_event_us[i]
-            if waited > physics.refractory_us or (waited == physics.refractory_us and not physics.gpu):
+            if event_us - pixels.last_event_us[i] >= physics.refractory_us:
                 offset_us = min(np.int64(event_us), np.int64(math.ceil(stop_us)) - 1) - base_us
                 pending.events[n] = event_of(offset_us, place, on)
-                if pending.unrounded_us.size:
-                    pending.unrounded_us[n] = event_us
                 pixels.last_event_us[i] = event_us
                 n += 1
-        if physics.gpu:  # this variant computes the new reference in one fused operation
-            level = np.float32(np.float64(reference) + np.float64(sign * threshold) * crossed)
         pixels.reference[i] = level
     return pending, n
 
 
 @compiled
-def _levels(physics, before, after, reference, sign, threshold):
+def _levels(before, after, reference, sign, threshold):
     """Number of threshold levels that a pixel crosses between two frames."""
-    if physics.gpu:
-        return int(abs(after - reference) / threshold)
     crossed, level = 0, reference + sign * threshold
     if abs(np.float64(after) - np.float64(before)) > NO_CHANGE:
         while level * sign > before * sign and level * sign <= after * sign:

@@ -14,9 +14,8 @@ import numpy as np
 from polarnet.simulation.compilation import ZERO, borrowing, compiled, inlined
 from polarnet.simulation.pixels import physics, randomness
 from polarnet.simulation.pixels.active import empty_active, gather, keep_continuing, scatter
-from polarnet.simulation.pixels.columns import event_of, place_of
+from polarnet.simulation.pixels.columns import event_of, pending_events, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.light import intensity_rows, linlog
-from polarnet.simulation.pixels.pending import pending_events, roomier, write_in_order
 from polarnet.simulation.pixels.physics import (
     DARK_OFFSET,
     DARK_SHOT_NOISE,
@@ -44,28 +43,19 @@ physics_of = physics.physics_of
 class Pixels(NamedTuple):
     """State of one channel, one array [h * w] per quantity; float32 unless stated."""
 
-    change: np.ndarray
-    """Filtered log intensity since the last event, leak included."""
-    dn: np.ndarray
-    """Light of the last frame, DN."""
-    linlog: np.ndarray
-    """Response to that light: linear up to 20 DN, logarithmic above."""
-    lag: np.ndarray
-    """Output of the photoreceptor minus response."""
+    change: np.ndarray  # filtered log intensity since the last event, leak included
+    dn: np.ndarray  # light of the last frame, DN
+    linlog: np.ndarray  # response to that light: linear up to 20 DN, logarithmic above
+    lag: np.ndarray  # output of the photoreceptor minus response
     buffer_lag: np.ndarray
     """Output of the source follower minus that of the photoreceptor; empty without a source follower."""
     threshold_on: np.ndarray
     threshold_off: np.ndarray
-    leak_nominal: np.ndarray
-    """Log intensity per microsecond, frozen per pixel."""
-    leak: np.ndarray
-    """Leak until the next event, jitter included."""
-    last_event_us: np.ndarray
-    """float64"""
-    events: np.ndarray
-    """int32, number of events so far; numbers the draws of the leak's jitter."""
-    next_shot_us: np.ndarray
-    """float64, time of the next candidate for a shot-noise event."""
+    leak_nominal: np.ndarray  # log intensity per microsecond, frozen per pixel
+    leak: np.ndarray  # leak until the next event, jitter included
+    last_event_us: np.ndarray  # float64
+    events: np.ndarray  # int32, number of events so far; numbers the draws of the leak's jitter
+    next_shot_us: np.ndarray  # float64, time of the next candidate for a shot-noise event
 
 
 class Step(NamedTuple):
@@ -76,12 +66,19 @@ class Step(NamedTuple):
     stop_us: float
     duration_us: float
     refractory_us: float
-    jitter: float
-    """Relative standard deviation of the leak; 0 where nothing leaks."""
+    jitter: float  # relative standard deviation of the leak; 0 where nothing leaks
     leak_key: np.uint64
     shot_key: np.uint64
-    has_shots: bool
-    """Whether a shot-noise candidate of any pixel falls into the step."""
+    has_shots: bool  # whether a shot-noise candidate of any pixel falls into the step
+
+
+class Moved(NamedTuple):
+    """A strip of pixels that moved through a step as if nothing fired."""
+
+    first: int  # number of the strip's first pixel
+    before: np.ndarray  # float32, change at the start of the step
+    rise: np.ndarray  # float32, rise of the filtered log intensity
+    words: np.ndarray  # uint64, flags of the pixels that may fire
 
 
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
@@ -139,7 +136,7 @@ def advance(light, pixels, steps, columns):
     leak_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
     shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
     jitter = physics.leak_jitter if physics.leak_rate_hz > 0 else 0.0
-    pending = pending_events(h * w, columns.unrounded_us.size > 0)
+    pending = pending_events(h * w)
     soonest_us = np.array([pixels.next_shot_us[y * w : (y + rows) * w].min() for y in range(0, h, rows)])
     used = ZERO
     for k in range(times_us.size - 1):
@@ -167,13 +164,11 @@ def advance(light, pixels, steps, columns):
                 _buffer(
                     rise, pixels.buffer_lag[first:stop], 2e-6 * math.pi * physics.source_follower_hz * step.duration_us
                 )
-            change, leak = pixels.change[first:stop], pixels.leak[first:stop]
-            threshold_on, threshold_off = pixels.threshold_on[first:stop], pixels.threshold_off[first:stop]
             fires = flags_of(words, stop - first)
-            _move(change, leak, rise, np.float32(stop_us - start_us), before, threshold_on, threshold_off, fires)
+            _move(pixels, first, rise, np.float32(stop_us - start_us), before, fires)
             if soonest_us[y // rows] < stop_us:
                 _flag_shots(pixels.next_shot_us[first:stop], stop_us, fires)
-            count = _activate(words, first, before, rise, pixels, step, active, count)
+            count = _activate(pixels, Moved(first, before, rise, words), step, active, count)
             if count >= BATCH or y + rows >= h:
                 pending, n = _fire(pixels, step, active, count, w, pending, n)
                 count = ZERO
@@ -233,8 +228,11 @@ def _buffer(rise, lag, a):
 
 
 @borrowing
-def _move(change, leak, rise, dt_us, before, threshold_on, threshold_off, fires):
+def _move(pixels, first, rise, dt_us, before, fires):
     """Advance each change by its rise and leak as if nothing fired; flag pixels beyond a threshold at either end."""
+    strip = slice(first, first + rise.size)
+    change, leak = pixels.change[strip], pixels.leak[strip]
+    threshold_on, threshold_off = pixels.threshold_on[strip], pixels.threshold_off[strip]
     for j in range(rise.size):
         start = change[j]
         stop = start + (rise[j] + leak[j] * dt_us)
@@ -249,18 +247,15 @@ def _flag_shots(next_shot_us, stop_us, fires):
 
 
 @borrowing
-def _activate(words, first, before, rise, pixels, step, active, count):
-    """Append the flagged pixels of a strip to the `count` active ones; returns their new number.
-
-    `first` is the strip's first pixel.
-    """
+def _activate(pixels, strip, step, active, count):
+    """Append the flagged pixels of a strip to the `count` active ones; returns their new number."""
     pixel, index = active.pixel[count:], active.scratch[count:]
-    stop = count + flagged(words, before.size, index, pixel)
+    stop = count + flagged(strip.words, strip.before.size, index, pixel)
     pixel, index = active.pixel[count:stop], active.scratch[count:stop]
     for a in range(stop - count):
-        pixel[a] = first + index[a]
-    gather(before, index, active.change[count:stop])
-    gather(rise, index, active.slope[count:stop])
+        pixel[a] = strip.first + index[a]
+    gather(strip.before, index, active.change[count:stop])
+    gather(strip.rise, index, active.slope[count:stop])
     gather(pixels.threshold_on, pixel, active.threshold_on[count:stop])
     gather(pixels.threshold_off, pixel, active.threshold_off[count:stop])
     gather(pixels.leak, pixel, active.leak[count:stop])
@@ -375,10 +370,7 @@ def _append_events(active, count, width, start_us, pending, n):
         place = place_of(y, active.pixel[a] - y * width)
         active.event[a] |= event_of(since_whole_us + active.next_now[a], place, 0)
     for a in range(count):
-        at = np.uint64(n)  # the entry of a pixel that does not fire is overwritten by the next
-        pending.events[at] = active.event[a]
-        if pending.unrounded_us.size:
-            pending.unrounded_us[at] = start_us + active.next_now[a]
+        pending.events[np.uint64(n)] = active.event[a]  # overwritten by the next if the pixel does not fire
         n += active.fires[a]
     return n
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from polarnet.simulation.compilation import ONE, ZERO, borrowing, compiled
 from polarnet.simulation.pixels import physics, randomness
-from polarnet.simulation.pixels.columns import sort_ties, with_room
+from polarnet.simulation.pixels.columns import first_tied, sort_ties, with_room
 from polarnet.simulation.pixels.light import intensity_rows, linlog_8bit, linlog_as_v2e
 from polarnet.simulation.pixels.physics import (
     DARK_OFFSET,
@@ -34,18 +34,14 @@ physics_of = physics.physics_of
 class Pixels(NamedTuple):
     """State of one channel, one array [h * w] per quantity; float32 unless stated."""
 
-    memory: np.ndarray
-    """Log intensity at the last event, less what leaked; float64 with a low-pass."""
+    memory: np.ndarray  # log intensity at the last event, less what leaked; float64 with a low-pass
     filtered: np.ndarray
     """Log intensity behind the low-passes of photoreceptor and source follower; float64 with a low-pass."""
-    photoreceptor: np.ndarray
-    """float64, log intensity between the two; empty without a source follower."""
+    photoreceptor: np.ndarray  # float64, log intensity between the two; empty without a source follower
     threshold_on: np.ndarray
     threshold_off: np.ndarray
-    leak_factor: np.ndarray
-    """Leak rate relative to the nominal rate, frozen per pixel."""
-    refractory_since: np.ndarray
-    """Time in seconds of the last event that started a refractory period."""
+    leak_factor: np.ndarray  # leak rate relative to the nominal rate, frozen per pixel
+    refractory_since: np.ndarray  # time in seconds of the last event that started a refractory period
 
 
 class Step(NamedTuple):
@@ -64,14 +60,20 @@ class Step(NamedTuple):
 class Firing(NamedTuple):
     """Pixels that fire in a step, and scratch to find and list them."""
 
-    entries: np.ndarray
-    """int32 [h * w + 1, 4], a row per pixel: PIXEL, PLACE, CROSSED, ACCEPTED."""
-    order: np.ndarray
-    """int32, working memory: indices of the entries with events left."""
-    words: np.ndarray
-    """uint64, flags of a strip."""
-    candidates: np.ndarray
-    """int32 [2, pixels of a strip + SPARE], scratch."""
+    entries: np.ndarray  # int32 [h * w + 1, 4], a row per pixel: PIXEL, PLACE, CROSSED, ACCEPTED
+    order: np.ndarray  # int32, working memory: indices of the entries with events left
+    words: np.ndarray  # uint64, flags of a strip
+    candidates: np.ndarray  # int32 [2, pixels of a strip + SPARE], scratch
+
+
+class Slot(NamedTuple):
+    """One of the times in a step at which pixels may fire."""
+
+    number: int  # from 1
+    t_us: np.int64
+    stamp: np.float32  # the same time in seconds
+    least: np.float32  # seconds since the last event of a pixel, which the next must exceed
+    refractory: bool  # whether the refractory period can suppress an event of this step
 
 
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
@@ -152,7 +154,7 @@ def advance(light, pixels, steps, columns):
                 rough_normals(step.leak_key, first, noise)
                 _leak(memory, threshold_on, pixels.leak_factor[first:stop], noise, dt, physics)
             _flag(filtered, memory, threshold_on, threshold_off, flags_of(firing.words, stop - first))
-            n, most = _count(pixels, physics, first, stop, y, w, firing, n, most)
+            n, most = _count(pixels, steps, y, stop, firing, n, most)
         before = used
         columns, used = _emit(pixels, step, firing, n, most, columns, used)
         if dt < 1e-6 * most:
@@ -199,11 +201,12 @@ def _flag(filtered, memory, threshold_on, threshold_off, fires):
 
 
 @borrowing
-def _count(pixels, physics, first, stop, y, w, firing, n, most):
-    """List the flagged pixels of the strip `first` .. `stop`, with their threshold crossings (negative for OFF).
+def _count(pixels, steps, y, stop, firing, n, most):
+    """List the flagged pixels from row y up to pixel `stop`, with their threshold crossings (negative for OFF).
 
     `n` is the length of the list, `most` the largest number of crossings so far; returns both.
     """
+    physics, w, first = steps.physics, steps.width, y * steps.width
     filtered, memory = pixels.filtered[first:stop], pixels.memory[first:stop]
     threshold_on, threshold_off = pixels.threshold_on[first:stop], pixels.threshold_off[first:stop]
     entries, candidates = firing.entries, firing.candidates
@@ -245,44 +248,43 @@ def _emit(pixels, step, firing, n, most, columns, used):
     for a in range(n):
         order[a] = a
     active = n
-    for slot in range(1, most + 1):
-        unrounded_us = start_us + (stop_us - start_us) * slot / most
+    for number in range(1, most + 1):
+        t_us = np.int64(np.rint(start_us + (stop_us - start_us) * number / most))
         # torch.linspace, which v2e calls, counts from both ends
         stamp = (
-            first + interval * np.float32(slot - 1) if slot <= most // 2 else last - interval * np.float32(most - slot)
+            first + interval * np.float32(number - 1)
+            if number <= most // 2
+            else last - interval * np.float32(most - number)
         )
         columns = with_room(columns, used, active + 1)
-        written, active = _emit_slot(
-            pixels, firing, active, slot, unrounded_us, stamp, least, refractory, columns, used
-        )
+        slot = Slot(number, t_us, stamp, least, refractory)
+        written, active = _emit_slot(pixels, firing, active, slot, columns, used)
         used += written
     _consume(pixels, firing.entries, n)
     return columns, used
 
 
 @borrowing
-def _emit_slot(pixels, firing, active, slot, unrounded_us, stamp, least, refractory, columns, used):
+def _emit_slot(pixels, firing, active, slot, columns, used):
     """Append the events of one slot; returns their number, and how many pixels have events left.
 
     The columns have room for one event more than there are active pixels.
     """
     entries, order, since = firing.entries, firing.order, pixels.refractory_since
     t, x, y, p = columns.t[used:], columns.x[used:], columns.y[used:], columns.p[used:]
-    t_us, written, remaining = np.int64(np.rint(unrounded_us)), 0, 0
+    written, remaining = 0, 0
     for a in range(active):  # without branches: an event that is suppressed is overwritten by the next
         e, at = np.uint64(order[a]), np.uint64(written)
         i, place, crossed = np.uint64(entries[e, PIXEL]), entries[e, PLACE], entries[e, CROSSED]
-        accepted = np.float32(stamp - since[i]) > least
-        if refractory:
-            since[i] = stamp if accepted else since[i]
+        accepted = np.float32(slot.stamp - since[i]) > slot.least
+        if slot.refractory:
+            since[i] = slot.stamp if accepted else since[i]
         polarity = np.int32(1) if crossed > 0 else np.int32(-1)
-        t[at], x[at], y[at], p[at] = t_us, place & 0xFFFF, place >> 16, polarity
+        t[at], x[at], y[at], p[at] = slot.t_us, place & 0xFFFF, place >> 16, polarity
         entries[e, ACCEPTED] += polarity if accepted else np.int32(0)
-        if columns.unrounded_us.size:
-            columns.unrounded_us[used + written] = unrounded_us
         written += int(accepted)
         order[np.uint64(remaining)] = e
-        remaining += abs(crossed) > slot
+        remaining += abs(crossed) > slot.number
     return written, remaining
 
 
@@ -325,12 +327,7 @@ def _emit_shots(light, frame, pixels, step, w, columns, used):
         columns = with_room(columns, used, ONE)
         columns.t[used], columns.x[used], columns.y[used] = np.int64(np.rint(step.stop_us)), i - row * w, row
         columns.p[used] = 1 if u < on else -1
-        if columns.unrounded_us.size:
-            columns.unrounded_us[used] = step.stop_us
         pixels.memory[i] = pixels.filtered[i]
         used += 1
-    tied = before
-    while used > before and tied > 0 and columns.t[tied - 1] >= columns.t[before]:
-        tied -= 1
-    sort_ties(columns, tied, used)
+    sort_ties(columns, first_tied(columns, before, used), used)
     return columns, used

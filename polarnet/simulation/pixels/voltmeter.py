@@ -12,9 +12,8 @@ import numpy as np
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.compilation import ZERO, compiled
 from polarnet.simulation.pixels import randomness
-from polarnet.simulation.pixels.columns import event_of, place_of
+from polarnet.simulation.pixels.columns import event_of, pending_events, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.light import intensity_rows
-from polarnet.simulation.pixels.pending import pending_events, roomier, write_in_order
 from polarnet.simulation.pixels.randomness import key_for, mixed, normal, uniform
 
 EIGHT_BIT_VIDEO = False
@@ -24,18 +23,12 @@ DRAWS = 3  # random numbers for the way from one event to the next
 class Physics(NamedTuple):
     """k1 to k6 of the paper's Eq. 10, fitted to one camera."""
 
-    k1: float
-    """Drift per relative change of light."""
-    k2: float
-    """Dark offset, DN."""
-    k3: float
-    """Photon noise."""
-    k4: float
-    """Leak in the dark, per microsecond."""
-    k5: float
-    """Leak per DN."""
-    k6: float
-    """Noise that does not depend on light."""
+    k1: float  # drift per relative change of light
+    k2: float  # dark offset, DN
+    k3: float  # photon noise
+    k4: float  # leak in the dark, per microsecond
+    k5: float  # leak per DN
+    k6: float  # noise that does not depend on light
 
 
 CAMERAS = {
@@ -55,10 +48,8 @@ class VoltmeterConfig:
 class Pixels(NamedTuple):
     """State of one channel, one array [h * w] per quantity."""
 
-    dn: np.ndarray
-    """float32, light of the last frame, DN."""
-    voltage: np.ndarray
-    """float64, change since the last event, in thresholds."""
+    dn: np.ndarray  # float32, light of the last frame, DN
+    voltage: np.ndarray  # float64, change since the last event, in thresholds
 
 
 class Step(NamedTuple):
@@ -91,7 +82,7 @@ def advance(light, pixels, steps, columns):
     """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
     times_us, h, w = steps.times_us, steps.height, steps.width
     passage_key, used, dn = key_for(steps.key, randomness.FIRST_PASSAGE, steps.channel), ZERO, np.empty(w, np.float32)
-    pending = pending_events(h * w, columns.unrounded_us.size > 0)
+    pending = pending_events(h * w)
     for k in range(times_us.size - 1):
         n, key = ZERO, mixed(passage_key, steps.first_number + k)
         step = Step(steps.physics, times_us[k], times_us[k + 1] - times_us[k], key)
@@ -127,8 +118,6 @@ def _walk(pixels, step, y, dn, pending, n):
             if n == pending.events.size:
                 pending = roomier(pending)
             pending.events[n] = event_of(np.int64(start_us - base_us + now), place, on)
-            if pending.unrounded_us.size:
-                pending.unrounded_us[n] = start_us + now
             n += 1
         pixels.voltage[i] = voltage + (distance if on else -distance) * (dt - now) / wait
         pixels.dn[i] = dn[x]
