@@ -199,7 +199,8 @@ def emulate_lights(
     with ThreadPoolExecutor(threads) as pool:
         channel_map = pool.map if threads > 1 else map
         columns, pixels = zip(*channel_map(emulate_channel, range(len(numbers))), strict=True)
-    events = [Events(*map(torch.from_numpy, channel), height=height, width=width) for channel in columns]
+    tensors = ([torch.from_numpy(column) for column in channel] for channel in columns)
+    events = [Events(t, x, y, p, height, width) for t, x, y, p in tensors]
     steps_taken = first_number + len(times) - 1
     return events, SensorState(config.model, height, width, numbers, pixels, float(times[-1]), steps_taken)
 
