@@ -210,7 +210,7 @@ class Config:
     def _check_files(self) -> None:
         """ValueError for a file outside the folder of data/external that the stage which reads it depends on."""
         for key, file, folder in (("train.start", self.train.start, "start"), ("lpips.path", self.lpips.path, "lpips")):
-            watched = Path(self.paths.data, "external", folder)
+            watched = Path("data", "external", folder)  # of the project, as in dvc.yaml
             if file is not None and not Path(file).absolute().is_relative_to(watched.absolute()):
                 raise ValueError(
                     f"{key}: expected a file below {watched}, whose content `dvc repro` follows, got {file}; copy it "
