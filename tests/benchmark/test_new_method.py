@@ -57,7 +57,7 @@ def test_it_is_a_row_of_the_benchmark_with_its_name_in_tables(activity, with_act
 
 def test_it_needs_no_section_in_the_configuration(activity, project_root):
     config = load(project_root, ["benchmark.methods=[oracle_mean,activity]"])
-    assert context_of(config, None).setups["activity"].config is None
+    assert context_of(config, ["activity"], None).setups["activity"].config is None
     assert config.used_baselines == []
 
 

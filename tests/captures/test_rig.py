@@ -148,7 +148,7 @@ def test_the_stores_are_benchmarked_like_simulated_sequences_and_the_diagnosis_i
     whole = load(project_root, [f"paths.data={tmp_path}"])
     methods = ["zeros", "oracle_mean", "cf", "highpass"]
     settings = replace(whole.benchmark, methods=methods, warmup_windows=2, bootstrap_samples=20, panel_scenes=1)
-    benchmark = run_benchmark(test_set, context_of(whole, 0.2), settings, None)
+    benchmark = run_benchmark(test_set, context_of(whole, settings.methods, 0.2), settings, None)
     assert {row.method for row in benchmark.rows} == set(methods)
     draw_calibration(found, config, tmp_path / "one.png")
     assert (tmp_path / "one.png").stat().st_size > 10_000

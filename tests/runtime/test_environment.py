@@ -56,7 +56,7 @@ def test_importing_polarnet_loads_no_package(project_root):
 
 @pytest.mark.parametrize("package", ["stages", "studies", "polarnet.cli"])
 def test_a_program_decides_how_threads_wait_before_torch_is_there(package, project_root):
-    call = "; polarnet.cli.main(['verify', 'nothing'])" if package == "polarnet.cli" else ""
+    call = "; polarnet.cli.main(['preset', 'none'])" if package == "polarnet.cli" else ""
     script = f"import os, sys, {package}{call}; print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("OMP", "GOMP"))}
     environment["PYTHONPATH"] = str(Path.cwd())
