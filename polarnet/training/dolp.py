@@ -70,7 +70,6 @@ def dolp_task(
         wants_intensity=False,
         optimizer=config.optimizer or build.optimizer,
         scored=lambda maps: maps[:, :, 0],
-        replays=build.replays,
         unroll_with_features=unroll_with_features if build.predicts_stokes else None,
         scene_dolp=config.scene_dolp,
     )

@@ -182,7 +182,6 @@ class StokesUNet(nn.Module):
 
     representation = "event_counts"
     predicts_stokes = True
-    replays = True
     optimizer = "muon"
     outputs = ("choose", "gains", "trust", "add", "scale.out")
     memories: Float[Tensor, " m"]
