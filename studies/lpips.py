@@ -1,4 +1,4 @@
-"""Cost and accuracy of LPIPS: python -m studies.lpips [--squeeze FILE] [--rounds N] [--write]
+"""Cost and accuracy of LPIPS: python -m studies.lpips [--rounds N] [--write]
 
 - Errors: the largest difference from the values in tests/golden/lpips.json, by the programs that the weights come from.
 - Scoring: milliseconds for one frame of one method, 120 x 180 pixels, in float32 as the benchmark scores; the truth's
@@ -7,9 +7,8 @@
   LPIPS's share of the step; the same of `experiment=paper`. Weights and inputs are random; settings take turns, and the
   figures are medians over the rounds.
 
-Squeeze is measured where its weights are: in torch's hub cache, or in the file that --squeeze names. `--write` puts the
-figures into docs/results/lpips.json, with the rows of docs/results/pipeline.json that have LPIPS and the points of
-docs/results/sweep.json.
+`--write` puts the figures into docs/results/lpips.json, with the rows of docs/results/pipeline.json that have LPIPS and
+the points of docs/results/sweep.json.
 """
 
 import json
@@ -30,7 +29,7 @@ from polarnet.benchmark.score import FRAMES_AT_ONCE
 from polarnet.config.tree import Config, load
 from polarnet.events.representations import channels_of
 from polarnet.metrics.lpips import BACKBONES, Lpips
-from polarnet.metrics.lpips_weights import find_weights, local_source
+from polarnet.metrics.lpips_weights import find_weights
 from polarnet.runtime.machine import configure, device_of, precision_on, usable_cores
 from polarnet.training.dolp import dolp_task
 from polarnet.training.engine.loop import train_batch
@@ -43,20 +42,9 @@ HEIGHT, WIDTH = 120, 180
 WITHOUT = "none"
 
 
-def networks(squeeze: str | None) -> dict[str, Lpips]:
-    """LPIPS on every backbone whose weights are here; says which are not."""
-    losses = {}
-    for backbone in BACKBONES:
-        path = squeeze if backbone == "squeeze" else None
-        try:
-            local_source(backbone, path)
-        except ValueError as error:
-            if backbone != "squeeze":
-                raise
-            print(f"squeeze is left out: {error}")
-            continue
-        losses[backbone] = Lpips.of(backbone, find_weights(backbone, path).tensors)
-    return losses
+def networks() -> dict[str, Lpips]:
+    """LPIPS on every backbone."""
+    return {backbone: Lpips.of(backbone, find_weights(backbone, None).tensors) for backbone in BACKBONES}
 
 
 def largest_error(lpips: Lpips) -> float:
@@ -160,14 +148,13 @@ def elsewhere() -> dict[str, int]:
 def main() -> None:
     """The command line."""
     parser = command_line(__doc__, "docs/results/lpips.json")
-    parser.add_argument("--squeeze", metavar="FILE", help="weights of the squeeze backbone")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=usable_cores())
     parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
     arguments = arguments_of(parser)
     record = machine_record(ROOT)
     print(f"{record['machine']}, {record['cores']} cores, load {record['load']}")
-    cost, headlines = measure(networks(arguments.squeeze), arguments.rounds, arguments.threads, arguments.device)
+    cost, headlines = measure(networks(), arguments.rounds, arguments.threads, arguments.device)
     headlines |= elsewhere()
     print(json.dumps(headlines, indent=2))
     if arguments.write:

@@ -40,7 +40,7 @@ def test_the_total_is_equation_9():
 
 def test_lpips_is_weighed_with_the_rest_where_there_is_a_network():
     torch.manual_seed(0)
-    lpips = Lpips("squeeze")
+    lpips = Lpips("vgg")
     loss = of_dolp(1.0, 0.0, 10.0, lpips)
     predicted, truth = torch.rand(1, 2, 1, 32, 32), torch.rand(1, 2, 1, 32, 32)
     terms = loss(predicted, truth)
@@ -124,7 +124,7 @@ def test_a_loss_of_nothing_is_refused():
 
 def test_masked_pixels_and_frames_count_in_no_term_and_get_no_gradient():
     torch.manual_seed(0)
-    lpips = Lpips("squeeze")
+    lpips = Lpips("vgg")
     loss = FrameLoss({"mse": 1.0, "mae": 1.0, "ssim_loss": 1.0, "lpips": 1.0}, lpips)
     truth = torch.rand(2, 2, 32, 32)
     predicted = torch.rand(2, 2, 32, 32, requires_grad=True)
