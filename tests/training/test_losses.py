@@ -89,6 +89,13 @@ def test_with_a_half_weight_errors_count_half_where_the_mean_squared_dolp_has_th
     torch.testing.assert_close(relative.total(terms), shares * plain.total(plain(predicted, truth)))
 
 
+def test_terms_have_the_order_of_their_weights_by_which_the_loop_names_them():
+    for half_weight in (None, 0.25):
+        config = LossConfig(mse=1.0, ssim=1.0, lpips=0.0, stokes=1.0, half_weight=half_weight)
+        loss = PolarizationLoss(config, None, dolp_only=False)
+        assert [*loss(of_everything(0.5, 0.3, 0.4), of_everything(0.4, 0.1, 0.4))] == [*loss.weights]
+
+
 def test_frames_without_a_valid_pixel_count_in_no_relative_term_and_leave_the_gradient_finite():
     relative, predicted, truth = of_two_frames(half_weight=0.25)
     predicted = predicted.clone().requires_grad_()

@@ -94,7 +94,7 @@ class PolarizationLoss(FrameLoss):
     def __call__(
         self, predicted: Float[Tensor, "t b k h w"], truth: Float[Tensor, "t b m h w"], valid: Valid = None
     ) -> dict[str, Float[Tensor, ""]]:
-        """Return the unweighted terms by name. The maps are DoLP, s1 and s2; `predicted` may be DoLP alone."""
+        """Return the unweighted terms by name, in the order of `weights`. The maps are DoLP, s1 and s2; `predicted` may be DoLP alone."""
         terms = super().__call__(predicted[:, :, 0], truth[:, :, 0], valid)
         if "relative_mse" in self.weights:
             squared = (predicted[:, :, 0] - truth[:, :, 0]).square()
@@ -103,7 +103,7 @@ class PolarizationLoss(FrameLoss):
             terms["stokes"] = _mean_of_known(_stokes_errors(predicted, truth), valid)
         if "relative_stokes" in self.weights:
             terms["relative_stokes"] = self._relative(_stokes_errors(predicted, truth), truth, valid)
-        return terms
+        return {name: terms[name] for name in self.weights}
 
     def _relative(self, errors: Frames, truth: Float[Tensor, "t b m h w"], valid: Valid) -> Float[Tensor, ""]:
         """Mean of `errors` in which a frame counts fully if it is unpolarized, and less the higher its DoLP."""
