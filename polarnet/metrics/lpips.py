@@ -28,32 +28,6 @@ NO_RECORD: Mapping[str, str | None] = {"backbone": None, "sha256": None, "source
 """Record for a purpose that does not use LPIPS."""
 
 
-class Fire(nn.Module):
-    """SqueezeNet's block: a 1x1 bottleneck, then 1x1 and 3x3 convolutions side by side."""
-
-    def __init__(self, channels: int, squeezed: int, expanded: int):
-        super().__init__()
-        self.squeeze = nn.Conv2d(channels, squeezed, 1)
-        self.expand1x1 = nn.Conv2d(squeezed, expanded, 1)
-        self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
-
-    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h w"]:
-        """Return 2 * `expanded` channels of the same size."""
-        x = self.squeeze(x).relu()
-        return torch.cat([self.expand1x1(x), self.expand3x3(x)], dim=1).relu()
-
-
-def squeezenet1_1() -> nn.Sequential:
-    """torchvision's squeezenet1_1 `features`."""
-    pool = nn.MaxPool2d(3, stride=2, ceil_mode=True)
-    return nn.Sequential(
-        *(nn.Conv2d(3, 64, 3, stride=2), nn.ReLU(), pool),
-        *(Fire(64, 16, 64), Fire(128, 16, 64), pool),
-        *(Fire(128, 32, 128), Fire(256, 32, 128), pool),
-        *(Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)),
-    )
-
-
 def alexnet() -> nn.Sequential:
     """torchvision's alexnet `features` (Krizhevsky, "One weird trick", 2014) without the last pooling."""
     pool = nn.MaxPool2d(3, stride=2)
@@ -91,7 +65,6 @@ class Backbone(NamedTuple):
 
 
 BACKBONES = {
-    "squeeze": Backbone(squeezenet1_1, (2, 5, 8, 10, 11, 12, 13), (64, 128, 256, 384, 384, 512, 512), 17),
     "alex": Backbone(alexnet, (2, 5, 8, 10, 12), (64, 192, 384, 256, 256), 31),
     "vgg": Backbone(vgg16, (4, 9, 16, 23, 30), (64, 128, 256, 512, 512), 16),
 }

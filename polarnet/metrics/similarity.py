@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from polarnet.metrics.lpips import Lpips
+from polarnet.metrics.lpips import Lpips as Lpips
 from polarnet.runtime.arrays import (
     Array,
     as_tensor,
@@ -27,21 +27,6 @@ from polarnet.runtime.arrays import (
     check_shape,
     mask_of,
 )
-
-__all__ = [
-    "Lpips",
-    "aolp_error_deg",
-    "correlation",
-    "gradient_agreement",
-    "level_mse",
-    "mean_where",
-    "mse",
-    "pattern_mse",
-    "psnr",
-    "spread_mse",
-    "ssim",
-    "with_truth_outside",
-]
 
 Valid = Bool[Array, "*b h w"] | None
 
@@ -79,29 +64,25 @@ def mse(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = Non
     >>> mse(torch.zeros(2, 16, 16), torch.full((2, 16, 16), 0.5))
     tensor([0.2500, 0.2500])
     """
-    a, b = _frames(a=a, b=b)
-    valid = None if valid is None else mask_of("valid", valid, a.shape)
+    (a, b), valid = _checked(valid, a=a, b=b)
     return mean_where((a - b).square(), valid)
 
 
 def level_mse(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Squared error of the frame's mean: the part of `mse` that a constant offset explains."""
-    a, b = _frames(a=a, b=b)
-    valid = None if valid is None else mask_of("valid", valid, a.shape)
+    (a, b), valid = _checked(valid, a=a, b=b)
     return mean_where(a - b, valid).square()
 
 
 def pattern_mse(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """Remainder of `mse` after both frames get the same mean: mse = level_mse + pattern_mse."""
-    a, b = _frames(a=a, b=b)
-    valid = None if valid is None else mask_of("valid", valid, a.shape)
+    (a, b), valid = _checked(valid, a=a, b=b)
     return mse(_centred(a, valid), _centred(b, valid), valid)
 
 
 def spread_mse(truth: Float[Array, "*b h w"], valid: Valid = None) -> Float[Tensor, "*b"]:
     """`mse` of the best constant, the frame's own mean: the variance over its pixels, and the reference for skill."""
-    (truth,) = _frames(truth=truth)
-    valid = None if valid is None else mask_of("valid", valid, truth.shape)
+    (truth,), valid = _checked(valid, truth=truth)
     return mean_where(_centred(truth, valid).square(), valid)
 
 
@@ -113,8 +94,7 @@ def psnr(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = No
     >>> round(psnr(torch.full((16, 16), 0.1), torch.zeros(16, 16)).item(), 2)
     20.0
     """
-    a, b = _frames(a=a, b=b)
-    valid = None if valid is None else mask_of("valid", valid, a.shape)
+    (a, b), valid = _checked(valid, a=a, b=b)
     _check_unit(b, valid)
     return -10 * torch.log10(mse(a, b, valid).clamp(min=MIN_MSE))
 
@@ -124,8 +104,7 @@ def correlation(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Val
 
     A constant frame shows nothing of the other's pattern, so its score is 0 and no frame is left out.
     """
-    a, b = _frames(a=a, b=b)
-    valid = None if valid is None else mask_of("valid", valid, a.shape)
+    (a, b), valid = _checked(valid, a=a, b=b)
     dtype = torch.promote_types(a.dtype, b.dtype)
     a, b = _centred(a.double(), valid), _centred(b.double(), valid)
     variance = mean_where(a.square(), valid) * mean_where(b.square(), valid)
@@ -152,8 +131,7 @@ def gradient_agreement(
 
     ValueError for a frame smaller than 3 pixels.
     """
-    a, b = _frames(a=a, b=b)
-    valid = None if valid is None else mask_of("valid", valid, a.shape)
+    (a, b), valid = _checked(valid, a=a, b=b)
     if min(a.shape[-2:]) < len(SOBEL_SLOPE):
         raise ValueError(f"gradients need frames of at least 3 pixels a side, got {tuple(a.shape[-2:])}")
     dtype = torch.promote_types(a.dtype, b.dtype)
@@ -177,8 +155,7 @@ def aolp_error_deg(
     `weight` is the true DoLP: an angle matters in proportion to it. A frame without any polarization has no angle; it
     scores as chance, 45 degrees, so that no frame is left out.
     """
-    a, b, weight = _frames(a=a, b=b, weight=weight)
-    valid = None if valid is None else mask_of("valid", valid, a.shape)
+    (a, b, weight), valid = _checked(valid, a=a, b=b, weight=weight)
     period = math.pi
     between = ((a - b).double() + period / 2).remainder(period) - period / 2
     counted = weight.double() if valid is None else torch.where(valid, weight.double(), 0.0)
@@ -203,8 +180,7 @@ def ssim(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = No
     >>> round(ssim(frame, frame).item(), 3)
     1.0
     """
-    a, b = _frames(a=a, b=b)
-    valid = None if valid is None else mask_of("valid", valid, a.shape)
+    (a, b), valid = _checked(valid, a=a, b=b)
     _check_unit(b, valid)
     if min(a.shape[-2:]) <= SSIM_RADIUS:
         raise ValueError(f"ssim needs frames of at least {SSIM_RADIUS + 1} pixels a side, got {tuple(a.shape[-2:])}")
@@ -219,14 +195,15 @@ def ssim(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = No
         return mean_where(luminance * structure, valid)
 
 
-def _frames(**frames: Array) -> tuple[Tensor, ...]:
-    """The frames as tensors, checked to be floating-point and of one shape."""
+def _checked(valid: Valid, **frames: Array) -> tuple[list[Tensor], Tensor | None]:
+    """Frames, checked to be floating-point and of one shape, and their mask, as tensors."""
     tensors = {name: as_tensor(name, values) for name, values in frames.items()}
     for name, values in tensors.items():
         check_shape(name, values, "... height width")
         check_floating(name, values)
     check_same_shape(tensors)
-    return tuple(tensors.values())
+    first, *others = tensors.values()
+    return [first, *others], None if valid is None else mask_of("valid", valid, first.shape)
 
 
 def _check_unit(truth: Tensor, valid: Tensor | None) -> None:

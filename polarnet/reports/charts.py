@@ -21,7 +21,6 @@ TERMS = {
     "stokes": "S1/S0, S2/S0",
     "relative_mse": "MSE (relative)",
     "relative_stokes": "S1/S0, S2/S0 (relative)",
-    "uncertainty": "likelihood of the error",
 }
 """Legend labels of loss terms."""
 BRANCHES = {"intensity": "intensity", "aolp": "AoLP", "dolp": "DoLP"}

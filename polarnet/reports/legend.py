@@ -81,7 +81,7 @@ GAINS = (
     "The same intensities, each polarizer's scale solved from I0 + I90 = I45 + I135 before the Stokes formula. Nothing "
     "is trained for it."
 )
-LPIPS_BACKBONES = {"vgg": "VGG16", "alex": "AlexNet", "squeeze": "SqueezeNet 1.1"}
+LPIPS_BACKBONES = {"vgg": "VGG16", "alex": "AlexNet"}
 
 
 class Legend(NamedTuple):

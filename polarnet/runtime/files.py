@@ -2,7 +2,7 @@
 
 import hashlib
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -83,10 +83,10 @@ def check_seal(folder: Path, names: Collection[str] | None = None) -> None:
 
 
 @contextmanager
-def claimed(path: Path) -> Iterator[None]:
+def claimed(path: Path, say_waiting: Callable[[], None] | None = None) -> Iterator[None]:
     """Lock `path`, by PATH.lock.tmp, so that only this process may write it, until the block or the process ends.
 
-    ValueError if another process has it.
+    If another process has it: ValueError, or with `say_waiting` a call of it and a wait until the other one ends.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     file = path.with_name(f"{path.name}.lock.tmp")
@@ -94,9 +94,12 @@ def claimed(path: Path) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout:
-        raise ValueError(
-            f"{path}: another process is writing it; wait until that has ended, or write to another path"
-        ) from None
+        if say_waiting is None:
+            raise ValueError(
+                f"{path}: another process is writing it; wait until that has ended, or write to another path"
+            ) from None
+        say_waiting()
+        lock.acquire(timeout=-1)
     try:
         yield
     finally:

@@ -26,8 +26,8 @@ def dolp_task(
 
     The expected errors of `config.start` are left out, because they fit the errors of that network.
 
-    The truth is a stack of DoLP, s1 and s2. The prediction is the same stack plus the log-variance, or DoLP alone if
-    the network predicts nothing else. ValueError if the checkpoint holds another network, FileNotFoundError if there is
+    The truth is a stack of DoLP, s1 and s2. The prediction is the same stack, or DoLP alone if the network predicts
+    nothing else. ValueError if the checkpoint holds another network, FileNotFoundError if there is
     none.
     """
     build = network_config.network_class
@@ -45,8 +45,8 @@ def dolp_task(
     def unroll(inputs: Tensor, state: State) -> tuple[Float[Tensor, "t b k h w"], State]:
         prediction, state = network.unroll(inputs, state)
         maps = prediction.dolp[:, :, None]
-        if prediction.stokes is not None and prediction.log_variance is not None:
-            maps = torch.cat([maps, prediction.stokes, prediction.log_variance[:, :, None]], dim=2)
+        if prediction.stokes is not None:
+            maps = torch.cat([maps, prediction.stokes], dim=2)
         return maps, state
 
     def unroll_with_features(inputs: Tensor, state: State) -> tuple[Tensor, Tensor, State]:
@@ -70,7 +70,6 @@ def dolp_task(
         wants_intensity=False,
         optimizer=config.optimizer or build.optimizer,
         scored=lambda maps: maps[:, :, 0],
-        replays=build.replays,
         unroll_with_features=unroll_with_features if build.predicts_stokes else None,
         scene_dolp=config.scene_dolp,
     )

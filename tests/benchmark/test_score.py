@@ -92,7 +92,7 @@ def test_frames_of_another_size_are_refused(sequence):
 
 def test_lpips_sees_the_truth_once_for_all_methods_and_a_constant_once(make_sequence, monkeypatch):
     torch.manual_seed(0)
-    lpips, batches = Lpips("squeeze"), []
+    lpips, batches = Lpips("vgg"), []
     features = Lpips.features
 
     def counted(self, images):
@@ -110,7 +110,7 @@ def test_lpips_sees_the_truth_once_for_all_methods_and_a_constant_once(make_sequ
 
 def test_lpips_in_chunks_is_lpips_frame_by_frame(make_sequence):
     torch.manual_seed(0)
-    lpips = Lpips("squeeze")
+    lpips = Lpips("vgg")
     sequence, other = make_sequence(windows=10), make_sequence(windows=10, seed=1)
     rows = score_sequence(sequence, {"m": Prediction(other.dolp)}, 0, lpips, CPU)
     for r in rows:
@@ -227,7 +227,7 @@ def test_masked_pixels_count_in_no_score(make_sequence):
     valid = torch.rand(sequence.dolp.shape, generator=torch.Generator().manual_seed(3)) < 0.7
     masked = dataclasses.replace(sequence, valid=valid)
     torch.manual_seed(0)
-    lpips = Lpips("squeeze")
+    lpips = Lpips("vgg")
     spoilt = torch.where(valid, other, 1 - other)
     rows, again = (score_sequence(masked, {"m": Prediction(frames)}, 1, lpips, CPU) for frames in (other, spoilt))
     assert rows == again

@@ -26,34 +26,11 @@ def installed(request):
     return Lpips.of(request.param, find_weights(request.param, None).tensors)
 
 
-@pytest.fixture(scope="module")
-def squeeze(shared):
-    file = shared / "weights" / "lpips_squeeze_v0.1.npz"
-    return Lpips.of("squeeze", find_weights("squeeze", str(file)).tensors)
-
-
 @pytest.mark.parametrize("blur", [3, 7, 15])
 def test_alexnet_and_vgg_give_the_values_of_the_program_that_their_weights_come_from(installed, blur):
     assert installed(*astronaut(blur)).item() == pytest.approx(
         GOLDEN["distances"][installed.backbone][str(blur)], abs=2e-6
     )
-
-
-@pytest.mark.parametrize("blur", [3, 7, 15])
-def test_squeezenet_gives_the_published_values(squeeze, blur):
-    assert squeeze(*astronaut(blur)).item() == pytest.approx(GOLDEN["distances"]["squeeze"][str(blur)], abs=2e-6)
-
-
-def test_the_check_pairs_of_the_reference_material_are_these(shared):
-    with np.load(shared / "weights" / "lpips_squeeze_check.npz") as arrays:
-        for blur in (3, 7, 15):
-            pair = torch.from_numpy(arrays[f"pair{blur}"]).permute(0, 3, 1, 2)
-            assert torch.equal(torch.cat(astronaut(blur)), pair)
-
-
-def test_squeezenet_of_a_grey_pair_gives_the_published_value(squeeze):
-    a, b = (image.mean(1) for image in astronaut(7))
-    assert squeeze(a, b).item() == pytest.approx(0.360800, abs=2e-6)
 
 
 def test_in_bf16_the_distance_is_within_a_percent(installed):
@@ -77,22 +54,12 @@ def test_the_gradient_is_that_of_finite_differences(installed):
     torch.testing.assert_close(slope, (ahead - behind) / (2 * step), rtol=1e-4, atol=0)
 
 
-@pytest.mark.parametrize(("backbone", "parameters"), [("squeeze", 722_496), ("alex", 2_469_696), ("vgg", 14_714_688)])
-def test_a_backbone_has_the_parameters_of_torchvisions_features(backbone, parameters):
-    with torch.device("meta"):
-        layers = BACKBONES[backbone].features()
-    assert sum(p.numel() for p in layers.parameters()) == parameters
-
-
-@pytest.mark.parametrize("backbone", ["squeeze", "alex", "vgg"])
-def test_taps_have_the_channels_that_the_heads_expect(backbone):
-    features = Lpips(backbone).features(torch.rand(1, 64, 64))
-    assert tuple(x.shape[1] for x in features) == BACKBONES[backbone].channels
-
-
-@pytest.mark.parametrize(("backbone", "side"), [("squeeze", 17), ("alex", 31), ("vgg", 16)])
-def test_the_smallest_image_that_a_backbone_takes(backbone, side):
+@pytest.mark.parametrize(("backbone", "parameters", "side"), [("alex", 2_469_696, 31), ("vgg", 14_714_688, 16)])
+def test_a_backbone_has_torchvisions_parameters_the_heads_channels_and_a_smallest_image(backbone, parameters, side):
     distance = Lpips(backbone)
+    assert sum(p.numel() for p in distance.layers.parameters()) == parameters
+    features = distance.features(torch.rand(1, 64, 64))
+    assert tuple(x.shape[1] for x in features) == BACKBONES[backbone].channels
     assert distance(torch.zeros(1, side, side), torch.ones(1, side, side)).isfinite().all()
     with pytest.raises(ValueError, match=rf"LPIPS \({backbone}\) needs images of {side} pixels a side"):
         distance.features(torch.zeros(1, 50, side - 1))
@@ -100,7 +67,7 @@ def test_the_smallest_image_that_a_backbone_takes(backbone, side):
 
 def test_lpips_is_0_for_equal_images_symmetric_and_reaches_the_images_but_not_their_truth():
     torch.manual_seed(0)
-    distance = Lpips("squeeze")
+    distance = Lpips("alex")
     a, b = torch.rand(2, 2, 40, 48, generator=torch.Generator().manual_seed(0))
     assert distance(a, a).tolist() == [0.0, 0.0]
     torch.testing.assert_close(distance(a, b), distance(b, a))
@@ -112,7 +79,7 @@ def test_lpips_is_0_for_equal_images_symmetric_and_reaches_the_images_but_not_th
 
 
 def test_lpips_of_a_grey_image_is_that_of_three_equal_channels():
-    distance = Lpips("squeeze")
+    distance = Lpips("alex")
     a, b = torch.rand(2, 1, 40, 48, generator=torch.Generator().manual_seed(0))
     rgb = [x[:, None].expand(-1, 3, -1, -1) for x in (a, b)]
     torch.testing.assert_close(distance(a, b), distance(*rgb))
@@ -120,5 +87,5 @@ def test_lpips_of_a_grey_image_is_that_of_three_equal_channels():
 
 def test_a_blank_image_has_a_finite_gradient():
     blank = torch.zeros(1, 40, 40, requires_grad=True)
-    Lpips("squeeze")(blank, torch.rand(1, 40, 40)).sum().backward()
+    Lpips("alex")(blank, torch.rand(1, 40, 40)).sum().backward()
     assert blank.grad.isfinite().all()

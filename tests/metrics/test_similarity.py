@@ -260,7 +260,7 @@ def test_frames_of_bytes_or_of_different_shapes_are_refused(unchecked_annotation
 
 
 def test_lpips_takes_numpy_and_refuses_bytes_and_a_truth_of_another_range(unchecked_annotations):
-    network = Lpips("squeeze")
+    network = Lpips("vgg")
     a, b = torch.rand(2, 1, 32, 32, generator=torch.Generator().manual_seed(0))
     assert torch.equal(network(a.numpy(), b.numpy()), network(a, b))
     with pytest.raises(ValueError, match=r"images: expected floating-point numbers, got torch\.uint8"):

@@ -10,8 +10,6 @@ from polarnet.networks.base.blocks import (
     ResidualBlock,
     UpBlock,
     conv3x3,
-    enlarged,
-    enlarged_by_products,
     on_blocks,
 )
 
@@ -101,12 +99,3 @@ def test_a_convolution_on_blocks_is_that_of_the_unshuffled_image():
     torch.manual_seed(0)
     layer, image = conv3x3(4 * 3, 5), torch.randn(2, 3, 8, 10)
     torch.testing.assert_close(on_blocks(layer, image), layer(F.pixel_unshuffle(image, 2)))
-
-
-@pytest.mark.parametrize("factor", [2, 4])
-def test_enlargement_by_products_equals_bilinear_interpolation_and_so_does_its_gradient(factor: int):
-    images = torch.randn(2, 5, 15, 23, generator=torch.Generator().manual_seed(1), requires_grad=True)
-    large, expected = enlarged_by_products(images, factor), enlarged(images, factor)
-    assert torch.allclose(large, expected, atol=1e-6)
-    gradient, expected_gradient = (torch.autograd.grad(one.square().sum(), images)[0] for one in (large, expected))
-    assert torch.allclose(gradient, expected_gradient, atol=1e-4)

@@ -8,6 +8,7 @@ from polarnet.networks.polarnet.expected_error import (
     FEATURES,
     MIN_DISAGREEMENT,
     MIN_ROOM,
+    UNFITTED,
     USUAL_DISAGREEMENT,
     USUAL_ROOM,
     ExpectedError,
@@ -63,10 +64,10 @@ def test_squares_and_products_of_all_pairs_follow():
     torch.testing.assert_close(computed[BASIC:], torch.stack(pairs))
 
 
-def test_it_says_nothing_until_it_is_told_and_has_nothing_to_learn():
+def test_it_expects_one_error_everywhere_until_it_is_fitted_and_has_nothing_to_learn():
     expected = ExpectedError()
     assert not [*expected.parameters()]
-    assert not expected(torch.randn(2, FEATURES, 3, 5)).any()
+    assert expected(torch.randn(2, FEATURES, 3, 5)).unique().tolist() == [UNFITTED]
     expected.weight[0], expected.weight[-1] = 1.0, 2.0
     expected.bias.fill_(-3.0)
     inputs = torch.randn(2, FEATURES, 3, 5)

@@ -10,10 +10,8 @@ from polarnet.networks.polarnet.redundancy import (
     LeastSquares,
     SecondMoments,
     SlopeMoments,
-    box_means,
     faded,
     neighbourhoods,
-    pooled_means,
 )
 from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
 
@@ -140,9 +138,3 @@ def test_neighbourhoods_are_means_of_what_lies_inside_the_image():
     assert torch.equal(one, x)
     assert three[0, 0, 0].tolist() == [2.0, 2.5, 3.0]
     assert everything.unique().tolist() == [4.0]
-
-
-@pytest.mark.parametrize("width", [3, 9, 25])
-def test_means_by_pooling_equal_means_by_convolution_up_to_the_image_border(width: int):
-    images = torch.randn(2, 5, 15, 23, generator=torch.Generator().manual_seed(1))
-    assert torch.allclose(pooled_means(images, width), box_means(images, width), atol=1e-6)

@@ -49,7 +49,7 @@ def test_epochs_count_from_one():
 
 
 def test_every_term_of_the_losses_has_a_readable_name():
-    terms = ["total", "mse", "mae", "ssim_loss", "lpips", "stokes", "uncertainty", "intensity_lpips", "aolp_ssim_loss"]
+    terms = ["total", "mse", "mae", "ssim_loss", "lpips", "stokes", "intensity_lpips", "aolp_ssim_loss"]
     labels = [term_label(term) for term in terms]
     assert labels[-2:] == ["intensity: LPIPS", "AoLP: 1 - SSIM"]
     assert not [label for label in labels if "_" in label]

@@ -78,7 +78,7 @@ def test_the_truth_is_s0_the_coded_angle_and_dolp_and_dolp_is_scored(stores):
 
 def test_the_loss_is_the_published_one():
     torch.manual_seed(0)
-    lpips = Lpips("squeeze")
+    lpips = Lpips("vgg")
     config = dataclasses.replace(E2P, intensity_lpips=3.0, lpips=1.0)
     loss = e2p_task(config, lpips, SEED).loss
     assert isinstance(loss, BranchLoss)

@@ -1,5 +1,3 @@
-import math
-
 import pytest
 import torch
 
@@ -28,7 +26,7 @@ def test_constant_frames_half_apart():
 
 
 def of_dolp(mse: float, ssim: float, lpips: float, network: Lpips | None = None) -> PolarizationLoss:
-    config = LossConfig(mse=mse, ssim=ssim, lpips=lpips, stokes=1.0, uncertainty=1.0, half_weight=None)
+    config = LossConfig(mse=mse, ssim=ssim, lpips=lpips, stokes=1.0, half_weight=None)
     return PolarizationLoss(config, network, dolp_only=True)
 
 
@@ -42,7 +40,7 @@ def test_the_total_is_equation_9():
 
 def test_lpips_is_weighed_with_the_rest_where_there_is_a_network():
     torch.manual_seed(0)
-    lpips = Lpips("squeeze")
+    lpips = Lpips("vgg")
     loss = of_dolp(1.0, 0.0, 10.0, lpips)
     predicted, truth = torch.rand(1, 2, 1, 32, 32), torch.rand(1, 2, 1, 32, 32)
     terms = loss(predicted, truth)
@@ -56,30 +54,27 @@ def test_a_weight_of_lpips_without_a_network_is_refused_and_never_left_out():
     assert of_dolp(1.0, 1.0, 0.0).weights == {"mse": 1.0, "ssim_loss": 1.0}
 
 
-def of_everything(dolp: float, s1: float, s2: float, log_variance: float) -> torch.Tensor:
-    return torch.tensor([dolp, s1, s2, log_variance])[None, None, :, None, None].expand(2, 3, 4, 12, 12)
+def of_everything(dolp: float, s1: float, s2: float) -> torch.Tensor:
+    return torch.tensor([dolp, s1, s2])[None, None, :, None, None].expand(2, 3, 3, 12, 12)
 
 
-def test_angles_and_uncertainty_are_judged_where_a_network_predicts_them():
-    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=2.0, uncertainty=3.0, half_weight=None)
-    loss = PolarizationLoss(config, None, dolp_only=False)
-    terms = loss(of_everything(0.5, 0.3, 0.4, math.log(0.02)), of_everything(0.4, 0.1, 0.4, 0)[:, :, :3])
-    assert {name: round(term.item(), 5) for name, term in terms.items()} == {
-        "mse": 0.01,
-        "stokes": 0.04,
-        "uncertainty": round((0.01 / 0.02 + math.log(0.02)) / 2, 5),
-    }
-    assert loss.total(terms).item() == pytest.approx(0.01 + 2 * 0.04 + 3 * terms["uncertainty"].item())
+def test_angles_are_judged_where_a_network_predicts_them():
+    loss = PolarizationLoss(
+        LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=2.0, half_weight=None), None, dolp_only=False
+    )
+    terms = loss(of_everything(0.5, 0.3, 0.4), of_everything(0.4, 0.1, 0.4))
+    assert {name: round(term.item(), 5) for name, term in terms.items()} == {"mse": 0.01, "stokes": 0.04}
+    assert loss.total(terms).item() == pytest.approx(0.01 + 2 * 0.04)
 
 
 def of_two_frames(half_weight: float | None) -> tuple[PolarizationLoss, torch.Tensor, torch.Tensor]:
     """A loss, and predictions and truths of an unpolarized frame and of one with a mean squared DoLP of 0.25."""
-    config = LossConfig(mse=2.0, ssim=0.0, lpips=0.0, stokes=3.0, uncertainty=0.0, half_weight=half_weight)
-    truth = torch.stack([of_everything(0.0, 0.0, 0.0, 0.0)[0, 0], of_everything(0.5, 0.3, 0.4, 0.0)[0, 0]])[:, None]
+    config = LossConfig(mse=2.0, ssim=0.0, lpips=0.0, stokes=3.0, half_weight=half_weight)
+    truth = torch.stack([of_everything(0.0, 0.0, 0.0)[0, 0], of_everything(0.5, 0.3, 0.4)[0, 0]])[:, None]
     return (
         PolarizationLoss(config, None, dolp_only=False),
-        truth + torch.tensor([0.1, 0.2, 0, 0])[:, None, None],
-        truth[:, :, :3],
+        truth + torch.tensor([0.1, 0.2, 0])[:, None, None],
+        truth,
     )
 
 
@@ -94,6 +89,13 @@ def test_with_a_half_weight_errors_count_half_where_the_mean_squared_dolp_has_th
     torch.testing.assert_close(relative.total(terms), shares * plain.total(plain(predicted, truth)))
 
 
+def test_terms_have_the_order_of_their_weights_by_which_the_loop_names_them():
+    for half_weight in (None, 0.25):
+        config = LossConfig(mse=1.0, ssim=1.0, lpips=0.0, stokes=1.0, half_weight=half_weight)
+        loss = PolarizationLoss(config, None, dolp_only=False)
+        assert [*loss(of_everything(0.5, 0.3, 0.4), of_everything(0.4, 0.1, 0.4))] == [*loss.weights]
+
+
 def test_frames_without_a_valid_pixel_count_in_no_relative_term_and_leave_the_gradient_finite():
     relative, predicted, truth = of_two_frames(half_weight=0.25)
     predicted = predicted.clone().requires_grad_()
@@ -103,29 +105,19 @@ def test_frames_without_a_valid_pixel_count_in_no_relative_term_and_leave_the_gr
     assert terms["relative_mse"].item() == pytest.approx(0.01)
     relative.total(terms).backward()
     assert predicted.grad is not None
-    assert predicted.grad[0, :, :3].any()
+    assert predicted.grad[0].any()
     assert predicted.grad.isfinite().all()
     assert not predicted.grad[1].any()
 
 
-def test_the_uncertainty_learns_from_the_error_and_the_error_not_from_the_uncertainty():
-    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=0.0, uncertainty=1.0, half_weight=None)
-    predicted = of_everything(0.5, 0.3, 0.4, 0.0).clone().requires_grad_()
-    PolarizationLoss(config, None, dolp_only=False)(predicted, torch.zeros(2, 3, 3, 12, 12))["uncertainty"].backward()
-    assert predicted.grad is not None
-    assert not predicted.grad[:, :, :3].any()
-    assert (predicted.grad[:, :, 3] > 0).all()  # the variance of 1 is too much for an error of 0.5
-
-
-def test_masked_pixels_count_neither_for_angles_nor_for_uncertainty():
-    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=1.0, half_weight=None)
+def test_masked_pixels_do_not_count_for_angles():
+    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0, half_weight=None)
     valid = torch.zeros(2, 3, 12, 12, dtype=torch.bool)
     valid[..., :6] = True
-    predicted = of_everything(0.5, 0.5, 0.0, 0.0).clone()
-    truth = predicted[:, :, :3].clone()
-    truth[..., 6:] = 0.9
+    predicted = of_everything(0.5, 0.5, 0.0)
+    truth = torch.where(valid[:, :, None], predicted, 0.9)
     terms = PolarizationLoss(config, None, dolp_only=False)(predicted, truth, valid)
-    assert [term.item() for term in terms.values()] == [0, 0, 0]
+    assert [term.item() for term in terms.values()] == [0, 0]
 
 
 def test_a_weight_of_zero_is_not_even_computed():
@@ -134,12 +126,12 @@ def test_a_weight_of_zero_is_not_even_computed():
 
 def test_a_loss_of_nothing_is_refused():
     with pytest.raises(ValueError, match="mse, ssim, lpips: expected at least one weight > 0"):
-        LossConfig(mse=0.0, ssim=0.0, lpips=0.0, stokes=1.0, uncertainty=1.0, half_weight=None)
+        LossConfig(mse=0.0, ssim=0.0, lpips=0.0, stokes=1.0, half_weight=None)
 
 
 def test_masked_pixels_and_frames_count_in_no_term_and_get_no_gradient():
     torch.manual_seed(0)
-    lpips = Lpips("squeeze")
+    lpips = Lpips("vgg")
     loss = FrameLoss({"mse": 1.0, "mae": 1.0, "ssim_loss": 1.0, "lpips": 1.0}, lpips)
     truth = torch.rand(2, 2, 32, 32)
     predicted = torch.rand(2, 2, 32, 32, requires_grad=True)

@@ -41,7 +41,7 @@ NETWORK = DolpUNetConfig(
 )
 TRAIN = TrainConfig(**LOOP, representation="event_tensor", optimizer=None, start=None, scene_dolp=None)
 E2V = E2vConfig(**LOOP, arch="firenet", bins=3, ssim=1.0, lpips=0.0)
-LOSS = LossConfig(mse=1.0, ssim=1.0, lpips=0.0, stokes=0.0, uncertainty=0.0, half_weight=None)
+LOSS = LossConfig(mse=1.0, ssim=1.0, lpips=0.0, stokes=0.0, half_weight=None)
 
 
 def dolp() -> Task:

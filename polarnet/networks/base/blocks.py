@@ -30,18 +30,7 @@ def compressed(x: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
 
 def enlarged(x: Float[Tensor, "n c h w"], factor: int) -> Float[Tensor, "n c h2 w2"]:
     """Interpolate bilinearly to `factor` times the height and width."""
-    return enlarged_by_products(x, factor) if x.is_cuda else F.interpolate(x, scale_factor=factor, mode="bilinear")
-
-
-def enlarged_by_products(x: Float[Tensor, "n c h w"], factor: int) -> Float[Tensor, "n c h2 w2"]:
-    """Return the same as `enlarged`, as products with two matrices.
-
-    On a GPU, the deterministic gradient of F.interpolate sorts its summands; that of a product has none to sort.
-    """
-    with torch.autocast(x.device.type, enabled=False):
-        units = (torch.eye(size, dtype=x.dtype, device=x.device)[None] for size in x.shape[-2:])
-        down, across = (F.interpolate(unit, scale_factor=factor, mode="linear")[0] for unit in units)
-        return ((x @ across).mT @ down).mT
+    return F.interpolate(x, scale_factor=factor, mode="bilinear")
 
 
 def conv3x3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:

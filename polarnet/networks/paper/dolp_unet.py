@@ -58,7 +58,6 @@ class DolpUNet(nn.Module):
 
     representation = "event_tensor"
     predicts_stokes = False
-    replays = False
     optimizer = "adam"
     outputs = ("p1",)
 

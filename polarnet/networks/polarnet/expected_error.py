@@ -23,13 +23,15 @@ USUAL_DISAGREEMENT = 0.007  # squared DoLP; features near 0 are less collinear w
 USUAL_ROOM = 0.17  # the same for the room for errors
 MIN_WEIGHT = 1e-6  # lower limit of the candidates' total weight
 MIN_ROOM = 0.05  # added to dolp * (1 - dolp)
+UNFITTED = -4.0  # log-variance before the fit, for an error of 0.14
 LITTLE_EVIDENCE = 0.1  # mean evidence of a frame with a silence of 1/2
 
 
 class ExpectedError(nn.Module):
-    """Correction to the initial log-variance, at half resolution: weight @ features + bias.
+    """Log-variance of DoLP's error at half resolution: weight @ features + bias.
 
-    Weight and bias are not trained by gradients. They stay 0 until `polarnet.training.engine.loop.calibrate` sets them.
+    Weight and bias are not trained by gradients. The network expects the error `UNFITTED` everywhere until
+    `polarnet.training.engine.loop.calibrate` sets them.
     """
 
     weight: Float[Tensor, " k"]
@@ -38,10 +40,10 @@ class ExpectedError(nn.Module):
     def __init__(self):
         super().__init__()
         self.register_buffer("weight", torch.zeros(FEATURES))
-        self.register_buffer("bias", torch.zeros(()))
+        self.register_buffer("bias", torch.tensor(UNFITTED))
 
     def forward(self, features: Float[Tensor, "n k h w"]) -> Float[Tensor, "n 1 h w"]:
-        """Return the correction for features from `error_features`."""
+        """Return the log-variance for features from `error_features`."""
         return (self.weight.view(-1, 1, 1) * features).sum(1, keepdim=True) + self.bias
 
 

@@ -156,11 +156,8 @@ def block_means(x: Float[Tensor, "*b h w"], size: int) -> Float[Tensor, "*b h/{s
 def box_means(x: Float[Tensor, "n c h w"], width: int) -> Float[Tensor, "n c h w"]:
     """Return means over boxes of `width` pixels around each pixel; pixels outside the image do not count.
 
-    On a processor, depthwise convolutions of channels_last images, one axis after the other, need fewer additions than
-    pooling.
+    Depthwise convolutions of channels_last images, one axis after the other, need fewer additions than pooling.
     """
-    if x.is_cuda:
-        return pooled_means(x, width)
     channels, rows, columns = x.shape[-3:]
     ones = x.new_ones(channels, 1, 1, width)
     with torch.autocast(x.device.type, enabled=False):
@@ -168,12 +165,6 @@ def box_means(x: Float[Tensor, "n c h w"], width: int) -> Float[Tensor, "n c h w
         sums = F.conv2d(sums, ones, padding=(0, width // 2), groups=channels)
         sums = F.conv2d(sums, ones.transpose(2, 3), padding=(width // 2, 0), groups=channels)
     return sums / (inside(rows, width, x)[:, None] * inside(columns, width, x))
-
-
-def pooled_means(x: Float[Tensor, "n c h w"], width: int) -> Float[Tensor, "n c h w"]:
-    """Return the same as `box_means`, by pooling along one axis after the other; used on a GPU."""
-    means = F.avg_pool2d(x.float(), (1, width), stride=1, padding=(0, width // 2), count_include_pad=False)
-    return F.avg_pool2d(means, (width, 1), stride=1, padding=(width // 2, 0), count_include_pad=False)
 
 
 def inside(pixels: int, width: int, like: Tensor) -> Float[Tensor, " pixels"]:

@@ -56,10 +56,6 @@ NOISE_TENSORS = 2  # isolated events and quiet pixels; how many pixels around ea
 PANORAMA_TENSORS = 1 + len(Panorama._fields)  # events of the previous window, then the panorama
 NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window: no sums, moments or wide sums, and no more
 SOLVER_TENSORS = SENSITIVITY_TENSORS + NOISE_TENSORS + len(NO_STATE) + PANORAMA_TENSORS  # recurrent layers' follow
-LOG_VARIANCE = -4.0  # initial log-variance, for an error of 0.14
-LOG_VARIANCE_OUTPUTS = slice(12, 16)  # outputs of the last layer that hold the log-variance: the fourth map, 2x2 pixels
-
-
 MAX_BINNING = 8
 Binning = Annotated[int, Field(ge=1, le=MAX_BINNING)]
 
@@ -182,7 +178,6 @@ class StokesUNet(nn.Module):
 
     representation = "event_counts"
     predicts_stokes = True
-    replays = True
     optimizer = "muon"
     outputs = ("choose", "gains", "trust", "add", "scale.out")
     memories: Float[Tensor, " m"]
@@ -227,7 +222,7 @@ class StokesUNet(nn.Module):
         self.trust = nn.Conv2d(half, 1, kernel_size=1)
         self.look = conv3x3(half + 4 * 3, half)
         self.refine = ResidualBlock(half)
-        self.add = nn.Conv2d(half, 4 * 4, kernel_size=1)
+        self.add = nn.Conv2d(half, 3 * 4, kernel_size=1)  # s1, s2 and DoLP of 2x2 pixels
         self.constant = nn.Parameter(torch.tensor(MIDDLE_DOLP))
         self.expected = ExpectedError()
         for last in (self.choose, self.gains, self.add, self.trust):
@@ -313,9 +308,9 @@ class StokesUNet(nn.Module):
         features = torch.cat([y2, F.pixel_unshuffle(fine, 2).to(y2.dtype)], dim=1)
         added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(features)))), 2).float()
 
-        recovered = fine + added[:, :3]
+        recovered = fine + added
         features = error_features(candidates.dolp, weights[:, :-1], candidates.evidence, recovered[:, 2:])
-        log_variance = LOG_VARIANCE + added[:, 3:] + F.interpolate(self.expected(features), scale_factor=2)
+        log_variance = F.interpolate(self.expected(features), scale_factor=2)
         of_pixels = self._enlarged(torch.cat([recovered, log_variance], dim=1))
         stokes, dolp, log_variance = of_pixels[:, :2], of_pixels[:, 2], of_pixels[:, 3]
         aolp = torch.remainder(torch.atan2(stokes[:, 1], stokes[:, 0]) / 2, math.pi)
@@ -325,12 +320,9 @@ class StokesUNet(nn.Module):
 
     @torch.no_grad()
     def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:
-        """Set the log-variance to weight @ features + bias; keep other outputs."""
-        assert self.add.bias is not None
-        self.add.weight[LOG_VARIANCE_OUTPUTS] = 0
-        self.add.bias[LOG_VARIANCE_OUTPUTS] = 0
+        """Set the log-variance to weight @ features + bias."""
         self.expected.weight.copy_(weight)
-        self.expected.bias.fill_(bias - LOG_VARIANCE)
+        self.expected.bias.fill_(bias)
 
     def _candidates(
         self, events: Float[Tensor, "n m 4 h w"], streams: int, state: Float[Tensor, "b d c h4 w4"] | None

@@ -1,8 +1,7 @@
 """Expected-error fit: a map from features to the log-variance of DoLP's error, fitted after training.
 
-During training the variance head learns little beyond the average error, because the errors keep changing. After
-training the errors are fixed. The log of the expected squared error is then a linear function of the features, fitted
-by maximum likelihood under normal errors, which is a convex problem.
+The log of the expected squared error is a linear function of the features, fitted by maximum likelihood under normal
+errors, which is a convex problem.
 
 There are many pixels but few scenes, so a ridge penalty guards against overfitting. Cross-validation over left-out
 scenes selects the ridge. If the features do not help on left-out scenes, the fit expects the same error everywhere.

@@ -3,7 +3,6 @@
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 from statistics import fmean
 from typing import Annotated
 
@@ -22,7 +21,6 @@ from polarnet.training.engine.losses import known_frames
 from polarnet.training.engine.optimizers import OPTIMIZERS
 from polarnet.training.engine.parallel import add_up, place, wait_for_all
 from polarnet.training.engine.recorder import Recorder
-from polarnet.training.engine.replay import Replayed
 from polarnet.training.engine.sequences import (
     Batch,
     ViewConfig,
@@ -106,10 +104,6 @@ def train(
     optimizer = OPTIMIZERS[task.optimizer](network, config.learning_rate)
     progress = recorder.resume(network, optimizer)
     wait_for_all()  # every process has read the running checkpoint before the first process writes it again
-    stepped = task
-    if device.type == "cuda" and task.replays and config.accumulate == 1:
-        uncached = autocast(config.precision, device, cache_enabled=False)
-        stepped = replace(task, unroll=Replayed(task, uncached))
     helpers = workers if device.type == "cuda" else 0  # on a processor, the training itself needs the cores
     trained = progress.epoch == config.epochs
     loaded = None if trained else loaded_if_it_fits(split.train, task.wants_intensity, helpers)
@@ -120,7 +114,7 @@ def train(
         batches = batches_of(visits, order[progress.visits :], config.batch_size, workers)
         for batch in recorder.show(batches, progress, len(order), config.epochs):
             set_learning_rate(optimizer, config, (epoch + progress.visits / len(order)) / config.epochs)
-            losses = train_batch(stepped, optimizer, batch, config, device)
+            losses = train_batch(task, optimizer, batch, config, device)
             progress.add(losses, len(batch.names))
             recorder.keep(progress, network, optimizer)
         recorder.end_epoch(progress, network, validate(task, split.val, config, device, workers))
@@ -237,10 +231,9 @@ def set_learning_rate(optimizer: torch.optim.Optimizer, config: LoopConfig, done
         group["lr"] = config.learning_rate * rise * fall
 
 
-def autocast(precision: str, device: torch.device, cache_enabled: bool = True) -> torch.autocast:
+def autocast(precision: str, device: torch.device) -> torch.autocast:
     """Run convolutions and matrix products in bfloat16 if `precision` resolves to bf16 on this device."""
-    enabled = precision_on(device, precision) == "bf16"
-    return torch.autocast(device.type, torch.bfloat16, enabled, cache_enabled)
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision_on(device, precision) == "bf16")
 
 
 def sequences_to_fit(task: Task, dataset: WindowDataset) -> WindowDataset:

@@ -13,15 +13,12 @@ from polarnet.runtime.sections import section
 Frames = Float[Tensor, "t b h w"]
 Valid = Bool[Tensor, "t b h w"] | None
 
-LOG_VARIANCES = (-10.0, 1.0)  # limits of DoLP's log-variance, wide enough for every possible error
-
 
 @section
 class LossConfig:
     """Section `loss` of params.yaml: weights of the loss terms (Eq. 9). A weight of 0 leaves a term out.
 
-    The paper uses 1, 1, 10 for the first three. `stokes` and `uncertainty` apply only to networks that predict more
-    than DoLP.
+    The paper uses 1, 1, 10 for the first three. `stokes` applies only to networks that predict more than DoLP.
     """
 
     mse: NonNegativeFloat
@@ -29,9 +26,6 @@ class LossConfig:
     lpips: NonNegativeFloat
     stokes: NonNegativeFloat
     """Weight of the squared error of (S1, S2) / S0."""
-    uncertainty: NonNegativeFloat
-    """Weight of the negative log-likelihood of DoLP's error under its predicted variance. Only the variance learns
-    from this term."""
     half_weight: PositiveFloat | None
     """Mean squared DoLP of a frame whose squared errors count half in `mse` and `stokes`; those of unpolarized frames
     count fully, and those of strongly polarized frames less. None: all frames count alike."""
@@ -84,7 +78,7 @@ class FrameLoss:
 
 
 class PolarizationLoss(FrameLoss):
-    """A `FrameLoss` of DoLP, plus terms for (s1, s2) and the log-variance if the network predicts them.
+    """A `FrameLoss` of DoLP, plus a term for (s1, s2) if the network predicts them.
 
     With `config.half_weight`, the terms `mse` and `stokes` are replaced by `relative_mse` and `relative_stokes`.
     """
@@ -93,17 +87,14 @@ class PolarizationLoss(FrameLoss):
         prefix = "" if config.half_weight is None else "relative_"
         of_dolp = {f"{prefix}mse": config.mse, "ssim_loss": config.ssim, "lpips": config.lpips}
         super().__init__({name: weight for name, weight in of_dolp.items() if name != "relative_mse"}, lpips)
-        more = {} if dolp_only else {f"{prefix}stokes": config.stokes, "uncertainty": config.uncertainty}
+        more = {} if dolp_only else {f"{prefix}stokes": config.stokes}
         self.weights = {name: weight for name, weight in (of_dolp | more).items() if weight}
         self._half_weight = config.half_weight
 
     def __call__(
         self, predicted: Float[Tensor, "t b k h w"], truth: Float[Tensor, "t b m h w"], valid: Valid = None
     ) -> dict[str, Float[Tensor, ""]]:
-        """Return the unweighted terms by name.
-
-        The maps of `predicted` and `truth` are DoLP, s1 and s2; `predicted` adds the log-variance.
-        """
+        """Return the unweighted terms by name, in the order of `weights`. The maps are DoLP, s1 and s2; `predicted` may be DoLP alone."""
         terms = super().__call__(predicted[:, :, 0], truth[:, :, 0], valid)
         if "relative_mse" in self.weights:
             squared = (predicted[:, :, 0] - truth[:, :, 0]).square()
@@ -112,12 +103,7 @@ class PolarizationLoss(FrameLoss):
             terms["stokes"] = _mean_of_known(_stokes_errors(predicted, truth), valid)
         if "relative_stokes" in self.weights:
             terms["relative_stokes"] = self._relative(_stokes_errors(predicted, truth), truth, valid)
-        if "uncertainty" in self.weights:
-            log_variance = predicted[:, :, 3].clamp(*LOG_VARIANCES)
-            squared = (predicted[:, :, 0].detach().clamp(0, 1) - truth[:, :, 0]).square()
-            nll = (squared * torch.exp(-log_variance) + log_variance) / 2
-            terms["uncertainty"] = _mean_of_known(nll, valid)
-        return terms
+        return {name: terms[name] for name in self.weights}
 
     def _relative(self, errors: Frames, truth: Float[Tensor, "t b m h w"], valid: Valid) -> Float[Tensor, ""]:
         """Mean of `errors` in which a frame counts fully if it is unpolarized, and less the higher its DoLP."""
@@ -128,7 +114,7 @@ class PolarizationLoss(FrameLoss):
 
 def _stokes_errors(predicted: Float[Tensor, "t b k h w"], truth: Float[Tensor, "t b m h w"]) -> Frames:
     """Squared error of (s1, s2) at each pixel."""
-    return (predicted[:, :, 1:3] - truth[:, :, 1:]).square().sum(2)
+    return (predicted[:, :, 1:] - truth[:, :, 1:]).square().sum(2)
 
 
 def _mean_of_known(of_pixels: Frames, valid: Valid) -> Float[Tensor, ""]:

@@ -29,7 +29,6 @@ class Muon(Optimizer):
             self._matrices, lr=learning_rate, weight_decay=0.0, adjust_lr_fn="match_rms_adamw"
         )
         self._adam = Adam(self._others, lr=learning_rate, fused=True)
-        self._recorded: torch.cuda.CUDAGraph | None = None
         super().__init__([*self._matrices, *self._others], {"lr": learning_rate})
         self._share_groups()
 
@@ -45,9 +44,6 @@ class Muon(Optimizer):
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """Update the weights that have gradients; there is no `closure`."""
         self._adam.step()
-        if self._matrices[0].is_cuda:
-            self._replay()
-            return
         for matrix, weight in self._pairs():
             matrix.copy_(weight.flatten(1))
             matrix.grad = None if weight.grad is None else weight.grad.flatten(1)
@@ -63,33 +59,7 @@ class Muon(Optimizer):
         """Restore the state of both optimizers."""
         self._muon.load_state_dict(state_dict["muon"])
         self._adam.load_state_dict(state_dict["adam"])
-        self._recorded = None  # the graph writes to other momenta
         self._share_groups()
-
-    def _replay(self) -> None:
-        """Update the matrices on a GPU by one CUDA graph, which launches all their operations at once.
-
-        The graph leaves the step of learning rate 1 in `_matrices`. A weight without a gradient counts as one whose
-        gradient is 0.
-        """
-        rate, self._muon.param_groups[0]["lr"] = self._muon.param_groups[0]["lr"], 1.0
-        if self._recorded is None:
-            for matrix in self._matrices:
-                matrix.grad = torch.zeros_like(matrix)
-            if not self._muon.state:
-                self._muon.step()  # without gradients: allocates the momenta
-            self._recorded = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self._recorded):
-                torch._foreach_zero_(self._matrices)
-                self._muon.step()
-        self._muon.param_groups[0]["lr"] = rate
-        for matrix, weight in self._pairs():
-            assert matrix.grad is not None
-            gradient = matrix.grad.view(weight.shape)
-            gradient.zero_() if weight.grad is None else gradient.copy_(weight.grad)
-        self._recorded.replay()
-        for matrix, weight in self._pairs():
-            weight.add_(matrix.view(weight.shape), alpha=rate)
 
     def _share_groups(self) -> None:
         """Let a learning rate that is set here, as by torch's schedulers, hold in both optimizers."""

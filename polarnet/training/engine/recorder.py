@@ -22,7 +22,7 @@ from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.runtime.files import claimed, replaced, seal, sha256
 from polarnet.terminal.progress import ProgressBar
 from polarnet.training.engine.history import Row, best_row, write_history
-from polarnet.training.engine.parallel import place
+from polarnet.training.engine.parallel import place, wait_for_all
 from polarnet.training.engine.sequences import Batch
 
 KEEP_EVERY_S = 60.0  # writing a running checkpoint of the paper's network takes 0.1 s
@@ -69,8 +69,10 @@ class Recorder:
 
     `metadata` records everything that determines the weights. It goes into the JSON of the best and last checkpoints,
     and its hash names the folder of the running checkpoint. `finish` deletes the running checkpoint. Old files in `out`
-    are removed first. If several processes share a training, only the first one writes. ValueError while another
-    training writes into `out`.
+    are removed first. If several processes share a training, only the first one writes.
+
+    ValueError while another training writes into `out`. A training that is equal to a running one with another `out`,
+    as two points of a sweep may be, waits until that has ended.
     """
 
     def __init__(self, out: Path, resume: Path, metadata: Mapping[str, Any], keep_every_s: float = KEEP_EVERY_S):
@@ -79,11 +81,13 @@ class Recorder:
         self.running = resume / key[:16]
         self.kept_at = time.monotonic()
         self.writes = place()[0] == 0
-        self._claim = contextlib.ExitStack()
+        self._claims = contextlib.ExitStack()
         if self.writes:
-            self._claim.enter_context(claimed(out))
+            self._claims.enter_context(claimed(out))
+            self._claims.enter_context(claimed(self.running, self._say_waiting))
             shutil.rmtree(out, ignore_errors=True)
             out.mkdir(parents=True)
+        wait_for_all()  # no process reads the running checkpoint of the training that the first one waits for
 
     def resume(self, network: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
         """Restore network and optimizer from the running checkpoint, if it exists, and return the progress.
@@ -148,7 +152,10 @@ class Recorder:
         """Delete the running checkpoint, because the training is complete."""
         if self.writes:
             shutil.rmtree(self.running, ignore_errors=True)
-            self._claim.close()
+            self._claims.close()
+
+    def _say_waiting(self) -> None:
+        ProgressBar.write(f"waiting until an equal training ends, whose running checkpoint is in {self.running}")
 
     def _write(self, progress: Progress, network: nn.Module) -> None:
         last = progress.history[-1]

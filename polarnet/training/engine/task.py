@@ -54,8 +54,6 @@ class Task:
     scored: Callable[[Tensor], Float[Tensor, "t b h w"]] = lambda frames: frames
     """Function that picks the map to score from the predicted or true maps; its validation MSE selects the best
     epoch."""
-    replays: bool = False
-    """Whether a GPU may replay `unroll` (polarnet.training.engine.replay)."""
     unroll_with_features: (
         Callable[[Tensor, State], tuple[Float[Tensor, "t b h w"], Float[Tensor, "n c i j"], State]] | None
     ) = None
