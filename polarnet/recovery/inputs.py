@@ -177,11 +177,11 @@ def _sequence(store: EventStore, path: Path, sequence: str | None) -> Sequence[E
     return store.read(_named(sequence, store.sequences, path.name))
 
 
-def _named(sequence: str | None, names: Sequence[str], where: str) -> str:
+def _named(sequence: str | None, names: list[str], where: str) -> str:
     """The sequence of that name, or the only one; ValueError if there is none."""
     if sequence is None and len(names) == 1:
         return names[0]
-    if sequence not in names:
+    if sequence is None or sequence not in names:
         raise ValueError(f"{where}: --sequence: {unknown_sequence(sequence, names)}")
     return sequence
 
