@@ -35,4 +35,5 @@ def aedat4_frames(path: Path) -> CameraFrames:
         raise RecordingError(
             f"{path.name}: expected raw frames of one size and one channel as true polarization, there are none"
         )
-    return CameraFrames(*arrays)  # type: ignore[arg-type]
+    t_us, levels = arrays
+    return CameraFrames(t_us, levels)
