@@ -28,7 +28,7 @@ from polarnet.events.representations import polarity_sums
 from polarnet.methods import METHODS
 from polarnet.networks import shipped_weights
 from polarnet.pictures import BUILTIN_PHOTOS, read_rgb
-from polarnet.reports.maps import angle_bytes, fraction_bytes, signed_bytes
+from polarnet.reports.film import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.reports.player import TRUTH, Film, Map, write_player
 from polarnet.simulation import MOTIONS, SENSORS, simulate
 
