@@ -18,7 +18,7 @@ from polarnet.events.stream import slice_time
 from polarnet.events.windows import encode_windows
 from polarnet.metrics.reliability import HIGHEST, LOWEST, Reliability, reliability
 from polarnet.metrics.similarity import Lpips
-from polarnet.reports.maps import angle_bytes, fraction_bytes, signed_bytes
+from polarnet.reports.film import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import (

@@ -21,17 +21,15 @@ from torch import Tensor
 
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Recoverer, State
+from polarnet.reports.film import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.reports.maps import (
     EventScale,
-    angle_bytes,
     angle_image,
     dolp_image,
     encode_png,
     event_image,
-    fraction_bytes,
     intensity_image,
     polarization_hsv,
-    signed_bytes,
 )
 from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map, write_player
 from polarnet.reports.preview import Panel, Sheet, foot_of
@@ -64,7 +62,7 @@ class Picture(NamedTuple):
     t_us: int
     pixels: UInt8[np.ndarray, "h w 3"]
     maps: Mapping[Kind, UInt8[Tensor, "h w"]]
-    """The maps as bytes (`polarnet.reports.maps`), for the page."""
+    """The maps as bytes (`polarnet.reports.film`), for the page."""
 
 
 @dataclass

@@ -24,7 +24,6 @@ EVENT_COLOURS = LinearSegmentedColormap.from_list(
 )
 DOTS_PER_INCH = 160  # of figures
 FULL_SCALE_QUANTILE = 0.99  # of the pixels with events, so that a few hot pixels do not bleach a picture
-NO_EVENTS = 128  # byte of a pixel with as many ON as OFF events, see `signed_bytes`
 SCALE_INERTIA = 0.9  # share of the previous picture's full scale of events, which prevents flicker
 
 
@@ -159,18 +158,3 @@ def _coloured(unit: np.ndarray, table: UInt8[np.ndarray, "n 3"]) -> UInt8[np.nda
 
 
 DOLP_TABLE, EVENT_TABLE = table_of(matplotlib.colormaps[DOLP_COLOURS]), table_of(EVENT_COLOURS)
-
-
-def fraction_bytes(fraction: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
-    """DoLP or intensity in steps of 1/255; values outside 0 to 1 are clamped."""
-    return (fraction.clamp(0, 1) * 255).round().to(torch.uint8)
-
-
-def angle_bytes(aolp: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
-    """AoLP in radians, period pi, in steps of pi/256."""
-    return (aolp * (256 / math.pi)).round().remainder(256).to(torch.uint8)
-
-
-def signed_bytes(counts: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
-    """ON minus OFF events, clamped to -127 .. 127, plus `NO_EVENTS`."""
-    return (counts.round().clamp(-127, 127) + NO_EVENTS).to(torch.uint8)

@@ -15,9 +15,10 @@ import torch
 from jaxtyping import UInt8
 
 from polarnet.reports.artefacts import Panel
+from polarnet.reports.film import NO_EVENTS
 from polarnet.reports.html import embedded_json, script, template
 from polarnet.reports.legend import Legend, with_structure
-from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, NO_EVENTS, data_uri, event_full_scale, paper_map, table_of
+from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, data_uri, event_full_scale, paper_map, table_of
 
 Kind = Literal["events", "s0", "dolp", "aolp"]
 
@@ -44,7 +45,7 @@ class Map(NamedTuple):
     """Label of its origin: a method, the truth, or a recording."""
     kind: Kind
     frames: UInt8[np.ndarray, "n h w"]
-    """Bytes in the steps of `polarnet.reports.maps`."""
+    """Bytes in the steps of `polarnet.reports.film`."""
 
 
 class Film(NamedTuple):
