@@ -113,7 +113,7 @@ def open_files(
     """Read channels from files, starting at time 0 and reduced to `size` (height, width) if given.
 
     Four files hold one channel each, in the order of `arrangement.angles`, and are read by `read`. A single path is a
-    recording of a camera with a mosaic, an event store, a folder that `polarnet export` wrote, or a folder of
+    recording of a camera with a mosaic, an event store, a folder that `polarnet convert` wrote, or a folder of
     division-of-time captures, which are calibrated in `work` with the settings that `captures` returns. With `plain`,
     any other file is one channel, of a camera without polarizers. `clean` removes noise before the size is reduced.
     A ValueError or FileNotFoundError says what is missing.
@@ -167,7 +167,7 @@ def _channels(
 
 
 def _exported(folder: Path, sequence: str | None) -> dict[int, Path]:
-    """Files by angle in a folder that `polarnet export` or `polarnet simulate` wrote; empty for any other folder."""
+    """Files by angle in a folder that `polarnet convert` or `polarnet simulate` wrote; empty for any other folder."""
     if (folder / EXPORT_INDEX).is_file():
         names = sorted(path.name for path in folder.iterdir() if path.is_dir())
         name = names[0] if sequence is None and len(names) == 1 else sequence

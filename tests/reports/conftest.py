@@ -119,7 +119,7 @@ def paths(tmp_path_factory):
     synthesize(paths.images, paths.scenes, paths.frames, motion, 1, map, 2)
     frames = FrameStore.open(paths.frames)
     write_events(paths.events, frames)
-    run_methods(EventStore.open(paths.events), frames, paths.benchmark)
+    run_methods(EventStore.open(paths.events), frames, paths.simulated)
     for folder, network in ((paths.train / "ours", "paper"), (paths.train / "e2v", "firenet")):
         folder.mkdir(parents=True)
         write_history(folder, HISTORY)
