@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 
-from polarnet.config.sweep import COLUMNS, mean_scores, sweep_points
+from polarnet.config.sweep import SCORES, mean_scores, sweep_points
 from polarnet.reports.figures import LIGHT
 from polarnet.reports.maps import png
 from polarnet.reports.provenance import git, processor
@@ -306,7 +306,7 @@ def measure_sweep(root: Path, sweeps: Sequence[Path]) -> list[Path]:
         {
             "weights": dict(zip(EQ9_WEIGHTS, weights, strict=True)),
             "seeds": sorted(seeds),
-            **{split: mean_scores([one[split] for one in seeds.values()], names) for split, names in COLUMNS.items()},
+            **{split: mean_scores([one[split] for one in seeds.values()], names) for split, names in SCORES.items()},
             "notes": list(dict.fromkeys(note for one in seeds.values() for note in one["notes"])),
         }
         for weights, seeds in jobs.items()

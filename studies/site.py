@@ -30,7 +30,7 @@ from polarnet.networks import shipped_weights
 from polarnet.pictures import BUILTIN_PHOTOS, read_rgb
 from polarnet.reports.player import TRUTH, Film, Map, write_player
 from polarnet.simulation import MOTIONS, SENSORS, simulate
-from polarnet.storage.film import angle_bytes, fraction_bytes, signed_bytes
+from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTSIDE = re.compile(r"\]\(\.\./([^)#]+)(#[^)]*)?\)")

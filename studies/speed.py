@@ -29,7 +29,7 @@ from typing import Any
 
 import fsspec
 
-from polarnet.config.sweep import write_comparison
+from polarnet.config.sweep import sweep_points, sweep_rows
 from polarnet.config.tree import DOLP_TRAINING
 from polarnet.runtime.cluster import pmap
 from polarnet.training.engine.history import read_history
@@ -135,7 +135,7 @@ def _killed_half_way(options: argparse.Namespace, sweep: Path) -> Callable[[], i
 
 
 def _dask_points(options: argparse.Namespace, sweep: Path) -> None:
-    """Run the sweep's points as tasks of two Dask workers on loopback, and write its table."""
+    """Run the sweep's points as tasks of two Dask workers on loopback."""
     from distributed import LocalCluster
 
     swept = SWEEP[len(SHORT) :]
@@ -147,12 +147,10 @@ def _dask_points(options: argparse.Namespace, sweep: Path) -> None:
     run = functools.partial(subprocess.run, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         pmap(run, points, workers=1, label="points", address=cluster.scheduler_address)
-    write_comparison(sweep)
 
 
 def _points(sweep: Path) -> list[Any]:
-    content = json.loads((sweep / "comparison.json").read_text())
-    return [(point["validation"], point["test"]) for point in content["points"]]
+    return [(point["validation"], point["test"]) for point in sweep_points(sweep)]
 
 
 def search(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
@@ -165,7 +163,7 @@ def search(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     again = subprocess.run(
         words_of("search", options, *words, *asked), cwd=ROOT, check=True, capture_output=True, text=True
     )
-    rows = json.loads((folder / "search" / "comparison.json").read_text())["rows"]
+    rows = sweep_rows(sweep_points(folder / "search"))
     stopped = [path for path in (folder / "search").glob("*/failure.txt") if path.read_text().startswith("stopped")]
     own = [one for one in rows[0]["overrides"] if one.partition("=")[0] in {word.partition("=")[0] for word in SEARCH}]
     return {

@@ -85,11 +85,11 @@ def _add_inspection(commands: Commands) -> None:
         "inspect",
         help="summarise a camera's file and draw its busiest moment, or list the sequences of a store",
         description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
-        "camera's file, with signs of a readout at its limit, and draws its busiest moment as a PNG. Of a store it names the "
-        "sequences instead.",
+        "camera's file, with signs of a readout at its limit, and draws its busiest moment as a PNG. Of a store it "
+        "names the sequences.",
         epilog="example: polarnet inspect recording.aedat4 --hot-pixels hot.png",
     )
-    inspect.add_argument("file", help="file of a camera, an event store with --part, or a store to list (folder or URL)")
+    inspect.add_argument("file", help="file of a camera, an event store with --part, or a store to list")
     add_reading(inspect)
     inspect.add_argument("--part", metavar="SEQUENCE/ANGLE", help="sequence and channel of an event store: NAME/45")
     add_hot_pixel_factor(inspect)

@@ -129,7 +129,7 @@ def _simulate(options: argparse.Namespace) -> int:
     if config.storage.labels and (unable := [form for form in formats if form not in LABEL_FORMATS]):
         raise ValueError(
             f"storage.labels=true: expected formats that hold labels ({', '.join(LABEL_FORMATS)}), "
-            f"got {', '.join(unable)}; leave it out, and write it with `polarnet convert` from the store, without labels"
+            f"got {', '.join(unable)}; leave it out, and write it with `polarnet convert`, without labels"
         )
     configure(config.runtime, config.seed)
     outputs = Outputs(

@@ -29,7 +29,6 @@ from polarnet.config.tree import Config
 from polarnet.events.representations import event_tensor
 from polarnet.events.streaming import EventWindow
 from polarnet.reports.curves import PAPER_EVENTS_PER_PIXEL, event_budget_figure, sensitivity_figure
-from polarnet.reports.figures import LIGHT
 from polarnet.reports.maps import png, write_figure
 from polarnet.reports.paper import EXPERIMENTS, Moment, figure_11
 from polarnet.runtime.machine import threads_of
@@ -79,7 +78,7 @@ def run_event_budget(
         if name in EXPERIMENTS:
             test_set = pipeline_set(config, name)
             _write_figure_11(out, name, test_set.sequence(test_set.sequences[0]), context)
-    return _written(out, "event_budget", results, png(event_budget_figure(results, LIGHT)))
+    return _written(out, "event_budget", results, png(event_budget_figure(results)))
 
 
 def _write_figure_11(out: Path, name: str, sequence: TestSequence, context: Context) -> None:
@@ -121,7 +120,7 @@ def run_sensitivity(
         context, threads=threads_of(config.runtime),
     )  # fmt: skip
     results = {"methods": list(methods), "sequences": list(sequences), "conditions": conditions, "settings": table}
-    return _written(out, "sensitivity", results, png(sensitivity_figure(table, LIGHT)))
+    return _written(out, "sensitivity", results, png(sensitivity_figure(table)))
 
 
 def _prepared(config: Config, methods: Sequence[str], limit: int | None, weights: Path | None) -> Any:

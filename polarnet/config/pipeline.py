@@ -5,13 +5,13 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from polarnet.benchmark.references import REFERENCES
 from polarnet.benchmark.row_results import RowRecord, write_row
 from polarnet.benchmark.rows import Context, available, weights_used
 from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp
 from polarnet.config.tree import Config, or_exit
 from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup
+from polarnet.metrics.references import REFERENCES
 from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.machine import device_of
 from polarnet.simulation.rotating import RotatingConfig

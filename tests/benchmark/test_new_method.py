@@ -9,13 +9,12 @@ import torch
 from polarnet import methods
 from polarnet.analysis.event_budget import since_start, sliding_recovery
 from polarnet.benchmark.results import write_benchmark
-from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.score import BenchmarkConfig
 from polarnet.config.pipeline import context_of
 from polarnet.config.tree import load
 from polarnet.events.streaming import WindowRule
-from polarnet.methods import METHODS
+from polarnet.methods import METHODS, ROWS
 from polarnet.recordings.live import Piece
 from polarnet.recovery.stream import Input, frames_of
 from polarnet.reports.tables import score_table

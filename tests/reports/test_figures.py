@@ -3,23 +3,22 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.reports.artefacts import Panel
-from polarnet.reports.figures import (
-    comparison_figure,
-    score_line,
-)
+from polarnet.reports.figures import comparison_figure, score_line
 from polarnet.reports.maps import png
+from polarnet.storage.panels import Panel, Shown, fraction_bytes
 
 TRUTH = torch.linspace(0, 1, 24 * 36).view(24, 36)
 
 
 def scene(*methods):
-    dolp = dict.fromkeys(methods, TRUTH / 2)
-    return Panel("tree", 0, 33_333, torch.zeros(4, 24, 36), TRUTH, TRUTH, TRUTH, dolp, aolp={})
+    film, times = fraction_bytes(TRUTH)[None], torch.tensor([33_333])
+    truth, half = (Shown(dolp, None, film, None) for dolp in (TRUTH, TRUTH / 2))
+    half = dict.fromkeys(methods, half)
+    return Panel("tree", 0, 33_333, torch.zeros(4, 24, 36), TRUTH, times, film, film, truth, half)
 
 
 def panel(rows):
-    return png(comparison_figure(rows, rows[0].dolp))
+    return png(comparison_figure(rows, rows[0].predictions))
 
 
 def test_a_comparison_panel_gives_the_same_bytes():

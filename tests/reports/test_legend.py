@@ -1,7 +1,7 @@
 import pytest
 
-from polarnet.methods import METHODS
-from polarnet.reports.legend import GENERAL, NETWORKS, ROWS, glossary, legend_of, lpips_about
+from polarnet.methods import METHODS, ROWS
+from polarnet.reports.legend import GENERAL, NETWORKS, glossary, legend_of, lpips_about
 
 
 def weights(**networks):
