@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from polarnet.cli.own_scenes import benchmark_recordings
+from polarnet.cli.own_scenes import Request, benchmark_recordings
 from polarnet.config.tree import Config, load
 from polarnet.events.mosaic import join_mosaic
 from polarnet.networks.e2p.network import MOSAIC
@@ -72,7 +72,8 @@ def measured(config: Config, work: Path, photographs: Sequence[Path]) -> tuple[d
     write_recordings(made, folder)
     out.mkdir()
     command = "polarnet benchmark --recordings recordings"
-    notes = benchmark_recordings(config, folder, MOSAIC, NO_CLEANING, out, work / "work", None, command)
+    request = Request(folder, out, work / "work", None, command)
+    notes = benchmark_recordings(config, request, MOSAIC, NO_CLEANING)
     print("\n".join(notes))
     scores = json.loads((out / "metrics.json").read_text())
     return {"scores": scores, "reader_errors": reader_errors(made, folder)}, out

@@ -11,15 +11,6 @@ from polarnet.simulation.ranges import NAMES
 NOT_COMPARED = ("synthesize.sequences_per_picture",)
 MODEL_ALONE = {"esim_log_eps": ("esim", "esim_gpu"), "voltmeter_camera": ("dvs_voltmeter",)}
 """Parameters that exist only in the pixel models listed."""
-RANGES_BEFORE = {
-    "random_threshold_on": ("contrast_threshold_on",),
-    "random_threshold_off": ("contrast_threshold_off",),
-    "random_threshold_sigma": ("contrast_threshold_sigma_on", "contrast_threshold_sigma_off"),
-    "random_cutoff_hz": ("cutoff_hz",),
-    "random_leak_rate_hz": ("leak_rate_hz",),
-    "random_shot_noise_rate_hz": ("shot_noise_rate_hz",),
-}
-"""Parameters with the same range, by the key of this range in some checkpoints."""
 SPEEDS = ("synthesize.speed_min_px_s", "synthesize.speed_max_px_s")
 
 
@@ -51,25 +42,7 @@ def configured(synthesize: SynthesizeConfig, emulate: EmulatorConfig) -> Conditi
 def stored(attributes: Mapping[str, Any], height: int, width: int) -> Conditions:
     """Conditions from the attributes of an event store; only the size if its events were not simulated."""
     size = {"sensor_height": height, "sensor_width": width}
-    return Conditions(
-        attributes.get("scenes", {}).get("synthesize", {}) | size, _as_today(attributes.get("emulate", {}))
-    )
-
-
-def _as_today(emulate: Mapping[str, Any]) -> dict[str, Any]:
-    """Section `emulate` of any checkpoint, by the keys of `EmulatorConfig`.
-
-    Some checkpoints have one deviation for ON and OFF, a range for each of six parameters beside the switch
-    `randomise`, and no defective pixels.
-    """
-    section = {key: value for key, value in emulate.items() if not key.startswith("random_")}
-    if "contrast_threshold_sigma" in section:
-        sigma = section.pop("contrast_threshold_sigma")
-        section |= {"contrast_threshold_sigma_on": sigma, "contrast_threshold_sigma_off": sigma}
-        section |= {"contrast_threshold_correlation": 0.0, "hot_pixel_share": 0.0, "dead_pixel_share": 0.0}
-        ranges = {new: emulate[old] for old, news in RANGES_BEFORE.items() for new in news}
-        section["randomise"] = ranges if emulate["randomise"] else None
-    return section
+    return Conditions(attributes.get("scenes", {}).get("synthesize", {}) | size, attributes.get("emulate", {}))
 
 
 def trained_on(metadata: Mapping[str, Any]) -> Conditions | None:
