@@ -8,7 +8,7 @@ import torch
 
 from polarnet.benchmark.rows import Context, predictions_of
 from polarnet.benchmark.score import BenchmarkConfig, Cost, FrameScore, score_sequence, scored_windows
-from polarnet.benchmark.sequences import BenchmarkSet, TestSequence, train_mean_dolp
+from polarnet.benchmark.sequences import BenchmarkSet, TestSequence
 from polarnet.events.representations import event_tensor, polarity_sums
 from polarnet.events.windows import encode_windows
 from polarnet.metrics.reliability import HIGHEST, LOWEST, Reliability, reliability
@@ -16,8 +16,6 @@ from polarnet.metrics.similarity import Lpips
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import dequantise_angle, dequantise_fraction, quantise_angle, quantise_fraction
 from polarnet.storage.panels import Panel, Shown, angle_bytes, fraction_bytes, signed_bytes
-
-__all__ = ["Benchmark", "BenchmarkSet", "at_stored_precision", "panel_of", "run_benchmark", "train_mean_dolp"]
 
 MAX_FILM_FRAMES = 12
 """Frames of the report's player for each scene; they keep a page of 50 scenes below 30 MB."""

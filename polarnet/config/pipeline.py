@@ -7,7 +7,8 @@ from pathlib import Path
 
 from polarnet.benchmark.row_results import RowRecord, write_row
 from polarnet.benchmark.rows import Context, available, weights_used
-from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp
+from polarnet.benchmark.run import run_benchmark
+from polarnet.benchmark.sequences import BenchmarkSet, train_mean_dolp
 from polarnet.config.tree import Config, or_exit
 from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup

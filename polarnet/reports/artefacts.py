@@ -70,17 +70,6 @@ class Overview(NamedTuple):
     recovered: Float[Tensor, "h w"]
 
 
-class EventRate(NamedTuple):
-    """Number of events in a split, summed over the four channels."""
-
-    split: str
-    sequences: int
-    seconds: float
-    events: int
-    per_pixel_second: float
-    """Events per pixel and second, mean over the four channels."""
-
-
 class BudgetPoint(NamedTuple):
     """Mean error of a method over the scored frames of one bin of events per pixel."""
 
@@ -126,7 +115,6 @@ class Artefacts:
     ours: History
     baselines: Mapping[str, History]
     """Trained baselines by name."""
-    rates: Sequence[EventRate]
     budget: Sequence[BudgetPoint]
     """Error on the simulated test set by events per pixel, method by method."""
     overview: Overview | None
@@ -153,7 +141,6 @@ def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
         sets=[read_results(one) for one in sorted(paths.benchmark.glob("sets/*")) if one.name != SIMULATED],
         ours=training_history(paths.train / OURS),
         baselines={name: training_history(paths.train / name) for name in baselines},
-        rates=event_rates(events, frames),
         budget=event_budget(paths.simulated / "frames.csv", events),
         overview=_overview(panels, scenes, frames, events),
         thumbnails={
@@ -185,19 +172,6 @@ def training_history(folder: Path) -> History:
     )
     best_epoch = rows.index(best_row(rows))
     return History(_json(folder / "best.json")["network"], loss, validation, best_epoch)
-
-
-def event_rates(events: EventStore, frames: FrameStore) -> list[EventRate]:
-    """Number and rate of events in each split; a split without sequences is left out."""
-    rates = []
-    for split in SPLITS:
-        names = [name for name in frames.of_split(split) if name in set(events.sequences)]
-        if names:
-            seconds = sum(events.duration_us(name) for name in names) / 1e6
-            count = sum(sum(events.count(name)) for name in names)
-            rate = count / (4 * events.height * events.width * seconds)
-            rates.append(EventRate(split, len(names), seconds, count, rate))
-    return rates
 
 
 def thumbnails(pictures: Sequence[str], scenes: SceneStore) -> dict[str, UInt8[np.ndarray, "h w 3"]]:

@@ -157,7 +157,7 @@ def term_label(name: str) -> str:
 
 
 @_charted
-def reliability_chart(curves: Mapping[str, Sequence[Sequence[float]]], legend: Legend) -> Figure:
+def reliability_chart(curves: Mapping[str, Sequence[Sequence[float | int]]], legend: Legend) -> Figure:
     """Measured against expected squared error by method; dots grow with the number of pixels."""
     figure, axes = _axes()
     _diagonal(axes, [end for curve in curves.values() for point in curve for end in point[:2]])

@@ -262,10 +262,6 @@ def _data(artefacts: Artefacts) -> dict[str, Any]:
             split: {name: data_uri(encode_jpeg(small), "jpeg") for name, small in artefacts.thumbnails[split].items()}
             for split in SPLITS
         },
-        "rates": [
-            (one.split, one.sequences, f"{one.seconds:.1f}", f"{one.events:,}", f"{one.per_pixel_second:.1f}")
-            for one in artefacts.rates
-        ],
         "skipped": [(one.file, one.reason) for one in manifest.skipped],
         "licences": [
             (one.name, one.split, one.origin, one.author or "not stated", one.licence or "not stated")

@@ -97,12 +97,6 @@ def test_a_pixel_model_is_compared_with_the_names_that_the_training_drew(config)
     assert line.endswith("Set emulate.model=exact")
 
 
-def test_a_drawn_pixel_model_is_not_named_as_the_one_in_use(config):
-    emulate = dataclasses.replace(config.emulate, randomise={"model": ["exact", "dvs_voltmeter"]})
-    text = sentence(configured(config.synthesize, emulate))
-    assert text.endswith("; sensor: model drawn for each sequence (emulate.randomise).")
-
-
 def test_a_drawn_sensor_is_a_difference_for_a_training_that_drew_none(config):
     random = dataclasses.replace(config.emulate, randomise={"cutoff_hz": [30.0, 300.0]})
     (line,) = warnings(configured(config.synthesize, random), {"ours": checkpoint(config)}, "Set")

@@ -49,12 +49,6 @@ def test_a_table_holds_the_rows_it_is_asked_for_whatever_else_lies_in_the_folder
     assert set(left.costs) == {"zeros", "ours"}
 
 
-def test_a_row_that_was_left_out_says_why(tmp_path):
-    record = RowRecord("no weights are given", {})
-    write_row(tmp_path / "e2p", "e2p", record, {})
-    assert read_record(tmp_path / "e2p") == record
-
-
 def test_a_row_or_a_set_that_was_not_run_is_named(benchmark, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"row cf was not run; run `dvc repro`"):
         read_record(tmp_path / "cf")

@@ -3,7 +3,7 @@ import pytest
 import torch
 from matplotlib.colors import rgb_to_hsv
 
-from polarnet.reports.artefacts import event_budget, event_rates, read_artefacts, training_history
+from polarnet.reports.artefacts import event_budget, read_artefacts, training_history
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 
@@ -55,16 +55,6 @@ def test_a_thumbnail_of_a_scene_looks_like_its_picture(artefacts, source_picture
     assert name == "park"
     expected = np.rint(255 * source_picture(0.0)).mean(axis=(0, 1))
     assert small.mean(axis=(0, 1)) == pytest.approx(expected, abs=2)
-
-
-def test_event_rates_count_every_event_of_a_split_once(paths):
-    rates = event_rates(EventStore.open(paths.events), FrameStore.open(paths.frames))
-    assert [(rate.split, rate.sequences, rate.events) for rate in rates] == [
-        ("train", 1, 2000),
-        ("val", 1, 2000),
-        ("test", 2, 4000),
-    ]
-    assert rates[2].per_pixel_second == pytest.approx(4000 / (4 * 24 * 36 * 0.4))
 
 
 def test_the_best_epoch_is_the_one_with_the_lowest_validation_mse(paths):

