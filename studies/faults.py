@@ -111,7 +111,11 @@ def read_row(folder: Path) -> str:
     values: list[Any] = [read_record(folder)]
     for test_set in sorted(path.name for path in folder.iterdir() if path.is_dir()):
         results = read_rows({folder.name: folder}, test_set)
-        values += [results.rows, results.costs, *(frame for panel in results.panels for frame in panel.maps.values())]
+        values += [results.rows, results.costs]
+        for panel in results.panels:
+            shown = [panel.truth, *panel.predictions.values()]
+            values += [panel.events, panel.s0, panel.film_events, panel.film_s0, panel.film_t_us]
+            values += [frame for one in shown for frame in one if frame is not None]
     return digest(*values)
 
 

@@ -20,18 +20,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from polarnet.analysis.between_windows import frames_between
-from polarnet.analysis.resimulate import sequence_at
-from polarnet.benchmark.rows import Context, opened, predictions_of
+from polarnet.analysis.resimulate import StoredSequences
+from polarnet.benchmark.rows import Context, predictions_of
 from polarnet.benchmark.score import FrameScore, mean_scores, score_sequence
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import Events, slice_count, slice_time
 from polarnet.events.streaming import EventWindow
 from polarnet.events.windows import BIN_EDGES, events_per_pixel
-from polarnet.methods import METHODS
 from polarnet.methods.between import BetweenConfig
+from polarnet.methods.method import Recoverer
 from polarnet.metrics.similarity import correlation, mse, psnr
-from polarnet.storage.events import EventStore
-from polarnet.storage.scenes import SceneStore
 from polarnet.terminal.progress import ProgressBar
 
 SHOWN = ("mse", "psnr", "ssim", "corr", "skill")
@@ -68,13 +66,7 @@ def since_start(sequences: Iterable[TestSequence], methods: Sequence[str], conte
 
 
 def by_window_length(
-    scenes: SceneStore,
-    events: EventStore,
-    sequences: Sequence[str],
-    lengths_us: Sequence[int],
-    settle_us: int,
-    methods: Sequence[str],
-    context: Context,
+    stored: StoredSequences, lengths_us: Sequence[int], settle_us: int, methods: Sequence[str], context: Context
 ) -> dict[str, list[dict]]:
     """Mean scores and events per window, by method and window length, over windows that end after `settle_us`.
 
@@ -84,15 +76,15 @@ def by_window_length(
     for length_us in ProgressBar(lengths_us, "window length", unit="length"):
         rows: list[FrameScore] = []
         per_window: list[float] = []
-        for sequence in sequences:
-            end_us = scenes.duration_us(sequence)
+        for name in stored.names:
+            end_us = stored.scenes.duration_us(name)
             t_us = torch.arange(0, end_us + 1, length_us)
             warmup = int((t_us[1:] <= settle_us).sum())
             if len(t_us) < 2 or warmup >= len(t_us) - 1:
                 raise ValueError(
-                    f"{sequence}: windows of {length_us} us leave none after the first {settle_us} us of {end_us} us"
+                    f"{name}: windows of {length_us} us leave none after the first {settle_us} us of {end_us} us"
                 )
-            test = sequence_at(scenes, sequence, events.read(sequence), t_us)
+            test = stored.sequence(name, t_us)
             predictions = predictions_of(methods, test, context)
             rows += score_sequence(test, predictions, warmup, None, context.device)
             per_window.append(float(events_per_pixel(test.events, t_us).diff().mean()))
@@ -119,30 +111,31 @@ def last_window(channels: Sequence[Events], count: int, t_us: int) -> EventWindo
     return EventWindow(last, min((int(events.t[0]) for events in last if len(events)), default=t_us), t_us)
 
 
-def recovered_alone(windows: Sequence[EventWindow], method: str, context: Context) -> Float[Tensor, "n h w"]:
+@torch.no_grad()
+def recovered_alone(windows: Sequence[EventWindow], recoverer: Recoverer) -> Float[Tensor, "n h w"]:
     """DoLP from each window alone, without a state."""
-    recoverer, first = opened(METHODS[method], context), windows[0].channels[0]
+    first = windows[0].channels[0]
     start = recoverer.start(first.height, first.width)
     return torch.cat([recoverer.step(start, [window])[1].dolp.cpu() for window in windows])
 
 
 @torch.no_grad()
 def sliding_recovery(
-    sequence: TestSequence, count: int, t_us: Sequence[int], carry: bool, method: str, context: Context
+    sequence: TestSequence, count: int, t_us: Sequence[int], carry: bool, recoverer: Recoverer
 ) -> Float[Tensor, "n h w"]:
     """DoLP at times `t_us` from the last `count` events of each channel.
 
     With `carry`, the method's state passes from one overlapping window to the next; otherwise every window starts
     from the initial state.
     """
-    recoverer = opened(METHODS[method], context)
-    start = recoverer.start(sequence.events[0].height, sequence.events[0].width)
-    state, frames = start, []
-    for t in t_us:
-        after, prediction = recoverer.step(state, [last_window(sequence.events, count, t)])
-        state = after if carry else start
-        frames.append(prediction.dolp[0].cpu())
-    return torch.stack(frames)
+    windows = [last_window(sequence.events, count, t) for t in t_us]
+    if not carry:
+        return recovered_alone(windows, recoverer)
+    state, frames = recoverer.start(sequence.events[0].height, sequence.events[0].width), []
+    for window in windows:
+        state, prediction = recoverer.step(state, [window])
+        frames.append(prediction.dolp.cpu())
+    return torch.cat(frames)
 
 
 def _last(channels: Sequence[Events], count: int, t_us: int) -> list[Events]:
@@ -156,65 +149,50 @@ def _length_us(events: Events) -> int:
     return int(events.t[-1] - events.t[0]) if len(events) else 0
 
 
-def by_sliding_window(
-    scenes: SceneStore,
-    events: EventStore,
-    sequences: Sequence[str],
-    span_us: tuple[int, int],
-    spacing_us: int,
-    method: str,
-    context: Context,
-) -> list[dict]:
-    """Mean scores of frames every `spacing_us`, for each of `EVENTS_PER_PIXEL`, with and without carried state.
+def by_sliding_window(stored: StoredSequences, times_us: range, recoverer: Recoverer) -> list[dict]:
+    """Mean scores of frames at evenly spaced times, for each of `EVENTS_PER_PIXEL`, with and without carried state.
 
     `change` is the mean absolute difference of consecutive frames, and `true_change` is that of the truth; a
     steady method has a small `change`.
     """
-    times = list(range(span_us[0], span_us[1] + 1, spacing_us))
+    tests = [_truth_at(stored, name, times_us) for name in ProgressBar(stored.names, "truth", unit="sequence")]
     table = []
-    tests = [
-        sequence_at(scenes, name, events.read(name), torch.tensor([times[0] - spacing_us, *times]))
-        for name in ProgressBar(sequences, "truth", unit="sequence")
-    ]
     for per_pixel in ProgressBar(EVENTS_PER_PIXEL, "overlapping windows", unit="size"):
         for carry in (False, True):
-            of_sequences = [_sliding_scores(one, per_pixel, times, carry, method, context) for one in tests]
-            means = {name: float(np.mean([scores[name] for scores in of_sequences])) for name in of_sequences[0]}
-            table.append({"events_per_pixel": per_pixel, "carry": carry, "spacing_us": spacing_us, **means})
+            scores = [_sliding_scores(one, per_pixel, times_us, carry, recoverer) for one in tests]
+            table.append(
+                {"events_per_pixel": per_pixel, "carry": carry, "spacing_us": times_us.step, **_mean_of(scores)}
+            )
     return table
 
 
 def between_windows(
-    scenes: SceneStore,
-    events: EventStore,
-    sequences: Sequence[str],
-    span_us: tuple[int, int],
-    spacing_us: int,
-    window_us: int,
-    method: str,
-    config: BetweenConfig,
-    context: Context,
+    stored: StoredSequences, times_us: range, window_us: int, recoverer: Recoverer, config: BetweenConfig
 ) -> dict[str, Any]:
-    """Mean scores, as in `by_sliding_window`, of frames every `spacing_us` carried on between `window_us` windows."""
-    times = list(range(span_us[0], span_us[1] + 1, spacing_us))
-    recoverer = opened(METHODS[method], context)
-    of_sequences = []
-    for name in ProgressBar(sequences, "frames between windows", unit="sequence"):
-        channels = events.read(name)
-        run = sequence_at(scenes, name, channels, torch.arange(0, span_us[1] + 1, window_us))
-        truth = sequence_at(scenes, name, channels, torch.tensor([times[0] - spacing_us, *times]))
-        frames = frames_between(run, times, recoverer, config).carried.dolp
-        of_sequences.append(_frame_scores(frames, truth))
-    means = {name: float(np.mean([scores[name] for scores in of_sequences])) for name in of_sequences[0]}
-    return {"window_us": window_us, "spacing_us": spacing_us, **means}
+    """Mean scores, as in `by_sliding_window`, of frames carried on between windows of `window_us`."""
+    scores = []
+    for name in ProgressBar(stored.names, "frames between windows", unit="sequence"):
+        run = stored.sequence(name, torch.arange(0, times_us[-1] + 1, window_us))
+        frames = frames_between(run, times_us, recoverer, config).carried.dolp
+        scores.append(_frame_scores(frames, _truth_at(stored, name, times_us)))
+    return {"window_us": window_us, "spacing_us": times_us.step, **_mean_of(scores)}
+
+
+def _truth_at(stored: StoredSequences, name: str, times_us: range) -> TestSequence:
+    """A sequence whose windows end at these times."""
+    return stored.sequence(name, torch.tensor([times_us[0] - times_us.step, *times_us]))
+
+
+def _mean_of(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    return {name: float(np.mean([one[name] for one in scores])) for name in scores[0]}
 
 
 def _sliding_scores(
-    sequence: TestSequence, per_pixel: float, times: Sequence[int], carry: bool, method: str, context: Context
+    sequence: TestSequence, per_pixel: float, times: Sequence[int], carry: bool, recoverer: Recoverer
 ) -> Mapping[str, float]:
     first = sequence.events[0]
     count = max(2, round(per_pixel * first.height * first.width))
-    frames = sliding_recovery(sequence, count, times, carry, method, context)
+    frames = sliding_recovery(sequence, count, times, carry, recoverer)
     spans = [_length_us(last) for last in _last(sequence.events, count, times[len(times) // 2])]
     return {**_frame_scores(frames, sequence), "window_ms": float(np.mean(spans)) / 1000}
 

@@ -16,7 +16,21 @@ from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.polarizers import grid
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.truth import frames_of, valid_frames
+from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneRecord, SceneStore
+
+
+@dataclasses.dataclass(frozen=True)
+class StoredSequences:
+    """Some sequences of a store of events, and the scenes behind them."""
+
+    scenes: SceneStore
+    events: EventStore
+    names: Sequence[str]
+
+    def sequence(self, name: str, t_us: Int64[Tensor, " n"]) -> TestSequence:
+        """A sequence with exact truth at the window boundaries `t_us`."""
+        return sequence_at(self.scenes, name, self.events.read(name), t_us)
 
 
 def sequence_at(scenes: SceneStore, sequence: str, events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> TestSequence:

@@ -35,9 +35,19 @@ SETTINGS: Mapping[str, Sequence[float]] = {
 SHOWN = ("mse", "psnr", "corr", "skill")
 
 
-def cameras(setting: str, value: float, camera: Camera) -> list[Camera]:
-    """Cameras whose four channels have one setting of the sensor changed; `speed` leaves them unchanged."""
-    return [dataclasses.replace(camera, sensor=sensor) for sensor in _sensors(setting, value, camera.sensor)]
+@dataclasses.dataclass(frozen=True)
+class Emulation:
+    """How scenes are emulated again: the unchanged motion and camera, and the seed of their noise."""
+
+    motion: SynthesizeConfig
+    camera: Camera
+    seed: int
+    threads: int = 1
+
+    def cameras(self, setting: str, value: float, sequence: str) -> list[Camera]:
+        """Cameras whose four channels have one setting of the sensor changed; `speed` leaves them unchanged."""
+        camera = self.camera.drawn(self.seed, sequence)
+        return [dataclasses.replace(camera, sensor=sensor) for sensor in _sensors(setting, value, camera.sensor)]
 
 
 def _sensors(setting: str, value: float, emulate: EmulatorConfig) -> list[EmulatorConfig]:
@@ -62,14 +72,11 @@ def _sensors(setting: str, value: float, emulate: EmulatorConfig) -> list[Emulat
 def sensitivity(
     scenes: SceneStore,
     sequences: Sequence[str],
-    motion: SynthesizeConfig,
-    camera: Camera,
-    seed: int,
-    warmup_windows: int,
+    emulation: Emulation,
     methods: Sequence[str],
     context: Context,
+    warmup_windows: int,
     settings: Mapping[str, Sequence[float]] = SETTINGS,
-    threads: int = 1,
 ) -> dict[str, list[dict[str, Any]]]:
     """Event rates per pixel and second and mean scores over scenes of each method, for every value of each setting.
 
@@ -86,14 +93,9 @@ def sensitivity(
             speed = value if setting == "speed" else 1.0
             try:
                 test = resimulated(
-                    scenes,
-                    sequence,
-                    motion,
-                    cameras(setting, value, camera.drawn(seed, sequence)),
-                    seed,
-                    speed,
-                    threads,
-                )
+                    scenes, sequence, emulation.motion, emulation.cameras(setting, value, sequence), emulation.seed,
+                    speed, emulation.threads,
+                )  # fmt: skip
             except ValueError as error:
                 if setting != "speed":
                     raise

@@ -16,7 +16,6 @@ from torch.utils.flop_counter import flop_registry, sdpa_flop, shape_wrapper
 from polarnet.benchmark.rows import Context, opened, predictions_of
 from polarnet.benchmark.score import Cost
 from polarnet.benchmark.sequences import TestSequence
-from polarnet.events.stream import slice_time
 from polarnet.methods import METHODS
 
 COUNTED_WINDOWS = 3  # windows to count arithmetic and memory over: enough for the state to be passed on
@@ -36,37 +35,30 @@ def cost_of(row: str, sequence: TestSequence, context: Context) -> Cost:
     """Measure a row on the first windows of a sequence, several times; the first call is not timed."""
     network = opened(METHODS[row], context).network if row in METHODS else None
 
-    def run(count: int) -> Callable[[], Any]:
-        part = first_windows(sequence, count)
-        return lambda: predictions_of([row], part, context)
+    few, many = first_windows(sequence, COUNTED_WINDOWS), first_windows(sequence, TIMED_WINDOWS)
 
-    counted, timed = run(COUNTED_WINDOWS), run(TIMED_WINDOWS)
+    def counted() -> Any:
+        return predictions_of([row], few, context)
+
+    def timed() -> Any:
+        return predictions_of([row], many, context)
+
     counted()  # compiles and allocates
     with _Flops() as flops:
         peak = _peak_bytes(counted, context.device)
-    windows = len(sequence.dolp)
     return Cost(
-        ms_per_window=1000 * statistics.median(_seconds(timed) for _ in range(REPEATS)) / min(TIMED_WINDOWS, windows),
-        gflop=flops.total / min(COUNTED_WINDOWS, windows) / 1e9 if network is not None else None,
+        ms_per_window=1000 * statistics.median(_seconds(timed) for _ in range(REPEATS)) / len(many.dolp),
+        gflop=flops.total / len(few.dolp) / 1e9 if network is not None else None,
         params=sum(p.numel() for p in network.parameters()) if network is not None else 0,
         peak_mib=peak / MIB,
     )
 
 
 def first_windows(sequence: TestSequence, count: int) -> TestSequence:
-    """The first `count` windows of a sequence; all of it if it is shorter."""
-    t_us = sequence.t_us[: count + 1]
-    end_us = int(t_us[-1]) + 1
-    return replace(
-        sequence,
-        events=[slice_time(events, 0, end_us) for events in sequence.events],
-        t_us=t_us,
-        dolp=sequence.dolp[:count],
-        aolp=sequence.aolp[:count],
-        s0=sequence.s0[:count],
-        valid=None if sequence.valid is None else sequence.valid[:count],
-        rotating=None if sequence.rotating is None else slice_time(sequence.rotating, 0, end_us),
-    )
+    """The first `count` windows of a sequence; all of it if it is shorter. Later events belong to no window."""
+    frames = {name: getattr(sequence, name)[:count] for name in ("dolp", "aolp", "s0")}
+    valid = None if sequence.valid is None else sequence.valid[:count]
+    return replace(sequence, t_us=sequence.t_us[: count + 1], valid=valid, **frames)
 
 
 def _seconds(run: Callable[[], Any]) -> float:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.benchmark.paired import paired_comparisons
-from polarnet.benchmark.row_results import write_panel
 from polarnet.benchmark.run import Benchmark
 from polarnet.benchmark.score import METRICS, BenchmarkConfig, scene_means, summary, write_frames
+from polarnet.storage.panels import write_panel
 
 
 def write_benchmark(

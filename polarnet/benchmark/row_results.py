@@ -10,15 +10,15 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
 import torch
 
-from polarnet.benchmark.run import Benchmark, Panel
+from polarnet.benchmark.run import Benchmark
 from polarnet.benchmark.score import Cost, FrameScore
 from polarnet.metrics.reliability import Reliability
 from polarnet.runtime.files import check_seal, seal
+from polarnet.storage.panels import Panel, read_panel, write_panel
 
 MADE_BY = "run `dvc repro`, or `python -m stages.row` for all rows"
 
@@ -46,7 +46,7 @@ def write_row(folder: Path, row: str, record: RowRecord, sets: Mapping[str, Benc
         }
         (folder / name / "results.json").write_text(json.dumps(results) + "\n")
         for panel in benchmark.panels:
-            write_panel(folder / name / "panels", panel.of_row(row))
+            write_panel(folder / name / "panels", panel, [row])
     (folder / "row.json").write_text(json.dumps(record._asdict(), indent=2) + "\n")
     seal(folder)
 
@@ -91,26 +91,12 @@ def read_rows(folders: Mapping[str, Path], test_set: str) -> Benchmark:
     return Benchmark(ordered, costs, together, sums)
 
 
-def write_panel(folder: Path, panel: Panel) -> None:
-    """Write SEQUENCE.npz: `window`, `t_us` and the maps of a panel by their names."""
-    arrays: dict[str, Any] = {name: frame.numpy() for name, frame in panel.maps.items()}
-    np.savez_compressed(
-        folder / f"{panel.sequence}.npz", window=np.int64(panel.window), t_us=np.int64(panel.t_us), **arrays
-    )
-
-
-def read_panel(path: Path) -> Panel:
-    """Read a file of `write_panel`."""
-    with np.load(path) as file:
-        arrays = dict(file)
-    window, t_us = int(arrays.pop("window")), int(arrays.pop("t_us"))
-    return Panel(path.stem, window, t_us, {name: torch.from_numpy(array) for name, array in arrays.items()})
-
-
 def _sequences(frames: Sequence[FrameScore]) -> list[str]:
     return list(dict.fromkeys(score.sequence for score in frames))
 
 
 def _together(panels: Sequence[Panel]) -> Panel:
     """One panel with the predictions of all of `panels`, which show the same window."""
-    return dataclasses.replace(panels[0], maps={name: frame for panel in panels for name, frame in panel.maps.items()})
+    return dataclasses.replace(
+        panels[0], predictions={row: one for panel in panels for row, one in panel.predictions.items()}
+    )

@@ -1,7 +1,6 @@
 """Rows of the benchmark: references and methods, and running them over a sequence."""
 
 import functools
-from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,10 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from polarnet.benchmark.references import REFERENCES, Reference
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.streaming import EventWindow
-from polarnet.methods import METHODS
+from polarnet.methods import METHODS, ROWS
 from polarnet.methods.method import (
     Method,
     Recoverer,
@@ -24,11 +22,9 @@ from polarnet.methods.method import (
     weights_record,
     why_absent,
 )
+from polarnet.metrics.references import REFERENCES, Reference
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.stokes import Prediction
-
-ROWS: Mapping[str, Reference | Method] = ChainMap(METHODS, REFERENCES)  # type: ignore[arg-type]
-"""Reference or method by name, in the order of all tables: references first."""
 
 MAX_OPEN = 32
 """Maximum number of methods whose weights stay in memory between sequences."""
@@ -56,7 +52,7 @@ def predictions_of(names: Sequence[str], sequence: TestSequence, context: Contex
     predictions: dict[str, Prediction] = {}
     for name in sorted(names, key=lambda name: name in METHODS and METHODS[name].wraps is not None):
         if name in REFERENCES:
-            predictions[name] = clamped(REFERENCES[name].predict(sequence, context.train_mean))
+            predictions[name] = REFERENCES[name].predict(sequence.dolp, sequence.valid, context.train_mean)
             continue
         method = METHODS[name]
         if method.wraps is not None and method.convert is not None and method.wraps.name in predictions:

@@ -13,8 +13,8 @@ from jaxtyping import Float
 from pydantic import Field, NonNegativeInt
 from torch import Tensor
 
-from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.sequences import TestSequence
+from polarnet.methods import ROWS
 from polarnet.metrics.lpips import BACKBONES
 from polarnet.metrics.similarity import (
     MIN_MSE,

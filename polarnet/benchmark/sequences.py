@@ -1,4 +1,4 @@
-"""Simulated sequences with their truth, for testing methods."""
+"""Test sequences with their truth, for testing methods."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +10,8 @@ from torch import Tensor
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow
 from polarnet.events.windows import windows_of
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
 
 
 @dataclass(frozen=True)
@@ -36,26 +38,76 @@ class TestSequence:
 
     @property
     def windows(self) -> list[EventWindow]:
-        """Windows between consecutive frames, half-open: each includes its start and excludes its end."""
-        return self._windows(self.events)
+        """Windows of the four channels."""
+        return self.windows_for(rotating=False)
 
     def windows_for(self, rotating: bool) -> list[EventWindow]:
-        """The same windows of the four channels, or of the camera behind a rotating polarizer.
+        """Windows of the four channels, or of the camera behind a rotating polarizer, in the first channel.
 
-        ValueError if the latter was not simulated.
+        They lie between consecutive frames and are half-open: each includes its start and excludes its end. ValueError
+        if that camera was not simulated.
         """
-        if not rotating:
-            return self.windows
-        if self.rotating is None:
-            raise ValueError(
-                f"{self.name}: expected events of a camera behind a rotating polarizer, there are none; leave the row "
-                f"rotating_polarizer out of the methods"
-            )
-        empty = Events.empty(self.rotating.height, self.rotating.width)
-        return self._windows([self.rotating, *[empty] * (len(self.events) - 1)])
-
-    def _windows(self, channels: Sequence[Events]) -> list[EventWindow]:
+        channels = list(self.events)
+        if rotating:
+            if self.rotating is None:
+                raise ValueError(
+                    f"{self.name}: expected events of a camera behind a rotating polarizer, there are none; leave the "
+                    f"row rotating_polarizer out of the methods"
+                )
+            channels = [self.rotating, *[slice_time(self.rotating, 0, 0)] * (len(channels) - 1)]
         return [
             EventWindow([slice_time(events, start, stop) for events in channels], start, stop)
             for start, stop in windows_of(self.t_us)
         ]
+
+
+@dataclass(frozen=True)
+class BenchmarkSet:
+    """Stores of test sequences with their truth."""
+
+    name: str
+    events: EventStore
+    frames: FrameStore
+    rotating: EventStore | None = None
+    """Events of one camera behind a rotating polarizer, in the first channel; None: no row needs them."""
+
+    @property
+    def sequences(self) -> list[str]:
+        """Sequences of the test split, in the store's order; ValueError if there are none."""
+        names = self.frames.of_split("test")
+        if not names:
+            raise ValueError(
+                f"{self.frames.path} has no test sequence; raise ingest.test_fraction or ingest more pictures"
+            )
+        return names
+
+    def sequence(self, name: str) -> TestSequence:
+        """One sequence with its truth."""
+        truth = self.frames.frames(name)
+        i0, _, i90, _ = truth.intensity[1:].unbind(1)
+        return TestSequence(
+            name,
+            self.frames.original_of(name),
+            self.events.read(name),
+            truth.t_us,
+            truth.dolp[1:],
+            truth.aolp[1:],
+            i0 + i90,
+            None if truth.valid is None else truth.valid[1:],
+            None if self.rotating is None else self.rotating.read(name)[0],
+        )
+
+
+def train_mean_dolp(frames: FrameStore, warmup_windows: int) -> float:
+    """Mean DoLP of the training split, over the windows and pixels that the benchmark scores.
+
+    ValueError if the split is empty.
+    """
+    total, count = 0.0, 0
+    for name in frames.of_split("train"):
+        dolp, valid = frames.dolp(name)[1 + warmup_windows :], frames.valid(name)
+        scored = dolp if valid is None else dolp[valid[1 + warmup_windows :]]
+        total, count = total + scored.double().sum().item(), count + scored.numel()
+    if count == 0:
+        raise ValueError("the mean DoLP needs at least one frame, got none: is the training split empty?")
+    return total / count

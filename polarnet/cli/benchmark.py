@@ -110,7 +110,7 @@ def _benchmark(options: argparse.Namespace) -> int:
 def _own_folder(
     options: argparse.Namespace, config: "Config", root: Path, cleaning: "Cleaning", out: Path, weights: Path | None
 ) -> int:
-    from polarnet.cli.own_scenes import benchmark_folder, benchmark_recordings
+    from polarnet.cli.own_scenes import Request, benchmark_folder, benchmark_recordings
     from polarnet.reports.artefacts import read_results, results_table
     from polarnet.reports.tables import as_plain
     from polarnet.stokes import parse_mosaic
@@ -118,12 +118,11 @@ def _own_folder(
     source = "--scenes" if options.scenes else "--recordings"
     command = f"polarnet benchmark {source} {options.scenes or options.recordings}"
     with run_folder(out, f"benchmark {source}") as folder:
+        request = Request(root, folder, out / WORK, weights, command)
         if options.scenes:
-            kind, limit = options.kind, options.limit
-            notes = benchmark_folder(config, root, kind, folder, out / WORK, weights, command, limit)
+            notes = benchmark_folder(config, request, options.kind, options.limit)
         else:
-            mosaic = parse_mosaic(options.mosaic or PDAVIS)
-            notes = benchmark_recordings(config, root, mosaic, cleaning, folder, out / WORK, weights, command)
+            notes = benchmark_recordings(config, request, parse_mosaic(options.mosaic or PDAVIS), cleaning)
     print(as_plain(results_table(read_results(out))))
     for note in notes:
         print(note)

@@ -10,7 +10,8 @@ from polarnet.analysis.conditions import announced, configured
 from polarnet.analysis.recorded import make_recorded_set
 from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.rows import Context, available, metadata_used, weights_used
-from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp
+from polarnet.benchmark.run import run_benchmark
+from polarnet.benchmark.sequences import train_mean_dolp
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, with_lpips
 from polarnet.methods import is_rotating
@@ -39,6 +40,19 @@ RECORDED = {
 }
 
 
+class Request(NamedTuple):
+    """A folder to score, and where the results go."""
+
+    root: Path
+    out: Path
+    """Receives metrics.json, cost.json, details.json, frames.csv, panels and index.html."""
+    work: Path
+    """Receives pictures, scenes and events, so a stopped run resumes and a second run only runs the methods."""
+    weights: Path | None
+    """Checkpoint of the DoLP network; None uses the shipped one."""
+    command: str
+
+
 class Inputs(NamedTuple):
     """Inputs of a run besides its test set, and the methods that cannot run."""
 
@@ -49,64 +63,41 @@ class Inputs(NamedTuple):
     lpips: Weights | None
 
 
-def benchmark_folder(
-    config: Config,
-    root: Path,
-    kind: str,
-    out: Path,
-    work: Path,
-    weights: Path | None,
-    command: str,
-    limit: int | None = None,
-) -> list[str]:
+def benchmark_folder(config: Config, request: Request, kind: str, limit: int | None = None) -> list[str]:
     """Run the benchmark on a folder of photographs or measured scenes, without training; return the notes.
 
-    `out` receives metrics.json, cost.json, details.json, frames.csv, panels and index.html. `work` receives the
-    pictures, scenes and events, so a stopped run resumes and a second run only runs the methods. `limit` is the
-    maximum number of pictures. Methods without weights are left out and unusable files are skipped; the notes list
-    both. Size, duration and sensor are printed first, with a warning if a network was trained with others. `weights` is
-    a checkpoint of the DoLP network; None uses the shipped one. Raises ValueError if the folder has no usable file, or
-    if the weights for an LPIPS column are missing.
+    `limit` is the maximum number of pictures. Methods without weights are left out and unusable files are skipped; the
+    notes list both. Size, duration and sensor are printed first, with a warning if a network was trained with others.
+    Raises ValueError if the folder has no usable file, or if the weights for an LPIPS column are missing.
     """
-    inputs = _inputs(config, weights)
+    inputs = _inputs(config, request.weights)
     used = configured(config.synthesize, config.emulate)
     conditions = announced(used, metadata_used(inputs.methods, inputs.context), SET_THEM)
     try:
-        make_folder_set(root, kind, work, config.recipe, config.mapper, limit)
+        make_folder_set(request.root, kind, request.work, config.recipe, config.mapper, limit)
     except ValueError as error:
-        raise ValueError(f"--scenes {root}: no scene to score. {error}") from error
-    notes = [*_skipped(config, work), *(_left_out(row, reason) for row, reason in inputs.left_out.items())]
-    rotating = _rotating_events(config, work) if any(map(is_rotating, inputs.methods)) else None
-    test_set = made_set(root.resolve().name, work, rotating)
-    _scored(config, inputs, test_set, out, {"conditions": conditions, "left_out": notes}, command)
+        raise ValueError(f"--scenes {request.root}: no scene to score. {error}") from error
+    notes = [*_skipped(config, request.work), *(_left_out(row, reason) for row, reason in inputs.left_out.items())]
+    rotating = _rotating_events(config, request.work) if any(map(is_rotating, inputs.methods)) else None
+    _scored(config, inputs, request, rotating, {"conditions": conditions, "left_out": notes})
     return notes
 
 
-def benchmark_recordings(
-    config: Config,
-    root: Path,
-    mosaic: Mosaic,
-    cleaning: Cleaning,
-    out: Path,
-    work: Path,
-    weights: Path | None,
-    command: str,
-) -> list[str]:
+def benchmark_recordings(config: Config, request: Request, mosaic: Mosaic, cleaning: Cleaning) -> list[str]:
     """Run the benchmark on a folder of recordings with true polarization, as `benchmark_folder` does on scenes.
 
     Windows lie between the recordings' frames.
     """
-    inputs = _inputs(config, weights)
+    inputs = _inputs(config, request.weights)
     for row in filter(is_rotating, inputs.methods):
         inputs.left_out[row] = "recordings hold the events of four channels, not those behind a rotating polarizer"
     inputs = inputs._replace(methods=[row for row in inputs.methods if not is_rotating(row)])
     try:
-        notes = make_recorded_set(root, work, mosaic, cleaning)
+        notes = make_recorded_set(request.root, request.work, mosaic, cleaning)
     except ValueError as error:
         raise ValueError(f"--recordings {error}") from error
     notes += [_left_out(row, reason) for row, reason in inputs.left_out.items()]
-    test_set = made_set(root.resolve().name, work)
-    _scored(config, inputs, test_set, out, {"conditions": RECORDED, "left_out": notes}, command)
+    _scored(config, inputs, request, None, {"conditions": RECORDED, "left_out": notes})
     return notes
 
 
@@ -121,10 +112,9 @@ def _inputs(config: Config, weights: Path | None) -> Inputs:
     return Inputs(context, *available(wanted, context), lpips)
 
 
-def _scored(
-    config: Config, inputs: Inputs, test_set: BenchmarkSet, out: Path, about: Mapping[str, Any], command: str
-) -> None:
-    """Run the rows on a test set and write scores and page."""
+def _scored(config: Config, inputs: Inputs, request: Request, rotating: Path | None, about: Mapping[str, Any]) -> None:
+    """Run the rows on the set in the folder `work` and write scores and page."""
+    test_set = made_set(request.root.resolve().name, request.work, rotating)
     settings = dataclasses.replace(config.benchmark, methods=inputs.methods)
     lpips = None if inputs.lpips is None else Lpips.of(inputs.lpips.backbone, inputs.lpips.tensors)
     mapper = config.mapper("benchmark")
@@ -140,8 +130,9 @@ def _scored(
         "weights": weights_used(inputs.methods, inputs.context),
         **about,
     }
-    write_benchmark(out, benchmark, settings, config.seed, details)
-    write_set_page(out, test_set.name, command, [*about["conditions"]["warnings"], *about["left_out"]])
+    write_benchmark(request.out, benchmark, settings, config.seed, details)
+    notes = [*about["conditions"]["warnings"], *about["left_out"]]
+    write_set_page(request.out, test_set.name, request.command, notes)
 
 
 def _rotating_events(config: Config, work: Path) -> Path:

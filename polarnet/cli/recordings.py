@@ -1,7 +1,6 @@
 """Commands for recordings: inspect, recover DoLP."""
 
 import argparse
-import contextlib
 import functools
 import sys
 from collections.abc import Sequence
@@ -57,7 +56,7 @@ Writes frames, pictures, a video and a page. INPUT is one of:
   four files, one for each polarizer, with --angles
   one file of a camera with polarizers on its pixels, with --mosaic
   one file of a camera behind a rotating polarizer, with --rotating or --triggers
-  an event store, or a folder that `polarnet export` or `polarnet simulate --format hdf5` wrote
+  an event store, or a folder that `polarnet convert` or `polarnet simulate --format hdf5` wrote
   a folder of division-of-time captures
   with --live, a growing file or standard input (-) with lines `t x y p angle`, or a camera with --mosaic:
   dv://HOST:PORT of a program that streams its events, or dv://camera
@@ -82,12 +81,13 @@ def add_to(commands: Commands) -> None:
 def _add_inspection(commands: Commands) -> None:
     inspect = commands.add_parser(
         "inspect",
-        help="summarise a camera's file and draw its busiest moment",
+        help="summarise a camera's file and draw its busiest moment, or list the sequences of a store",
         description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
-        "camera's file, with its longest gap and empty rows, and draws its busiest moment as a PNG.",
+        "camera's file, with its longest gap and empty rows, and draws its busiest moment as a PNG. Of a store it "
+        "names the sequences.",
         epilog="example: polarnet inspect recording.aedat4 --hot-pixels hot.png",
     )
-    inspect.add_argument("file", type=Path, help="file of a camera, or an event store with --part")
+    inspect.add_argument("file", help="file of a camera, an event store with --part, or a store to list")
     add_reading(inspect)
     inspect.add_argument("--part", metavar="SEQUENCE/ANGLE", help="sequence and channel of an event store: NAME/45")
     add_hot_pixel_factor(inspect)
@@ -209,25 +209,26 @@ def _add_output(recover: argparse.ArgumentParser) -> None:
         help="file types to write (default: zarr png mp4)",
     )  # fmt: skip
     recover.add_argument(
-        "--rerun", type=Path, metavar="FILE|viewer",
-        help="also log events, frames, expected errors and timings for Rerun: into FILE.rrd, or to the running viewer",
-    )  # fmt: skip
-    recover.add_argument(
         "--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)"
     )
 
 
 def _inspect(options: argparse.Namespace) -> int:
+    from polarnet.cli.verification import is_store, listing
     from polarnet.recordings.inspection import findings, inspect_recording
     from polarnet.recordings.recording import open_recording
     from polarnet.reports.recordings import recording_picture
 
-    recording = open_recording(options.file, part=options.part, **reading_of(options))
+    if options.part is None and is_store(options.file):
+        print(*listing(options.file), sep="\n")
+        return 0
+    file = Path(options.file)
+    recording = open_recording(file, part=options.part, **reading_of(options))
     inspection = inspect_recording(recording, options.hot_pixel_factor)
     for finding in findings(inspection):
         print(finding)
     folder = options.out or Path("outputs") / "inspect"
-    path = options.picture or folder / f"{options.file.name}.png"
+    path = options.picture or folder / f"{file.name}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(recording_picture(inspection))
     print(f"picture     {path}")
@@ -247,9 +248,8 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
     from polarnet.recovery.stream import ChosenMethod, facts_of, frames_of, open_method, recover
-    from polarnet.recovery.watching import TruthScores, logged
+    from polarnet.recovery.watching import TruthScores
     from polarnet.recovery.writer import RecoveryWriter
-    from polarnet.reports.rerun_log import RerunLog
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
     check_options(options)
@@ -274,7 +274,7 @@ def _recover(options: argparse.Namespace) -> int:
     out = options.out or Path("outputs") / "recover" / ("live" if options.live else Path(options.input[0]).stem)
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     cleaner = Cleaner(cleaning_of(options), mosaic)
-    with run_folder(out, "recover") as folder, contextlib.ExitStack() as stack:
+    with run_folder(out, "recover") as folder:
         if options.live:
             print(f"writing frames to {folder}; the folder becomes {out} at the end", file=sys.stderr)
         source = source or _input(options, mosaic, cleaner, folder / WORK, config)
@@ -288,8 +288,6 @@ def _recover(options: argparse.Namespace) -> int:
         frames = frames_at_rate(source, rule, recoverer, rate) if rate else frames_of(source, rule, recoverer)
         if scores:
             frames = scores.watch(frames)
-        if options.rerun:
-            frames = logged(stack.enter_context(RerunLog(options.rerun, source.name)), frames, options.live)
         facts = facts_of(source, rule, words, recover(source, rule, recoverer, writer, frames))
         facts |= _further_facts(options.rate, check)
         if scores:

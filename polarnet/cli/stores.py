@@ -1,16 +1,15 @@
-"""Commands for stores: view, list, verify, export, video, replay."""
+"""Commands for stores: view, verify, video, replay."""
 
 import argparse
 import sys
 from pathlib import Path
 
-from polarnet.cli.outputs import run_folder
 from polarnet.cli.parsers import Commands, add_reading, add_stored_sequence, reading_of
 
 
 def add_to(commands: Commands) -> None:
-    """Add the commands view, list, verify, export, video and replay."""
-    for add in (_add_view, _add_list, _add_verify, _add_export, _add_video, _add_replay):
+    """Add the commands view, verify, video and replay."""
+    for add in (_add_view, _add_verify, _add_video, _add_replay):
         add(commands)
 
 
@@ -24,22 +23,9 @@ def _add_view(commands: Commands) -> None:
     view.add_argument("path", type=Path, help="store, folder with stores (of simulate or recover), or a camera's file")
     view.add_argument("--sequence", nargs="+", default=[], metavar="NAME", help="sequences (default: the first twelve)")
     view.add_argument("--out", type=Path, help="page (default: outputs/view/NAME.html)")
-    view.add_argument(
-        "--rerun", type=Path, metavar="FILE|viewer", help="log an event store for Rerun instead of a page"
-    )
     view.add_argument("--no-browser", action="store_true", help="write the page without opening it")
     add_reading(view)
     view.set_defaults(run=_view)
-
-
-def _add_list(commands: Commands) -> None:
-    listing = commands.add_parser(
-        "list",
-        help="name the sequences of a store of events, frames or scenes",
-        epilog="example: polarnet list data/events.zarr",
-    )
-    listing.add_argument("store", help="store: folder or fsspec URL")
-    listing.set_defaults(run=_list)
 
 
 def _add_verify(commands: Commands) -> None:
@@ -52,24 +38,6 @@ def _add_verify(commands: Commands) -> None:
         "store", help="store (folder or fsspec URL), checkpoint (.safetensors), running.pt or data folder"
     )
     verify.set_defaults(run=_verify)
-
-
-def _add_export(commands: Commands) -> None:
-    export = commands.add_parser(
-        "export",
-        help="export an event store to files for other tools",
-        epilog="example: polarnet export data/events.zarr exported --format evt3 --sequence lake-0",
-    )
-    export.add_argument("store", help="event store: folder or fsspec URL")
-    export.add_argument("folder", type=Path, help="output folder; one file for each sequence and channel")
-    export.add_argument(
-        "--format",
-        choices=("hdf5", "text", "evt3"),
-        default="hdf5",
-        help="HDF5 in DSEC's layout, text lines t x y p, or Prophesee's EVT3 (default: hdf5)",
-    )
-    export.add_argument("--sequence", nargs="+", metavar="NAME", help="sequences to export (default: all)")
-    export.set_defaults(run=_export)
 
 
 def _add_video(commands: Commands) -> None:
@@ -116,12 +84,6 @@ def _view(options: argparse.Namespace) -> int:
     from polarnet.reports.player import write_player
     from polarnet.reports.viewing import films_of
 
-    if options.rerun:
-        from polarnet.reports.rerun_log import log_sequence
-
-        log_sequence(options.path, options.sequence[0] if options.sequence else None, options.rerun)
-        print(f"rerun {options.rerun}")
-        return 0
     films = films_of(options.path, options.sequence, functools.partial(read_recording, **reading_of(options)))
     path = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -129,23 +91,6 @@ def _view(options: argparse.Namespace) -> int:
     print(f"page {path}")
     if not options.no_browser:
         webbrowser.open(path.resolve().as_uri())
-    return 0
-
-
-def _list(options: argparse.Namespace) -> int:
-    from polarnet.cli.verification import kind_of
-    from polarnet.storage.events import EventStore
-    from polarnet.storage.frames import SplitStore
-
-    store = kind_of(options.store).open(options.store)
-    width = max(map(len, store.sequences), default=0)
-    for name in store.sequences:
-        facts = ""
-        if isinstance(store, EventStore):
-            facts = f"{store.duration_us(name) * 1e-6:8.3f} s  {sum(store.count(name)):12,d} events"
-        elif isinstance(store, SplitStore):
-            facts = store.splits[name]
-        print(f"{name:{width}s}  {facts}")
     return 0
 
 
@@ -186,15 +131,6 @@ def _verify(options: argparse.Namespace) -> int:
             print(f"{name}: intact")
     return 1 if problems else 0
 
-
-def _export(options: argparse.Namespace) -> int:
-    from polarnet.storage.events import EventStore
-    from polarnet.storage.exchange import export_store
-
-    store = EventStore.open(options.store)
-    with run_folder(options.folder, "export") as folder:
-        export_store(store, folder, options.format, options.sequence)
-    print(f"{options.store} -> {options.folder}")
     return 0
 
 

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from polarnet.analysis.conditions import announced, configured, stored
+from polarnet.analysis.conditions import announced, configured
+from polarnet.analysis.conditions import stored as from_attributes
 from polarnet.analysis.event_budget import (
     between_windows,
     by_sliding_window,
@@ -20,16 +21,17 @@ from polarnet.analysis.event_budget import (
     recovered_alone,
     since_start,
 )
-from polarnet.analysis.sensitivity import sensitivity
-from polarnet.benchmark.rows import ROWS, Context, metadata_used, why_left_out
-from polarnet.benchmark.run import train_mean_dolp
-from polarnet.benchmark.sequences import TestSequence
+from polarnet.analysis.resimulate import StoredSequences
+from polarnet.analysis.sensitivity import Emulation, sensitivity
+from polarnet.benchmark.rows import Context, metadata_used, opened, why_left_out
+from polarnet.benchmark.sequences import TestSequence, train_mean_dolp
 from polarnet.config.pipeline import context_of, pipeline_set, set_names
 from polarnet.config.tree import Config
 from polarnet.events.representations import event_tensor
 from polarnet.events.streaming import EventWindow
+from polarnet.methods import METHODS, ROWS
+from polarnet.methods.method import Recoverer
 from polarnet.reports.curves import PAPER_EVENTS_PER_PIXEL, event_budget_figure, sensitivity_figure
-from polarnet.reports.figures import LIGHT
 from polarnet.reports.maps import png, write_figure
 from polarnet.reports.paper import EXPERIMENTS, Moment, figure_11
 from polarnet.runtime.machine import threads_of
@@ -52,37 +54,35 @@ def run_event_budget(
     Fig. 11 is drawn of the simulated set and, if they are enabled, of the real targets. ValueError if `ours` has no
     weights.
     """
-    sequences, context, tests, scenes = _prepared(config, methods, limit, weights)
+    stored, context = _prepared(config, methods, limit, weights)
     if reason := why_left_out("ours", context):
         raise ValueError(f"the event budget needs the DoLP network: {reason}; give --weights FILE")
-    events = tests.events
-    used = stored(events.attributes, events.height, events.width)
+    recoverer, tests = opened(METHODS["ours"], context), pipeline_set(config, "simulated")
+    used = from_attributes(stored.events.attributes, stored.events.height, stored.events.width)
     conditions = announced(used, metadata_used(methods, context), SET_THEM)
-    end_us = min(scenes.duration_us(name) for name in sequences)
+    end_us = min(stored.scenes.duration_us(name) for name in stored.names)
     settle_us = round(config.benchmark.warmup_windows * 1e6 / config.synthesize.frame_rate_hz)
     lengths = [length for length in WINDOW_LENGTHS_US if settle_us + length <= end_us]
     first = min(end_us // 2, end_us - SPACING_US)
-    span = (first, min(first + SLIDING_FRAMES * SPACING_US, end_us))
+    times_us = range(first, min(first + SLIDING_FRAMES * SPACING_US, end_us) + 1, SPACING_US)
     window_us = round(1e6 / config.synthesize.frame_rate_hz)
     results = {
         "methods": list(methods),
-        "sequences": list(sequences),
+        "sequences": list(stored.names),
         "conditions": conditions,
-        "since_start": since_start((tests.sequence(name) for name in sequences), methods, context),
-        "window_length": by_window_length(scenes, tests.events, sequences, lengths, settle_us, methods, context),
-        "sliding": by_sliding_window(scenes, tests.events, sequences, span, SPACING_US, "ours", context),
-        "between": between_windows(
-            scenes, tests.events, sequences, span, SPACING_US, window_us, "ours", config.between, context
-        ),
+        "since_start": since_start((tests.sequence(name) for name in stored.names), methods, context),
+        "window_length": by_window_length(stored, lengths, settle_us, methods, context),
+        "sliding": by_sliding_window(stored, times_us, recoverer),
+        "between": between_windows(stored, times_us, window_us, recoverer, config.between),
     }
     for name in set_names(config):
         if name in EXPERIMENTS:
             test_set = pipeline_set(config, name)
-            _write_figure_11(out, name, test_set.sequence(test_set.sequences[0]), context)
-    return _written(out, "event_budget", results, png(event_budget_figure(results, LIGHT)))
+            _write_figure_11(out, name, test_set.sequence(test_set.sequences[0]), recoverer)
+    return _written(out, "event_budget", results, png(event_budget_figure(results)))
 
 
-def _write_figure_11(out: Path, name: str, sequence: TestSequence, context: Context) -> None:
+def _write_figure_11(out: Path, name: str, sequence: TestSequence, recoverer: Recoverer) -> None:
     """Write the paper's Fig. 11 of one sequence: a window that grows from 0, and the last events before each time."""
     events, end_us = sequence.events, int(sequence.t_us[-1])
     pixels = events[0].height * events[0].width
@@ -95,7 +95,7 @@ def _write_figure_11(out: Path, name: str, sequence: TestSequence, context: Cont
     times = torch.linspace(int(t_us[enough - 1]) + 1, end_us, len(GROWING_EVENTS_PER_PIXEL)).long().tolist()
     sliding = [last_window(events, round(PAPER_EVENTS_PER_PIXEL * pixels), time) for time in times]
     for part, windows in (("a", growing), ("b", sliding)):
-        recovered = recovered_alone(windows, "ours", context)
+        recovered = recovered_alone(windows, recoverer)
         moments = [_moment(sequence, *pair) for pair in zip(windows, recovered, strict=True)]
         write_figure(figure_11(moments), out / f"figure_11{part}_{name}")
 
@@ -112,26 +112,26 @@ def run_sensitivity(
     config: Config, out: Path, methods: Sequence[str], limit: int | None, weights: Path | None
 ) -> dict[str, Any]:
     """Write sensitivity.json and sensitivity.png to `out`."""
-    sequences, context, _, scenes = _prepared(config, methods, limit, weights)
-    size = {"sensor_height": scenes.sensor_height, "sensor_width": scenes.sensor_width}
+    stored, context = _prepared(config, methods, limit, weights)
+    size = {"sensor_height": stored.scenes.sensor_height, "sensor_width": stored.scenes.sensor_width}
     motion = dataclasses.replace(config.synthesize, **size)  # emulated again at the scenes' sensor size
     conditions = announced(configured(motion, config.emulate), metadata_used(methods, context), SET_THEM)
-    table = sensitivity(
-        scenes, sequences, config.synthesize, config.camera, config.seed, config.benchmark.warmup_windows, methods,
-        context, threads=threads_of(config.runtime),
-    )  # fmt: skip
-    results = {"methods": list(methods), "sequences": list(sequences), "conditions": conditions, "settings": table}
-    return _written(out, "sensitivity", results, png(sensitivity_figure(table, LIGHT)))
+    emulation = Emulation(config.synthesize, config.camera, config.seed, threads_of(config.runtime))
+    table = sensitivity(stored.scenes, stored.names, emulation, methods, context, config.benchmark.warmup_windows)
+    results = {"methods": list(methods), "sequences": list(stored.names), "conditions": conditions, "settings": table}
+    return _written(out, "sensitivity", results, png(sensitivity_figure(table)))
 
 
-def _prepared(config: Config, methods: Sequence[str], limit: int | None, weights: Path | None) -> Any:
+def _prepared(
+    config: Config, methods: Sequence[str], limit: int | None, weights: Path | None
+) -> tuple[StoredSequences, Context]:
+    """Test sequences and the inputs of the methods; ValueError for a method that does not exist."""
     unknown = [method for method in methods if method not in ROWS]
     if unknown or not methods:
         raise ValueError(f"--methods: expected some of {', '.join(ROWS)}, got {', '.join(unknown) or 'none'}")
     tests = pipeline_set(config, "simulated")
-    scenes = SceneStore.open(config.paths.scenes)
     context = context_of(config, methods, train_mean_dolp(tests.frames, config.benchmark.warmup_windows), weights)
-    return tests.sequences[:limit], context, tests, scenes
+    return StoredSequences(SceneStore.open(config.paths.scenes), tests.events, tests.sequences[:limit]), context
 
 
 def _written(out: Path, name: str, results: dict[str, Any], picture: bytes) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Checks of `polarnet verify`: stores, sealed folders, checkpoints and running checkpoints, alone or in a folder."""
+"""Stores on the command line: `polarnet verify` (with sealed folders and checkpoints) and the list of `inspect`."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -7,7 +7,7 @@ from pathlib import Path
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.runtime.files import SUMS, changed_files
 from polarnet.storage.events import EventStore
-from polarnet.storage.frames import FrameStore
+from polarnet.storage.frames import FrameStore, SplitStore
 from polarnet.storage.groups import open_group
 from polarnet.storage.parts import Store
 from polarnet.storage.scenes import SceneStore
@@ -50,6 +50,24 @@ def kind_of(path: str) -> type[Store]:
     if form not in STORES:
         raise ValueError(f"{path}: expected a store of format {', '.join(STORES)}, got {form!r}")
     return STORES[form]
+
+
+def is_store(path: str) -> bool:
+    """Whether a path, or an fsspec URL, is that of a store."""
+    return "://" in path or (Path(path) / "zarr.json").is_file()
+
+
+def listing(path: str) -> Iterator[str]:
+    """A line for each sequence of a store: its duration and events, or its split. ValueError for other content."""
+    store = kind_of(path).open(path)
+    width = max(map(len, store.sequences), default=0)
+    for name in store.sequences:
+        facts = ""
+        if isinstance(store, EventStore):
+            facts = f"{store.duration_us(name) * 1e-6:8.3f} s  {sum(store.count(name)):12,d} events"
+        elif isinstance(store, SplitStore):
+            facts = store.splits[name]
+        yield f"{name:{width}s}  {facts}"
 
 
 def _store_problems(path: str) -> list[str]:

@@ -6,14 +6,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from polarnet.benchmark.references import REFERENCES
 from polarnet.benchmark.row_results import RowRecord, write_row
 from polarnet.benchmark.rows import Context, available, weights_used
-from polarnet.benchmark.run import BenchmarkSet, run_benchmark, train_mean_dolp
+from polarnet.benchmark.run import run_benchmark
+from polarnet.benchmark.sequences import BenchmarkSet, train_mean_dolp
 from polarnet.config.tree import Config, or_exit
 from polarnet.events.rotation import steady_rotation
 from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup
+from polarnet.metrics.references import REFERENCES
 from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.machine import device_of
 from polarnet.storage.events import EventStore

@@ -1,4 +1,4 @@
-"""Table at the end of a Hydra multirun of trials: points ranked by validation MSE, seeds averaged."""
+"""Table and plot at the end of a Hydra multirun of trials: points ranked by validation MSE, seeds averaged."""
 
 import csv
 import json
@@ -18,30 +18,17 @@ FAILURE = "failure.txt"
 """File in the folder of a failed job with the reason in one line."""
 FINISHED = "finished.json"
 """File in the folder of a finished job with all of its values, and hashes of its inputs."""
-COLUMNS = {
-    "validation": {"mse": "validation MSE ↓", "psnr": "validation PSNR ↑"},
-    "test": {
-        "mse": "test MSE ↓",
-        "psnr": "test PSNR ↑",
-        "ssim": "test SSIM ↑",
-        "lpips": "test LPIPS ↓",
-        "corr": "test corr. ↑",
-    },
-}
-"""Scores in the table by split, with their headings."""
-ABOUT = (
-    "Ranked by validation MSE; test scores rank nothing. Of several seeds: mean ± standard deviation, over the seeds "
-    "that finished."
-)
+SCORES = {"validation": ("mse", "psnr"), "test": ("mse", "psnr", "ssim", "lpips", "corr")}
+"""Scores of a point by split; test scores rank nothing."""
 LOG_RECORD = re.compile(r"^\[[^\]]*\]\[[^\]]*\]\[(\w+)\] - ", re.MULTILINE)  # Hydra's format of job logs
 PYTHON_WARNING = re.compile(r"^\S+:\d+: (\w+: .*)$", re.MULTILINE)
 
 
 class SweepTable(Callback):
-    """Writes comparison.md, .json and .csv into the sweep's folder and prints the table (conf/config.yaml)."""
+    """Writes comparison.csv and comparison.png into the sweep's folder and prints the ranking (conf/config.yaml)."""
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Collect the trials and write the table; a sweep of another entry point has no trials and gets no table.
+        """Collect the trials and write their table; a sweep of another entry point has no trials and gets no table.
 
         Raises SystemExit if a point failed, the only exception of a callback with which Hydra ends the sweep.
         """
@@ -49,24 +36,13 @@ class SweepTable(Callback):
         points = sweep_points(folder)
         if not points:
             return
-        print(f"\n{write_comparison(folder)}")
+        rows = sweep_rows(points)
+        write_csv(rows, folder / "comparison.csv")
+        if axes := swept_axes(rows):
+            (folder / "comparison.png").write_bytes(_plot(*axes))
+        print(f"\n{ranking(rows)}\n{best_point(rows)}\nAll scores: {folder / 'comparison.csv'}")
         if failed := sum(point["failure"] is not None for point in points):
             raise SystemExit(f"{failed} of {len(points)} points failed; the table has their reasons")
-
-
-def write_comparison(folder: Path) -> str:
-    """Write comparison.md, .json, .csv and, if points differ, .png into a sweep's folder; return the table as text."""
-    points = sweep_points(folder)
-    rows = sweep_rows(points)
-    table = f"{sweep_table(rows)}\n\n{ABOUT}\n{best_point(rows)}"
-    (folder / "comparison.md").write_text(f"{table}\n")
-    (folder / "comparison.json").write_text(json.dumps({"rows": rows, "points": points}, indent=2) + "\n")
-    write_csv(rows, folder / "comparison.csv")
-    kinds = ".json and .csv"
-    if axes := swept_axes(rows):
-        (folder / "comparison.png").write_bytes(_plot(axes))
-        kinds = ".json, .csv and .png"
-    return f"{table}\nwritten to {folder / 'comparison.md'}, {kinds}"
 
 
 def why_unfinished(job: Path, record: Mapping[str, Any]) -> str | None:
@@ -109,7 +85,7 @@ def shared_overrides(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 def sweep_points(folder: Path) -> list[dict[str, Any]]:
     """Trials of a sweep in the order of the jobs: overrides, seed, loss weights, scores, notes and reason of failure.
 
-    `validation` holds the scores of the best epoch, and `test` holds those of `ours`; null if a trial has none.
+    `validation` holds the scores of the best epoch, and `test` holds those of `ours`; None if a trial has none.
     """
     jobs = [path.parent.parent for path in folder.glob("**/.hydra/overrides.yaml")]
     trials = [job for job in jobs if (job / "train").exists() or (job / FAILURE).exists()]
@@ -120,7 +96,7 @@ def sweep_rows(points: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Merge points that differ only in the seed into one row, and sort the rows by validation MSE.
 
     The smallest MSE comes first, and rows without MSE come last. Each score becomes `mean` and `std`, the standard
-    deviation over seeds (null for one seed).
+    deviation over seeds (None for one seed).
     """
     groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
     for point in points:
@@ -134,13 +110,13 @@ def sweep_rows(points: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             "overrides": list(overrides),
             "seeds": [point["seed"] for point in finished],
             "failed_seeds": [point["seed"] for point in group if point["failure"]],
-            **{split: mean_scores([point[split] for point in finished], names) for split, names in COLUMNS.items()},
+            **{split: mean_scores([point[split] for point in finished], names) for split, names in SCORES.items()},
             "notes": list(dict.fromkeys([*failures, *(note for point in group for note in point["notes"])])),
         })  # fmt: skip
     return sorted(rows, key=lambda row: row["validation"]["mse"]["mean"] if row["validation"] else float("inf"))
 
 
-def mean_scores(scores: Sequence[Mapping[str, float | None]], names: Mapping[str, str]) -> dict[str, Any]:
+def mean_scores(scores: Sequence[Mapping[str, float | None]], names: Sequence[str]) -> dict[str, Any]:
     """Mean and standard deviation over trainings of the scores `names`; a score missing from a training is omitted."""
     means = {}
     for name in names:
@@ -150,8 +126,8 @@ def mean_scores(scores: Sequence[Mapping[str, float | None]], names: Mapping[str
     return means
 
 
-def swept_axes(rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, list[str]], list[float], str] | None:
-    """Values of the keys that differ between finished rows, validation MSE and its heading; None if none differs."""
+def swept_axes(rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, list[str]], list[float]] | None:
+    """Values of the keys that differ between finished rows, and their validation MSE; None if no key differs."""
     done = [row for row in rows if row["validation"]]
     given = [dict(one.lstrip("+").split("=", 1) for one in row["overrides"]) for row in done]
     keys = [
@@ -159,45 +135,44 @@ def swept_axes(rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, list[str]],
     ]
     if not keys:
         return None
-    scores = [row["validation"]["mse"]["mean"] for row in done]
-    return {key: [one.get(key, "-") for one in given] for key in keys}, scores, COLUMNS["validation"]["mse"]
+    return {key: [one.get(key, "-") for one in given] for key in keys}, [
+        row["validation"]["mse"]["mean"] for row in done
+    ]
 
 
-def sweep_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format `sweep_rows` as a Markdown table, with the overrides that all rows share in a line below it."""
+def ranking(rows: Sequence[Mapping[str, Any]]) -> str:
+    """`sweep_rows` as lines: validation and test MSE, seeds, the overrides that not all rows share, and notes."""
     shared = shared_overrides(rows)
-    headings = [heading for names in COLUMNS.values() for heading in names.values()]
-    lines = [f"| jobs | overrides | seeds | {' | '.join(headings)} | notes |", "|" + "---|" * (4 + len(headings))]
+    lines = [f"{'validation MSE':>19}  {'test MSE':>19}  seeds   overrides"]
     for row in rows:
         finished, failed = len(row["seeds"]), len(row["failed_seeds"])
+        scores = [_printed(row[split].get("mse")) for split in SCORES]
         seeds = f"{finished} of {finished + failed}" if failed else f"{finished}"
-        cells = [_cell(row[split].get(name)) for split, names in COLUMNS.items() for name in names]
-        notes = "; ".join(row["notes"]).replace("|", "/")
         own = " ".join(one for one in row["overrides"] if one not in shared)
-        lines.append(f"| {' '.join(row['jobs'])} | {own} | {seeds} | {' | '.join(cells)} | {notes} |")
-    return "\n".join([*lines, *(["", f"Shared overrides: {' '.join(shared)}"] if shared else [])])
+        lines.append(f"{scores[0]:>19}  {scores[1]:>19}  {seeds:<6}  {own}".rstrip())
+        lines += [f"    {note}" for note in row["notes"]]
+    return "\n".join([*lines, *([f"All have {' '.join(shared)}."] if shared else [])])
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write `sweep_rows` as one line each, with columns SPLIT_SCORE and SPLIT_SCORE_std."""
     with path.open("w", newline="") as file:
-        names = [f"{split}_{name}{end}" for split in COLUMNS for name in COLUMNS[split] for end in ("", "_std")]
+        names = [f"{split}_{name}{end}" for split in SCORES for name in SCORES[split] for end in ("", "_std")]
         writer = csv.DictWriter(file, ["jobs", "overrides", "seeds", "failed_seeds", *names, "notes"])
         writer.writeheader()
         for row in rows:
             line = {key: " ".join(map(str, row[key])) for key in ("jobs", "overrides", "seeds", "failed_seeds")}
-            for split in COLUMNS:
+            for split in SCORES:
                 for name, score in row[split].items():
                     line |= {f"{split}_{name}": score["mean"], f"{split}_{name}_std": score["std"]}
             writer.writerow({**line, "notes": "; ".join(row["notes"])})
 
 
-def _plot(axes: tuple[dict[str, list[str]], list[float], str]) -> bytes:
-    from polarnet.reports.figures import LIGHT  # every stage imports this module, and only a sweep draws
+def _plot(values: Mapping[str, Sequence[str]], scores: Sequence[float]) -> bytes:
+    from polarnet.reports.curves import parallel_coordinates  # every stage imports this module, and only a sweep draws
     from polarnet.reports.maps import png
-    from polarnet.reports.sweep import parallel_coordinates
 
-    return png(parallel_coordinates(*axes, LIGHT))
+    return png(parallel_coordinates(values, scores, "validation MSE"))
 
 
 def _point(folder: Path, job: Path) -> dict[str, Any]:
@@ -244,7 +219,7 @@ def _read(path: Path) -> Any:
     return json.loads(path.read_text()) if path.exists() else None
 
 
-def _cell(score: Mapping[str, float | None] | None) -> str:
+def _printed(score: Mapping[str, float | None] | None) -> str:
     if score is None:
         return "-"
     return f"{score['mean']:.4f}" + (f" ± {score['std']:.4f}" if score["std"] is not None else "")

@@ -2,9 +2,12 @@
 
 import importlib
 import pkgutil
+from collections import ChainMap
+from collections.abc import Mapping
 from types import ModuleType
 
 from polarnet.methods.method import Method
+from polarnet.metrics.references import REFERENCES, Reference
 
 
 def _modules() -> list[ModuleType]:
@@ -31,6 +34,9 @@ METHODS = _assembled()
 >>> METHODS["highpass"].label
 'high-pass'
 """
+
+ROWS: Mapping[str, Reference | Method] = ChainMap(METHODS, REFERENCES)  # type: ignore[arg-type]
+"""Row of the tables by name, in the order of all tables: references first, then methods."""
 
 
 def is_rotating(row: str) -> bool:

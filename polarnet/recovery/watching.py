@@ -1,4 +1,4 @@
-"""Watch a recovery: scores against a known truth, and a log for Rerun."""
+"""Watch a recovery: scores against a known truth."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -6,19 +6,10 @@ from dataclasses import dataclass, field
 
 from polarnet.metrics.scores import frame_scores
 from polarnet.recovery.stream import Frame
-from polarnet.reports.rerun_log import RerunLog
 from polarnet.stokes import Prediction
 from polarnet.storage.true_frames import TrueFrames
 
 MAX_GAP = 0.01  # between the end of a window and its true frame, as a fraction of the window
-
-
-def logged(log: RerunLog, frames: Iterable[Frame], live: bool) -> Iterator[Frame]:
-    """Yield the frames, logged for Rerun; `live` ones with their latency."""
-    for frame in frames:
-        log.events(frame.window)
-        log.prediction(frame.window.stop_us, frame.prediction, frame.step_s, frame.latency_s if live else None)
-        yield frame
 
 
 @dataclass

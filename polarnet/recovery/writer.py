@@ -21,7 +21,6 @@ from torch import Tensor
 
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Recoverer, State
-from polarnet.reports.film import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.reports.maps import (
     EventScale,
     angle_image,
@@ -32,12 +31,13 @@ from polarnet.reports.maps import (
     polarization_hsv,
 )
 from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map, write_player
-from polarnet.reports.preview import Panel, Sheet, foot_of
+from polarnet.reports.preview import Sheet, foot_of
 from polarnet.reports.videos import VideoWriter, with_even_sides
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import FRAMES_PER_CHUNK
 from polarnet.storage.groups import GrowingColumns
+from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.storage.true_frames import TrueFrames
 
 VIDEO = "recovered.mp4"
@@ -62,7 +62,7 @@ class Picture(NamedTuple):
     t_us: int
     pixels: UInt8[np.ndarray, "h w 3"]
     maps: Mapping[Kind, UInt8[Tensor, "h w"]]
-    """The maps as bytes (`polarnet.reports.film`), for the page."""
+    """The maps as bytes (`polarnet.storage.panels`), for the page."""
 
 
 @dataclass
@@ -176,22 +176,21 @@ class RecoveryWriter:
         """The picture of the video: events and DoLP above polarization and AoLP, with their truth where it is known."""
         if self._sheet is None:
             self._sheet = Sheet(*prediction.dolp.shape)
-        above, below = [Panel("events", events)], []
+        above, below = {"events": events}, {}
         plain = plain_intensity(prediction)
         if plain is None:
-            above.append(Panel("DoLP", dolp_image(prediction.dolp)))
+            above["DoLP"] = dolp_image(prediction.dolp)
         else:
-            above.append(Panel("intensity", intensity_image(plain)))
+            above["intensity"] = intensity_image(plain)
         true = None if self._truth is None else self._truth.at(window.stop_us)
         if prediction.aolp is not None:
             s0, kind = (true.s0, "true") if true else (self._s0(window, prediction), "reconstructed")
             if s0 is not None:
-                light = polarization_hsv(s0, prediction.dolp, prediction.aolp)
-                below.append(Panel(f"polarization, {kind} S0", light))
-            below.append(Panel("AoLP (hue), DoLP (saturation)", angle_image(prediction.dolp, prediction.aolp)))
+                below[f"polarization, {kind} S0"] = polarization_hsv(s0, prediction.dolp, prediction.aolp)
+            below["AoLP (hue), DoLP (saturation)"] = angle_image(prediction.dolp, prediction.aolp)
         if true:
-            above.append(Panel("true DoLP", dolp_image(true.dolp)))
-            below.append(Panel("true AoLP (hue), DoLP (saturation)", angle_image(true.dolp, true.aolp)))
+            above["true DoLP"] = dolp_image(true.dolp)
+            below["true AoLP (hue), DoLP (saturation)"] = angle_image(true.dolp, true.aolp)
         foot = foot_of((window.start_us, window.stop_us), sum(map(len, window.channels)))
         return self._sheet.picture([above, below], foot)
 

@@ -6,13 +6,12 @@ from bisect import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from polarnet.events.stream import Events
@@ -25,8 +24,9 @@ from polarnet.runtime.splits import SPLITS
 from polarnet.simulation.motion import Pose, Trajectory, sensor_to_scene
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
+from polarnet.storage.panels import Panel, read_panel
 from polarnet.storage.scenes import SceneStore
-from polarnet.training.engine.history import HISTORY, best_row, read_history
+from polarnet.training.engine.history import best_row, read_history
 
 SIMULATED = "simulated"  # name of the pipeline's own test set
 OURS = "ours"  # folder of the DoLP network's training
@@ -51,39 +51,6 @@ class ReportPaths:
         """Results on the simulated test set."""
         return self.benchmark / "sets" / SIMULATED
 
-    def check(self, baselines: Sequence[str]) -> None:
-        """FileNotFoundError that names each missing artefact and the stage that makes it; `baselines` were trained."""
-        needed = {
-            self.images / "manifest.json": "ingest",
-            self.scenes: "synthesize",
-            self.frames: "synthesize",
-            self.events: "emulate",
-            self.train / OURS / HISTORY: "train",
-            **{self.train / name / HISTORY: f"train_baseline@{name}" for name in baselines},
-            self.simulated / "metrics.json": "report",
-            self.simulated / "cost.json": "report",
-            self.simulated / "details.json": "report",
-        }
-        missing = [f"{path} (stage {stage})" for path, stage in needed.items() if not path.exists()]
-        if missing:
-            raise FileNotFoundError(f"the report needs {', '.join(missing)}; run `dvc repro` to make what is missing")
-
-
-class Panel(NamedTuple):
-    """One window of one test sequence, as stored by the benchmark; `dolp` and `aolp` by method."""
-
-    sequence: str
-    window: int
-    t_us: int
-    events: Float[Tensor, "4 h w"]
-    truth_dolp: Float[Tensor, "h w"]
-    truth_aolp: Float[Tensor, "h w"]
-    truth_s0: Float[Tensor, "h w"]
-    dolp: Mapping[str, Float[Tensor, "h w"]]
-    aolp: Mapping[str, Float[Tensor, "h w"]]
-    film: Mapping[str, Shaped[Tensor, "n ..."]] = MappingProxyType({})
-    """Times and maps of the scene's frames, named as in `polarnet.benchmark.run.Panel` without `film_`."""
-
 
 class Overview(NamedTuple):
     """One test sequence, from the picture that the sensor moved over to the DoLP recovered from one window."""
@@ -102,17 +69,6 @@ class Overview(NamedTuple):
     start_us: int
     duration_us: int
     recovered: Float[Tensor, "h w"]
-
-
-class EventRate(NamedTuple):
-    """Number of events in a split, summed over the four channels."""
-
-    split: str
-    sequences: int
-    seconds: float
-    events: int
-    per_pixel_second: float
-    """Events per pixel and second, mean over the four channels."""
 
 
 class BudgetPoint(NamedTuple):
@@ -160,7 +116,6 @@ class Artefacts:
     ours: History
     baselines: Mapping[str, History]
     """Trained baselines by name."""
-    rates: Sequence[EventRate]
     budget: Sequence[BudgetPoint]
     """Error on the simulated test set by events per pixel, method by method."""
     overview: Overview | None
@@ -170,8 +125,7 @@ class Artefacts:
 
 
 def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
-    """Read everything under `paths`, with the trainings of `baselines`; FileNotFoundError names the stage to run."""
-    paths.check(baselines)
+    """Read everything under `paths`, with the trainings of `baselines`."""
     scenes, frames = SceneStore.open(paths.scenes), FrameStore.open(paths.frames)
     events = EventStore.open(paths.events)
     manifest, results = read_manifest(paths.images), read_results(paths.simulated)
@@ -180,7 +134,7 @@ def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
     pictures.sort(key=lambda entry: entry.source == "dead_leaves")  # photographs first
     generated = {entry.name for entry in pictures if entry.source == "dead_leaves"}
     panels = sorted(
-        results.panels, key=lambda p: (scenes.scene_of[p.sequence] in generated, -float(p.truth_dolp.std()))
+        results.panels, key=lambda p: (scenes.scene_of[p.sequence] in generated, -float(p.truth.dolp.std()))
     )
     return Artefacts(
         manifest=manifest,
@@ -188,7 +142,6 @@ def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
         sets=[read_results(one) for one in sorted(paths.benchmark.glob("sets/*")) if one.name != SIMULATED],
         ours=training_history(paths.train / OURS),
         baselines={name: training_history(paths.train / name) for name in baselines},
-        rates=event_rates(events, frames),
         budget=event_budget(paths.simulated / "frames.csv", events),
         overview=_overview(panels, scenes, frames, events),
         thumbnails={
@@ -199,13 +152,10 @@ def read_artefacts(paths: ReportPaths, baselines: Sequence[str]) -> Artefacts:
 
 def read_results(folder: Path) -> Results:
     """Read a folder written by `write_benchmark`; the set's name comes from details.json, or from the folder."""
-    for name in ("metrics.json", "cost.json", "details.json"):
-        if not (folder / name).exists():
-            raise FileNotFoundError(f"{folder / name} is missing; run the benchmark of this test set again")
     details, costs = _json(folder / "details.json"), _json(folder / "cost.json")
     metrics = {row: {**scores, **costs[row]} for row, scores in _json(folder / "metrics.json").items()}
     return Results(
-        details.get("set", folder.name), metrics, details, [*map(_panel, sorted((folder / "panels").glob("*.npz")))]
+        details.get("set", folder.name), metrics, details, [*map(read_panel, sorted((folder / "panels").glob("*.npz")))]
     )
 
 
@@ -223,19 +173,6 @@ def training_history(folder: Path) -> History:
     )
     best_epoch = rows.index(best_row(rows))
     return History(_json(folder / "best.json")["network"], loss, validation, best_epoch)
-
-
-def event_rates(events: EventStore, frames: FrameStore) -> list[EventRate]:
-    """Number and rate of events in each split; a split without sequences is left out."""
-    rates = []
-    for split in SPLITS:
-        names = [name for name in frames.of_split(split) if name in set(events.sequences)]
-        if names:
-            seconds = sum(events.duration_us(name) for name in names) / 1e6
-            count = sum(sum(events.count(name)) for name in names)
-            rate = count / (4 * events.height * events.width * seconds)
-            rates.append(EventRate(split, len(names), seconds, count, rate))
-    return rates
 
 
 def thumbnails(pictures: Sequence[str], scenes: SceneStore) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
@@ -270,8 +207,8 @@ def event_budget(file: Path, events: EventStore) -> list[BudgetPoint]:
 
 def _overview(panels: Sequence[Panel], scenes: SceneStore, frames: FrameStore, events: EventStore) -> Overview | None:
     """Data of the first panel, which has the largest variation of the true DoLP; None without one of the network."""
-    panel = next((panel for panel in panels if OURS in panel.dolp), None)
-    if panel is None:
+    panel = next((panel for panel in panels if OURS in panel.predictions), None)
+    if panel is None or panel.truth.aolp is None:
         return None
     scene = scenes.read(panel.sequence)
     start_us = int(frames.t_us(panel.sequence)[panel.window])
@@ -285,12 +222,12 @@ def _overview(panels: Sequence[Panel], scenes: SceneStore, frames: FrameStore, e
         path=np.stack([path.x, path.y]) / size,
         outline=outline / size,
         intensity=frames.intensity(panel.sequence)[panel.window + 1],
-        dolp=panel.truth_dolp,
-        aolp=panel.truth_aolp,
+        dolp=panel.truth.dolp,
+        aolp=panel.truth.aolp,
         streams=events.read(panel.sequence, start_us, panel.t_us),
         start_us=start_us,
         duration_us=panel.t_us - start_us,
-        recovered=panel.dolp[OURS],
+        recovered=panel.predictions[OURS].dolp,
     )
 
 
@@ -299,20 +236,6 @@ def _outline(pose: Pose, height: int, width: int) -> Float[np.ndarray, "2 corner
     left, top, along, across = sensor_to_scene(*(float(column[0]) for column in pose), height, width)
     columns, rows = np.array([[0, width, width, 0, 0], [0, 0, height, height, 0]])
     return np.stack([left + columns * along - rows * across, top + columns * across + rows * along])
-
-
-def _panel(file: Path) -> Panel:
-    with np.load(file) as arrays:
-        tensors = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
-
-    def by_method(kind: str) -> dict[str, Tensor]:
-        return {name.removeprefix(kind): frame for name, frame in tensors.items() if name.startswith(kind)}
-
-    truth = {name: tensors[name] for name in ("events", "truth_dolp", "truth_aolp", "truth_s0")}
-    window, t_us = int(tensors["window"]), int(tensors["t_us"])
-    return Panel(
-        file.stem, window, t_us, **truth, dolp=by_method("dolp_"), aolp=by_method("aolp_"), film=by_method("film_")
-    )
 
 
 def _json(path: Path) -> Any:

@@ -1,16 +1,20 @@
-"""Charts of the pages as Vega-Lite specifications made with Altair; charts.js draws them with Vega inside the page."""
+"""Charts of the pages, drawn in the page's own colours (`polarnet.reports.html.svg`)."""
 
 import functools
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, ParamSpec
 
-import altair as alt
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from polarnet.reports.artefacts import BudgetPoint, EventRate, History, Results
+from polarnet.reports.artefacts import BudgetPoint, History, Results
+from polarnet.reports.figures import PAGE, chart_style
 from polarnet.reports.legend import Legend, in_order, with_structure
 from polarnet.reports.tables import Column
-
-Spec = Mapping[str, Any]
 
 TERMS = {
     "total": "total (weighted)",
@@ -25,113 +29,125 @@ TERMS = {
 """Legend labels of loss terms."""
 BRANCHES = {"intensity": "intensity", "aolp": "AoLP", "dolp": "DoLP"}
 """Outputs of a network with one loss per output; their terms are named BRANCH_TERM."""
-ROW_HEIGHT = 22  # pixels
-METHOD_AXIS = alt.Axis(labelLimit=170, ticks=False, domain=False)
+WIDTH, HEIGHT = 4.8, 2.8  # inches
+ROW_HEIGHT, LABEL_LETTERS = 0.26, 28  # of a method beside a chart: inches, and letters in a line of its label
+
+Arguments = ParamSpec("Arguments")
 
 
-@functools.cache
-def vega_bundle() -> str:
-    """Vega, Vega-Lite and Vega-Embed as one script, so that a page needs no network."""
-    import vl_convert
+def _charted(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
+    """Draw in the style of the pages."""
 
-    return vl_convert.javascript_bundle()  # type: ignore[call-arg]  # its stub lacks the default
+    @functools.wraps(draw)
+    def drawn(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Figure:
+        with matplotlib.rc_context(chart_style(PAGE)):
+            return draw(*args, **kwargs)
 
-
-def score_chart(metrics: Mapping[str, Mapping[str, Any]], columns: Mapping[str, Column], legend: Legend) -> Spec:
-    """Scores with their 95 % intervals, one metric at a time."""
-    methods = in_order(metrics)
-    values: list[dict[str, Any]] = [
-        _score(columns[key], key, legend, method, metrics[method])
-        for key in columns
-        for method in methods
-        if metrics[method].get(key) is not None
-    ]
-    names = list(dict.fromkeys(value["metric"] for value in values))
-    chosen = alt.param("metric", value=names[0], bind=alt.binding_select(options=names, name="Score "))
-    x = alt.X("value:Q", title=None, scale=alt.Scale(zero=False, nice=True), axis=alt.Axis(tickCount=5))
-    order = [legend.label(method) for method in methods]
-    base = alt.Chart(alt.Data(values=values)).encode(
-        y=alt.Y("method:N", sort=order, title=None, axis=METHOD_AXIS), color=alt.Color("colour:N", scale=None)
-    )
-    dots = base.mark_point(filled=True, size=60, opacity=1).encode(
-        x=x, tooltip=["method:N", "metric:N", "value:Q", "low:Q", "high:Q"]
-    )
-    bars = base.mark_rule(strokeWidth=2).encode(x="low:Q", x2="high:Q").transform_filter("isValid(datum.low)")
-    chart = alt.layer(bars, dots).transform_filter("datum.metric == metric").add_params(chosen)
-    return _finished(chart, ROW_HEIGHT * len(methods))
+    return drawn
 
 
-def _score(column: Column, key: str, legend: Legend, method: str, row: Mapping[str, Any]) -> dict[str, Any]:
-    low, high = row.get(f"{key}_ci") or (None, None)
-    label, colour = legend.label(method), legend.colour(method)
-    return {"metric": column.heading, "method": label, "colour": colour, "value": row[key], "low": low, "high": high}
+def _axes(height: float = HEIGHT, width: float = WIDTH) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="none")
+    return figure, figure.subplots()
 
 
-def scatter_chart(means: Mapping[str, Mapping[str, float]], legend: Legend) -> Spec | None:
+def _method_axes(labels: Sequence[str]) -> tuple[Figure, Axes]:
+    """Axes with a row for each label, the first at the top."""
+    figure, axes = _axes(0.5 + ROW_HEIGHT * len(labels))
+    axes.set_yticks(range(len(labels)), [textwrap.fill(label, LABEL_LETTERS) for label in labels])
+    axes.tick_params(axis="y", length=0)
+    axes.set_ylim(len(labels) - 0.5, -0.5)
+    axes.spines["left"].set_visible(False)
+    return figure, axes
+
+
+def _above(figure: Figure) -> None:
+    """Put the legend above the axes."""
+    figure.legend(loc="outside upper left", ncols=2, frameon=False, fontsize=7)
+
+
+def _logarithmic(axes: Axes, which: str) -> None:
+    """Make `which` of the axes x and y logarithmic, with plain numbers at 1, 2 and 5 of each decade."""
+    for name in which:
+        axes.set(**{f"{name}scale": "log"})
+        axis = axes.xaxis if name == "x" else axes.yaxis
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=6))
+        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.set_minor_locator(NullLocator())
+
+
+def _diagonal(axes: Axes, values: Iterable[float]) -> None:
+    """Logarithmic axes with equal ends, and the line on which both are equal."""
+    given = list(values)
+    ends = max(0.8 * min(given), 1e-6), 1.25 * max(given)
+    axes.plot(ends, ends, "--", color=PAGE.quiet, linewidth=1)
+    _logarithmic(axes, "xy")
+    axes.set(xlim=ends, ylim=ends)
+
+
+@_charted
+def score_chart(metrics: Mapping[str, Mapping[str, Any]], key: str, column: Column, legend: Legend) -> Figure:
+    """A score of each method that has it, with its 95 % interval."""
+    methods = [method for method in in_order(metrics) if metrics[method].get(key) is not None]
+    figure, axes = _method_axes([legend.label(method) for method in methods])
+    for place, method in enumerate(methods):
+        axes.plot(metrics[method].get(f"{key}_ci", []) or [], [place] * len(metrics[method].get(f"{key}_ci") or []),
+                  color=legend.colour(method))  # fmt: skip
+        axes.plot(metrics[method][key], place, "o", color=legend.colour(method), markersize=5)
+    axes.set_xlabel(column.heading)
+    return figure
+
+
+@_charted
+def scatter_chart(means: Mapping[str, Mapping[str, float]], rival: str, legend: Legend) -> Figure:
     """MSE of ours against that of another method, a dot a scene; below the line ours is better.
 
-    `means` is method, then scene. None without `ours` or another method.
+    `means` is method, then scene.
     """
-    rivals = [method for method in in_order(means) if method != "ours"]
-    if "ours" not in means or not rivals:
-        return None
-    values: list[dict[str, Any]] = [
-        {"scene": scene, "rival": legend.label(rival), "other": means[rival][scene], "ours": ours}
-        for rival in rivals
-        for scene, ours in means["ours"].items()
-        if scene in means[rival]
-    ]
-    names = [legend.label(rival) for rival in rivals]
-    chosen = alt.param("rival", value=names[-1], bind=alt.binding_select(options=names, name="Compare with "))
-    ends = [value[axis] for value in values for axis in ("other", "ours")]
-    domain = [max(min(ends) * 0.8, 1e-6), max(ends) * 1.25]
-    scale = alt.Scale(type="log", domain=domain, nice=False)
-    x = alt.X("other:Q", scale=scale, title="MSE of the other method", axis=alt.Axis(tickCount=5, format="~g"))
-    y = alt.Y("ours:Q", scale=scale, title=f"MSE of {legend.label('ours')}", axis=alt.Axis(tickCount=5, format="~g"))
-    line = alt.Chart(alt.Data(values=[{"other": end, "ours": end} for end in domain]))
-    dots = alt.Chart(alt.Data(values=values)).mark_point(filled=True, size=70, color=legend.colour("ours"))
-    dots = dots.encode(x=x, y=y, tooltip=["scene:N", "rival:N", "other:Q", "ours:Q"])
-    dots = dots.transform_filter("datum.rival == rival").add_params(chosen)
-    return _finished(line.mark_line(color="#8a93a3", strokeDash=[4, 4]).encode(x=x, y=y) + dots, 280)
+    scenes = [scene for scene in means["ours"] if scene in means[rival]]
+    figure, axes = _axes()
+    _diagonal(axes, [means[method][scene] for method in ("ours", rival) for scene in scenes])
+    x, y = ([means[method][scene] for scene in scenes] for method in (rival, "ours"))
+    axes.plot(x, y, "o", color=legend.colour("ours"), markersize=5)
+    axes.set(xlabel=f"MSE of {legend.label(rival)}", ylabel="MSE of ours")
+    return figure
 
 
-def spread_chart(means: Mapping[str, Mapping[str, float]], legend: Legend) -> Spec:
+@_charted
+def spread_chart(means: Mapping[str, Mapping[str, float]], legend: Legend) -> Figure:
     """MSE of every scene and method; the stroke is the median."""
     methods = in_order(means)
-    values: list[dict[str, Any]] = [
-        {"method": legend.label(method), "colour": legend.colour(method), "scene": scene, "mse": mse}
-        for method in methods
-        for scene, mse in means[method].items()
-        if mse > 0
-    ]
-    order = [legend.label(method) for method in methods]
-    x = alt.X("mse:Q", scale=alt.Scale(type="log"), title="MSE of a scene", axis=alt.Axis(tickCount=5, format="~g"))
-    base = alt.Chart(alt.Data(values=values)).encode(y=alt.Y("method:N", sort=order, title=None, axis=METHOD_AXIS))
-    dots = base.mark_point(filled=True, size=35, opacity=0.6).encode(
-        x=x, color=alt.Color("colour:N", scale=None), tooltip=["method:N", "scene:N", "mse:Q"]
-    )
-    medians = base.mark_tick(thickness=2, size=16, color="#8a93a3").encode(
-        x=alt.X("median(mse):Q", scale=alt.Scale(type="log"))
-    )
-    return _finished(dots + medians, ROW_HEIGHT * len(methods))
+    figure, axes = _method_axes([legend.label(method) for method in methods])
+    for place, method in enumerate(methods):
+        values = [mse for mse in means[method].values() if mse > 0]
+        axes.plot(values, [place] * len(values), "o", color=legend.colour(method), markersize=4, alpha=0.6)
+        axes.plot([np.median(values)] if values else [], [place] if values else [], "|", color=PAGE.text, markersize=12)
+    _logarithmic(axes, "x")
+    axes.set_xlabel("MSE of a scene")
+    return figure
 
 
-def training_chart(history: History, output: str) -> Sequence[Spec]:
-    """Loss terms (logarithmic) and validation PSNR over epochs from 1: two charts, one below the other on a phone."""
-    losses: list[dict[str, Any]] = [
-        {"epoch": epoch + 1, "term": term_label(term), "loss": loss}
-        for term, values in history.loss.items()
-        for epoch, loss in enumerate(values)
-    ]
-    scores = [{"epoch": epoch + 1, "psnr": psnr} for epoch, psnr in enumerate(history.validation["psnr"])]
-    kind: Literal["log", "linear"] = "log" if all(value["loss"] > 0 for value in losses) else "linear"
-    epochs = alt.X("epoch:Q", title="epoch", axis=alt.Axis(tickMinStep=1, format="d"), scale=alt.Scale(nice=False))
-    loss = alt.Chart(alt.Data(values=losses)).mark_line(point=True)
-    y = alt.Y("loss:Q", title="training loss", scale=alt.Scale(type=kind), axis=alt.Axis(tickCount=5, format="~g"))
-    loss = loss.encode(x=epochs, y=y, color=alt.Color("term:N", title=None), tooltip=["epoch:Q", "term:N", "loss:Q"])
-    psnr = alt.Chart(alt.Data(values=scores)).mark_line(point=True)
-    y = alt.Y("psnr:Q", title=f"validation PSNR of {output}, dB", scale=alt.Scale(zero=False))
-    return [_finished(chart, 220) for chart in (loss, psnr.encode(x=epochs, y=y, tooltip=["epoch:Q", "psnr:Q"]))]
+@_charted
+def loss_chart(history: History) -> Figure:
+    """Loss terms over epochs from 1, logarithmic if all are positive."""
+    figure, axes = _axes()
+    for term, values in history.loss.items():
+        axes.plot(range(1, len(values) + 1), values, "o-", markersize=3, label=term_label(term))
+    if all(value > 0 for values in history.loss.values() for value in values):
+        _logarithmic(axes, "y")
+    axes.set(xlabel="epoch", ylabel="training loss")
+    _above(figure)
+    return figure
+
+
+@_charted
+def psnr_chart(history: History, output: str) -> Figure:
+    """Validation PSNR over epochs from 1."""
+    figure, axes = _axes()
+    psnr = history.validation["psnr"]
+    axes.plot(range(1, len(psnr) + 1), psnr, "o-", markersize=3)
+    axes.set(xlabel="epoch", ylabel=f"validation PSNR of {output}, dB")
+    return figure
 
 
 def term_label(name: str) -> str:
@@ -140,83 +156,54 @@ def term_label(name: str) -> str:
     return f"{BRANCHES[branch]}: {TERMS[term]}" if branch in BRANCHES and term in TERMS else TERMS.get(name, name)
 
 
-def reliability_chart(details: Mapping[str, Any], legend: Legend) -> Spec | None:
-    """Measured against predicted squared error; dots grow with the pixels. None if no method predicts its error."""
-    values: list[dict[str, Any]] = [
-        {"method": legend.label(method), "expected": expected, "measured": measured, "pixels": pixels}
-        for method, entry in details.get("reliability", {}).items()
-        for expected, measured, pixels in entry["curve"]
-        if expected > 0 and measured > 0
-    ]
-    if not values:
-        return None
-    ends = [value[key] for value in values for key in ("expected", "measured")]
-    diagonal = [{"expected": end, "measured": end} for end in (min(ends), max(ends))]
-    scale, axis = alt.Scale(type="log"), alt.Axis(tickCount=5, format="~g")
-    x = alt.X("expected:Q", scale=scale, axis=axis, title="expected squared error")
-    y = alt.Y("measured:Q", scale=scale, axis=axis, title="measured squared error")
-    line = alt.Chart(alt.Data(values=diagonal)).mark_line(color="#8a93a3", strokeDash=[4, 4]).encode(x=x, y=y)
-    curves = alt.Chart(alt.Data(values=values)).encode(x=x, y=y, color=alt.Color("method:N", title=None))
-    dots = curves.mark_point(filled=True).encode(
-        size=alt.Size("pixels:Q", legend=None), tooltip=["method:N", "expected:Q", "measured:Q", "pixels:Q"]
-    )
-    return _finished(line + curves.mark_line() + dots, 280)
+@_charted
+def reliability_chart(curves: Mapping[str, Sequence[Sequence[float | int]]], legend: Legend) -> Figure:
+    """Measured against expected squared error by method; dots grow with the number of pixels."""
+    figure, axes = _axes()
+    _diagonal(axes, [end for curve in curves.values() for point in curve for end in point[:2]])
+    for method, curve in curves.items():
+        expected, measured, pixels = np.array(curve).T
+        axes.plot(expected, measured, color=legend.colour(method), label=legend.label(method))
+        axes.scatter(expected, measured, 4 + 40 * pixels / pixels.max(), color=legend.colour(method))
+    axes.set(xlabel="expected squared error", ylabel="measured squared error")
+    _above(figure)
+    return figure
 
 
-def budget_chart(points: Sequence[BudgetPoint], legend: Legend) -> Spec:
+@_charted
+def budget_chart(points: Sequence[BudgetPoint], legend: Legend) -> Figure:
     """Mean MSE against the events per pixel since the start of a sequence, a line a method."""
-    methods = in_order(dict.fromkeys(point.method for point in points))
-    values = [{**one._asdict(), "method": legend.label(one.method)} for one in points if one.events_per_pixel > 0]
-    scale = alt.Scale(domain=[*map(legend.label, methods)], range=[*map(legend.colour, methods)])
-    scale_x = alt.Scale(type="log", nice=False, padding=10)
-    x = alt.X("events_per_pixel:Q", title="events per pixel since the start", scale=scale_x)
-    y = alt.Y("mse:Q", title="MSE", axis=alt.Axis(tickCount=5, format="~g"))
-    lines = alt.Chart(alt.Data(values=values)).mark_line(point=True)
-    tooltip = ["method:N", "events_per_pixel:Q", "mse:Q", "frames:Q"]
-    return _finished(lines.encode(x=x, y=y, color=alt.Color("method:N", scale=scale, title=None), tooltip=tooltip), 280)
+    figure, axes = _axes(HEIGHT + 0.5)
+    for method in in_order(dict.fromkeys(point.method for point in points)):
+        own = [point for point in points if point.method == method and point.events_per_pixel > 0]
+        axes.plot([point.events_per_pixel for point in own], [point.mse for point in own], "o-", markersize=3,
+                  color=legend.colour(method), label=legend.label(method))  # fmt: skip
+    _logarithmic(axes, "x")
+    axes.set(xlabel="events per pixel since the start", ylabel="MSE")
+    _above(figure)
+    return figure
 
 
-def rates_chart(rates: Sequence[EventRate]) -> Spec:
-    """Events per pixel, polarizer and second of each split."""
-    values = [rate._asdict() for rate in rates]
-    bars = alt.Chart(alt.Data(values=values)).mark_bar()
-    tooltip = ["split:N", "sequences:Q", "seconds:Q", "events:Q", "per_pixel_second:Q"]
-    x = alt.X("per_pixel_second:Q", title="events per pixel, polarizer and second")
-    y = alt.Y("split:N", sort=None, title=None)
-    return _finished(bars.encode(x=x, y=y, tooltip=tooltip), 30 * len(values))
+@_charted
+def sets_chart(sets: Sequence[Results], titles: Mapping[str, str], legend: Legend) -> Figure:
+    """Heat map: MSE of each method on each test set, divided by the best constant's; no tile without both."""
+    methods = with_structure(dict.fromkeys(method for one in sets for method in one.metrics))
+    ratios = np.array([[_to_constant(one, method) for one in sets] for method in methods])
+    figure, axes = _method_axes([legend.label(method) for method in methods])
+    logarithms = np.log(ratios)
+    axes.imshow(logarithms, cmap="cividis_r", aspect="auto")
+    axes.set_xticks(range(len(sets)), [textwrap.fill(titles.get(one.name, one.name), 14) for one in sets])
+    axes.xaxis.tick_top()
+    axes.grid(visible=False)
+    middle = (np.nanmin(logarithms) + np.nanmax(logarithms)) / 2
+    for (row, column), ratio in np.ndenumerate(ratios):
+        if np.isfinite(ratio):
+            ink = "#ffffff" if logarithms[row, column] > middle else "#10141b"
+            axes.text(column, row, f"{ratio:.2f}", ha="center", va="center", color=ink)
+    return figure
 
 
-def sets_chart(sets: Sequence[Results], titles: Mapping[str, str], legend: Legend) -> Spec | None:
-    """Heat map: MSE of each method on each test set, divided by the best constant's. None for a single set."""
-    constant = "oracle_mean"
-    values: list[dict[str, Any]] = [
-        {
-            "method": legend.label(method),
-            "set": titles.get(one.name, one.name),
-            "ratio": one.metrics[method]["mse"] / one.metrics[constant]["mse"],
-        }
-        for one in sets
-        if one.metrics.get(constant, {}).get("mse")
-        for method in with_structure(one.metrics)
-        if one.metrics[method].get("mse") is not None
-    ]
-    if len({value["set"] for value in values}) < 2:
-        return None
-    order = [legend.label(method) for method in with_structure(dict.fromkeys(m for one in sets for m in one.metrics))]
-    base = alt.Chart(alt.Data(values=values)).encode(
-        x=alt.X("set:N", sort=None, title=None, axis=alt.Axis(labelAngle=0, orient="top", labelLimit=90)),
-        y=alt.Y("method:N", sort=order, title=None, axis=METHOD_AXIS),
-        tooltip=["method:N", "set:N", "ratio:Q"],
-    )
-    scale = alt.Scale(type="log", scheme="cividis", reverse=True)
-    tiles = base.mark_rect().encode(color=alt.Color("ratio:Q", scale=scale, legend=None))
-    middle = (min(v["ratio"] for v in values) * max(v["ratio"] for v in values)) ** 0.5
-    ink = alt.condition(f"datum.ratio > {middle}", alt.value("#ffffff"), alt.value("#10141b"))
-    return _finished(
-        tiles + base.mark_text().encode(text=alt.Text("ratio:Q", format=".2f"), color=ink), 24 * len(order)
-    )
-
-
-def _finished(chart: Any, height: int) -> Spec:
-    """The specification, as wide as its place on the page."""
-    return chart.properties(width="container", height=height).to_dict()
+def _to_constant(one: Results, method: str) -> float:
+    """MSE of a method on a set, divided by that of the best constant; not a number where either is unknown."""
+    mse, constant = (one.metrics.get(row, {}).get("mse") for row in (method, "oracle_mean"))
+    return mse / constant if mse and constant else float("nan")

@@ -18,31 +18,30 @@ from matplotlib.rcsetup import cycler
 from torch import Tensor
 
 from polarnet.metrics.similarity import mse, psnr
-from polarnet.reports.artefacts import Panel
 from polarnet.reports.legend import GENERAL, Legend, with_structure
 from polarnet.reports.maps import DOLP_COLOURS, dolp_image, event_full_scale, event_image, hue_wheel
+from polarnet.storage.panels import Panel
 
 HEADING_LETTERS = 19  # in a line above a picture
 
 
 @dataclass(frozen=True)
 class Theme:
-    """Colours of text and lines on a light or a dark page; the figure itself has no background."""
+    """Colours of text and lines; charts have no background."""
 
     text: str
     quiet: str
     grid: str
     face: str
-    """Colour of the page, for markers that must hide lines behind them; "none" is transparent."""
+    """Colour behind pictures; "none" is transparent."""
 
 
 LIGHT = Theme(text="#1c2330", quiet="#667085", grid="#e4e7ec", face="#ffffff")
-DARK = Theme(text="#e6e9ef", quiet="#98a2b3", grid="#313947", face="#161b24")
+PAGE = Theme(text="#00000a", quiet="#00000b", grid="#00000c", face="none")
+"""Stands for the colours of the page, which `polarnet.reports.html.svg` puts in."""
 
 
-def comparison_figure(
-    panels: Sequence[Panel], methods: Iterable[str], legend: Legend = GENERAL, theme: Theme = LIGHT
-) -> Figure:
+def comparison_figure(panels: Sequence[Panel], methods: Iterable[str], legend: Legend = GENERAL) -> Figure:
     """Draw panels like the paper's Fig. 9 and 10: a row each, with events, truth and the DoLP of `methods`.
 
     MSE and PSNR stand below each method; methods of one constant value are left out. ValueError without panels.
@@ -53,36 +52,39 @@ def comparison_figure(
     labels = ["events, 0°", "true DoLP", *map(legend.label, methods)]
     headings = [textwrap.fill(label, HEADING_LETTERS) for label in labels]
     lines = max(1 + heading.count("\n") for heading in headings)
-    with matplotlib.rc_context(chart_style(theme)):
-        figure, grid = tile_grid(len(panels), len(headings), panels[0].truth_dolp.shape, theme, heading_lines=lines)
+    with matplotlib.rc_context(chart_style(LIGHT)):
+        figure, grid = tile_grid(len(panels), len(headings), panels[0].s0.shape, heading_lines=lines)
         for panel, row in zip(panels, grid, strict=True):
             full_scale = event_full_scale(panel.events)
-            tiles = [(event_image(panel.events[0], full_scale), ""), (dolp_image(panel.truth_dolp), "")]
-            tiles += [(dolp_image(panel.dolp[m]), score_line(panel.dolp[m], panel.truth_dolp)) for m in methods]
+            tiles = [(event_image(panel.events[0], full_scale), ""), (dolp_image(panel.truth.dolp), "")]
+            shown = [panel.predictions[method].dolp for method in methods]
+            tiles += [(dolp_image(dolp), score_line(dolp, panel.truth.dolp)) for dolp in shown]
             for axes, (picture, below) in zip(row, tiles, strict=True):
-                show_picture(axes, picture, theme)
-                axes.set_xlabel(below, color=theme.quiet, fontsize=6, labelpad=2.5)
-            row[0].set_ylabel(_short(panel.sequence), color=theme.quiet, fontsize=6)
+                show_picture(axes, picture, LIGHT)
+                axes.set_xlabel(below, color=LIGHT.quiet, fontsize=6, labelpad=2.5)
+            row[0].set_ylabel(_short(panel.sequence), color=LIGHT.quiet, fontsize=6)
         for axes, heading in zip(grid[0], headings, strict=True):
-            axes.set_title(heading, color=theme.text, fontsize=8, pad=4)
+            axes.set_title(heading, color=LIGHT.text, fontsize=8, pad=4)
     return figure
 
 
 def tile_grid(
-    rows: int, columns: int, shape: Sequence[int], theme: Theme, bar_row: int = 0, heading_lines: int = 1
+    rows: int, columns: int, shape: Sequence[int], bar_row: int = 0, heading_lines: int = 1
 ) -> tuple[Figure, np.ndarray]:
     """A figure and its axes for pictures of `shape`, with a colour bar of DoLP beside row `bar_row`."""
     tile, gap, left, right, top, below = 1.35, 0.06, 0.22, 0.5, 0.12 + 0.14 * heading_lines, 0.2  # inches
     tile_height = tile * shape[0] / shape[1]
     width, height = left + columns * (tile + gap) + right, top + rows * (tile_height + below)
-    figure = Figure(figsize=(width, height), facecolor=theme.face)
+    figure = Figure(figsize=(width, height), facecolor=LIGHT.face)
     grid = figure.subplots(rows, columns, squeeze=False)
     figure.subplots_adjust(
         left / width, below / height, 1 - (right + gap) / width, 1 - top / height, gap / tile, below / tile_height
     )
     place = grid[bar_row, -1].get_position()
     bar = figure.add_axes((place.x1 + (gap + 0.04) / width, place.y0, 0.09 / width, place.height))
-    _colour_bar(figure, bar, theme, "vertical", label_size=6.0)
+    colours = figure.colorbar(ScalarMappable(cmap=DOLP_COLOURS), cax=bar, ticks=[0, 0.5, 1])
+    colours.ax.tick_params(labelsize=6, length=2, pad=2, colors=LIGHT.quiet)
+    colours.outline.set_visible(False)
     return figure, grid
 
 
@@ -92,7 +94,7 @@ def score_line(recovered: Float[Tensor, "h w"], truth: Float[Tensor, "h w"]) -> 
     return f"{error:.4f} · {ratio:.2f} dB"
 
 
-def draw_wheel(axes: Axes, theme: Theme, size: int, label_size: float) -> None:
+def draw_wheel(axes: Axes, size: int, label_size: float) -> None:
     """Draw `hue_wheel`, `size` pixels wide, labelled with AoLP at 0, 45, 90 and 135 degrees."""
     axes.imshow(hue_wheel(size))
     axes.axis("off")
@@ -101,7 +103,7 @@ def draw_wheel(axes: Axes, theme: Theme, size: int, label_size: float) -> None:
         "90°": (0.5, 1.03, "center", "bottom"), "135°": (0.13, 0.88, "right", "bottom"),
     }.items():  # fmt: skip
         place: dict[str, Any] = {"transform": axes.transAxes, "ha": sideways, "va": upright}
-        axes.text(across, up, angle, color=theme.quiet, fontsize=label_size, **place)
+        axes.text(across, up, angle, color=LIGHT.quiet, fontsize=label_size, **place)
 
 
 def chart_style(theme: Theme) -> dict[Any, Any]:
@@ -137,12 +139,6 @@ def show_picture(axes: Axes, picture: np.ndarray, theme: Theme) -> None:
     axes.grid(visible=False)
     for spine in axes.spines.values():
         spine.set(visible=True, color=theme.grid, linewidth=0.6)
-
-
-def _colour_bar(figure: Figure, axes: Axes, theme: Theme, orientation: str, label_size: float) -> None:
-    bar = figure.colorbar(ScalarMappable(cmap=DOLP_COLOURS), cax=axes, orientation=orientation, ticks=[0, 0.5, 1])
-    bar.ax.tick_params(labelsize=label_size, length=2, pad=2, colors=theme.quiet)
-    bar.outline.set_visible(False)
 
 
 def _short(name: str) -> str:

@@ -3,41 +3,13 @@
 The networks behind `ours` and `E2V` depend on the weights.
 """
 
-from collections import ChainMap
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from polarnet.methods import METHODS
+from polarnet.methods import METHODS, ROWS
 from polarnet.methods.intensities import GAIN
-from polarnet.methods.method import Method
-
-GREY = "#98a2b3"
-
-
-class ReferenceRow(NamedTuple):
-    """A row of `polarnet.benchmark.references`, whose DoLP is constant over a frame."""
-
-    label: str
-    colour: str
-    about: str
-    """Glossary sentence of the HTML pages."""
-
-
-REFERENCES = {
-    "zeros": ReferenceRow("zeros", GREY, "A constant: no polarization anywhere."),
-    "train_mean": ReferenceRow("training mean", GREY, "A constant: the mean DoLP of the training split."),
-    "oracle_mean": ReferenceRow(
-        "oracle mean",
-        GREY,
-        "Each true frame's own mean, the best constant there is. It looks at the truth, so it is no method; what does "
-        "not beat it shows little spatial skill in MSE.",
-    ),
-}
-"""Reference by name."""
-
-ROWS: Mapping[str, ReferenceRow | Method] = ChainMap(METHODS, REFERENCES)  # type: ignore[arg-type]
-"""Reference or method by name, in the order of all tables: references first."""
+from polarnet.metrics.references import REFERENCES
 
 LABELS: Mapping[str, str] = MappingProxyType({name: row.label for name, row in ROWS.items()})
 """Default labels of the rows, in table order, for results that do not name the networks."""

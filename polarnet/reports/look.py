@@ -10,7 +10,7 @@ from torch import Tensor
 from polarnet.events.representations import polarity_sums
 from polarnet.events.stream import Events
 from polarnet.reports.maps import angle_image, dolp_image, intensity_image, polarization_hsv
-from polarnet.reports.preview import Panel, Sheet, foot_of
+from polarnet.reports.preview import Sheet, foot_of
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
 
 
@@ -24,10 +24,10 @@ def plot_events(events: Sequence[Events]) -> Image.Image:
     """
     sheet = Sheet(events[0].height, events[0].width)
     maps = sheet.events(torch.stack([polarity_sums(channel) for channel in events]))
-    panels = [Panel(f"events, {angle}°", one) for angle, one in zip(POLARIZER_ANGLES_DEG, maps, strict=True)]
+    captioned = {f"events, {angle}°": one for angle, one in zip(POLARIZER_ANGLES_DEG, maps, strict=True)}
     times = torch.cat([channel.t for channel in events])
     span = (int(times.min()), int(times.max())) if len(times) else (0, 0)
-    return Image.fromarray(sheet.picture([panels], foot_of(span, len(times))))
+    return Image.fromarray(sheet.picture([captioned], foot_of(span, len(times))))
 
 
 def plot_frame(s0: Float[Tensor, "h w"], dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]) -> Image.Image:
@@ -38,13 +38,13 @@ def plot_frame(s0: Float[Tensor, "h w"], dolp: Float[Tensor, "h w"], aolp: Float
     >>> plot_frame(torch.rand(20, 30), torch.rand(20, 30), torch.rand(20, 30)).mode
     'RGB'
     """
-    panels = [
-        Panel("S0", intensity_image(s0)),
-        Panel("DoLP", dolp_image(dolp)),
-        Panel("AoLP (hue), DoLP (saturation)", angle_image(dolp, aolp)),
-        Panel("polarization and S0", polarization_hsv(s0, dolp, aolp)),
-    ]
-    return Image.fromarray(Sheet(*dolp.shape).picture([panels], ""))
+    captioned = {
+        "S0": intensity_image(s0),
+        "DoLP": dolp_image(dolp),
+        "AoLP (hue), DoLP (saturation)": angle_image(dolp, aolp),
+        "polarization and S0": polarization_hsv(s0, dolp, aolp),
+    }
+    return Image.fromarray(Sheet(*dolp.shape).picture([captioned], ""))
 
 
 def plot_prediction(prediction: Prediction, dolp: Float[Tensor, "h w"] | None = None) -> Image.Image:
@@ -56,14 +56,11 @@ def plot_prediction(prediction: Prediction, dolp: Float[Tensor, "h w"] | None = 
     >>> plot_prediction(Prediction(torch.rand(20, 30)), torch.rand(20, 30)).mode
     'RGB'
     """
-    panels = [Panel("DoLP", dolp_image(prediction.dolp))]
+    captioned = {"DoLP": dolp_image(prediction.dolp)}
     if prediction.aolp is not None:
-        panels.append(Panel("AoLP (hue), DoLP (saturation)", angle_image(prediction.dolp, prediction.aolp)))
+        captioned["AoLP (hue), DoLP (saturation)"] = angle_image(prediction.dolp, prediction.aolp)
     if prediction.log_variance is not None:
-        panels.append(Panel("expected error", dolp_image(torch.exp(prediction.log_variance / 2))))
+        captioned["expected error"] = dolp_image(torch.exp(prediction.log_variance / 2))
     if dolp is not None:
-        panels += [
-            Panel("true DoLP", dolp_image(dolp)),
-            Panel("error", dolp_image((prediction.dolp - dolp).abs())),
-        ]
-    return Image.fromarray(Sheet(*prediction.dolp.shape).picture([panels], ""))
+        captioned |= {"true DoLP": dolp_image(dolp), "error": dolp_image((prediction.dolp - dolp).abs())}
+    return Image.fromarray(Sheet(*prediction.dolp.shape).picture([captioned], ""))

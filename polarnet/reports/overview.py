@@ -97,7 +97,7 @@ def _source(figure: Figure, x: float, overview: Overview) -> None:
         axes.plot(across, down, color="black", linewidth=2.4, alpha=0.6)
         axes.plot(across, down, color="white", linewidth=1.2)
     axes.set(xlim=(0, columns), ylim=(rows, 0))
-    draw_wheel(_place(figure, x + 0.4, 1.0, 1.2, 1.2), LIGHT, size=480, label_size=9.0)
+    draw_wheel(_place(figure, x + 0.4, 1.0, 1.2, 1.2), size=480, label_size=9.0)
     text = "hue → AoLP\nsaturation → DoLP\nvalue → S0"
     style: dict[str, Any] = {"color": LIGHT.quiet, "fontsize": 9.5, "ha": "center", "va": "center", "linespacing": 1.5}
     _text(figure, x + PICTURE_WIDTH / 2, 0.52, text, **style)

@@ -11,19 +11,17 @@ from markupsafe import Markup
 from polarnet.methods import METHODS, is_rotating
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, Results, read_artefacts, read_results
 from polarnet.reports.charts import (
-    Spec,
     budget_chart,
-    rates_chart,
+    loss_chart,
+    psnr_chart,
     reliability_chart,
     scatter_chart,
     score_chart,
     sets_chart,
     spread_chart,
-    training_chart,
-    vega_bundle,
 )
 from polarnet.reports.figures import comparison_figure
-from polarnet.reports.html import embedded_json, script, template
+from polarnet.reports.html import embedded_json, script, svg, template
 from polarnet.reports.legend import (
     LABELS,
     NAMED_BY_NETWORK,
@@ -91,16 +89,16 @@ def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder:
     artefacts = read_artefacts(paths, baselines)
     results, legend = artefacts.results, legend_of(artefacts.results.details["weights"])
     folder.mkdir(parents=True, exist_ok=True)
-    write_paper_files(folder / "paper", [results, *artefacts.sets], legend)
     overview = None
     if artefacts.overview is not None:
         overview = png(overview_figure(artefacts.overview))
         (folder / "overview.png").write_bytes(overview)
-    trainings, charts = _trainings(artefacts)
+    sets = [results, *artefacts.sets]
+    write_paper_files(folder / "paper", sets, legend)
     budget = [point for point in artefacts.budget if not is_rotating(point.method)]  # that camera has other events
-    charts |= {"rates": rates_chart(artefacts.rates), "budget": budget_chart(budget, legend)}
-    if heat := sets_chart([results, *artefacts.sets], SET_TITLES, legend):
-        charts["sets"] = heat
+    charts = {"budget": svg(budget_chart(budget, legend))}
+    if len(sets) > 1:
+        charts["sets"] = svg(sets_chart(sets, SET_TITLES, legend))
     context = {
         "title": "polarnet report",
         "command": run.command,
@@ -108,10 +106,10 @@ def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder:
         "sections": _sections(run.parameters),
         "overview": None if overview is None else data_uri(overview, "png"),
         "sets": [_set(one, legend) for one in artefacts.sets],
-        "trainings": trainings,
+        "trainings": _trainings(artefacts),
         "data": _data(artefacts),
     }
-    return _write_page(folder, [results, *artefacts.sets], legend, context, charts)
+    return _write_page(folder, sets, legend, context, charts)
 
 
 def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str]) -> Path:
@@ -127,26 +125,22 @@ def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str])
 
 
 def _write_page(
-    folder: Path, sets: Sequence[Results], legend: Legend, context: Mapping[str, Any], charts: Mapping[str, Spec]
+    folder: Path, sets: Sequence[Results], legend: Legend, context: Mapping[str, Any], charts: Mapping[str, Markup]
 ) -> Path:
     """Fill the template into index.html, and write the panels as comparison.png; no such file without panels."""
     results = sets[0]
     if results.panels:
-        figure = comparison_figure(results.panels[:MAX_FIGURE_PANELS], results.panels[0].dolp, legend)
+        figure = comparison_figure(results.panels[:MAX_FIGURE_PANELS], results.panels[0].predictions, legend)
         (folder / "comparison.png").write_bytes(png(figure))
     films = [
         panel_film(panel, legend, "" if one is results else SET_TITLES.get(one.name, one.name))
         for one in sets
         for panel in one.panels
-        if panel.film
     ]
-    charts = {**_result_charts(results, legend), **charts}
     values = _results_context(results, legend, films) | dict(context)
     values |= {
-        "charts": charts,
-        "charts_json": embedded_json(charts),
+        "charts": {**_result_charts(results, legend), **charts},
         "player_json": embedded_json(player_data(films)) if films else None,
-        "vega_bundle": Markup(vega_bundle()),
         "script": script,
     }
     path = folder / "index.html"
@@ -182,15 +176,20 @@ def _page_table(results: Results, legend: Legend) -> Table:
     return score_table(results.metrics, PAGE_COLUMNS, legend.labels, results.details["warmup_windows"])
 
 
-def _result_charts(results: Results, legend: Legend) -> dict[str, Spec]:
-    means = results.details["scene_means"].get("mse", {})
-    charts = {
-        "scores": score_chart(results.metrics, PAGE_COLUMNS, legend),
-        "spread": spread_chart(means, legend),
-        "scatter": scatter_chart(means, legend),
-        "reliability": reliability_chart(results.details, legend),
+def _result_charts(results: Results, legend: Legend) -> dict[str, Any]:
+    """Charts of the results on a test set: a list or None where there may be several or none."""
+    means, metrics = results.details["scene_means"].get("mse", {}), results.metrics
+    shown = [key for key in PAGE_COLUMNS if any(row.get(key) is not None for row in metrics.values())]
+    rivals = sorted((row for row in with_structure(means) if row != "ours"), key=lambda row: metrics[row]["mse"])
+    groups = {row: entry["curve"] for row, entry in results.details.get("reliability", {}).items()}
+    curves = {row: known for row, curve in groups.items() if (known := [one for one in curve if min(one[:2]) > 0])}
+    return {
+        "scores": [svg(score_chart(metrics, key, PAGE_COLUMNS[key], legend)) for key in shown],
+        "spread": svg(spread_chart(means, legend)),
+        "scatter": [svg(scatter_chart(means, row, legend)) for row in rivals] if "ours" in means else [],
+        "reliability": svg(reliability_chart(curves, legend)) if curves else None,
+        "sets": None,
     }
-    return {name: spec for name, spec in charts.items() if spec is not None}
 
 
 def verdict(metrics: Scores, details: Mapping[str, Any], legend: Legend) -> str:
@@ -263,10 +262,6 @@ def _data(artefacts: Artefacts) -> dict[str, Any]:
             split: {name: data_uri(encode_jpeg(small), "jpeg") for name, small in artefacts.thumbnails[split].items()}
             for split in SPLITS
         },
-        "rates": [
-            (one.split, one.sequences, f"{one.seconds:.1f}", f"{one.events:,}", f"{one.per_pixel_second:.1f}")
-            for one in artefacts.rates
-        ],
         "skipped": [(one.file, one.reason) for one in manifest.skipped],
         "licences": [
             (one.name, one.split, one.origin, one.author or "not stated", one.licence or "not stated")
@@ -275,26 +270,20 @@ def _data(artefacts: Artefacts) -> dict[str, Any]:
     }
 
 
-def _trainings(artefacts: Artefacts) -> tuple[list[dict[str, Any]], dict[str, Spec]]:
-    """Template values and charts of each training."""
+def _trainings(artefacts: Artefacts) -> list[dict[str, Any]]:
+    """Template values of each training."""
     histories = [("ours: ", artefacts.ours, "DoLP")]
     histories += [_baseline(name, history) for name, history in artefacts.baselines.items()]
-    trainings: list[dict[str, Any]] = []
-    charts: dict[str, Spec] = {}
-    for number, (row, history, output) in enumerate(histories):
-        names = [f"training_{number}_{kind}" for kind in ("loss", "psnr")]
-        charts |= dict(zip(names, training_chart(history, output), strict=True))
-        psnr = history.validation["psnr"]
-        trainings.append(
-            {
-                "title": f"{row}{network_label(history.network)}, events to {output}",
-                "charts": names,
-                "epochs": len(psnr),
-                "best_epoch": history.best_epoch + 1,
-                "best_psnr": psnr[history.best_epoch],
-            }
-        )
-    return trainings, charts
+    return [
+        {
+            "title": f"{row}{network_label(history.network)}, events to {output}",
+            "charts": [svg(loss_chart(history)), svg(psnr_chart(history, output))],
+            "epochs": len(history.validation["psnr"]),
+            "best_epoch": history.best_epoch + 1,
+            "best_psnr": history.validation["psnr"][history.best_epoch],
+        }
+        for row, history, output in histories
+    ]
 
 
 def _baseline(name: str, history: History) -> tuple[str, History, str]:

@@ -28,7 +28,7 @@ def write_paper_files(folder: Path, results: Sequence[Results], legend: Legend) 
     sets = {one.name: one for one in results if one.name in EXPERIMENTS}
     for name, one in sets.items():
         if one.panels:
-            methods = [row for row in METHODS if row in one.panels[0].dolp]
+            methods = [row for row in METHODS if row in one.panels[0].predictions]
             write_figure(comparison_figure(one.panels, methods, legend), folder / FIGURES[name])
     if set(sets) == set(EXPERIMENTS) and set(METHODS).intersection(*(one.metrics for one in sets.values())):
         warmup_windows = sets["simulated"].details["warmup_windows"]
@@ -73,7 +73,7 @@ class Moment(NamedTuple):
 def figure_11(moments: Sequence[Moment]) -> Figure:
     """Draw event tensors, the DoLP recovered from them and the true DoLP, with t and n above each column."""
     with matplotlib.rc_context(chart_style(LIGHT)):
-        figure, grid = tile_grid(3, len(moments), moments[0].truth.shape, LIGHT, bar_row=1)
+        figure, grid = tile_grid(3, len(moments), moments[0].truth.shape, bar_row=1)
         for k, moment in enumerate(moments):
             tensor = event_image(moment.tensor, event_full_scale(moment.tensor))
             for axes, picture in zip(

@@ -14,11 +14,10 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from polarnet.reports.artefacts import Panel
-from polarnet.reports.film import NO_EVENTS
 from polarnet.reports.html import embedded_json, script, template
 from polarnet.reports.legend import Legend, with_structure
 from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, data_uri, event_full_scale, paper_map, table_of
+from polarnet.storage.panels import NO_EVENTS, Panel
 
 Kind = Literal["events", "s0", "dolp", "aolp"]
 
@@ -45,7 +44,7 @@ class Map(NamedTuple):
     """Label of its origin: a method, the truth, or a recording."""
     kind: Kind
     frames: UInt8[np.ndarray, "n h w"]
-    """Bytes in the steps of `polarnet.reports.film`."""
+    """Bytes in the steps of `polarnet.storage.panels`."""
 
 
 class Film(NamedTuple):
@@ -58,17 +57,19 @@ class Film(NamedTuple):
 
 def panel_film(panel: Panel, legend: Legend, title: str = "") -> Film:
     """The film of a benchmark's panel: events, truth, ours, and the other methods that are no constants."""
-    film = panel.film
-    maps = [Map("Events", "events", film["events"].numpy())]
-    maps += [Map(TRUTH, kind, film[f"truth_{kind}"].numpy()) for kind in ("s0", "aolp", "dolp")]
-    for method in sorted(with_structure(panel.dolp), key=lambda method: method != "ours"):
-        kinds: tuple[Kind, ...] = ("dolp", "aolp")
-        maps += [
-            Map(legend.label(method), kind, film[f"{kind}_{method}"].numpy())
-            for kind in kinds
-            if f"{kind}_{method}" in film
-        ]
-    return Film(f"{title}: {panel.sequence}" if title else panel.sequence, film["t_us"].tolist(), maps)
+    truth = panel.truth
+    maps = [
+        Map("Events", "events", panel.film_events.numpy()),
+        Map(TRUTH, "s0", panel.film_s0.numpy()),
+        *([] if truth.film_aolp is None else [Map(TRUTH, "aolp", truth.film_aolp.numpy())]),
+        Map(TRUTH, "dolp", truth.film_dolp.numpy()),
+    ]
+    for method in sorted(with_structure(panel.predictions), key=lambda method: method != "ours"):
+        shown = panel.predictions[method]
+        maps.append(Map(legend.label(method), "dolp", shown.film_dolp.numpy()))
+        if shown.film_aolp is not None:
+            maps.append(Map(legend.label(method), "aolp", shown.film_aolp.numpy()))
+    return Film(f"{title}: {panel.sequence}" if title else panel.sequence, panel.film_t_us.tolist(), maps)
 
 
 def player_data(films: Sequence[Film]) -> dict[str, Any]:

@@ -1,9 +1,9 @@
 """Labelled pictures of a sequence, side by side: events, DoLP, AoLP, S0 and polarization as hue, saturation, value."""
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -38,11 +38,8 @@ BAR = (10, 120)  # height and width of the colour bar of DoLP
 TEXT_COLOUR = np.array([31, 35, 40], np.float32)
 
 
-class Panel(NamedTuple):
-    """One captioned map of a sheet."""
-
-    caption: str
-    pixels: UInt8[np.ndarray, "h w 3"]
+Captioned: TypeAlias = Mapping[str, UInt8[np.ndarray, "h w 3"]]
+"""Maps of a row of a sheet, by caption."""
 
 
 class Sheet:
@@ -60,8 +57,8 @@ class Sheet:
         scale = self._scale.after(sums)
         return [event_image(image, scale) for image in sums]
 
-    def picture(self, rows: Sequence[Sequence[Panel]], foot: str) -> UInt8[np.ndarray, "h2 w2 3"]:
-        """Rows of panels above a line of text and the colour bar of DoLP, with even sides."""
+    def picture(self, rows: Sequence[Captioned], foot: str) -> UInt8[np.ndarray, "h2 w2 3"]:
+        """Rows of captioned maps above a line of text and the colour bar of DoLP, with even sides."""
         drawn = [self._row(row) for row in rows if row]
         width = max(row.shape[1] for row in drawn)
         parts = [_widened(part, width) for row in drawn for part in (row, _white(GAP, width))]
@@ -76,20 +73,20 @@ class Sheet:
         S0 is raised to 1 / `gamma`: 1 for code values, 2.2 for linear light.
         """
         maps = self.events(torch.stack([polarity_sums(channel) for channel in channels]))
-        events = [Panel(f"events, {angle}°", one) for angle, one in zip(POLARIZER_ANGLES_DEG, maps, strict=True)]
+        events = [(f"events, {angle}°", one) for angle, one in zip(POLARIZER_ANGLES_DEG, maps, strict=True)]
         bright = truth.s0.clamp(0, 1) ** (1 / gamma)
-        pale = Panel("true AoLP (hue), DoLP (saturation)", angle_image(truth.dolp, truth.aolp))
-        light = Panel("true polarization and S0", polarization_hsv(bright, truth.dolp, truth.aolp))
-        rows = [
-            [*events[:2], Panel("true S0", intensity_image(bright)), Panel("true DoLP", dolp_image(truth.dolp))],
-            [*events[2:], light, pale],
-        ]
+        above = {"true S0": intensity_image(bright), "true DoLP": dolp_image(truth.dolp)}
+        below = {
+            "true polarization and S0": polarization_hsv(bright, truth.dolp, truth.aolp),
+            "true AoLP (hue), DoLP (saturation)": angle_image(truth.dolp, truth.aolp),
+        }
+        rows = [dict(events[:2]) | above, dict(events[2:]) | below]
         return self.picture(rows, foot_of(span_us, sum(map(len, channels))))
 
-    def _row(self, panels: Sequence[Panel]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    def _row(self, maps: Captioned) -> UInt8[np.ndarray, "h2 w2 3"]:
         height, width = self._size
         parts = []
-        for caption, image in panels:
+        for caption, image in maps.items():
             enlarged = height > image.shape[0]
             method = cv2.INTER_NEAREST if enlarged else cv2.INTER_AREA
             panel = image if image.shape[:2] == self._size else cv2.resize(image, (width, height), interpolation=method)

@@ -1,7 +1,6 @@
 """The realism page of `polarnet fit-sensor`: each recording beside its simulated twin."""
 
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import matplotlib
@@ -9,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from polarnet.characterization.twin import INTERVAL_EDGES_US, Comparison
-from polarnet.reports.figures import Theme, chart_style
-from polarnet.reports.html import Chart, chart, template
+from polarnet.reports.figures import PAGE, chart_style
+from polarnet.reports.html import svg, template
 
 LABELS = {"recording": "recording", "twin": "simulated twin"}
 
@@ -24,24 +23,15 @@ class FitRow(NamedTuple):
     source: str
 
 
-class RealismSection(NamedTuple):
-    """A recording of the page."""
-
-    comparison: Comparison
-    chart: Chart
-
-
 def realism_page(name: str, rows: Sequence[FitRow], notes: Sequence[str], comparisons: Sequence[Comparison]) -> str:
     """The page as HTML; it needs no other file and no network."""
-    sections = [
-        RealismSection(one, chart(partial(realism_figure, one), f"{one.name}: four statistics")) for one in comparisons
-    ]
+    sections = [(one, svg(realism_figure(one))) for one in comparisons]
     return template("realism.html.jinja").render(title=name, rows=rows, notes=notes, sections=sections)
 
 
-def realism_figure(comparison: Comparison, theme: Theme) -> Figure:
+def realism_figure(comparison: Comparison) -> Figure:
     """Event rate over time, ON/OFF ratio, inter-event intervals and the pixels' rates of a recording and its twin."""
-    with matplotlib.rc_context(chart_style(theme)):
+    with matplotlib.rc_context(chart_style(PAGE)):
         figure = Figure(figsize=(9.6, 5.2), layout="constrained", facecolor="none")
         rate, ratio, intervals, pixels = figure.subplots(2, 2).flat
         for key, label in LABELS.items():
@@ -68,5 +58,5 @@ def realism_figure(comparison: Comparison, theme: Theme) -> Figure:
             intervals.set_xlim(INTERVAL_EDGES_US[filled[0]] * 5e-4, INTERVAL_EDGES_US[filled[-1] + 1] * 2e-3)
         pixels.set_yscale("symlog", linthresh=max(1e-3, 1 / comparison.duration_s))
         pixels.set_ylim(bottom=0)
-        rate.legend(frameon=False, fontsize=7, labelcolor=theme.text)
+        rate.legend(frameon=False, fontsize=7, labelcolor=PAGE.text)
     return figure

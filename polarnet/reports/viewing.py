@@ -14,11 +14,11 @@ from polarnet.events.representations import polarity_sums
 from polarnet.events.stream import Events, slice_time
 from polarnet.recordings.arrangements import read_plain
 from polarnet.recordings.recording import Recording, read_recording
-from polarnet.reports.film import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore, dequantise_angle, dequantise_fraction
 from polarnet.storage.groups import open_group
+from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.storage.scenes import SceneStore
 
 MAX_FILMS = 12  # sequences of a store shown without a choice

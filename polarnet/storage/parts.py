@@ -392,7 +392,7 @@ def unknown_sequence(sequence: str | None, sequences: list[str]) -> str:
     """Message about a sequence that a store does not have: it lists those that the store has."""
     listed = ", ".join(sequences[:MAX_LISTED])
     if len(sequences) > MAX_LISTED:
-        listed += f", ... (`polarnet list` names all {len(sequences)})"
+        listed += f", ... (`polarnet inspect` names all {len(sequences)})"
     return f"expected a sequence of {listed}; got {sequence!r}"
 
 

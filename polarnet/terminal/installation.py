@@ -15,7 +15,6 @@ EXTRAS = {
     "live": "a running camera",
     "remote": "stores in a bucket",
     "export": "polarnet onnx",
-    "rerun": "polarnet view --rerun",
     "sweep": "sweeps",
 }
 """Task of each extra."""

@@ -2,7 +2,7 @@ import pytest
 import torch
 from method_fixtures import checkpoints, context, make_context, make_sequence, make_setup, sequence
 
-from polarnet.benchmark.run import BenchmarkSet
+from polarnet.benchmark.sequences import BenchmarkSet
 from polarnet.events.stream import Events
 from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
 from polarnet.storage.events import EventStore

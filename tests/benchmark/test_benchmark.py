@@ -1,19 +1,21 @@
+import dataclasses
 import functools
 import json
 import math
 
-import numpy as np
 import pytest
 import torch
 
-from polarnet.benchmark.references import REFERENCES, Reference
 from polarnet.benchmark.results import write_benchmark
-from polarnet.benchmark.rows import ROWS
-from polarnet.benchmark.run import BenchmarkSet, at_stored_precision, run_benchmark, train_mean_dolp
+from polarnet.benchmark.run import at_stored_precision, run_benchmark
 from polarnet.benchmark.score import BenchmarkConfig
+from polarnet.benchmark.sequences import BenchmarkSet, train_mean_dolp
+from polarnet.methods import ROWS
+from polarnet.metrics.references import REFERENCES
 from polarnet.runtime.cluster import pmap
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import Contents, FrameStore
+from polarnet.storage.panels import read_panel
 
 pytestmark = pytest.mark.usefixtures("brief_costs")
 
@@ -81,14 +83,13 @@ def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
 def test_expected_errors_are_held_against_measured_ones_in_the_scored_windows(
     five_scenes, context, tmp_path, monkeypatch
 ):
-    def sure(sequence, train_mean):
+    def sure(truth, valid, train_mean):
         """Off by 0.1 everywhere and knows it, but in the warm-up."""
-        log_variance = torch.full_like(sequence.dolp, math.log(0.01))
+        log_variance = torch.full_like(truth, math.log(0.01))
         log_variance[0] = 0.0
-        off = torch.where(sequence.dolp < 0.5, 0.1, -0.1)
-        return Prediction(sequence.dolp + off, None, log_variance)
+        return Prediction(truth + torch.where(truth < 0.5, 0.1, -0.1), None, log_variance)
 
-    monkeypatch.setitem(REFERENCES, "train_mean", Reference("train_mean", sure))
+    monkeypatch.setitem(REFERENCES, "train_mean", dataclasses.replace(REFERENCES["train_mean"], predict=sure))
     benchmark = run_benchmark(five_scenes, context, config(methods=["zeros", "train_mean"]), None)
     assert set(benchmark.reliability) == {"train_mean"}
     assert benchmark.reliability["train_mean"].pixels.sum() == 4 * 3 * 18 * 20
@@ -111,14 +112,13 @@ def test_panels_show_one_window_of_different_scenes_and_every_method(five_scenes
     (folder / "panels" / "old.npz").touch()
     write_benchmark(folder, benchmark, wanted, 1, {})
     assert {p.name for p in (folder / "panels").iterdir()} == {"a1.npz", "c1.npz"}
-    with np.load(folder / "panels" / "a1.npz") as panel:
-        assert set(panel.files) == {
-            *("window", "t_us", "events", "truth_dolp", "truth_aolp", "truth_s0", "dolp_zeros", "dolp_cf", "aolp_cf"),
-            *("film_t_us", "film_events", "film_truth_dolp", "film_truth_aolp", "film_truth_s0"),
-            *("film_dolp_zeros", "film_dolp_cf", "film_aolp_cf"),
-        }
-        assert panel["events"].shape == (4, 18, 20)
-        assert panel["dolp_cf"].dtype == np.float32
+    written, given = read_panel(folder / "panels" / "a1.npz"), benchmark.panels[0]
+    assert written.events.shape == (4, 18, 20)
+    assert torch.equal(written.film_events, given.film_events)
+    assert list(written.predictions) == ["zeros", "cf"]
+    assert torch.equal(written.predictions["cf"].aolp, given.predictions["cf"].aolp)
+    assert written.predictions["zeros"].aolp is None
+    assert torch.equal(written.truth.film_aolp, given.truth.film_aolp)
 
 
 @pytest.mark.thorough

@@ -69,51 +69,20 @@ def test_of_events_that_were_not_simulated_the_size_alone_is_known(config):
     assert warnings(recorded, {"ours": checkpoint(config)}, "Set") == []
 
 
-BEFORE = {
-    "contrast_threshold_sigma": 0.03,
-    "random_threshold_on": [0.08, 0.31],
-    "random_threshold_off": [0.14, 0.42],
-    "random_threshold_sigma": [0.02, 0.06],
-    "random_cutoff_hz": [30.0, 300.0],
-    "random_leak_rate_hz": [0.01, 0.1],
-    "random_shot_noise_rate_hz": [0.001, 5.0],
-}
-"""Keys of section `emulate` when ON and OFF thresholds had one deviation."""
-
-
-def checkpoint_before(config, randomise: bool):
-    metadata = checkpoint(config)
-    emulate = metadata["data"]["events_from"]["emulate"]
-    for key in emulate.keys() & {"contrast_threshold_sigma_on", "contrast_threshold_sigma_off", "randomise"}:
-        del emulate[key]
-    for key in ("contrast_threshold_correlation", "hot_pixel_share", "hot_pixel_rate_hz", "dead_pixel_share"):
-        del emulate[key]
-    emulate |= BEFORE | {"randomise": randomise}
-    return metadata
-
-
-def test_a_checkpoint_with_one_deviation_for_both_thresholds_is_compared_by_todays_keys(config):
-    old = {"ours": checkpoint_before(config, randomise=False)}
-    assert warnings(configured(config.synthesize, config.emulate), old, "Set") == []
-    other = dataclasses.replace(config.emulate, contrast_threshold_sigma_off=0.05, dead_pixel_share=0.01)
-    (line,) = warnings(configured(config.synthesize, other), old, "Set")
-    assert line.endswith("Set emulate.contrast_threshold_sigma_off=0.03 emulate.dead_pixel_share=0.0")
-
-
 def drawn(config, **ranges):
     """Metadata of a training whose sequences drew their sensors."""
     return checkpoint(dataclasses.replace(config, emulate=dataclasses.replace(config.emulate, randomise=ranges)))
 
 
 def test_a_sensor_and_a_speed_within_the_ranges_of_the_training_are_no_difference(config):
-    trained = {"ours": checkpoint_before(config, randomise=True)}
+    trained = {"ours": drawn(config, cutoff_hz=[30.0, 300.0])}
     assert warnings(configured(config.synthesize, config.emulate), trained, "Set") == []
     slower = dataclasses.replace(config.synthesize, speed_min_px_s=50.0)
     assert warnings(configured(slower, config.emulate), {"ours": checkpoint(config)}, "Set") == []
 
 
 def test_a_sensor_beyond_the_ranges_of_the_training_is_said_with_the_range_and_the_nearest_value(config):
-    trained = {"ours": checkpoint_before(config, randomise=True)}
+    trained = {"ours": drawn(config, cutoff_hz=[30.0, 300.0])}
     other = dataclasses.replace(config.emulate, cutoff_hz=400.0)
     (line,) = warnings(configured(config.synthesize, other), trained, "Set")
     assert line.endswith("emulate.cutoff_hz 400.0 (training: [30.0,300.0]). Set emulate.cutoff_hz=300.0")
@@ -126,12 +95,6 @@ def test_a_pixel_model_is_compared_with_the_names_that_the_training_drew(config)
     (line,) = warnings(configured(config.synthesize, esim), trained, "Set")
     assert "emulate.model esim (training: [exact,v2e])" in line
     assert line.endswith("Set emulate.model=exact")
-
-
-def test_a_drawn_pixel_model_is_not_named_as_the_one_in_use(config):
-    emulate = dataclasses.replace(config.emulate, randomise={"model": ["exact", "dvs_voltmeter"]})
-    text = sentence(configured(config.synthesize, emulate))
-    assert text.endswith("; sensor: model drawn for each sequence (emulate.randomise).")
 
 
 def test_a_drawn_sensor_is_a_difference_for_a_training_that_drew_none(config):

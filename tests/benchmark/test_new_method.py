@@ -9,13 +9,13 @@ import torch
 from polarnet import methods
 from polarnet.analysis.event_budget import since_start, sliding_recovery
 from polarnet.benchmark.results import write_benchmark
-from polarnet.benchmark.rows import ROWS
+from polarnet.benchmark.rows import opened
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.score import BenchmarkConfig
 from polarnet.config.pipeline import context_of
 from polarnet.config.tree import load
 from polarnet.events.streaming import WindowRule
-from polarnet.methods import METHODS
+from polarnet.methods import METHODS, ROWS
 from polarnet.recordings.live import Piece
 from polarnet.recovery.stream import Input, frames_of
 from polarnet.reports.tables import score_table
@@ -69,12 +69,12 @@ def test_recover_runs_it(activity, sequence, make_setup):
     assert frames[-1].prediction.dolp.sum().item() == pytest.approx(4 * 300 * EVENT)
 
 
-def test_the_event_budget_runs_it(with_activity, sequence):
+def test_the_event_budget_runs_it(activity, with_activity, sequence):
     table = since_start([sequence], ["activity"], with_activity)
     assert sum(entry["frames"] for entry in table["activity"]) == 4
+    recoverer = opened(activity, with_activity)
     alone, carried = (
-        sliding_recovery(sequence, 50, [2000, 2100], carry, "activity", with_activity).sum(dim=(1, 2))
-        for carry in (False, True)
+        sliding_recovery(sequence, 50, [2000, 2100], carry, recoverer).sum(dim=(1, 2)) for carry in (False, True)
     )
     torch.testing.assert_close(alone, torch.tensor([200 * EVENT, 200 * EVENT]))
     torch.testing.assert_close(carried, torch.tensor([200 * EVENT, 400 * EVENT]))

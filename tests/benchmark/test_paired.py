@@ -23,10 +23,6 @@ def test_ranks_by_hand():
     assert comparison["p"] == pytest.approx(wilcoxon([0.1, -0.2, 0.3, 0.4]).pvalue)
 
 
-def test_equal_scenes_count_for_neither_side():
-    assert compared(np.zeros(3)) == {"scenes": 3, "better": 0, "effect": 0.0, "p": 1.0}
-
-
 def test_lower_is_better_for_errors_and_higher_for_psnr():
     rows = [row("ours", f"s{i}", 1.0 + i) for i in range(4)] + [row("cf", f"s{i}", 2.0 + 1.5 * i) for i in range(4)]
     comparison = paired_comparisons(rows, "ours")["cf"]

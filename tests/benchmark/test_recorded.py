@@ -112,12 +112,6 @@ def test_events_that_have_nothing_to_do_with_the_frames_are_reported(recording, 
     assert "whether they are on one clock is unknown" in note
 
 
-def test_windows_of_another_length_than_in_training_are_reported(recording):
-    truth = read_truth(recording, MOSAIC)
-    (note,) = clock_notes(3 * truth.t_us, frame_lag(read_recording(recording).events, truth))
-    assert "windows between frames are 100.0 ms long; networks were trained on 33.3 ms" in note
-
-
 def test_frames_far_from_the_events_are_refused(recording, tmp_path):
     truth = read_truth(recording, MOSAIC)
     levels = np.rint(WHITE * truth.light.clip(0, 1)).astype(np.uint8)

@@ -1,7 +1,6 @@
 import dataclasses
 import json
 
-import numpy as np
 import pytest
 
 from polarnet.benchmark.results import write_benchmark
@@ -37,9 +36,8 @@ def test_rows_that_ran_alone_give_the_table_of_one_run_to_the_last_digit(five_sc
     for file in ("metrics.json", "details.json", "frames.csv"):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes(), file
     for panel in ("a1", "c1"):
-        one, two = (np.load(tmp_path / run / "panels" / f"{panel}.npz") for run in ("one", "two"))
-        assert set(one.files) == set(two.files)
-        assert all(np.array_equal(one[name], two[name]) for name in one.files)
+        one, two = ((tmp_path / run / "panels" / f"{panel}.npz").read_bytes() for run in ("one", "two"))
+        assert one == two
 
 
 def test_a_table_holds_the_rows_it_is_asked_for_whatever_else_lies_in_the_folder(benchmark, tmp_path):
@@ -47,15 +45,8 @@ def test_a_table_holds_the_rows_it_is_asked_for_whatever_else_lies_in_the_folder
     del folders["cf"]
     left = read_rows(folders, "simulated")
     assert {score.method for score in left.rows} == {"zeros", "ours"}
-    predictions = {name for panel in left.panels for name in panel.maps if name.startswith("dolp_")}
-    assert predictions == {"dolp_zeros", "dolp_ours"}
+    assert [list(panel.predictions) for panel in left.panels] == [["zeros", "ours"]] * 2
     assert set(left.costs) == {"zeros", "ours"}
-
-
-def test_a_row_that_was_left_out_says_why(tmp_path):
-    record = RowRecord("no weights are given", {})
-    write_row(tmp_path / "e2p", "e2p", record, {})
-    assert read_record(tmp_path / "e2p") == record
 
 
 def test_a_row_or_a_set_that_was_not_run_is_named(benchmark, tmp_path):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from polarnet.analysis.resimulate import resimulated, sequence_at
-from polarnet.analysis.sensitivity import CHANNEL_SIGNS, SETTINGS, cameras, sensitivity
+from polarnet.analysis.sensitivity import CHANNEL_SIGNS, SETTINGS, Emulation, sensitivity
 from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import write_png
@@ -102,20 +102,20 @@ def test_twice_the_speed_is_twice_the_speed(stores, config, monkeypatch):
 
 
 def test_channel_errors_are_opposite_in_each_pair_of_polarizers(config):
-    result = cameras("channel_error", 0.1, config.camera)
+    cameras = Emulation(config.synthesize, config.camera, config.seed).cameras
+    result = cameras("channel_error", 0.1, "leaf-00")
     assert [s.sensor.contrast_threshold_on for s in result] == pytest.approx([0.22, 0.18, 0.18, 0.22])
     assert CHANNEL_SIGNS[0] == -CHANNEL_SIGNS[2]
     assert CHANNEL_SIGNS[1] == -CHANNEL_SIGNS[3]
-    assert {s.sensor.shot_noise_rate_hz for s in cameras("noise_rate_hz", 5.0, config.camera)} == {5.0}
+    assert {s.sensor.shot_noise_rate_hz for s in cameras("noise_rate_hz", 5.0, "leaf-00")} == {5.0}
     with pytest.raises(ValueError, match="expected one of threshold_mismatch"):
-        cameras("colour", 1.0, config.camera)
+        cameras("colour", 1.0, "leaf-00")
 
 
 def test_each_setting_and_value_is_scored_for_each_method(stores, config, context):
     settings = {"noise_rate_hz": (0.0, 20.0), "speed": (1.0,)}
-    table = sensitivity(
-        stores[0], ["leaf-00"], config.synthesize, config.camera, 1, 1, ["zeros", "cf"], context, settings
-    )
+    emulation = Emulation(config.synthesize, config.camera, 1)
+    table = sensitivity(stores[0], ["leaf-00"], emulation, ["zeros", "cf"], context, 1, settings)
     quiet, noisy = table["noise_rate_hz"]
     assert noisy["events_per_pixel_second"] > quiet["events_per_pixel_second"] + 5
     assert quiet["scores"]["zeros"] == noisy["scores"]["zeros"]  # the truth does not change with the sensor

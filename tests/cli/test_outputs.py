@@ -50,7 +50,7 @@ def test_a_folder_with_other_files_is_refused_and_untouched(tmp_path):
     (tmp_path / "thesis.tex").touch()
     with pytest.raises(ValueError, match="contains files that `polarnet recover` did not write; name another folder"):
         write(tmp_path, "0.png")
-    with run_folder(tmp_path / "out", "export") as partial:
+    with run_folder(tmp_path / "out", "convert") as partial:
         (partial / "events.h5").touch()
     with pytest.raises(ValueError, match="`polarnet recover` did not write"):
         write(tmp_path / "out", "0.png")
@@ -87,6 +87,6 @@ def test_an_export_holds_the_sequences_of_one_store(tmp_path):
         store = EventStore.create(tmp_path / f"{name}.zarr", [name], 4, 6, {})
         store.write(name, [Events.empty(4, 6)] * 4, 1000)
         store.finish()
-        assert main(["export", str(tmp_path / f"{name}.zarr"), str(tmp_path / "out"), "--format", "text"]) == 0
+        assert main(["convert", str(tmp_path / f"{name}.zarr"), str(tmp_path / "out"), "--to", "text"]) == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"road", "store.json", MARKER}
-    assert json.loads((tmp_path / "out" / MARKER).read_text()) == {"command": "polarnet export"}
+    assert json.loads((tmp_path / "out" / MARKER).read_text()) == {"command": "polarnet convert"}

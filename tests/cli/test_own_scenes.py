@@ -1,7 +1,4 @@
 import json
-import os
-import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -131,20 +128,6 @@ def test_weights_that_are_not_there_are_named(photographs, project_root, tmp_pat
     assert "expected a checkpoint of the DoLP network (.safetensors)" in capsys.readouterr().err
 
 
-def test_measured_polarization_is_found_and_scored(project_root, tmp_path, monkeypatch):
-    folder = tmp_path / "measured"
-    folder.mkdir()
-    across = np.linspace(0, np.pi, 150)[None, :] * np.ones((100, 1))
-    s0, degree = 0.8, np.linspace(0.1, 0.6, 100)[:, None]
-    angles = {f"I{a}": s0 / 2 * (1 + degree * np.cos(2 * (np.deg2rad(a) - across))) for a in (0, 45, 90, 135)}
-    np.savez(folder / "plate.npz", **angles)
-    out = tmp_path / "out"
-    assert run(project_root, monkeypatch, folder, out, "--methods", "zeros,oracle_mean") == 0
-    manifest = json.loads((out / "work" / "images" / "manifest.json").read_text())
-    assert [picture["source"] for picture in manifest["pictures"]] == ["polarization"]
-    assert json.loads((out / "metrics.json").read_text())["oracle_mean"]["skill"] == pytest.approx(0, abs=1e-3)
-
-
 def test_a_measured_scene_smaller_than_the_window_is_skipped_and_named(project_root, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "measured"
     folder.mkdir()
@@ -164,14 +147,3 @@ def test_a_measured_scene_smaller_than_the_window_is_skipped_and_named(project_r
     error = capsys.readouterr().err
     assert "no scene to score. none of 1 pictures can be used" in error
     assert "use larger pictures or a smaller sensor" in error
-
-
-@pytest.mark.skipif("POLARNET_SHARED" not in os.environ, reason="POLARNET_SHARED names no reference material")
-def test_a_scene_that_a_camera_measured(project_root, tmp_path, monkeypatch):
-    folder = tmp_path / "camera"
-    folder.mkdir()
-    shutil.copy(Path(os.environ["POLARNET_SHARED"]) / "data" / "polarization" / "wan_Scene1_HT.npz", folder)
-    out = tmp_path / "out"
-    assert run(project_root, monkeypatch, folder, out) == 0
-    metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["oracle_mean"]["mse"] <= metrics["zeros"]["mse"]

@@ -1,4 +1,4 @@
-"""Commands on stored sequences: list, video, export of some, and recovery with truth."""
+"""Commands on stored sequences: inspect, video, convert of some, and recovery with truth."""
 
 import av
 import numpy as np
@@ -8,12 +8,12 @@ import zarr
 from polarnet.cli import main
 
 
-def test_list_names_sequences_with_events_and_splits(simulated, capsys):
-    assert main(["list", str(simulated.events)]) == 0
+def test_inspect_names_sequences_with_events_and_splits(simulated, capsys):
+    assert main(["inspect", str(simulated.events)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["a-0", "b-0", "c-0", "d-0"]
     assert all("0.200 s" in line and line.endswith(" events") for line in lines)
-    assert main(["list", str(simulated.frames)]) == 0
+    assert main(["inspect", str(simulated.frames)]) == 0
     assert [line.split()[1] for line in capsys.readouterr().out.splitlines()] == ["train", "train", "train", "val"]
 
 
@@ -33,7 +33,7 @@ def zarr_times(simulated):
 
 def test_an_exported_sequence_gives_the_frames_of_the_store(simulated, tmp_path):
     pytest.importorskip("h5py")
-    assert main(["export", str(simulated.events), str(tmp_path / "files"), "--sequence", "b-0"]) == 0
+    assert main(["convert", str(simulated.events), str(tmp_path / "files"), "--sequence", "b-0"]) == 0
     assert sorted(path.name for path in (tmp_path / "files").iterdir()) == ["b-0", "run.json", "store.json"]
     options = ["--write", "zarr", "--method", "highpass", "--sequence", "b-0"]
     for source, out in ((simulated.events, "a"), (tmp_path / "files", "b"), (tmp_path / "files" / "b-0", "c")):

@@ -1,6 +1,5 @@
 import csv
 import io
-import json
 
 import preloaded
 import pytest
@@ -9,9 +8,9 @@ from omegaconf import OmegaConf
 from polarnet.config.sweep import (
     SweepTable,
     mark_finished,
+    ranking,
     sweep_points,
     sweep_rows,
-    sweep_table,
     swept_axes,
     why_unfinished,
 )
@@ -45,25 +44,20 @@ def test_rows_are_ranked_by_validation_scores_and_seeds_become_mean_and_standard
     assert rows[1]["test"]["mse"] == {"mean": 0.01, "std": None}
 
 
-def test_the_table_says_which_scores_are_of_the_test_split_and_has_failures_and_warnings(sweep):
-    lines = sweep_table(sweep_rows(sweep_points(sweep))).splitlines()
-    assert "| seeds | validation MSE ↓ | validation PSNR ↑ | test MSE ↓ |" in lines[0]
-    assert lines[2] == (
-        "| 0 1 | loss.ssim=0.0 | 2 | 0.0400 ± 0.0141 | 14.0000 ± 0.0000 | 0.0500 ± 0.0141 | 15.0000 ± 0.0000 | "
-        "0.5000 ± 0.0000 | - | 0.2500 ± 0.0000 | one frame is dark; UserWarning: slow kernel |"
-    )
-    assert lines[4] == (
-        "| 10 | loss.mse=-1.0 | 0 of 1 | - | - | - | - | - | - | - | "
-        "seed 1 failed: train: configuration error: loss.mse: expected >= 0 |"
-    )
+def test_the_ranking_has_scores_failures_and_warnings(sweep):
+    lines = ranking(sweep_rows(sweep_points(sweep))).splitlines()
+    assert lines[1].split() == ["0.0400", "±", "0.0141", "0.0500", "±", "0.0141", "2", "loss.ssim=0.0"]
+    assert [line.strip() for line in lines[2:4]] == ["one frame is dark", "UserWarning: slow kernel"]
+    assert lines[5].split() == ["-", "-", "0", "of", "1", "loss.mse=-1.0"]
+    assert lines[6].strip() == "seed 1 failed: train: configuration error: loss.mse: expected >= 0"
 
 
-def test_overrides_that_all_points_share_stand_once_below_the_table(tmp_path, write_trial):
+def test_overrides_that_all_points_share_stand_once_below_the_ranking(tmp_path, write_trial):
     for number, weight in enumerate(("0.0", "1.0")):
         write_trial(tmp_path / str(number), ["network=paper", f"loss.ssim={weight}"], test=scored(0.04))
-    lines = sweep_table(sweep_rows(sweep_points(tmp_path))).splitlines()
-    assert [line.split(" | ")[1] for line in lines[2:4]] == ["loss.ssim=0.0", "loss.ssim=1.0"]
-    assert lines[4:] == ["", "Shared overrides: network=paper"]
+    lines = ranking(sweep_rows(sweep_points(tmp_path))).splitlines()
+    assert [line.split()[-1] for line in lines[1:3]] == ["loss.ssim=0.0", "loss.ssim=1.0"]
+    assert lines[3:] == ["All have network=paper."]
 
 
 def test_a_failed_seed_counts_in_no_mean_and_is_named(tmp_path, write_trial):
@@ -86,20 +80,17 @@ def test_a_term_that_the_loss_does_not_have_is_noted(tmp_path, write_trial):
 def test_a_sweep_with_a_failed_point_writes_its_tables_and_ends_with_an_error(sweep, capsys):
     with pytest.raises(SystemExit, match="1 of 4 points failed"):
         SweepTable().on_multirun_end(OmegaConf.create({"hydra": {"sweep": {"dir": str(sweep)}}}))
-    assert (sweep / "comparison.md").read_text().startswith("| jobs | overrides |")
-    assert len(json.loads((sweep / "comparison.json").read_text())["points"]) == 4
     lines = list(csv.DictReader(io.StringIO((sweep / "comparison.csv").read_text())))
     assert [line["validation_mse"] for line in lines] == ["0.04", "0.08", ""]
     assert lines[0]["seeds"] == "1 2"
     printed = capsys.readouterr().out
-    assert "Ranked by validation MSE" in printed
     # Student's t of 95 % and two seeds is 12.71: 0.04 -+ 12.71 * 0.01414 / sqrt(2)
     assert "Best: loss.ssim=0.0, validation MSE 0.0400, 95 % interval over 2 seeds -0.0871 to 0.1671." in printed
     assert (sweep / "comparison.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_axes_of_the_plot_are_the_keys_that_differ_and_only_finished_points_have_lines(sweep):
-    keys, scores, _ = swept_axes(sweep_rows(sweep_points(sweep)))
+    keys, scores = swept_axes(sweep_rows(sweep_points(sweep)))
     assert keys == {"loss.ssim": ["0.0", "1.0"]}
     assert scores == pytest.approx([0.04, 0.08])
 
@@ -120,7 +111,6 @@ def test_a_refused_point_is_a_row_with_its_reason_and_stops_no_other(project_roo
     assert done.returncode == 1
     assert "2 of 2 points failed" in done.stdout
     assert "Traceback" not in done.stdout
-    rows = json.loads((tmp_path / "comparison.json").read_text())["rows"]
-    assert [row["notes"] for row in rows] == [
+    assert [row["notes"] for row in sweep_rows(sweep_points(tmp_path))] == [
         [f"seed 1 failed: train.epochs: expected > 0, got {epochs}"] for epochs in (0, -1)
     ]

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from polarnet.benchmark.results import write_benchmark
-from polarnet.benchmark.run import Benchmark, BenchmarkSet, _panel
+from polarnet.benchmark.run import Benchmark, panel_of
 from polarnet.benchmark.score import BenchmarkConfig, Cost, score_sequence
+from polarnet.benchmark.sequences import BenchmarkSet
 from polarnet.events.stream import Events
 from polarnet.pictures.images import write_png
 from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, write_manifest
@@ -91,7 +92,7 @@ def run_methods(events, frames, folder):
         answers = {method: Prediction(frames) for method, frames in dolp.items()}
         answers["e2v"] = Prediction(dolp["e2v"], sequence.aolp)
         rows += score_sequence(sequence, answers, 1, None, torch.device("cpu"))
-        panels.append(_panel(sequence, answers, 1))
+        panels.append(panel_of(sequence, answers, 1))
     about = {
         "lpips": {"backbone": None, "sha256": None, "source": None},
         "weights": {
@@ -119,7 +120,7 @@ def paths(tmp_path_factory):
     synthesize(Synthesis(paths.images, motion, 1, 2), paths.scenes, paths.frames, map)
     frames = FrameStore.open(paths.frames)
     write_events(paths.events, frames)
-    run_methods(EventStore.open(paths.events), frames, paths.benchmark)
+    run_methods(EventStore.open(paths.events), frames, paths.simulated)
     for folder, network in ((paths.train / "ours", "paper"), (paths.train / "e2v", "firenet")):
         folder.mkdir(parents=True)
         write_history(folder, HISTORY)

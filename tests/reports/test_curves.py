@@ -1,10 +1,8 @@
 import io
 
 import matplotlib.image
-import pytest
 
 from polarnet.reports.curves import event_budget_figure, sensitivity_figure
-from polarnet.reports.figures import DARK, LIGHT
 from polarnet.reports.maps import png
 
 
@@ -28,29 +26,28 @@ SETTINGS = {
 }
 
 
-@pytest.mark.parametrize("theme", [LIGHT, pytest.param(DARK, marks=pytest.mark.thorough)])
-def test_the_figures_are_drawn_the_same_each_time(theme):
+def test_the_figures_are_drawn_the_same_each_time():
     for draw, results in (
         (event_budget_figure, BUDGET),
         (sensitivity_figure, SETTINGS),
     ):
-        content = png(draw(results, theme))
-        assert content == png(draw(results, theme))
+        content = png(draw(results))
+        assert content == png(draw(results))
         assert matplotlib.image.imread(io.BytesIO(content)).std() > 0
 
 
 def test_frames_carried_on_between_windows_are_a_line_beside_the_overlapping_windows():
-    sliding = event_budget_figure(BUDGET, LIGHT).axes[2]
+    sliding = event_budget_figure(BUDGET).axes[2]
     (line,) = [one for one in sliding.lines if one.get_label() == "carried on between windows of 33 ms"]
     assert set(line.get_ydata()) == {10.9}
 
 
 def test_the_papers_answer_is_marked_in_the_event_budget():
-    start = event_budget_figure(BUDGET, LIGHT).axes[0]
+    start = event_budget_figure(BUDGET).axes[0]
     assert any(line.get_linestyle() == "--" and line.get_xdata()[0] == 1.04 for line in start.lines)
 
 
 def test_a_setting_is_a_column_with_its_values_below():
-    axes = sensitivity_figure(SETTINGS, LIGHT).axes
+    axes = sensitivity_figure(SETTINGS).axes
     assert len(axes) == 4
     assert [tick.get_text() for tick in axes[1].get_xticklabels()] == ["0", "0.2"]

@@ -1,7 +1,7 @@
 import pytest
 
-from polarnet.methods import METHODS
-from polarnet.reports.legend import GENERAL, NETWORKS, ROWS, glossary, legend_of, lpips_about
+from polarnet.methods import METHODS, ROWS
+from polarnet.reports.legend import NETWORKS, glossary, legend_of, lpips_about
 
 
 def weights(**networks):
@@ -29,25 +29,12 @@ def test_a_second_network_that_is_not_the_papers_is_not_called_the_papers():
     assert legend_of(weights(paper="polarnet")).label("paper") == "second network: polarnet's network"
 
 
-def test_without_weights_the_rows_have_their_general_names():
-    assert legend_of({}) == GENERAL
-    assert GENERAL.label("somebody's") == "somebody's"
-
-
 def test_the_glossary_has_the_rows_of_the_table_and_no_other():
     entries = dict(glossary(["cf", "cf+gain", "e2v", "ours"], weights(e2v="firenet", ours="paper")))
     assert list(entries) == ["CF", "E2V: FireNet", "ours: the paper's network", "gains solved"]
     assert "Fig. 6" in entries["ours: the paper's network"]
     assert "FireNet (Scheerlinck et al. 2020)" in entries["E2V: FireNet"]
     assert "gains solved" not in dict(glossary(["cf"], {}))
-
-
-def test_weights_of_other_authors_are_told_from_those_trained_here():
-    published = {"firenet_published": {"file": "firenet_1000.pth.tar", "sha256": "0" * 64, "network": "firenet"}}
-    assert (
-        "as its authors published them"
-        in dict(glossary(["firenet_published"], published))["FireNet, published weights"]
-    )
 
 
 def test_every_method_is_explained_with_the_weights_that_it_takes():
@@ -63,14 +50,6 @@ def test_every_method_is_explained_with_the_weights_that_it_takes():
     assert entries["E2V: FireNet"].startswith("Events to video. FireNet (Scheerlinck et al. 2020)")
 
 
-def test_a_row_without_the_network_that_it_needs_is_not_explained():
-    assert glossary(["cf", "ours"], {}) == glossary(["cf"], {})
-
-
 @pytest.mark.parametrize(("backbone", "name"), [("vgg", "VGG16"), ("alex", "AlexNet")])
 def test_lpips_is_explained_with_its_backbone(backbone, name):
     assert f"with {name} as its backbone" in lpips_about({"backbone": backbone})
-
-
-def test_lpips_is_not_explained_where_the_table_has_no_such_column():
-    assert lpips_about({"backbone": None}) is None

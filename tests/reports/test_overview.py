@@ -1,9 +1,8 @@
-import numpy as np
 import pytest
 
 from polarnet.reports.artefacts import read_artefacts
 from polarnet.reports.maps import png
-from polarnet.reports.overview import MAX_EVENTS, _oblique, overview_figure
+from polarnet.reports.overview import MAX_EVENTS, overview_figure
 
 
 @pytest.fixture(scope="module")
@@ -19,9 +18,3 @@ def test_every_event_of_a_sparse_stream_is_drawn(overview):
     clouds = [axes.collections[0] for axes in overview_figure(overview).axes if axes.collections]
     assert [len(cloud.get_offsets()) for cloud in clouds] == [len(stream) for stream in overview.streams]
     assert max(len(stream) for stream in overview.streams) < MAX_EVENTS
-
-
-def test_the_space_time_box_fills_the_page_from_corner_to_corner():
-    start, end = np.zeros(1), np.ones(1)
-    assert _oblique(start, start, end) == (0, 0)
-    assert _oblique(end, end, start) == (1, 1)

@@ -18,7 +18,7 @@ ENDINGS = ("png", "pdf")
 
 @pytest.fixture
 def results(paths):
-    simulated = read_results(paths.benchmark)
+    simulated = read_results(paths.simulated)
     real = {row: {**scores, "mse": scores["mse"] / 2} for row, scores in simulated.metrics.items()}
     return [simulated._replace(name="simulated"), simulated._replace(name="recordings", metrics=real)]
 

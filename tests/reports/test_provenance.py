@@ -19,10 +19,6 @@ def project(tmp_path):
     return tmp_path
 
 
-def test_a_folder_without_a_commit_says_so(tmp_path):
-    assert facts(tmp_path)["commit"] == "none: not a git repository with a commit"
-
-
 def test_a_clean_clone_is_named_by_its_commit_alone(project):
     assert len(facts(project)["commit"]) == 40
 
@@ -35,7 +31,3 @@ def test_edited_code_is_said(project):
 def test_what_the_pipeline_writes_is_no_edit(project):
     (project / "dvc.lock").write_text("2\n")
     assert len(facts(project)["commit"]) == 40
-
-
-def test_versions_name_the_libraries_that_decide_results(tmp_path):
-    assert "torch 2" in facts(tmp_path)["versions"]
