@@ -94,7 +94,10 @@ class PolarizationLoss(FrameLoss):
     def __call__(
         self, predicted: Float[Tensor, "t b k h w"], truth: Float[Tensor, "t b m h w"], valid: Valid = None
     ) -> dict[str, Float[Tensor, ""]]:
-        """Return the unweighted terms by name, in the order of `weights`. The maps are DoLP, s1 and s2; `predicted` may be DoLP alone."""
+        """Return the unweighted terms by name, in the order of `weights`.
+
+        The maps are DoLP, s1 and s2; `predicted` may be DoLP alone.
+        """
         terms = super().__call__(predicted[:, :, 0], truth[:, :, 0], valid)
         if "relative_mse" in self.weights:
             squared = (predicted[:, :, 0] - truth[:, :, 0]).square()
