@@ -48,16 +48,3 @@ def test_a_bin_spans_half_a_unit_of_log_variance_from_minus_12_to_0():
     result = reliability(log_variance, torch.zeros(1, 1, 4), torch.ones(1, 1, 4))
     assert result.pixels.nonzero().flatten().tolist() == [0, 1, 11, 23]
     assert len(result.pixels) == 24
-
-
-def test_the_predicted_variances_of_joined_sequences_add_up():
-    frames = torch.zeros(1, 1, 1)
-    one, two = (reliability(torch.full((1, 1, 1), v), frames, frames + 0.1) for v in (-2.0, -4.0))
-    assert (one + two).predicted.sum().item() == pytest.approx(math.exp(-2) + math.exp(-4))
-
-
-def test_one_pixel_has_an_error_and_a_bin_without_any_does_not_count():
-    log_variance = torch.tensor([[[math.log(0.01), math.log(0.3)]]])
-    truth = torch.zeros(1, 1, 2)
-    result = reliability(log_variance, truth + torch.tensor([0.2, 0.0]), truth)
-    assert result.log_error() == pytest.approx(math.log(4), rel=1e-5)

@@ -8,7 +8,6 @@ from polarnet.networks.base.blocks import (
     ConvGRU,
     Level,
     ResidualBlock,
-    UpBlock,
     conv3x3,
     on_blocks,
 )
@@ -59,14 +58,6 @@ def test_a_residual_block_with_zero_weights_is_a_relu():
     for parameter in block.parameters():
         torch.nn.init.zeros_(parameter)
     assert block(torch.tensor([-1.0, 2.0]).view(1, 2, 1, 1)).flatten().tolist() == [0.0, 2.0]
-
-
-def test_a_residual_block_has_two_3x3_convolutions_with_biases():
-    assert sum(p.numel() for p in ResidualBlock(128).parameters()) == 2 * (128 * 128 * 9 + 128)
-
-
-def test_an_up_block_doubles_the_size_and_takes_the_channels_of_its_skip():
-    assert UpBlock(8, 4)(torch.randn(3, 8, 5, 6), skip=torch.randn(3, 4, 10, 12)).shape == (3, 4, 10, 12)
 
 
 @torch.no_grad()

@@ -19,13 +19,6 @@ def test_the_published_weights_give_the_images_of_the_authors_network(shared):
 
 
 @torch.no_grad()
-def test_the_five_iterations_share_one_block():
-    network = CistaTc(5)
-    first = network.lista_blocks[0]
-    assert all(block is first for block in network.lista_blocks)
-
-
-@torch.no_grad()
 def test_any_size_gives_an_image_of_that_size_that_depends_on_the_windows_before():
     torch.manual_seed(0)
     network, window = CistaTc(5).eval(), torch.randn(2, 5, 21, 30)
@@ -33,11 +26,3 @@ def test_any_size_gives_an_image_of_that_size_that_depends_on_the_windows_before
     assert image.shape == (2, 21, 30)
     assert 0 <= image.min() <= image.max() <= 1
     assert not torch.equal(network(window, state)[0], image)
-
-
-def test_a_file_of_another_network_is_refused(tmp_path):
-    torch.save({"state_dict": {"head.conv2d.weight": torch.zeros(1)}}, tmp_path / "other.pth.tar")
-    with pytest.raises(ValueError, match=r"holds no CISTA-TC: expected a tensor We\.conv2d\.weight"):
-        CistaTc.load(tmp_path / "other.pth.tar")
-    with pytest.raises(ValueError, match="this CISTA-TC takes 5 bins, got 4"):
-        CistaTc(5)(torch.zeros(1, 4, 8, 8))

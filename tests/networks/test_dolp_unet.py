@@ -102,11 +102,4 @@ def test_the_channels_are_those_of_the_stokes_parameters_for_each_bin_of_its_own
 
 def test_heads_that_do_not_divide_the_channels_are_refused():
     with pytest.raises(ValueError, match="swin_heads: expected a divisor of 64 channels, got 3"):
-        DolpUNetConfig(
-            channels=[32, 64, 128],
-            swin_depth=2,
-            swin_window=5,
-            swin_heads=[3, 4],
-            residual_blocks=2,
-            input_mixing="contrasts",
-        )
+        replace(PAPER, swin_heads=[3, 4])

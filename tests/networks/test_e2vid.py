@@ -116,8 +116,3 @@ def test_an_lstm_whose_forget_gate_is_open_and_input_gate_shut_keeps_its_memory(
     output, memory_after = lstm(torch.rand(1, 2, 3, 3), (torch.zeros(1, 2, 3, 3), memory))
     torch.testing.assert_close(memory_after, memory)
     torch.testing.assert_close(output, memory.tanh())
-
-
-def test_another_number_of_bins_is_refused(network):
-    with pytest.raises(ValueError, match="this E2VID takes 5 bins, got 4"):
-        network(torch.zeros(1, 4, 8, 8))

@@ -6,11 +6,10 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jaxtyping
 import numpy as np
-import onnx
 import onnxruntime
 import pytest
 import torch
@@ -21,7 +20,7 @@ from polarnet.events.representations import event_counts
 from polarnet.events.stream import Events
 from polarnet.networks import onnx_export
 from polarnet.networks.base.checkpoint import save_checkpoint
-from polarnet.networks.onnx_export import check_program, export_network, random_windows
+from polarnet.networks.onnx_export import check_program, random_windows
 from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
 from polarnet.networks.polarnet.stokes_unet import StokesUNet
 from polarnet.networks.registry import load_network
@@ -250,13 +249,3 @@ def test_the_lines_on_the_page_run_as_they_stand(of_each, monkeypatch, project_r
     t = torch.arange(len(x))
     images = [event_counts(Events(t[k], x[k], y[k], p[k], HEIGHT, WIDTH), 33_333) for k in of]
     assert torch.equal(torch.cat(images), torch.from_numpy(names["events"][0]))
-
-
-def test_the_path_of_an_export_may_be_text(of_each, tmp_path, monkeypatch):
-    path, checkpoint, _ = of_each["polarnet"]
-    program: Any = program_in(path)
-    program.model_proto = onnx.load(path)
-    monkeypatch.setattr(onnx_export, "_traced", lambda *_: (program, {}))  # tracing takes seconds
-    network, metadata = load_network(str(checkpoint))
-    export_network(network, metadata, str(tmp_path / "n.onnx"), HEIGHT, WIDTH)
-    assert program_in(tmp_path / "n.onnx")

@@ -172,8 +172,3 @@ def test_every_stream_is_followed_by_itself():
         alone = follow(changes[stream : stream + 1], motion, empty_panorama(changes[:1], MARGIN), MEMORY)
         for image, expected in zip(together, alone, strict=True):
             torch.testing.assert_close(image[stream : stream + 1], expected, atol=1e-5, rtol=1e-5)
-
-
-def test_the_margin_is_at_least_what_was_asked_for():
-    panorama = empty_panorama(torch.zeros(2, 3, 60, 92), 16)
-    assert [tuple(image.shape) for image in panorama] == [(2, 3, 80, 112), (2, 3, 60, 92), (2, 4, 80, 57)]

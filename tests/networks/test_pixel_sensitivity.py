@@ -85,10 +85,3 @@ def test_windows_at_once_are_windows_one_by_one():
         one, state = equaliser(polarity[number, None], events[number, None], state)
         torch.testing.assert_close(one.polarity[0], together.polarity[number])
     torch.testing.assert_close(state, last)
-
-
-@torch.no_grad()
-def test_a_state_of_zeros_is_the_start():
-    polarity, events = counts(torch.rand(8, HEIGHT, WIDTH), 3)
-    nothing = [torch.zeros(1, 8, HEIGHT, WIDTH)] * 2
-    torch.testing.assert_close(Equaliser()(polarity, events, nothing), Equaliser()(polarity, events, []))

@@ -1,14 +1,13 @@
+import pytest
 import torch
 
 from polarnet.networks.paper.swin import (
-    PatchMerging,
     SwinBlock,
     WindowAttention,
     attend,
     join_windows,
     relative_position,
     split_windows,
-    visible_pixels,
 )
 
 CPU = torch.device("cpu")
@@ -31,25 +30,19 @@ def test_windows_put_back_together_give_the_image_for_any_size_and_shift():
             assert torch.equal(join_windows(part, height, width, window, shift), image)
 
 
-def test_plain_windows_see_their_own_window_and_nothing_else():
-    pixels = influence(WindowAttention(8, 2, window=4, shift=0), row=5, column=2, height=8, width=8)
+@pytest.mark.parametrize(
+    ("shift", "pixel", "rows", "columns"),
+    [
+        (0, (5, 2), slice(4, 8), slice(0, 4)),  # its own window
+        (2, (3, 3), slice(2, 6), slice(2, 6)),  # a window that straddles the plain ones
+        (2, (0, 0), slice(0, 2), slice(0, 2)),  # the part of a window inside the image, not the opposite border
+    ],
+)
+def test_a_pixel_is_seen_in_its_window_and_nowhere_else(shift, pixel, rows, columns):
     expected = torch.zeros(8, 8, dtype=torch.bool)
-    expected[4:8, 0:4] = True
-    assert torch.equal(pixels, expected)
-
-
-def test_shifted_windows_straddle_the_plain_ones():
-    pixels = influence(WindowAttention(8, 2, window=4, shift=2), row=3, column=3, height=8, width=8)
-    expected = torch.zeros(8, 8, dtype=torch.bool)
-    expected[2:6, 2:6] = True
-    assert torch.equal(pixels, expected)
-
-
-def test_shifted_windows_do_not_leak_from_one_border_to_the_opposite_one():
-    pixels = influence(WindowAttention(8, 2, window=4, shift=2), row=0, column=0, height=8, width=8)
-    expected = torch.zeros(8, 8, dtype=torch.bool)
-    expected[:2, :2] = True
-    assert torch.equal(pixels, expected)
+    expected[rows, columns] = True
+    attention = WindowAttention(8, 2, window=4, shift=shift)
+    assert torch.equal(influence(attention, *pixel, height=8, width=8), expected)
 
 
 def test_a_window_that_reaches_beyond_the_image_gives_what_the_part_inside_would_give_alone():
@@ -64,16 +57,6 @@ def test_a_window_that_reaches_beyond_the_image_gives_what_the_part_inside_would
     torch.testing.assert_close(masked, attend(*part, bias[:, inside][:, :, inside], None))
 
 
-def test_nothing_is_masked_where_windows_fill_the_image():
-    assert visible_pixels(60, 90, 5, 0, CPU) is None
-    assert visible_pixels(61, 90, 5, 0, CPU) is not None
-
-
-def test_masks_and_position_indices_are_made_once_and_kept():
-    assert visible_pixels(7, 9, 4, 2, CPU) is visible_pixels(7, 9, 4, 2, CPU)
-    assert relative_position(5, CPU) is relative_position(5, CPU)
-
-
 def test_relative_position_depends_on_the_offset_alone():
     index = relative_position(3, CPU)  # pixels 0 1 2 / 3 4 5 / 6 7 8
     assert index[0, 4] == index[4, 8] == index[1, 5]  # one down, one right
@@ -85,10 +68,6 @@ def test_attention_of_equal_pixels_is_their_value():
     value = torch.tensor([2.0, -1.0]).expand(1, 1, 1, 9, 2).contiguous()
     attended = attend(torch.zeros_like(value), torch.zeros_like(value), value, torch.zeros(1, 9, 9), None)
     torch.testing.assert_close(attended, value)
-
-
-def test_patch_merging_halves_an_even_size():
-    assert PatchMerging(4, 8)(torch.randn(2, 4, 6, 10)).shape == (2, 3, 5, 8)
 
 
 def test_a_swin_block_has_the_parameters_that_its_paper_counts():

@@ -95,12 +95,6 @@ def test_the_errors_of_heavy_scenes_decide():
         assert errors.mean().item() == pytest.approx(expected.item(), rel=0.05)
 
 
-def test_weights_do_not_depend_on_their_scale():
-    scenes = scenes_of(in_all=1.0, in_each=0.0)
-    doubled = [scene._replace(weights=2 * scene.weights) for scene in scenes]
-    assert fitted(doubled).weight.tolist() == fitted(scenes).weight.tolist()
-
-
 def test_weighted_sequences_are_polarized_like_the_scenes_that_errors_are_expected_for():
     degree = torch.rand(2000, generator=torch.Generator().manual_seed(0)).tolist()
     weights = weights_for(degree, 0.045, 0.13)
@@ -111,11 +105,6 @@ def test_weighted_sequences_are_polarized_like_the_scenes_that_errors_are_expect
 
     assert share_below(0.045) == pytest.approx(0.5, abs=0.02)
     assert share_below(0.13) == pytest.approx(0.9, abs=0.02)
-
-
-def test_a_single_sequence_weighs_1_and_equal_ones_share_their_part():
-    assert weights_for([0.3], 0.045, 0.13) == [1.0]
-    assert sum(weights_for([0.0, 0.0, 0.2], 0.045, 0.13)) == pytest.approx(3)
 
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])

@@ -1,10 +1,10 @@
 """E2P in the loop of every other network, at a size where a training takes seconds."""
 
 import dataclasses
-from typing import Any
 
 import pytest
 import torch
+from test_loop import CPU, LOOP, SEED
 
 from polarnet.metrics.lpips import Lpips
 from polarnet.metrics.similarity import ssim
@@ -17,25 +17,9 @@ from polarnet.training.engine.recorder import Recorder
 from polarnet.training.engine.sequences import stack
 from polarnet.training.engine.task import describe, open_split
 
-SEED = 7
-CPU = torch.device("cpu")
-LOOP: dict[str, Any] = {
-    "data": "store",
-    "visits": 1,
-    "windows": 3,
-    "crop": [16, 20],
-    "symmetries": True,
-    "epochs": 1,
-    "accumulate": 1,
-    "batch_size": 2,
-    "bptt_windows": 3,
-    "learning_rate": 1e-3,
-    "schedule": "cosine",
-    "warmup": 0.1,
-    "gradient_norm": 1.0,
-    "precision": "fp32",
-}
-E2P = E2pConfig(**LOOP, bins=5, intensity_lpips=0.0, lpips=0.0, mse=50.0, ssim=1.0)
+E2P = E2pConfig(
+    **LOOP | {"visits": 1, "windows": 3, "epochs": 1}, bins=5, intensity_lpips=0.0, lpips=0.0, mse=50.0, ssim=1.0
+)
 
 
 def test_a_training_of_e2p_leaves_a_checkpoint_of_the_published_size(stores, tmp_path):

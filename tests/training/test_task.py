@@ -4,44 +4,24 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
+import test_loop
 import torch
+from test_loop import LOSS, NETWORK
 
 from polarnet.networks.base.checkpoint import load_checkpoint, save_checkpoint
-from polarnet.networks.paper.dolp_unet import DolpUNetConfig
 from polarnet.storage.frames import Contents, FrameStore
 from polarnet.training.dolp import dolp_task
-from polarnet.training.e2v import E2vConfig, e2v_task
-from polarnet.training.engine.loop import TrainConfig, train_batch, validate
-from polarnet.training.engine.losses import LossConfig
+from polarnet.training.e2v import e2v_task
+from polarnet.training.engine.loop import train_batch, validate
 from polarnet.training.engine.sequences import Visits, batches_of
 from polarnet.training.engine.task import Split, Task, describe, open_events, open_split
 
 SEED = 5
-LOOP: dict[str, Any] = {
-    "data": "store",
-    "visits": 1,
-    "windows": 4,
-    "crop": [16, 20],
-    "symmetries": True,
-    "epochs": 1,
-    "accumulate": 1,
-    "batch_size": 2,
-    "bptt_windows": 2,
-    "learning_rate": 1e-3,
-    "schedule": "constant",
-    "warmup": 0.0,
-    "gradient_norm": 1.0,
-    "precision": "fp32",
-}
-NETWORK = DolpUNetConfig(
-    channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1, input_mixing="contrasts"
-)
-TRAIN = TrainConfig(**LOOP, representation="event_tensor", optimizer=None, start=None, scene_dolp=None)
-E2V = E2vConfig(**LOOP, arch="firenet", bins=3, ssim=1.0, lpips=0.0)
-LOSS = LossConfig(mse=1.0, ssim=1.0, lpips=0.0, stokes=0.0, half_weight=None)
+CHANGES = {"visits": 1, "epochs": 1, "bptt_windows": 2, "schedule": "constant", "warmup": 0.0}
+TRAIN = dataclasses.replace(test_loop.TRAIN, **CHANGES)
+E2V = dataclasses.replace(test_loop.E2V, **CHANGES, bins=3)
 
 
 def dolp() -> Task:
