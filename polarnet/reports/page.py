@@ -1,12 +1,14 @@
 """Self-contained HTML pages: the report of a pipeline run, and the page of one test set (`polarnet benchmark`)."""
 
+import io
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from markupsafe import Markup
+from ruamel.yaml import YAML
 
 from polarnet.methods import METHODS, is_rotating
 from polarnet.reports.artefacts import Artefacts, History, ReportPaths, Results, read_artefacts, read_results
@@ -103,7 +105,7 @@ def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder:
         "title": "polarnet report",
         "command": run.command,
         "facts": run.facts,
-        "sections": _sections(run.parameters),
+        "parameters": _as_yaml(run.parameters),
         "overview": None if overview is None else data_uri(overview, "png"),
         "sets": [_set(one, legend) for one in artefacts.sets],
         "trainings": _trainings(artefacts),
@@ -164,7 +166,7 @@ def _results_context(results: Results, legend: Legend, films: Sequence[Film]) ->
         "lpips_about": lpips_about(details["lpips"]),
         "published": {experiment: paper_table(experiment) for experiment in ("simulated", "real")},
         "notes": [],
-        "sections": {},
+        "parameters": None,
         "overview": None,
         "sets": [],
         "trainings": [],
@@ -292,18 +294,9 @@ def _baseline(name: str, history: History) -> tuple[str, History, str]:
     return row, history, "intensity" if METHODS[name].reconstructs else "polarization"
 
 
-def _sections(parameters: Mapping[str, Any]) -> dict[str, list[tuple[str, Any]]]:
-    """Dotted keys and values by top-level section; single values are under general."""
-    sections: dict[str, list[tuple[str, Any]]] = {"general": []}
-    for key, value in _flat(parameters):
-        section, dot, _ = key.partition(".")
-        sections.setdefault(section if dot else "general", []).append((key, value))
-    return sections
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
+def _as_yaml(values: Mapping[str, Any]) -> str:
+    """Parameters as they stand in params.yaml."""
+    text, yaml = io.StringIO(), YAML()
+    yaml.default_flow_style = False
+    yaml.dump(dict(values), text)
+    return text.getvalue()

@@ -1,6 +1,7 @@
 """Labelled pictures of a sequence, side by side: events, DoLP, AoLP, S0 and polarization as hue, saturation, value."""
 
 import functools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from matplotlib.font_manager import findfont
-from matplotlib.ft2font import FT2Font
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from polarnet.events.representations import polarity_sums
@@ -176,22 +177,10 @@ def _write(picture: UInt8[np.ndarray, "h w 3"], text: str, left: int) -> None:
     place[:] = np.rint(place * (1 - ink) + TEXT_COLOUR * ink).astype(np.uint8)
 
 
-@functools.cache
-def _font() -> FT2Font:
-    font = FT2Font(findfont("DejaVu Sans"))  # comes with matplotlib
-    font.set_size(FONT_SIZE, 72)
-    return font
-
-
 @functools.lru_cache(maxsize=TEXTS)
 def _text(text: str) -> Float[np.ndarray, "line w"]:
     """Coverage of each pixel of a line by the letters, in [0, 1]."""
-    font = _font()
-    font.set_text(text, 0.0)
-    font.draw_glyphs_to_bitmap(antialiased=True)
-    ink = np.asarray(font.get_image()) / 255
-    bottom = LINE - 6 + round(font.get_descent() / 64)
-    line = np.zeros((LINE, ink.shape[1]))
-    first = max(0, bottom - ink.shape[0])
-    line[first : min(LINE, bottom)] = ink[ink.shape[0] - (bottom - first) :][: LINE - first]
-    return line
+    font = ImageFont.truetype(findfont("DejaVu Sans"), FONT_SIZE)  # comes with matplotlib
+    line = Image.new("L", (math.ceil(font.getlength(text)), LINE))
+    ImageDraw.Draw(line).text((0, LINE - 6), text, fill=255, font=font, anchor="ls")  # its base line above the edge
+    return np.asarray(line) / 255

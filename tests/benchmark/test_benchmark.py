@@ -121,16 +121,6 @@ def test_panels_show_one_window_of_different_scenes_and_every_method(five_scenes
     assert torch.equal(written.truth.film_aolp, given.truth.film_aolp)
 
 
-@pytest.mark.thorough
-def test_all_but_the_time_is_the_same_in_two_runs(five_scenes, context, tmp_path):
-    some = config(methods=["cf", "e2v", "ours"])
-    for name in ("one", "two"):
-        benchmark = run_benchmark(five_scenes, context, some, None)
-        write_benchmark(tmp_path / name, benchmark, some, 1, {})
-    for file in ("metrics.json", "frames.csv", "details.json", "panels/a1.npz"):
-        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
-
-
 def test_no_test_sequence_is_an_error(five_scenes, context, tmp_path):
     frames = FrameStore.create(tmp_path / "f.zarr", Contents({"t1": "train"}), 5, 18, 20)
     frames.write("t1", *five_scenes.frames.frames("t1"))

@@ -57,12 +57,6 @@ def test_lpips_names_its_backbone_in_heading_and_caption():
     assert score_table(scores, ERROR_PARTS).notes == ()
 
 
-def test_a_value_that_is_missing_is_never_the_best():
-    table = score_table({"zeros": {"ssim": None}, "ours": {"ssim": -0.5}})
-    assert row(table, "zeros").cells[0].text == "-"
-    assert row(table, "ours").cells[0].best
-
-
 def test_intervals_stand_below_their_values_with_the_same_decimals():
     table = score_table({"cf": {"psnr": 7.0}, "ours": {"psnr": 17.0, "psnr_ci": [16.125, 18.0]}})
     assert "**17.00**<br><sub>16.12 to 18.00</sub>" in as_markdown(table)
