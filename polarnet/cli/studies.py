@@ -54,7 +54,7 @@ def run_event_budget(
     Fig. 11 is drawn of the simulated set and, if they are enabled, of the real targets. ValueError if `ours` has no
     weights.
     """
-    stored, context = _prepared(config, methods, limit, weights)
+    stored, context = _prepared(config, [*dict.fromkeys([*methods, "ours"])], limit, weights)
     if reason := why_left_out("ours", context):
         raise ValueError(f"the event budget needs the DoLP network: {reason}; give --weights FILE")
     recoverer, tests = opened(METHODS["ours"], context), pipeline_set(config, "simulated")

@@ -83,7 +83,12 @@ def unpack_mask(packed: UInt8[np.ndarray, "*b h bytes"], width: int) -> Bool[Ten
 
 @dataclass(frozen=True)
 class Contents:
-    """The sequences of a store of scenes or frames, and the values that it is made from."""
+    """The sequences of a store of scenes or frames, and the values that it is made from.
+
+    >>> from polarnet.storage import Contents
+    >>> Contents({"lake-00": "train", "road-00": "test"}, {"seed": 1}).splits["road-00"]
+    'test'
+    """
 
     splits: Mapping[str, str]
     """Split (train, val or test) of each sequence, in the store's order."""
