@@ -16,7 +16,7 @@ from polarnet.reports.figures import PAGE
 
 VARIABLES = {PAGE.text: "var(--text)", PAGE.quiet: "var(--quiet)", PAGE.grid: "var(--line)"}
 """Variable of style.css.jinja for each colour of `PAGE`."""
-UNUSED_IDS = re.compile(r' id="[a-z0-9]+(?:\.[a-z]+)?_\d+"')  # nothing refers to the names of groups
+UNUSED_IDS = re.compile(r' id="[A-Za-z0-9]+(?:\.[a-z]+)?_\d+"')  # nothing refers to the names of groups
 
 
 def svg(figure: Figure) -> Markup:
