@@ -361,7 +361,7 @@ def input_folder(key: str, folder: str) -> Path:
 
     A queued DVC experiment runs in a copy of the workspace; there the message says how to bring in the files.
     """
-    files = (path for path in Path(folder).rglob("*") if path.is_file() and not path.name.startswith("."))
+    files = (path for path in Path(folder).rglob("*") if (path.is_file() or path.is_symlink()) and path.name[0] != ".")
     if any(path.name != "README.md" and path.suffix != ".dvc" for path in files):
         return Path(folder)
     project, copy, _ = str(Path.cwd()).partition(EXPERIMENT_COPY)

@@ -175,7 +175,7 @@ FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
         thorough("networks/registry.py", {"report"} | ROWS),
         thorough("training/dolp.py", {"train"}),
         thorough("clips/video.py", set()),
-        thorough("simulation/pixels/exact.py", (FROM_SIMULATION | TRAININGS) - {"ingest"}),
+        thorough("simulation/pixels/exact.py", (FROM_SIMULATION | TRAININGS | ROWS) - {"ingest"}),
         thorough("metrics/similarity.py", {"weights", "report"} | TRAININGS | ROWS),
         thorough("reports/charts.py", {"calibrate", "report"}),
         thorough("benchmark/paired.py", {"report"} | ROWS),

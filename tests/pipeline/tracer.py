@@ -124,7 +124,7 @@ def _files_of(codes: set[CodeType]) -> set[str]:
             continue
         file = path.relative_to(ROOT).as_posix()
         files.add(file)
-        if file.startswith(ENTRY):
+        if file.startswith(ENTRY) or path.suffix != ".py":  # a template of a page imports nothing
             continue
         module = by_file.get(code.co_filename)
         sources = _sources(code.co_filename)
