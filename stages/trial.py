@@ -74,7 +74,9 @@ def _failure_of_point(node: DictConfig, job: Path, overrides: list[str]) -> str 
     OmegaConf.save(OmegaConf.create(point), job / f"{POINT}.yaml")
     for command, name in _commands(plan, config):
         logs = f"hydra.run.dir={quoted(str(job / 'logs' / name))}"
-        failure = _failure([sys.executable, *command, f"--config-dir={job}", f"--config-name={POINT}", logs])
+        module, overrides = command[:2], command[2:]  # Hydra takes options before overrides only
+        point_file = [f"--config-dir={job}", f"--config-name={POINT}"]
+        failure = _failure([sys.executable, *module, *point_file, *overrides, logs])
         if failure:
             return f"{name}: {failure}"
     collect_rows(typed(OmegaConf.create(point)))

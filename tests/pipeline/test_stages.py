@@ -13,6 +13,7 @@ import torch
 
 from polarnet.benchmark import cost
 from polarnet.config.origins import pipeline
+from polarnet.config.sweep import sweep_points
 from polarnet.config.tree import load
 from polarnet.metrics.lpips import PURPOSES
 from polarnet.pictures.dead_leaves import dead_leaves
@@ -244,7 +245,7 @@ def test_a_point_of_a_sweep_leaves_what_the_pipeline_made_and_kept_alone(project
     before = {name: bytes_of(data / name) for name in parts}
     run_stage(project_root, "trial", data, "loss.ssim=0.5", f"hydra.sweep.dir={tmp_path}", "--multirun")
     assert {name: bytes_of(data / name) for name in parts} == before
-    (point,) = json.loads((tmp_path / "comparison.json").read_text())["points"]
+    (point,) = sweep_points(tmp_path)
     assert "loss.ssim=0.5" in point["overrides"]
     own = json.loads((tmp_path / point["job"] / "benchmark" / "metrics.json").read_text())["simulated"]
     whole = json.loads((data / "benchmark" / "metrics.json").read_text())["simulated"]
