@@ -6,6 +6,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.representer import RoundTripRepresenter
 
 from polarnet.runtime.files import replaced
 from polarnet.terminal.installation import shipped_settings
@@ -15,6 +16,13 @@ MAPPINGS = ("randomise",)
 
 GROUPS = ("experiment", "sensor", "polarizers")
 """Folders of conf/ whose presets can be written into params.yaml."""
+
+
+class WithNulls(RoundTripRepresenter):
+    """Writes null where ruamel leaves a blank."""
+
+
+WithNulls.add_representer(type(None), lambda r, _: r.represent_scalar("tag:yaml.org,2002:null", "null"))
 
 
 def preset_names(root: Path, group: str) -> list[str]:
@@ -51,7 +59,7 @@ def write_preset(root: Path, name: str) -> list[str]:
     yaml = YAML()
     yaml.preserve_quotes = True
     yaml.width = 120
-    yaml.representer.add_representer(type(None), lambda r, _: r.represent_scalar("tag:yaml.org,2002:null", "null"))
+    yaml.Representer = WithNulls
     path, group = root / "params.yaml", group_of(root, name)
     params = yaml.load(path)
     changed = []

@@ -8,6 +8,7 @@ from polarnet.networks.base.blocks import (
     ConvGRU,
     Level,
     ResidualBlock,
+    UpBlock,
     conv3x3,
     on_blocks,
 )
@@ -90,3 +91,11 @@ def test_a_convolution_on_blocks_is_that_of_the_unshuffled_image():
     torch.manual_seed(0)
     layer, image = conv3x3(4 * 3, 5), torch.randn(2, 3, 8, 10)
     torch.testing.assert_close(on_blocks(layer, image), layer(F.pixel_unshuffle(image, 2)))
+
+
+def test_a_residual_block_has_two_3x3_convolutions_with_biases():
+    assert sum(p.numel() for p in ResidualBlock(128).parameters()) == 2 * (128 * 128 * 9 + 128)
+
+
+def test_an_up_block_doubles_the_size_and_takes_the_channels_of_its_skip():
+    assert UpBlock(8, 4)(torch.randn(3, 8, 5, 6), skip=torch.randn(3, 4, 10, 12)).shape == (3, 4, 10, 12)
