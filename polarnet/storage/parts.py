@@ -80,7 +80,8 @@ class Store:
         }
         """Names of the sequences in each part."""
         self._part_of = {sequence: part for part, names in self.parts.items() for sequence in names}
-        self._groups: dict[tuple[int, str], tuple[zarr.Group, dict[str, Any], dict[str, Header]]] = {}
+        self._groups: dict[tuple[int, str], tuple[zarr.Group, dict[str, Header]]] = {}
+        self._arrays: dict[tuple[int, str, str], Any] = {}
         self._unfinished: dict[str, _Part] = {}
         self._claim = contextlib.ExitStack()
 
@@ -248,7 +249,7 @@ class Store:
         """Record of a stored sequence, with [start, stop] of its `rows`; ValueError if unreadable."""
         part = self.part_of(sequence)
         try:
-            _, _, records = self._opened(part)
+            _, records = self._opened(part)
             return records[sequence]
         except Exception as error:  # Zarr raises many kinds of exceptions
             raise_unreadable(error, f"{self.path}: {sequence}, {part}")
@@ -259,10 +260,11 @@ class Store:
         try:
             first, end = record["rows"]
             rows = slice(first + start, end if stop is None else min(first + stop, end))
-            group, arrays, _ = self._opened(part)
-            if name not in arrays:
-                arrays[name] = group[name]
-            values = np.asarray(arrays[name][rows])
+            group, _ = self._opened(part)
+            key = os.getpid(), part, name
+            if key not in self._arrays:
+                self._arrays[key] = group[name]
+            values = np.asarray(self._arrays[key][rows])
             if len(values) != max(0, rows.stop - rows.start):
                 raise ValueError(f"expected rows {rows.start} to {rows.stop}, got {len(values)} of them")
         except Exception as error:  # each codec raises its own exceptions
@@ -290,7 +292,7 @@ class Store:
     def _changed_files(self, part: str) -> list[str]:
         """Files of a part whose SHA-256 is not the one that was written."""
         try:
-            group, *_ = self._opened(part)
+            group, _ = self._opened(part)
         except ValueError:
             return [f"{part}/{METADATA}"]
         digests: Any = group.attrs["sha256"]
@@ -304,15 +306,15 @@ class Store:
         """Path or fsspec URL of a part, or of a file of a part."""
         return "/".join((self.path, *names))
 
-    def _opened(self, part: str) -> tuple[zarr.Group, dict[str, Any], dict[str, Header]]:
-        """Group of a part, a dict for its arrays, and its records; each process opens its own."""
+    def _opened(self, part: str) -> tuple[zarr.Group, dict[str, Header]]:
+        """Group of a part, and the records of its sequences; each process opens its own."""
         key = os.getpid(), part
         if key not in self._groups:
             if part in self.digests and _digest(self._url(part, METADATA)) != self.digests[part]:
                 raise ValueError("it is not the part that was written into this store")
             group = open_group(self._url(part))
             written: Any = group.attrs["sequences"]
-            self._groups[key] = group, {}, {name: dict(written[name]) for name in self.parts[part]}
+            self._groups[key] = group, {name: dict(written[name]) for name in self.parts[part]}
         return self._groups[key]
 
 

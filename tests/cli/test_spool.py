@@ -1,9 +1,12 @@
 """Pieces of events that wait on disk come back as one sequence."""
 
 import torch
+from event_fixtures import make_events, make_random_events
 
 from polarnet.cli.spool import EventSpool
 from polarnet.events.stream import concatenate
+
+__all__ = ["make_events", "make_random_events"]
 
 
 def test_pieces_come_back_joined_and_a_channel_without_events_is_empty(tmp_path, make_random_events, make_events):
