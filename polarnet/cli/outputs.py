@@ -4,10 +4,10 @@ import contextlib
 import json
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from polarnet.runtime.files import claimed
+from polarnet.runtime.files import claimed, publish
 
 MARKER = "run.json"
 """File that names the command whose run a folder holds."""
@@ -17,41 +17,38 @@ WORK = "work"
 
 @contextlib.contextmanager
 def run_folder(folder: Path, command: str) -> Iterator[Path]:
-    """FOLDER.partial, which takes the files of one run of `command`; they move to `folder` when the block ends.
+    """FOLDER.partial, which takes the files of one run of `command`; it becomes `folder` when the block ends.
 
-    They replace the files of an earlier run of `command` there. After an error or an interruption, `folder` is
-    unchanged. FOLDER.partial then remains only if it contains a file, and the next run replaces it. Raises ValueError
-    if either folder contains other files, or while another run writes to `folder`.
+    It replaces an earlier run of `command` there, at once. After an error or an interruption, `folder` is unchanged.
+    FOLDER.partial then remains only if it contains a file, and the next run replaces it. Raises ValueError if either
+    folder contains other files, or while another run writes to `folder`.
     """
-    partial = folder.resolve().with_name(f"{folder.resolve().name}.partial")
-    for each in (folder, partial):
-        _check_owner(each, command)
+    place = folder.resolve()
+    partial = place.with_name(f"{place.name}.partial")
+    if Path.cwd().is_relative_to(place):
+        raise ValueError(f"{folder}: expected a folder of its own, got the one you are in; name one below it")
     absent = [each for each in (partial, *partial.parents) if not each.exists()]
-    partial.mkdir(parents=True, exist_ok=True)
-    with claimed(partial / MARKER):
-        for earlier in _entries(partial):
-            _remove(earlier)
-        shutil.rmtree(partial / WORK, ignore_errors=True)
+    with contextlib.ExitStack() as at_end:
+        at_end.callback(_remove_empty, absent[1:])
+        at_end.enter_context(claimed(place))
+        for each in (place, partial):
+            _check_owner(each, command)
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir()
         (partial / MARKER).write_text(json.dumps({"command": f"polarnet {command}"}) + "\n", encoding="utf-8")
         try:
             yield partial
         except BaseException:
-            _clean_up(partial, absent)
+            _remove_without_results(partial)
             raise
-    folder.mkdir(exist_ok=True)
-    for earlier in _entries(folder):
-        _remove(earlier)
-    for entry in partial.iterdir():
-        if entry.name == WORK and (folder / WORK).exists():
-            shutil.rmtree(folder / WORK)
-        entry.rename(folder / entry.name)
-    partial.rmdir()
+        if (place / WORK).exists() and not (partial / WORK).exists():
+            (place / WORK).rename(partial / WORK)
+        publish(partial, place)
 
 
 def _entries(folder: Path) -> list[Path]:
-    """Entries of a folder other than `WORK` and the lock of a run; none if the folder does not exist."""
-    others = (WORK, f"{MARKER}.lock.tmp")
-    return [path for path in folder.iterdir() if path.name not in others] if folder.is_dir() else []
+    """Entries of a folder other than `WORK`; none if the folder does not exist."""
+    return [path for path in folder.iterdir() if path.name != WORK] if folder.is_dir() else []
 
 
 def _check_owner(folder: Path, command: str) -> None:
@@ -69,20 +66,17 @@ def _check_owner(folder: Path, command: str) -> None:
         )
 
 
-def _clean_up(partial: Path, absent: list[Path]) -> None:
-    """Remove the files of a failed run that left no results; `absent` are the folders it created, innermost first."""
+def _remove_without_results(partial: Path) -> None:
+    """Remove the folder of a failed run unless it has results, which it then names."""
     results = (path for entry in _entries(partial) for path in (entry, *entry.rglob("*")))
     if any(path.is_file() and path.name != MARKER for path in results):
         print(f"files of the unfinished run: {partial}", file=sys.stderr)
-        return
-    shutil.rmtree(partial)
-    for created in absent[1:]:
-        with contextlib.suppress(OSError):  # another run has written into it
-            created.rmdir()
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
     else:
-        path.unlink()
+        shutil.rmtree(partial)
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    """Remove those of the folders that are empty, innermost first."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.rmdir()

@@ -1,7 +1,16 @@
-"""Checksums and locks, and files that are written whole or not at all."""
+"""Checksums and locks, and files and folders that are published whole or not at all.
 
+One way to publish: write beside the place, seal, bring every byte to the disk, and rename once.
+"""
+
+import contextlib
+import ctypes
+import errno
+import functools
 import hashlib
+import os
 import shutil
+import unicodedata
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +19,12 @@ from filelock import FileLock, Timeout
 
 SUMS = "SHA256SUMS"
 """File with the checksums of a folder, in the format of `sha256sum --check`."""
+ORIGIN = "origin.json"
+"""File in a folder of the pipeline that says how it was made (`polarnet.config.origins`); it has its own checksum."""
 REMAKE = "run the stage that makes it again, or copy the folder again from where it is whole"
+MAX_NAME = 200  # bytes; file systems allow 255, and names get suffixes
+EXCHANGE = 2  # RENAME_EXCHANGE of Linux
+AT_FDCWD = -100
 
 
 def sha256(*parts: bytes | memoryview | Path) -> str:
@@ -25,6 +39,24 @@ def sha256(*parts: bytes | memoryview | Path) -> str:
     return digest.hexdigest()
 
 
+@functools.cache
+def code_digest() -> str:
+    """SHA-256 of all modules of polarnet: what another version of the code has begun is not continued."""
+    package = Path(__file__).parent.parent
+    modules = sorted(package.rglob("*.py"))
+    return sha256(*(part for file in modules for part in (str(file.relative_to(package)).encode(), file)))
+
+
+def check_name(name: str) -> str:
+    """The name itself, of a sequence or another thing that a path is made of; ValueError if it could name a place."""
+    strange = any(letter in "/\\" or unicodedata.category(letter) == "Cc" for letter in name)
+    if strange or name in ("", ".", "..") or len(name.encode(errors="replace")) > MAX_NAME:
+        raise ValueError(
+            f"expected a name without slashes and control characters, of at most {MAX_NAME} bytes, got {name[:80]!r}"
+        )
+    return name
+
+
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
     """PATH.tmp for the new content of a file; it becomes `path` once the block ends.
@@ -34,9 +66,51 @@ def replaced(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f"{path.name}.tmp")
     try:
         yield temporary
+        _to_disk(temporary)
         temporary.replace(path)
+        _to_disk(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def publish(finished: Path, place: Path) -> None:
+    """Move a finished folder to its place, where it replaces what was there.
+
+    At every moment, after a kill or a power cut too, `place` is the old folder or the new one. Where the system cannot
+    exchange two folders at once, a kill between two renames leaves the old one as PLACE.old, which `claimed` restores.
+    """
+    for path in (*finished.rglob("*"), finished):
+        if not path.is_symlink():
+            _to_disk(path)
+    old = place.with_name(f"{place.name}.old")
+    if not place.exists():
+        os.rename(finished, place)
+    elif _exchanged(finished, place):
+        os.rename(finished, old)
+    else:
+        shutil.rmtree(old, ignore_errors=True)
+        os.rename(place, old)
+        os.rename(finished, place)
+    _to_disk(place.parent)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _exchanged(one: Path, other: Path) -> bool:
+    """Whether two folders took each other's place, in one step."""
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    return rename is not None and not rename(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), EXCHANGE)
+
+
+def _to_disk(path: Path) -> None:
+    """Bring a file, or the names in a folder, to the disk; a folder on a system that cannot do so stays as it is."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EBADF):
+            raise
+    finally:
+        os.close(handle)
 
 
 def check_room(folder: Path, needed: int, work: str) -> None:
@@ -51,28 +125,40 @@ def check_room(folder: Path, needed: int, work: str) -> None:
 
 def seal(folder: Path) -> None:
     """Write the checksum of every file below a finished folder into its `SUMS`."""
-    files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    lines = [f"{sha256(folder / name)}  {name}\n" for name in files if name != SUMS]
     with replaced(folder / SUMS) as temporary:
+        lines = [f"{sha256(folder / name)}  {name}\n" for name in _sealable(folder)]
         temporary.write_text("".join(lines), encoding="utf-8")
+
+
+def _sealable(folder: Path) -> list[str]:
+    """Names of the files below a folder that a seal lists: all but the seal, the origin, hidden and temporary ones."""
+    files = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    return [
+        file.as_posix()
+        for file in files
+        if str(file) not in (SUMS, ORIGIN) and file.suffix != ".tmp" and not file.name.startswith(".")
+    ]
 
 
 def changed_files(folder: Path, names: Collection[str] | None = None) -> list[str]:
     """A message for each file (of `names`; None: all) that is not as it was when `folder` was sealed.
 
-    A folder without `SUMS` gives no message.
+    A missing seal and a file that the seal does not list are changes, too.
     """
-    if not (folder / SUMS).is_file():
-        return []
+    seal_file = folder / SUMS
+    if not seal_file.is_file():
+        return [f"{seal_file} is missing, so that nothing says whether {folder} is whole; {REMAKE}"]
+    lines = [line.partition("  ") for line in seal_file.read_text(encoding="utf-8", errors="replace").splitlines()]
+    listed = {name: digest for digest, _, name in lines}
     problems = []
-    for line in (folder / SUMS).read_text(encoding="utf-8", errors="replace").splitlines():
-        digest, _, name = line.partition("  ")
-        if names is None or name in names:
-            path = folder / name
-            if not name or not path.is_file():
-                problems.append(f"{path} is missing, but {folder / SUMS} lists it; {REMAKE}")
-            elif sha256(path) != digest:
-                problems.append(f"{path} is not the file that {folder / SUMS} describes; {REMAKE}")
+    for name in sorted({*listed, *_sealable(folder)} if names is None else names):
+        path = folder / name
+        if name not in listed:
+            problems.append(f"{path} is not in {seal_file}; {REMAKE}")
+        elif not name or not path.is_file():
+            problems.append(f"{path} is missing, but {seal_file} lists it; {REMAKE}")
+        elif sha256(path) != listed[name]:
+            problems.append(f"{path} is not the file that {seal_file} describes; {REMAKE}")
     return problems
 
 
@@ -101,6 +187,9 @@ def claimed(path: Path, say_waiting: Callable[[], None] | None = None) -> Iterat
         say_waiting()
         lock.acquire(timeout=-1)
     try:
+        if not path.exists():
+            with contextlib.suppress(FileNotFoundError):
+                path.with_name(f"{path.name}.old").rename(path)
         yield
     finally:
         file.unlink(missing_ok=True)

@@ -12,9 +12,9 @@ one decodes nothing of its neighbours; the rows between two sequences are 0.
 
 A store is written as NAME.zarr.tmp. One process writes a part, under a temporary name, and renames it when it is
 complete; different processes write different parts. After a kill a part is whole or missing, and a rerun makes the
-missing parts. `finish` writes the digests into the header, which marks the store complete, and renames it. At an fsspec
-URL nothing is renamed: a part is whole once it has its zarr.json, which is copied last. The same sequences give the
-same bytes, in any order of the parts.
+missing parts, if its header and its code (`code_digest`) are those that began the store. `finish` writes the digests
+into the header, which marks the store complete, and publishes it. At an fsspec URL nothing is renamed: a part is whole
+once it has its zarr.json, which is copied last. The same sequences give the same bytes, in any order of the parts.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ import numpy as np
 import zarr
 from pydantic import PositiveInt
 
-from polarnet.runtime.files import check_room, claimed, sha256
+from polarnet.runtime.files import check_name, check_room, claimed, code_digest, publish, sha256
 from polarnet.runtime.sections import section
 from polarnet.storage.groups import REPAIR, GrowingColumns, is_url, open_group, raise_unreadable
 
@@ -113,10 +113,7 @@ class Store:
         sends it to the others that write. ValueError while a store that another process created at `path` is
         unfinished. With an fsspec URL as `path`, the store lies there from the start; ValueError if another store does.
         """
-        if not sequences:
-            raise ValueError("expected at least one name, got none")
-        if repeated := [name for name, times in Counter(sequences).items() if times > 1]:
-            raise ValueError(f"expected each name once, got {', '.join(repeated[:8])} again")
+        _check_names(sequences)
         if sequences_per_part < 1:
             raise ValueError(f"expected at least one sequence per part, got {sequences_per_part}")
         header = {
@@ -134,11 +131,12 @@ class Store:
         store = cls(os.fspath(path) if is_url(path) else str(Path(path).with_name(Path(path).name + ".tmp")), header)
         if not is_url(path):
             store._claim.enter_context(claimed(Path(path)))
-        if (known := _created(store.path)) != header:
+        begun = {**header, "code": code_digest()}
+        if (known := _created(store.path)) != begun:
             if known is not None and is_url(path):
                 raise ValueError(f"{path}: expected nothing there, or this store unfinished, got another; delete it")
             shutil.rmtree(store.path, ignore_errors=True)
-        zarr.open_group(store.path, mode="a", zarr_format=3).attrs.put(header)
+        zarr.open_group(store.path, mode="a", zarr_format=3).attrs.put(begun)
         return store
 
     @classmethod
@@ -164,6 +162,7 @@ class Store:
             raise ValueError(f"{path}: the attributes in zarr.json are not what was written; {REPAIR}")
         try:
             store = cls(os.fspath(path), header)
+            _check_names(store.sequences)
             if not store.columns or set(store.digests) != set(store.parts):
                 raise ValueError("expected a digest of every part")
         except (AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError) as error:
@@ -228,21 +227,11 @@ class Store:
             )
         header = {**self.header, "digests": {part: _digest(self._url(part, METADATA)) for part in self.parts}}
         zarr.open_group(self.path, mode="r+").attrs.put({**header, "checksum": _checksum(header)})
-        if not is_url(self.path):
-            self._rename()
-
-    def _rename(self) -> None:
-        """Move a finished store from PATH.tmp to PATH."""
-        folder = Path(self.path)
-        for leftover in [*folder.glob("*.tmp"), *folder.glob("*.partial")]:  # from processes killed while writing
+        if is_url(self.path):
+            return
+        for leftover in [*Path(self.path).glob("*.tmp"), *Path(self.path).glob("*.partial")]:  # of killed processes
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
-        final = folder.with_name(folder.name.removesuffix(".tmp"))
-        replaced = final.with_name(final.name + ".old")
-        shutil.rmtree(replaced, ignore_errors=True)
-        if final.exists():
-            os.replace(final, replaced)  # a folder cannot be renamed onto one that is not empty
-        os.replace(folder, final)
-        shutil.rmtree(replaced, ignore_errors=True)
+        publish(Path(self.path), Path(self.path.removesuffix(".tmp")))
         self._claim.close()
 
     def record(self, sequence: str) -> Header:
@@ -396,6 +385,14 @@ def unknown_sequence(sequence: str | None, sequences: list[str]) -> str:
     if len(sequences) > MAX_LISTED:
         listed += f", ... (`polarnet inspect` names all {len(sequences)})"
     return f"expected a sequence of {listed}; got {sequence!r}"
+
+
+def _check_names(sequences: Sequence[str]) -> None:
+    """ValueError unless the names of a store's sequences are at least one, each once, and safe in a path."""
+    if not sequences:
+        raise ValueError("expected at least one name, got none")
+    if repeated := [name for name, times in Counter(map(check_name, sequences)).items() if times > 1]:
+        raise ValueError(f"expected each name once, got {', '.join(repeated[:8])} again")
 
 
 def _checksum(header: Header) -> str:

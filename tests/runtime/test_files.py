@@ -1,9 +1,12 @@
 import hashlib
+import os
+import shutil
 import subprocess
 
 import pytest
 
-from polarnet.runtime.files import SUMS, changed_files, check_seal, replaced, seal, sha256
+from polarnet.runtime import files
+from polarnet.runtime.files import SUMS, changed_files, check_name, check_seal, publish, replaced, seal, sha256
 
 
 def test_the_hash_of_parts_is_that_of_their_concatenation(tmp_path):
@@ -40,7 +43,7 @@ def sealed(tmp_path):
     (tmp_path / "below").mkdir()
     for name in ("a", "below/b"):
         (tmp_path / name).write_text(f"content of {name}")
-    assert changed_files(tmp_path) == []
+    assert "SHA256SUMS is missing, so that nothing says whether" in changed_files(tmp_path)[0]
     seal(tmp_path)
     assert changed_files(tmp_path) == []
     return tmp_path
@@ -59,3 +62,73 @@ def test_a_changed_and_a_missing_file_are_named(sealed):
     assert changed_files(sealed, ["below/b"]) == [missing]
     with pytest.raises(ValueError, match="a is not the file"):
         check_seal(sealed)
+
+
+@pytest.mark.parametrize("emptied", ["all", "one"])
+def test_a_seal_must_name_every_file(sealed, emptied):
+    lines = (sealed / SUMS).read_text().splitlines(keepends=True)
+    (sealed / SUMS).write_text("" if emptied == "all" else lines[1])
+    assert changed_files(sealed)[0].startswith(f"{sealed / 'a'} is not in {sealed / SUMS}")
+    (sealed / ".DS_Store").touch()  # hidden files hold no results
+    seal(sealed)
+    assert changed_files(sealed) == []
+
+
+@pytest.mark.parametrize("name", ["", "..", "/tmp/x", "a/../../b", "a\\b", "a\nb", "x" * 300])
+def test_a_name_that_could_be_a_place_is_refused(name):
+    with pytest.raises(ValueError, match="expected a name without slashes"):
+        check_name(name)
+    assert check_name("lake 01 ü") == "lake 01 ü"
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL."""
+
+
+@pytest.mark.parametrize("exchange", [True, False])
+def test_a_published_folder_is_the_old_one_or_the_new_one_whenever_the_process_dies(tmp_path, monkeypatch, exchange):
+    rename, deaths = os.rename, 0
+    monkeypatch.setattr(files, "_exchanged", files._exchanged if exchange else lambda one, other: False)
+    for dies_at in range(10):
+        shutil.rmtree(tmp_path)
+        for name in ("out", "out.partial"):
+            (tmp_path / name).mkdir(parents=True)
+            (tmp_path / name / "a").write_text(name)
+        renames = iter(range(10))
+
+        def dying(source, target, renames=renames, dies_at=dies_at):
+            if next(renames) == dies_at:
+                raise Killed
+            rename(source, target)
+
+        monkeypatch.setattr(os, "rename", dying)
+        try:
+            publish(tmp_path / "out.partial", tmp_path / "out")
+        except Killed:
+            deaths += 1
+        monkeypatch.setattr(os, "rename", rename)
+        with files.claimed(tmp_path / "out"):
+            assert (tmp_path / "out" / "a").read_text() in ("out", "out.partial")
+    assert deaths == (1 if exchange else 2)
+    assert (tmp_path / "out" / "a").read_text() == "out.partial"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_bytes_are_on_the_disk_before_the_rename_and_the_name_after_it(tmp_path, monkeypatch):
+    calls, fsync, rename = [], os.fsync, os.rename
+    paths = {}
+
+    def opened(path, flags, *mode, open_file=os.open):
+        handle = open_file(path, flags, *mode)
+        paths[handle] = os.fspath(path)
+        return handle
+
+    monkeypatch.setattr(os, "open", opened)
+    monkeypatch.setattr(os, "fsync", lambda handle: (calls.append(paths[handle]), fsync(handle)))
+    monkeypatch.setattr(os, "rename", lambda one, other: (calls.append("rename"), rename(one, other)))
+    (tmp_path / "out.tmp" / "below").mkdir(parents=True)
+    (tmp_path / "out.tmp" / "below" / "b").write_text("b")
+    publish(tmp_path / "out.tmp", tmp_path / "out")
+    place = calls.index("rename")
+    assert {*calls[:place]} == {f"{tmp_path}/{name}" for name in ("out.tmp", "out.tmp/below", "out.tmp/below/b")}
+    assert calls[place + 1 :] == [str(tmp_path)]
