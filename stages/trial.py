@@ -5,11 +5,14 @@
 values of the simulation, such as `-m emulate.contrast_threshold_on=0.1,0.2`, makes its own. Jobs may run in parallel.
 
 A failed point writes the reason to `failure.txt`; the other points continue. The same command with the same
-`hydra.sweep.dir` continues a sweep: a point runs again unless all of its values and inputs are those of today.
+`hydra.sweep.dir` continues a sweep: a point runs again unless all of its values and inputs, and the code, are those of
+today.
 """
 
 import dataclasses
+import functools
 import io
+import os
 import subprocess
 import sys
 from collections import deque
@@ -25,6 +28,7 @@ from polarnet.config.origins import Run, Stage, digest
 from polarnet.config.sweep import FAILURE, mark_finished, why_unfinished
 from polarnet.config.tables import collect_rows
 from polarnet.config.tree import Config, check_ablation, hydra_command, typed
+from polarnet.runtime.files import code_digest
 from polarnet.runtime.machine import end_with_parent
 
 # The trained network and the references for it; no other method of the benchmark depends on the training.
@@ -62,7 +66,8 @@ def _failure_of_point(node: DictConfig, job: Path, overrides: list[str]) -> str 
     run = Run(ROOT, config, "trial")
     plan, inputs = _plan(run)
     values = {name: value for name, value in dataclasses.asdict(config).items() if name not in CHANGES_NO_RESULT}
-    record = {"values": values, "inputs": {dep: digest([config.place(dep)]) for dep in inputs}}
+    digests = {dep: digest([config.place(dep)]) for dep in inputs}
+    record = {"values": values, "inputs": digests, "code": code_digest()}
     reason = why_unfinished(job, record)
     if reason is None:
         print(f"{job} is finished already")
@@ -120,7 +125,8 @@ def quoted(value: str) -> str:
 def _failure(command: Sequence[str]) -> str | None:
     """Run a command, passing its errors on as they arrive; return its message if it fails, None if it succeeds."""
     lines: deque[str] = deque(maxlen=20)
-    with subprocess.Popen(command, stderr=subprocess.PIPE, preexec_fn=end_with_parent) as child:
+    bound = functools.partial(end_with_parent, os.getpid())
+    with subprocess.Popen(command, stderr=subprocess.PIPE, preexec_fn=bound) as child:
         assert child.stderr is not None
         for line in io.TextIOWrapper(child.stderr, errors="replace", newline=""):  # progress bars end lines with \r
             print(line, end="", file=sys.stderr, flush=True)

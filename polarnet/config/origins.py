@@ -1,8 +1,9 @@
-"""Origins: the values that each artefact was made with, kept beside it and compared by every stage that reads it.
+"""Origins: what each artefact was made with and from, kept beside it and compared by every stage that reads it.
 
 dvc.yaml is the one list of what a stage reads (`params`, `deps`) and makes (`outs`), for DVC and for stages that a
-person runs by hand. After a stage, each folder that it made holds `origin.json`: the values of its `params`, and those
-of its inputs. Before a stage, the origins of its inputs are compared with its own configuration.
+person runs by hand. After a stage, each folder that it made holds `origin.json`: its name, a digest of its files, the
+values of its `params` and those of its inputs, and digests of these. Before a stage, the origins of its inputs are
+compared with their files, with each other and with the configuration.
 """
 
 import dataclasses
@@ -17,20 +18,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ruamel.yaml import YAML
 
-from polarnet.runtime.files import replaced, sha256
+from polarnet.runtime.files import ORIGIN, REMAKE, replaced, sha256
 
 if TYPE_CHECKING:
     from polarnet.config.tree import Config
 
-ORIGIN = "origin.json"
 UNCOMPARED = ("rows",)
 """Keys that decide whether an artefact is made at all, not what it holds."""
 TEMPLATE = re.compile(r"\$\{([^}]+)\}")
 MAX_HASHED = 2**16  # bytes; larger files of a store or training have checksums in smaller ones
 ABSENT = "nothing"
-
-Origin = dict[str, Any]
-"""Value by key of params.yaml, where a key may name a section."""
 
 
 class Stage(NamedTuple):
@@ -100,44 +97,73 @@ class Run:
         of_script = [stage for stage in self.pipeline.values() if stage.script == script]
         exact = [stage for stage in of_script if set(stage.overrides) == chosen]
         self.stages = exact or ([] if chosen else of_script)  # without `row`, a script runs all rows
+        self._contents: dict[str, str] = {}
 
     def check_inputs(self) -> None:
-        """ValueError for the first value that an input was not made with, with the command that makes it anew."""
-        for dep in dict.fromkeys(dep for stage in self.stages for dep in stage.deps):
-            origin = self.origin_of(dep)
-            if origin and (change := self.change_since(origin)):
-                key, was, now = change
-                maker = self.maker_of(dep)
-                raise ValueError(
-                    f"{key}: {self.config.place(dep)} was made with {was}, this run has {now}; make it again with this "
-                    f"value (`dvc repro {maker.name}` after an edit of params.yaml, or `{shlex.join(maker.command)} "
-                    f"{key}={now}`), or run with {key}={was}"
-                )
+        """ValueError for the first artefact that is not what its name says, or was made from others than those here."""
+        for artefact in dict.fromkeys(made for stage in self.stages for made in self.made_inputs(stage)):
+            if problem := self.problem_of(artefact):
+                raise ValueError(problem)
 
     def write_origins(self) -> None:
         """Write the origin of each folder that the stages made."""
         for stage in self.stages:
-            origin: Origin = {}
-            for dep in stage.deps:
-                origin |= self.origin_of(dep) or {}
+            values: dict[str, Any] = {}
+            made = self.made_inputs(stage)
+            for artefact in made:
+                if origin := self.origin_of(artefact):
+                    values |= origin.values
             for key in (key for key in stage.params if key not in UNCOMPARED):
-                origin[key] = functools.reduce(operator.getitem, key.split("."), self.values)
-            for folder in (path for path in map(self.config.place, stage.outs) if path.is_dir()):
-                with replaced(folder / ORIGIN) as temporary:
-                    temporary.write_text(json.dumps(origin, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+                values[key] = functools.reduce(operator.getitem, key.split("."), self.values)
+            inputs = {artefact: self._content_of(artefact) for artefact in made}
+            for out, folder in ((out, self.config.place(out)) for out in stage.outs):
+                if folder.is_dir():
+                    write_origin(folder, Origin(out, digest([folder]), inputs, values))
 
-    def origin_of(self, artefact: str) -> Origin | None:
-        """Values that an artefact was made with; None if it keeps no origin, as files of a user do."""
-        path = self.config.place(artefact)
-        file = (path if path.is_dir() else path.parent) / ORIGIN
-        if not artefact.startswith("data/") or not file.is_file():
+    def made_inputs(self, stage: Stage) -> list[str]:
+        """The artefacts of other stages that a stage reads: its `deps`, or what they hold or are part of."""
+        outs = [out for other in self.pipeline.values() for out in other.outs if self.config.place(out).is_dir()]
+        related = [
+            out
+            for dep in map(PurePath, stage.deps)
+            for out in outs
+            if dep.is_relative_to(out) or PurePath(out).is_relative_to(dep)
+        ]
+        return list(dict.fromkeys(related))
+
+    def problem_of(self, artefact: str) -> str | None:
+        """Why an artefact cannot be used with this configuration; None if it can, or keeps no origin as a user's own.
+
+        ValueError for a damaged origin.
+        """
+        origin, place, maker = self.origin_of(artefact), self.config.place(artefact), self.maker_of(artefact)
+        command = shlex.join(maker.command)
+        if origin is None:
             return None
-        return json.loads(file.read_text(encoding="utf-8"))
+        if change := self.change_since(origin):
+            key, was, now = change
+            return (
+                f"{key}: {place} was made with {was}, this run has {now}; make it again with this value (`dvc repro "
+                f"{maker.name}` after an edit of params.yaml, or `{command} {key}={now}`), or run with {key}={was}"
+            )
+        again = f"make it again (`dvc repro {maker.name}`, or `{command}`)"
+        if origin.artefact != artefact:
+            return f"{place}: expected {artefact}, got a copy of {origin.artefact}; {again}"
+        if origin.content != self._content_of(artefact):
+            return f"{place}: its files are not those that `{command}` wrote; {again}"
+        for source, was in origin.inputs.items():
+            if self.config.place(source).is_dir() and self._content_of(source) != was:
+                return f"{place} was made from another {self.config.place(source)} than the one there now; {again}"
+        return None
 
-    def change_since(self, origin: Origin) -> tuple[str, Any, Any] | None:
+    def origin_of(self, artefact: str) -> "Origin | None":
+        """How an artefact was made; None if it keeps no origin, as files of a user do; ValueError for a damaged one."""
+        return read_origin(self.config.place(artefact))
+
+    def change_since(self, origin: "Origin") -> tuple[str, Any, Any] | None:
         """Key, old and new value of the first value that differs from an origin; None if all are equal."""
         now = json.loads(json.dumps(self.values))
-        for key, was in origin.items():
+        for key, was in origin.values.items():
             value: Any = now
             for part in key.split("."):
                 value = value.get(part, ABSENT) if isinstance(value, dict) else ABSENT
@@ -145,19 +171,64 @@ class Run:
                 return change
         return None
 
+    def _content_of(self, artefact: str) -> str:
+        """Digest of an artefact's folder at the first call: what the stages of this run read."""
+        if artefact not in self._contents:
+            self._contents[artefact] = digest([self.config.place(artefact)])
+        return self._contents[artefact]
+
     def is_made(self, artefact: str) -> bool:
         """Whether a stage makes an artefact."""
         return any(PurePath(artefact).is_relative_to(out) for stage in self.pipeline.values() for out in stage.outs)
 
     def is_stale(self, stage: Stage) -> bool:
-        """Whether an output of a stage is missing or was made with other values."""
-        origins = [self.origin_of(out) for out in stage.outs]
-        return any(origin is None or self.change_since(origin) is not None for origin in origins)
+        """Whether an output of a stage is missing, has no origin, or cannot be used with this configuration."""
+        return any(self.origin_of(out) is None or self.problem_of(out) is not None for out in stage.outs)
 
     def maker_of(self, artefact: str) -> Stage:
         """The stage that makes an artefact of the pipeline."""
         path = PurePath(artefact)
         return next(s for s in self.pipeline.values() if any(path.is_relative_to(out) for out in s.outs))
+
+
+class Origin(NamedTuple):
+    """How an artefact was made."""
+
+    artefact: str
+    """Its name in dvc.yaml."""
+    content: str
+    """`digest` of its folder."""
+    inputs: dict[str, str]
+    """`digest` of each artefact that it was made from, by name."""
+    values: dict[str, Any]
+    """The values that it and its inputs were made with, by key of params.yaml; a key may name a section."""
+
+
+def write_origin(folder: Path, origin: Origin) -> None:
+    """Write the origin of a folder, with a checksum of its own."""
+    content = json.loads(json.dumps(origin._asdict()))
+    with replaced(folder / ORIGIN) as temporary:
+        record = {**content, "sha256": _checksum(content)}
+        temporary.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def read_origin(folder: Path) -> Origin | None:
+    """The origin in a folder; None if there is none, ValueError if it is not as it was written."""
+    file = folder / ORIGIN
+    if not file.is_file():
+        return None
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        written = content.pop("sha256")
+        if _checksum(content) == written:
+            return Origin(**content)
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
+        pass
+    raise ValueError(f"{file} is not as it was written; {REMAKE}")
+
+
+def _checksum(content: Mapping[str, Any]) -> str:
+    return sha256(json.dumps(content, sort_keys=True).encode())
 
 
 def first_difference(was: Any, now: Any, key: str) -> tuple[str, Any, Any] | None:
@@ -171,13 +242,18 @@ def first_difference(was: Any, now: Any, key: str) -> tuple[str, Any, Any] | Non
 
 
 def digest(paths: Iterable[Path]) -> str:
-    """Hash of folders or files by the names and sizes of all files and the content of small ones.
+    """Hash of folders or files by the names and sizes of all files and the content of small ones, without origins.
 
-    The small files of an artefact (headers, SHA256SUMS, origins) hold the checksums of its large ones.
+    The small files of an artefact (headers, SHA256SUMS) hold the checksums of its large ones.
     """
     parts = []
     for path in paths:
-        for file in sorted(one for one in (path, *path.rglob("*")) if one.is_file()):
+        for file in sorted(one for one in (path, *path.rglob("*")) if one.is_file() and _counts(one)):
             parts.append(f"{file.relative_to(path)}\0{(size := file.stat().st_size)}\0".encode())
             parts += [file.read_bytes()] if size <= MAX_HASHED else []
     return sha256(*parts)
+
+
+def _counts(file: Path) -> bool:
+    """Whether a file is a part of an artefact: not its origin, a hidden or a temporary file."""
+    return file.name != ORIGIN and file.suffix != ".tmp" and not file.name.startswith(".")

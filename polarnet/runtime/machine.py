@@ -132,10 +132,15 @@ def precision_on(device: torch.device, precision: str) -> str:
     return precision
 
 
-def end_with_parent() -> None:
-    """Let Linux kill this process when the one that started it ends, however that ends; no effect on other systems."""
+def end_with_parent(parent: int) -> None:
+    """Let Linux kill this process when the one that started it ends, however that ends; no effect on other systems.
+
+    `parent` is the process number of that one, which may have ended already.
+    """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os.kill(os.getpid(), signal.SIGKILL)
 
 
 def keep_freed_memory() -> None:

@@ -1,11 +1,11 @@
 """Values that an artefact was made with, compared with those of the run that reads it."""
 
-import json
+import shutil
 from pathlib import Path
 
 import pytest
 
-from polarnet.config.origins import ORIGIN, Run, digest
+from polarnet.config.origins import ORIGIN, Run, digest, read_origin
 from polarnet.config.tree import Config, load
 
 
@@ -92,9 +92,38 @@ def test_an_artefact_is_stale_if_it_is_missing_or_of_other_values(run):
 
 def test_the_origin_of_an_artefact_holds_its_own_values_and_those_of_its_inputs(run, tmp_path):
     make_all(run, *SIMULATION)
-    origin = json.loads((tmp_path / "data" / "events.zarr" / ORIGIN).read_text())
-    assert {"ingest", "synthesize", "emulate", "polarizers", "readout", "seed"} <= set(origin)
-    assert not {"loss", "train", "runtime", "paths"} & set(origin)
+    origin = read_origin(tmp_path / "data" / "events.zarr")
+    assert {"ingest", "synthesize", "emulate", "polarizers", "readout", "seed"} <= set(origin.values)
+    assert not {"loss", "train", "runtime", "paths"} & set(origin.values)
+    assert origin.inputs == {"data/scenes.zarr": digest([tmp_path / "data" / "scenes.zarr"])}
+
+
+def test_an_artefact_in_anothers_place_or_of_another_run_is_refused(run, tmp_path):
+    make_all(run, *SIMULATION, "train", "row")
+    data = tmp_path / "data"
+    run("report").check_inputs()
+    rows = data / "benchmark" / "rows"
+    shutil.rmtree(rows / "cf")
+    shutil.copytree(rows / "highpass", rows / "cf")
+    with pytest.raises(ValueError, match=r"rows/cf: expected data/benchmark/rows/cf, got a copy of .*highpass; make it"):
+        run("report").check_inputs()
+    (data / "frames.zarr" / "zarr.json").write_text("of another run")
+    with pytest.raises(ValueError, match=r"frames.zarr: its files are not those that `python -m stages.synthesize`"):
+        run("train").check_inputs()
+    make_all(run, "emulate")
+    (data / "scenes.zarr" / "zarr.json").write_text("of another run")
+    run("synthesize").write_origins()
+    with pytest.raises(ValueError, match=r"events.zarr was made from another \S+scenes.zarr than the one there now"):
+        run("train").check_inputs()
+
+
+def test_an_origin_with_one_other_digit_is_refused(run, tmp_path):
+    make_all(run, *SIMULATION)
+    file = tmp_path / "data" / "frames.zarr" / ORIGIN
+    for content in (file.read_text().replace("0.2", "0.3"), "{", "[]", "[" * 100_000):
+        file.write_text(content)
+        with pytest.raises(ValueError, match=r"origin.json is not as it was written"):
+            run("train").check_inputs()
 
 
 def test_a_digest_changes_with_a_header_a_name_and_a_size(tmp_path):

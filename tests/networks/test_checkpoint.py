@@ -1,4 +1,3 @@
-import json
 from dataclasses import asdict
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import torch
 from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors, save_checkpoint
 from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
 from polarnet.networks.registry import load_network
+from polarnet.runtime.files import SUMS, seal
 
 CONFIG = DolpUNetConfig(
     channels=[4, 4, 4], swin_depth=1, swin_window=4, swin_heads=[1, 1], residual_blocks=1, input_mixing="contrasts"
@@ -24,9 +24,9 @@ def saved(tmp_path: Path) -> tuple[Path, DolpUNet]:
 
 
 def rewrite(path: Path, **changes: object) -> None:
-    """Change entries of the JSON beside a checkpoint."""
-    record = json.loads(path.with_suffix(".json").read_text())
-    path.with_suffix(".json").write_text(json.dumps(record | changes))
+    """Save a checkpoint again with other metadata, as a hostile file may have."""
+    tensors, metadata = load_checkpoint(path)
+    save_checkpoint(path, tensors, {key: value for key, value in metadata.items() if key != "sha256"} | changes)
 
 
 @torch.no_grad()
@@ -56,11 +56,38 @@ def test_another_file_under_a_checkpoints_name_is_refused(saved):
 def test_any_json_is_not_a_checkpoints_json(saved):
     path, _ = saved
     path.with_suffix(".json").write_text("[1, 2]")
-    with pytest.raises(ValueError, match="expected a polarnet-checkpoint-1"):
+    with pytest.raises(ValueError, match="expected a polarnet-checkpoint-2"):
         load_network(path)
-    path.with_suffix(".json").write_text("{")
-    with pytest.raises(ValueError, match="is not JSON"):
-        load_network(path)
+    for text in ("{", "[" * 100_000, "9" * 5000):
+        path.with_suffix(".json").write_text(text)
+        with pytest.raises(ValueError, match="is not JSON"):
+            load_network(path)
+
+
+def test_every_digit_of_the_json_is_covered_by_its_hash(saved):
+    record = saved[0].with_suffix(".json")
+    text = record.read_text()
+    for place in (place for place, letter in enumerate(text) if letter.isdigit()):
+        record.write_text(text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :])
+        with pytest.raises(ValueError):
+            load_checkpoint(saved[0])
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("-inf")])
+def test_weights_that_are_not_finite_are_refused_by_name(saved, value):
+    tensors, metadata = load_checkpoint(saved[0])
+    tensors["p1.bias"][0] = value
+    save_checkpoint(saved[0], tensors, metadata)
+    with pytest.raises(ValueError, match=r"n\.safetensors: expected finite weights, p1\.bias has NaN or infinity"):
+        load_network(saved[0])
+
+
+def test_a_seal_beside_a_checkpoint_must_vouch_for_both_files(saved):
+    (saved[0].parent / SUMS).touch()
+    with pytest.raises(ValueError, match=r"n\.json is not in .*SHA256SUMS"):
+        load_checkpoint(saved[0])
+    seal(saved[0].parent)
+    load_checkpoint(saved[0])
 
 
 def test_a_checkpoint_of_another_kind_of_network_is_refused(saved):

@@ -1,6 +1,7 @@
 """Checkpoints: tensors in NAME.safetensors, and all metadata needed to use them in NAME.json beside it.
 
-Loading runs no code from either file. Neither file contains a date, so equal trainings give equal bytes.
+The JSON holds one hash over the tensors and the metadata. Loading runs no code from either file. Neither file contains
+a date, so equal trainings give equal bytes.
 """
 
 import json
@@ -13,47 +14,66 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from polarnet.runtime.files import check_seal, replaced, sha256
+from polarnet.runtime.files import SUMS, check_seal, replaced, sha256
 
-FORMAT = "polarnet-checkpoint-1"
+FORMAT = "polarnet-checkpoint-2"
 
 
 def save_checkpoint(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
     """Write `path` (.safetensors) and the .json beside it.
 
-    `metadata` contains at least "network", "config" and "in_channels". The JSON is written last and contains the hash
-    of the tensors, so that loading rejects a pair of files from two different saves.
+    `metadata` contains at least "network", "config" and "in_channels". The JSON is written last; its hash rejects a
+    pair of files from two different saves.
     """
     path = Path(path)
     _check_suffix(path)
     content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
-    record = {"format": FORMAT, "sha256": sha256(content), **metadata}
+    plain = {key: value for key, value in {"format": FORMAT, **metadata}.items() if key != "sha256"}
+    record = {"format": FORMAT, "sha256": _digest(content, plain), **plain}
     for file, data in ((path, content), (path.with_suffix(".json"), (json.dumps(record, indent=2) + "\n").encode())):
         with replaced(file) as temporary:
             temporary.write_bytes(data)
 
 
 def load_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Load tensors (on the CPU) and metadata; ValueError or FileNotFoundError if the pair of files is not intact."""
+    """Load tensors (on the CPU) and metadata.
+
+    FileNotFoundError if a file of the pair is missing. ValueError if they are not a pair, if a number is not finite, or
+    if the folder has a seal that does not vouch for both.
+    """
     path = Path(path)
     _check_suffix(path)
-    for file in (path, path.with_suffix(".json")):
+    record = path.with_suffix(".json")
+    for file in (path, record):
         if not file.exists():
             raise FileNotFoundError(f"{file} is missing; a checkpoint is NAME.safetensors and NAME.json together")
-    check_seal(path.parent, [path.name, path.with_suffix(".json").name])
+    if (path.parent / SUMS).exists():
+        check_seal(path.parent, [path.name, record.name])
     try:
-        metadata = json.loads(path.with_suffix(".json").read_text())
-    except ValueError as error:
-        raise ValueError(f"{path.with_suffix('.json')} is not JSON: {error}") from None
+        metadata = json.loads(record.read_text())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{record} is not JSON: {error}") from None
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
-        raise ValueError(f"{path.with_suffix('.json')}: expected a {FORMAT}, but the file states another format")
+        raise ValueError(f"{record}: expected a {FORMAT}, but the file states another format; train the network again")
     content = path.read_bytes()
-    if sha256(content) != metadata.get("sha256"):
-        raise ValueError(f"{path} is not the file that {path.stem}.json describes; copy or train the pair again")
+    if _digest(content, metadata) != metadata.get("sha256"):
+        raise ValueError(
+            f"{path} is not the file that {record.name} describes, or that has changed; copy or train the pair again"
+        )
     try:
-        return load(content), metadata
+        tensors = load(content)
     except SafetensorError as error:
         raise ValueError(f"{path} is not a safetensors file: {error}") from None
+    for name, tensor in tensors.items():
+        if not tensor.isfinite().all():
+            raise ValueError(f"{path}: expected finite weights, {name} has NaN or infinity; train the network again")
+    return tensors, metadata
+
+
+def _digest(content: bytes, metadata: Mapping[str, Any]) -> str:
+    """SHA-256 of the tensors' file and of the metadata without its hash."""
+    plain = json.loads(json.dumps({key: value for key, value in metadata.items() if key != "sha256"}))  # as read back
+    return sha256(content, json.dumps(plain, sort_keys=True).encode())
 
 
 def trained_window_us(metadata: Mapping[str, Any]) -> int | None:

@@ -5,6 +5,7 @@ one process with the same batches, up to rounding. Without torchrun's environmen
 `add_up` and `wait_for_all` do nothing.
 """
 
+import functools
 import os
 import subprocess
 import sys
@@ -29,7 +30,7 @@ def launched(module: str, runtime: RuntimeConfig) -> bool:
         meeting = ["--rdzv-backend=c10d", f"--rdzv-endpoint={runtime.rendezvous}"]
     torchrun = ["torch.distributed.run", f"--nnodes={runtime.nodes}", f"--nproc-per-node={runtime.devices}", *meeting]
     command = [sys.executable, "-m", *torchrun, "-m", module, *sys.argv[1:]]
-    status = subprocess.run(command, preexec_fn=end_with_parent).returncode
+    status = subprocess.run(command, preexec_fn=functools.partial(end_with_parent, os.getpid())).returncode
     if status:
         raise RuntimeError(f"{module}: a process of {runtime.devices} on this machine failed; its message is above")
     return True
@@ -38,7 +39,7 @@ def launched(module: str, runtime: RuntimeConfig) -> bool:
 def join(device: torch.device) -> None:
     """Join the process group if torchrun has started several processes; this one then ends with torchrun."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        end_with_parent()
+        end_with_parent(os.getppid())
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
 
 
