@@ -2,7 +2,6 @@
 
 import functools
 import multiprocessing
-import os
 import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -67,9 +66,9 @@ def _over_processes(
     return [results[i] for i in range(len(items))]
 
 
-def _start_worker(threads: int, parent: int) -> None:
+def _start_worker(threads: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a worker without a traceback
-    end_with_parent(parent)
+    end_with_parent()
     limit_threads(threads)
     tune()
 
@@ -84,7 +83,7 @@ def _collect(
     """Add the missing entries of `results`, until all are there or the pool breaks."""
     spawn = multiprocessing.get_context("spawn")  # forking a process with running OpenMP threads can hang
     threads = max(1, usable_cores() // workers)
-    with ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(threads, os.getpid())) as pool:
+    with ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(threads,)) as pool:
         futures = {pool.submit(function, items[i]): i for i in range(len(items)) if i not in results}
         try:
             for future in as_completed(futures):

@@ -2,6 +2,7 @@
 
 import ctypes
 import hashlib
+import multiprocessing
 import os
 import platform
 import signal
@@ -132,15 +133,18 @@ def precision_on(device: torch.device, precision: str) -> str:
     return precision
 
 
-def end_with_parent(parent: int) -> None:
+def end_with_parent(parent: int | None = None) -> None:
     """Let Linux kill this process when the one that started it ends, however that ends; no effect on other systems.
 
-    `parent` is the process number of that one, which may have ended already.
+    That one may have ended already: `parent` is its process number; None: multiprocessing knows it.
     """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:
-            os.kill(os.getpid(), signal.SIGKILL)
+    if sys.platform != "linux":
+        return
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    starter = multiprocessing.parent_process()
+    lives = os.getppid() == parent if parent is not None else starter is None or starter.is_alive()
+    if not lives:
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def keep_freed_memory() -> None:

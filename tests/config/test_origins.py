@@ -105,7 +105,7 @@ def test_an_artefact_in_anothers_place_or_of_another_run_is_refused(run, tmp_pat
     rows = data / "benchmark" / "rows"
     shutil.rmtree(rows / "cf")
     shutil.copytree(rows / "highpass", rows / "cf")
-    with pytest.raises(ValueError, match=r"rows/cf: expected data/benchmark/rows/cf, got a copy of .*highpass; make it"):
+    with pytest.raises(ValueError, match=r"rows/cf: expected data/benchmark/rows/cf, got a copy of .*highpass; make"):
         run("report").check_inputs()
     (data / "frames.zarr" / "zarr.json").write_text("of another run")
     with pytest.raises(ValueError, match=r"frames.zarr: its files are not those that `python -m stages.synthesize`"):

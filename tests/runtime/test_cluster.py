@@ -1,11 +1,11 @@
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 from preloaded import FORKSERVER
 
@@ -60,14 +60,16 @@ def test_a_killed_worker_loses_nothing(tmp_path):
 
 
 @pytest.mark.thorough
-def test_workers_end_with_the_process_that_started_them(tmp_path):
+@pytest.mark.parametrize("moment", ["while they import", "at work"])
+def test_workers_end_with_the_process_that_started_them(tmp_path, moment):
     script = "import sys, test_cluster as t; t.pmap(t.note_and_sleep, [sys.argv[1]] * 2, workers=2, label='asleep')"
     paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    main = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], env={**os.environ, "PYTHONPATH": paths})
-    until(lambda: len(list(tmp_path.iterdir())) == 2)
+    main = psutil.Popen([sys.executable, "-c", script, str(tmp_path)], env={**os.environ, "PYTHONPATH": paths})
+    until(lambda: len(main.children() if moment == "while they import" else list(tmp_path.iterdir())) >= 2)
+    workers = main.children()
     main.kill()
     assert main.wait() == -signal.SIGKILL
-    until(lambda: not any(Path("/proc", note.name).exists() for note in tmp_path.iterdir()))
+    until(lambda: not any(worker.is_running() for worker in workers))
 
 
 def until(true) -> None:

@@ -39,7 +39,7 @@ def launched(module: str, runtime: RuntimeConfig) -> bool:
 def join(device: torch.device) -> None:
     """Join the process group if torchrun has started several processes; this one then ends with torchrun."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        end_with_parent(os.getppid())
+        end_with_parent()
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
 
 
