@@ -1,29 +1,28 @@
-"""What damaged files do, and whether bytes are the same elsewhere: python -m studies.faults [--only NAME] [--write]
+"""What damaged artefacts and killed writers do, and whether bytes are the same elsewhere: python -m studies.faults
 
-- artefacts: copies of the artefacts of a finished run are damaged, one file at a time: a flipped bit, a truncation, a
-  deletion, an exchange with another file of its kind, or a changed digit of a text. The reader of the next stage must
-  refuse the whole artefact with one line that names the file or the folder, or read the same values as before. --data
-  names the `paths.data` of the run (`polarnet preset smoke`, then `dvc repro`).
-- inputs: pictures, recordings, values of the configuration and checkpoints are damaged; half of the checkpoints get the
-  hash of the damaged tensors, as a hostile file would have. A case must end with a result or with a refusal of one
-  line. Other endings are a traceback, the end of the process (crash), or more than `HANG_S` seconds (hang).
+- artefacts: copies of the artefacts of a finished run are damaged, one after another, by one of FAULTS. Used as the
+  next stage would, an artefact must be refused with one line that names the file or the folder, or give the same values
+  as before. --runs names projects with a finished run (`polarnet preset smoke`, then `dvc repro`); the first is
+  damaged, the others, such as one with seed=2, serve for exchanges.
+- kills: writers are killed at a random rename. The old or the new result must be whole, and a rerun must work.
 - same_bytes: the stages ingest, synthesize and emulate run at smoke size on several workers, and with libraries that
   are restricted to older instructions of an x86-64 processor. Before each run, the libraries must say that they use no
   newer instructions. The files must be equal.
 
---write puts the counts into docs/results/reliability.json.
+--only NAME runs one of them; --write puts the counts into docs/results/reliability.json.
 """
 
 import hashlib
+import itertools
 import json
 import multiprocessing
 import os
 import platform
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,16 +30,18 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from safetensors.torch import save
 
 from polarnet.benchmark.row_results import read_record, read_rows
+from polarnet.cli.outputs import run_folder
+from polarnet.config.origins import Run
 from polarnet.config.tree import load
+from polarnet.events.stream import Events
 from polarnet.metrics.lpips import Lpips, stored_record
-from polarnet.networks.base.checkpoint import load_checkpoint, save_checkpoint
+from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.pictures.images import read_rgb
 from polarnet.pictures.manifest import read_manifest
-from polarnet.recordings.recording import FORMATS
-from polarnet.runtime.files import sha256
+from polarnet.runtime import files
+from polarnet.runtime.files import ORIGIN, SUMS, seal, sha256
 from polarnet.runtime.machine import generator_for
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
@@ -51,9 +52,6 @@ from studies.study import ROOT, arguments_of, command_line, machine_record, run_
 REFUSALS = (ValueError, OSError, RuntimeError, MemoryError)  # what stages and commands end with, in one line
 TEXTS = (".json", ".csv", "SHA256SUMS")
 OUTCOMES = ("refused", "harmless", "unnamed", "traceback", "silent", "lost")
-ENDINGS = ("read", "refused", "traceback", "crash", "hang")
-HANG_S = 30
-SECTIONS = ("ingest", "synthesize", "emulate", "loss", "train")  # whose parameters are replaced
 WORKERS = (2, 5)
 SMALL = ("experiment=smoke", "storage.sequences_per_part=2")  # ten parts, so that five workers have work
 OLD_PROCESSOR = {
@@ -68,8 +66,8 @@ OLD_PROCESSOR = {
 """Variables that keep numpy, torch, oneDNN, OpenCV, numba and the C library from AVX and FMA."""
 
 Generator = np.random.Generator
-Case = Callable[[Generator], object]
-"""Draws a damaged input and reads it."""
+Fault = Callable[[Path, Sequence[Path], Generator], None]
+"""Damages the artefact in a folder; further folders hold others of its kind."""
 
 
 def digest(*values: Any) -> str:
@@ -137,194 +135,217 @@ READERS: tuple[tuple[str, str, Callable[[Path], str]], ...] = (
 """Kind of artefact, its folders below `paths.data`, and its reader: the hash of all values that the next stage uses."""
 
 
-def damaged(content: bytes, fault: str, others: Sequence[Path], generator: Generator) -> bytes | None:
-    """The content of a file after `fault`, None if it is deleted; text without digits and a lone file stay."""
-    place, bit = int(generator.integers(len(content))), int(generator.integers(8))
-    if fault == "swap":
-        return others[int(generator.integers(len(others)))].read_bytes() if others else content
-    if fault == "truncation":
-        return content[:place]
-    if fault == "flip":
-        return content[:place] + bytes([content[place] ^ 1 << bit]) + content[place + 1 :]
-    if fault == "digit" and (digits := [place for place, byte in enumerate(content) if 48 <= byte <= 57]):
-        place = digits[int(generator.integers(len(digits)))]
-        return content[:place] + bytes([48 + (content[place] - 47) % 10]) + content[place + 1 :]
-    return None if fault == "deletion" else content
+def files_in(folder: Path) -> list[Path]:
+    """Files of an artefact that have content."""
+    return sorted(path for path in folder.rglob("*") if path.is_file() and path.stat().st_size)
 
 
-def outcome(read: Callable[[Path], str], folder: Path, file: Path, undamaged: str) -> tuple[str, str]:
-    """One of OUTCOMES for a damaged file, and the reader's message."""
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.stat().st_size < 2**16}
+def flip(content: bytes, generator: Generator) -> bytes:
+    """One other bit."""
+    place = int(generator.integers(len(content)))
+    return content[:place] + bytes([content[place] ^ 1 << int(generator.integers(8))]) + content[place + 1 :]
+
+
+def truncation(content: bytes, generator: Generator) -> bytes:
+    """The end lost, as after a power cut."""
+    return content[: int(generator.integers(len(content)))]
+
+
+def digit(content: bytes, generator: Generator) -> bytes:
+    """One other digit; content without digits stays."""
+    places = [place for place, byte in enumerate(content) if 48 <= byte <= 57]
+    if not places:
+        return content
+    place = places[int(generator.integers(len(places)))]
+    return content[:place] + bytes([48 + (content[place] - 47) % 10]) + content[place + 1 :]
+
+
+def one_file(change: Callable[[bytes, Generator], bytes], endings: tuple[str, ...] = ("",)) -> Fault:
+    """The fault that changes one file whose name has one of these endings."""
+
+    def fault(folder: Path, others: Sequence[Path], generator: Generator) -> None:
+        files = [file for file in files_in(folder) if file.name.endswith(endings)]
+        if files:
+            file = files[int(generator.integers(len(files)))]
+            file.write_bytes(change(file.read_bytes(), generator))
+
+    return fault
+
+
+def deletion(folder: Path, others: Sequence[Path], generator: Generator) -> None:
+    """One file less."""
+    files = files_in(folder)
+    files[int(generator.integers(len(files)))].unlink()
+
+
+def exchange_of_files(folder: Path, others: Sequence[Path], generator: Generator) -> None:
+    """One file replaced by another of its kind, in this artefact or in another of its kind."""
+    files = files_in(folder)
+    file = files[int(generator.integers(len(files)))]
+    alike = [one for place in (folder, *others) for one in files_in(place) if one.suffix == file.suffix and one != file]
+    if alike:
+        shutil.copy(alike[int(generator.integers(len(alike)))], file)
+
+
+def exchange_of_artefacts(folder: Path, others: Sequence[Path], generator: Generator) -> None:
+    """The whole artefact replaced by another of its kind, of this run or of one with another seed."""
+    if others:
+        shutil.rmtree(folder)
+        shutil.copytree(others[int(generator.integers(len(others)))], folder)
+
+
+def without_seal(folder: Path, others: Sequence[Path], generator: Generator) -> None:
+    """The seal or the origin removed or emptied, and then one other digit in a text."""
+    seals = [file for file in files_in(folder) if file.name in (SUMS, ORIGIN)]
+    for file in seals:
+        file.unlink() if generator.random() < 0.5 else file.write_bytes(b"")
+    one_file(digit, TEXTS)(folder, others, generator)
+
+
+def sealed_again(folder: Path, others: Sequence[Path], generator: Generator) -> None:
+    """One other digit in a text, and a seal that fits it."""
+    one_file(digit, (".json", ".csv"))(folder, others, generator)
+    if (folder / SUMS).exists():
+        seal(folder)
+
+
+FAULTS: dict[str, Fault] = {
+    "flipped bit": one_file(flip),
+    "truncation": one_file(truncation),
+    "other digit": one_file(digit, TEXTS),
+    "deletion": deletion,
+    "exchange of files": exchange_of_files,
+    "exchange of artefacts": exchange_of_artefacts,
+    "no seal": without_seal,
+    "sealed again": sealed_again,
+}
+
+
+def outcome(use: Callable[[], str], folder: Path, undamaged: str) -> tuple[str, str]:
+    """One of OUTCOMES for a damaged artefact, and the message."""
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     try:
-        same = read(folder) == undamaged
-        result = ("harmless", "") if same else ("silent", "other values")
+        result = ("harmless", "") if use() == undamaged else ("silent", "other values")
     except REFUSALS as error:
-        named = any(name in str(error) for name in (file.name, file.stem, str(folder)))
+        named = folder.name in str(error) or any(path.name in str(error) for path in before)
         result = ("refused" if named and "\n" not in str(error) else "unnamed"), str(error)
     except Exception as error:
         result = "traceback", repr(error)
-    changed = any(not path.exists() or path.read_bytes() != content for path, content in before.items())
-    return ("lost", "the reader changed files") if changed else result
+    changed = {path for path in folder.rglob("*") if path.is_file()} != {*before}
+    lost = changed or any(path.read_bytes() != content for path, content in before.items())
+    return ("lost", "the reader changed files") if lost else result
 
 
-def inject(data: Path, faults: int, seed: int) -> tuple[dict[str, dict[str, int]], list[str]]:
-    """Outcomes of `faults` faults by kind of artefact, and a line for each one that is neither refused nor harmless."""
+def inject(runs: Sequence[Path], faults: int, seed: int) -> tuple[dict[str, dict[str, int]], list[str]]:
+    """Outcomes of `faults` faults by kind (FAULT of ARTEFACT), and a line for each that is no refusal and not harmless.
+
+    The artefacts of the first of `runs` (each the root of a project with a finished run) are damaged in a copy, and
+    used as the report would: their origins are compared, then all values are read. Others serve for exchanges.
+    """
     generator = generator_for(seed, "faults", "place and kind")
+    counts: dict[str, dict[str, int]] = {}
     lines: list[str] = []
     with tempfile.TemporaryDirectory() as scratch:
-        copies: dict[str, list[tuple[Callable[[Path], str], Path, str]]] = {}
-        folders = [(kind, read, folder) for kind, pattern, read in READERS for folder in sorted(data.glob(pattern))]
-        for number, (kind, read, folder) in enumerate(folders):
-            if any(folder.iterdir()):
-                shutil.copytree(folder, copy := Path(scratch, str(number), folder.name))
-                copies.setdefault(kind, []).append((read, copy, read(copy)))
-        if not copies:
-            raise SystemExit(f"--data {data}: no artefacts of a run there; `dvc repro` makes some")
-        counts = {kind: dict.fromkeys(OUTCOMES, 0) for kind in sorted(copies)}
+        data = shutil.copytree(runs[0] / "data", Path(scratch, "data"))
+        config = load(runs[0], [f"paths.data={data}"])
+        every = [(kind, read, folder) for kind, at, read in READERS for folder in sorted(data.glob(at))]
+        found = [one for one in every if files_in(one[2])]
+        if not found:
+            raise SystemExit(f"--runs {runs[0]}: no artefacts of a run there; `dvc repro` makes some")
+        sound = {folder: read(folder) for _, read, folder in found}
         for number in range(faults):
-            kind = [*counts][number % len(counts)]
-            read, folder, undamaged = copies[kind][int(generator.integers(len(copies[kind])))]
-            files = sorted(path for path in folder.rglob("*") if path.is_file() and path.stat().st_size)
-            file = files[int(generator.integers(len(files)))]
-            possible = ["flip", "truncation", "deletion", "swap", *(["digit"] if file.name.endswith(TEXTS) else [])]
-            fault, content = possible[int(generator.integers(len(possible)))], file.read_bytes()
-            others = [path for path in files if path.suffix == file.suffix and path != file]
-            file.unlink()
-            if (after := damaged(content, fault, others, generator)) is not None:
-                file.write_bytes(after)
-            what, message = outcome(read, folder, file, undamaged)
-            file.write_bytes(content)
-            counts[kind][what] += 1
+            kind, read, folder = found[number % len(found)]
+            name = [*FAULTS][int(generator.integers(len(FAULTS)))]
+            alike = [other for one, _, other in found if (one, other.suffix) == (kind, folder.suffix)]
+            others = [other for other in alike if other != folder]
+            others += [run / "data" / folder.relative_to(data) for run in runs[1:]]
+            kept = shutil.copytree(folder, Path(scratch, "kept"))
+            FAULTS[name](folder, others, generator)
+
+            def use(read: Callable[[Path], str] = read, folder: Path = folder) -> str:
+                Run(runs[0], config, "report").check_inputs()
+                return read(folder)
+
+            what, message = outcome(use, folder, sound[folder])
+            shutil.rmtree(folder)
+            kept.rename(folder)
+            counts.setdefault(f"{name} of {kind}", dict.fromkeys(OUTCOMES, 0))[what] += 1
             if what not in ("refused", "harmless"):
-                lines.append(f"{what}: {fault} of {file.relative_to(scratch)} ({kind}): {message}")
+                lines.append(f"{what}: {name} of {folder.relative_to(data)}: {message}")
                 print(lines[-1], flush=True)
-    return counts, lines
+    return dict(sorted(counts.items())), lines
 
 
-def changed(content: bytes, generator: Generator) -> bytes:
-    """Bytes with one to four changes: a bit, a number of four bytes, a cut, a deletion, a repetition, an insertion."""
-    for _ in range(int(generator.integers(1, 5))):
-        reach = min(len(content), 200) if generator.random() < 0.5 else len(content)  # headers are at the start
-        place, length = int(generator.integers(max(1, reach))), int(generator.integers(1, 40))
-        head, tail = content[:place], content[place:]
-        tails = (
-            bytes([tail[0] ^ 1 << length % 8]) + tail[1:] if tail else tail,
-            int(generator.integers(2**32)).to_bytes(4, "little") + tail[4:],
-            b"" if length < 10 else tail,
-            tail[length:],
-            tail[:length] * 2 + tail[length:],
-            generator.bytes(length % 12) + tail,
-        )
-        content = head + tails[int(generator.integers(len(tails)))]
-    return content
+def write_folder(place: Path, value: str) -> None:
+    """A run of a command that writes 30 files of a value."""
+    with run_folder(place, "recover") as partial:
+        for number in range(30):
+            (partial / f"{number}.txt").write_text(value)
 
 
-def pictures(folder: Path) -> Case:
-    """Small pictures of six formats."""
-    rgb = generator_for(0, "faults", "picture").integers(0, 256, (12, 16, 3)).astype(np.uint8)
-    files = [folder / f"picture.{extension}" for extension in ("png", "jpg", "tif", "bmp", "webp", "hdr")]
-    for file in files:
-        cv2.imwrite(str(file), rgb.astype(np.float32) / 255 if file.suffix == ".hdr" else rgb)
-    sound = {file: file.read_bytes() for file in files}
-
-    def case(generator: Generator) -> object:
-        file = files[int(generator.integers(len(files)))]
-        file.write_bytes(changed(sound[file], generator))
-        return read_rgb(file)
-
-    return case
+def read_folder(place: Path) -> set[str]:
+    """The values in the folder of a command."""
+    return {file.read_text() for file in place.glob("*.txt")}
 
 
-def recordings(folder: Path) -> Case:
-    """Small recordings of every format whose library is installed, as tests/recordings makes them."""
-    sys.path[:0] = [str(ROOT / "tests" / "recordings"), str(ROOT / "tests")]
-    from damaged_files import EVENTS, Sample
-    from recording_fixtures import random_events
-
-    samples = [Sample(form, folder, random_events(0, EVENTS, 300_000, 260, 346)) for form in FORMATS]
-
-    def case(generator: Generator) -> None:
-        sample = samples[int(generator.integers(len(samples)))]
-        number = int(generator.integers(len(sample.sound)))
-        content, says_format = changed(sample.sound[number], generator), generator.random() < 0.8
-        if sample.ending_of(content, number, says_format, int(generator.integers(1, 101))) == "refused":
-            raise ValueError("refused")
-
-    return case
+def write_store(place: Path, value: str) -> None:
+    """A store of three parts with a value as its attribute and in its events."""
+    store = EventStore.create(place, ["a", "b", "c"], 8, 9, {"value": value})
+    for name in store.missing():
+        t = torch.full((50,), int(value))
+        x = torch.ones(50)
+        store.write(name, [Events(t, x.short(), x.short(), x.to(torch.int8), 8, 9)] * 4, 5000)
+    store.finish()
 
 
-def parameters(folder: Path) -> Case:
-    """Values of the configuration, replaced by others of any kind on the command line."""
-    config = load(ROOT)
-    keys = [f"{name}.{key}" for name in SECTIONS for key in vars(getattr(config, name))]
-    values = ("0", "-1", "3.5", "1e300", "nan", "inf", "true", "null", "''", "../x", "[]", "[[]]", "{a: 1}", "x" * 500)
-
-    def case(generator: Generator) -> object:
-        chosen = generator.choice(keys, int(generator.integers(1, 4)))
-        return load(ROOT, [f"{key}={values[int(generator.integers(len(values)))]}" for key in chosen])
-
-    return case
+def read_events(place: Path) -> set[str]:
+    """The values in a store of `write_store`."""
+    store = EventStore.open(place)
+    return {str(int(t)) for name in store.sequences for t in store.read(name)[0].t} | {store.attributes["value"]}
 
 
-def checkpoints(folder: Path) -> Case:
-    """A checkpoint; half of the damaged tensor files have the hash that the record names."""
-    path = folder / "best.safetensors"
-    tensors = {"w": torch.arange(12.0).view(3, 4), "b": torch.zeros(3)}
-    save_checkpoint(path, tensors, {"network": "x", "config": {"a": 1}, "in_channels": 4})
-    record, weights = path.with_suffix(".json").read_text(), save(tensors)
-
-    def case(generator: Generator) -> object:
-        content, text = weights, record.encode()
-        if generator.random() < 0.6:
-            content = changed(weights, generator)
-            if generator.random() < 0.5:
-                text = json.dumps(json.loads(record) | {"sha256": sha256(content)}).encode()
-        else:
-            text = changed(text, generator)
-        path.write_bytes(content)
-        path.with_suffix(".json").write_bytes(text)
-        return load_checkpoint(path)
-
-    return case
+WRITERS: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], set[str]]]] = {
+    "folder of a command": (write_folder, read_folder),
+    "store": (write_store, read_events),
+}
+"""What is killed while it replaces an old result with a new one, and what reads the values there."""
 
 
-KINDS = {each.__name__: each for each in (pictures, recordings, parameters, checkpoints)}
+def killed_write(write: Callable[[Path, str], None], place: Path, value: str, after: int) -> None:
+    """In a process of its own: write, and die by SIGKILL before call `after` of a rename."""
+    calls = itertools.count()
+
+    def dying(call: Callable[..., Any]) -> Callable[..., Any]:
+        def call_or_die(*paths: Any) -> Any:
+            if next(calls) == after:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return call(*paths)
+
+        return call_or_die
+
+    os.rename, os.replace, files._exchanged = dying(os.rename), dying(os.replace), dying(files._exchanged)
+    write(place, value)
 
 
-def run_cases(kind: str, cases: int, counts: Any, state: Any) -> None:
-    """In a process of its own: run the cases from number `state[0]` on; `state[1]` is the time at which one began."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libpng and others write lines about damage
-    with tempfile.TemporaryDirectory() as scratch:
-        case = KINDS[kind](Path(scratch))
-        while (number := int(state[0])) < cases:
-            state[0], state[1] = number + 1, time.time()
-            try:
-                case(generator_for(1, f"{kind} {number}", "faults"))
-                what = "read"
-            except REFUSALS as error:
-                what = "traceback" if kind != "parameters" and "\n" in str(error) else "refused"
-            except Exception as error:
-                what = "traceback"
-                print(f"{kind} {number}: {error!r}", flush=True)
-            counts[ENDINGS.index(what)] += 1
-
-
-def endings_of(kind: str, cases: int) -> dict[str, int]:
-    """Endings of the cases of a kind; a new process replaces one that crashes or hangs, from the next case on."""
-    context = multiprocessing.get_context("spawn")
-    counts, state = context.RawArray("q", len(ENDINGS)), context.RawArray("d", 2)
-    while state[0] < cases:
-        state[1] = time.time() + 60  # setting up takes time, too
-        process = context.Process(target=run_cases, args=(kind, cases, counts, state), daemon=True)
-        process.start()
-        while process.is_alive() and time.time() - state[1] < HANG_S:
-            process.join(1)
-        if process.is_alive() or process.exitcode:
-            counts[ENDINGS.index("hang" if process.is_alive() else "crash")] += 1
-            print(f"{kind} {state[0] - 1:.0f}: ended with {process.exitcode}", flush=True)
-            process.kill()
-            process.join()
-    return dict(zip(ENDINGS, counts, strict=True))
+def kills(cases: int) -> dict[str, dict[str, int]]:
+    """Outcomes of writers killed at any rename: the old or the new result is whole, or lost; no rerun works: stuck."""
+    counts = {f"kill of a {name}": dict.fromkeys(("whole", "lost", "stuck"), 0) for name in WRITERS}
+    for name, (write, read) in WRITERS.items():
+        with tempfile.TemporaryDirectory() as scratch:
+            place, value = Path(scratch, "place"), 1
+            write(place, str(value))
+            for number in range(cases):
+                after = int(80 ** generator_for(number, name, "kill").random()) - 1  # folders have few renames
+                process = multiprocessing.get_context("fork").Process(
+                    target=killed_write, args=(write, place, str(value + 1), after)
+                )
+                process.start()
+                process.join()
+                what = "whole" if read(place) in ({str(value)}, {str(value + 1)}) else "lost"
+                value += 2
+                write(place, str(value))
+                counts[f"kill of a {name}"][what if read(place) == {str(value)} else "stuck"] += 1
+    return counts
 
 
 def older_processor() -> dict[str, str]:
@@ -374,19 +395,19 @@ def same_bytes() -> dict[str, dict[str, Any]]:
 
 def main() -> None:
     """The command line."""
-    names = ("artefacts", "inputs", "same_bytes")
     parser = command_line(__doc__, "docs/results/reliability.json")
-    parser.add_argument("--only", choices=names, help="default: all three")
-    parser.add_argument("--data", type=Path, default=ROOT / "data", help="`paths.data` of a finished run")
+    parser.add_argument("--only", choices=("artefacts", "kills", "same_bytes"), help="default: all three")
+    parser.add_argument("--runs", type=Path, nargs="+", default=[ROOT], help="projects with finished runs")
     parser.add_argument("--faults", type=int, default=1000)
-    parser.add_argument("--cases", type=int, default=10_000, help="damaged inputs of each kind")
+    parser.add_argument("--kills", type=int, default=100, help="of each kind")
     arguments = arguments_of(parser)
-    for name in [arguments.only] if arguments.only else names:
-        record = machine_record()
-        if name == "artefacts":
-            figures: Mapping[str, Any] = inject(arguments.data, arguments.faults, seed=1)[0]
-        else:
-            figures = same_bytes() if name == "same_bytes" else {k: endings_of(k, arguments.cases) for k in KINDS}
+    studies: dict[str, Callable[[], Mapping[str, Any]]] = {
+        "artefacts": lambda: inject(arguments.runs, arguments.faults, seed=1)[0],
+        "kills": lambda: kills(arguments.kills),
+        "same_bytes": same_bytes,
+    }
+    for name in [arguments.only] if arguments.only else studies:
+        record, figures = machine_record(), studies[name]()
         print(name, json.dumps(figures, indent=2))
         if arguments.write:
             write_section("reliability", name, figures, record)
