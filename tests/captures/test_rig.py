@@ -14,8 +14,7 @@ from polarnet.captures.dot import (
     RecordingsConfig,
     find_captures,
 )
-from polarnet.captures.imported import import_targets
-from polarnet.captures.targets import calibrate_targets
+from polarnet.captures.targets import calibrate_targets, import_targets
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
