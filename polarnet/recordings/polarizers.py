@@ -7,15 +7,14 @@ counts nor between pairings saw no polarization.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 
-from polarnet.events.stream import Events, slice_time
+from polarnet.events.stream import slice_time
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
 from polarnet.recordings.live import Piece
-from polarnet.recordings.pixels import HOT_FACTOR, event_counts, hot_pixels, without_pixels
+from polarnet.recordings.noise import HOT_FACTOR, event_counts, hot_pixels, without_pixels
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 WINDOW_US = 33_333
@@ -34,15 +33,6 @@ PAIRS = (((0, 90), (45, 135)), ((0, 45), (90, 135)), ((0, 135), (45, 90)))
 """The three pairings of the four angles; the first pairs polarizers at right angles."""
 EXCHANGED = ((45, 90), (90, 135))
 """Angles to exchange where the second or the third of `PAIRS` fits best, so that the first does."""
-
-
-class Misfits(NamedTuple):
-    """Differences between the sums of two pairs of channels."""
-
-    rms: Float64[np.ndarray, " 3"]
-    """Difference in ON minus OFF events per block and window, for each of `PAIRS`."""
-    blocks: int
-    """Number of blocks with events, over all windows."""
 
 
 class ChannelCheck:
@@ -67,22 +57,34 @@ class ChannelCheck:
 
     def findings(self) -> list[str]:
         """Problems found, a sentence each; empty if there are none, or too few events to judge."""
-        findings = channel_findings(pair_misfits(self._windows), self.counts, mosaic=self._mosaic)
-        return findings + disturbing_pixels(self._windows)
+        seconds = len(self._windows) * WINDOW_US * 1e-6
+        counts = np.sum([[event_counts(e) for e in window.channels] for window in self._windows] or [[]], axis=0)
+        hot = [hot_pixels(count, seconds, HOT_FACTOR) for count in counts]
+        findings = _channel_findings(*pair_misfits(self._windows, hot), self.counts, self._mosaic)
+        if disturbing := sum(
+            int((bad & (n > DISTURBING_HZ * seconds)).sum()) for n, bad in zip(counts, hot, strict=True)
+        ):
+            findings.append(
+                f"Hot pixels with more than {DISTURBING_HZ:,.0f} events a second: {disturbing}. DoLP is wrong in the "
+                f"whole image; remove them with --hot-pixels found, or for a live camera with --hot-pixels FILE."
+            )
+        return findings
 
 
-def channel_findings(misfits: Misfits, counts: Sequence[int], *, mosaic: bool) -> list[str]:
-    """Problems shown by the misfits and counts of the four channels, a sentence each; empty without enough evidence."""
+def _channel_findings(
+    misfits: Float64[np.ndarray, " 3"], blocks: int, counts: Sequence[int], mosaic: bool
+) -> list[str]:
+    """Problems shown by `pair_misfits` and the counts of the channels; empty without enough evidence."""
     silent = [f"{angle}" for angle, count in zip(POLARIZER_ANGLES_DEG, counts, strict=True) if count == 0]
     if silent:
         return [f"There are no events behind the polarizer at {' and '.join(silent)} degrees. DoLP and AoLP are wrong."]
-    if misfits.blocks < MIN_BLOCKS:
+    if blocks < MIN_BLOCKS:
         return []
-    if not misfits.rms.any():
+    if not misfits.any():
         return ["The four channels are the same, event by event: one recording was given four times."]
-    if not misfits.rms[0]:
+    if not misfits[0]:
         return []
-    ratio = misfits.rms / misfits.rms[0]
+    ratio = misfits / misfits[0]
     spread = max(counts) / min(counts)
     if spread < EQUAL_COUNTS and ratio.max() < (EQUAL_MISFITS_MOSAIC if mosaic else EQUAL_MISFITS):
         return [
@@ -103,56 +105,24 @@ def channel_findings(misfits: Misfits, counts: Sequence[int], *, mosaic: bool) -
     return []
 
 
-def disturbing_pixels(windows: Sequence[EventWindow]) -> list[str]:
-    """A sentence about hot pixels with so many events that they change DoLP of the whole image; empty without them."""
-    if not windows:
-        return []
-    seconds = len(windows) * WINDOW_US * 1e-6
-    counts, hot = _counts_and_hot_pixels(windows)
-    disturbing = sum(
-        int((bad & (count > DISTURBING_HZ * seconds)).sum()) for count, bad in zip(counts, hot, strict=True)
-    )
-    if not disturbing:
-        return []
-    return [
-        f"Hot pixels with more than {DISTURBING_HZ:,.0f} events a second: {disturbing}. DoLP is wrong in the whole "
-        f"image; remove them with --hot-pixels found, or for a live camera with --hot-pixels FILE."
-    ]
+def pair_misfits(
+    windows: Sequence[EventWindow], hot: Sequence[Bool[np.ndarray, "h w"]]
+) -> tuple[Float64[np.ndarray, " 3"], int]:
+    """Root mean square difference between the sums of each of `PAIRS` of channels, without hot pixels.
 
-
-def pair_misfits(windows: Sequence[EventWindow]) -> Misfits:
-    """Differences between the sums of each pairing of the channels, without hot pixels.
-
-    OFF events are weighted so that all ON and OFF events of the recording cancel, since the two thresholds may differ.
+    The sums are ON minus OFF events per block and window. The second value is the number of blocks with events. OFF
+    events are weighted so that all ON and OFF events cancel, since the two thresholds may differ.
     """
-    if not windows:
-        return Misfits(np.zeros(3), 0)
-    first = windows[0].channels[0]
-    _, hot = _counts_and_hot_pixels(windows)
     cleaned = [[without_pixels(e, bad) for e, bad in zip(w.channels, hot, strict=True)] for w in windows]
     on = sum(int((events.p > 0).sum()) for channels in cleaned for events in channels)
     off = sum(len(events) for channels in cleaned for events in channels) - on
-    columns = -(-first.width // BLOCK)
-    blocks = -(-first.height // BLOCK) * columns
     squares, lit = np.zeros(3), 0
     for channels in cleaned:
-        place = [_block(events, columns) for events in channels]
-        sums = dict(zip(POLARIZER_ANGLES_DEG, (
-            np.bincount(at, np.where(events.p.numpy() > 0, 1.0, -on / max(off, 1)), blocks)
-            for at, events in zip(place, channels, strict=True)
-        ), strict=True))  # fmt: skip
+        columns = -(-channels[0].width // BLOCK)
+        blocks = -(-channels[0].height // BLOCK) * columns
+        place = [(e.y.long() // BLOCK * columns + e.x // BLOCK).numpy() for e in channels]
+        weights = [np.where(e.p.numpy() > 0, 1.0, -on / max(off, 1)) for e in channels]
+        sums = dict(zip(POLARIZER_ANGLES_DEG, map(np.bincount, place, weights, [blocks] * 4), strict=True))
         lit += int(np.count_nonzero(np.bincount(np.concatenate(place), minlength=blocks)))
         squares += [((sums[a] + sums[b] - sums[c] - sums[d]) ** 2).sum() for (a, b), (c, d) in PAIRS]
-    return Misfits(np.sqrt(squares / max(lit, 1)), lit)
-
-
-def _counts_and_hot_pixels(
-    windows: Sequence[EventWindow],
-) -> tuple[Int64[np.ndarray, "channels h w"], list[Bool[np.ndarray, "h w"]]]:
-    """Number of events of each pixel of the channels, and which of these pixels are hot."""
-    counts = np.sum([[event_counts(events) for events in window.channels] for window in windows], axis=0)
-    return counts, [hot_pixels(count, len(windows) * WINDOW_US * 1e-6, HOT_FACTOR) for count in counts]
-
-
-def _block(events: Events, columns: int) -> Int64[np.ndarray, " n"]:
-    return events.y.numpy().astype(np.int64) // BLOCK * columns + events.x.numpy() // BLOCK
+    return np.sqrt(squares / max(lit, 1)), lit

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import strategies as st
 
 from polarnet.events.stream import Events, slice_count, validate
-from polarnet.recordings.formats.celex5_bin import celex5_pictures
+from polarnet.recordings.formats.celex5 import celex5_pictures
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import REPAIRS, RecordingError
 from polarnet.storage.events import EventStore

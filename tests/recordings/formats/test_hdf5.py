@@ -80,7 +80,7 @@ def test_other_columns_are_refused_by_name(tmp_path, columns, message):
 
 
 def test_e2p_of_another_shape_is_refused(tmp_path):
-    with pytest.raises(RecordingError, match="the four columns t, x, y, p of events, got 3"):
+    with pytest.raises(RecordingError, match=r"expected events as a table of another shape, got \(1, 3\)"):
         read_recording(write_e2p(tmp_path / "a.h5", [[1, 2, 3]]))
     with pytest.raises(RecordingError, match="expected width and height as sensor_resolution"):
         read_recording(write_e2p(tmp_path / "b.h5", [[1, 2, 3, 1]], (1, 2, 3)))

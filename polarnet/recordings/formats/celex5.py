@@ -1,0 +1,301 @@
+"""Files of a CeleX-5: raw ones (BIN, little endian), and event lists from the vendor's converter (CSV).
+
+A BIN file has packages of events or of a full picture, as the sensor sends them. A header gives the data type (bit 0
+loop mode, bit 1 IMU), the modes of the sensor, the event format, the time of day and the number of packages. Each
+package is a length and that many bytes. With an IMU, the computer's time in milliseconds and the IMU's samples follow.
+The last byte of a package is 0 for a full picture.
+
+The sensor sends 14-bit words, four in 7 bytes: the high 8 bits of each, then the low 6 of all. An item is two words,
+and its two lowest bits give its kind. Time stamps of 16 bits wrap around.
+
+A line of CSV is row, column, intensity (0 to 4095), polarity (-1, 0 or 1), t in Event Intensity mode. The modes without
+polarity have three or four columns: row, column, t of the pixel, and t of the readout.
+"""
+
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple, no_type_check
+
+import numba
+import numpy as np
+from jaxtyping import UInt8, UInt16
+
+from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
+from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size
+
+HEIGHT, WIDTH = 800, 1280
+WHITE = 4095  # maximum of the 12-bit converter
+
+CLOCK_MHZ = 100.0  # the vendor's default
+TICK_CYCLES = 1024  # clock cycles per step of the time stamp
+
+HEADER = struct.Struct("<8B I")
+LENGTH = struct.Struct("<I")
+STAMP = struct.Struct("<q I")  # the computer's time in milliseconds, and the number of IMU samples that follow
+IMU_SAMPLE_BYTES = 32
+LOOP, IMU = 1, 2  # bits of the data type
+
+MODES = ("Event Off-Pixel Timestamp", "Event In-Pixel Timestamp", "Event Intensity", "Full Picture",
+         "Optical Flow", "Optical Flow FPN", "Multi-Read Optical Flow")  # fmt: skip
+INTENSITY, FULL_PICTURE = 2, 3  # of `MODES`
+
+PICTURE_BYTES = HEIGHT * WIDTH * 3 // 2 + 1
+MAX_PACKAGE = 2_048_000  # bytes; the limit of the vendor's library
+
+ROW, COLUMN = 2, 1  # kinds of items
+CSV_COLUMNS = (3, 4, 5)  # by mode
+
+
+class Header(NamedTuple):
+    """The first 12 bytes of a file."""
+
+    data_type: int
+    loop_a: int
+    """Mode of the sensor outside loop mode."""
+    loop_b: int
+    loop_c: int
+    event_format: int
+    hour: int
+    minute: int
+    second: int
+    packages: int
+
+
+class Picture(NamedTuple):
+    """A full picture."""
+
+    t_us: int | None
+    """The computer's time on arrival, to the millisecond; None in files without it."""
+    intensity: UInt16[np.ndarray, "h w"]
+    """800 x 1280 pixels from a BIN file; 0 to 4095; brighter is larger."""
+
+
+def matches_bin(path: Path, head: bytes) -> bool:
+    """Whether the header and the first length are plausible for a BIN file."""
+    if len(head) < HEADER.size + LENGTH.size:
+        return len(head) >= HEADER.size and _plausible(Header(*HEADER.unpack_from(head)))
+    (length,) = LENGTH.unpack_from(head, HEADER.size)
+    return _plausible(Header(*HEADER.unpack_from(head))) and 0 < length <= MAX_PACKAGE
+
+
+def open_bin(path: Path, choices: Choices) -> Source:
+    """Open the events of a BIN file of event format 1; format 2 and some modes have no polarity and are refused.
+
+    A pixel's polarity is the sign of its intensity change. Its first event is compared with 0 and therefore brighter.
+    Time 0 is the first time stamp. Full pictures between the events are left out; `celex5_pictures` reads them.
+    """
+    header = _header(path)
+    if header.event_format == 0:
+        raise RecordingError(
+            f"{path.name}: the events are of format 0, whose intensities are wrong according to the vendor; record in "
+            f"event format 1"
+        )
+    if header.data_type & LOOP:
+        raise RecordingError(
+            f"{path.name}: recorded in loop mode, where the time stamps of events do not run on during pictures; "
+            f"record events and pictures each in a mode of their own"
+        )
+    if header.event_format == 2 or header.loop_a < INTENSITY:
+        mode = MODES[header.loop_a] if header.loop_a < len(MODES) else MODES[INTENSITY]
+        raise _no_polarity(path, mode if header.event_format == 1 else f"{mode}, event format 2")
+    height, width = sensor_size(path, choices, HEIGHT, WIDTH)
+    clock_mhz = choices.clock_mhz or CLOCK_MHZ
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        state = np.array([-1, -1, 0])  # row, last time stamp, ticks since the first
+        last_adc = np.zeros((HEIGHT, WIDTH), np.uint16)
+        for _, package in _packages(path, counts):
+            if package[-1] == 0:
+                state[0] = -1  # the events after a picture begin with their row
+            else:
+                counts["unreadable_packages"] += len(package) % 7 != 1
+                size = 2 * (len(package) // 7)
+                columns = tuple(np.empty(size, dtype) for dtype in (np.int64, np.int16, np.int16, np.int8))
+                events, orphans, unchanged = _decode(package[:-1], state, last_adc, columns)
+                counts.update({"orphans": orphans, "no_change": unchanged})
+                t, x, y, p = (column[:events] for column in columns)
+                yield Block(microseconds(t, clock_mhz), x, y, p)
+
+    return Source(height, width, blocks)
+
+
+def microseconds(ticks: np.ndarray, clock_mhz: float | int) -> np.ndarray:
+    """Convert the sensor's time stamps to microseconds, rounded down as in the vendor's library."""
+    return np.asarray(ticks, np.int64) * (1000 * TICK_CYCLES) // round(1000 * clock_mhz)
+
+
+def _no_polarity(path: Path, mode: str) -> RecordingError:
+    return RecordingError(
+        f"{path.name}: events of a CeleX-5 in its mode {mode} have no polarity, so nothing can be recovered from them; "
+        f"record in Event Intensity mode"
+    )
+
+
+def celex5_pictures(path: Path) -> Iterator[Picture]:
+    """The full pictures of a BIN file, in order; RecordingError for other or damaged files."""
+    counts: Counter[str] = Counter()
+    for t_ms, package in _packages(path, counts):
+        if package[-1] == 0:
+            if len(package) != PICTURE_BYTES:
+                raise RecordingError(
+                    f"{path.name}: expected {PICTURE_BYTES} bytes of a full picture, got {len(package)}; "
+                    f"the file is damaged"
+                )
+            yield Picture(None if t_ms is None else 1000 * t_ms, _unpacked(package[:-1]))
+
+
+def matches_csv(path: Path, head: bytes) -> bool:
+    """Whether the columns are those of a mode; four columns that end with a polarity are `t,x,y,p` and do not match."""
+    lines = [line.words for line in numbers_of(head)]
+    if not lines or b"," not in head or len(lines[0]) not in CSV_COLUMNS:
+        return False
+    last, second_last = zip(*(words[:-3:-1] for words in lines if len(words) == len(lines[0])), strict=True)
+    if len(lines[0]) == 5:
+        return _polarities(second_last)
+    return len(lines[0]) == 3 or not _polarities(last)
+
+
+def _polarities(words: tuple[str, ...]) -> bool:
+    known = sum(word in ("-1", "0", "1") for word in words)
+    return 2 * known > len(words)
+
+
+def open_csv(path: Path, choices: Choices) -> Source:
+    """Open a CSV file of Event Intensity mode; the other two modes have no polarity and are refused.
+
+    Times are microseconds. Converters older than SDK 2.0 (December 2019) wrote the sensor's time stamps; `clock_mhz`
+    selects this interpretation.
+    """
+    with path.open("rb") as file:
+        lines = numbers_of(file.read(HEAD_BYTES))
+    columns = len(lines[0].words) if lines else 5
+    if columns not in CSV_COLUMNS:
+        raise RecordingError(
+            f"{path.name}: expected the 5 columns row,col,adc,polarity,t of Event Intensity mode, or the 3 or 4 of the "
+            f"other modes of a CeleX-5, got {columns}"
+        )
+    if columns != 5:
+        raise _no_polarity(path, MODES[CSV_COLUMNS.index(columns)])
+    height, width = sensor_size(path, choices, HEIGHT, WIDTH)
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        for rows in number_blocks(path, (0,) * columns, 0, counts):
+            row, column, _, p, t = np.ascontiguousarray(rows[rows[:, 3] != 0].T)
+            counts["no_change"] += len(rows) - len(t)
+            yield Block(t if choices.clock_mhz is None else microseconds(t, choices.clock_mhz), column, row, p)
+
+    return Source(height, width, blocks)
+
+
+def _unpacked(data: np.ndarray) -> np.ndarray:
+    """Unpack two 12-bit pixels from 3 bytes: their high 8 bits, then the low 4 of the first, then those of the second.
+
+    The sensor sends larger values for darker pixels, so they are inverted. It sends its mode in place of the high bits
+    of pixel (0, 0), which gets the value of pixel (0, 1).
+    """
+    first, second, low = data.reshape(-1, 3).T.astype(np.uint16)
+    pixels = np.stack([first << 4 | low & 15, second << 4 | low >> 4], axis=1)
+    picture = np.uint16(WHITE) - pixels.reshape(HEIGHT, WIDTH)
+    picture[0, 0] = picture[0, 1]
+    return picture
+
+
+def _header(path: Path) -> Header:
+    with path.open("rb") as file:
+        head = file.read(HEADER.size)
+    if len(head) < HEADER.size:
+        raise RecordingError(f"{path.name}: expected a header of {HEADER.size} bytes, the file ends after {len(head)}")
+    header = Header(*HEADER.unpack(head))
+    if not _plausible(header):
+        raise RecordingError(f"{path.name}: its header is not that of a BIN file of a CeleX-5: {header}")
+    return header
+
+
+def _plausible(header: Header) -> bool:
+    return (
+        header.data_type <= LOOP | IMU
+        and header.event_format <= 2
+        and header.hour < 24
+        and header.minute < 60
+        and header.second < 60
+        and all(mode < len(MODES) + 1 or mode == 255 for mode in (header.loop_a, header.loop_b, header.loop_c))
+    )
+
+
+def _packages(path: Path, counts: Counter[str]) -> Iterator[tuple[int | None, UInt8[np.ndarray, " bytes"]]]:
+    """The computer's time in milliseconds, and the bytes, of each package."""
+    header = _header(path)
+    with path.open("rb") as file:
+        file.seek(HEADER.size)
+        number = 0
+        while start := file.read(LENGTH.size):
+            length = LENGTH.unpack(start)[0] if len(start) == LENGTH.size else 1
+            if not 0 < length <= MAX_PACKAGE:
+                raise RecordingError(
+                    f"{path.name}: package {number} before byte {file.tell()} states a length of {length} bytes, "
+                    f"expected up to {MAX_PACKAGE}; the file is damaged there and what follows cannot be found"
+                )
+            package = file.read(length)
+            if len(start) < LENGTH.size or len(package) < length:
+                counts["cut_tail"] += 1
+                return
+            t_ms = None
+            if header.data_type & IMU:
+                t_ms = _skip_imu(path, file)
+            yield t_ms, np.frombuffer(package, np.uint8)
+            number += 1
+
+
+def _skip_imu(path: Path, file: BinaryIO) -> int | None:
+    """Skip the time and the IMU's samples; returns the time in milliseconds, or None if the file ends early."""
+    stamp = file.read(STAMP.size)
+    if len(stamp) < STAMP.size:
+        return None
+    t_ms, samples = STAMP.unpack(stamp)
+    if samples * IMU_SAMPLE_BYTES > MAX_PACKAGE or not abs(t_ms) < 2**43:
+        raise RecordingError(f"{path.name}: a package has {samples} IMU samples at {t_ms} ms; the file is damaged")
+    file.seek(samples * IMU_SAMPLE_BYTES, 1)
+    return t_ms
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _decode(data, state, last_adc, columns):
+    """Decode items of 28 bits: row and time stamp, or intensity and column."""
+    row, stamp, now = state
+    t, x, y, p = columns
+    n, orphans, unchanged = 0, 0, 0
+    height, width = last_adc.shape
+    for i in range(len(data) // 7):
+        a, b, c, d = data[7 * i], data[7 * i + 1], data[7 * i + 2], data[7 * i + 3]
+        low = np.int64(data[7 * i + 4]) | np.int64(data[7 * i + 5]) << 8 | np.int64(data[7 * i + 6]) << 16
+        first = np.int64(b) << 20 | (low >> 6 & 63) << 14 | np.int64(a) << 6 | low & 63
+        second = np.int64(d) << 20 | low >> 18 << 14 | np.int64(c) << 6 | low >> 12 & 63
+        for item in (first, second):
+            kind = item & 3
+            if kind == ROW:
+                row = item >> 18
+                tick = item >> 2 & 0xFFFF
+                if stamp >= 0:
+                    now += (tick - stamp) & 0xFFFF
+                stamp = tick
+            elif kind == COLUMN:
+                if row < 0:
+                    orphans += 1
+                    continue
+                adc = 4095 - (item >> 16)
+                column = item >> 5 & 0x7FF
+                sign = 1
+                if row < height and column < width:
+                    before = np.int64(last_adc[row, column])
+                    last_adc[row, column] = adc
+                    sign = 1 if adc > before else -1 if adc < before else 0
+                if sign == 0:
+                    unchanged += 1
+                else:
+                    t[n], x[n], y[n], p[n] = now, column, row, sign
+                    n += 1
+    state[:] = row, stamp, now
+    return n, orphans, unchanged
