@@ -205,7 +205,7 @@ def _add_method(recover: argparse.ArgumentParser) -> None:
 def _add_output(recover: argparse.ArgumentParser) -> None:
     recover.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
     recover.add_argument(
-        "--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), default=("zarr", "png", "mp4"),
+        "--write", nargs="+", choices=("zarr", "png", "mp4"), default=("zarr", "png", "mp4"),
         help="file types to write (default: zarr png mp4)",
     )  # fmt: skip
     recover.add_argument(
@@ -247,8 +247,7 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.recordings.noise import Cleaner
     from polarnet.recordings.polarizers import ChannelCheck
     from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
-    from polarnet.recovery.stream import ChosenMethod, facts_of, frames_of, open_method, recover
-    from polarnet.recovery.watching import TruthScores
+    from polarnet.recovery.stream import ChosenMethod, TruthScores, frames_of, open_method, recover
     from polarnet.recovery.writer import RecoveryWriter
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
@@ -288,7 +287,7 @@ def _recover(options: argparse.Namespace) -> int:
         frames = frames_at_rate(source, rule, recoverer, rate) if rate else frames_of(source, rule, recoverer)
         if scores:
             frames = scores.watch(frames)
-        facts = facts_of(source, rule, words, recover(source, rule, recoverer, writer, frames))
+        facts = recover(source, rule, words, writer, frames)
         facts |= _further_facts(options.rate, check)
         if scores:
             facts["scores"] = scores.sentence(config.benchmark.warmup_windows)

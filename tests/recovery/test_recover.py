@@ -20,10 +20,10 @@ from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.formats.lines import lines_of
-from polarnet.recordings.live import live_lines
+from polarnet.recordings.live import live_lines, replay
 from polarnet.recovery import inputs
 from polarnet.recovery.inputs import Files, open_files
-from polarnet.recovery.stream import ChosenMethod, frames_of, open_method, replay
+from polarnet.recovery.stream import ChosenMethod, frames_of, open_method
 from polarnet.runtime import machine as runtime
 from polarnet.storage.events import EventStore
 
@@ -176,10 +176,10 @@ def test_files_are_reduced_to_the_size_that_is_asked_for(store):
     assert source.duration_us == DURATION_US
 
 
-def test_a_sequence_is_replayed_as_lines_at_its_own_pace(store, channels):
+def test_a_sequence_is_replayed_as_lines_at_its_own_pace(channels):
     head, _, lines = live_lines(channels)
     out = io.BytesIO()
-    replay(EventStore.open(store), "lake", 1000.0, out.write)
+    replay(channels, 1000.0, out.write)
     assert out.getvalue() == head + lines
 
 
