@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from polarnet.config.tree import Config
     from polarnet.events.rotation import Rotation
     from polarnet.events.streaming import WindowRule
-    from polarnet.recordings.noise import Cleaner
-    from polarnet.recordings.polarizers import ChannelCheck
+    from polarnet.recordings.noise import ChannelCheck, Cleaner
     from polarnet.recovery.stream import Input
     from polarnet.stokes import Mosaic
     from polarnet.storage.true_frames import TrueFrames
@@ -244,8 +243,7 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.config.pipeline import setup_of
     from polarnet.config.tree import load
     from polarnet.methods import METHODS
-    from polarnet.recordings.noise import Cleaner
-    from polarnet.recordings.polarizers import ChannelCheck
+    from polarnet.recordings.noise import ChannelCheck, Cleaner
     from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
     from polarnet.recovery.stream import ChosenMethod, TruthScores, frames_of, open_method, recover
     from polarnet.recovery.writer import RecoveryWriter
@@ -279,7 +277,7 @@ def _recover(options: argparse.Namespace) -> int:
         source = source or _input(options, mosaic, cleaner, folder / WORK, config)
         check, polarized = None, source.channels == len(POLARIZER_ANGLES_DEG)
         if polarized:
-            check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
+            check = ChannelCheck(source.height, source.width)
             source = source._replace(pieces=check.watch(source.pieces))
         drawn = polarized and "mp4" in options.write and truth is None
         reconstruct = METHODS[RECONSTRUCT].open(setup(METHODS[RECONSTRUCT])) if drawn else None
