@@ -229,7 +229,7 @@ class _Stack:
     """Reduced pictures of a capture from its start on, interpolated to any time of the common clock."""
 
     def __init__(self, capture: IntensityCapture, start_us: float, config: RecordingsConfig):
-        chosen = pictures_after(capture, start_us)
+        chosen = _pictures_after(capture, start_us)
         self.t_us = capture.t_us[chosen] - start_us
         self.period_us = float(np.median(np.diff(self.t_us)))
         self.frames = np.stack([reduced(picture, config) for picture in capture.pictures[chosen]])
@@ -243,7 +243,7 @@ class _Stack:
         return self.frames[k] + share * difference, difference / step.astype(np.float32)[:, None, None]
 
 
-def pictures_after(capture: IntensityCapture, start_us: float | int) -> slice:
+def _pictures_after(capture: IntensityCapture, start_us: float | int) -> slice:
     """Up to 64 pictures, starting with the last one before `start_us`."""
     first = max(0, int(np.searchsorted(capture.t_us, start_us)) - 1)
     return slice(first, first + MAX_PICTURES)
@@ -253,7 +253,7 @@ def _lag(
     events: Events, event_start_us: int, capture: IntensityCapture, picture_start_us: int, config: RecordingsConfig
 ) -> Lag:
     """Delay of the pictures relative to the events, from these starts."""
-    chosen = pictures_after(capture, picture_start_us)
+    chosen = _pictures_after(capture, picture_start_us)
     t_us = capture.t_us[chosen] - picture_start_us + event_start_us
     pairs = steps(events, config.crop_corner, (config.crop[0], config.crop[1]), int(t_us[0]), int(t_us[-1]))
     return best_lag(pairs, t_us, logarithms(capture.pictures[chosen]), 1000 * config.refine_within_ms)

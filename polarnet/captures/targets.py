@@ -161,7 +161,8 @@ def calibrate_targets(
         targets.append(one)
     events.finish()
     frames.finish()
-    (out / "calibration.json").write_text(json.dumps({one.name: _record(one) for one in targets}, indent=2) + "\n")
+    records = {one.name: _record(one) for one in targets}
+    (out / "calibration.json").write_text(json.dumps(records, indent=2) + "\n")
     return targets
 
 
@@ -221,21 +222,18 @@ def aligned(
         during = shifted(slice_time(events, start, start + int(t_us[-1]) + 1), start)
         part = crop(during, *config.crop_corner, *config.crop)
         channels.append(downscale(part, config.size[0], config.size[1], keep_rate=config.keep_event_rate))
-    planes = [interpolated(target.intensities[c], t_us + calibrated.start_us[c], config) for c in INTENSITY_CAPTURES]
+    planes = []
+    for name in INTENSITY_CAPTURES:
+        capture, own_us = target.intensities[name], t_us + calibrated.start_us[name]
+        k = np.clip(np.searchsorted(capture.t_us, own_us, side="right") - 1, 0, len(capture.t_us) - 2)
+        share = (own_us - capture.t_us[k]) / (capture.t_us[k + 1] - capture.t_us[k])
+        frames = [
+            (1 - s) * reduced(np.asarray(capture.pictures[before]), config)
+            + s * reduced(np.asarray(capture.pictures[before + 1]), config)
+            for before, s in zip(k.tolist(), share.tolist(), strict=True)
+        ]
+        planes.append(torch.from_numpy(np.stack(frames)).float().div_(WHITE).clamp_(0, 1))
     return channels, torch.from_numpy(t_us), torch.stack(planes, dim=1)
-
-
-def interpolated(
-    capture: IntensityCapture, t_us: Int64[np.ndarray, " n"], config: RecordingsConfig
-) -> Float32[Tensor, "n h w"]:
-    """Reduced pictures, 0 to 1, interpolated to the times `t_us`."""
-    k = np.clip(np.searchsorted(capture.t_us, t_us, side="right") - 1, 0, len(capture.t_us) - 2)
-    share = (t_us - capture.t_us[k]) / (capture.t_us[k + 1] - capture.t_us[k])
-    frames = []
-    for before, s in zip(k.tolist(), share.tolist(), strict=True):
-        pair = [reduced(np.asarray(capture.pictures[before + step]), config) for step in (0, 1)]
-        frames.append((1 - s) * pair[0] + s * pair[1])
-    return torch.from_numpy(np.stack(frames)).float().div_(WHITE).clamp_(0, 1)
 
 
 def frame_times_us(duration_us: int, config: RecordingsConfig) -> Int64[np.ndarray, " n"]:
@@ -245,12 +243,8 @@ def frame_times_us(duration_us: int, config: RecordingsConfig) -> Int64[np.ndarr
 
 
 def _record(calibrated: Calibrated) -> dict[str, Any]:
-    record: dict[str, Any] = {
-        "landmark_us": dict(calibrated.landmark_us),
-        "start_us": dict(calibrated.start_us),
-        "duration_us": calibrated.duration_us,
-        "hot_pixels": dict(calibrated.hot),
-    }
+    record: dict[str, Any] = {name: getattr(calibrated, name) for name in ("landmark_us", "start_us", "duration_us")}
+    record["hot_pixels"] = calibrated.hot
     if calibrated.alignment is not None:
         record["redundancy_residual"] = calibrated.alignment.residual
         for capture, lag in zip(EVENT_CAPTURES, calibrated.alignment.lags, strict=True):

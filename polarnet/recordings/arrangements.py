@@ -7,6 +7,7 @@ handles division-of-time captures.
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from polarnet.events.mosaic import split_mosaic
@@ -70,7 +71,7 @@ def read_plain(path: Path, read: Callable[[Path], Recording]) -> list[Events]:
 
 def shifted(events: Events, origin_us: int) -> Events:
     """The same events, with `origin_us` as time 0."""
-    return Events(events.t - origin_us, events.x, events.y, events.p, events.height, events.width)
+    return replace(events, t=events.t - origin_us)
 
 
 def _from_first_event(channels: Sequence[Events]) -> list[Events]:

@@ -67,8 +67,6 @@ def open_rotating(
 
     `rotation` is by the file's clock, the returned one by that of the events. RecordingError for a file without events.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: there is no such file")
     events = read(path).events
     if not len(events):
         raise RecordingError(f"{path.name}: expected events, the file has none")
@@ -120,8 +118,7 @@ def _whole(name: str, channels: Sequence[Events], size: Sequence[int] | None, cl
     if clean is not None:
         channels = clean(channels, duration_us)
     if size is not None:
-        height, width = size
-        channels = [downscale(events, height, width, keep_rate=True) for events in channels]
+        channels = [downscale(events, *size, keep_rate=True) for events in channels]
     pieces = [Piece(channels, duration_us, time.perf_counter())]
     return Input(name, channels[0].height, channels[0].width, pieces, duration_us, len(channels))
 
@@ -130,8 +127,6 @@ def _channels(files: Files, work: Path) -> Sequence[Events]:
     if len(files.paths) == 4:
         if files.angles is None:
             raise ValueError("four files: say the polarizer of each, in their order, such as --angles 0 45 90 135")
-        if len(set(files.angles)) < 4:
-            raise ValueError(f"four files: expected four different angles, got {list(files.angles)}")
         return read_four(dict(zip(files.angles, files.paths, strict=True)), read=files.read)
     if len(files.paths) != 1 or files.angles is not None:
         raise ValueError(f"expected one file or folder, or four files with --angles, got {len(files.paths)}")
@@ -193,8 +188,6 @@ def _captured(folder: Path, work: Path, config: RecordingsConfig | None) -> Sequ
 
 
 def _trigger_times_us(path: Path) -> np.ndarray:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: there is no such file")
     with path.open("rb") as file:
         if file.read(len(hdf5.MAGIC)) == hdf5.MAGIC:
             return hdf5.trigger_times_us(path)

@@ -1,5 +1,6 @@
 """Lines from a pipe or a file that grows, and a network stream of dv-processing from this machine to itself."""
 
+import contextlib
 import os
 import socket
 import subprocess
@@ -28,6 +29,13 @@ def read_lines(tmp_path, text, mosaic=None):
         return live, pieces
 
 
+@contextlib.contextmanager
+def pipe():
+    reader, writer = os.pipe()
+    with os.fdopen(reader, "rb") as source, os.fdopen(writer, "wb", buffering=0) as camera:
+        yield source, camera
+
+
 def test_what_is_written_as_lines_is_read_back(tmp_path, make_random_events):
     channels = [make_random_events(seed, 200, 10_000, 20, 30) for seed in range(4)]
     head, times, lines = live_lines(channels)
@@ -48,16 +56,14 @@ def test_commas_comments_zeros_and_a_last_line_without_an_end_are_read(tmp_path,
     assert sorted(events) == [(0, 1, 2, -1), (50, 3, 0, 1), (60, 0, 0, -1)]
 
 
-def test_a_mosaic_gives_each_pixel_to_its_polarizer(tmp_path):
+def test_a_mosaic_gives_each_pixel_to_its_polarizer(tmp_path, columns):
     live, (piece,) = read_lines(tmp_path, "4 2\n10 0 0 1\n11 1 0 1\n12 2 1 1\n13 3 1 1\n", MOSAIC)
     assert (live.height, live.width) == (1, 2)
-    assert [channel.t.tolist() for channel in piece.channels] == [[3], [1], [0], [2]]
-    assert [channel.x.tolist() for channel in piece.channels] == [[1], [0], [0], [1]]
+    assert [columns(channel)[:2] for channel in piece.channels] == [[[3], [1]], [[1], [0]], [[0], [0]], [[2], [1]]]
 
 
 def test_lines_are_handed_on_as_they_come_through_a_pipe():
-    reader, writer = os.pipe()
-    with os.fdopen(reader, "rb") as source, os.fdopen(writer, "wb", buffering=0) as camera:
+    with pipe() as (source, camera):
         camera.write(b"4 3\n")
         pieces = iter(LiveLines(source, "pipe", None, idle_s=0.0))
         camera.write(b"5 0 0 1 0\n9 1 1 1 45\n12 ")
@@ -90,8 +96,7 @@ def test_a_file_that_grows_is_followed(tmp_path):
 
 
 def test_late_events_and_single_bad_lines_are_left_out_and_counted(tmp_path):
-    reader, writer = os.pipe()
-    with os.fdopen(reader, "rb") as source, os.fdopen(writer, "wb", buffering=0) as camera:
+    with pipe() as (source, camera):
         camera.write(b"4 3\n100 0 0 1 0\n200 0 0 1 0\n")
         live = LiveLines(source, "pipe", None, idle_s=0.0)
         pieces = iter(live)
@@ -115,8 +120,7 @@ def test_what_is_no_such_stream_is_refused(tmp_path, text, reason):
 
 
 def test_lines_keep_the_time_at_which_they_came_while_nobody_reads():
-    reader, writer = os.pipe()
-    with os.fdopen(reader, "rb") as source, os.fdopen(writer, "wb", buffering=0) as camera:
+    with pipe() as (source, camera):
         camera.write(b"4 3\n")
         live = LiveLines(source, "pipe", None, idle_s=0.0)
         before = time.perf_counter()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 import zarr
+from recording_fixtures import events_of
 
-from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
 from polarnet.recovery import writer as recovery
 from polarnet.recovery.writer import RecoveryWriter
@@ -20,9 +20,7 @@ assert FRAMES > FRAMES_PER_CHUNK
 
 
 def window(k):
-    one = Events(torch.tensor([1000 * k]), torch.tensor([k]).short(), torch.tensor([3]).short(),
-                 torch.tensor([1]).to(torch.int8), HEIGHT, WIDTH)  # fmt: skip
-    return EventWindow([one] * 4, 1000 * k, 1000 * (k + 1))
+    return EventWindow([events_of([(1000 * k, k, 3, 1)], HEIGHT, WIDTH)] * 4, 1000 * k, 1000 * (k + 1))
 
 
 def frame(k, *, angle=True):

@@ -8,8 +8,7 @@ The last byte of a package is 0 for a full picture.
 The sensor sends 14-bit words, four in 7 bytes: the high 8 bits of each, then the low 6 of all. An item is two words,
 and its two lowest bits give its kind. Time stamps of 16 bits wrap around.
 
-A line of CSV is row, column, intensity (0 to 4095), polarity (-1, 0 or 1), t in Event Intensity mode. The modes without
-polarity have three or four columns: row, column, t of the pixel, and t of the readout.
+A line of CSV is row, column, intensity (0 to 4095), polarity (-1, 0 or 1), t in Event Intensity mode.
 """
 
 import struct
@@ -45,7 +44,7 @@ PICTURE_BYTES = HEIGHT * WIDTH * 3 // 2 + 1
 MAX_PACKAGE = 2_048_000  # bytes; the limit of the vendor's library
 
 ROW, COLUMN = 2, 1  # kinds of items
-CSV_COLUMNS = (3, 4, 5)  # by mode
+CSV_COLUMNS = 5
 
 
 class Header(NamedTuple):
@@ -74,10 +73,8 @@ class Picture(NamedTuple):
 
 def matches_bin(path: Path, head: bytes) -> bool:
     """Whether the header and the first length are plausible for a BIN file."""
-    if len(head) < HEADER.size + LENGTH.size:
-        return len(head) >= HEADER.size and _plausible(Header(*HEADER.unpack_from(head)))
-    (length,) = LENGTH.unpack_from(head, HEADER.size)
-    return _plausible(Header(*HEADER.unpack_from(head))) and 0 < length <= MAX_PACKAGE
+    length = head[HEADER.size : HEADER.size + LENGTH.size]
+    return _header(head) is not None and (len(length) < LENGTH.size or 0 < LENGTH.unpack(length)[0] <= MAX_PACKAGE)
 
 
 def open_bin(path: Path, choices: Choices) -> Source:
@@ -86,7 +83,7 @@ def open_bin(path: Path, choices: Choices) -> Source:
     A pixel's polarity is the sign of its intensity change. Its first event is compared with 0 and therefore brighter.
     Time 0 is the first time stamp. Full pictures between the events are left out; `celex5_pictures` reads them.
     """
-    header = _header(path)
+    header = _opened(path)
     if header.event_format == 0:
         raise RecordingError(
             f"{path.name}: the events are of format 0, whose intensities are wrong according to the vendor; record in "
@@ -99,7 +96,10 @@ def open_bin(path: Path, choices: Choices) -> Source:
         )
     if header.event_format == 2 or header.loop_a < INTENSITY:
         mode = MODES[header.loop_a] if header.loop_a < len(MODES) else MODES[INTENSITY]
-        raise _no_polarity(path, mode if header.event_format == 1 else f"{mode}, event format 2")
+        raise RecordingError(
+            f"{path.name}: events of a CeleX-5 in its mode {mode}, event format {header.event_format}, have no "
+            f"polarity, so nothing can be recovered from them; record in Event Intensity mode, event format 1"
+        )
     height, width = sensor_size(path, choices, HEIGHT, WIDTH)
     clock_mhz = choices.clock_mhz or CLOCK_MHZ
 
@@ -126,13 +126,6 @@ def microseconds(ticks: np.ndarray, clock_mhz: float | int) -> np.ndarray:
     return np.asarray(ticks, np.int64) * (1000 * TICK_CYCLES) // round(1000 * clock_mhz)
 
 
-def _no_polarity(path: Path, mode: str) -> RecordingError:
-    return RecordingError(
-        f"{path.name}: events of a CeleX-5 in its mode {mode} have no polarity, so nothing can be recovered from them; "
-        f"record in Event Intensity mode"
-    )
-
-
 def celex5_pictures(path: Path) -> Iterator[Picture]:
     """The full pictures of a BIN file, in order; RecordingError for other or damaged files."""
     counts: Counter[str] = Counter()
@@ -147,19 +140,11 @@ def celex5_pictures(path: Path) -> Iterator[Picture]:
 
 
 def matches_csv(path: Path, head: bytes) -> bool:
-    """Whether the columns are those of a mode; four columns that end with a polarity are `t,x,y,p` and do not match."""
+    """Whether there are five columns with commas, the fourth mostly a polarity."""
     lines = [line.words for line in numbers_of(head)]
-    if not lines or b"," not in head or len(lines[0]) not in CSV_COLUMNS:
+    if not lines or b"," not in head or len(lines[0]) != CSV_COLUMNS:
         return False
-    last, second_last = zip(*(words[:-3:-1] for words in lines if len(words) == len(lines[0])), strict=True)
-    if len(lines[0]) == 5:
-        return _polarities(second_last)
-    return len(lines[0]) == 3 or not _polarities(last)
-
-
-def _polarities(words: tuple[str, ...]) -> bool:
-    known = sum(word in ("-1", "0", "1") for word in words)
-    return 2 * known > len(words)
+    return 2 * sum(len(words) == CSV_COLUMNS and words[3] in ("-1", "0", "1") for words in lines) > len(lines)
 
 
 def open_csv(path: Path, choices: Choices) -> Source:
@@ -170,18 +155,15 @@ def open_csv(path: Path, choices: Choices) -> Source:
     """
     with path.open("rb") as file:
         lines = numbers_of(file.read(HEAD_BYTES))
-    columns = len(lines[0].words) if lines else 5
-    if columns not in CSV_COLUMNS:
+    if lines and len(lines[0].words) != CSV_COLUMNS:
         raise RecordingError(
-            f"{path.name}: expected the 5 columns row,col,adc,polarity,t of Event Intensity mode, or the 3 or 4 of the "
-            f"other modes of a CeleX-5, got {columns}"
+            f"{path.name}: expected the 5 columns row,col,adc,polarity,t of a CeleX-5 in Event Intensity mode, got "
+            f"{len(lines[0].words)}; its other modes, of 3 or 4 columns, have no polarity"
         )
-    if columns != 5:
-        raise _no_polarity(path, MODES[CSV_COLUMNS.index(columns)])
     height, width = sensor_size(path, choices, HEIGHT, WIDTH)
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        for rows in number_blocks(path, (0,) * columns, 0, counts):
+        for rows in number_blocks(path, (0,) * CSV_COLUMNS, 0, counts):
             row, column, _, p, t = np.ascontiguousarray(rows[rows[:, 3] != 0].T)
             counts["no_change"] += len(rows) - len(t)
             yield Block(t if choices.clock_mhz is None else microseconds(t, choices.clock_mhz), column, row, p)
@@ -202,31 +184,32 @@ def _unpacked(data: np.ndarray) -> np.ndarray:
     return picture
 
 
-def _header(path: Path) -> Header:
-    with path.open("rb") as file:
-        head = file.read(HEADER.size)
+def _header(head: bytes) -> Header | None:
+    """The header of a BIN file; None if the bytes are too few or not plausible."""
     if len(head) < HEADER.size:
-        raise RecordingError(f"{path.name}: expected a header of {HEADER.size} bytes, the file ends after {len(head)}")
-    header = Header(*HEADER.unpack(head))
-    if not _plausible(header):
-        raise RecordingError(f"{path.name}: its header is not that of a BIN file of a CeleX-5: {header}")
-    return header
-
-
-def _plausible(header: Header) -> bool:
-    return (
+        return None
+    header = Header(*HEADER.unpack_from(head))
+    modes = header.loop_a, header.loop_b, header.loop_c
+    plausible = (
         header.data_type <= LOOP | IMU
         and header.event_format <= 2
-        and header.hour < 24
-        and header.minute < 60
-        and header.second < 60
-        and all(mode < len(MODES) + 1 or mode == 255 for mode in (header.loop_a, header.loop_b, header.loop_c))
+        and (header.hour < 24 and header.minute < 60 and header.second < 60)
+        and all(mode <= len(MODES) or mode == 255 for mode in modes)
     )
+    return header if plausible else None
+
+
+def _opened(path: Path) -> Header:
+    with path.open("rb") as file:
+        header = _header(file.read(HEADER.size))
+    if header is None:
+        raise RecordingError(f"{path.name}: expected the {HEADER.size} bytes of a BIN header of a CeleX-5 at its start")
+    return header
 
 
 def _packages(path: Path, counts: Counter[str]) -> Iterator[tuple[int | None, UInt8[np.ndarray, " bytes"]]]:
     """The computer's time in milliseconds, and the bytes, of each package."""
-    header = _header(path)
+    header = _opened(path)
     with path.open("rb") as file:
         file.seek(HEADER.size)
         number = 0

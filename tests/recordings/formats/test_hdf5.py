@@ -15,7 +15,7 @@ def write(path, tables, **attributes):
     with h5py.File(path, "w") as file:
         for name, values in tables.items():
             if values is not None:
-                file[name] = np.asarray(values)
+                file[name] = values
         file.attrs.update(attributes)
     return path
 

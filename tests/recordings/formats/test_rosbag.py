@@ -25,7 +25,7 @@ def write(path, topics=("/dvs/events",), form="ros1", package="dvs_msgs"):
 @pytest.mark.parametrize(("form", "package"), [("ros1", "dvs_msgs"), ("ros2", "prophesee_event_msgs")])
 def test_events_of_a_bag_arrive_in_microseconds_with_the_sensors_size(rosbags, tmp_path, read, form, package):
     path = write(tmp_path / ("e.bag" if form == "ros1" else "e"), form=form, package=package)
-    assert read(path) == (("rosbag", 6, 8), np.array(EVENTS).T.tolist(), {})
+    assert read(path) == (("rosbag", 6, 8), np.array(EVENTS).T.tolist(), {"pauses": 1})
 
 
 def test_a_bag_of_several_topics_needs_the_topic(rosbags, tmp_path):
