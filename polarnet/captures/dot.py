@@ -115,7 +115,7 @@ def given_starts(folder: Path) -> dict[str, int]:
     if not path.exists():
         return {}
     try:
-        return TypeAdapter(dict[Literal[CAPTURES], StrictInt]).validate_json(path.read_text())
+        return TypeAdapter(dict[Literal[CAPTURES], StrictInt]).validate_json(path.read_text())  # type: ignore[valid-type]
     except ValueError as error:
         raise RecordingError(
             f"{folder.name}/{path.name}: expected whole microseconds of the capture's own clock for any of "

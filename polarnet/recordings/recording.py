@@ -90,7 +90,8 @@ class RecordingReader:
         """Iterate with another number of events in a chunk."""
         self.repairs.clear()
         for block in _cut(repaired(self.path.name, self._source, self.repairs), size):
-            yield Events(*map(torch.from_numpy, block), self.height, self.width)
+            t, x, y, p = map(torch.from_numpy, block)
+            yield Events(t, x, y, p, self.height, self.width)
 
 
 def open_recording(
