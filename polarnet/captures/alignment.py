@@ -91,10 +91,9 @@ def logarithms(pictures: UInt16[np.ndarray, "n h w"]) -> Float32[np.ndarray, "n 
 def changes(
     pairs: Steps, lag_us: float | int, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"]
 ) -> Float64[np.ndarray, " m"]:
-    """Change of log intensity over each step, read from the pictures taken at `t_us` with a delay of `lag_us`.
+    """Change of log intensity over each step, interpolated between pictures taken at `t_us` with a delay of `lag_us`.
 
-    Intensities between pictures are interpolated. The change is NaN where a step is not between the pictures, or too
-    dark.
+    NaN where a step is not between the pictures, or too dark.
     """
     start, stop = pairs.before_us + lag_us, pairs.after_us + lag_us
     between = (start >= t_us[0]) & (stop <= t_us[-1])
@@ -110,10 +109,7 @@ def changes(
 
 
 def agreement(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) -> float:
-    """Correlation of polarities with changes: 1 if every change equals the same threshold.
-
-    Large changes are clipped and NaN is ignored; the result is 0 without any known change.
-    """
+    """Correlation of polarities with changes, large ones clipped: 1 if all equal one threshold, 0 if none is known."""
     known = np.isfinite(change)
     clipped = np.clip(change[known], -MAX_CHANGE, MAX_CHANGE)
     norm = np.sqrt(np.dot(clipped, clipped) * len(clipped))
@@ -121,10 +117,9 @@ def agreement(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"
 
 
 def spread(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) -> float:
-    """Variance of the changes signed by their polarities, with large ones clipped.
+    """Variance of the changes signed by their polarities, large ones clipped: noise if all changes are one threshold.
 
-    Only noise contributes where every change is one threshold. Noise in the pictures does not move the minimum, unlike
-    the maximum of `agreement`.
+    Noise in the pictures does not move its minimum, unlike the maximum of `agreement`.
     """
     known = np.isfinite(change)
     return float(np.var(np.clip(polarity[known] * change[known], -MAX_CHANGE, MAX_CHANGE)))

@@ -138,7 +138,7 @@ def read_event_capture(path: Path, config: RecordingsConfig) -> Events:
 def read_intensity_capture(path: Path, config: RecordingsConfig) -> IntensityCapture:
     """The pictures of a BIN file, a video or a folder of frames, whose values are linear in light.
 
-    RecordingError where there are fewer than two, where they have no times or are smaller than the sensor.
+    RecordingError where they are fewer than two, without times, or smaller than the sensor.
     """
     (top, left), (height, width) = config.crop_corner, config.crop
     times, pictures, region = [], [], []

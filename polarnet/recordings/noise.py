@@ -1,8 +1,7 @@
 """Remove noise from events before recovery: those of hot pixels, and background activity.
 
-Hot pixels fire far more often than their neighbours.
-Background activity is events that no neighbour supports: an edge that moves over a pixel moves over the pixels around
-it too (Delbruck, "Frame-free dynamic digital vision", 2008).
+Hot pixels fire far more often than their neighbours. Background activity is events that no neighbour supports: an edge
+that moves over a pixel moves over the pixels around it too (Delbruck, "Frame-free dynamic digital vision", 2008).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
