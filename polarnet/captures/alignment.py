@@ -95,7 +95,7 @@ def changes(
 
     NaN where a step is not between the pictures, or too dark.
     """
-    start, stop = pairs.before_us + lag_us, pairs.after_us + lag_us
+    start, stop = pairs.before_us + float(lag_us), pairs.after_us + float(lag_us)
     between = (start >= t_us[0]) & (stop <= t_us[-1])
 
     def at(t: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:

@@ -224,12 +224,12 @@ def aligned(
         channels.append(downscale(part, config.size[0], config.size[1], keep_rate=config.keep_event_rate))
     planes = []
     for name in INTENSITY_CAPTURES:
-        capture, own_us = target.intensities[name], t_us + calibrated.start_us[name]
-        k = np.clip(np.searchsorted(capture.t_us, own_us, side="right") - 1, 0, len(capture.t_us) - 2)
-        share = (own_us - capture.t_us[k]) / (capture.t_us[k + 1] - capture.t_us[k])
+        pictures, own_us = target.intensities[name], t_us + calibrated.start_us[name]
+        k = np.clip(np.searchsorted(pictures.t_us, own_us, side="right") - 1, 0, len(pictures.t_us) - 2)
+        share = (own_us - pictures.t_us[k]) / (pictures.t_us[k + 1] - pictures.t_us[k])
         frames = [
-            (1 - s) * reduced(np.asarray(capture.pictures[before]), config)
-            + s * reduced(np.asarray(capture.pictures[before + 1]), config)
+            (1 - s) * reduced(np.asarray(pictures.pictures[before]), config)
+            + s * reduced(np.asarray(pictures.pictures[before + 1]), config)
             for before, s in zip(k.tolist(), share.tolist(), strict=True)
         ]
         planes.append(torch.from_numpy(np.stack(frames)).float().div_(WHITE).clamp_(0, 1))
