@@ -3,8 +3,7 @@
 import dataclasses
 from pathlib import Path
 
-from polarnet.captures.imported import start_over
-from polarnet.captures.targets import calibrate_targets
+from polarnet.captures.targets import calibrate_targets, start_over
 from polarnet.config.tree import Config, hydra_stage
 from polarnet.reports.recordings import draw_calibration, draw_sequence
 from polarnet.storage.events import EventStore

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from polarnet.captures.imported import import_targets, start_over
+from polarnet.captures.targets import import_targets, start_over
 from polarnet.config.tree import Config, hydra_stage, input_folder
 
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Int, Int64, UInt8, UInt16
 
 from polarnet.events.stream import Events, validate
-from polarnet.recordings.formats.celex5_bin import (
+from polarnet.recordings.formats.celex5 import (
     CLOCK_MHZ,
     COLUMN,
     FULL_PICTURE,

@@ -24,8 +24,7 @@ import torch
 from skimage import data
 
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig, read_event_capture
-from polarnet.captures.imported import import_targets
-from polarnet.captures.targets import Calibrated, calibrate_targets
+from polarnet.captures.targets import Calibrated, calibrate_targets, import_targets
 from polarnet.config.tree import load
 from polarnet.events.stream import Events, slice_time
 from polarnet.pictures.dead_leaves import dead_leaves

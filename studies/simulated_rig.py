@@ -25,7 +25,7 @@ from torch import Tensor
 from polarnet import stokes
 from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
 from polarnet.events.stream import Events, merge
-from polarnet.recordings.formats.celex5_bin import HEIGHT, WHITE, WIDTH
+from polarnet.recordings.formats.celex5 import HEIGHT, WHITE, WIDTH
 from polarnet.runtime.machine import generator_for, seed_for
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.camera import Camera

@@ -8,13 +8,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from polarnet.captures.alignment import Lag, best_lag, logarithms, steps
-from polarnet.captures.calibration import MAX_PICTURES
+from polarnet.captures.alignment import MAX_PICTURES, Lag, best_lag, logarithms, steps
 from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import TRAINED_WINDOW_US
 from polarnet.recordings.arrangements import shifted
-from polarnet.recordings.formats.celex5_bin import WHITE
+from polarnet.recordings.formats.celex5 import WHITE
 from polarnet.recordings.noise import Cleaner, Cleaning
 from polarnet.recordings.recording import Recording, detect_format, read_recording
 from polarnet.recordings.source import RecordingError

@@ -1,4 +1,9 @@
-"""Start times of eight captures, finer than the frame interval: events and intensity changes must agree everywhere.
+"""Start times of a target's eight captures on one clock, finer than the frame interval, and how well they agree.
+
+Two relations hold for any scene. Behind one polarizer, events and pictures see the same light, which ties the event
+capture to the intensity capture of each polarizer. Behind all four, I0 + I90 = I45 + I135 at every time, which ties the
+four to each other where the scene is polarized. Elsewhere the four are tied by the landmark's times from the events,
+which no polarizer changes.
 
 Between two events of a pixel the log intensity changes by one contrast threshold, in the direction of the second event.
 How the light varied in between does not matter. An event capture and an intensity capture behind the same polarizer are
@@ -7,13 +12,15 @@ threshold. Event sums per picture are unsuitable: each event comes after its cha
 milliseconds.
 """
 
-from typing import NamedTuple, no_type_check
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int64, UInt16
 
-from polarnet.events.stream import Events
+from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, IntensityCapture, RecordingsConfig, reduced
+from polarnet.events.stream import Events, crop
+from polarnet.recordings.source import RecordingError
 
 DARKEST = 64.0  # of 4095; below it the logarithm is mostly noise
 BRIGHT = 400.0  # of 4095; darker pixels respond less than logarithmically and have a different threshold
@@ -21,6 +28,11 @@ MAX_CHANGE = 1.0  # natural-log intensity; a larger change between two events is
 MAX_STEPS = 300_000
 STEP_US = 2_000  # between the lags of the first, coarse search
 FINEST_US = 20.0
+MAX_PICTURES = 64  # per capture, from the landmark on; bounds the memory of the refinement
+LANDMARK_ERROR_US = 500.0  # typical difference between the landmark's times in the events of two captures
+REDUNDANCY_SHARE = 1e-3  # share of the samples assumed independent: neighbours in space and time are not
+ITERATIONS = 6
+POLARIZER_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # I0 - I45 + I90 - I135 = 0
 
 
 class Steps(NamedTuple):
@@ -54,13 +66,19 @@ class Lag(NamedTuple):
     thresholds: Thresholds
 
 
-def steps(events: Events, corner: tuple[int, int], crop: tuple[int, int], start_us: int, stop_us: int) -> Steps:
-    """Pairs within a crop (size and upper left corner as row, column) and [start_us, stop_us), thinned to 300,000."""
-    columns = tuple(column.numpy() for column in (events.t, events.x, events.y, events.p))
-    pairs = Steps(*_steps(columns, corner, crop))
-    sample = np.flatnonzero((pairs.before_us >= start_us) & (pairs.after_us < stop_us))
+def steps(events: Events, corner: tuple[int, int], size: tuple[int, int], start_us: int, stop_us: int) -> Steps:
+    """Pairs within a crop (its upper left corner as row, column) and [start_us, stop_us), thinned to 300,000."""
+    part = crop(events, *corner, *size)
+    pixels = part.y.numpy().astype(np.int64) * part.width + part.x.numpy()
+    order = np.argsort(pixels, kind="stable")
+    second = np.flatnonzero(np.diff(pixels[order]) == 0) + 1
+    pairs = np.stack([order[second - 1], order[second]])
+    before, after = pairs[:, np.argsort(pairs[1])]
+    t = part.t.numpy()
+    sample = np.flatnonzero((t[before] >= start_us) & (t[after] < stop_us))
     sample = sample[:: max(1, -(-len(sample) // MAX_STEPS))]
-    return Steps(*(column[sample] for column in pairs))
+    before, after = before[sample], after[sample]
+    return Steps(t[before], t[after], pixels[after], part.p.numpy()[after])
 
 
 def logarithms(pictures: UInt16[np.ndarray, "n h w"]) -> Float32[np.ndarray, "n hw"]:
@@ -73,19 +91,25 @@ def logarithms(pictures: UInt16[np.ndarray, "n h w"]) -> Float32[np.ndarray, "n 
 def changes(
     pairs: Steps, lag_us: float | int, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"]
 ) -> Float64[np.ndarray, " m"]:
-    """Change of log intensity over each step, read from the pictures taken at `t_us` with a delay of `lag_us`.
+    """Change of log intensity over each step, interpolated between pictures taken at `t_us` with a delay of `lag_us`.
 
-    Intensities between pictures are interpolated. The change is NaN where a step is not between the pictures, or too
-    dark.
+    NaN where a step is not between the pictures, or too dark.
     """
-    return _changes(pairs.before_us, pairs.after_us, pairs.pixel, float(lag_us), t_us.astype(np.float64), logs)
+    start, stop = pairs.before_us + float(lag_us), pairs.after_us + float(lag_us)
+    between = (start >= t_us[0]) & (stop <= t_us[-1])
+
+    def at(t: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+        pixel, k = pairs.pixel[between], np.minimum(np.searchsorted(t_us, t, side="right") - 1, len(t_us) - 2)
+        share = (t - t_us[k]) / (t_us[k + 1] - t_us[k])
+        return logs[k, pixel] + share * (logs[k + 1, pixel] - logs[k, pixel])
+
+    change = np.full(len(start), np.nan)
+    change[between] = at(stop[between]) - at(start[between])
+    return change
 
 
 def agreement(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) -> float:
-    """Correlation of polarities with changes: 1 if every change equals the same threshold.
-
-    Large changes are clipped and NaN is ignored; the result is 0 without any known change.
-    """
+    """Correlation of polarities with changes, large ones clipped: 1 if all equal one threshold, 0 if none is known."""
     known = np.isfinite(change)
     clipped = np.clip(change[known], -MAX_CHANGE, MAX_CHANGE)
     norm = np.sqrt(np.dot(clipped, clipped) * len(clipped))
@@ -93,10 +117,9 @@ def agreement(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"
 
 
 def spread(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n"]) -> float:
-    """Variance of the changes signed by their polarities, with large ones clipped.
+    """Variance of the changes signed by their polarities, large ones clipped: noise if all changes are one threshold.
 
-    Only noise contributes where every change is one threshold. Noise in the pictures does not move the minimum, unlike
-    the maximum of `agreement`.
+    Noise in the pictures does not move its minimum, unlike the maximum of `agreement`.
     """
     known = np.isfinite(change)
     return float(np.var(np.clip(polarity[known] * change[known], -MAX_CHANGE, MAX_CHANGE)))
@@ -134,41 +157,98 @@ def best_lag(
     return Lag(lag_us, agreement(pairs.polarity, change), searched, agreements, thresholds(pairs.polarity, bright))
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
-def _steps(columns, corner, crop):
-    t, x, y, p = columns
-    (top, left), (height, width) = corner, crop
-    last = np.full(height * width, -1, np.int64)
-    before, after, pixel = (np.empty(len(t), np.int64), np.empty(len(t), np.int64), np.empty(len(t), np.int64))
-    polarity = np.empty(len(t), np.int8)
-    n = 0
-    for i in range(len(t)):
-        row, column = np.int64(y[i]) - top, np.int64(x[i]) - left
-        if 0 <= row < height and 0 <= column < width:
-            place = row * width + column
-            if last[place] >= 0:
-                before[n], after[n], pixel[n], polarity[n] = t[last[place]], t[i], place, p[i]
-                n += 1
-            last[place] = i
-    return before[:n], after[:n], pixel[:n], polarity[:n]
+class Alignment(NamedTuple):
+    """Start times of a target's captures, each by its own clock."""
+
+    start_us: Mapping[str, int]
+    lags: Sequence[Lag]
+    """Delay of the pictures relative to the events, for each polarizer, from the landmark's starts."""
+    residual: float
+    """Root mean square of I0 - I45 + I90 - I135 divided by that of the mean intensity, with these starts."""
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
-def _changes(before, after, pixel, lag, times, logs):
-    out = np.full(len(before), np.nan)
-    for i in range(len(before)):
-        start, stop = before[i] + lag, after[i] + lag
-        if start < times[0] or stop > times[-1]:
-            continue
-        out[i] = _at(stop, pixel[i], times, logs) - _at(start, pixel[i], times, logs)
-    return out
+def refined_starts(
+    starts: Mapping[str, int],
+    events: Mapping[str, Events],
+    intensities: Mapping[str, IntensityCapture],
+    config: RecordingsConfig,
+    given: Mapping[str, int],
+) -> Alignment:
+    """Refine the landmark's starts to less than a frame interval; starts `given` by hand stay unchanged.
+
+    Time 0 of the common clock stays: the start times of the four event captures change by 0 on average.
+    """
+    lags = [
+        _lag(events[e], starts[e], intensities[i], starts[i], config)
+        for e, i in zip(EVENT_CAPTURES, INTENSITY_CAPTURES, strict=True)
+    ]
+    picture_us = np.array([starts[i] for i in INTENSITY_CAPTURES]) + [lag.lag_us for lag in lags]
+    captures = [intensities[i] for i in INTENSITY_CAPTURES]
+    shifts, residual = redundancy_shifts(captures, picture_us, config)
+    refined = dict(starts)
+    for polarizer, (e, i) in enumerate(zip(EVENT_CAPTURES, INTENSITY_CAPTURES, strict=True)):
+        refined[i] = round(picture_us[polarizer] + shifts[polarizer])
+        refined[e] = round(starts[e] + shifts[polarizer])
+    return Alignment({**refined, **given}, lags, residual)
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
-def _at(t, pixel, times, logs):
-    k = min(np.searchsorted(times, t, side="right") - 1, len(times) - 2)
-    share = (t - times[k]) / (times[k + 1] - times[k])
-    return logs[k, pixel] + share * (logs[k + 1, pixel] - logs[k, pixel])
+def redundancy_shifts(
+    captures: Sequence[IntensityCapture], start_us: Float64[np.ndarray, " 4"], config: RecordingsConfig
+) -> tuple[Float64[np.ndarray, " 4"], float]:
+    """Shifts of four intensity captures that best satisfy I0 + I90 = I45 + I135, and the remaining residual.
+
+    The shifts come from linearised least squares (Gauss-Newton) and have mean 0. Shifts that the scene does not
+    determine, because all four captures see the same, stay near 0.
+    """
+    stacks = [_Stack(capture, start, config) for capture, start in zip(captures, start_us.tolist(), strict=True)]
+    first, last = max(stack.t_us[0] for stack in stacks), min(stack.t_us[-1] for stack in stacks)
+    margin = 1000 * config.refine_within_ms / 2
+    count = int((last - first - 2 * margin) / stacks[0].period_us)
+    if count < 2:
+        raise RecordingError("the intensity captures have too few pictures in common after the landmark to align them")
+    t_us = np.linspace(first + margin, last - margin, count)
+    shifts = np.zeros(4)
+    for _ in range(ITERATIONS):
+        values = [stack.at(t_us + shift) for stack, shift in zip(stacks, shifts.tolist(), strict=True)]
+        slopes = np.stack([s * v[1].reshape(-1) for s, v in zip(POLARIZER_SIGNS, values, strict=True)], axis=1)
+        left = sum(s * v[0].reshape(-1) for s, v in zip(POLARIZER_SIGNS, values, strict=True))
+        weight = REDUNDANCY_SHARE / max(float(np.mean(left**2)), 1e-12)
+        prior = np.eye(4) / LANDMARK_ERROR_US**2
+        shifts = np.linalg.solve(weight * slopes.T @ slopes + prior, weight * slopes.T @ (slopes @ shifts - left))
+        shifts -= shifts.mean()
+    level = np.sqrt(np.mean(sum(v[0] for v in values) ** 2)) / 4
+    return shifts, float(np.sqrt(np.mean(left**2)) / level)
+
+
+class _Stack:
+    """Reduced pictures of a capture from its start on, interpolated to any time of the common clock."""
+
+    def __init__(self, capture: IntensityCapture, start_us: float, config: RecordingsConfig):
+        chosen = _pictures_after(capture, start_us)
+        self.t_us = capture.t_us[chosen] - start_us
+        self.period_us = float(np.median(np.diff(self.t_us)))
+        self.frames = np.stack([reduced(picture, config) for picture in capture.pictures[chosen]])
+
+    def at(self, t_us: Float64[np.ndarray, " n"]) -> tuple[Float32[np.ndarray, "n h w"], Float32[np.ndarray, "n h w"]]:
+        """Pictures and their change per microsecond, by linear interpolation."""
+        k = np.clip(np.searchsorted(self.t_us, t_us, side="right") - 1, 0, len(self.t_us) - 2)
+        step = self.t_us[k + 1] - self.t_us[k]
+        share = np.clip((t_us - self.t_us[k]) / step, 0, 1).astype(np.float32)[:, None, None]
+        difference = self.frames[k + 1] - self.frames[k]
+        return self.frames[k] + share * difference, difference / step.astype(np.float32)[:, None, None]
+
+
+def _pictures_after(capture: IntensityCapture, start_us: float | int) -> slice:
+    """Up to 64 pictures, starting with the last one before `start_us`."""
+    first = max(0, int(np.searchsorted(capture.t_us, start_us)) - 1)
+    return slice(first, first + MAX_PICTURES)
+
+
+def _lag(
+    events: Events, event_start_us: int, capture: IntensityCapture, picture_start_us: int, config: RecordingsConfig
+) -> Lag:
+    """Delay of the pictures relative to the events, from these starts."""
+    chosen = _pictures_after(capture, picture_start_us)
+    t_us = capture.t_us[chosen] - picture_start_us + event_start_us
+    pairs = steps(events, config.crop_corner, (config.crop[0], config.crop[1]), int(t_us[0]), int(t_us[-1]))
+    return best_lag(pairs, t_us, logarithms(capture.pictures[chosen]), 1000 * config.refine_within_ms)

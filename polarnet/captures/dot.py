@@ -4,20 +4,19 @@ A target moves in the same way eight times, behind a polarizer at 0, 45, 90 and 
 landmark enters a region of the picture. That moment is time 0 of the clock that all eight share.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt16
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt, StrictInt, TypeAdapter
 from torch import Tensor
 
 from polarnet.events.stream import Events, concatenate, crop
 from polarnet.pictures.clips import TIMES_FILE, VIDEOS, ClipOptions, check_times, open_clip, times_from_file
-from polarnet.recordings.formats.celex5_bin import Picture, celex5_pictures
+from polarnet.recordings.formats.celex5 import Picture, celex5_pictures
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.runtime.sections import one_of, section
@@ -25,6 +24,7 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 EVENT_CAPTURES = tuple(f"events_{angle}" for angle in POLARIZER_ANGLES_DEG)
 INTENSITY_CAPTURES = tuple(f"intensity_{angle}" for angle in POLARIZER_ANGLES_DEG)
+CAPTURES = (*EVENT_CAPTURES, *INTENSITY_CAPTURES)
 STARTS_FILE = "starts.json"
 STEPS_OF_8_BITS = 16.0  # 12-bit steps per level of 8 bits, the scale of the vendor's programs and of `dark_level`
 STAMP_US = 1000  # resolution of the computer's picture times, which are rounded down
@@ -66,15 +66,12 @@ class RecordingsConfig:
     """Length of the sequence, from the landmark on; null: as long as all captures last."""
 
     def __post_init__(self):
-        for name in ("sensor", "region", "crop", "size"):
-            if len(getattr(self, name)) != 2:
-                raise ValueError(f"{name}: expected [height, width], got {list(getattr(self, name))}")
-        for inner, outer in (("region", "sensor"), ("crop", "sensor"), ("size", "crop")):
-            if any(a > b for a, b in zip(getattr(self, inner), getattr(self, outer), strict=True)):
-                raise ValueError(
-                    f"{inner}: expected at most the {outer}'s {list(getattr(self, outer))}, "
-                    f"got {list(getattr(self, inner))}"
-                )
+        for inner, outer in (("sensor", "sensor"), ("region", "sensor"), ("crop", "sensor"), ("size", "crop")):
+            size, limit = getattr(self, inner), getattr(self, outer)
+            if len(size) != 2:
+                raise ValueError(f"{inner}: expected [height, width], got {list(size)}")
+            if any(a > b for a, b in zip(size, limit, strict=True)):
+                raise ValueError(f"{inner}: expected at most the {outer}'s {list(limit)}, got {list(size)}")
 
     @property
     def crop_corner(self) -> tuple[int, int]:
@@ -100,15 +97,13 @@ def find_captures(folder: Path) -> dict[str, Path]:
     RecordingError where a capture has no file or more than one.
     """
     captures = {}
-    for name in (*EVENT_CAPTURES, *INTENSITY_CAPTURES):
-        files = sorted(path for path in folder.glob(f"{name}*") if path.stem == name)
-        if name in INTENSITY_CAPTURES:
-            files = [path for path in files if path.suffix != ".txt"]
+    for name in CAPTURES:
+        times = name in INTENSITY_CAPTURES and folder / f"{name}.txt"
+        files = sorted(path for path in folder.glob(f"{name}*") if path.stem == name and path != times)
         if len(files) != 1:
-            there = ", ".join(path.name for path in files) or "none"
             raise RecordingError(
-                f"target {folder.name}: expected one file {name}.bin (or another ending), got {there}; a target has "
-                f"{', '.join((*EVENT_CAPTURES, *INTENSITY_CAPTURES))}"
+                f"target {folder.name}: expected one file {name}.bin (or another ending), got "
+                f"{', '.join(path.name for path in files) or 'none'}; a target has {', '.join(CAPTURES)}"
             )
         captures[name] = files[0]
     return captures
@@ -120,18 +115,12 @@ def given_starts(folder: Path) -> dict[str, int]:
     if not path.exists():
         return {}
     try:
-        starts = json.loads(path.read_text())
+        return TypeAdapter(dict[Literal[CAPTURES], StrictInt]).validate_json(path.read_text())  # type: ignore[valid-type]
     except ValueError as error:
-        raise RecordingError(f"{folder.name}/{path.name}: not JSON: {error}") from error
-    known = (*EVENT_CAPTURES, *INTENSITY_CAPTURES)
-    if not isinstance(starts, dict) or not all(
-        name in known and isinstance(t, int) and not isinstance(t, bool) for name, t in starts.items()
-    ):
         raise RecordingError(
             f"{folder.name}/{path.name}: expected whole microseconds of the capture's own clock for any of "
-            f"{', '.join(known)}, got {starts!r}"
-        )
-    return starts
+            f"{', '.join(CAPTURES)}: {error}"
+        ) from error
 
 
 def read_event_capture(path: Path, config: RecordingsConfig) -> Events:
@@ -149,7 +138,7 @@ def read_event_capture(path: Path, config: RecordingsConfig) -> Events:
 def read_intensity_capture(path: Path, config: RecordingsConfig) -> IntensityCapture:
     """The pictures of a BIN file, a video or a folder of frames, whose values are linear in light.
 
-    RecordingError where there are fewer than two, where they have no times or are smaller than the sensor.
+    RecordingError where they are fewer than two, without times, or smaller than the sensor.
     """
     (top, left), (height, width) = config.crop_corner, config.crop
     times, pictures, region = [], [], []
@@ -158,7 +147,12 @@ def read_intensity_capture(path: Path, config: RecordingsConfig) -> IntensityCap
         if any(side < used for side, used in zip(picture.intensity.shape, config.sensor, strict=True)):
             size = "x".join(map(str, picture.intensity.shape))
             raise RecordingError(f"{path.name}: recordings.sensor is {config.sensor}, its pictures are {size}")
-        times.append(_stamp_us(path, k, picture, config))
+        if picture.t_us is None and config.picture_rate_hz is None:
+            raise RecordingError(
+                f"{path.name}: its pictures have no times (a BIN file recorded without the IMU's data, or frames "
+                f"without {TIMES_FILE}); set recordings.picture_rate_hz to the rate they were taken at"
+            )
+        times.append(round(k * 1e6 / config.picture_rate_hz) if config.picture_rate_hz else picture.t_us)
         pictures.append(picture.intensity[top : top + height, left : left + width].copy())
         region.append(float(region_of(picture.intensity, config).mean()) / STEPS_OF_8_BITS)
     if len(pictures) < 2:
@@ -256,28 +250,7 @@ def landmark_starts(
     given: Mapping[str, int],
 ) -> dict[str, int]:
     """Start time of each capture by its own clock: `given` by hand, or when the landmark enters the region."""
-    starts = {}
-    for name, capture in events.items():
-        starts[name] = given[name] if name in given else event_start_us(name, capture, config)
-    for name, pictures in intensities.items():
-        starts[name] = given[name] if name in given else intensity_start_us(name, pictures, config)
-    return starts
-
-
-def _stamp_us(path: Path, k: int, picture: Picture, config: RecordingsConfig) -> int:
-    if config.picture_rate_hz is not None:
-        return round(k * 1e6 / config.picture_rate_hz)
-    if picture.t_us is None:
-        raise RecordingError(
-            f"{path.name}: its pictures have no times (a BIN file recorded without the IMU's data, or frames without "
-            f"{TIMES_FILE}); set recordings.picture_rate_hz to the rate they were taken at"
-        )
-    return picture.t_us
-
-
-def targets_of(root: Path) -> list[str]:
-    """Sorted names of the folders in `root`; RecordingError if there are none."""
-    names = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
-    if not names:
-        raise RecordingError(f"{root}: expected a folder for each target with its eight captures, there is none")
-    return names
+    starts = {name: event_start_us(name, one, config) for name, one in events.items() if name not in given}
+    starts |= {name: intensity_start_us(name, one, config) for name, one in intensities.items() if name not in given}
+    starts |= given
+    return {name: starts[name] for name in (*events, *intensities)}

@@ -1,9 +1,10 @@
-"""Put imported division-of-time captures on one clock, in the stores that every later stage reads.
+"""Decode division-of-time captures once, then put them on one clock, in the stores that every later stage reads.
 
 The stores `events.zarr` and `frames.zarr` have the layout of simulated sequences; all targets are in the split `test`.
 """
 
 import json
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,25 +15,106 @@ from jaxtyping import Float32, Int64
 from torch import Tensor
 
 from polarnet import stokes
-from polarnet.captures.calibration import Alignment, refined_starts
+from polarnet.captures.alignment import Alignment, refined_starts
 from polarnet.captures.dot import (
     EVENT_CAPTURES,
     INTENSITY_CAPTURES,
     IntensityCapture,
     RecordingsConfig,
+    find_captures,
+    given_starts,
     landmark_starts,
+    read_event_capture,
+    read_intensity_capture,
     reduced,
     region_negative_times_us,
 )
-from polarnet.captures.imported import Target, open_target, start_over
 from polarnet.events.stream import Events, crop, downscale, slice_time
 from polarnet.recordings.arrangements import shifted
-from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
+from polarnet.recordings.noise import event_counts, hot_pixels, without_pixels
 from polarnet.recordings.source import RecordingError
+from polarnet.runtime.files import check_seal, seal, sha256
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import Contents, FrameStore
 
+STATUS_FILE = "status.json"
 WHITE = 255.0  # maximum of reduced pictures
+
+
+class Target(NamedTuple):
+    """The eight captures of one target, as stored by `import_targets`."""
+
+    name: str
+    events: Mapping[str, Events]
+    intensities: Mapping[str, IntensityCapture]
+    given: Mapping[str, int]
+    """Start times set by hand."""
+
+
+def import_targets(root: Path, out: Path, config: RecordingsConfig) -> list[str]:
+    """Decode every target of `root` into `out` and return the targets' names.
+
+    `out` gets events.zarr, a folder of pictures for each target, and status.json. In events.zarr the four event
+    captures of a target are its channels, each by its own clock from its first event on. RecordingError where a file is
+    missing or damaged.
+    """
+    names = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
+    if not names:
+        raise RecordingError(f"{root}: expected a folder for each target with its eight captures, there is none")
+    start_over(out, enabled=True)
+    captures = {name: find_captures(root / name) for name in names}
+    hashes = {
+        name: {key: sha256(*(sorted(one.iterdir()) if one.is_dir() else [one])) for key, one in captures[name].items()}
+        for name in names
+    }
+    attributes = {"sensor": list(config.sensor), "files": hashes}
+    store = EventStore.create(out / "events.zarr", names, config.sensor[0], config.sensor[1], attributes)
+    for name in names:
+        files, folder = captures[name], out / name
+        channels, origins = [], {}
+        for capture in EVENT_CAPTURES:
+            events = read_event_capture(files[capture], config)
+            origins[capture] = int(events.t[0]) if len(events) else 0
+            channels.append(shifted(events, origins[capture]))
+        store.write(name, channels, max((int(e.t[-1]) for e in channels if len(e)), default=0))
+        folder.mkdir()
+        for capture in INTENSITY_CAPTURES:
+            pictures = read_intensity_capture(files[capture], config)
+            np.save(folder / f"{capture}.npy", pictures.pictures)
+            np.savez(folder / f"{capture}_times.npz", t_us=pictures.t_us, region=pictures.region)
+        content = {"origin_us": origins, "given_us": given_starts(root / name)}
+        (folder / "clocks.json").write_text(json.dumps(content, indent=2) + "\n")
+        seal(folder)
+    store.finish()
+    return names
+
+
+def open_target(imported: Path, name: str) -> Target:
+    """Open an imported target, its events by the clocks of their files; pictures are memory-mapped.
+
+    ValueError if a file has changed since the import.
+    """
+    folder = imported / name
+    check_seal(folder)
+    clocks = json.loads((folder / "clocks.json").read_text())
+    channels = EventStore.open(imported / "events.zarr").read(name)
+    events = {
+        capture: shifted(channel, -clocks["origin_us"][capture])
+        for capture, channel in zip(EVENT_CAPTURES, channels, strict=True)
+    }
+    intensities = {}
+    for capture in INTENSITY_CAPTURES:
+        with np.load(folder / f"{capture}_times.npz") as times:
+            pictures = np.load(folder / f"{capture}.npy", mmap_mode="r")
+            intensities[capture] = IntensityCapture(times["t_us"], pictures, times["region"])
+    return Target(name, events, intensities, clocks["given_us"])
+
+
+def start_over(out: Path, *, enabled: bool) -> None:
+    """Empty a stage's output folder and write status.json, which says whether real recordings are in use."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    (out / STATUS_FILE).write_text(json.dumps({"enabled": enabled}) + "\n")
 
 
 class Calibrated(NamedTuple):
@@ -79,7 +161,8 @@ def calibrate_targets(
         targets.append(one)
     events.finish()
     frames.finish()
-    (out / "calibration.json").write_text(json.dumps({one.name: _record(one) for one in targets}, indent=2) + "\n")
+    records = {one.name: _record(one) for one in targets}
+    (out / "calibration.json").write_text(json.dumps(records, indent=2) + "\n")
     return targets
 
 
@@ -139,21 +222,18 @@ def aligned(
         during = shifted(slice_time(events, start, start + int(t_us[-1]) + 1), start)
         part = crop(during, *config.crop_corner, *config.crop)
         channels.append(downscale(part, config.size[0], config.size[1], keep_rate=config.keep_event_rate))
-    planes = [interpolated(target.intensities[c], t_us + calibrated.start_us[c], config) for c in INTENSITY_CAPTURES]
+    planes = []
+    for name in INTENSITY_CAPTURES:
+        pictures, own_us = target.intensities[name], t_us + calibrated.start_us[name]
+        k = np.clip(np.searchsorted(pictures.t_us, own_us, side="right") - 1, 0, len(pictures.t_us) - 2)
+        share = (own_us - pictures.t_us[k]) / (pictures.t_us[k + 1] - pictures.t_us[k])
+        frames = [
+            (1 - s) * reduced(np.asarray(pictures.pictures[before]), config)
+            + s * reduced(np.asarray(pictures.pictures[before + 1]), config)
+            for before, s in zip(k.tolist(), share.tolist(), strict=True)
+        ]
+        planes.append(torch.from_numpy(np.stack(frames)).float().div_(WHITE).clamp_(0, 1))
     return channels, torch.from_numpy(t_us), torch.stack(planes, dim=1)
-
-
-def interpolated(
-    capture: IntensityCapture, t_us: Int64[np.ndarray, " n"], config: RecordingsConfig
-) -> Float32[Tensor, "n h w"]:
-    """Reduced pictures, 0 to 1, interpolated to the times `t_us`."""
-    k = np.clip(np.searchsorted(capture.t_us, t_us, side="right") - 1, 0, len(capture.t_us) - 2)
-    share = (t_us - capture.t_us[k]) / (capture.t_us[k + 1] - capture.t_us[k])
-    frames = []
-    for before, s in zip(k.tolist(), share.tolist(), strict=True):
-        pair = [reduced(np.asarray(capture.pictures[before + step]), config) for step in (0, 1)]
-        frames.append((1 - s) * pair[0] + s * pair[1])
-    return torch.from_numpy(np.stack(frames)).float().div_(WHITE).clamp_(0, 1)
 
 
 def frame_times_us(duration_us: int, config: RecordingsConfig) -> Int64[np.ndarray, " n"]:
@@ -163,12 +243,8 @@ def frame_times_us(duration_us: int, config: RecordingsConfig) -> Int64[np.ndarr
 
 
 def _record(calibrated: Calibrated) -> dict[str, Any]:
-    record: dict[str, Any] = {
-        "landmark_us": dict(calibrated.landmark_us),
-        "start_us": dict(calibrated.start_us),
-        "duration_us": calibrated.duration_us,
-        "hot_pixels": dict(calibrated.hot),
-    }
+    record: dict[str, Any] = {name: getattr(calibrated, name) for name in ("landmark_us", "start_us", "duration_us")}
+    record["hot_pixels"] = calibrated.hot
     if calibrated.alignment is not None:
         record["redundancy_residual"] = calibrated.alignment.residual
         for capture, lag in zip(EVENT_CAPTURES, calibrated.alignment.lags, strict=True):

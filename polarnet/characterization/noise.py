@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from polarnet.characterization.estimates import Estimate
 from polarnet.characterization.increments import PixelEvents, chosen_pixels, intervals_of
 from polarnet.events.stream import Events
-from polarnet.recordings.pixels import event_counts, hot_pixels
+from polarnet.recordings.noise import event_counts, hot_pixels
 from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels.physics import shot_noise_fraction
 

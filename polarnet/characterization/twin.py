@@ -13,7 +13,7 @@ from polarnet.characterization.fit import SensorFit
 from polarnet.characterization.increments import by_pixel, intervals_of
 from polarnet.characterization.light import Flicker, MovingLight
 from polarnet.events.stream import Events, concatenate, crop, slice_time
-from polarnet.recordings.pixels import HOT_FACTOR, event_counts, hot_pixels, without_pixels
+from polarnet.recordings.noise import HOT_FACTOR, event_counts, hot_pixels, without_pixels
 from polarnet.runtime.machine import seed_for
 from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate
 

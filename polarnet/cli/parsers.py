@@ -21,7 +21,7 @@ def add_stored_sequence(command: argparse.ArgumentParser) -> None:
 
 
 def add_hot_pixel_factor(command: argparse.ArgumentParser) -> None:
-    """Add `--hot-pixel-factor`, the limit of `polarnet.recordings.pixels.hot_pixels`."""
+    """Add `--hot-pixel-factor`, the limit of `polarnet.recordings.noise.hot_pixels`."""
     command.add_argument(
         "--hot-pixel-factor",
         type=float,

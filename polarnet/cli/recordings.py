@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from polarnet.config.tree import Config
     from polarnet.events.rotation import Rotation
     from polarnet.events.streaming import WindowRule
-    from polarnet.recordings.noise import Cleaner
-    from polarnet.recordings.polarizers import ChannelCheck
+    from polarnet.recordings.noise import ChannelCheck, Cleaner
     from polarnet.recovery.stream import Input
     from polarnet.stokes import Mosaic
     from polarnet.storage.true_frames import TrueFrames
@@ -205,7 +204,7 @@ def _add_method(recover: argparse.ArgumentParser) -> None:
 def _add_output(recover: argparse.ArgumentParser) -> None:
     recover.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
     recover.add_argument(
-        "--write", nargs="+", choices=("zarr", "png", "exr", "mp4"), default=("zarr", "png", "mp4"),
+        "--write", nargs="+", choices=("zarr", "png", "mp4"), default=("zarr", "png", "mp4"),
         help="file types to write (default: zarr png mp4)",
     )  # fmt: skip
     recover.add_argument(
@@ -244,11 +243,9 @@ def _recover(options: argparse.Namespace) -> int:
     from polarnet.config.pipeline import setup_of
     from polarnet.config.tree import load
     from polarnet.methods import METHODS
-    from polarnet.recordings.noise import Cleaner
-    from polarnet.recordings.polarizers import ChannelCheck
+    from polarnet.recordings.noise import ChannelCheck, Cleaner
     from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
-    from polarnet.recovery.stream import ChosenMethod, facts_of, frames_of, open_method, recover
-    from polarnet.recovery.watching import TruthScores
+    from polarnet.recovery.stream import ChosenMethod, TruthScores, frames_of, open_method, recover
     from polarnet.recovery.writer import RecoveryWriter
     from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
@@ -280,7 +277,7 @@ def _recover(options: argparse.Namespace) -> int:
         source = source or _input(options, mosaic, cleaner, folder / WORK, config)
         check, polarized = None, source.channels == len(POLARIZER_ANGLES_DEG)
         if polarized:
-            check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
+            check = ChannelCheck(source.height, source.width)
             source = source._replace(pieces=check.watch(source.pieces))
         drawn = polarized and "mp4" in options.write and truth is None
         reconstruct = METHODS[RECONSTRUCT].open(setup(METHODS[RECONSTRUCT])) if drawn else None
@@ -288,7 +285,7 @@ def _recover(options: argparse.Namespace) -> int:
         frames = frames_at_rate(source, rule, recoverer, rate) if rate else frames_of(source, rule, recoverer)
         if scores:
             frames = scores.watch(frames)
-        facts = facts_of(source, rule, words, recover(source, rule, recoverer, writer, frames))
+        facts = recover(source, rule, words, writer, frames)
         facts |= _further_facts(options.rate, check)
         if scores:
             facts["scores"] = scores.sentence(config.benchmark.warmup_windows)

@@ -135,12 +135,12 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    from polarnet.recovery.stream import replay
+    from polarnet.recordings.live import replay
     from polarnet.storage.events import EventStore
 
     def write(data: bytes) -> None:
         sys.stdout.buffer.write(data)
         sys.stdout.buffer.flush()
 
-    replay(EventStore.open(options.store), options.sequence, options.speed, write)
+    replay(EventStore.open(options.store).read(options.sequence), options.speed, write)
     return 0

@@ -1,4 +1,4 @@
-"""Turn files of any polarizer arrangement into four channels on one clock, in an event store.
+"""Turn files of any polarizer arrangement into four channels on one clock.
 
 An arrangement is either four files, one per angle and in any order (four cameras, or one camera four times), or one
 file of a camera with a mosaic of polarizers on its pixels (division of focal plane). `polarnet.captures.targets`
@@ -7,17 +7,14 @@ handles division-of-time captures.
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from polarnet.events.mosaic import split_mosaic
-from polarnet.events.stream import Events, slice_count
+from polarnet.events.stream import Events, select
 from polarnet.recordings.recording import Recording, read_recording
 from polarnet.recordings.source import RecordingError
-from polarnet.runtime.files import sha256
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
-from polarnet.storage.events import EventStore
 
 
 def read_four(
@@ -49,7 +46,8 @@ def read_four(
         raise RecordingError(f"expected four files of one size of sensor, got {sorted(sizes)} (height, width)")
     if start_us is None:
         return _from_first_event(channels)
-    return [_since(c, start_us[by_angle[a]]) for c, a in zip(channels, POLARIZER_ANGLES_DEG, strict=True)]
+    starts = [start_us[by_angle[angle]] for angle in POLARIZER_ANGLES_DEG]
+    return [shifted(select(c, c.t >= start), start) for c, start in zip(channels, starts, strict=True)]
 
 
 def read_mosaic(
@@ -73,33 +71,10 @@ def read_plain(path: Path, read: Callable[[Path], Recording]) -> list[Events]:
 
 def shifted(events: Events, origin_us: int) -> Events:
     """The same events, with `origin_us` as time 0."""
-    return Events(events.t - origin_us, events.x, events.y, events.p, events.height, events.width)
+    return replace(events, t=events.t - origin_us)
 
 
 def _from_first_event(channels: Sequence[Events]) -> list[Events]:
     """The channels, with time 0 at the earliest event of any of them."""
     start_us = min((int(channel.t[0]) for channel in channels if len(channel)), default=0)
     return [shifted(channel, start_us) for channel in channels]
-
-
-def _since(events: Events, start_us: int) -> Events:
-    first = int(torch.searchsorted(events.t, torch.tensor(start_us)))
-    return shifted(slice_count(events, first, len(events)), start_us)
-
-
-def write_store(path: str | os.PathLike[str], sequences: Mapping[str, Sequence[Events]]) -> None:
-    """Write sequences of four channels, starting at time 0, as an event store; each lasts until its last event."""
-    sizes = {(channel.height, channel.width) for channels in sequences.values() for channel in channels}
-    if len(sizes) != 1:
-        raise RecordingError(f"expected sequences of one size of sensor, got {sorted(sizes)} (height, width)")
-    attributes = {"events_sha256": {name: _digest(channels) for name, channels in sequences.items()}}
-    store = EventStore.create(path, list(sequences), *sizes.pop(), attributes)
-    for name, channels in sequences.items():
-        store.write(name, channels, max((int(c.t[-1]) for c in channels if len(c)), default=0))
-    store.finish()
-
-
-def _digest(channels: Sequence[Events]) -> str:
-    """SHA-256 of all columns, so that an interrupted store of other events is not resumed."""
-    columns = (column for channel in channels for column in (channel.t, channel.x, channel.y, channel.p))
-    return sha256(*(part for c in columns for part in (len(c).to_bytes(8, "little"), c.numpy().data)))

@@ -1,41 +1,42 @@
-"""Read events as a camera delivers them: lines of text from standard input or from a file that grows.
+"""Read events as a camera delivers them: lines of text from standard input or from a file that grows, or a camera.
 
 The first line is `width height` of the sensor. Each other line is an event: `t x y p angle`, separated by blanks or
 commas; t in whole microseconds, p 1 or 0 (or -1), angle the polarizer's, 0, 45, 90 or 135. A camera with a mosaic of
 polarizers gives `t x y p`. # starts a comment.
+
+Cameras are read through the package dv-processing. dv://HOST:PORT is a running acquisition program that streams events
+over the network (DV, dv-runtime, or another program with a NetworkWriter); dv://camera is the first camera of iniVation
+that is plugged in.
 """
 
 import itertools
 import os
+import re
 import stat
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from queue import Queue
 from threading import Thread
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Int64
 
 from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import MAX_SIDE, Events
 from polarnet.recordings.formats.lines import lines_of, numbers_of, rows_of
-from polarnet.recordings.repair import TOLERATED_COUNT, TOLERATED_SHARE
-from polarnet.recordings.source import RecordingError
+from polarnet.recordings.repair import refuse_much_damage, usable
+from polarnet.recordings.source import Block, RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
+from polarnet.terminal.installation import installation
 
 READ_BYTES = 2**20
 MAX_READ_AHEAD = 64  # blocks of READ_BYTES, for a file; a camera does not wait, so its queue is unbounded
 POLL_S = 0.001
-DAMAGE = {
-    "unreadable_lines": "lines that are not {columns}",
-    "bad_polarity": "events of a polarity that is not 1, 0 or -1",
-    "bad_angle": "events of an angle that is not 0, 45, 90 or 135",
-    "out_of_range": "events that are not on the sensor",
-    "late": "events earlier than others that were used already",
-}
+SCHEME, CAMERA = "dv://", "camera"
+NETWORK = re.compile(r"(?P<host>[^:/]+):(?P<port>\d{1,5})")
 
 
 class Piece(NamedTuple):
@@ -49,20 +50,37 @@ class Piece(NamedTuple):
     """When its first data arrived, by `time.perf_counter`."""
 
 
-class StreamClock:
-    """Time of a stream, which counts from its first event; events older than those of an earlier piece are late."""
+class _Stream:
+    """Makes pieces of rows `t x y p` of a mosaic, or `t x y p angle`; events older than an earlier piece are late."""
 
-    def __init__(self) -> None:
-        self.until_us = 0
+    def __init__(self, height: int, width: int, mosaic: Mosaic | None):
+        self.height, self.width = (side // 2 if mosaic else side for side in (height, width))
+        self.counts: Counter[str] = Counter()
+        self._sensor, self._mosaic = (height, width), mosaic
         self._origin_us: int | None = None
+        self._until_us = 0
 
-    def on_time(self, t: Int64[np.ndarray, " n"]) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """Times of the next n >= 1 events by this clock, and which events are not late; moves `until_us` on."""
-        self._origin_us = int(t[0]) if self._origin_us is None else self._origin_us
-        times_us = t - self._origin_us
-        current = times_us >= self.until_us
-        self.until_us = max(self.until_us, int(times_us.max()))
-        return times_us, current
+    def pieces(self, table: Int64[np.ndarray, "n columns"], read_at: float) -> Iterator[Piece]:
+        """The piece of the next rows; none if all of them are late."""
+        if not len(table):
+            return
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        self._origin_us = int(table[0, 0]) if self._origin_us is None else self._origin_us
+        table = np.column_stack([table[:, 0] - self._origin_us, table[:, 1:]])
+        current = table[table[:, 0] >= self._until_us]
+        self.counts["late"] += len(table) - len(current)
+        if len(current):
+            self._until_us = int(current[-1, 0])
+            yield Piece(self._channels(current), self._until_us, read_at)
+
+    def _channels(self, table: Int64[np.ndarray, "n columns"]) -> list[Events]:
+        if self._mosaic:
+            return split_mosaic(self._events(table), self._mosaic)
+        return [self._events(table[table[:, 4] == angle]) for angle in POLARIZER_ANGLES_DEG]
+
+    def _events(self, table: Int64[np.ndarray, "n columns"]) -> Events:
+        t, x, y, p = table[:, :4].T
+        return Events.from_columns(t, x, y, np.where(p > 0, 1, -1), *self._sensor)
 
 
 class LiveLines:
@@ -74,33 +92,34 @@ class LiveLines:
     """
 
     def __init__(self, source: BinaryIO, name: str, mosaic: Mosaic | None, idle_s: float):
-        self.name, self.mosaic = name, mosaic
-        self.counts: Counter[str] = Counter()
-        self._source, self._idle_s = source, idle_s
+        self.name = name
+        self._source, self._idle_s, self._columns = source, idle_s, 4 if mosaic else 5
         self._grows = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
         self._queue: Queue[tuple[bytes, float] | None] = Queue(MAX_READ_AHEAD if self._grows else 0)
         own = os.dup(source.fileno())  # a duplicate, so that a file opened later cannot get its number
         Thread(target=self._read, args=[own], daemon=True).start()
         self._blocks = self._whole_lines()
         self._sensor = self._first_line()
-        self.height, self.width = (side // 2 if mosaic else side for side in self._sensor)
+        self._stream = _Stream(*self._sensor, mosaic)
+        self.height, self.width, self.counts = self._stream.height, self._stream.width, self._stream.counts
 
     def __iter__(self) -> Iterator[Piece]:
-        columns = "t x y p" if self.mosaic else "t x y p angle"
-        shift = np.zeros(len(columns.split()), np.int64)
-        clock, lines = StreamClock(), 0
+        shift, lines = np.zeros(self._columns, np.int64), 0
         for data, read_at in self._blocks:
-            rows = [*rows_of(data, shift, self.counts, "unreadable_lines")]
-            table = self._usable(np.concatenate(rows)) if rows else np.empty((0, len(shift)), np.int64)
+            rows = [np.empty((0, self._columns), np.int64), *rows_of(data, shift, self.counts, "unreadable_lines")]
+            table = self._usable(np.concatenate(rows))
             lines += data.count(b"\n")
-            self._refuse_damage(columns, lines)
-            if len(table) == 0:
-                continue
-            table = table[np.argsort(table[:, 0], kind="stable")]
-            table[:, 0], current = clock.on_time(table[:, 0])
-            self.counts["late"] += int(np.count_nonzero(~current))
-            if current.any():
-                yield Piece(self._channels(table[current]), clock.until_us, read_at)
+            refuse_much_damage(self.name, self.counts, lines)
+            yield from self._stream.pieces(table, read_at)
+
+    def _usable(self, table: Int64[np.ndarray, "n columns"]) -> Int64[np.ndarray, "m columns"]:
+        t, x, y, p, *angle = table.T
+        good = usable(Block(t, x, y, np.where(p == -1, 0, p)), *self._sensor, 0, self.counts)
+        if angle:
+            known = np.isin(angle[0], POLARIZER_ANGLES_DEG)
+            self.counts["bad_angle"] += int(np.count_nonzero(good & ~known))
+            good &= known
+        return table[good]
 
     def _first_line(self) -> tuple[int, int]:
         """Height and width; the rest of what has arrived stays in `_blocks`."""
@@ -150,31 +169,57 @@ class LiveLines:
                 self._source.close()
             self._queue.put(None)
 
-    def _usable(self, table: Int64[np.ndarray, "n columns"]) -> Int64[np.ndarray, "m columns"]:
-        height, width = self._sensor
-        checks = {
-            "out_of_range": (table[:, 1] >= 0) & (table[:, 1] < width) & (table[:, 2] >= 0) & (table[:, 2] < height),
-            "bad_polarity": np.abs(table[:, 3]) <= 1,
-            "bad_angle": np.isin(table[:, 4], POLARIZER_ANGLES_DEG) if not self.mosaic else np.ones(len(table), bool),
-        }
-        usable = np.ones(len(table), bool)
-        for kind, good in checks.items():
-            self.counts[kind] += int(np.count_nonzero(~good))
-            usable &= good
-        return table[usable]
 
-    def _refuse_damage(self, columns: str, lines: int) -> None:
-        for kind, words in DAMAGE.items():
-            if kind != "late" and self.counts[kind] > max(TOLERATED_COUNT, TOLERATED_SHARE * lines):
-                raise RecordingError(
-                    f"{self.name}: {self.counts[kind]} of the first {lines} lines are "
-                    f"{words.format(columns=f'`{columns}`')}; is the format right, and the size in the first line?"
-                )
+class LiveCamera:
+    """Events of a camera in pieces, as they arrive; ends with the connection, or after `idle_s` without an event.
 
-    def _channels(self, table: Int64[np.ndarray, "n columns"]) -> list[Events]:
-        if self.mosaic:
-            return split_mosaic(_events(table, *self._sensor), self.mosaic)
-        return [_events(table[table[:, 4] == angle], *self._sensor) for angle in POLARIZER_ANGLES_DEG]
+    Events older than the last one of an earlier piece are left out and counted in `counts`. RuntimeError where
+    dv-processing is missing; RecordingError where the camera or program cannot be reached.
+    """
+
+    def __init__(self, address: str, mosaic: Mosaic, idle_s: float):
+        self.name = address
+        self._idle_s = idle_s
+        self._reader = _opened(address)
+        width, height = self._reader.getEventResolution()
+        self._stream = _Stream(height, width, mosaic)
+        self.height, self.width, self.counts = self._stream.height, self._stream.width, self._stream.counts
+
+    def __iter__(self) -> Iterator[Piece]:
+        quiet_since = time.monotonic()
+        while time.monotonic() - quiet_since < self._idle_s:
+            batch = self._reader.getNextEventBatch()
+            if batch is not None and not batch.isEmpty():
+                read_at, quiet_since = time.perf_counter(), time.monotonic()
+                columns = batch.timestamps(), batch.coordinates(), batch.polarities()
+                table = np.concatenate([np.array(one, np.int64).reshape(batch.size(), -1) for one in columns], axis=1)
+                yield from self._stream.pieces(table, read_at)
+            elif self._reader.isRunning():
+                time.sleep(POLL_S)
+            else:
+                return
+
+
+def _opened(address: str) -> Any:
+    """The camera, or the connection to a program."""
+    try:
+        import dv_processing
+    except ImportError:
+        raise RuntimeError(f"{address} needs dv-processing: {installation('live')}") from None
+    place = address.removeprefix(SCHEME)
+    network = NETWORK.fullmatch(place)
+    if network is None and place != CAMERA:
+        raise ValueError(f"expected {SCHEME}HOST:PORT or {SCHEME}{CAMERA}, got {address}")
+    try:
+        if network:
+            reader = dv_processing.io.NetworkReader(network["host"], int(network["port"]))
+        else:
+            reader = dv_processing.io.camera.open()
+    except RuntimeError as error:
+        raise RecordingError(f"{address} cannot be reached: {error}; is it running, and does it stream?") from None
+    if not reader.isEventStreamAvailable():
+        raise RecordingError(f"{address}: expected a stream of events, there is none; choose another output")
+    return reader
 
 
 def live_lines(channels: Sequence[Events]) -> tuple[bytes, Int64[np.ndarray, " n"], bytes]:
@@ -189,6 +234,19 @@ def live_lines(channels: Sequence[Events]) -> tuple[bytes, Int64[np.ndarray, " n
     return head, table[:, 0], lines_of(table, " ")
 
 
-def _events(table: Int64[np.ndarray, "n columns"], height: int, width: int) -> Events:
-    t, x, y, p = table[:, :4].T
-    return Events.from_columns(t, x, y, np.where(p > 0, 1, -1), height, width)
+def replay(channels: Sequence[Events], speed: float, write: Callable[[bytes], object]) -> None:
+    """Write four channels in the format of `LiveLines`, at `speed` times the original pace."""
+    head, times, lines = live_lines(channels)
+    write(head)
+    ends = [0, *itertools.accumulate(map(len, lines.splitlines(keepends=True)))]
+    started, sent = time.perf_counter(), 0
+    while sent < len(times):
+        due_us = int((time.perf_counter() - started) * 1e6 * speed)
+        come = int(times.searchsorted(due_us, side="right"))
+        if come > sent:
+            asked = time.perf_counter()
+            write(lines[ends[sent] : ends[come]])
+            started += time.perf_counter() - asked  # time spent waiting for the reader does not count
+            sent = come
+        else:
+            time.sleep(POLL_S)

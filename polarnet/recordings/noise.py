@@ -1,7 +1,7 @@
 """Remove noise from events before recovery: those of hot pixels, and background activity.
 
-Background activity is events that no neighbour supports: an edge that moves over a pixel moves over the pixels around
-it too (Delbruck, "Frame-free dynamic digital vision", 2008).
+Hot pixels fire far more often than their neighbours. Background activity is events that no neighbour supports: an edge
+that moves over a pixel moves over the pixels around it too (Delbruck, "Frame-free dynamic digital vision", 2008).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -11,16 +11,22 @@ from typing import NamedTuple, no_type_check
 import numba
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from polarnet.events.mosaic import places_of
-from polarnet.events.stream import Events, select
+from polarnet.events.stream import Events, select, slice_time
 from polarnet.recordings.live import Piece
-from polarnet.recordings.pixels import event_counts, hot_pixels, without_pixels
-from polarnet.stokes import Mosaic
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 
 FOUND = "found"
 NEVER = np.iinfo(np.int64).min // 2
+
+NEIGHBOURHOOD = 5  # side of a square, in pixels
+HOT_FACTOR = 4.0  # default of the commands
+MIN_HOT_HZ = 20.0  # slower pixels are harmless in a scene
+MIN_EVENTS = 8  # fewer events are no evidence
+DISTURBING_HZ = 10_000.0  # events a second of a pixel; more change the shipped network's DoLP far from the pixel
+CHECKED_US = 1_000_000
 
 
 class Cleaning(NamedTuple):
@@ -52,7 +58,7 @@ class Cleaner:
         """The channels of a whole recording, or of its next piece, without noise."""
         if self._bad is None:
             self._bad = [self._hot(events, k, duration_us) for k, events in enumerate(channels)]
-            self._last = [np.full((e.height + 2, e.width + 2), NEVER) for e in channels]
+            self._last = [never(events) for events in channels]
             self.hot = sum(int(bad.sum()) for bad in self._bad)
         clean = [without_pixels(events, bad) for events, bad in zip(channels, self._bad, strict=True)]
         self.removed["hot pixels"] += sum(map(len, channels)) - sum(map(len, clean))
@@ -92,6 +98,71 @@ class Cleaner:
         return listed[row::2, column::2]
 
 
+class ChannelCheck:
+    """Counts the events of a recording's four channels as they pass through `watch`; `findings` reports problems."""
+
+    def __init__(self, height: int, width: int):
+        self.counts = [0, 0, 0, 0]
+        """Number of events in each channel."""
+        self._early = np.zeros((4, height, width), np.int64)
+        self._checked_us = 0
+
+    def watch(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
+        """Pass the pieces on unchanged, counting the events of each pixel in the first second."""
+        for piece in pieces:
+            self.counts = [n + len(events) for n, events in zip(self.counts, piece.channels, strict=True)]
+            if self._checked_us < CHECKED_US:
+                self._early += [event_counts(slice_time(events, 0, CHECKED_US)) for events in piece.channels]
+                self._checked_us = min(piece.until_us, CHECKED_US)
+            yield piece
+
+    def findings(self) -> list[str]:
+        """Problems found, a sentence each: channels without events, and hot pixels that disturb the whole image."""
+        seconds = self._checked_us * 1e-6
+        findings = [
+            f"There are no events behind the polarizer at {angle} degrees. DoLP and AoLP are wrong."
+            for angle, count in zip(POLARIZER_ANGLES_DEG, self.counts, strict=True)
+            if count == 0
+        ]
+        hot = np.stack([hot_pixels(counts, seconds, HOT_FACTOR) for counts in self._early])
+        if disturbing := int((hot & (self._early > DISTURBING_HZ * seconds)).sum()):
+            findings.append(
+                f"Hot pixels with more than {DISTURBING_HZ:,.0f} events a second: {disturbing}. DoLP is wrong in the "
+                f"whole image; remove them with --hot-pixels found, or for a live camera with --hot-pixels FILE."
+            )
+        return findings
+
+
+def event_counts(events: Events) -> Int[np.ndarray, "h w"]:
+    """Number of events of each pixel."""
+    pixel = events.y.long() * events.width + events.x.long()
+    counts = torch.bincount(pixel, minlength=events.height * events.width)
+    return counts.view(events.height, events.width).numpy()
+
+
+def hot_pixels(
+    counts: Int[np.ndarray, "h w"], duration_s: float, factor: float | int, min_hz: float = MIN_HOT_HZ
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels that fired more than `factor` times as often as the third busiest of the 5x5 pixels around them.
+
+    `counts` are the events of each pixel in `duration_s`. The third busiest is the reference so that thin lines and
+    their ends are not hot, but two hot neighbours are. Pixels with less than `min_hz`, or 8 events, never are.
+    """
+    border = NEIGHBOURHOOD // 2
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(counts, border), (NEIGHBOURHOOD, NEIGHBOURHOOD))
+    hot = (counts >= MIN_EVENTS) & (counts > min_hz * duration_s)
+    third = np.partition(around[hot].reshape(-1, NEIGHBOURHOOD**2), -3, axis=-1)[:, -3]
+    hot[hot] = counts[hot] > factor * third
+    return hot
+
+
+def without_pixels(events: Events, bad: Bool[np.ndarray, "h w"]) -> Events:
+    """The events of all pixels outside `bad`."""
+    if not bad.any():
+        return events
+    return select(events, ~torch.from_numpy(bad)[events.y.long(), events.x.long()])
+
+
 def read_hot_pixels(path: Path, height: int, width: int) -> Bool[np.ndarray, "h w"]:
     """Pixels listed in a text file, `x y` a line; ValueError for other lines and for pixels that are off the sensor."""
     bad = np.zeros((height, width), bool)
@@ -108,16 +179,19 @@ def read_hot_pixels(path: Path, height: int, width: int) -> Bool[np.ndarray, "h 
     return bad
 
 
-def without_background(events: Events, within_us: int, last_us: np.ndarray | None = None) -> Events:
+def without_background(events: Events, within_us: int, last_us: np.ndarray) -> Events:
     """Events that a neighbour supports: one of the 8 pixels around fired at most `within_us` before.
 
     `last_us` holds the time of each pixel's last event with a border of one pixel, and is updated, so that a stream can
-    come in pieces; None: nothing came before.
+    come in pieces; see `never`.
     """
-    if last_us is None:
-        last_us = np.full((events.height + 2, events.width + 2), NEVER)
     keep = _supported(events.t.numpy(), events.x.numpy(), events.y.numpy(), within_us, last_us)
     return select(events, torch.from_numpy(keep))
+
+
+def never(events: Events) -> np.ndarray:
+    """`last_us` of `without_background` before the first event."""
+    return np.full((events.height + 2, events.width + 2), NEVER)
 
 
 @numba.njit(nogil=True, cache=True)

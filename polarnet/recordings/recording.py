@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 
-from polarnet.events.stream import MAX_SIDE, Events, concatenate
-from polarnet.recordings.formats import aedat2, celex5_bin, celex5_csv, faery, hdf5, prophesee, rosbag, store, text
-from polarnet.recordings.formats.lines import HEAD_BYTES
+from polarnet.events.stream import Events, concatenate
+from polarnet.recordings.formats import aedat2, celex5, faery, hdf5, lines, prophesee, rosbag, store
 from polarnet.recordings.repair import HARMLESS, repaired
-from polarnet.recordings.source import REPAIRS, Block, CameraFrames, Choices, RecordingError, Source
+from polarnet.recordings.source import REPAIRS, Block, CameraFrames, Choices, RecordingError, Source, joined
 
 CHUNK_EVENTS = 2**20
 
@@ -50,9 +48,9 @@ FORMATS = {
     "event_stream": Format("Event Stream (.es)", signature(b"Event Stream"), faery.opener("es")),
     "evt": Format("EVT2, EVT2.1 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
     "dat": Format("DAT of Prophesee", prophesee.matches_dat, prophesee.open_dat),
-    "text": Format("lines `t x y p`", text.matches, text.open_text),
-    "celex5_csv": Format("CSV of a CeleX-5", celex5_csv.matches, celex5_csv.open_celex5_csv),
-    "celex5_bin": Format("BIN of a CeleX-5", celex5_bin.matches, celex5_bin.open_celex5_bin),
+    "text": Format("lines `t x y p`", lines.matches_text, lines.open_text),
+    "celex5_csv": Format("CSV of a CeleX-5", celex5.matches_csv, celex5.open_csv),
+    "celex5_bin": Format("BIN of a CeleX-5", celex5.matches_bin, celex5.open_bin),
 }
 """Ordered as they are tried on a file of unknown format."""
 FOLDERS = ("store", "rosbag")
@@ -86,9 +84,12 @@ class RecordingReader:
         self._chunk_events = chunk_events
 
     def __iter__(self) -> Iterator[Events]:
+        return self.chunks(self._chunk_events)
+
+    def chunks(self, size: int) -> Iterator[Events]:
+        """Iterate with another number of events in a chunk."""
         self.repairs.clear()
-        blocks = repaired(self.path.name, self._source, self.repairs)
-        for block in _cut(blocks, self._chunk_events):
+        for block in _cut(repaired(self.path.name, self._source, self.repairs), size):
             t, x, y, p = map(torch.from_numpy, block)
             yield Events(t, x, y, p, self.height, self.width)
 
@@ -113,9 +114,6 @@ def open_recording(
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
-    for name, side in (("height", height), ("width", width)):
-        if side is not None and not 0 < side <= MAX_SIDE:
-            raise ValueError(f"expected a {name} of 1 to {MAX_SIDE} px, got {side}")
     if chunk_events < 1:
         raise ValueError(f"expected at least one event in a chunk, got {chunk_events}")
     if clock_mhz is not None and not 0.001 <= clock_mhz <= 10_000:
@@ -158,7 +156,7 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     path, head = Path(path), b""
     if path.is_file():
         with path.open("rb") as file:
-            head = file.read(HEAD_BYTES)
+            head = file.read(lines.HEAD_BYTES)
         if not head:
             raise RecordingError(f"{path.name}: the file is empty")
     for name, form in FORMATS.items():
@@ -176,16 +174,11 @@ def _cut(blocks: Iterator[Block], size: int) -> Iterator[Block]:
     for block in blocks:
         waiting.append(block)
         count += len(block.t)
-        if count < size:
-            continue
-        joined = _joined(waiting)
-        for start in range(0, count - size + 1, size):
-            yield Block(*(column[start : start + size] for column in joined))
-        waiting = [Block(*(column[count - count % size :] for column in joined))]
-        count %= size
+        if count >= size:
+            whole = joined(waiting)
+            for start in range(0, count - size + 1, size):
+                yield whole.rows(slice(start, start + size))
+            count %= size
+            waiting = [whole.rows(slice(len(whole.t) - count, None))]
     if count:
-        yield _joined(waiting)
-
-
-def _joined(blocks: list[Block]) -> Block:
-    return blocks[0] if len(blocks) == 1 else Block(*map(np.concatenate, zip(*blocks, strict=True)))
+        yield joined(waiting)

@@ -9,8 +9,9 @@ from typing import no_type_check
 
 import numba
 import numpy as np
+from jaxtyping import Bool
 
-from polarnet.recordings.source import REPAIRS, SAFE, Block, RecordingError, Source
+from polarnet.recordings.source import REPAIRS, SAFE, Block, RecordingError, Source, joined
 
 LATE_US = 10_000
 """Events late by at most this are put in order: packets overtake each other, clocks do not."""
@@ -24,6 +25,9 @@ FIRST_PAUSE_US = 3_600_000_000  # a longer pause right after the first event mea
 MAX_TIME = 2**60  # microseconds; differences still fit into int64
 
 
+NOTHING = Block(np.empty(0, np.int64), *(np.empty(0, dtype) for dtype in (np.int16, np.int16, np.int8)))
+
+
 def repaired(name: str, source: Source, counts: Counter[str]) -> Iterator[Block]:
     """The events of a source, t as int64, x and y as int16, p as int8; repairs are added to `counts`.
 
@@ -35,22 +39,18 @@ def repaired(name: str, source: Source, counts: Counter[str]) -> Iterator[Block]
     events = 0
     for block in source.blocks(counts):
         events += len(block.t)
-        if darker is None:
-            darker = _darker(block.p)
-        usable = _on_sensor(name, _with_sign(block, darker, counts), source, counts)
-        yield from _filled(clock.ordered(usable, counts, last=False))
-        _refuse_much_damage(name, counts, events)
-    nothing = Block(np.empty(0, np.int64), *(np.empty(0, dtype) for dtype in (np.int16, np.int16, np.int8)))
-    yield from _filled(clock.ordered(nothing, counts, last=True))
-    _refuse_much_damage(name, counts, events)
+        darker = _darker(block.p) if darker is None else darker
+        for column in (block.x, block.y):
+            if column.dtype.kind == "f" and not np.equal(column, np.floor(column)).all():
+                raise RecordingError(f"{name}: expected x and y to be whole numbers")
+        good = usable(block, source.height, source.width, darker, counts)
+        yield clock.ordered(_typed(block if good.all() else block.rows(good)), counts, last=False)
+        refuse_much_damage(name, counts, events)
+    yield clock.ordered(NOTHING, counts, last=True)
+    refuse_much_damage(name, counts, events)
     damage = {kind: count for kind, count in counts.items() if count and kind not in HARMLESS}
     if damage and events == 0:
         raise RecordingError(f"{name}: no event can be read in it: {damage}; is the format right?")
-
-
-def _filled(block: Block) -> Iterator[Block]:
-    if len(block.t):
-        yield block
 
 
 def _darker(p: np.ndarray) -> int | None:
@@ -59,34 +59,19 @@ def _darker(p: np.ndarray) -> int | None:
     return None if zeros == minus_ones == 0 else -1 if minus_ones > zeros else 0
 
 
-def _with_sign(block: Block, darker: int | None, counts: Counter[str]) -> Block:
-    brighter = block.p == 1
-    known = brighter if darker is None else brighter | (block.p == darker)
-    bad = len(known) - np.count_nonzero(known)
-    if bad:
-        counts["bad_polarity"] += int(bad)
-        block, brighter = _select(block, known), brighter[known]
-    return block._replace(p=np.where(brighter, np.int8(1), np.int8(-1)))
+def usable(block: Block, height: int, width: int, darker: int | None, counts: Counter[str]) -> Bool[np.ndarray, " n"]:
+    """Which events have a polarity, 1 or `darker`, and are on the sensor; the others are added to `counts`."""
+    known = block.p == 1
+    if darker is not None:
+        known |= block.p == darker
+    inside = (block.x >= 0) & (block.x < width) & (block.y >= 0) & (block.y < height)
+    counts["bad_polarity"] += int(np.count_nonzero(~known))
+    counts["out_of_range"] += int(np.count_nonzero(known & ~inside))
+    return known & inside
 
 
-def _on_sensor(name: str, block: Block, source: Source, counts: Counter[str]) -> Block:
-    for axis in "xy":
-        column = getattr(block, axis)
-        if column.dtype.kind == "f" and not np.equal(column, np.floor(column)).all():
-            raise RecordingError(f"{name}: expected x and y to be whole numbers")
-    inside = (block.x >= 0) & (block.x < source.width) & (block.y >= 0) & (block.y < source.height)
-    outside = len(inside) - np.count_nonzero(inside)
-    if outside:
-        counts["out_of_range"] += int(outside)
-        block = _select(block, inside)
-    return block._replace(
-        t=block.t.astype(np.int64, copy=False),
-        x=block.x.astype(np.int16, copy=False),
-        y=block.y.astype(np.int16, copy=False),
-    )
-
-
-def _refuse_much_damage(name: str, counts: Counter[str], events: int) -> None:
+def refuse_much_damage(name: str, counts: Counter[str], events: int) -> None:
+    """RecordingError if more than 1 % of the events (and 8) have the same damage, unless it is `SAFE`."""
     for kind, words in REPAIRS.items():
         if kind not in SAFE and counts[kind] > max(TOLERATED_COUNT, TOLERATED_SHARE * events):
             raise RecordingError(
@@ -95,8 +80,9 @@ def _refuse_much_damage(name: str, counts: Counter[str], events: int) -> None:
             )
 
 
-def _select(block: Block, which: np.ndarray) -> Block:
-    return Block(*(column[which] for column in block))
+def _typed(block: Block) -> Block:
+    x, y = (column.astype(np.int16, copy=False) for column in (block.x, block.y))
+    return Block(block.t.astype(np.int64, copy=False), x, y, np.where(block.p == 1, np.int8(1), np.int8(-1)))
 
 
 class _Clock:
@@ -107,48 +93,44 @@ class _Clock:
         self.judged = 0
         self.newest: int | None = None
         self.floor = -MAX_TIME
-        self.unjudged: Block | None = None
-        self.held: Block | None = None
+        self.unjudged = self.held = NOTHING
 
     def ordered(self, block: Block, counts: Counter[str], *, last: bool) -> Block:
         """Events in time order that no later event can precede."""
-        if self.unjudged is not None:
-            block = Block(*map(np.concatenate, zip(self.unjudged, block, strict=True)))
+        block = joined([self.unjudged, block])
         count = len(block.t) if last else max(0, len(block.t) - LOOKAHEAD)
         keep = np.ones(count, np.bool_)
         started = self.newest is not None
         newest, glitches, unsorted, pauses, refused = _judge(block.t, keep, self.newest or 0, started, self.floor)
         if refused >= 0:
-            self._refuse(int(block.t[refused]), int(newest), self.judged + int(refused))
+            t_us = int(block.t[refused])
+            raise RecordingError(
+                f"{self.name}: after event {self.judged + refused}, time goes back by {newest - t_us} us, from "
+                f"{newest} to {t_us} us, and stays there: the camera's clock was set anew, or recordings were joined; "
+                f"cut the file there"
+            )
         counts.update({"time_glitches": int(glitches), "unsorted": int(unsorted), "pauses": int(pauses)})
         self.judged += count
-        self.unjudged = Block(*(column[count:] for column in block))
-        accepted = Block(*(column[:count] for column in block))
+        self.unjudged = block.rows(slice(count, None))
+        accepted = block.rows(slice(count))
         if glitches:
-            accepted = _select(accepted, keep)
+            accepted = accepted.rows(keep)
         if len(accepted.t):
             self.newest = int(newest)
-        return self._release(accepted, in_order=unsorted == 0, last=last)
+        accepted = joined([self.held, accepted])
+        if unsorted:
+            accepted = accepted.rows(np.argsort(accepted.t, kind="stable"))
+        ready = len(accepted.t) if last else self._ready(accepted)
+        self.held = accepted.rows(slice(ready, None))
+        return accepted.rows(slice(ready))
 
-    def _release(self, accepted: Block, *, in_order: bool, last: bool) -> Block:
-        if self.held is not None and len(self.held.t):
-            accepted = Block(*map(np.concatenate, zip(self.held, accepted, strict=True)))
-        if not in_order:
-            accepted = _select(accepted, np.argsort(accepted.t, kind="stable"))
-        count = len(accepted.t)
-        if count and not last:
-            count = int(np.searchsorted(accepted.t, (self.newest or 0) - LATE_US))
-            if len(accepted.t) - count > MAX_HELD:
-                count = len(accepted.t) // 2
-                self.floor = int(accepted.t[count - 1])
-        self.held = Block(*(column[count:] for column in accepted))
-        return Block(*(column[:count] for column in accepted))
-
-    def _refuse(self, t_us: int, newest_us: int, place: int) -> None:
-        raise RecordingError(
-            f"{self.name}: after event {place}, time goes back by {newest_us - t_us} us, from {newest_us} to {t_us} "
-            f"us, and stays there: the camera's clock was set anew, or recordings were joined; cut the file there"
-        )
+    def _ready(self, accepted: Block) -> int:
+        """Number of events more than `LATE_US` older than the newest; half of all if too many would be held back."""
+        ready = int(np.searchsorted(accepted.t, (self.newest or 0) - LATE_US))
+        if len(accepted.t) - ready > MAX_HELD:
+            ready = len(accepted.t) // 2
+            self.floor = int(accepted.t[ready - 1])
+        return ready
 
 
 @numba.njit(nogil=True, cache=True)

@@ -1,7 +1,7 @@
 """The interface of a file format's module: an opened file that yields its columns in blocks, unchanged."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -23,14 +23,16 @@ REPAIRS = {
     "orphans": "events before the first row address or time of their package: left out",
     "no_change": "events of polarity 0, whose pixel did not change: left out",
     "bad_polarity": "events of a polarity that is neither brighter nor darker: left out",
+    "bad_angle": "live events of an angle that is not 0, 45, 90 or 135: left out",
     "out_of_range": "events that are not on the sensor: left out",
     "time_glitches": "events far from the time of those before and after them: left out",
     "unsorted": "events a little earlier than the one before: put in order",
+    "late": "live events earlier than others that were used already: left out",
     "pauses": "pauses of a second or more between events: kept",
 }
 """Kinds of damage that readers count. No event is ever given another time, pixel or polarity."""
 
-SAFE = ("cut_tail", "no_change", "unsorted", "pauses")
+SAFE = ("cut_tail", "no_change", "unsorted", "late", "pauses")
 """Repairs allowed any number of times. A file with too many of another kind is refused."""
 
 
@@ -45,6 +47,15 @@ class Block(NamedTuple):
     x: np.ndarray
     y: np.ndarray
     p: np.ndarray
+
+    def rows(self, which: np.ndarray | slice) -> "Block":
+        """Some of the events."""
+        return Block(*(column[which] for column in self))
+
+
+def joined(blocks: Sequence[Block]) -> Block:
+    """One block of the events of at least one."""
+    return blocks[0] if len(blocks) == 1 else Block(*map(np.concatenate, zip(*blocks, strict=True)))
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
-from polarnet.captures.imported import import_targets
-from polarnet.captures.targets import calibrate_targets
+from polarnet.captures.targets import calibrate_targets, import_targets
 from polarnet.events.rotation import Rotation, steady_rotation, triggered_rotation
 from polarnet.events.stream import Events, downscale
 from polarnet.events.streaming import WindowRule
 from polarnet.recordings.arrangements import read_four, read_mosaic, read_plain, shifted
 from polarnet.recordings.formats import hdf5
-from polarnet.recordings.live import LiveLines, Piece
-from polarnet.recordings.live_camera import SCHEME, LiveCamera
+from polarnet.recordings.live import SCHEME, LiveCamera, LiveLines, Piece
 from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.recording import Recording, detect_format, read_recording
 from polarnet.recordings.source import RecordingError
@@ -59,11 +57,7 @@ def open_files(files: Files, work: Path, size: Sequence[int] | None = None, clea
     missing = [str(path) for path in files.paths if not path.exists()]
     if missing:
         raise FileNotFoundError(f"{', '.join(missing)}: there is no such file")
-    channels = _channels(files, work)
-    duration_us = max((int(events.t[-1]) + 1 for events in channels if len(events)), default=0)
-    if clean is not None:
-        channels = clean(channels, duration_us)
-    return _whole(", ".join(path.name for path in files.paths), channels, duration_us, size)
+    return _whole(", ".join(path.name for path in files.paths), _channels(files, work), size, clean)
 
 
 def open_rotating(
@@ -73,14 +67,11 @@ def open_rotating(
 
     `rotation` is by the file's clock, the returned one by that of the events. RecordingError for a file without events.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: there is no such file")
     events = read(path).events
     if not len(events):
         raise RecordingError(f"{path.name}: expected events, the file has none")
     start_us = int(events.t[0])
-    channel = shifted(events, start_us)
-    return _whole(path.name, [channel], int(channel.t[-1]) + 1, size), rotation.since(start_us)
+    return _whole(path.name, [shifted(events, start_us)], size), rotation.since(start_us)
 
 
 def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> Input:
@@ -122,10 +113,12 @@ def half_turn_rule(rotation: Rotation, step_us: int | None = None) -> WindowRule
     return WindowRule(step_us or max(1, round(rotation.half_turn_us)), None, None)
 
 
-def _whole(name: str, channels: Sequence[Events], duration_us: int, size: Sequence[int] | None) -> Input:
+def _whole(name: str, channels: Sequence[Events], size: Sequence[int] | None, clean: Cleaner | None = None) -> Input:
+    duration_us = max((int(events.t[-1]) + 1 for events in channels if len(events)), default=0)
+    if clean is not None:
+        channels = clean(channels, duration_us)
     if size is not None:
-        height, width = size
-        channels = [downscale(events, height, width, keep_rate=True) for events in channels]
+        channels = [downscale(events, *size, keep_rate=True) for events in channels]
     pieces = [Piece(channels, duration_us, time.perf_counter())]
     return Input(name, channels[0].height, channels[0].width, pieces, duration_us, len(channels))
 
@@ -134,8 +127,6 @@ def _channels(files: Files, work: Path) -> Sequence[Events]:
     if len(files.paths) == 4:
         if files.angles is None:
             raise ValueError("four files: say the polarizer of each, in their order, such as --angles 0 45 90 135")
-        if len(set(files.angles)) < 4:
-            raise ValueError(f"four files: expected four different angles, got {list(files.angles)}")
         return read_four(dict(zip(files.angles, files.paths, strict=True)), read=files.read)
     if len(files.paths) != 1 or files.angles is not None:
         raise ValueError(f"expected one file or folder, or four files with --angles, got {len(files.paths)}")
@@ -147,7 +138,8 @@ def _channels(files: Files, work: Path) -> Sequence[Events]:
     if path.is_dir() and (exported := _exported(path, files.sequence)):
         return read_four(exported, dict.fromkeys(exported, 0), files.read)  # times count from the sequence's start
     if detect_format(path) == "store":
-        return _sequence(EventStore.open(path), path, files.sequence)
+        store = EventStore.open(path)
+        return store.read(_named(files.sequence, store.sequences, path.name))
     if files.plain:
         return read_plain(path, files.read)
     raise ValueError(
@@ -173,10 +165,6 @@ def _exported(folder: Path, sequence: str | None) -> dict[int, Path]:
     return {angle: path for angle, (path,) in files.items()}
 
 
-def _sequence(store: EventStore, path: Path, sequence: str | None) -> Sequence[Events]:
-    return store.read(_named(sequence, store.sequences, path.name))
-
-
 def _named(sequence: str | None, names: list[str], where: str) -> str:
     """The sequence of that name, or the only one; ValueError if there is none."""
     if sequence is None and len(names) == 1:
@@ -200,8 +188,6 @@ def _captured(folder: Path, work: Path, config: RecordingsConfig | None) -> Sequ
 
 
 def _trigger_times_us(path: Path) -> np.ndarray:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: there is no such file")
     with path.open("rb") as file:
         if file.read(len(hdf5.MAGIC)) == hdf5.MAGIC:
             return hdf5.trigger_times_us(path)

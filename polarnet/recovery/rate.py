@@ -17,6 +17,7 @@ from polarnet.recovery.stream import Frame, Input, runs_of
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 POLARIZERS = len(POLARIZER_ANGLES_DEG)
+MAX_HZ = 1_000_000 / SHORTEST_STEP_US
 
 
 class Rate(NamedTuple):
@@ -37,9 +38,8 @@ class Rate(NamedTuple):
 
 def check_rate(rate_hz: float, rule: WindowRule, recoverer: Recoverer) -> None:
     """ValueError for a rate out of range or beside a --step, or one that windows or a --step reach as cheaply."""
-    highest = 1_000_000 / SHORTEST_STEP_US
-    if not 0 < rate_hz <= highest:
-        raise ValueError(f"--rate: expected more than 0 and at most {highest:,.0f} frames a second, got {rate_hz:g}")
+    if not 0 < rate_hz <= MAX_HZ:
+        raise ValueError(f"--rate: expected more than 0 and at most {MAX_HZ:,.0f} frames a second, got {rate_hz:g}")
     if rule.step_us is not None:
         raise ValueError(
             "--rate and --step: expected one of them; --step runs the method for each frame, --rate once a window"

@@ -1,6 +1,6 @@
 """`polarnet recover`: frames of DoLP and AoLP from event-camera files or a running camera."""
 
-import itertools
+import math
 import operator
 import statistics
 import time
@@ -17,16 +17,25 @@ from polarnet.events.streaming import SHORTEST_STEP_US, TRAINED_WINDOW_US, Event
 from polarnet.methods import METHODS
 from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_record, why_absent
 from polarnet.methods.overlap import advance, begin, warm_up
+from polarnet.metrics.scores import frame_scores
 from polarnet.networks.weights import shipped_weights
-from polarnet.recordings.live import Piece, live_lines
+from polarnet.recordings.live import Piece
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import precision_on, tune
 from polarnet.stokes import Prediction
-from polarnet.storage.events import EventStore
+from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.progress import ProgressBar
 
 BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}{postfix}]"
 LIVE_BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
+MAX_GAP = 0.01  # between the end of a window and its true frame, as a fraction of the window
+SCORES = {
+    "mse": "MSE {:.4f}",
+    "psnr": "PSNR {:.2f} dB",
+    "ssim": "SSIM {:.3f}",
+    "corr": "correlation {:.3f}",
+    "aolp_deg": "AoLP error {:.1f} degrees",
+}
 
 
 class Input(NamedTuple):
@@ -53,27 +62,6 @@ class Frame(NamedTuple):
     """Time from the window's events in memory to the frame in memory; for a batch of windows, an equal share."""
     latency_s: float
     """Time from the arrival of the window's last event to the frame in memory."""
-
-
-@dataclass(frozen=True)
-class Summary:
-    """Number of frames and timing of one run."""
-
-    frames: int
-    stream_s: float
-    """Time in the recording at the end of the last window."""
-    run_s: float
-    step_ms: float
-    """Median of `Frame.step_s`, in ms."""
-    latency_ms: float | None
-    """Median of `Frame.latency_s`, in ms; None if all events were available from the start."""
-    latency_ms_95: float | None
-    """95th percentile of the latency, in ms; None as for `latency_ms`."""
-
-    @property
-    def realtime_factor(self) -> float:
-        """Seconds of recording processed per second of computation."""
-        return self.stream_s / self.run_s
 
 
 @dataclass(frozen=True)
@@ -155,43 +143,42 @@ def runs_of(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWin
 
 
 def recover(
-    source: Input,
-    rule: WindowRule,
-    recoverer: Recoverer,
-    writer: RecoveryWriter,
-    frames: Iterable[Frame] | None = None,
-) -> Summary:
-    """Write all `frames` (default: `frames_of`), with a progress bar.
+    source: Input, rule: WindowRule, words: str, writer: RecoveryWriter, frames: Iterable[Frame]
+) -> dict[str, str]:
+    """Write all frames of the method that `words` describe, with a progress bar; facts for the page and the terminal.
 
     ValueError if the input is shorter than one window.
     """
     live = source.duration_us is None
-    steps, latencies = array("d"), array("d")  # 16 bytes a frame, because a camera may run for days
+    step_ms, latency_ms = array("d"), array("d")  # 16 bytes a frame, because a camera may run for days
     last_us, started = 0, time.perf_counter()
-    with (
-        writer,
-        ProgressBar(
-            total=source.duration_us, desc="recover", unit_scale=1e-6, bar_format=LIVE_BAR if live else BAR
-        ) as bar,
-    ):
-        for frame in frames or frames_of(source, rule, recoverer):
+    bar_format = LIVE_BAR if live else BAR
+    with writer, ProgressBar(total=source.duration_us, desc="recover", unit_scale=1e-6, bar_format=bar_format) as bar:
+        for frame in frames:
             writer.add(frame.window, frame.prediction, live)
-            steps.append(frame.step_s)
-            latencies.append(frame.latency_s)
+            step_ms.append(1000 * frame.step_s)
+            latency_ms.append(1000 * frame.latency_s)
             bar.update(frame.window.stop_us - last_us)
             last_us = frame.window.stop_us
-            latency = {"latency": f"{1000 * frame.latency_s:.1f} ms"} if live else {}
-            bar.set_postfix(frames=len(steps), step=f"{1000 * frame.step_s:.1f} ms", refresh=False, **latency)
-    if not steps:
+            latency = {"latency": f"{latency_ms[-1]:.1f} ms"} if live else {}
+            bar.set_postfix(frames=len(step_ms), step=f"{step_ms[-1]:.1f} ms", refresh=False, **latency)
+    if not step_ms:
         raise ValueError(_too_short(source, rule))
-    return Summary(
-        len(steps),
-        last_us * 1e-6,
-        time.perf_counter() - started,
-        1000 * statistics.median(steps),
-        1000 * statistics.median(latencies) if live else None,
-        1000 * sorted(latencies)[int(0.95 * (len(latencies) - 1))] if live else None,
-    )
+    run_s, stream_s = time.perf_counter() - started, last_us * 1e-6
+    length = f"{rule.length_us / 1000:g} ms" if rule.length_us is not None else f"{rule.events:,} events"
+    step = "one after the other" if rule.step_us is None else f"one every {rule.step_us / 1000:g} ms"
+    facts = {
+        "input": source.name,
+        "size": f"{source.height} x {source.width} px",
+        "method": words,
+        "windows": f"of {length}, {step}",
+        "frames": f"{len(step_ms):,} of {stream_s:.3f} s",
+        "step": f"{statistics.median(step_ms):.2f} ms (median)",
+    }
+    if not live:
+        return facts | {"time": f"{run_s:.2f} s, {stream_s / run_s:.2f} times as fast as real time"}
+    most_ms = sorted(latency_ms)[int(0.95 * (len(latency_ms) - 1))]
+    return facts | {"latency": f"{statistics.median(latency_ms):.1f} ms (median), 95 % within {most_ms:.1f} ms"}
 
 
 def _too_short(source: Input, rule: WindowRule) -> str:
@@ -212,36 +199,38 @@ def _too_short(source: Input, rule: WindowRule) -> str:
     return lasts
 
 
-def facts_of(source: Input, rule: WindowRule, words: str, summary: Summary) -> dict[str, str]:
-    """Facts about a run for the HTML page and the terminal."""
-    length = f"{rule.length_us / 1000:g} ms" if rule.length_us is not None else f"{rule.events:,} events"
-    step = "one after the other" if rule.step_us is None else f"one every {rule.step_us / 1000:g} ms"
-    facts = {
-        "input": source.name,
-        "size": f"{source.height} x {source.width} px",
-        "method": words,
-        "windows": f"of {length}, {step}",
-        "frames": f"{summary.frames:,} of {summary.stream_s:.3f} s",
-        "step": f"{summary.step_ms:.2f} ms (median)",
-    }
-    if summary.latency_ms is None:
-        return facts | {"time": f"{summary.run_s:.2f} s, {summary.realtime_factor:.2f} times as fast as real time"}
-    return facts | {"latency": f"{summary.latency_ms:.1f} ms (median), 95 % within {summary.latency_ms_95:.1f} ms"}
+class TruthScores:
+    """Scores of the frames that have a true frame at the end of their window, as in the benchmark."""
 
+    def __init__(self, truth: TrueFrames):
+        self._truth = truth
+        self._scores: list[dict[str, float]] = []
+        self._unmatched = 0
 
-def replay(store: EventStore, sequence: str, speed: float, write: Callable[[bytes], object]) -> None:
-    """Write a sequence in the line format of `LiveLines`, at `speed` times the original pace."""
-    head, times, lines = live_lines(store.read(sequence))
-    write(head)
-    ends = [0, *itertools.accumulate(map(len, lines.splitlines(keepends=True)))]
-    started, sent = time.perf_counter(), 0
-    while sent < len(times):
-        due_us = int((time.perf_counter() - started) * 1e6 * speed)
-        come = int(times.searchsorted(due_us, side="right"))
-        if come > sent:
-            asked = time.perf_counter()
-            write(lines[ends[sent] : ends[come]])
-            started += time.perf_counter() - asked  # time spent waiting for the reader does not count
-            sent = come
-        else:
-            time.sleep(0.001)
+    def watch(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """Yield the frames, scored."""
+        for frame in frames:
+            if self._truth.has(frame.window.stop_us, MAX_GAP * frame.window.length_us):
+                true = self._truth.at(frame.window.stop_us)
+                aolp = frame.prediction.aolp
+                batch = Prediction(frame.prediction.dolp[None], None if aolp is None else aolp[None])
+                valid = None if true.valid is None else true.valid[None]
+                scores = frame_scores(batch, true.dolp[None], true.aolp[None], valid)
+                self._scores.append({name: float(values) for name, values in scores.items()})
+            else:
+                self._unmatched += 1
+            yield frame
+
+    def sentence(self, skipped: int) -> str:
+        """Means after the first `skipped` scored frames, in words; ValueError if none is left."""
+        scores = self._scores[skipped:]
+        if not scores:
+            raise ValueError(
+                f"--truth: expected more than {skipped} frames with a true frame at the end of their window, got "
+                f"{len(self._scores)} of {len(self._scores) + self._unmatched}; leave out --window and --rate, or "
+                f"record for longer"
+            )
+        means = {name: math.fsum(one[name] for one in scores) / len(scores) for name in scores[0]}
+        words = ", ".join(SCORES[name].format(value) for name, value in means.items())
+        rest = f", {self._unmatched} frames without a true frame" if self._unmatched else ""
+        return f"{words} ({len(scores)} frames after the first {skipped}{rest})"

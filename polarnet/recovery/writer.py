@@ -1,4 +1,4 @@
-"""Write the results of `polarnet recover`: numbers (Zarr, EXR), pictures (PNG), a video, and a page.
+"""Write the results of `polarnet recover`: numbers (Zarr), pictures (PNG), a video, and a page.
 
 A picture shows DoLP, AoLP and the events of the window side by side; of a camera without polarizers, the intensity and
 the events. The video's pictures are labelled and also show polarization with the reconstructed S0. Everything is
@@ -11,14 +11,15 @@ from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import cv2
 import numpy as np
-import OpenImageIO as oiio
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from polarnet.events.representations import polarity_sums
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Recoverer, State
 from polarnet.reports.maps import (
@@ -41,7 +42,6 @@ from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.storage.true_frames import TrueFrames
 
 VIDEO = "recovered.mp4"
-PNG_STORED, NO_FILTER = 0, 8  # no compression, libpng's PNG_FILTER_NONE: larger files, but fast to write
 MIN_FREE_BYTES = 2**26  # disk space kept free for the last frames, the video's index and the page
 MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, a live camera's network needs all cores: a writing thread delays every operation
@@ -81,10 +81,10 @@ class _Sample:
 class RecoveryWriter:
     """Writes frames into a folder as they arrive; as a context manager it waits for the last and closes the files.
 
-    `outputs` is a subset of zarr, png, exr and mp4. The folder gets recovered.zarr, png/*.png, exr/*.exr and
-    recovered.mp4 (`video_rate_hz` frames a second, whatever the time between them). `write_page` adds index.html and
-    recovered.png. `reconstruct` is a method that reconstructs intensity, for the S0 of the video; without it the
-    video shows polarization at full value. `truth` is shown in the video beside each frame.
+    `outputs` is a subset of zarr, png and mp4. The folder gets recovered.zarr, png/*.png and recovered.mp4
+    (`video_rate_hz` frames a second, whatever the time between them). `write_page` adds index.html and recovered.png.
+    `reconstruct` is a method that reconstructs intensity, for the S0 of the video; without it the video shows
+    polarization at full value. `truth` is shown in the video beside each frame.
     """
 
     def __init__(
@@ -109,9 +109,8 @@ class RecoveryWriter:
         self._thread = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,))
         self._waiting: deque[Future] = deque()
         folder.mkdir(parents=True, exist_ok=True)
-        for kind in ("png", "exr"):
-            if kind in outputs:
-                (folder / kind).mkdir(exist_ok=True)
+        if "png" in outputs:
+            (folder / "png").mkdir(exist_ok=True)
 
     def __enter__(self) -> "RecoveryWriter":
         return self
@@ -153,12 +152,10 @@ class RecoveryWriter:
             raise OSError(f"{self.folder}: the disk is full; all {number} frames up to here are whole")
         if "zarr" in self.outputs:
             self._add_to_zarr(window, prediction)
-        if "exr" in self.outputs:
-            _write_exr(self.folder / "exr" / f"{number:06d}.exr", prediction)
         sampled = number % self._sample.every == 0
         if not (sampled or {"mp4", "png"} & set(self.outputs)):
             return
-        events = signed_events(window)
+        events = torch.stack([polarity_sums(channel) for channel in window.channels]).sum(0)
         pixels = event_image(events, self._scale.after(events))
         if "mp4" in self.outputs:
             self._video.add(self._labelled(window, prediction, pixels))
@@ -232,15 +229,6 @@ def plain_intensity(prediction: Prediction) -> Float[Tensor, "h w"] | None:
     return prediction.intensities[0].float()
 
 
-def signed_events(window: EventWindow) -> Float[Tensor, "h w"]:
-    """ON minus OFF events of the four channels, summed per pixel."""
-    first = window.channels[0]
-    image = torch.zeros(first.height * first.width)
-    for events in window.channels:
-        image.index_add_(0, events.y.long() * events.width + events.x.long(), events.p.float())
-    return image.view(first.height, first.width)
-
-
 def _quantised(values: Tensor, largest: int) -> np.ndarray:
     return values.round().clamp(0, largest).numpy().astype(np.uint16)
 
@@ -266,44 +254,6 @@ def _film(source: str, pictures: Sequence[Picture]) -> Film:
 
 
 def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-    spec = oiio.ImageSpec(picture.shape[1], picture.shape[0], 3, oiio.UINT8)
-    spec["png:compressionLevel"] = PNG_STORED  # thousands of files are written while a camera runs
-    spec["png:filter"] = NO_FILTER
-    _write_picture(path, spec, picture)
-
-
-def _write_exr(path: Path, prediction: Prediction) -> None:
-    """Write the channels DoLP and, if present, AoLP (radians) and log_variance, as half floats; or intensity alone."""
-    plain = plain_intensity(prediction)
-    maps = {
-        "DoLP": prediction.dolp if plain is None else None,
-        "intensity": plain,
-        "AoLP": prediction.aolp,
-        "log_variance": prediction.log_variance,
-    }
-    known: dict[str, Any] = {name: values for name, values in maps.items() if values is not None}
-    height, width = prediction.dolp.shape
-    spec = oiio.ImageSpec(width, height, len(known), oiio.HALF)
-    spec.channelnames = tuple(known)
-    _write_picture(path, spec, torch.stack([*known.values()], dim=-1).float().numpy())
-
-
-def _write_picture(path: Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> None:
-    file = oiio.ImageOutput.create(str(path))
-    done = file and file.open(str(path), spec) and file.write_image(np.ascontiguousarray(pixels)) and file.close()
-    problem = file.geterror() if file else oiio.geterror()
-    if not done or problem or not _has_last_row(path):
-        first, *_ = problem.strip().splitlines() or ["it is cut off"]
-        raise OSError(f"{path}: the picture was not written: {first}; make room or write to another disk")
-
-
-def _has_last_row(path: Path) -> bool:
-    """Whether a picture is whole: on a full disk OpenImageIO loses the end of a file without an error."""
-    file = oiio.ImageInput.open(str(path))
-    if not file:
-        return False
-    spec = file.spec()
-    row = file.read_scanlines(spec.height - 1, spec.height, 0, 0, spec.nchannels, "unknown")
-    problem = file.geterror()
-    file.close()
-    return row is not None and not problem
+    """Write a PNG without compression: thousands are written while a camera runs."""
+    _, data = cv2.imencode(".png", picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 0])
+    path.write_bytes(data.tobytes())

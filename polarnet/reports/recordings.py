@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 
 from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
 from polarnet.captures.targets import Calibrated
-from polarnet.events.representations import event_tensor
+from polarnet.events.representations import event_tensor, polarity_sums
 from polarnet.events.stream import Events, slice_time
-from polarnet.recordings.formats.celex5_bin import WHITE
+from polarnet.recordings.formats.celex5 import WHITE
 from polarnet.recordings.inspection import Inspection
 from polarnet.reports.maps import (
     DOLP_COLOURS,
@@ -36,9 +36,9 @@ SPAN_MS = 60.0  # on each side of the start
 
 def recording_picture(inspection: Inspection) -> bytes:
     """A PNG of the busiest events without hot pixels, ON red and OFF blue; without events, the first full picture."""
-    if inspection.on + inspection.off == 0 and inspection.first_picture is not None:
+    if inspection.events == 0 and inspection.first_picture is not None:
         return encode_png(intensity_image(torch.from_numpy(inspection.first_picture / np.float32(WHITE))))
-    signed = torch.from_numpy(np.where(inspection.hot, 0, inspection.busiest)).float()
+    signed = polarity_sums(inspection.busiest).masked_fill(torch.from_numpy(inspection.hot), 0.0)
     return encode_png(event_image(signed, event_full_scale(signed)))
 
 

@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-import torch
 
 from polarnet.captures.alignment import agreement, best_lag, changes, logarithms, spread, steps, thresholds
-from polarnet.events.stream import Events
 
 HEIGHT, WIDTH, THRESHOLD_ON, THRESHOLD_OFF = 4, 5, 0.2, 0.25
 PERIOD_US = 16_667
@@ -17,7 +15,7 @@ def log_light(t_s, pixel):
 
 
 @pytest.fixture(scope="module")
-def events():
+def events(make_events):
     """Events of ideal pixels with larger OFF than ON thresholds."""
     t_us = np.arange(0, 1_000_000, 20)
     rows = []
@@ -31,9 +29,7 @@ def events():
             elif level <= reference - THRESHOLD_OFF:
                 reference -= THRESHOLD_OFF
                 rows.append((t, pixel % WIDTH, pixel // WIDTH, -1))
-    t, x, y, p = np.array(sorted(rows)).T
-    return Events(torch.from_numpy(t), *map(torch.from_numpy, (x.astype(np.int16), y.astype(np.int16))),
-                  torch.from_numpy(p.astype(np.int8)), HEIGHT, WIDTH)  # fmt: skip
+    return make_events(sorted(rows), HEIGHT, WIDTH)
 
 
 @pytest.fixture(scope="module")
@@ -48,21 +44,20 @@ def of(events):
     return steps(events, (0, 0), (HEIGHT, WIDTH), -(10**9), 10**9)
 
 
-def test_each_step_lies_between_two_events_of_one_pixel():
-    x = torch.tensor([0, 1, 0, 1, 0], dtype=torch.int16)
-    p = torch.tensor([1, -1, 1, 1, -1], dtype=torch.int8)
-    pairs = steps(Events(torch.tensor([1, 2, 5, 9, 9]), x, torch.zeros_like(x), p, 1, 2), (0, 0), (1, 2), 0, 9)
+def test_each_step_lies_between_two_events_of_one_pixel(make_events):
+    rows = [(1, 0, 0, 1), (2, 1, 0, -1), (5, 0, 0, 1), (9, 1, 0, 1), (9, 0, 0, -1)]
+    pairs = steps(make_events(rows, 1, 2), (0, 0), (1, 2), 0, 9)
     assert pairs.before_us.tolist() == [1]  # those that end at 9 us are not before the stop
     assert (pairs.after_us.tolist(), pairs.pixel.tolist(), pairs.polarity.tolist()) == ([5], [0], [1])
 
 
 @pytest.mark.parametrize("shift_us", [-31_400, -700, 0, 12_345])
-def test_the_lag_of_pictures_is_found_much_finer_than_a_picture(events, pictures, shift_us):
+def test_the_lag_of_pictures_is_found_much_finer_than_a_picture_and_the_thresholds_too(events, pictures, shift_us):
     t_us, values = pictures
     lag = best_lag(of(events), t_us + shift_us, logarithms(values), 50_000)
     assert lag.lag_us == pytest.approx(shift_us, abs=150)
     assert lag.agreement > 0.97
-    assert len(lag.searched_us) == len(lag.agreements) == 51
+    assert lag.thresholds == pytest.approx((THRESHOLD_ON, THRESHOLD_OFF), rel=0.05)
 
 
 def test_noise_of_the_pictures_does_not_move_the_lag(events, pictures):
@@ -72,24 +67,12 @@ def test_noise_of_the_pictures_does_not_move_the_lag(events, pictures):
     assert best_lag(of(events), t_us, logarithms(noisy), 20_000).lag_us == pytest.approx(0, abs=500)
 
 
-def test_thresholds_are_the_changes_between_events(events, pictures):
-    t_us, values = pictures
-    contrast = best_lag(of(events), t_us, logarithms(values), 20_000).thresholds
-    assert contrast.on == pytest.approx(THRESHOLD_ON, rel=0.05)
-    assert contrast.off == pytest.approx(THRESHOLD_OFF, rel=0.05)
-
-
 def test_without_any_change_there_is_no_agreement(events, pictures):
     t_us, values = pictures
-    still = logarithms(np.full_like(values, 2000))
-    change = changes(of(events), 0, t_us, still)
+    change = changes(of(events), 0, t_us, logarithms(np.full_like(values, 2000)))
     polarity = of(events).polarity
-    assert agreement(polarity, change) == 0
-    assert spread(polarity, change) == 0
+    assert agreement(polarity, change) == spread(polarity, change) == 0
     assert np.isnan(thresholds(polarity[:0], change[:0]).on)
-
-
-def test_dark_pixels_and_steps_outside_of_the_pictures_do_not_count(events, pictures):
-    t_us, values = pictures
+    # dark pixels, and steps outside of the pictures, do not count
     assert np.isnan(changes(of(events), 0, t_us, logarithms(np.full_like(values, 63)))).all()
     assert np.isnan(changes(of(events), 2_000_000, t_us, logarithms(values))).all()

@@ -5,7 +5,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from polarnet.captures.dot import (
     EVENT_CAPTURES,
@@ -21,7 +20,6 @@ from polarnet.captures.dot import (
     regular_times_us,
 )
 from polarnet.config.tree import load
-from polarnet.events.stream import Events
 from polarnet.recordings.source import RecordingError
 
 HEIGHT, WIDTH = 80, 60
@@ -32,19 +30,9 @@ def config(project_root):
     return replace(load(project_root).recordings, sensor=[HEIGHT, WIDTH], crop=[8, 12], size=[2, 3])
 
 
-def events_at(times, x, y, p):
-    n = len(times)
-    full = lambda value, dtype: torch.as_tensor(np.broadcast_to(value, n).copy(), dtype=dtype)  # noqa: E731
-    return Events(
-        torch.as_tensor(times, dtype=torch.int64), full(x, torch.int16), full(y, torch.int16), full(p, torch.int8),
-        HEIGHT, WIDTH,
-    )  # fmt: skip
-
-
-def pictures(region, t_us=None):
-    n = len(region)
-    t_us = np.arange(n, dtype=np.int64) * 10_000 if t_us is None else t_us
-    return IntensityCapture(t_us, np.zeros((n, 8, 12), np.uint16), np.array(region, float))
+def pictures(region):
+    t_us = 10_000 * np.arange(len(region))
+    return IntensityCapture(t_us, np.zeros((len(region), 8, 12), np.uint16), np.array(region, float))
 
 
 def test_the_papers_values_are_the_default(project_root):
@@ -61,12 +49,8 @@ def write_frames(folder, pictures):
     return folder
 
 
-@pytest.fixture
-def grey_pictures():
-    return np.random.default_rng(0).integers(0, 256, (12, HEIGHT, WIDTH), np.uint8)
-
-
-def test_frames_of_a_folder_are_an_intensity_capture_with_the_times_of_its_text(config, grey_pictures, tmp_path):
+def test_frames_of_a_folder_are_an_intensity_capture_with_the_times_of_its_text(config, tmp_path):
+    grey_pictures = np.random.default_rng(0).integers(0, 256, (12, HEIGHT, WIDTH), np.uint8)
     folder = write_frames(tmp_path / "intensity_0", grey_pictures)
     with pytest.raises(RecordingError, match=r"intensity_0: its pictures have no times .*timestamps\.txt"):
         read_intensity_capture(folder, config)
@@ -82,6 +66,9 @@ def test_frames_of_a_folder_are_an_intensity_capture_with_the_times_of_its_text(
     (folder / "timestamps.txt").write_text("0\n10\n")
     with pytest.raises(RecordingError, match=r"expected a time for each of 12 frames, timestamps\.txt has 2"):
         read_intensity_capture(folder, config)
+    folder = write_frames(tmp_path / "intensity_45", np.zeros((2, HEIGHT - 1, WIDTH), np.uint8))
+    with pytest.raises(RecordingError, match=r"recordings\.sensor is \[80, 60\], its pictures are 79x60"):
+        read_intensity_capture(folder, replace(config, picture_rate_hz=50.0))
 
 
 def test_a_video_is_an_intensity_capture_with_its_own_times_or_those_beside_it(config, tmp_path):
@@ -95,46 +82,31 @@ def test_a_video_is_an_intensity_capture_with_its_own_times_or_those_beside_it(c
     np.testing.assert_allclose(capture.pictures.mean(axis=(1, 2)) / 16, frames, atol=4)  # MPEG-4 is lossy
     (tmp_path / "intensity_0.txt").write_text("".join(f"{5000 * k}\n" for k in range(12)))
     assert read_intensity_capture(tmp_path / "intensity_0.mp4", config).t_us[-1] == 55_000
-    for name in (*EVENT_CAPTURES, *INTENSITY_CAPTURES[1:]):
-        (tmp_path / f"{name}.bin").touch()
-    assert find_captures(tmp_path)["intensity_0"].suffix == ".mp4"
-
-
-def test_pictures_smaller_than_the_sensor_are_refused(config, tmp_path):
-    folder = write_frames(tmp_path / "intensity_0", np.zeros((2, HEIGHT - 1, WIDTH), np.uint8))
-    with pytest.raises(RecordingError, match=r"recordings\.sensor is \[80, 60\], its pictures are 79x60"):
-        read_intensity_capture(folder, replace(config, picture_rate_hz=50.0))
 
 
 def test_an_intensity_capture_starts_with_the_first_picture_whose_mean_is_below_30(config):
     assert intensity_start_us("a", pictures([100.0, 30.0, 29.99, 100.0, 5.0]), config) == 20_000
-
-
-def test_a_region_that_is_never_or_always_dark_has_no_start(config):
-    with pytest.raises(
-        RecordingError, match=r"a: no picture is darker than 30 .* darkest has mean 31\.0; set the start"
+    for region, message in (
+        ([100.0, 31.0], r"a: no picture is darker than 30 .* darkest has mean 31\.0; set the start"),
+        ([3.0, 4.0], r"a: the first picture is dark .* already \(mean 3\.0\)"),
     ):
-        intensity_start_us("a", pictures([100.0, 31.0]), config)
-    with pytest.raises(RecordingError, match=r"a: the first picture is dark .* already \(mean 3\.0\)"):
-        intensity_start_us("a", pictures([3.0, 4.0]), config)
+        with pytest.raises(RecordingError, match=message):
+            intensity_start_us("a", pictures(region), config)
 
 
-def test_an_event_capture_starts_with_the_45th_negative_event_of_the_region(config):
-    times = np.arange(100) * 10
-    assert event_start_us("a", events_at(times, WIDTH - 2, 44, -1), config) == 440
-    for elsewhere in ({"x": WIDTH - 3}, {"y": 45}, {"p": 1}):
-        place = {"x": WIDTH - 2, "y": 44, "p": -1, **elsewhere}
+def test_an_event_capture_starts_with_the_45th_negative_event_of_the_region(config, make_events):
+    def start_us(x, y, p):
+        return event_start_us("a", make_events([(10 * k, x, y, p) for k in range(100)], HEIGHT, WIDTH), config)
+
+    assert start_us(WIDTH - 2, 44, -1) == 440
+    for elsewhere in ((WIDTH - 3, 44, -1), (WIDTH - 2, 45, -1), (WIDTH - 2, 44, 1)):
         with pytest.raises(RecordingError, match="expected 45 negative events in the landmark's region, got 0"):
-            event_start_us("a", events_at(times, **place), config)
+            start_us(*elsewhere)
 
 
-def test_starts_given_by_hand_take_the_place_of_the_rule(config):
-    starts = landmark_starts(
-        {"events_0": events_at([1, 2], 0, 0, 1)},
-        {"intensity_0": pictures([100.0, 1.0])},
-        config,
-        {"events_0": 123},
-    )
+def test_starts_given_by_hand_take_the_place_of_the_rule(config, make_events):
+    events, intensities = {"events_0": make_events([], HEIGHT, WIDTH)}, {"intensity_0": pictures([100.0, 1.0])}
+    starts = landmark_starts(events, intensities, config, {"events_0": 123})
     assert starts == {"events_0": 123, "intensity_0": 10_000}
 
 
@@ -159,10 +131,10 @@ def test_a_picture_is_reduced_by_averaging(config):
 
 
 def test_a_target_needs_one_file_for_each_of_its_eight_captures(tmp_path):
-    for name in ("events", "intensity"):
-        for angle in (0, 45, 90, 135):
-            (tmp_path / f"{name}_{angle}.bin").touch()
-    assert len(find_captures(tmp_path)) == 8
+    for name in (*EVENT_CAPTURES, *INTENSITY_CAPTURES):
+        (tmp_path / f"{name}.bin").touch()
+    (tmp_path / "intensity_0.txt").touch()  # times of a video
+    assert find_captures(tmp_path).keys() == {*EVENT_CAPTURES, *INTENSITY_CAPTURES}
     (tmp_path / "events_45.csv").touch()
     with pytest.raises(RecordingError, match=r"expected one file events_45\.bin .* got events_45\.bin, events_45\.csv"):
         find_captures(tmp_path)

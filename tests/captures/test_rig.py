@@ -8,14 +8,8 @@ import pytest
 import torch
 
 from polarnet.benchmark.run import run_benchmark
-from polarnet.captures.dot import (
-    EVENT_CAPTURES,
-    INTENSITY_CAPTURES,
-    RecordingsConfig,
-    find_captures,
-)
-from polarnet.captures.imported import import_targets
-from polarnet.captures.targets import calibrate_targets
+from polarnet.captures.dot import RecordingsConfig, find_captures
+from polarnet.captures.targets import calibrate_targets, import_targets
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
@@ -26,24 +20,12 @@ from polarnet.storage.frames import FrameStore
 from studies.simulated_rig import RigConfig, spread_us, true_dolp, write_rig
 
 PICTURE_RATE_HZ = 60.0
-SMALL = {
-    "enabled": True,
-    "sensor": [96, 160],
-    "region": [24, 2],
-    "negative_events": 24,
-    "crop": [64, 96],
-    "size": [16, 24],
-}
+SMALL = {"enabled": True, "sensor": [96, 160], "region": [24, 2], "negative_events": 24, "crop": [64, 96],
+         "size": [16, 24]}  # fmt: skip
 RIG = RigConfig(
-    speed_px_s=80.0,
-    longest_delay_s=0.25,
-    duration_s=0.3,
-    picture_rate_hz=PICTURE_RATE_HZ,
-    full_well_electrons=20000.0,
-    read_noise=2.0,
-    hot_pixels=3,
-    file_type="bin",
-)
+    speed_px_s=80.0, longest_delay_s=0.25, duration_s=0.3, picture_rate_hz=PICTURE_RATE_HZ,
+    full_well_electrons=20000.0, read_noise=2.0, hot_pixels=3, file_type="bin",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +63,7 @@ def test_a_folder_of_captures_goes_into_recover_calibrated(rig, config, project_
 
 def test_the_rig_writes_eight_captures_and_says_what_is_true_of_them(rig):
     root, truth = rig
-    assert set(find_captures(root / "one")) == {*EVENT_CAPTURES, *INTENSITY_CAPTURES}
+    assert len(find_captures(root / "one")) == 8
     written = json.loads((root / "one" / "truth.json").read_text())
     assert written["start_us"] == dict(truth.start_us)
     assert len(set(truth.start_us.values())) == 8  # random delays
@@ -91,14 +73,10 @@ def test_the_rig_writes_eight_captures_and_says_what_is_true_of_them(rig):
         assert frames["dolp"].mean() == pytest.approx(written["mean_dolp"], abs=1e-6)
 
 
-def test_start_times_by_the_landmark_are_right_within_one_picture(calibrated):
+def test_start_times_by_the_landmark_are_right_within_one_picture_and_refined_within_a_millisecond(calibrated):
     _, found, truth = calibrated
     for capture, start in truth.start_us.items():
         assert abs(found.landmark_us[capture] - start) <= 1e6 / PICTURE_RATE_HZ, capture
-
-
-def test_refined_start_times_are_right_within_a_millisecond(calibrated):
-    _, found, truth = calibrated
     by_landmark = np.abs(spread_us(found.landmark_us, truth.start_us)).max()
     refined = np.abs(spread_us(found.start_us, truth.start_us)).max()
     assert refined < 1000 < by_landmark

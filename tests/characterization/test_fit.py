@@ -19,7 +19,7 @@ from polarnet.characterization.twin import (
     flicker_light,
 )
 from polarnet.pictures.dead_leaves import dead_leaves
-from polarnet.recordings.pixels import event_counts
+from polarnet.recordings.noise import event_counts
 from polarnet.simulation.presets import SENSORS
 
 TRUTH = dataclasses.replace(

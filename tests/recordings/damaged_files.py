@@ -10,7 +10,7 @@ import pytest
 from hypothesis import strategies as st
 
 from polarnet.events.stream import Events, slice_count, validate
-from polarnet.recordings.formats.celex5_bin import celex5_pictures
+from polarnet.recordings.formats.celex5 import celex5_pictures
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import REPAIRS, RecordingError
 from polarnet.storage.events import EventStore
@@ -90,31 +90,23 @@ def write_sample(form: str, path: Path, events: Events) -> None:
         store.finish()
     elif form == "dsec":
         write_hdf5(path, events, 400_000)
-    elif form == "e2p":
+    elif form in ("e2p", "esfp", "metavision"):
         h5py = pytest.importorskip("h5py")
+        columns = {"t": events.t, "x": events.x, "y": events.y, "p": events.p > 0}
         with h5py.File(path, "w") as file:
-            file["events"] = np.stack([events.t, events.x, events.y, events.p > 0], axis=1).astype(np.uint32)
-            file.attrs["sensor_resolution"] = (events.width, events.height)
-    elif form == "esfp":
-        h5py = pytest.importorskip("h5py")
-        with h5py.File(path, "w") as file:
-            columns = {"t": events.t, "x": events.x, "y": events.y, "p": events.p > 0}
-            for name, column in columns.items():
-                file[name] = column.numpy()
-    elif form == "metavision":
-        h5py = pytest.importorskip("h5py")
-        with h5py.File(path, "w") as file:
-            columns = {
-                "x": ("<u2", events.x),
-                "y": ("<u2", events.y),
-                "p": ("<i2", events.p > 0),
-                "t": ("<i8", events.t),
-            }
-            table = np.zeros(len(events), [(name, kind) for name, (kind, _) in columns.items()])
-            for name, (_, column) in columns.items():
-                table[name] = column.numpy()
-            file["CD/events"] = table
-            file.attrs["geometry"] = f"{events.width}x{events.height}"
+            if form == "e2p":
+                file["events"] = np.stack([*columns.values()], axis=1).astype(np.uint32)
+                file.attrs["sensor_resolution"] = (events.width, events.height)
+            elif form == "esfp":
+                for name, column in columns.items():
+                    file[name] = column.numpy()
+            else:
+                kinds = {"x": "<u2", "y": "<u2", "p": "<i2", "t": "<i8"}
+                table = np.zeros(len(events), [*kinds.items()])
+                for name in kinds:
+                    table[name] = columns[name].numpy()
+                file["CD/events"] = table
+                file.attrs["geometry"] = f"{events.width}x{events.height}"
     elif form == "rosbag":
         pytest.importorskip("rosbags", reason="the extra rosbag is not installed")
         rows = list(zip(*(getattr(events, name).tolist() for name in "txyp"), strict=True))

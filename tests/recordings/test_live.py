@@ -1,29 +1,45 @@
-"""Lines from a pipe or a file that grows."""
+"""Lines from a pipe or a file that grows, and a network stream of dv-processing from this machine to itself."""
 
+import contextlib
 import os
+import socket
+import subprocess
+import sys
 import threading
 import time
 
+import numpy as np
 import pytest
 import torch
 
-from polarnet.recordings.live import LiveLines, live_lines
+from polarnet.recordings.live import LiveCamera, LiveLines, live_lines
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import parse_mosaic
 
+MOSAIC = parse_mosaic("90 45 / 135 0")
 
-def read(tmp_path, text, mosaic=None):
+
+def read_lines(tmp_path, text, mosaic=None):
     path = tmp_path / "camera.txt"
     path.write_text(text)
     with path.open("rb") as file:
         live = LiveLines(file, path.name, mosaic, idle_s=0.0)
-        return live, list(live)
+        pieces = list(live)
+        assert file.closed
+        return live, pieces
+
+
+@contextlib.contextmanager
+def pipe():
+    reader, writer = os.pipe()
+    with os.fdopen(reader, "rb") as source, os.fdopen(writer, "wb", buffering=0) as camera:
+        yield source, camera
 
 
 def test_what_is_written_as_lines_is_read_back(tmp_path, make_random_events):
     channels = [make_random_events(seed, 200, 10_000, 20, 30) for seed in range(4)]
     head, times, lines = live_lines(channels)
-    live, pieces = read(tmp_path, (head + lines).decode())
+    live, pieces = read_lines(tmp_path, (head + lines).decode())
     assert (live.height, live.width) == (20, 30)
     assert not +live.counts
     first = int(times[0])
@@ -34,31 +50,20 @@ def test_what_is_written_as_lines_is_read_back(tmp_path, make_random_events):
     assert pieces[-1].until_us == int(times[-1]) - first
 
 
-def test_a_file_is_closed_at_its_end(tmp_path):
-    path = tmp_path / "camera.txt"
-    path.write_text("4 3\n100 1 2 0 0\n")
-    source = path.open("rb")
-    assert len(list(LiveLines(source, path.name, None, idle_s=0.0))) == 1
-    assert source.closed
-
-
-def test_commas_comments_zeros_and_a_last_line_without_an_end_are_read(tmp_path):
-    _, pieces = read(tmp_path, "4 3\n# t x y p angle\n100,1,2,0,0\n150 3 0 1 135\n160 0 0 -1 90")
-    events = [(int(e.t[k]), int(e.x[k]), int(e.y[k]), int(e.p[k])) for piece in pieces for e in piece.channels
-              for k in range(len(e))]  # fmt: skip
+def test_commas_comments_zeros_and_a_last_line_without_an_end_are_read(tmp_path, columns):
+    _, pieces = read_lines(tmp_path, "4 3\n# t x y p angle\n100,1,2,0,0\n150 3 0 1 135\n160 0 0 -1 90")
+    events = [event for piece in pieces for e in piece.channels for event in zip(*columns(e), strict=True)]
     assert sorted(events) == [(0, 1, 2, -1), (50, 3, 0, 1), (60, 0, 0, -1)]
 
 
-def test_a_mosaic_gives_each_pixel_to_its_polarizer(tmp_path):
-    live, (piece,) = read(tmp_path, "4 2\n10 0 0 1\n11 1 0 1\n12 2 1 1\n13 3 1 1\n", parse_mosaic("90 45 / 135 0"))
+def test_a_mosaic_gives_each_pixel_to_its_polarizer(tmp_path, columns):
+    live, (piece,) = read_lines(tmp_path, "4 2\n10 0 0 1\n11 1 0 1\n12 2 1 1\n13 3 1 1\n", MOSAIC)
     assert (live.height, live.width) == (1, 2)
-    assert [channel.t.tolist() for channel in piece.channels] == [[3], [1], [0], [2]]
-    assert [channel.x.tolist() for channel in piece.channels] == [[1], [0], [0], [1]]
+    assert [columns(channel)[:2] for channel in piece.channels] == [[[3], [1]], [[1], [0]], [[0], [0]], [[2], [1]]]
 
 
 def test_lines_are_handed_on_as_they_come_through_a_pipe():
-    reader, writer = os.pipe()
-    with os.fdopen(reader, "rb") as source, os.fdopen(writer, "wb", buffering=0) as camera:
+    with pipe() as (source, camera):
         camera.write(b"4 3\n")
         pieces = iter(LiveLines(source, "pipe", None, idle_s=0.0))
         camera.write(b"5 0 0 1 0\n9 1 1 1 45\n12 ")
@@ -91,8 +96,7 @@ def test_a_file_that_grows_is_followed(tmp_path):
 
 
 def test_late_events_and_single_bad_lines_are_left_out_and_counted(tmp_path):
-    reader, writer = os.pipe()
-    with os.fdopen(reader, "rb") as source, os.fdopen(writer, "wb", buffering=0) as camera:
+    with pipe() as (source, camera):
         camera.write(b"4 3\n100 0 0 1 0\n200 0 0 1 0\n")
         live = LiveLines(source, "pipe", None, idle_s=0.0)
         pieces = iter(live)
@@ -107,17 +111,16 @@ def test_late_events_and_single_bad_lines_are_left_out_and_counted(tmp_path):
 @pytest.mark.parametrize(("text", "reason"), [
     ("", "expected a first line `width height`"), ("hello", "expected a first line"),
     ("0 0 0 1 0\n", "expected a first line `width height`"),
-    ("4 3\n" + "1 2 3\n" * 20, "20 of the first 20 lines are lines that are not `t x y p angle`"),
+    ("4 3\n" + "1 2 3\n" * 20, "20 among the first 20 events: lines that are not the numbers they should be"),
     ("4 3\n" + "1 7 2 1 0\n" * 20, "not on the sensor"),
 ])  # fmt: skip
 def test_what_is_no_such_stream_is_refused(tmp_path, text, reason):
     with pytest.raises(RecordingError, match=reason):
-        read(tmp_path, text)
+        read_lines(tmp_path, text)
 
 
 def test_lines_keep_the_time_at_which_they_came_while_nobody_reads():
-    reader, writer = os.pipe()
-    with os.fdopen(reader, "rb") as source, os.fdopen(writer, "wb", buffering=0) as camera:
+    with pipe() as (source, camera):
         camera.write(b"4 3\n")
         live = LiveLines(source, "pipe", None, idle_s=0.0)
         before = time.perf_counter()
@@ -127,3 +130,90 @@ def test_lines_keep_the_time_at_which_they_came_while_nobody_reads():
             time.sleep(0.001)
         after = time.perf_counter()
         assert all(before <= piece.read_at <= after for piece in live)
+
+
+@pytest.fixture
+def dv():
+    return pytest.importorskip("dv_processing", reason="the extra live is not installed")
+
+
+def free_port():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+SENDER = """
+import sys, time
+import dv_processing as dv
+import numpy as np
+
+events, port = np.load(sys.argv[1]), int(sys.argv[2])
+writer = dv.io.NetworkWriter("127.0.0.1", port, dv.io.Stream.EventStream(0, "events", "DAVIS346_test", (8, 6)))
+while writer.getClientCount() == 0:
+    time.sleep(0.01)
+for start in range(0, len(events), 1000):
+    store = dv.EventStore()
+    for t, x, y, p in events[start : start + 1000].tolist():
+        store.push_back(1_700_000_000_000_000 + t, x, y, p > 0)
+    writer.writeEvents(store)
+    time.sleep(0.02)
+time.sleep(100)
+"""
+
+
+@pytest.fixture
+def sender(dv, tmp_path):
+    """Start a process that sends events to the first reader of its port; the writer would wait for it on deletion."""
+    started = []
+
+    def start(events):
+        np.save(tmp_path / "events.npy", torch.stack([events.t, events.x, events.y, events.p], dim=1).numpy())
+        port = free_port()
+        started.append(subprocess.Popen([sys.executable, "-c", SENDER, tmp_path / "events.npy", str(port)]))
+        return port
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+def connected(port):
+    """The camera, once the process has opened its port."""
+    for _ in range(200):
+        try:
+            return LiveCamera(f"dv://127.0.0.1:{port}", MOSAIC, idle_s=100.0)
+        except RecordingError:
+            time.sleep(0.1)
+    raise AssertionError("the sender did not open its port within 20 s")
+
+
+def test_events_sent_over_loopback_arrive_in_their_channels(sender, make_random_events):
+    events = make_random_events(0, 5000, 10**6, 6, 8)
+    camera = connected(sender(events))
+    assert (camera.height, camera.width) == (3, 4)
+    pieces, received = [], 0
+    for piece in camera:
+        pieces.append(piece)
+        received += sum(map(len, piece.channels))
+        if received == len(events):
+            break
+    t = torch.cat([channel.t for piece in pieces for channel in piece.channels]).sort().values
+    assert torch.equal(t, events.t - events.t[0])
+    assert sum(len(piece.channels[2]) for piece in pieces) == int(((events.x % 2 == 0) & (events.y % 2 == 0)).sum())
+    assert [piece.until_us for piece in pieces] == sorted(piece.until_us for piece in pieces)
+    assert len(pieces) >= 2
+
+
+def test_nobody_at_the_address_is_reported(dv):
+    with pytest.raises(RecordingError, match="cannot be reached"):
+        LiveCamera(f"dv://127.0.0.1:{free_port()}", MOSAIC, idle_s=1.0)
+    with pytest.raises(ValueError, match="expected dv://HOST:PORT or dv://camera"):
+        LiveCamera("dv://somewhere", MOSAIC, idle_s=1.0)
+
+
+def test_without_dv_processing_the_error_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "dv_processing", None)
+    with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[live\]' in the clone"):
+        LiveCamera("dv://127.0.0.1:7777", MOSAIC, idle_s=1.0)

@@ -17,13 +17,11 @@ SAMPLES = {
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", SAMPLES)
-def test_a_sample_has_the_number_of_events_that_other_readers_found(shared, name):
+def test_a_sample_has_the_number_of_events_that_other_readers_found(shared, read, name):
     if SAMPLES[name][0] != "evt":
         pytest.importorskip("faery")
-    recording = read_recording(shared / "data" / "recordings" / name)
-    events = recording.events
-    assert (recording.format, len(events), events.height, events.width) == SAMPLES[name]
-    assert recording.repairs == {}
+    (form, height, width), (t, *_), repairs = read(shared / "data" / "recordings" / name)
+    assert ((form, len(t), height, width), repairs) == (SAMPLES[name], {})
 
 
 @pytest.mark.shared
@@ -73,10 +71,9 @@ def test_iterating_again_starts_again_and_counts_again(tmp_path):
         assert reader.repairs["unsorted"] == 1
 
 
-def test_a_recording_without_events_is_an_empty_stream_of_its_sensor(tmp_path):
+def test_a_recording_without_events_is_an_empty_stream_of_its_sensor(tmp_path, read):
     (tmp_path / "e.txt").write_text("18 12\n")
-    recording = read_recording(tmp_path / "e.txt")
-    assert (len(recording.events), recording.events.height, recording.events.width) == (0, 12, 18)
+    assert read(tmp_path / "e.txt") == (("text", 12, 18), [[]] * 4, {})
 
 
 @pytest.mark.parametrize(
@@ -106,16 +103,13 @@ def test_impossible_arguments_are_refused_before_reading(tmp_path):
         open_recording(tmp_path / "nothing.csv")
     (tmp_path / "e.txt").write_text("5 1 2 1\n")
     for arguments, message in (
-        ({"height": 0, "width": 4}, "expected a height of 1 to 32767 px, got 0"),
+        ({"height": 0, "width": 4}, "expected a sensor with sides of 1 to 32767 px, got 0x4"),
         ({"chunk_events": 0}, "at least one event"),
         ({"clock_mhz": 0.0}, r"a clock of 0\.001 to 10000 MHz"),
         ({}, "give height and width"),
     ):
         with pytest.raises(ValueError, match=message):
             open_recording(tmp_path / "e.txt", **arguments)
-
-
-def test_a_size_that_differs_from_the_files_is_refused(tmp_path):
     (tmp_path / "e.txt").write_text("18 12\n5 1 2 1\n")
     with pytest.raises(RecordingError, match="the file states a height of 12 px, 13 was given"):
         read_recording(tmp_path / "e.txt", height=13, width=18)

@@ -61,9 +61,7 @@ def test_maps_of_e2p_are_the_truth_where_the_file_has_them(tmp_path, make_events
     truth = read_truth(tmp_path / "e.h5", MOSAIC)
     assert (truth.dolp - torch.from_numpy(true_dolp)).abs().max() < 1e-7
     assert torch.sin(truth.aolp - torch.from_numpy(true_aolp)).abs().max() < 1e-6
-    assert (truth.aolp >= 0).all()
-    assert (truth.aolp < math.pi).all()
-    assert truth.valid.all()
+    assert ((truth.aolp >= 0) & (truth.aolp < math.pi) & truth.valid).all()
     stokes = stokes_from_intensities(truth.intensity)
     assert (dolp(stokes) - truth.dolp).abs().max() < 1e-6
     np.testing.assert_allclose(truth.light, mosaicked(2 * truth.intensity.numpy()))
@@ -84,11 +82,9 @@ def samples(raw, reset_us, signal_us, reset_level=900):
     height, width = raw.shape
     y, x = np.mgrid[:height, :width]
     place = (1 << 31) | (height - 1 - y).ravel() << 22 | x.ravel() << 12
-    reset = np.stack([place | reset_level, np.full(place.size, reset_us)], 1)
-    signal = np.stack(
-        [place | 1 << 10 | (reset_level - raw.ravel().astype(np.int64)), np.full(place.size, signal_us)], 1
-    )
-    return np.concatenate([reset, signal])
+    signal = place | 1 << 10 | (reset_level - raw.ravel().astype(np.int64))
+    times = np.repeat([reset_us, signal_us], place.size)
+    return np.stack([np.concatenate([place | reset_level, signal]), times], axis=1)
 
 
 HEADER = b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis346blue\r\n#End Of ASCII Header\r\n"
@@ -139,13 +135,8 @@ def test_frames_of_aedat4_have_the_middle_of_their_exposure_and_the_known_polari
     inside = np.s_[:, 1:-1, 1:-1]
     assert (truth.dolp[inside] - true_dolp[None][inside]).abs().max() < 1e-7
     assert torch.sin(truth.aolp[inside] - true_aolp[None][inside]).abs().max() < 1e-6
-
-
-def test_aedat4_without_frames_says_so(tmp_path):
-    path = write_aedat4(tmp_path / "e.aedat4", [(known(20, 24)[0], 1000, 8000)], [(5000, 3, 4, 1)])
     faery = pytest.importorskip("faery")
-    stream = faery.events_stream_from_file(path)
-    stream.to_file(tmp_path / "events.aedat4")
+    faery.events_stream_from_file(tmp_path / "e.aedat4").to_file(tmp_path / "events.aedat4")
     with pytest.raises(RecordingError, match="expected raw frames of one size and one channel"):
         read_truth(tmp_path / "events.aedat4", MOSAIC)
 

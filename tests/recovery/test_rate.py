@@ -1,10 +1,9 @@
-import numpy as np
 import pytest
 import torch
 import zarr
 
 from polarnet.cli import main
-from polarnet.events.stream import Events, slice_time
+from polarnet.events.stream import slice_time
 from polarnet.events.streaming import WindowRule
 from polarnet.methods.between import BetweenConfig
 from polarnet.methods.method import Recoverer
@@ -12,7 +11,6 @@ from polarnet.recordings.live import Piece
 from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
 from polarnet.recovery.stream import Input, frames_of
 from polarnet.stokes import Prediction
-from polarnet.storage.events import EventStore
 
 HEIGHT, WIDTH, DURATION_US, WINDOW_US = 16, 20, 100_000, 20_000
 CONFIG = BetweenConfig(reach=12, share=0.25, width=3, threshold_on=0.2, threshold_off=0.2)
@@ -33,20 +31,6 @@ def _predicted(state, windows):
 
 
 NETWORK = Recoverer(lambda height, width: None, _predicted)
-
-
-def random_events(seed, count=3000):
-    generator = np.random.default_rng(seed)
-    t = np.sort(generator.integers(0, DURATION_US, count))
-    t[0], t[-1] = 0, DURATION_US - 1
-    x, y = generator.integers(0, WIDTH, count), generator.integers(0, HEIGHT, count)
-    columns = (t, x.astype(np.int16), y.astype(np.int16), generator.choice([-1, 1], count).astype(np.int8))
-    return Events(*map(torch.from_numpy, columns), HEIGHT, WIDTH)
-
-
-@pytest.fixture(scope="module")
-def channels():
-    return [random_events(seed) for seed in range(4)]
 
 
 def source_of(channels, ends=(DURATION_US,)):
@@ -78,7 +62,9 @@ def test_frames_at_the_ends_of_windows_are_those_of_the_windows(channels):
     for stop_us, expected in of_windows.items():
         assert torch.equal(frames[stop_us].prediction.dolp, expected.prediction.dolp)
         assert torch.equal(frames[stop_us].prediction.aolp, expected.prediction.aolp)
-    assert not torch.equal(frames[30_000].prediction.dolp, frames[20_000].prediction.dolp)
+    between = frames[30_000]
+    assert not torch.equal(between.prediction.dolp, frames[20_000].prediction.dolp)
+    assert [len(e) for e in between.window.channels] == [len(slice_time(e, 10_000, 30_000)) for e in channels]
 
 
 @pytest.mark.parametrize("rule", [WINDOWS, WindowRule(None, 2000, None)])
@@ -90,13 +76,6 @@ def test_pieces_of_any_length_give_the_same_frames(channels, rule):
     for one, other in zip(whole, pieces, strict=True):
         torch.testing.assert_close(one.prediction.dolp, other.prediction.dolp)
         assert [len(events) for events in one.window.channels] == [len(events) for events in other.window.channels]
-
-
-def test_the_pictures_of_a_frame_show_the_events_of_a_window_that_ends_with_it(channels):
-    frame = at_rate(1000, channels)[7]
-    assert (frame.window.start_us, frame.window.stop_us) == (7000, 27_000)
-    expected = [slice_time(events, 7000, 27_000) for events in channels]
-    assert [len(events) for events in frame.window.channels] == [len(events) for events in expected]
 
 
 @pytest.mark.parametrize(("hz", "step_us", "once", "reason"), [
@@ -114,19 +93,14 @@ def test_rates_that_make_no_sense_are_refused(hz, step_us, once, reason):
 
 
 def test_the_command_writes_frames_at_the_rate_and_refuses_it_with_a_rotating_polarizer(
-    channels, project_root, tmp_path, monkeypatch, capsys
+    store, at_root, tmp_path, capsys
 ):
-    monkeypatch.chdir(project_root)
-    store = tmp_path / "events.zarr"
-    writer = EventStore.create(store, ["lake"], HEIGHT, WIDTH, {})
-    writer.write("lake", channels, DURATION_US)
-    writer.finish()
-    out = ("--out", str(tmp_path / "out"), "--write", "zarr")
-    assert main(["recover", str(store), "--rate", "1000", "--device", "cpu", *out]) == 0
+    lake, out = (str(store), "--sequence", "lake"), ("--out", str(tmp_path / "out"), "--write", "zarr")
+    assert main(["recover", *lake, "--rate", "1000", "--device", "cpu", *out]) == 0
     assert "1000 frames a second" in capsys.readouterr().out
     times = zarr.open_group(tmp_path / "out" / "recovered.zarr", mode="r")["t_us"][:]
     assert times.tolist() == list(range(34_000, 100_001, 1000))
-    assert main(["recover", str(store), "--rate", "20", *out]) == 1
+    assert main(["recover", *lake, "--rate", "20", *out]) == 1
     assert "windows of 33.333 ms give, got 20" in capsys.readouterr().err
     camera = tmp_path / "camera.txt"
     camera.write_text("20 16\n0 0 0 1\n")

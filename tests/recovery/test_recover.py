@@ -20,10 +20,10 @@ from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.formats.lines import lines_of
-from polarnet.recordings.live import live_lines
+from polarnet.recordings.live import live_lines, replay
 from polarnet.recovery import inputs
 from polarnet.recovery.inputs import Files, open_files
-from polarnet.recovery.stream import ChosenMethod, frames_of, open_method, replay
+from polarnet.recovery.stream import ChosenMethod, frames_of, open_method
 from polarnet.runtime import machine as runtime
 from polarnet.storage.events import EventStore
 
@@ -34,31 +34,6 @@ NETWORK = {
 }  # fmt: skip
 
 
-def random_events(seed, height=HEIGHT, width=WIDTH, count=2000):
-    generator = np.random.default_rng(seed)
-    t = np.sort(generator.integers(0, DURATION_US, count))
-    t[0], t[-1] = 0, DURATION_US - 1
-    x, y = generator.integers(0, width, count), generator.integers(0, height, count)
-    p = generator.choice([-1, 1], count)
-    columns = (t, x.astype(np.int16), y.astype(np.int16), p.astype(np.int8))
-    return Events(*map(torch.from_numpy, columns), height, width)
-
-
-@pytest.fixture(scope="module")
-def channels():
-    return [random_events(seed) for seed in range(4)]
-
-
-@pytest.fixture(scope="module")
-def store(channels, tmp_path_factory):
-    path = tmp_path_factory.mktemp("store") / "events.zarr"
-    writer = EventStore.create(path, ["lake", "road"], HEIGHT, WIDTH, {})
-    for name in writer.sequences:
-        writer.write(name, channels, DURATION_US)
-    writer.finish()
-    return path
-
-
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     torch.manual_seed(0)
@@ -66,11 +41,6 @@ def weights(tmp_path_factory):
     metadata = {"network": "paper", "config": NETWORK, "in_channels": 4, "representation": "event_tensor"}
     save_checkpoint(path, DolpUNet(DolpUNetConfig(**NETWORK)).state_dict(), metadata)
     return path
-
-
-@pytest.fixture
-def at_root(project_root, monkeypatch):
-    monkeypatch.chdir(project_root)
 
 
 def write_lines(path, events):
@@ -114,11 +84,12 @@ def test_a_store_four_files_and_lines_that_come_give_the_same(store, channels, w
         np.testing.assert_allclose(frames["dolp"].astype(float), expected["dolp"], atol=3)
 
 
-def test_a_mosaic_is_one_file_with_channels_of_half_its_size(tmp_path, at_root):
-    whole = write_lines(tmp_path / "camera.txt", random_events(1, 2 * HEIGHT, 2 * WIDTH))
+def test_a_mosaic_is_one_file_with_channels_of_half_its_size(make_channel, tmp_path, at_root, capsys):
+    whole = write_lines(tmp_path / "camera.txt", make_channel(1, 2 * HEIGHT, 2 * WIDTH))
     options = ("--mosaic", "90 45 / 135 0", "--method", "cf+gain", "--window", "500ev", "--step", "5ms")
     assert run(whole, *options, out=tmp_path / "out") == 0
     assert recovered(tmp_path / "out")["dolp"].shape[1:] == (HEIGHT, WIDTH)
+    assert re.search(r"events +\d+ at 0, \d+ at 45, \d+ at 90, \d+ at 135 degrees", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(
@@ -170,16 +141,12 @@ def test_a_file_goes_through_the_network_several_windows_at_once_and_gives_the_s
         torch.testing.assert_close(one.prediction.dolp, other.prediction.dolp, atol=1e-5, rtol=1e-4)
 
 
-def test_files_are_reduced_to_the_size_that_is_asked_for(store):
+def test_a_sequence_is_reduced_to_the_size_that_is_asked_for_or_replayed_as_lines(store, channels):
     source = opened(store, (8, 10))
-    assert (source.height, source.width) == (8, 10)
-    assert source.duration_us == DURATION_US
-
-
-def test_a_sequence_is_replayed_as_lines_at_its_own_pace(store, channels):
+    assert (source.height, source.width, source.duration_us) == (8, 10, DURATION_US)
     head, _, lines = live_lines(channels)
     out = io.BytesIO()
-    replay(EventStore.open(store), "lake", 1000.0, out.write)
+    replay(channels, 1000.0, out.write)
     assert out.getvalue() == head + lines
 
 
@@ -277,25 +244,6 @@ def test_a_second_recovery_replaces_the_first_and_other_files_are_refused(store,
     assert "contains files that `polarnet recover` did not write; name another folder" in capsys.readouterr().err
 
 
-def test_a_mosaic_without_polarizers_is_named_on_the_terminal_and_on_the_page(tmp_path, at_root, capsys):
-    """Every pixel fires at once in a random pattern of edges, whatever its place in a cell."""
-    generator = np.random.default_rng(2)
-    t = np.repeat(np.arange(0, 330_000, 1000), 60)
-    cells = generator.integers(0, (40, 60), (len(t), 2))
-    p = generator.choice([-1, 1], len(t))
-    y, x, t, p = (np.repeat(values, 4) for values in (2 * cells[:, 0], 2 * cells[:, 1], t, p))
-    y, x = y + np.tile([0, 0, 1, 1], len(cells)), x + np.tile([0, 1, 0, 1], len(cells))
-    keep = generator.random(len(t)) < 0.9  # pixels do not fire alike to the last event
-    columns = (t[keep], x[keep].astype(np.int16), y[keep].astype(np.int16), p[keep].astype(np.int8))
-    camera = write_lines(tmp_path / "camera.txt", Events(*map(torch.from_numpy, columns), 80, 120))
-    out = tmp_path / "out"
-    assert run(camera, "--mosaic", "90 45 / 135 0", "--method", "highpass", out=out) == 0
-    printed = capsys.readouterr()
-    assert "warning: The four channels show the same" in printed.err
-    assert re.search(r"events +[\d,]+ at 0, [\d,]+ at 45, [\d,]+ at 90, [\d,]+ at 135 degrees", printed.out)
-    assert "was made without polarizers" in (out / "index.html").read_text()
-
-
 def test_what_a_very_short_recording_is_told_works(channels, tmp_path, at_root, capsys):
     early = [slice_time(events, 0, 8000) for events in channels]
     files = [write_lines(tmp_path / f"{angle}.txt", e) for angle, e in zip(ANGLES, early, strict=True)]
@@ -309,13 +257,16 @@ def test_what_a_very_short_recording_is_told_works(channels, tmp_path, at_root, 
     assert run(*arguments, "--window", advice[1], out=tmp_path / "out") == 0
 
 
-def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):
-    one = write_lines(tmp_path / "camera.txt", random_events(1))
+def test_files_of_no_arrangement_are_refused(make_channel, tmp_path, at_root, capsys):
+    one = write_lines(tmp_path / "camera.txt", make_channel(1))
     for files, reason in (
         ([one], "say where the polarizers of its pixels are"),
         ([one, one], "four files with --angles, got 2"),
         ([one] * 4, "say the polarizer of each"),
-        ([one] * 4 + ["--angles", 0, 45, 90, 90], "four different angles"),
+        (
+            [one] * 4 + ["--angles", 0, 45, 90, 90],
+            "one file for each of 0, 45, 90 and 135 degrees, got [0, 45, 90]",
+        ),
         ([one, "--angles", 0, 45, 90, 135], "four files with --angles, got 1"),
         ([one, "--mosaic", "90 45 / 135 0", "--angles", 0, 45, 90, 135], "got --angles, --mosaic"),
         ([one, "--live", "--sequence", "lake"], "--live: expected no --sequence"),
@@ -327,19 +278,11 @@ def test_files_of_no_arrangement_are_refused(tmp_path, at_root, capsys):
         assert reason in capsys.readouterr().err
 
 
-@pytest.fixture
-def setup_of_demo(project_root):
-    return functools.partial(setup_of, load(project_root, ["runtime.device=cpu"]))
-
-
-@pytest.mark.parametrize("option", [{"thresholds": (0.1, 0.1)}, {"binning": 2}])
-def test_options_of_the_network_are_refused_for_a_method_that_does_not_use_them(option, setup_of_demo):
-    (name,) = option
-    with pytest.raises(ValueError, match=f"--{name} is for the DoLP network, highpass does not use it"):
-        open_method(ChosenMethod("highpass", **option), setup_of_demo)
-
-
-def test_the_shipped_network_takes_the_thresholds_of_the_camera(setup_of_demo):
+def test_the_shipped_network_takes_the_thresholds_of_the_camera_and_other_methods_do_not(project_root):
+    setup_of_demo = functools.partial(setup_of, load(project_root, ["runtime.device=cpu"]))
+    for option, value in (("thresholds", (0.1, 0.1)), ("binning", 2)):
+        with pytest.raises(ValueError, match=f"--{option} is for the DoLP network, highpass does not use it"):
+            open_method(ChosenMethod("highpass", **{option: value}), setup_of_demo)
     windows = [EventWindow([Events.empty(HEIGHT, WIDTH)] * 4, 0, 33_333)]
     recoverer, words = open_method(ChosenMethod("ours", thresholds=(0.1, 0.4)), setup_of_demo)
     assert words.endswith(str(shipped_weights()))

@@ -6,9 +6,8 @@ import torch
 import zarr
 
 from polarnet.cli import main
-from polarnet.events.streaming import WindowRule
 from polarnet.recordings.source import RecordingError
-from polarnet.recovery.inputs import half_turn_rule, rotation_of
+from polarnet.recovery.inputs import rotation_of
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.motion import resting_trajectory
 from polarnet.simulation.polarizers import Grid
@@ -38,8 +37,7 @@ def recovered(arguments, out):
     return {name: group[name][:] for name in ("t_us", "dolp", "aolp", "log_variance")}
 
 
-def test_a_recording_gives_dolp_and_aolp_every_half_turn(recording, tmp_path, monkeypatch, project_root):
-    monkeypatch.chdir(project_root)
+def test_a_recording_gives_dolp_and_aolp_every_half_turn(recording, tmp_path, at_root):
     frames = recovered([recording, "--rotating", RATE_HZ, "--start-angle", START_DEG], tmp_path / "a")
     assert frames["t_us"][:2].tolist() == [100_000, 200_000]
     assert frames["dolp"][-1].mean() / 65535 == pytest.approx(0.5, abs=0.05)
@@ -62,8 +60,7 @@ def test_a_recording_gives_dolp_and_aolp_every_half_turn(recording, tmp_path, mo
         (["--method", "rotating_polarizer"], "expected the rotation of the polarizer too: --rotating HZ"),
     ],
 )
-def test_options_of_other_inputs_are_refused(recording, arguments, reason, capsys, monkeypatch, project_root):
-    monkeypatch.chdir(project_root)
+def test_options_of_other_inputs_are_refused(recording, arguments, reason, capsys, at_root):
     assert main(["recover", str(recording), *arguments]) == 1
     assert reason in capsys.readouterr().err
 
@@ -75,9 +72,3 @@ def test_a_rate_beside_triggers_gives_the_sense_of_rotation(tmp_path):
     (tmp_path / "t.txt").write_text("soon")
     with pytest.raises(RecordingError, match="a time in whole microseconds on each line"):
         rotation_of(None, tmp_path / "t.txt", 0.0)
-
-
-def test_windows_follow_each_other_every_half_turn_or_step():
-    rotation = rotation_of(5.0, None, 0.0)
-    assert half_turn_rule(rotation) == WindowRule(100_000, None, None)
-    assert half_turn_rule(rotation, 50_000) == WindowRule(50_000, None, None)

@@ -3,12 +3,11 @@ import shutil
 
 import cv2
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 import torch
 import zarr
+from recording_fixtures import events_of
 
-from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
 from polarnet.recovery import writer as recovery
 from polarnet.recovery.writer import RecoveryWriter
@@ -21,9 +20,7 @@ assert FRAMES > FRAMES_PER_CHUNK
 
 
 def window(k):
-    one = Events(torch.tensor([1000 * k]), torch.tensor([k]).short(), torch.tensor([3]).short(),
-                 torch.tensor([1]).to(torch.int8), HEIGHT, WIDTH)  # fmt: skip
-    return EventWindow([one] * 4, 1000 * k, 1000 * (k + 1))
+    return EventWindow([events_of([(1000 * k, k, 3, 1)], HEIGHT, WIDTH)] * 4, 1000 * k, 1000 * (k + 1))
 
 
 def frame(k, *, angle=True):
@@ -39,7 +36,7 @@ def cores(request, monkeypatch):
 
 @pytest.fixture
 def written(tmp_path, cores):
-    with RecoveryWriter(tmp_path, ("zarr", "png", "exr", "mp4"), 30.0) as writer:
+    with RecoveryWriter(tmp_path, ("zarr", "png", "mp4"), 30.0) as writer:
         for k in range(FRAMES):
             writer.add(window(k), frame(k), live=True)
     writer.write_page("a & b", {"windows": "of 1 ms"}, ["one note"])
@@ -53,13 +50,6 @@ def test_the_numbers_are_in_a_zarr_group_of_its_own(written):
     np.testing.assert_allclose(group["aolp"][:, 3, 4] * np.pi / 65536, 0.05 * np.arange(FRAMES), atol=1e-4)
     np.testing.assert_allclose(group["log_variance"][:, 3, 4], -np.arange(FRAMES) / FRAMES, rtol=1e-6)
     assert set(group.attrs["conventions"]) == {"t_us", "dolp", "aolp", "log_variance"}
-
-
-def test_exr_holds_the_floats_and_names_them(written):
-    file = oiio.ImageInput.open(str(written / "exr" / "000007.exr"))
-    assert set(file.spec().channelnames) == {"DoLP", "AoLP", "log_variance"}
-    pixels = dict(zip(file.spec().channelnames, file.read_image()[2, 5], strict=True))
-    assert pixels == pytest.approx({"DoLP": 0.175, "AoLP": 0.35, "log_variance": -0.175}, abs=1e-3)
 
 
 def test_pictures_show_three_maps_side_by_side_and_the_video_labels_them(written):
@@ -108,15 +98,11 @@ def test_a_full_disk_stops_at_a_whole_frame_and_says_so(tmp_path, cores, monkeyp
     assert zarr.open_group(tmp_path / "recovered.zarr", mode="r")["t_us"].shape == (3,)
 
 
-@pytest.mark.parametrize("kind", ["png", "exr"])
-def test_a_picture_that_is_cut_off_is_an_error(tmp_path, kind):
+def test_a_picture_that_is_cut_off_is_an_error(tmp_path):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (400, limits[1]))  # bytes of a file, as a quota or a full disk would
     try:
-        with (
-            pytest.raises(OSError, match=rf"000000\.{kind}: the picture was not written: "),
-            RecoveryWriter(tmp_path, (kind,), 30.0) as writer,
-        ):
+        with pytest.raises(OSError, match="File too large"), RecoveryWriter(tmp_path, ("png",), 30.0) as writer:
             writer.add(window(0), frame(0))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

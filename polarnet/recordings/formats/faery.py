@@ -7,33 +7,32 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from polarnet.recordings.formats import isolated_worker
 from polarnet.recordings.formats.isolated import Library, ask, ask_once
 from polarnet.recordings.source import Block, CameraFrames, Choices, RecordingError, Source, sensor_size
 
-FAERY = Library("faery", "faery", "recordings", "polarnet.recordings.formats.faery_tasks", "the file is damaged")
+FAERY = Library("faery", "faery", "recordings", "the file is damaged")
 
 
 def opener(file_type: str) -> Callable[[Path, Choices], Source]:
     """A function that opens AEDAT4's first event stream (`aedat`, microseconds since 1970), or Event Stream (`es`)."""
 
     def open_file(path: Path, choices: Choices) -> Source:
-        height, width = sensor_size(path, choices, *ask_once(FAERY, path, "size", file_type).value)
-
         def blocks(counts: Counter[str]) -> Iterator[Block]:
-            for answer in ask(FAERY, path, "events", file_type):
-                yield Block(*answer.arrays)
+            for columns in ask(FAERY, path, isolated_worker.faery_events, file_type):
+                yield Block(*columns)
 
-        return Source(height, width, blocks)
+        size = ask_once(FAERY, path, isolated_worker.faery_size, file_type)
+        return Source(*sensor_size(path, choices, *size), blocks)
 
     return open_file
 
 
 def aedat4_frames(path: Path) -> CameraFrames:
     """Grey frames, timed by the middle of their exposure, or by their time stamp where the file has no exposure."""
-    arrays = ask_once(FAERY, path, "frames").arrays
-    if not arrays:
+    frames = ask_once(FAERY, path, isolated_worker.aedat4_frames)
+    if frames is None:
         raise RecordingError(
             f"{path.name}: expected raw frames of one size and one channel as true polarization, there are none"
         )
-    t_us, levels = arrays
-    return CameraFrames(t_us, levels)
+    return CameraFrames(*frames)

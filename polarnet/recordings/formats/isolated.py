@@ -2,18 +2,15 @@
 
 import contextlib
 import importlib.util
-import json
 import multiprocessing
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from polarnet.recordings.formats.isolated_worker import serve
 from polarnet.recordings.source import RecordingError
@@ -26,24 +23,15 @@ SPAWN = multiprocessing.get_context("spawn")  # a forked process would hold torc
 
 
 class Library(NamedTuple):
-    """A library that reads files, and the module of its tasks (see `isolated_worker`)."""
+    """A library that reads files."""
 
     name: str
     package: str
-    """Package that the tasks import."""
+    """Package that its tasks import."""
     extra: str
     """polarnet's extra that installs the package."""
-    tasks: str
     advice: str
     """End of the message about an unreadable file."""
-
-
-class Answer(NamedTuple):
-    """One answer of a task."""
-
-    value: Any
-    """Numbers, text, lists and dictionaries."""
-    arrays: list[np.ndarray]
 
 
 class _Worker(NamedTuple):
@@ -60,57 +48,45 @@ _idle: list[_Worker] = []
 os.register_at_fork(after_in_child=_idle.clear)  # a forked process must not share its parent's workers
 
 
-def ask(library: Library, path: Path, task: str, *arguments: Any) -> Iterator[Answer]:
+def ask(library: Library, path: Path, task: Callable[..., Iterable[Any]], *arguments: Any) -> Iterator[Any]:
     """The answers of a task about a file; RecordingError with the library's message, or if it crashed or took too long.
 
-    A process answers one task at a time; it starts on first use and serves later tasks, whichever their library.
-    RuntimeError names the package to install where the library is missing.
+    A process answers one task at a time; it starts on first use and serves later tasks, whichever their library. It
+    imports the task's module. RuntimeError names the package to install where the library is missing.
     """
     if sys.modules.get(library.package, True) is None or importlib.util.find_spec(library.package) is None:
         raise RuntimeError(f"{path.name}: this format needs {library.package}: {installation(library.extra)}")
-    worker, done = _ready_worker(), False
+    worker, kind = _ready_worker(), "answer"
     try:
         with contextlib.suppress(OSError):  # a process that has ended has no answer either
-            worker.pipe.send_bytes(json.dumps([library.tasks, task, str(path.absolute()), *arguments]).encode())
-        while not done:
-            answer = _received(worker.pipe)
-            if answer is None:
-                raise RecordingError(
-                    f"{path.name}: {library.name} cannot read it: the library crashed or took over {PATIENCE_S} s; "
-                    f"the file is damaged"
-                )
-            done = not isinstance(answer, Answer)
-            if isinstance(answer, str):
-                raise RecordingError(f"{path.name}: {library.name} cannot read it: {answer}; {library.advice}")
-            if isinstance(answer, Answer):
+            worker.pipe.send((task, str(path.absolute()), *arguments))
+        while kind != "end":
+            kind, answer = _received(worker.pipe)
+            if kind in ("error", "crash"):
+                advice = library.advice if kind == "error" else "the file is damaged"
+                raise RecordingError(f"{path.name}: {library.name} cannot read it: {answer}; {advice}")
+            if kind == "answer":
                 yield answer
     finally:
-        if done:
+        if kind in ("end", "error"):
             _idle.append(worker)
         else:
             worker.end()
 
 
-def ask_once(library: Library, path: Path, task: str, *arguments: Any) -> Answer:
+def ask_once(library: Library, path: Path, task: Callable[..., Iterable[Any]], *arguments: Any) -> Any:
     """The one answer of a task, with the errors of `ask`."""
     (answer,) = ask(library, path, task, *arguments)
     return answer
 
 
-def _received(pipe: Connection) -> "Answer | str | bool | None":
-    """The next answer, the error that ends the task, True at its end; None if the process gives no sound answer."""
-    try:
-        if not pipe.poll(PATIENCE_S):
-            return None
-        head = json.loads(pipe.recv_bytes())
-        if "end" in head:
-            return head.get("error", True)
-        arrays = [
-            np.frombuffer(pipe.recv_bytes(), np.dtype(kind)).reshape(shape).copy() for kind, shape in head["arrays"]
-        ]
-        return Answer(head["value"], arrays)
-    except (EOFError, OSError, ValueError, KeyError, TypeError):
-        return None
+def _received(pipe: Connection) -> tuple[str, Any]:
+    """`answer` and the next one, `error` and its message, or `end`; `crash` if the process gives no sound answer."""
+    with contextlib.suppress(Exception):  # half an answer fails in any way
+        if pipe.poll(PATIENCE_S):
+            kind, answer = pipe.recv()
+            return kind, answer
+    return "crash", f"the library crashed or took over {PATIENCE_S} s"
 
 
 def _ready_worker() -> _Worker:

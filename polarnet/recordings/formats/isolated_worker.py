@@ -1,12 +1,9 @@
-"""The process of `isolated.ask`: runs the tasks of format libraries and sends their answers as raw bytes.
+"""The process of `isolated.ask`: runs tasks with format libraries and sends their answers.
 
-It imports nothing else of polarnet, so that it starts quickly. A task is a function in the dictionary TASKS of a
-module. It yields answers: a value for JSON and a list of arrays.
+It imports nothing else of polarnet, so that it starts quickly. A task is a function of a path that yields answers.
 """
 
 import contextlib
-import importlib
-import json
 import os
 import signal
 from collections.abc import Iterator, Sequence
@@ -17,26 +14,27 @@ import numpy as np
 
 GATHERED_EVENTS = 2**16  # per answer; the packets and messages of a file are small
 
-Answer = tuple[Any, Sequence[np.ndarray]]
-
 
 def serve(pipe: Connection, max_mib: int) -> None:
-    """Answer requests, a JSON list of module, task and arguments, until the pipe closes."""
+    """Answer requests, a task and its arguments, until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the main process, which then ends this one
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what libraries print about damage; the error is sent
-    _limit_memory(max_mib)
+    with contextlib.suppress(ImportError, ValueError):  # makes larger allocations fail, where the system supports it
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (max_mib * 2**20, resource.getrlimit(resource.RLIMIT_AS)[1]))
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:
-            module, task, *arguments = json.loads(pipe.recv_bytes())
-            end: dict[str, Any] = {"end": True}
+            task, *arguments = pipe.recv()
+            end = "end", ""
             try:
-                for value, arrays in importlib.import_module(module).TASKS[task](*arguments):
-                    _send(pipe, value, arrays)
+                for answer in task(*arguments):
+                    pipe.send(("answer", answer))
             except BrokenPipeError:
                 raise
             except BaseException as error:  # HDF5 raises many kinds, and a panic in Rust code is not an Exception
-                end["error"] = f"{type(error).__name__}: {error}"[:500]
-            pipe.send_bytes(json.dumps(end).encode())
+                end = "error", f"{type(error).__name__}: {error}"[:500]
+            pipe.send(end)
 
 
 def gathered(pieces: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
@@ -51,17 +49,74 @@ def gathered(pieces: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
         yield np.concatenate(batch)
 
 
-def _send(pipe: Connection, value: Any, arrays: Sequence[np.ndarray]) -> None:
-    """Send the value with the types and shapes of the arrays as JSON, and then the bytes of each array."""
-    kinds = [(array.dtype.str, array.shape) for array in arrays]
-    pipe.send_bytes(json.dumps({"value": value, "arrays": kinds}).encode())
-    for array in arrays:
-        pipe.send_bytes(array.tobytes())
+def hdf5_description(path: str, tables: Sequence[str], attributes: Sequence[str]) -> Iterator[tuple[dict, dict]]:
+    """Shape, number kind and field names of each existing table, and values of existing scalars and attributes."""
+    shapes, values = {}, {}
+    with _hdf5(path) as (file, dataset):
+        for key in tables:
+            if isinstance(table := file.get(key), dataset) and table.shape is not None:
+                shapes[key] = (table.shape, table.dtype.kind, table.dtype.names or ())
+        for key in attributes:
+            if key in file.attrs:
+                values[key] = _plain(np.asarray(file.attrs[key]))
+            elif isinstance(scalar := file.get(key), dataset) and scalar.shape == ():
+                values[key] = _plain(np.asarray(scalar[()]))
+    yield shapes, values
 
 
-def _limit_memory(mib: int) -> None:
-    """Make allocations beyond the limit fail, where the system supports it."""
-    with contextlib.suppress(ImportError, ValueError):
-        import resource
+def hdf5_columns(
+    path: str, columns: Sequence[tuple[str, str | int | None]], block_rows: int
+) -> Iterator[list[np.ndarray]]:
+    """Columns in blocks of rows: of each table the whole, a field of its records, or a column by number."""
+    with _hdf5(path) as (file, _):
+        for start in range(0, len(file[columns[0][0]]), block_rows):
+            rows = {name: file[name][start : start + block_rows] for name in dict(columns)}
+            yield [
+                rows[name] if part is None else rows[name][part if isinstance(part, str) else (slice(None), part)]
+                for name, part in columns
+            ]
 
-        resource.setrlimit(resource.RLIMIT_AS, (mib * 2**20, resource.getrlimit(resource.RLIMIT_AS)[1]))
+
+@contextlib.contextmanager
+def _hdf5(path: str) -> Iterator[Any]:
+    """An open file, and the class of its tables."""
+    import h5py
+
+    with contextlib.suppress(ImportError):
+        import hdf5plugin  # noqa: F401  # the compression of DSEC's own files
+    with h5py.File(path, "r") as file:
+        yield file, h5py.Dataset
+
+
+def _plain(value: np.ndarray) -> Any:
+    """Python numbers for short numeric arrays, text for anything else."""
+    return value.tolist() if value.dtype.kind in "iuf" and value.size <= 8 else str(value)[:80]
+
+
+def faery_size(path: str, file_type: str) -> Iterator[tuple[int, int]]:
+    """Height and width of the sensor."""
+    import faery
+
+    width, height = faery.events_stream_from_file(path, file_type=file_type).dimensions()
+    yield height, width
+
+
+def faery_events(path: str, file_type: str) -> Iterator[list[np.ndarray]]:
+    """Columns t, x, y and polarity (1 or 0) of the events."""
+    import faery
+
+    for table in gathered(iter(faery.events_stream_from_file(path, file_type=file_type))):
+        yield [table["t"], table["x"], table["y"], table["on"].astype(np.uint8)]
+
+
+def aedat4_frames(path: str) -> Iterator[tuple[np.ndarray, np.ndarray] | None]:
+    """Times and grey levels of all frames; None if there are none, or if they differ in size."""
+    import faery
+
+    times, levels = [], []
+    for track, packet in faery.aedat.Decoder(path):
+        if track.data_type == "frame" and packet.pixels.ndim == 2:
+            start, end = packet.exposure_start_t, packet.exposure_end_t
+            times.append((start + end) // 2 if 0 < start < end else packet.t)
+            levels.append(packet.pixels)
+    yield (np.array(times), np.stack(levels)) if len({one.shape for one in levels}) == 1 else None

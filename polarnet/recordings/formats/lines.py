@@ -1,4 +1,7 @@
-"""Convert lines of decimal numbers to columns of whole numbers, at disk speed and in blocks."""
+"""Lines of decimal numbers as columns of whole numbers, at disk speed and in blocks.
+
+The format `text` has lines `t x y p`, as written by E2VID, ESIM and numpy; commas are accepted too.
+"""
 
 import re
 from collections import Counter
@@ -10,17 +13,72 @@ import numba
 import numpy as np
 from jaxtyping import Int64
 
-from polarnet.recordings.source import BLOCK_EVENTS, RecordingError
+from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, sensor_size
 
 HEAD_BYTES = 4096  # bytes at the start of a file; enough for every format to recognise its own
 BLOCK_BYTES = 2**22
 MAX_LINE = 2**12  # bytes
+
+COLUMNS = ("t", "x", "y", "p")
+NAMES = {"time": "t", "timestamp": "t", "ts": "t", "pol": "p", "polarity": "p", "on": "p"}
+MICROSECONDS = 6  # decimals of a second
 
 _SEPARATORS = re.compile(rb"[,;]")
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _DIGITS = 18  # decimal digits that always fit into int64; further ones are less than a microsecond
 _MAX_VALUE = 2**60
 _END, _COMMENT = 10, 35  # line feed, #
+
+
+def matches_text(path: Path, head: bytes) -> bool:
+    """Whether the first line names the columns, is `width height`, or is four numbers, the last mostly a polarity."""
+    if _names(head)[1]:
+        return True
+    lines = numbers_of(head)
+    if not lines:
+        return not head.strip()
+    words = lines[0].words
+    polarities = sum(float(line.words[-1]) in (-1, 0, 1) for line in lines)
+    return len(words) == 2 or (len(words) == len(COLUMNS) and 2 * polarities > len(lines))
+
+
+def open_text(path: Path, choices: Choices) -> Source:
+    """Open lines `t x y p`, after a line `width height` or with the given size; # starts a comment.
+
+    A first line of names may give another order of the columns. t is in seconds where the first event's t has a decimal
+    point, else in microseconds; p is 1 or 0, or 1 or -1.
+    """
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    lines = numbers_of(head)
+    height = width = None
+    order, start = _names(head)
+    if lines and len(lines[0].words) == 2:
+        (size, start), *lines = lines
+        if not all(word.isdigit() for word in size):
+            raise RecordingError(f"{path.name}: expected a first line `width height`, got {' '.join(size)!r}")
+        width, height = map(int, size)
+    height, width = sensor_size(path, choices, height, width)
+    columns = len(lines[0].words) if lines else len(COLUMNS)
+    if columns != len(COLUMNS):
+        raise RecordingError(f"{path.name}: expected lines of the four columns t x y p, got {columns} columns")
+    place = order.index("t")
+    seconds = bool(lines) and "." in lines[0].words[place]
+    decimals = tuple(MICROSECONDS if seconds and name == "t" else 0 for name in order)
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        for rows in number_blocks(path, decimals, start, counts):
+            yield Block(*(np.ascontiguousarray(rows[:, order.index(name)]) for name in COLUMNS))
+
+    return Source(height, width, blocks)
+
+
+def _names(head: bytes) -> tuple[tuple[str, ...], int]:
+    """Column order from the names in the first line, and the next line's offset; t x y p if there are no names."""
+    line = head.split(b"\n", 1)[0]
+    words = re.split(r"[,;\s]+", line.decode("ascii", "replace").lower().strip(" #\r\t\ufeff"))
+    order = tuple(NAMES.get(word, word) for word in words)
+    return (order, len(line) + 1) if sorted(order) == sorted(COLUMNS) else (COLUMNS, 0)
 
 
 def number_blocks(

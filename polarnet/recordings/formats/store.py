@@ -22,7 +22,17 @@ def open_store(path: Path, choices: Choices) -> Source:
         store = EventStore.open(path)
     except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{path.name}: {error}") from error
-    sequence, channel = _part(path, store, choices.part)
+    sequence, _, angle = (choices.part or "").rpartition("/")
+    if not sequence and len(store.sequences) == 1:
+        sequence = store.sequences[0]
+    angles = [str(a) for a in POLARIZER_ANGLES_DEG]
+    if sequence not in store.sequences or angle not in angles:
+        names = ", ".join(store.sequences[:8]) + (", ..." if len(store.sequences) > 8 else "")
+        raise RecordingError(
+            f"{path.name}: say which part to read as SEQUENCE/ANGLE, with a sequence of {names} and an angle of "
+            f"{', '.join(angles)}; got {choices.part!r}"
+        )
+    channel = angles.index(angle)
     height, width = sensor_size(path, choices, store.height, store.width)
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
@@ -37,17 +47,3 @@ def open_store(path: Path, choices: Choices) -> Source:
             raise RecordingError(str(error)) from error
 
     return Source(height, width, blocks)
-
-
-def _part(path: Path, store: EventStore, part: str | None) -> tuple[str, int]:
-    sequence, _, angle = (part or "").rpartition("/")
-    if not sequence and len(store.sequences) == 1:
-        sequence = store.sequences[0]
-    angles = [str(a) for a in POLARIZER_ANGLES_DEG]
-    if sequence not in store.sequences or angle not in angles:
-        names = ", ".join(store.sequences[:8]) + (", ..." if len(store.sequences) > 8 else "")
-        raise RecordingError(
-            f"{path.name}: say which part to read as SEQUENCE/ANGLE, with a sequence of {names} and an angle of "
-            f"{', '.join(angles)}; got {part!r}"
-        )
-    return sequence, angles.index(angle)

@@ -1,3 +1,4 @@
+import importlib
 import os
 import subprocess
 import sys
@@ -21,24 +22,27 @@ class Panic(BaseException):
 
 def answers(path, count):
     for k in range(count):
-        yield {"size": os.path.getsize(path), "process": os.getpid()}, [np.arange(k), np.ones((k, 2), np.int8)]
+        yield os.path.getsize(path), os.getpid(), np.arange(k), np.ones((k, 2), np.int8)
 
 
 def panic(path):
-    yield None, []
+    yield None
     raise Panic("out of bounds")
 
 
-TASKS = {
-    "answers": answers,
-    "panic": panic,
-    "crash": lambda path: os.abort(),
-    "circle": lambda path: time.sleep(1000),
-    "claim": lambda path, size: [(None, [np.zeros(size, np.uint8)[:1]])],
-}
+def crash(path):
+    os.abort()
+
+
+def circle(path):
+    time.sleep(1000)
+
+
+def claim(path, size):
+    yield np.zeros(size, np.uint8)[:1]
 """
 FILE = Path("file.bin")
-LIBRARY = Library("Fragile", "numpy", "recordings", "fragile_tasks", "the file is damaged")
+LIBRARY = Library("Fragile", "numpy", "recordings", "the file is damaged")
 
 
 @pytest.fixture(autouse=True)
@@ -48,33 +52,36 @@ def file_and_tasks(tmp_path, monkeypatch):
     monkeypatch.setattr(isolated, "_idle", [])
     FILE.write_bytes(bytes(5))
     (tmp_path / "fragile_tasks.py").write_text(TASKS)
+    monkeypatch.delitem(sys.modules, "fragile_tasks", raising=False)
+
+
+def task(name):
+    return getattr(importlib.import_module("fragile_tasks"), name)
 
 
 def process_of():
-    return ask_once(LIBRARY, FILE, "answers", 1).value["process"]
+    return ask_once(LIBRARY, FILE, task("answers"), 1)[1]
 
 
 def test_values_and_arrays_come_from_one_process_that_is_not_ours():
-    first, second = ask(LIBRARY, FILE, "answers", 2)
-    assert first.value == second.value
-    assert first.value["size"] == 5
-    assert [array.tolist() for array in second.arrays] == [[0], [[1, 1]]]
-    assert second.arrays[1].dtype == "int8"
-    assert first.value["process"] == process_of() != os.getpid()
+    (size, process, *_), (*_, numbers, ones) = ask(LIBRARY, FILE, task("answers"), 2)
+    assert (size, numbers.tolist(), ones.tolist(), ones.dtype) == (5, [0], [[1, 1]], "int8")
+    assert process == process_of() != os.getpid()
 
 
 def test_two_tasks_at_a_time_do_not_disturb_each_other():
-    one, two = (ask(LIBRARY, FILE, "answers", 3) for _ in range(2))
-    sizes = [len(next(answers).arrays[0]) for answers in (one, two, two, one, one, two)]
+    one, two = (ask(LIBRARY, FILE, task("answers"), 3) for _ in range(2))
+    sizes = [len(next(answers)[2]) for answers in (one, two, two, one, one, two)]
     assert sizes == [0, 0, 1, 1, 2, 2]
 
 
 def test_a_script_without_a_guard_runs_once_and_leaves_no_process_and_no_pipe_open(project_root):
     Path("script.py").write_text(
         "from pathlib import Path\n"
+        "import fragile_tasks\n"
         "from polarnet.recordings.formats.isolated import Library, ask_once\n"
-        "library = Library('Fragile', 'numpy', 'recordings', 'fragile_tasks', '')\n"
-        "print(ask_once(library, Path('file.bin'), 'answers', 1).value['size'])\n"
+        "library = Library('Fragile', 'numpy', 'recordings', '')\n"
+        "print(ask_once(library, Path('file.bin'), fragile_tasks.answers, 1)[0])\n"
     )
     environment = os.environ | {"PYTHONPATH": str(project_root)}
     command = [sys.executable, "-X", "dev", "script.py"]
@@ -85,7 +92,7 @@ def test_a_script_without_a_guard_runs_once_and_leaves_no_process_and_no_pipe_op
 def test_a_crash_ends_in_a_reason_and_the_next_task_in_a_new_process():
     before = process_of()
     with pytest.raises(RecordingError, match=r"file\.bin: Fragile cannot read it: the library crashed"):
-        ask_once(LIBRARY, FILE, "crash")
+        ask_once(LIBRARY, FILE, task("crash"))
     assert process_of() != before
 
 
@@ -93,24 +100,24 @@ def test_a_file_that_sends_the_library_round_in_circles_is_given_up(monkeypatch)
     process_of()  # the start of a process takes longer
     monkeypatch.setattr(isolated, "PATIENCE_S", 0.2)
     with pytest.raises(RecordingError, match=r"file\.bin: .* took over 0\.2 s"):
-        ask_once(LIBRARY, FILE, "circle")
+        ask_once(LIBRARY, FILE, task("circle"))
 
 
 def test_what_the_library_raises_is_the_reason_and_the_process_stays():
     before = process_of()
     with pytest.raises(RecordingError, match=r"file\.bin: Fragile cannot read it: Panic: out of bounds; the file is"):
-        list(ask(LIBRARY, FILE, "panic"))
+        list(ask(LIBRARY, FILE, task("panic")))
     assert process_of() == before
 
 
 def test_a_library_that_is_not_there_is_asked_for():
     with pytest.raises(RuntimeError, match=r"file\.bin: .* no_such_package: run pip install -e '\.\[recordings\]'"):
-        ask_once(LIBRARY._replace(package="no_such_package"), FILE, "answers", 1)
+        ask_once(LIBRARY._replace(package="no_such_package"), FILE, task("answers"), 1)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the memory of a process")
 def test_a_claim_beyond_the_limit_of_memory_is_refused(monkeypatch):
     monkeypatch.setattr(isolated, "MAX_MIB", 2048)
-    assert ask_once(LIBRARY, FILE, "claim", 2**20).arrays[0].tolist() == [0]
+    assert ask_once(LIBRARY, FILE, task("claim"), 2**20).tolist() == [0]
     with pytest.raises(RecordingError, match="MemoryError"):
-        ask_once(LIBRARY, FILE, "claim", 2**32)
+        ask_once(LIBRARY, FILE, task("claim"), 2**32)

@@ -8,109 +8,75 @@ DAT_HEADER = b"% Data file containing CD events.\n% Version 2\n% Height 720\n% W
 EVT_HEADER = {2: b"% evt 2.0\n% geometry 640x480\n", 3: b"% format EVT3;height=720;width=1280\n% end\n"}
 
 
-def columns(tmp_path, version, words):
-    path = tmp_path / "e.raw"
-    path.write_bytes(EVT_HEADER[version] + np.array(words, {2: "<u4", 3: "<u2"}[version]).tobytes())
-    recording = read_recording(path)
-    assert recording.format == "evt"
-    return [getattr(recording.events, name).tolist() for name in "txyp"], recording.repairs
+@pytest.fixture
+def read_words(tmp_path, read):
+    """Columns and repairs of a file of these words."""
+
+    def columns(version, words):
+        path = tmp_path / "e.raw"
+        path.write_bytes(EVT_HEADER[version] + np.array(words, {2: "<u4", 3: "<u2"}[version]).tobytes())
+        (form, *_), *rows = read(path)
+        assert form == "evt"
+        return rows
+
+    return columns
 
 
-def test_evt2_words_worked_out_by_hand(tmp_path):
+def test_evt2_words_worked_out_by_hand(read_words):
     """The time is 28 high bits and 6 low ones; 0 is OFF, 1 is ON."""
-    words = [
-        8 << 28 | 100,
-        1 << 28 | 5 << 22 | 639 << 11 | 7,
-        0 << 28 | 63 << 22 | 1 << 11 | 479,
-        8 << 28 | 101,
-        1 << 28,
-    ]
-    rows, repairs = columns(tmp_path, 2, words)
-    assert rows == [[6405, 6463, 6464], [639, 1, 0], [7, 479, 0], [1, -1, 1]]
-    assert repairs == {}
+    words = [8 << 28 | 100, 1 << 28 | 5 << 22 | 639 << 11 | 7, 63 << 22 | 1 << 11 | 479, 8 << 28 | 101, 1 << 28]
+    assert read_words(2, words) == [[[6405, 6463, 6464], [639, 1, 0], [7, 479, 0], [1, -1, 1]], {}]
 
 
-def test_evt3_words_worked_out_by_hand(tmp_path):
+def test_evt3_words_worked_out_by_hand(read_words):
     """The time is 12 high bits and 12 low ones; vectors of 12 and 8 pixels follow a base."""
-    words = [
-        0x8001,
-        0x6002,
-        0x0007,
-        0x2000 | 5,
-        0x2800 | 6,
-        0x3800 | 100,
-        0x4000 | 0b1001,
-        0x5000 | 0b10,
-        0x6003,
-        0x0008,
-        0x2001,
-    ]
-    rows, repairs = columns(tmp_path, 3, words)
-    assert rows[0] == [4098] * 5 + [4099]
-    assert rows[1:] == [[5, 6, 100, 103, 113, 1], [7, 7, 7, 7, 7, 8], [-1, 1, 1, 1, 1, -1]]
+    first = [0x8001, 0x6002, 0x0007, 0x2000 | 5, 0x2800 | 6]
+    vectors = [0x3800 | 100, 0x4000 | 0b1001, 0x5000 | 0b10]
+    (t, *rows), repairs = read_words(3, [*first, *vectors, 0x6003, 0x0008, 0x2001])
+    assert t == [4098] * 5 + [4099]
+    assert rows == [[5, 6, 100, 103, 113, 1], [7, 7, 7, 7, 7, 8], [-1, 1, 1, 1, 1, -1]]
     assert repairs == {}
 
 
-def test_evt_times_run_on_when_the_high_bits_are_full(tmp_path):
-    rows, _ = columns(tmp_path, 3, [0x8FFF, 0x6FFF, 0x0007, 0x2000, 0x8000, 0x2000])
-    assert rows[0] == [2**24 - 1, 2**24]
-    rows, _ = columns(tmp_path, 2, [8 << 28 | 2**28 - 1, 63 << 22, 8 << 28, 0])
-    assert rows[0] == [2**34 - 1, 2**34]
+@pytest.mark.parametrize("header", [b"% evt 2.1\n% geometry 640x480\n", b"% format EVT21;height=480;width=640\n"])
+def test_evt21_has_32_pixels_in_a_word_of_64_bits(tmp_path, read, header):
+    def word(kind, low6_us, x, y, valid):
+        return kind << 60 | low6_us << 54 | x << 43 | y << 32 | valid
+
+    words = [word(1, 9, 0, 0, 1), 8 << 60 | 3 << 32, word(1, 5, 32, 7, 0b101), word(0, 63, 608, 479, 1 << 31)]
+    (tmp_path / "e.raw").write_bytes(header + b"% end\n" + np.array(words, "<u8").tobytes())
+    form, columns, repairs = read(tmp_path / "e.raw")
+    assert (form, repairs) == (("evt", 480, 640), {"orphans": 1})
+    assert columns == [[3 * 64 + 5, 3 * 64 + 5, 3 * 64 + 63], [32, 34, 639], [7, 7, 479], [1, 1, -1]]
 
 
-def test_events_before_the_first_time_and_row_are_left_out_and_counted(tmp_path):
-    assert columns(tmp_path, 3, [0x2000, 0x8001, 0x2000, 0x0007, 0x2000])[1] == {"orphans": 2}
-    assert columns(tmp_path, 2, [1 << 28, 8 << 28, 1 << 28])[1] == {"orphans": 1}
+def test_evt_times_run_on_when_the_high_bits_are_full(read_words):
+    assert read_words(3, [0x8FFF, 0x6FFF, 0x0007, 0x2000, 0x8000, 0x2000])[0][0] == [2**24 - 1, 2**24]
+    assert read_words(2, [8 << 28 | 2**28 - 1, 63 << 22, 8 << 28, 0])[0][0] == [2**34 - 1, 2**34]
 
 
-def test_the_sensors_name_stands_for_its_size(tmp_path):
+def test_events_before_the_first_time_and_row_are_left_out_and_counted(read_words):
+    assert read_words(3, [0x2000, 0x8001, 0x2000, 0x0007, 0x2000])[1] == {"orphans": 2}
+    assert read_words(2, [1 << 28, 8 << 28, 1 << 28])[1] == {"orphans": 1}
+
+
+def test_the_sensors_name_stands_for_its_size(tmp_path, read):
     words = np.array([0x8001, 0x0007, 0x2000], "<u2").tobytes()
     (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n% plugin_name hal_plugin_gen41_evk3\n" + words)
-    events = read_recording(tmp_path / "e.raw").events
-    assert (events.height, events.width) == (720, 1280)
+    assert read(tmp_path / "e.raw")[0] == ("evt", 720, 1280)
     (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n" + words)
     with pytest.raises(RecordingError, match="give height and width"):
-        read_recording(tmp_path / "e.raw")
+        read(tmp_path / "e.raw")
 
 
-def dat_events(rows):
-    return np.array([(t % 2**32, x | y << 14 | p << 28) for t, x, y, p in rows], "<u4").tobytes()
-
-
-def test_dat_version_2_has_14_bits_for_each_coordinate(tmp_path):
-    content = DAT_HEADER + b"\x0c\x08" + dat_events([(5, 1279, 0, 1), (7, 0, 719, 0)])
-    (tmp_path / "e.dat").write_bytes(content)
-    recording = read_recording(tmp_path / "e.dat")
-    events = recording.events
-    assert (recording.format, events.height, events.width, recording.repairs) == ("dat", 720, 1280, {})
-    assert [events.t.tolist(), events.x.tolist(), events.y.tolist()] == [[5, 7], [1279, 0], [0, 719]]
-    assert events.p.tolist() == [1, -1]
-
-
-def test_dat_version_1_has_9_and_8_bits(tmp_path):
+def test_dat_version_2_has_14_bits_for_each_coordinate_and_version_1_has_9_and_8(tmp_path, read):
+    rows = [(5, 1279, 0, 1), (7, 0, 719, 0)]
+    words = np.array([(t, x | y << 14 | p << 28) for t, x, y, p in rows], "<u4").tobytes()
+    (tmp_path / "e.dat").write_bytes(DAT_HEADER + b"\x0c\x08" + words)
+    assert read(tmp_path / "e.dat") == (("dat", 720, 1280), [[5, 7], [1279, 0], [0, 719], [1, -1]], {})
     words = np.array([(5, 303 | 239 << 9 | 1 << 17)], "<u4").tobytes()
     (tmp_path / "e.dat").write_bytes(b"% Version 1\n\x00\x08" + words)
-    events = read_recording(tmp_path / "e.dat", height=240, width=304).events
-    assert [events.x.tolist(), events.y.tolist(), events.p.tolist()] == [[303], [239], [1]]
-
-
-def evt21(kind, low6_us, x, y, valid):
-    return kind << 60 | low6_us << 54 | x << 43 | y << 32 | valid
-
-
-@pytest.mark.parametrize(
-    "header", [b"% evt 2.1\n% geometry 640x480\n% end\n", b"% format EVT21;height=480;width=640\n% end\n"]
-)
-def test_evt21_has_32_pixels_in_a_word_of_64_bits(tmp_path, header):
-    high = 8 << 60 | 3 << 32
-    words = [evt21(1, 9, 0, 0, 1), high, evt21(1, 5, 32, 7, 0b101), evt21(0, 63, 608, 479, 1 << 31)]
-    path = tmp_path / "e.raw"
-    path.write_bytes(header + np.array(words, "<u8").tobytes())
-    recording = read_recording(path)
-    events = recording.events
-    assert (recording.format, events.height, events.width, recording.repairs) == ("evt", 480, 640, {"orphans": 1})
-    assert events.t.tolist() == [3 * 64 + 5, 3 * 64 + 5, 3 * 64 + 63]
-    assert [events.x.tolist(), events.y.tolist(), events.p.tolist()] == [[32, 34, 639], [7, 7, 479], [1, 1, -1]]
+    assert read(tmp_path / "e.dat", height=240, width=304)[1] == [[5], [303], [239], [1]]
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,14 @@
-"""Raw files of a CeleX-5 (BIN, little endian): packages of events or of a full picture, as the sensor sends them.
+"""Files of a CeleX-5: raw ones (BIN, little endian), and event lists from the vendor's converter (CSV).
 
-A header gives the data type (bit 0 loop mode, bit 1 IMU), the modes of the sensor, the event format, the time of day
-and the number of packages. Each package is a length and that many bytes. With an IMU, the computer's time in
-milliseconds and the IMU's samples follow. The last byte of a package is 0 for a full picture.
+A BIN file has packages of events or of a full picture, as the sensor sends them. A header gives the data type (bit 0
+loop mode, bit 1 IMU), the modes of the sensor, the event format, the time of day and the number of packages. Each
+package is a length and that many bytes. With an IMU, the computer's time in milliseconds and the IMU's samples follow.
+The last byte of a package is 0 for a full picture.
 
 The sensor sends 14-bit words, four in 7 bytes: the high 8 bits of each, then the low 6 of all. An item is two words,
 and its two lowest bits give its kind. Time stamps of 16 bits wrap around.
+
+A line of CSV is row, column, intensity (0 to 4095), polarity (-1, 0 or 1), t in Event Intensity mode.
 """
 
 import struct
@@ -16,8 +19,9 @@ from typing import BinaryIO, NamedTuple, no_type_check
 
 import numba
 import numpy as np
-from jaxtyping import Int64, UInt8, UInt16
+from jaxtyping import UInt8, UInt16
 
+from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
 from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size
 
 HEIGHT, WIDTH = 800, 1280
@@ -32,14 +36,15 @@ STAMP = struct.Struct("<q I")  # the computer's time in milliseconds, and the nu
 IMU_SAMPLE_BYTES = 32
 LOOP, IMU = 1, 2  # bits of the data type
 
-OFF_PIXEL, IN_PIXEL, INTENSITY, FULL_PICTURE = range(4)
 MODES = ("Event Off-Pixel Timestamp", "Event In-Pixel Timestamp", "Event Intensity", "Full Picture",
          "Optical Flow", "Optical Flow FPN", "Multi-Read Optical Flow")  # fmt: skip
+INTENSITY, FULL_PICTURE = 2, 3  # of `MODES`
 
 PICTURE_BYTES = HEIGHT * WIDTH * 3 // 2 + 1
 MAX_PACKAGE = 2_048_000  # bytes; the limit of the vendor's library
 
 ROW, COLUMN = 2, 1  # kinds of items
+CSV_COLUMNS = 5
 
 
 class Header(NamedTuple):
@@ -66,22 +71,19 @@ class Picture(NamedTuple):
     """800 x 1280 pixels from a BIN file; 0 to 4095; brighter is larger."""
 
 
-def matches(path: Path, head: bytes) -> bool:
+def matches_bin(path: Path, head: bytes) -> bool:
     """Whether the header and the first length are plausible for a BIN file."""
-    if len(head) < HEADER.size:
-        return False
-    header = Header(*HEADER.unpack_from(head))
-    length = LENGTH.unpack_from(head, HEADER.size)[0] if len(head) >= HEADER.size + LENGTH.size else 1
-    return _plausible(header) and 0 < length <= MAX_PACKAGE
+    length = head[HEADER.size : HEADER.size + LENGTH.size]
+    return _header(head) is not None and (len(length) < LENGTH.size or 0 < LENGTH.unpack(length)[0] <= MAX_PACKAGE)
 
 
-def open_celex5_bin(path: Path, choices: Choices) -> Source:
+def open_bin(path: Path, choices: Choices) -> Source:
     """Open the events of a BIN file of event format 1; format 2 and some modes have no polarity and are refused.
 
     A pixel's polarity is the sign of its intensity change. Its first event is compared with 0 and therefore brighter.
     Time 0 is the first time stamp. Full pictures between the events are left out; `celex5_pictures` reads them.
     """
-    header = _header(path)
+    header = _opened(path)
     if header.event_format == 0:
         raise RecordingError(
             f"{path.name}: the events are of format 0, whose intensities are wrong according to the vendor; record in "
@@ -92,9 +94,12 @@ def open_celex5_bin(path: Path, choices: Choices) -> Source:
             f"{path.name}: recorded in loop mode, where the time stamps of events do not run on during pictures; "
             f"record events and pictures each in a mode of their own"
         )
-    if header.event_format == 2 or header.loop_a in (OFF_PIXEL, IN_PIXEL):
+    if header.event_format == 2 or header.loop_a < INTENSITY:
         mode = MODES[header.loop_a] if header.loop_a < len(MODES) else MODES[INTENSITY]
-        raise no_polarity(path, mode if header.event_format == 1 else f"{mode}, event format 2")
+        raise RecordingError(
+            f"{path.name}: events of a CeleX-5 in its mode {mode}, event format {header.event_format}, have no "
+            f"polarity, so nothing can be recovered from them; record in Event Intensity mode, event format 1"
+        )
     height, width = sensor_size(path, choices, HEIGHT, WIDTH)
     clock_mhz = choices.clock_mhz or CLOCK_MHZ
 
@@ -105,7 +110,12 @@ def open_celex5_bin(path: Path, choices: Choices) -> Source:
             if package[-1] == 0:
                 state[0] = -1  # the events after a picture begin with their row
             else:
-                t, x, y, p = _decoded(package[:-1], state, last_adc, counts)
+                counts["unreadable_packages"] += len(package) % 7 != 1
+                size = 2 * (len(package) // 7)
+                columns = tuple(np.empty(size, dtype) for dtype in (np.int64, np.int16, np.int16, np.int8))
+                events, orphans, unchanged = _decode(package[:-1], state, last_adc, columns)
+                counts.update({"orphans": orphans, "no_change": unchanged})
+                t, x, y, p = (column[:events] for column in columns)
                 yield Block(microseconds(t, clock_mhz), x, y, p)
 
     return Source(height, width, blocks)
@@ -114,14 +124,6 @@ def open_celex5_bin(path: Path, choices: Choices) -> Source:
 def microseconds(ticks: np.ndarray, clock_mhz: float | int) -> np.ndarray:
     """Convert the sensor's time stamps to microseconds, rounded down as in the vendor's library."""
     return np.asarray(ticks, np.int64) * (1000 * TICK_CYCLES) // round(1000 * clock_mhz)
-
-
-def no_polarity(path: Path, mode: str) -> RecordingError:
-    """The error for a file of a mode without polarity."""
-    return RecordingError(
-        f"{path.name}: events of a CeleX-5 in its mode {mode} have no polarity, so nothing can be recovered from them; "
-        f"record in Event Intensity mode"
-    )
 
 
 def celex5_pictures(path: Path) -> Iterator[Picture]:
@@ -137,6 +139,38 @@ def celex5_pictures(path: Path) -> Iterator[Picture]:
             yield Picture(None if t_ms is None else 1000 * t_ms, _unpacked(package[:-1]))
 
 
+def matches_csv(path: Path, head: bytes) -> bool:
+    """Whether there are five columns with commas, the fourth mostly a polarity."""
+    lines = [line.words for line in numbers_of(head)]
+    if not lines or b"," not in head or len(lines[0]) != CSV_COLUMNS:
+        return False
+    return 2 * sum(len(words) == CSV_COLUMNS and words[3] in ("-1", "0", "1") for words in lines) > len(lines)
+
+
+def open_csv(path: Path, choices: Choices) -> Source:
+    """Open a CSV file of Event Intensity mode; the other two modes have no polarity and are refused.
+
+    Times are microseconds. Converters older than SDK 2.0 (December 2019) wrote the sensor's time stamps; `clock_mhz`
+    selects this interpretation.
+    """
+    with path.open("rb") as file:
+        lines = numbers_of(file.read(HEAD_BYTES))
+    if lines and len(lines[0].words) != CSV_COLUMNS:
+        raise RecordingError(
+            f"{path.name}: expected the 5 columns row,col,adc,polarity,t of a CeleX-5 in Event Intensity mode, got "
+            f"{len(lines[0].words)}; its other modes, of 3 or 4 columns, have no polarity"
+        )
+    height, width = sensor_size(path, choices, HEIGHT, WIDTH)
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        for rows in number_blocks(path, (0,) * CSV_COLUMNS, 0, counts):
+            row, column, _, p, t = np.ascontiguousarray(rows[rows[:, 3] != 0].T)
+            counts["no_change"] += len(rows) - len(t)
+            yield Block(t if choices.clock_mhz is None else microseconds(t, choices.clock_mhz), column, row, p)
+
+    return Source(height, width, blocks)
+
+
 def _unpacked(data: np.ndarray) -> np.ndarray:
     """Unpack two 12-bit pixels from 3 bytes: their high 8 bits, then the low 4 of the first, then those of the second.
 
@@ -150,31 +184,32 @@ def _unpacked(data: np.ndarray) -> np.ndarray:
     return picture
 
 
-def _header(path: Path) -> Header:
-    with path.open("rb") as file:
-        head = file.read(HEADER.size)
+def _header(head: bytes) -> Header | None:
+    """The header of a BIN file; None if the bytes are too few or not plausible."""
     if len(head) < HEADER.size:
-        raise RecordingError(f"{path.name}: expected a header of {HEADER.size} bytes, the file ends after {len(head)}")
-    header = Header(*HEADER.unpack(head))
-    if not _plausible(header):
-        raise RecordingError(f"{path.name}: its header is not that of a BIN file of a CeleX-5: {header}")
-    return header
-
-
-def _plausible(header: Header) -> bool:
-    return (
+        return None
+    header = Header(*HEADER.unpack_from(head))
+    modes = header.loop_a, header.loop_b, header.loop_c
+    plausible = (
         header.data_type <= LOOP | IMU
         and header.event_format <= 2
-        and header.hour < 24
-        and header.minute < 60
-        and header.second < 60
-        and all(mode < len(MODES) + 1 or mode == 255 for mode in (header.loop_a, header.loop_b, header.loop_c))
+        and (header.hour < 24 and header.minute < 60 and header.second < 60)
+        and all(mode <= len(MODES) or mode == 255 for mode in modes)
     )
+    return header if plausible else None
+
+
+def _opened(path: Path) -> Header:
+    with path.open("rb") as file:
+        header = _header(file.read(HEADER.size))
+    if header is None:
+        raise RecordingError(f"{path.name}: expected the {HEADER.size} bytes of a BIN header of a CeleX-5 at its start")
+    return header
 
 
 def _packages(path: Path, counts: Counter[str]) -> Iterator[tuple[int | None, UInt8[np.ndarray, " bytes"]]]:
     """The computer's time in milliseconds, and the bytes, of each package."""
-    header = _header(path)
+    header = _opened(path)
     with path.open("rb") as file:
         file.seek(HEADER.size)
         number = 0
@@ -206,17 +241,6 @@ def _skip_imu(path: Path, file: BinaryIO) -> int | None:
         raise RecordingError(f"{path.name}: a package has {samples} IMU samples at {t_ms} ms; the file is damaged")
     file.seek(samples * IMU_SAMPLE_BYTES, 1)
     return t_ms
-
-
-def _decoded(
-    data: UInt8[np.ndarray, " bytes"], state: Int64[np.ndarray, " 3"], last_adc: np.ndarray, counts: Counter[str]
-) -> list[np.ndarray]:
-    """Ticks, columns, rows and polarities of the events in a package; `state` and `last_adc` are updated."""
-    counts["unreadable_packages"] += len(data) % 7 != 0
-    columns = tuple(np.empty(2 * (len(data) // 7), dtype) for dtype in (np.int64, np.int16, np.int16, np.int8))
-    events, orphans, unchanged = _decode(data, state, last_adc, columns)
-    counts.update({"orphans": orphans, "no_change": unchanged})
-    return [column[:events] for column in columns]
 
 
 @numba.njit(nogil=True, cache=True)
