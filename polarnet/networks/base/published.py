@@ -31,7 +31,7 @@ class PublishedNetwork(nn.Module):
 
     def unroll(
         self, windows: Float[Tensor, "t b bins h w"], state: Any = None
-    ) -> tuple[Float[Tensor, "t b *k i j"], list[Tensor]]:
+    ) -> tuple[Float[Tensor, "t b *k i j"], Any]:
         """Process t windows of b streams, one window after the other; `state` is None at the start."""
         frames = []
         for window in windows:
