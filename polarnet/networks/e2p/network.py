@@ -95,8 +95,8 @@ class Branch(nn.Module):
         self.R1, self.R2 = ResidualBlock(CHANNELS), ResidualBlock(CHANNELS)
         self.pred = nn.Conv2d(CHANNELS, maps, 3, padding=1)
         for gate in (gate for gru in (self.G1, self.G2) for gate in gru.children()):
-            nn.init.orthogonal_(gate.weight)
-            nn.init.zeros_(gate.bias)
+            nn.init.orthogonal_(gate.get_parameter("weight"))
+            nn.init.zeros_(gate.get_parameter("bias"))
 
 
 class MosaicHead(nn.Module):

@@ -7,6 +7,7 @@ import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -18,6 +19,7 @@ from polarnet.networks.base.published import PublishedNetwork
 HEAD_CHANNELS = 32
 ENCODER_CHANNELS = (64, 128, 256)
 RESIDUAL_BLOCKS = 2
+Padding = Literal["zeros", "reflect"]
 SIZE_MULTIPLE = 2 ** len(ENCODER_CHANNELS)  # each encoder halves height and width
 
 
@@ -72,7 +74,7 @@ class E2vid(PublishedNetwork):
 
 def convolution(
     inputs: int, outputs: int, size: int, *, stride: int = 1, normalised: bool = False, relu: bool = False,
-    padding_mode: str = "zeros",
+    padding_mode: Padding = "zeros",
 ) -> nn.Sequential:  # fmt: skip
     """Build a convolution, with batch normalisation (which replaces the bias) and ReLU on request."""
     layer = nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=not normalised, padding_mode=padding_mode)
@@ -94,7 +96,7 @@ def named(**layers: nn.Module | None) -> nn.Sequential:
 class Recurrent(nn.Module):
     """A convolution, then a ConvLSTM."""
 
-    def __init__(self, conv: nn.Module, channels: int, padding_mode: str = "zeros"):
+    def __init__(self, conv: nn.Module, channels: int, padding_mode: Padding = "zeros"):
         super().__init__()
         self.conv = conv
         self.recurrent_block = ConvLstm(channels, padding_mode)
@@ -112,7 +114,7 @@ class ConvLstm(nn.Module):
     memory <- f memory + i g;  output <- o tanh(memory)
     """
 
-    def __init__(self, channels: int, padding_mode: str = "zeros"):
+    def __init__(self, channels: int, padding_mode: Padding = "zeros"):
         super().__init__()
         self.Gates = nn.Conv2d(2 * channels, 4 * channels, 3, padding=1, padding_mode=padding_mode)
 
