@@ -143,7 +143,8 @@ def test_the_order_is_a_permutation_that_depends_on_seed_and_epoch():
 
 
 def test_batches_follow_the_order_and_the_last_may_be_small():
-    dataset = [sequence("a"), sequence("bb"), sequence("ccc")]
+    plain = ViewConfig(visits=1, windows=None, crop=None, symmetries=False)
+    dataset = Visits([sequence("a"), sequence("bb"), sequence("ccc")], plain, seed=1, epoch=0)
     names = [batch.names for batch in batches_of(dataset, [2, 0, 1], batch_size=2, workers=0)]
     assert names == [["ccc", "a"], ["bb"]]
 

@@ -220,7 +220,7 @@ def shuffled(count: int, seed: int, epoch: int) -> list[int]:
 
 
 def batches_of(
-    dataset: Dataset[WindowSequence] | list[WindowSequence], order: Sequence[int], batch_size: int, workers: int
+    dataset: Dataset[WindowSequence], order: Sequence[int], batch_size: int, workers: int
 ) -> Iterator[Batch]:
     """Yield batches of the sequences in `order`; the last batch may be smaller. Workers, if any, read ahead."""
     return iter(DataLoader(dataset, batch_size, sampler=order, collate_fn=stack, num_workers=workers))
